@@ -1,0 +1,48 @@
+# Works on a machine that has only Python >= 3.11, make and git: every target makes its own .venv first.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+DATA ?= ../shared/data
+
+.PHONY: demo test lint types contracts check proto lock bench clean
+
+demo: $(STAMP)
+	$(BIN)/syncline demo --out demo-out
+
+test: $(STAMP)
+	$(BIN)/python -m pytest
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(STAMP)
+	$(BIN)/mypy
+
+contracts: $(STAMP)
+	$(BIN)/lint-imports
+
+check: test lint types contracts
+
+bench: $(STAMP)
+	$(BIN)/python -m tests.bench $(if $(QUICK),--quick) --data $(DATA)
+
+# Regenerates the protobuf code; a test fails if it is not what the .proto says.
+proto: $(STAMP)
+	$(BIN)/python -m tests.generate_messages
+
+# Renews the pinned versions in requirements.lock from pyproject.toml.
+lock: $(STAMP)
+	$(BIN)/uv pip compile --quiet --universal --no-header --no-annotate --no-emit-index-url --no-emit-find-links \
+	  --python-version 3.11 --extra dev --extra view pyproject.toml -o requirements.lock
+
+$(STAMP): pyproject.toml requirements.lock
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Syncline needs Python 3.11 or newer: make PYTHON=python3.12")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $(STAMP)
+
+clean:
+	rm -rf $(VENV) demo-out out

@@ -1,0 +1,5 @@
+"""The `syncline` command."""
+
+
+def main() -> None:
+    """Placeholder replaced by the command line application."""

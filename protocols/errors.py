@@ -1,0 +1,55 @@
+"""The two things that can go wrong for a user, and how they are told.
+
+    SynclineError
+    ├── InputError   bad use, configuration or input     exit status 2
+    └── Refused      well-formed, but no answer in it    exit status 3
+
+Anything else that escapes is a bug: exit status 1.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+EXIT_DONE = 0
+EXIT_BUG = 1
+EXIT_INPUT = 2
+EXIT_REFUSED = 3
+
+
+class SynclineError(Exception):
+    """Base of the errors that are told to a user as one line."""
+
+    exit_status = EXIT_BUG
+
+
+class InputError(SynclineError):
+    """Bad use, configuration or input: where it is, what is wrong, and what to do about it.
+
+    str() is one line: ``file:line: what: remedy``.
+    """
+
+    exit_status = EXIT_INPUT
+
+    def __init__(self, what: str, *, file: Path | str | None = None, line: int | None = None, remedy: str = "") -> None:
+        self.what = what
+        self.file = None if file is None else Path(file)
+        self.line = line
+        self.remedy = remedy
+        place = "" if file is None else f"{file}:{line}: " if line is not None else f"{file}: "
+        text = f"{place}{what}; {remedy}" if remedy else f"{place}{what}"
+        super().__init__(" ".join(text.split()))
+
+
+class Refused(SynclineError):
+    """The input is well-formed, but there is no trustworthy answer in it; the reason says why.
+
+    cameras: reasons by camera, where single ones can be told.
+    """
+
+    exit_status = EXIT_REFUSED
+
+    def __init__(self, reason: str, cameras: dict[str, str] | None = None) -> None:
+        self.reason = " ".join(reason.split())
+        self.cameras = dict(cameras or {})
+        super().__init__(self.reason)

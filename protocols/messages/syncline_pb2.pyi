@@ -1,0 +1,236 @@
+from google.protobuf.internal import containers as _containers
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class Colour(_message.Message):
+    __slots__ = ("red", "green", "blue")
+    RED_FIELD_NUMBER: _ClassVar[int]
+    GREEN_FIELD_NUMBER: _ClassVar[int]
+    BLUE_FIELD_NUMBER: _ClassVar[int]
+    red: int
+    green: int
+    blue: int
+    def __init__(self, red: _Optional[int] = ..., green: _Optional[int] = ..., blue: _Optional[int] = ...) -> None: ...
+
+class Detection(_message.Message):
+    __slots__ = ("u", "v", "size", "score", "label", "colour", "covariance")
+    U_FIELD_NUMBER: _ClassVar[int]
+    V_FIELD_NUMBER: _ClassVar[int]
+    SIZE_FIELD_NUMBER: _ClassVar[int]
+    SCORE_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    COLOUR_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    u: float
+    v: float
+    size: float
+    score: float
+    label: str
+    colour: Colour
+    covariance: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, u: _Optional[float] = ..., v: _Optional[float] = ..., size: _Optional[float] = ..., score: _Optional[float] = ..., label: _Optional[str] = ..., colour: _Optional[_Union[Colour, _Mapping]] = ..., covariance: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class Observation(_message.Message):
+    __slots__ = ("schema_version", "camera", "boot_id", "sequence", "frame", "device_time_ns", "exposure_ns", "detections")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    EXPOSURE_NS_FIELD_NUMBER: _ClassVar[int]
+    DETECTIONS_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    camera: str
+    boot_id: str
+    sequence: int
+    frame: int
+    device_time_ns: int
+    exposure_ns: int
+    detections: _containers.RepeatedCompositeFieldContainer[Detection]
+    def __init__(self, schema_version: _Optional[int] = ..., camera: _Optional[str] = ..., boot_id: _Optional[str] = ..., sequence: _Optional[int] = ..., frame: _Optional[int] = ..., device_time_ns: _Optional[int] = ..., exposure_ns: _Optional[int] = ..., detections: _Optional[_Iterable[_Union[Detection, _Mapping]]] = ...) -> None: ...
+
+class CameraInfo(_message.Message):
+    __slots__ = ("schema_version", "camera", "boot_id", "width", "height", "fps", "matrix", "distortions", "fisheye", "driver", "clock", "position", "rotation", "position_std", "rotation_std", "readout_s")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    FPS_FIELD_NUMBER: _ClassVar[int]
+    MATRIX_FIELD_NUMBER: _ClassVar[int]
+    DISTORTIONS_FIELD_NUMBER: _ClassVar[int]
+    FISHEYE_FIELD_NUMBER: _ClassVar[int]
+    DRIVER_FIELD_NUMBER: _ClassVar[int]
+    CLOCK_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_FIELD_NUMBER: _ClassVar[int]
+    POSITION_STD_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_STD_FIELD_NUMBER: _ClassVar[int]
+    READOUT_S_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    camera: str
+    boot_id: str
+    width: int
+    height: int
+    fps: float
+    matrix: _containers.RepeatedScalarFieldContainer[float]
+    distortions: _containers.RepeatedScalarFieldContainer[float]
+    fisheye: bool
+    driver: str
+    clock: str
+    position: _containers.RepeatedScalarFieldContainer[float]
+    rotation: _containers.RepeatedScalarFieldContainer[float]
+    position_std: _containers.RepeatedScalarFieldContainer[float]
+    rotation_std: _containers.RepeatedScalarFieldContainer[float]
+    readout_s: float
+    def __init__(self, schema_version: _Optional[int] = ..., camera: _Optional[str] = ..., boot_id: _Optional[str] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., fps: _Optional[float] = ..., matrix: _Optional[_Iterable[float]] = ..., distortions: _Optional[_Iterable[float]] = ..., fisheye: _Optional[bool] = ..., driver: _Optional[str] = ..., clock: _Optional[str] = ..., position: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., position_std: _Optional[_Iterable[float]] = ..., rotation_std: _Optional[_Iterable[float]] = ..., readout_s: _Optional[float] = ...) -> None: ...
+
+class RigInfo(_message.Message):
+    __slots__ = ("schema_version", "units", "clock", "distances", "up", "up_camera", "reference_camera")
+    class Distance(_message.Message):
+        __slots__ = ("camera_a", "camera_b", "distance")
+        CAMERA_A_FIELD_NUMBER: _ClassVar[int]
+        CAMERA_B_FIELD_NUMBER: _ClassVar[int]
+        DISTANCE_FIELD_NUMBER: _ClassVar[int]
+        camera_a: str
+        camera_b: str
+        distance: float
+        def __init__(self, camera_a: _Optional[str] = ..., camera_b: _Optional[str] = ..., distance: _Optional[float] = ...) -> None: ...
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    UNITS_FIELD_NUMBER: _ClassVar[int]
+    CLOCK_FIELD_NUMBER: _ClassVar[int]
+    DISTANCES_FIELD_NUMBER: _ClassVar[int]
+    UP_FIELD_NUMBER: _ClassVar[int]
+    UP_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    units: str
+    clock: str
+    distances: _containers.RepeatedCompositeFieldContainer[RigInfo.Distance]
+    up: _containers.RepeatedScalarFieldContainer[float]
+    up_camera: str
+    reference_camera: str
+    def __init__(self, schema_version: _Optional[int] = ..., units: _Optional[str] = ..., clock: _Optional[str] = ..., distances: _Optional[_Iterable[_Union[RigInfo.Distance, _Mapping]]] = ..., up: _Optional[_Iterable[float]] = ..., up_camera: _Optional[str] = ..., reference_camera: _Optional[str] = ...) -> None: ...
+
+class CameraCalibration(_message.Message):
+    __slots__ = ("camera", "rotation", "translation", "time_offset", "clock_rate", "time_offset_std", "position_std", "rms_px", "matrix", "distortions", "fisheye", "boot_id")
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_FIELD_NUMBER: _ClassVar[int]
+    TRANSLATION_FIELD_NUMBER: _ClassVar[int]
+    TIME_OFFSET_FIELD_NUMBER: _ClassVar[int]
+    CLOCK_RATE_FIELD_NUMBER: _ClassVar[int]
+    TIME_OFFSET_STD_FIELD_NUMBER: _ClassVar[int]
+    POSITION_STD_FIELD_NUMBER: _ClassVar[int]
+    RMS_PX_FIELD_NUMBER: _ClassVar[int]
+    MATRIX_FIELD_NUMBER: _ClassVar[int]
+    DISTORTIONS_FIELD_NUMBER: _ClassVar[int]
+    FISHEYE_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    camera: str
+    rotation: _containers.RepeatedScalarFieldContainer[float]
+    translation: _containers.RepeatedScalarFieldContainer[float]
+    time_offset: float
+    clock_rate: float
+    time_offset_std: float
+    position_std: _containers.RepeatedScalarFieldContainer[float]
+    rms_px: float
+    matrix: _containers.RepeatedScalarFieldContainer[float]
+    distortions: _containers.RepeatedScalarFieldContainer[float]
+    fisheye: bool
+    boot_id: str
+    def __init__(self, camera: _Optional[str] = ..., rotation: _Optional[_Iterable[float]] = ..., translation: _Optional[_Iterable[float]] = ..., time_offset: _Optional[float] = ..., clock_rate: _Optional[float] = ..., time_offset_std: _Optional[float] = ..., position_std: _Optional[_Iterable[float]] = ..., rms_px: _Optional[float] = ..., matrix: _Optional[_Iterable[float]] = ..., distortions: _Optional[_Iterable[float]] = ..., fisheye: _Optional[bool] = ..., boot_id: _Optional[str] = ...) -> None: ...
+
+class Refusal(_message.Message):
+    __slots__ = ("camera", "reason")
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    camera: str
+    reason: str
+    def __init__(self, camera: _Optional[str] = ..., reason: _Optional[str] = ...) -> None: ...
+
+class Calibration(_message.Message):
+    __slots__ = ("schema_version", "revision", "status", "reason", "reference_camera", "scale", "units", "solver", "cameras", "refused")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    REVISION_FIELD_NUMBER: _ClassVar[int]
+    STATUS_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    SCALE_FIELD_NUMBER: _ClassVar[int]
+    UNITS_FIELD_NUMBER: _ClassVar[int]
+    SOLVER_FIELD_NUMBER: _ClassVar[int]
+    CAMERAS_FIELD_NUMBER: _ClassVar[int]
+    REFUSED_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    revision: int
+    status: str
+    reason: str
+    reference_camera: str
+    scale: str
+    units: str
+    solver: str
+    cameras: _containers.RepeatedCompositeFieldContainer[CameraCalibration]
+    refused: _containers.RepeatedCompositeFieldContainer[Refusal]
+    def __init__(self, schema_version: _Optional[int] = ..., revision: _Optional[int] = ..., status: _Optional[str] = ..., reason: _Optional[str] = ..., reference_camera: _Optional[str] = ..., scale: _Optional[str] = ..., units: _Optional[str] = ..., solver: _Optional[str] = ..., cameras: _Optional[_Iterable[_Union[CameraCalibration, _Mapping]]] = ..., refused: _Optional[_Iterable[_Union[Refusal, _Mapping]]] = ...) -> None: ...
+
+class Track(_message.Message):
+    __slots__ = ("schema_version", "sequence", "label", "state", "reference_time_ns", "position", "velocity", "position_covariance")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    VELOCITY_FIELD_NUMBER: _ClassVar[int]
+    POSITION_COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    sequence: int
+    label: str
+    state: str
+    reference_time_ns: int
+    position: _containers.RepeatedScalarFieldContainer[float]
+    velocity: _containers.RepeatedScalarFieldContainer[float]
+    position_covariance: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, schema_version: _Optional[int] = ..., sequence: _Optional[int] = ..., label: _Optional[str] = ..., state: _Optional[str] = ..., reference_time_ns: _Optional[int] = ..., position: _Optional[_Iterable[float]] = ..., velocity: _Optional[_Iterable[float]] = ..., position_covariance: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class AgentStatus(_message.Message):
+    __slots__ = ("schema_version", "agent", "role", "boot_id", "sequence", "state", "message", "counters", "gauges", "version")
+    class CountersEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
+    class GaugesEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    AGENT_FIELD_NUMBER: _ClassVar[int]
+    ROLE_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    COUNTERS_FIELD_NUMBER: _ClassVar[int]
+    GAUGES_FIELD_NUMBER: _ClassVar[int]
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    agent: str
+    role: str
+    boot_id: str
+    sequence: int
+    state: str
+    message: str
+    counters: _containers.ScalarMap[str, float]
+    gauges: _containers.ScalarMap[str, float]
+    version: str
+    def __init__(self, schema_version: _Optional[int] = ..., agent: _Optional[str] = ..., role: _Optional[str] = ..., boot_id: _Optional[str] = ..., sequence: _Optional[int] = ..., state: _Optional[str] = ..., message: _Optional[str] = ..., counters: _Optional[_Mapping[str, float]] = ..., gauges: _Optional[_Mapping[str, float]] = ..., version: _Optional[str] = ...) -> None: ...
