@@ -1,0 +1,134 @@
+"""Uniform cubic B-splines over separate stretches of time, and their robust banded fit.
+
+One basis serves the smoothing of an image track (hub.timing) and the 3-D trajectory of the joint
+adjustment (hub.poses). A stretch is a span without long gaps; each has its own control points, and all
+control points lie in one vector, so that every normal matrix is banded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solveh_banded
+
+from protocols.geometry.types import Bools, Floats, Ints
+
+SUPPORT = 4
+"""Control points that act at one time."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SplineBasis:
+    """Cubic B-splines with knots every ``spacing`` seconds on each stretch.
+
+    starts: (s,) first knot of each stretch [s]. intervals: (s,) knot intervals of each.
+    """
+
+    spacing: float
+    starts: Floats
+    intervals: Ints
+
+    @classmethod
+    def over(cls, begins: Floats, ends: Floats, spacing: float) -> SplineBasis:
+        """A basis that covers the stretches [begins[i], ends[i]], sorted and disjoint."""
+        intervals = np.maximum(1, np.ceil((ends - begins) / spacing - 1e-9)).astype(np.int64)
+        # A stretch that is no multiple of the spacing is covered evenly from both sides.
+        starts = begins - 0.5 * (intervals * spacing - (ends - begins))
+        return cls(spacing, starts, intervals)
+
+    @property
+    def size(self) -> int:
+        """Number of control points."""
+        return int(self.intervals.sum() + 3 * len(self.intervals))
+
+    @property
+    def offsets(self) -> Ints:
+        """(s,) index of each stretch's first control point."""
+        return np.asarray(np.r_[0, np.cumsum(self.intervals + 3)[:-1]].astype(np.int64))
+
+    def locate(self, time: Floats) -> tuple[Ints, Floats, Bools]:
+        """First control point (n,), place in the knot interval (n,) in [0, 1], and inside a stretch (n,)."""
+        stretch = np.searchsorted(self.starts, time, side="right") - 1
+        inside = stretch >= 0
+        stretch = np.maximum(stretch, 0)
+        place = (time - self.starts[stretch]) / self.spacing
+        count = self.intervals[stretch]
+        inside &= place <= count + 1e-9
+        interval = np.clip(np.floor(place).astype(np.int64), 0, count - 1)
+        return self.offsets[stretch] + interval, place - interval, inside
+
+    def weights(self, time: Floats, derivative: int = 0) -> tuple[Ints, Floats, Bools]:
+        """First control point (n,), the 4 weights (n, 4), and whether inside a stretch (n,).
+
+        derivative: 0 value, 1 first, 2 second derivative by time.
+        """
+        index, u, inside = self.locate(time)
+        return index, basis_weights(u, derivative) / self.spacing**derivative, inside
+
+    def evaluate(self, control: Floats, time: Floats, derivative: int = 0) -> Floats:
+        """Values (n, d) at ``time`` of the spline with ``control`` (size, d); NaN outside the stretches."""
+        index, weights, inside = self.weights(time, derivative)
+        values = np.zeros((len(time), control.shape[1]))
+        for k in range(SUPPORT):
+            values += weights[:, k, None] * control[index + k]
+        values[~inside] = np.nan
+        return values
+
+    def interval_starts(self) -> Ints:
+        """(m,) first control point of every knot interval."""
+        return np.concatenate(
+            [offset + np.arange(count) for offset, count in zip(self.offsets, self.intervals, strict=True)]
+        )
+
+
+def basis_weights(u: Floats, derivative: int = 0) -> Floats:
+    """The four cubic B-spline weights (n, 4), or a derivative by u, at u in [0, 1] of a knot interval."""
+    u = np.asarray(u, dtype=np.float64)
+    v = 1.0 - u
+    if derivative == 0:
+        columns = [v**3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3]
+    elif derivative == 1:
+        columns = [-3 * v**2, 9 * u**2 - 12 * u, -9 * u**2 + 6 * u + 3, 3 * u**2]
+    else:
+        columns = [6 * v, 18 * u - 12, -18 * u + 6, 6 * u]
+    return np.stack(columns, axis=-1) / 6.0
+
+
+def normal_bands(index: Ints, weights: Floats, row_weight: Floats, size: int) -> Floats:
+    """Upper bands (4, size) of the normal matrix of rows with ``weights`` (n, 4) at ``index`` (n,)."""
+    bands = np.zeros((SUPPORT, size))
+    for a in range(SUPPORT):
+        for b in range(a, SUPPORT):
+            products = row_weight * weights[:, a] * weights[:, b]
+            bands[SUPPORT - 1 - (b - a)] += np.bincount(index + b, products, minlength=size)
+    return bands
+
+
+def fit_spline(
+    basis: SplineBasis, time: Floats, values: Floats, row_weight: Floats, stiffness: float = 1e-6
+) -> Floats:
+    """Weighted least-squares control points (size, d) of ``values`` (n, d) at ``time`` (n,).
+
+    stiffness: weight of squared third differences relative to one row; only closes empty intervals.
+    """
+    index, weights, inside = basis.weights(time)
+    used = np.where(inside, row_weight, 0.0)
+    bands = normal_bands(index, weights, used, basis.size)
+    intervals = basis.interval_starts()
+    third = np.tile(np.array([-1.0, 3.0, -3.0, 1.0]), (len(intervals), 1))
+    bands += normal_bands(intervals, third, np.full(len(intervals), stiffness), basis.size)
+    bands[-1] += 1e-12
+    target = np.zeros((basis.size, values.shape[1]))
+    for d in range(values.shape[1]):
+        for k in range(SUPPORT):
+            target[:, d] += np.bincount(index + k, used * weights[:, k] * values[:, d], minlength=basis.size)
+    return np.asarray(solveh_banded(bands, target, check_finite=False))
+
+
+def stretches(time: Floats, longest_gap: float) -> tuple[Floats, Floats]:
+    """Begins and ends of the stretches of sorted ``time`` (n,) that no gap over ``longest_gap`` cuts."""
+    if len(time) == 0:
+        return np.zeros(0), np.zeros(0)
+    cuts = np.flatnonzero(np.diff(time) > longest_gap)
+    return time[np.r_[0, cuts + 1]], time[np.r_[cuts, len(time) - 1]]

@@ -1,0 +1,161 @@
+"""Every alignment of two image tracks at once: which lags make one epipolar geometry possible.
+
+METHODS A, step 2, for all lags together: the 9x9 moment matrix of ``s_a(t) ⊗ s_b(t + lag)`` is made of 36
+cross-correlations, done by FFT; its smallest generalised eigenvalue (Taubin's normalisation) is the mean
+squared epipolar distance, in units of the noise, that the best fundamental matrix leaves at that lag.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+
+from hub.timing.tracks import SmoothTrack
+from protocols.geometry.types import Bools, Floats, Ints
+
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_PAIR_OF = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+_SLOW_PX = 20.0  # px/s: image speed at which a moment counts half
+_CHUNK = 4096  # lags per batch of eigenvalue problems
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GridTrack:
+    """A track on a regular grid of the camera's time, in coordinates centred and scaled for conditioning.
+
+    begin: time of the first sample [s]. step: [s]. points: (n, 2). weight: (n,) 0 where there is no track,
+    near 0 where it stands still, up to 1 where it moves. sigma: noise in the scaled coordinates.
+    transform: (3, 3), scaled from normalised homogeneous coordinates.
+    """
+
+    begin: float
+    step: float
+    points: Floats
+    weight: Floats
+    sigma: float
+    transform: Floats
+
+
+def grid_track(track: SmoothTrack, step: float, sigma_px: float) -> GridTrack:
+    """Sample a track every ``step`` seconds; sigma_px: the noise to reckon with."""
+    begin = float(np.floor(track.basis.starts[0] / step) * step)
+    end = float(track.basis.starts[-1] + track.basis.intervals[-1] * track.basis.spacing)
+    time = begin + step * np.arange(int(np.ceil((end - begin) / step)) + 1)
+    points = track.at(time)
+    speed = np.linalg.norm(track.at(time, 1), axis=1) * track.focal
+    there = np.isfinite(points).all(axis=1)
+    weight = np.where(there, speed / (speed + _SLOW_PX), 0.0)
+    points = np.where(there[:, None], points, 0.0)
+    total = max(float(weight.sum()), 1e-9)
+    centre = weight @ points / total
+    spread = np.sqrt(max(float(weight @ ((points - centre) ** 2).sum(axis=1)) / total / 2.0, 1e-12))
+    transform = np.array([[1 / spread, 0, -centre[0] / spread], [0, 1 / spread, -centre[1] / spread], [0, 0, 1.0]])
+    return GridTrack(begin, step, (points - centre) / spread, weight, sigma_px / track.focal / spread, transform)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """Scan over all lags.
+
+    offset: (n,) time maps ``t_a = t_b + offset`` [s]. support: (n,) seconds in which both move.
+    cost: (n,) mean squared epipolar distance over the noise; inf where the support is too small.
+    """
+
+    offset: Floats
+    support: Floats
+    cost: Floats
+
+
+class PairMoments:
+    """The 36 cross-correlations of two grid tracks, from which the moments of any lag are read."""
+
+    def __init__(self, a: GridTrack, b: GridTrack) -> None:
+        self.a, self.b = a, b
+        n_a, n_b = len(a.weight), len(b.weight)
+        length = next_fast_len(n_a + n_b, real=True)
+        spectra_a, spectra_b = rfft(_monomials(a), length), rfft(_monomials(b), length)
+        # c[lag] = sum_n a[n] b[n + lag], for lag = -(n_a - 1) … n_b - 1
+        product = np.conj(spectra_a)[:, None, :] * spectra_b[None, :, :]
+        correlation = irfft(product, length)
+        self.lags: Ints = np.arange(-(n_a - 1), n_b)
+        self.moments: Floats = correlation[:, :, self.lags % length]
+        self.offset: Floats = a.begin - b.begin - self.lags * a.step
+        self.support: Floats = np.maximum(self.moments[5, 5], 0.0) * a.step
+
+    def matrices(self, which: Ints) -> tuple[Floats, Floats]:
+        """Moment matrices (m, 9, 9) and Taubin's normalisation (m, 9, 9) of chosen lags, per sample."""
+        total = np.maximum(self.moments[5, 5, which], 1e-9)
+        c = np.moveaxis(self.moments[:, :, which] / total, -1, 0)
+        full = c[:, _PAIR_OF][:, :, :, _PAIR_OF]  # (m, i, j, k, l): sum a_i a_j b_k b_l
+        moment = full.transpose(0, 1, 3, 2, 4).reshape(-1, 9, 9)
+        plane = np.diag([1.0, 1.0, 0.0])
+        bb, aa = full[:, 2, 2], full[:, :, :, 2, 2]
+        first = self.a.sigma**2 * np.einsum("ij,mkl->mikjl", plane, bb)
+        second = self.b.sigma**2 * np.einsum("mij,kl->mikjl", aa, plane)
+        return moment, (first + second).reshape(-1, 9, 9)
+
+    def costs(self, which: Ints) -> Floats:
+        """Smallest generalised eigenvalue (m,) at chosen lags: squared distance over noise."""
+        out = np.full(len(which), np.inf)
+        for begin in range(0, len(which), _CHUNK):
+            part = which[begin : begin + _CHUNK]
+            moment, norm = self.matrices(part)
+            # The constant term is free: eliminate it, since its row of the normalisation is zero.
+            reduced = moment[:, :8, :8] - moment[:, :8, 8:] * moment[:, 8:, :8] / moment[:, 8:, 8:]
+            lower = np.linalg.inv(np.linalg.cholesky(norm[:, :8, :8] + 1e-14 * np.eye(8)))
+            white = lower @ reduced @ lower.transpose(0, 2, 1)
+            out[begin : begin + _CHUNK] = np.linalg.eigvalsh(white)[:, 0]
+        return np.maximum(out, 0.0)
+
+    def fundamental(self, which: int) -> Floats:
+        """The best matrix (3, 3) at one lag, in normalised coordinates: ``m_aᵀ F m_b = 0``, norm 1."""
+        moment, norm = self.matrices(np.array([which]))
+        reduced = moment[0, :8, :8] - np.outer(moment[0, :8, 8], moment[0, 8, :8]) / moment[0, 8, 8]
+        lower = np.linalg.inv(np.linalg.cholesky(norm[0, :8, :8] + 1e-14 * np.eye(8)))
+        _, vectors = np.linalg.eigh(lower @ reduced @ lower.T)
+        head = lower.T @ vectors[:, 0]
+        theta = np.r_[head, -moment[0, 8, :8] @ head / moment[0, 8, 8]].reshape(3, 3)
+        matrix = self.a.transform.T @ theta @ self.b.transform
+        return np.asarray(matrix / np.linalg.norm(matrix))
+
+
+def _monomials(track: GridTrack) -> Floats:
+    s = np.column_stack([track.points, np.ones(len(track.points))])
+    return np.stack([track.weight * s[:, i] * s[:, j] for i, j in _PAIRS])
+
+
+def scan_lags(moments: PairMoments, least_support: float) -> Scan:
+    """Cost at every lag with at least ``least_support`` seconds of common motion."""
+    cost = np.full(len(moments.lags), np.inf)
+    which = np.flatnonzero(moments.support >= least_support)
+    if len(which):
+        cost[which] = moments.costs(which)
+    return Scan(moments.offset, moments.support, cost)
+
+
+def candidates(scan: Scan, per_stratum: int, at_most: int) -> Ints:
+    """Lags worth a closer look: local minima of the cost, the best few in each octave of support.
+
+    Where little overlaps, any lag fits: comparing only lags of like support keeps the truth on the list.
+    """
+    cost = scan.cost
+    with np.errstate(invalid="ignore"):
+        minimum: Bools = np.isfinite(cost)
+        minimum[1:] &= ~(cost[1:] > cost[:-1])
+        minimum[:-1] &= cost[:-1] <= cost[1:]
+    where = np.flatnonzero(minimum)
+    if len(where) == 0:
+        return where
+    octave = np.floor(np.log2(scan.support[where])).astype(np.int64)
+    chosen: list[tuple[float, int]] = []
+    for level in np.unique(octave):
+        members = where[octave == level]
+        usual = max(float(np.median(cost[np.isfinite(cost) & (scan.support >= 2.0**level)])), 1e-9)
+        for index in members[np.argsort(cost[members], kind="stable")][:per_stratum]:
+            # Ranked by evidence: seconds of support times how much better than usual.
+            rank = scan.support[index] * np.log(usual / max(float(cost[index]), 0.05) + 1.0)
+            chosen.append((-float(rank), int(index)))
+    chosen.sort()
+    return np.array([index for _, index in chosen[:at_most]], dtype=np.int64)

@@ -1,0 +1,120 @@
+"""Two calibrated views: essential matrix, Sampson distance, and which side is in front.
+
+Convention: ``X_b = R X_a + t`` with |t| = 1, ``E = [t]x R``, ``s_bᵀ E s_a = 0`` for normalised
+homogeneous points. The published fundamental matrix is the transpose way round, ``m_aᵀ F m_b = 0``
+(eq. 5 of the paper).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from protocols.geometry import so3
+from protocols.geometry.types import Bools, Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativePose:
+    """``X_b = rotation @ X_a + direction * baseline`` with an unknown baseline.
+
+    rotation: (3, 3), b from a. direction: (3,), unit.
+    """
+
+    rotation: Floats
+    direction: Floats
+
+    @property
+    def essential(self) -> Floats:
+        """(3, 3), ``s_bᵀ E s_a = 0``."""
+        return np.asarray(so3.hat(self.direction) @ self.rotation)
+
+    def inverse(self) -> RelativePose:
+        """The pose of a from b."""
+        return RelativePose(self.rotation.T, -self.rotation.T @ self.direction)
+
+
+def homogeneous(points: Floats) -> Floats:
+    """(n, 3) of (n, 2)."""
+    return np.column_stack([points, np.ones(len(points))])
+
+
+def sampson(essential: Floats, a: Floats, b: Floats, sigma_a: float, sigma_b: float) -> Floats:
+    """Signed Sampson distances (n,) in units of the noise of normalised points a, b (n, 2)."""
+    ha, hb = homogeneous(a), homogeneous(b)
+    line_b, line_a = ha @ essential.T, hb @ essential
+    variance = sigma_b**2 * (line_b[:, :2] ** 2).sum(axis=1) + sigma_a**2 * (line_a[:, :2] ** 2).sum(axis=1)
+    return np.asarray((hb * line_b).sum(axis=1) / np.sqrt(np.maximum(variance, 1e-30)))
+
+
+def triangulate_midpoint(pose: RelativePose, a: Floats, b: Floats) -> tuple[Floats, Floats]:
+    """Depth-like distances along both rays (n,), (n,), baseline = 1; least squares, NaN for parallel rays."""
+    ray_a, ray_b = homogeneous(a) @ pose.rotation.T, homogeneous(b)
+    # baseline * direction = s_b ray_b - s_a ray_a
+    aa, bb, ab = (ray_a**2).sum(1), (ray_b**2).sum(1), (ray_a * ray_b).sum(1)
+    at, bt = ray_a @ pose.direction, ray_b @ pose.direction
+    determinant = aa * bb - ab * ab
+    determinant = np.where(determinant > 1e-14 * aa * bb, determinant, np.nan)
+    return (ab * bt - bb * at) / determinant, (aa * bt - ab * at) / determinant
+
+
+def in_front(pose: RelativePose, a: Floats, b: Floats) -> Bools:
+    """Which point pairs (n,) lie in front of both cameras."""
+    depth_a, depth_b = triangulate_midpoint(pose, a, b)
+    with np.errstate(invalid="ignore"):
+        return np.asarray((depth_a > 0) & (depth_b > 0))
+
+
+def decompose(essential: Floats, a: Floats, b: Floats) -> RelativePose:
+    """The one of the four poses of an (approximate) essential matrix with most points in front."""
+    u, _, vt = np.linalg.svd(essential)
+    u, vt = u * np.sign(np.linalg.det(u)), vt * np.sign(np.linalg.det(vt))
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    options = [RelativePose(u @ w @ vt, sign * u[:, 2]) for w in (turn, turn.T) for sign in (1.0, -1.0)]
+    return max(options, key=lambda option: int(in_front(option, a, b).sum()))
+
+
+def five_point(a: Floats, b: Floats, threshold: float, seed: int, subset: int = 300) -> list[RelativePose]:
+    """Poses from five-point RANSAC (OpenCV) over random subsets of the pairs; deterministic in ``seed``.
+
+    a, b: normalised points (n, 2). threshold: inlier distance in normalised coordinates.
+    """
+    rng = np.random.default_rng(seed)
+    poses: list[RelativePose] = []
+    pick = rng.permutation(len(a))[:subset] if len(a) > subset else np.arange(len(a))
+    if len(pick) < 8:
+        return poses
+    cv2.setRNGSeed(seed)
+    found = cv2.findEssentialMat(
+        np.ascontiguousarray(a[pick]),
+        np.ascontiguousarray(b[pick]),
+        np.eye(3),
+        method=cv2.RANSAC,
+        prob=0.999,
+        threshold=threshold,
+        maxIters=200,
+    )[0]
+    if found is None:
+        return poses
+    for matrix in np.asarray(found, dtype=np.float64).reshape(-1, 3, 3):
+        if np.isfinite(matrix).all():
+            poses.append(decompose(matrix, a[pick], b[pick]))
+    return poses
+
+
+def fundamental_from(pose: RelativePose, matrix_a: Floats, matrix_b: Floats) -> Floats:
+    """Fundamental matrix (3, 3) of undistorted pixels, ``m_aᵀ F m_b = 0``, Frobenius norm 1 (eqs. 4, 5)."""
+    f = np.linalg.inv(matrix_a).T @ pose.essential.T @ np.linalg.inv(matrix_b)
+    f = f / np.linalg.norm(f)
+    largest = np.unravel_index(int(np.argmax(np.abs(f))), f.shape)
+    return np.asarray(f * np.sign(f[largest]))
+
+
+def tangent_basis(direction: Floats) -> Floats:
+    """Two unit vectors (3, 2) orthogonal to ``direction`` (3,) and to each other."""
+    other = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    first = np.cross(direction, other)
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, np.cross(direction, first)])

@@ -1,0 +1,145 @@
+"""Camera intrinsics: pinhole with OpenCV's distortion, and OpenCV's fisheye model.
+
+Camera axes: x right, y down, z forward. Pixels are OpenCV's: (0, 0) is the centre of the top-left
+pixel. ``normalised`` coordinates are (x/z, y/z) without distortion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from protocols.geometry.types import Floats
+
+_NEWTON_STEPS = 20
+_NEWTON_TOLERANCE = 1e-12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Intrinsics:
+    """Lens and sensor of one camera.
+
+    width, height: image size [px].
+    matrix: (3, 3) camera matrix [px].
+    distortions: (5,) k1, k2, p1, p2, k3 of the pinhole model, or (4,) k1..k4 of the fisheye model.
+    """
+
+    width: int
+    height: int
+    matrix: Floats
+    distortions: Floats = field(default_factory=lambda: np.zeros(5))
+    fisheye: bool = False
+
+    @property
+    def focal(self) -> float:
+        """Mean focal length [px]: the size of a small angle in pixels."""
+        return float(0.5 * (self.matrix[0, 0] + self.matrix[1, 1]))
+
+    def project(self, points: Floats) -> Floats:
+        """Distorted pixels (n, 2) of points (n, 3) in camera axes; NaN where z <= 0 (pinhole)."""
+        points = np.asarray(points, dtype=np.float64)
+        if self.fisheye:
+            return self._to_pixels(self._distort_fisheye(points))
+        z = points[:, 2]
+        safe = np.where(z > 0, z, np.nan)
+        return self._to_pixels(self.distort(points[:, :2] / safe[:, None])[0])
+
+    def project_normalised(self, normalised: Floats) -> Floats:
+        """Distorted pixels (n, 2) of undistorted normalised coordinates (n, 2)."""
+        return self.project(np.column_stack([normalised, np.ones(len(normalised))]))
+
+    def unproject(self, pixels: Floats) -> Floats:
+        """Undistorted normalised coordinates (n, 2) of distorted pixels (n, 2).
+
+        NaN where the lens model has no inverse (far outside the image, where it folds over).
+        """
+        pixels = np.asarray(pixels, dtype=np.float64)
+        a = self.matrix
+        y = (pixels[:, 1] - a[1, 2]) / a[1, 1]
+        x = (pixels[:, 0] - a[0, 2] - a[0, 1] * y) / a[0, 0]
+        distorted = np.column_stack([x, y])
+        if self.fisheye:
+            return self._undistort_fisheye(distorted)
+        return self._undistort(distorted)
+
+    def distort(self, normalised: Floats) -> tuple[Floats, Floats]:
+        """Brown's distortion of the pinhole model.
+
+        normalised: (n, 2). Returns the distorted coordinates (n, 2) and their Jacobian (n, 2, 2).
+        """
+        k1, k2, p1, p2, k3 = self.distortions
+        x, y = normalised[:, 0], normalised[:, 1]
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2)  # d radial / d r2
+        out = np.empty_like(normalised)
+        out[:, 0] = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+        out[:, 1] = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+        jacobian = np.empty((len(normalised), 2, 2))
+        cross = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
+        jacobian[:, 0, 0] = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+        jacobian[:, 0, 1] = cross
+        jacobian[:, 1, 0] = cross
+        jacobian[:, 1, 1] = radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+        return out, jacobian
+
+    def pixel_jacobian(self, normalised: Floats) -> Floats:
+        """Derivative (n, 2, 2) of distorted pixels by undistorted normalised coordinates (n, 2)."""
+        if self.fisheye:
+            step = 1e-6
+            columns = []
+            for axis in np.eye(2):
+                ahead = self.project_normalised(normalised + step * axis)
+                behind = self.project_normalised(normalised - step * axis)
+                columns.append((ahead - behind) / (2 * step))
+            return np.stack(columns, axis=-1)
+        return np.asarray(self.matrix[:2, :2] @ self.distort(normalised)[1])
+
+    def _to_pixels(self, distorted: Floats) -> Floats:
+        return np.asarray(distorted @ self.matrix[:2, :2].T + self.matrix[:2, 2])
+
+    def _undistort(self, distorted: Floats) -> Floats:
+        """Newton's method on ``distort``; converges in a handful of steps inside the image."""
+        estimate = distorted.copy()
+        if not np.any(self.distortions):
+            return estimate
+        for _ in range(_NEWTON_STEPS):
+            value, jacobian = self.distort(estimate)
+            error = value - distorted
+            determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
+            determinant = np.where(np.abs(determinant) > 1e-9, determinant, np.nan)
+            step_x = (jacobian[:, 1, 1] * error[:, 0] - jacobian[:, 0, 1] * error[:, 1]) / determinant
+            step_y = (jacobian[:, 0, 0] * error[:, 1] - jacobian[:, 1, 0] * error[:, 0]) / determinant
+            step = np.column_stack([step_x, step_y])
+            estimate = estimate - step
+            if not np.nanmax(np.abs(step), initial=0.0) > _NEWTON_TOLERANCE:
+                break
+        value, jacobian = self.distort(estimate)
+        # A root behind the fold of the polynomial is no inverse: there the determinant is negative.
+        with np.errstate(invalid="ignore"):
+            good = (np.abs(value - distorted).max(axis=1) < 1e-9) & (np.linalg.det(jacobian) > 0)
+        return np.where(good[:, None], estimate, np.nan)
+
+    def _distort_fisheye(self, points: Floats) -> Floats:
+        radius = np.hypot(points[:, 0], points[:, 1])
+        theta = np.arctan2(radius, points[:, 2])
+        t2 = theta * theta
+        k1, k2, k3, k4 = self.distortions
+        bent = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        scale = np.where(radius > 1e-12, bent / np.where(radius > 1e-12, radius, 1.0), 1.0 / points[:, 2])
+        return np.asarray(points[:, :2] * scale[:, None])
+
+    def _undistort_fisheye(self, distorted: Floats) -> Floats:
+        bent = np.hypot(distorted[:, 0], distorted[:, 1])
+        k1, k2, k3, k4 = self.distortions
+        theta = bent.copy()
+        for _ in range(_NEWTON_STEPS):
+            t2 = theta * theta
+            value = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) - bent
+            slope = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
+            theta = theta - value / np.where(slope > 1e-6, slope, np.nan)
+        with np.errstate(invalid="ignore"):
+            good = (theta >= 0) & (theta < np.pi / 2 - 1e-3)
+        scale = np.where(bent > 1e-12, np.tan(theta) / np.where(bent > 1e-12, bent, 1.0), 1.0)
+        return np.where(good[:, None], distorted * scale[:, None], np.nan)

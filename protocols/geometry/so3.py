@@ -1,0 +1,96 @@
+"""Rotations: the group SO(3) and its tangent space, batched over leading axes.
+
+Convention: ``exp(w)`` turns by |w| radians about w; perturbations are on the left,
+``R(w) = exp(w) @ R``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from protocols.geometry.types import Floats
+
+_SMALL = 1e-4  # below, Taylor series: the next term is < 1e-17
+
+
+def hat(w: Floats) -> Floats:
+    """Skew matrices (…, 3, 3) of vectors (…, 3): ``hat(a) @ b == cross(a, b)``."""
+    w = np.asarray(w, dtype=np.float64)
+    out = np.zeros((*w.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -w[..., 2], w[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = w[..., 2], -w[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -w[..., 1], w[..., 0]
+    return out
+
+
+def exp(w: Floats) -> Floats:
+    """Rotation matrices (…, 3, 3) of rotation vectors (…, 3) [rad]; Rodrigues' formula."""
+    w = np.asarray(w, dtype=np.float64)
+    angle2 = np.sum(w * w, axis=-1)
+    angle = np.sqrt(angle2)
+    small = angle < _SMALL
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1.0 - angle2 / 6.0, np.sin(safe) / safe)[..., None, None]
+    b = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(safe)) / (safe * safe))[..., None, None]
+    k = hat(w)
+    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+
+
+def log(rotation: Floats) -> Floats:
+    """Rotation vector (3,) [rad], |w| <= pi, of one rotation matrix (3, 3).
+
+    Goes by the quaternion, so it is exact near 0 and near pi alike.
+    """
+    m = np.asarray(rotation, dtype=np.float64)
+    # The largest of the four squared quaternion components keeps the division well conditioned.
+    squares = np.array(
+        [
+            1.0 + m[0, 0] + m[1, 1] + m[2, 2],
+            1.0 + m[0, 0] - m[1, 1] - m[2, 2],
+            1.0 - m[0, 0] + m[1, 1] - m[2, 2],
+            1.0 - m[0, 0] - m[1, 1] + m[2, 2],
+        ]
+    )
+    largest = int(np.argmax(squares))
+    if largest == 0:
+        q = np.array([squares[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
+    elif largest == 1:
+        q = np.array([m[2, 1] - m[1, 2], squares[1], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]])
+    elif largest == 2:
+        q = np.array([m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], squares[2], m[1, 2] + m[2, 1]])
+    else:
+        q = np.array([m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], squares[3]])
+    q /= np.linalg.norm(q)
+    if q[0] < 0:
+        q = -q
+    sine = float(np.linalg.norm(q[1:]))
+    if sine < 1e-12:
+        return np.asarray(2.0 * q[1:])
+    return np.asarray(2.0 * np.arctan2(sine, q[0]) / sine * q[1:])
+
+
+def nearest(matrix: Floats) -> Floats:
+    """The rotation matrix nearest to ``matrix`` (3, 3) in the Frobenius norm."""
+    u, _, vt = np.linalg.svd(matrix)
+    d = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    return np.asarray((u * d) @ vt)
+
+
+def angle_between(a: Floats, b: Floats) -> float:
+    """Angle [rad] of the rotation that takes ``a`` to ``b``, both (3, 3)."""
+    return float(np.linalg.norm(log(a @ b.T)))
+
+
+def taking(a: Floats, b: Floats) -> Floats:
+    """The smallest rotation (3, 3) that takes direction ``a`` (3,) to direction ``b`` (3,)."""
+    a = a / np.linalg.norm(a)
+    b = b / np.linalg.norm(b)
+    axis = np.cross(a, b)
+    sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
+    if sine < 1e-12:
+        if cosine > 0:
+            return np.eye(3)
+        other = np.eye(3)[int(np.argmin(np.abs(a)))]
+        axis = np.cross(a, other)
+        return exp(np.pi * axis / np.linalg.norm(axis))
+    return exp(np.arctan2(sine, cosine) * axis / sine)

@@ -1,0 +1,224 @@
+"""The observations of a session: which pixel each camera saw each moving point at, and when by its own clock."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from protocols.errors import InputError
+from protocols.geometry.types import Floats, Ints
+
+REQUIRED = ("camera", "frame", "time", "u", "v")
+DEFAULT_LABEL = "marker"
+_REPEATS_ARE_NONSENSE = 0.1  # share of repeated frame numbers from which they are no numbering at all
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """One label as one camera saw it, sorted by time.
+
+    frame: (n,) labels. time: (n,) [s] on the camera's clock, strictly increasing.
+    pixels: (n, 2) distorted pixels. size: (n,) [px], NaN where not measured.
+    """
+
+    camera: str
+    label: str
+    frame: Ints
+    time: Floats
+    pixels: Floats
+    size: Floats
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """All tracks by (camera, label), in the order of the rig and of the labels' first rows."""
+
+    tracks: dict[tuple[str, str], Track]
+    warnings: tuple[str, ...] = ()
+
+    def of_camera(self, camera: str) -> list[Track]:
+        """The camera's tracks, one a label."""
+        return [track for (name, _), track in self.tracks.items() if name == camera]
+
+    @property
+    def cameras(self) -> list[str]:
+        """Cameras with at least one row."""
+        return list(dict.fromkeys(camera for camera, _ in self.tracks))
+
+    @property
+    def labels(self) -> list[str]:
+        """All labels."""
+        return list(dict.fromkeys(label for _, label in self.tracks))
+
+    def __len__(self) -> int:
+        return sum(len(track) for track in self.tracks.values())
+
+
+def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
+    """Read observations.csv: camera,frame,time,u,v[,size][,label] in any row order.
+
+    cameras: the names that the rig knows. Raises InputError: file, line, what, remedy.
+    """
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError("this observations file does not exist", file=file, remedy="check the path") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read: {error}", file=file, remedy="save it as UTF-8 CSV") from None
+    reader = csv.reader(io.StringIO(text))
+    header = [cell.strip() for cell in next(reader, [])]
+    columns = {name: index for index, name in reversed(list(enumerate(header)))}
+    missing = [name for name in REQUIRED if name not in columns]
+    if missing:
+        remedy = f"the first line must name {','.join(REQUIRED)}[,size][,label]"
+        raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    try:
+        for row in reader:
+            if row and any(row):
+                rows.append(row)
+                lines.append(reader.line_num)
+    except csv.Error as error:
+        raise InputError(f"not CSV: {error}", file=file, line=reader.line_num, remedy="correct this row") from None
+    if not rows:
+        raise InputError("no rows", file=file, line=1, remedy="record some observations first")
+    _check_width(rows, lines, max(columns[name] for name in columns if name in (*REQUIRED, "size", "label")), file)
+    numbers = {name: _column(rows, lines, columns[name], name, file) for name in ("time", "u", "v")}
+    frame = _column(rows, lines, columns["frame"], "frame", file)
+    size = np.full(len(rows), np.nan)
+    if "size" in columns:
+        size = _column(rows, lines, columns["size"], "size", file, empty=np.nan)
+        bad = np.flatnonzero(size < 0)
+        if len(bad):
+            raise InputError(f"size {size[bad[0]]:g} is negative", file=file, line=lines[bad[0]], remedy="remove it")
+        size = np.where(size > 0, size, np.nan)
+    names = [row[columns["camera"]].strip() for row in rows]
+    labels = [row[columns["label"]].strip() or DEFAULT_LABEL for row in rows] if "label" in columns else None
+    known = list(cameras)
+    _check_cameras(names, lines, known, file)
+    return gather_tracks(
+        names,
+        labels or [DEFAULT_LABEL] * len(rows),
+        frame.astype(np.int64),
+        numbers["time"],
+        np.column_stack([numbers["u"], numbers["v"]]),
+        size,
+        order=known,
+        file=file,
+        lines=lines,
+    )
+
+
+def gather_tracks(
+    cameras: list[str],
+    labels: list[str],
+    frame: Ints,
+    time: Floats,
+    pixels: Floats,
+    size: Floats,
+    *,
+    order: Iterable[str] = (),
+    file: Path | None = None,
+    lines: list[int] | None = None,
+) -> Observations:
+    """Sort rows into tracks. Raises InputError where two rows of one camera and label are of one time or frame."""
+    camera_ids = {name: index for index, name in enumerate(dict.fromkeys([*order, *cameras]))}
+    label_ids = {name: index for index, name in enumerate(dict.fromkeys(labels))}
+    c = np.array([camera_ids[name] for name in cameras], dtype=np.int64)
+    k = np.array([label_ids[name] for name in labels], dtype=np.int64)
+    sorting = np.lexsort((frame, time, k, c))
+    c, k, frame, time, pixels, size = c[sorting], k[sorting], frame[sorting], time[sorting], pixels[sorting], size[sorting]
+    line = None if lines is None else np.array(lines)[sorting]
+    starts = np.flatnonzero(np.r_[True, (np.diff(c) != 0) | (np.diff(k) != 0)])
+    ends = np.r_[starts[1:], len(c)]
+    camera_names, label_names = list(camera_ids), list(label_ids)
+    tracks: dict[tuple[str, str], Track] = {}
+    warnings: list[str] = []
+    for start, end in zip(starts, ends, strict=True):
+        part = slice(start, end)
+        camera, label = camera_names[c[start]], label_names[k[start]]
+        _check_repeats(camera, label, frame[part], time[part], None if line is None else line[part], file, warnings)
+        tracks[camera, label] = Track(camera, label, frame[part], time[part], pixels[part], size[part])
+    return Observations(tracks, tuple(warnings))
+
+
+def _check_repeats(
+    camera: str, label: str, frame: Ints, time: Floats, line: Ints | None, file: Path | None, warnings: list[str]
+) -> None:
+    same_time = np.flatnonzero(np.diff(time) == 0)
+    where = f"camera {camera}, label {label}" if label != DEFAULT_LABEL else f"camera {camera}"
+    if len(same_time):
+        i = int(same_time[0])
+        raise InputError(
+            f"two rows of {where} at time {time[i]:.6f} (frames {frame[i]}, {frame[i + 1]})",
+            file=file,
+            line=None if line is None else int(line[i : i + 2].max()),
+            remedy="keep one a frame, or tell points apart by label",
+        )
+    unique, counts = np.unique(frame, return_counts=True)
+    repeated = int((counts - 1).sum())
+    if not repeated:
+        return
+    if repeated < _REPEATS_ARE_NONSENSE * len(frame) or len(frame) < 3:
+        twice = unique[counts > 1][0]
+        at = np.flatnonzero(frame == twice)
+        raise InputError(
+            f"two rows of {where} in frame {twice}",
+            file=file,
+            line=None if line is None else int(line[at].max()),
+            remedy="keep one a frame, or tell points apart by label",
+        )
+    warnings.append(f"{where}: frame numbers repeat ({repeated} of {len(frame)}); only its times are used")
+
+
+def _check_width(rows: list[list[str]], lines: list[int], last: int, file: Path) -> None:
+    for row, line in zip(rows, lines, strict=True):
+        if len(row) <= last:
+            raise InputError(
+                f"{len(row)} columns where the first line has more", file=file, line=line, remedy="complete the row"
+            )
+
+
+def _column(
+    rows: list[list[str]], lines: list[int], index: int, name: str, file: Path, empty: float | None = None
+) -> Floats:
+    cells = [row[index] for row in rows]
+    if empty is not None:
+        cells = [cell if cell.strip() else str(empty) for cell in cells]
+    try:
+        values = np.array(cells, dtype=np.float64)
+    except ValueError:
+        for cell, line in zip(cells, lines, strict=True):
+            try:
+                float(cell)
+            except ValueError:
+                what = f"{name} {cell!r} is not a number"
+                raise InputError(what, file=file, line=line, remedy="correct or remove the row") from None
+        raise
+    finite = np.isfinite(values) if empty is None else np.isfinite(values) | np.isnan(values)
+    bad = np.flatnonzero(~finite)
+    if len(bad):
+        what = f"{name} is {values[bad[0]]}"
+        raise InputError(what, file=file, line=lines[bad[0]], remedy="remove the row: a point not seen has none")
+    return values
+
+
+def _check_cameras(names: list[str], lines: list[int], known: list[str], file: Path) -> None:
+    allowed = set(known)
+    for name, line in zip(names, lines, strict=True):
+        if name not in allowed:
+            raise InputError(
+                f"camera {name!r} is not in the rig ({', '.join(known)})",
+                file=file,
+                line=line,
+                remedy=f"add [{name}] to rig.toml or correct the name",
+            )

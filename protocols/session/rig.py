@@ -1,0 +1,261 @@
+"""The rig: which cameras there are, what is known of them, and what fixes gauge and scale (rig.toml)."""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from protocols.errors import InputError
+from protocols.geometry import so3
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Floats
+
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+CLOCKS = ("independent", "shared")
+_AGREE = 1e-3  # relative: position and translation may differ by rounding, not by more
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigCamera:
+    """One camera of the rig and what is known of it beforehand.
+
+    size: (width, height) [px]. fps: nominal, 0 = not told. intrinsics: None = uncalibrated.
+    position: centre in the world [rig units]. rotation: (3, 3) camera from world.
+    position_std: (3,) [rig units]. rotation_std: (3,) [rad]. body_from_camera: (3, 3).
+    table: the camera's table as it stands in the file, with keys this version does not know.
+    """
+
+    name: str
+    size: tuple[int, int]
+    fps: float = 0.0
+    intrinsics: Intrinsics | None = None
+    position: Floats | None = None
+    rotation: Floats | None = None
+    position_std: Floats | None = None
+    rotation_std: Floats | None = None
+    body_from_camera: Floats | None = None
+    table: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rig:
+    """All cameras in the file's order, and the metadata that fixes gauge and scale.
+
+    units: of every length. clock: "independent" or "shared". distances: (camera, camera, length).
+    up: a world vector (3,), or the name of a levelled camera, or None.
+    """
+
+    cameras: dict[str, RigCamera]
+    units: str = "m"
+    clock: str = "independent"
+    distances: tuple[tuple[str, str, float], ...] = ()
+    up: Floats | str | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+    file: Path | None = None
+
+    @property
+    def shared_clock(self) -> bool:
+        """Whether rows of the same time correspond."""
+        return self.clock == "shared"
+
+
+class _Table:
+    """One table of a TOML file with checks that name file and line."""
+
+    def __init__(self, values: dict[str, Any], where: str, file: Path, text: str) -> None:
+        self.values, self.where, self.file, self.text = values, where, file, text
+
+    def line(self, key: str | None = None) -> int | None:
+        """The line of the table's header, or of ``key`` in it, as far as a plain scan can tell."""
+        found: int | None = None
+        header = re.compile(r"\s*\[\s*[\"']?" + re.escape(self.where) + r"[\"']?\s*\]")
+        inside = False
+        for number, row in enumerate(self.text.splitlines(), 1):
+            if header.match(row):
+                inside, found = True, number
+            elif inside and row.lstrip().startswith("[") and "=" not in row:
+                return found
+            elif inside and key is not None and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*[=.]", row):
+                return number
+        return found
+
+    def fail(self, key: str | None, what: str, remedy: str) -> InputError:
+        return InputError(f"[{self.where}] {what}", file=self.file, line=self.line(key), remedy=remedy)
+
+    def numbers(self, key: str, count: int | tuple[int, ...], what: str) -> Floats | None:
+        """A list of finite numbers, or None where the key is absent."""
+        if key not in self.values:
+            return None
+        remedy = f"give {key} = {what}"
+        try:
+            array = np.array(self.values[key], dtype=np.float64)
+        except (TypeError, ValueError):
+            raise self.fail(key, f"{key} is not a list of numbers", remedy) from None
+        shape = (count,) if isinstance(count, int) else count
+        if array.shape != shape:
+            raise self.fail(key, f"{key} has shape {list(array.shape)}, not {list(shape)}", remedy)
+        if not np.isfinite(array).all():
+            raise self.fail(key, f"{key} is not finite", remedy)
+        return array
+
+    def std(self, key: str, what: str) -> Floats | None:
+        """A positive number, or three."""
+        value = self.values.get(key)
+        if value is None:
+            return None
+        table = self if isinstance(value, list) else _Table({key: [value] * 3}, self.where, self.file, self.text)
+        array = table.numbers(key, 3, what)
+        if array is not None and not (array > 0).all():
+            raise self.fail(key, f"{key} must be positive", f"give {key} = {what}")
+        return array
+
+
+def read_toml(file: Path, what: str = "file") -> tuple[dict[str, Any], str]:
+    """The parsed TOML file and its text. Raises InputError with file, line and remedy."""
+    try:
+        text = file.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"this {what} does not exist", file=file, remedy="check the path") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read: {error}", file=file, remedy="check the file and its rights") from None
+    try:
+        return tomllib.loads(text), text
+    except tomllib.TOMLDecodeError as error:
+        message = str(error)
+        place = re.search(r"at line (\d+)", message)
+        line = int(place.group(1)) if place else len(text.splitlines()) or 1
+        short = re.sub(r"\s*\(at .*\)", "", message)
+        raise InputError(f"not valid TOML: {short}", file=file, line=line, remedy="correct this line") from None
+
+
+def read_rig(file: Path) -> Rig:
+    """Read rig.toml (or a calibration.toml, which holds the same tables and more).
+
+    Raises InputError: file, line, what is wrong, what to do.
+    """
+    values, text = read_toml(file, "rig file")
+    metadata = values.pop("metadata", {})
+    meta = _Table(metadata if isinstance(metadata, dict) else {}, "metadata", file, text)
+    cameras: dict[str, RigCamera] = {}
+    for name, table in values.items():
+        if not isinstance(table, dict):
+            raise InputError(
+                f"{name} = … stands outside a camera's table", file=file, remedy="put it under [camera] or [metadata]"
+            )
+        camera = _read_camera(_Table(table, name, file, text))
+        cameras[camera.name] = camera
+    if not cameras:
+        raise InputError("no camera in it", file=file, remedy="add a table per camera: [cam0] name, size, matrix, …")
+    units = metadata.get("units", "m")
+    if units not in UNITS:
+        raise meta.fail("units", f"units = {units!r}", 'use "m", "cm" or "mm"')
+    clock = metadata.get("clock", "independent")
+    if clock not in CLOCKS:
+        raise meta.fail("clock", f"clock = {clock!r}", 'use "independent" or "shared"')
+    return Rig(cameras, units, clock, _read_distances(meta, cameras), _read_up(meta, cameras), dict(metadata), file)
+
+
+def _read_distances(meta: _Table, cameras: dict[str, RigCamera]) -> tuple[tuple[str, str, float], ...]:
+    remedy = 'give distances = [["cam0", "cam1", 3.42]]'
+    distances = []
+    rows = meta.values.get("distances", [])
+    for row in rows if isinstance(rows, list) else [rows]:
+        if not (isinstance(row, list) and len(row) == 3 and isinstance(row[2], int | float)):
+            raise meta.fail("distances", f"distance {row!r} is not [camera, camera, length]", remedy)
+        for name in row[:2]:
+            if name not in cameras:
+                raise meta.fail("distances", f"distance to an unknown camera {name!r}", "use a camera of this file")
+        if not (math.isfinite(row[2]) and row[2] > 0) or row[0] == row[1]:
+            raise meta.fail("distances", f"distance {row!r} is not a length between two cameras", remedy)
+        distances.append((row[0], row[1], float(row[2])))
+    return tuple(distances)
+
+
+def _read_up(meta: _Table, cameras: dict[str, RigCamera]) -> Floats | str | None:
+    up = meta.values.get("up")
+    if up is None:
+        return None
+    if isinstance(up, str):
+        if up not in cameras:
+            raise meta.fail("up", f"up names an unknown camera {up!r}", "use a camera of this file, or [x, y, z]")
+        return up
+    vector = meta.numbers("up", 3, "[x, y, z] or the name of a levelled camera")
+    if vector is None or float(np.linalg.norm(vector)) < 1e-9:
+        raise meta.fail("up", "up has no direction", "give up = [x, y, z] or the name of a levelled camera")
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _read_camera(table: _Table) -> RigCamera:
+    name = table.values.get("name", table.where)
+    if name != table.where:
+        raise table.fail("name", f"name = {name!r} differs from the table's key", "make them the same")
+    size = table.numbers("size", 2, "[width, height]")
+    if size is None or not (size > 0).all() or not (size == size.round()).all():
+        raise table.fail("size", "size is missing or not two whole numbers", "give size = [width, height] in pixels")
+    fps = table.values.get("fps", 0.0)
+    if not isinstance(fps, int | float) or not math.isfinite(fps) or fps < 0:
+        raise table.fail("fps", f"fps = {fps!r} is not a frame rate", "give fps = 30.0")
+    width, height = int(size[0]), int(size[1])
+    position, rotation = _read_pose(table)
+    return RigCamera(
+        name=name,
+        size=(width, height),
+        fps=float(fps),
+        intrinsics=_read_intrinsics(table, width, height),
+        position=position,
+        rotation=rotation,
+        position_std=table.std("position_std", "a length, or three"),
+        rotation_std=table.std("rotation_std", "radians, or three"),
+        body_from_camera=table.numbers("body_from_camera", (3, 3), "3x3"),
+        table=dict(table.values),
+    )
+
+
+def _read_intrinsics(table: _Table, width: int, height: int) -> Intrinsics | None:
+    matrix = table.numbers("matrix", (3, 3), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    fisheye = bool(table.values.get("fisheye", False))
+    if "distortions" in table.values and isinstance(table.values["distortions"], list):
+        given = len(table.values["distortions"])
+        if not fisheye and given == 4:  # OpenCV's shortest form: k3 = 0
+            padded = {**table.values, "distortions": [*table.values["distortions"], 0.0]}
+            table = _Table(padded, table.where, table.file, table.text)
+    distortions = table.numbers(
+        "distortions", 4 if fisheye else 5, "[k1, k2, k3, k4]" if fisheye else "[k1, k2, p1, p2, k3]"
+    )
+    if matrix is None:
+        return None
+    if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.allclose(matrix[2], [0, 0, 1]) and matrix[1, 0] == 0):
+        raise table.fail("matrix", "matrix is not a camera matrix", "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    zeros = np.zeros(4 if fisheye else 5)
+    return Intrinsics(width, height, matrix, zeros if distortions is None else distortions, fisheye)
+
+
+def _read_pose(table: _Table) -> tuple[Floats | None, Floats | None]:
+    """Position (3,) and rotation (3, 3); a translation is turned into a position."""
+    position = table.numbers("position", 3, "[x, y, z]")
+    rodrigues = table.numbers("rotation", 3, "a Rodrigues vector, camera from world")
+    translation = table.numbers("translation", 3, "camera from world")
+    rotation = None if rodrigues is None else so3.exp(rodrigues)
+    if translation is None:
+        return position, rotation
+    if rotation is None:
+        if position is not None:
+            return position, None
+        raise table.fail("translation", "translation without rotation says nothing", "give rotation too, or position")
+    centre = -rotation.T @ translation
+    if position is None:
+        return np.asarray(centre), rotation
+    if np.linalg.norm(position - centre) > _AGREE * max(float(np.linalg.norm(position)), 1e-3):
+        raise table.fail(
+            "position",
+            f"position {position.round(4).tolist()} contradicts translation, which puts the camera at "
+            f"{centre.round(4).tolist()}",
+            "remove one of the two, or correct it",
+        )
+    return position, rotation
