@@ -50,7 +50,8 @@ class PairFit:
 
     cost: mean robust squared distance over the noise. sigma_px: robust residual [px].
     support: seconds of agreeing motion. inliers, front: fractions of the moving samples.
-    moving_overlap: seconds in which both tracks exist and move.
+    moving_overlap: seconds in which both tracks exist and move. middle: time of a in the middle of them.
+    parallax: median angle [rad] between the two rays of a point.
     """
 
     rate: float
@@ -62,7 +63,8 @@ class PairFit:
     front: float
     support: float
     moving_overlap: float
-    samples: int = 0
+    middle: float
+    parallax: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -296,7 +298,7 @@ class _Samples:
             moving: Bools = there & (speed_a > self.s.moving_px) & (speed_b > self.s.moving_px)
         count = int(moving.sum())
         if count < 8:
-            return PairFit(rate, offset, pose, cost, np.inf, 0.0, 0.0, 0.0, 0.0, count)
+            return PairFit(rate, offset, pose, cost, np.inf, 0.0, 0.0, 0.0, 0.0, self.centre, 0.0)
         sigma_a, sigma_b = self.s.sigma_px / self.a.focal, self.s.sigma_px / self.b.focal
         distance = np.abs(two_view.sampson(pose.essential, a[moving], b[moving], sigma_a, sigma_b))
         sigma_px = float(np.median(distance)) / 0.6745 * self.s.sigma_px
@@ -308,7 +310,21 @@ class _Samples:
         seconds = float(count) * interval
         inliers = float(close.mean())
         share = float(front.mean()) if len(front) else 0.0
-        return PairFit(rate, offset, pose, cost, sigma_px, inliers, share, seconds * inliers, seconds, count)
+        rays_a, rays_b = two_view.homogeneous(a[moving]) @ pose.rotation.T, two_view.homogeneous(b[moving])
+        cosine = (rays_a * rays_b).sum(1) / np.linalg.norm(rays_a, axis=1) / np.linalg.norm(rays_b, axis=1)
+        return PairFit(
+            rate=rate,
+            offset=offset,
+            pose=pose,
+            cost=cost,
+            sigma_px=sigma_px,
+            inliers=inliers,
+            front=share,
+            support=seconds * inliers,
+            moving_overlap=seconds,
+            middle=float(np.median(self.time[moving])),
+            parallax=float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))),
+        )
 
     def _seconds_a_sample(self) -> float:
         gaps = np.diff(self.time)

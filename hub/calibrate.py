@@ -1,0 +1,240 @@
+"""The whole line of the hub: tracks → pairs → graph → poses → one adjustment → a published calibration.
+
+No sockets, files or clocks: `calibrate` offline and the live hub run the same code.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hub.poses.adjust import adjust
+from hub.poses.graph import ClockGraph, average_clocks, components
+from hub.poses.initialise import Camera, Scaffold, agreement, grow
+from hub.poses.problem import Freedom, Problem, Rows, State
+from hub.publish import publish
+from hub.timing.pair import PairSolution, solve_pair
+from hub.timing.tracks import smooth_track
+from protocols.errors import Refused
+from protocols.geometry.types import Floats
+from protocols.session.calibration import Calibration
+from protocols.session.observations import Observations
+from protocols.session.rig import Rig
+
+Progress = Callable[[str, float], None]
+"""Told what is being done and how much of the whole is done (0..1)."""
+
+_LEAST_AGREEMENT = 0.5  # share of a camera's rows that must fit the common path
+_LEAST_ROWS = 30
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """Cameras that can be tried: smoothed tracks, raw rows; and those that can't, with the reason."""
+
+    cameras: dict[str, Camera]
+    rows: dict[str, list[Rows]]
+    epochs: dict[str, float]
+    labels: list[str]
+    refused: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """An adjusted network in the internal gauge, before publication."""
+
+    scaffold: Scaffold
+    pairs: tuple[PairSolution, ...]
+    refused: dict[str, str]
+    prepared: Prepared
+    solver: str
+    warnings: tuple[str, ...] = field(default=())
+
+
+def calibrate(rig: Rig, observations: Observations, progress: Progress | None = None) -> Calibration:
+    """Timing and poses of all cameras from what they saw, with no guess (solver "joint").
+
+    Raises Refused, with a reason for every camera, where fewer than two can be tied together.
+    """
+    tell = progress or (lambda text, share: None)
+    prepared = prepare(rig, observations)
+    pairs = solve_pairs(prepared, tell)
+    solution = solve_network(prepared, pairs, tell)
+    tell("covariances", 0.95)
+    return publish(rig, solution)
+
+
+def prepare(rig: Rig, observations: Observations) -> Prepared:
+    """Undistort and smooth every track; name the cameras that cannot be used."""
+    refused: dict[str, str] = {}
+    cameras: dict[str, Camera] = {}
+    rows: dict[str, list[Rows]] = {}
+    epochs: dict[str, float] = {}
+    labels = observations.labels
+    for name, rig_camera in rig.cameras.items():
+        tracks = observations.of_camera(name)
+        if not tracks:
+            refused[name] = "no observations"
+            continue
+        lens = rig_camera.intrinsics
+        if lens is None:
+            refused[name] = "no intrinsics (matrix and distortions in rig.toml): run `syncline intrinsics`"
+            continue
+        epoch = min(float(track.time[0]) for track in tracks)
+        smooth, mine = {}, []
+        for track in tracks:
+            cleaned = smooth_track(track.time, lens.unproject(track.pixels), lens.focal, epoch)
+            if cleaned is None:
+                continue
+            smooth[track.label] = cleaned
+            use = np.ones(len(track), dtype=np.bool_)
+            mine.append(Rows(-1, labels.index(track.label), track.time - epoch, track.pixels, use))
+        if not smooth:
+            refused[name] = f"too few connected observations ({sum(len(track) for track in tracks)} rows)"
+            continue
+        cameras[name], rows[name], epochs[name] = Camera(name, lens, smooth), mine, epoch
+    return Prepared(cameras, rows, epochs, labels, refused)
+
+
+def solve_pairs(prepared: Prepared, tell: Progress) -> list[PairSolution]:
+    """All pairs of cameras, each by itself."""
+    names = list(prepared.cameras)
+    todo = list(itertools.combinations(names, 2))
+    pairs = []
+    for done, (a, b) in enumerate(todo):
+        tell(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
+        pairs.append(solve_pair(prepared.cameras[a].tracks, prepared.cameras[b].tracks, (a, b)))
+    return pairs
+
+
+def solve_network(prepared: Prepared, pairs: list[PairSolution], tell: Progress) -> Solution:
+    """From pairs to one adjusted network; cameras that don't fit are refused by name."""
+    refused = dict(prepared.refused)
+    names = list(prepared.cameras)
+    solved = [pair for pair in pairs if pair.solved]
+    if not solved:
+        raise Refused(_why_nothing(pairs, refused), refused | _pair_reasons(names, pairs))
+    groups = components(names, solved)
+    for name in set(names) - set(groups[0]):
+        refused[name] = _why_alone(name, groups, pairs)
+    graph = _graph(prepared, groups[0], solved)
+    scaffold, unplaced = grow(prepared.cameras, graph, prepared.rows, prepared.labels, lambda t: tell(t, 0.6))
+    refused |= unplaced
+    while True:
+        scaffold = _adjust_all(scaffold, tell)
+        bad = [name for name in scaffold.names if not _fits(scaffold, name)]
+        if not bad:
+            break
+        worst = min(bad, key=lambda name: agreement(scaffold, name)[0])
+        share, count = agreement(scaffold, worst)
+        refused[worst] = f"only {100 * share:.0f} % of its {count} observations fit the path that the others see"
+        remaining = [name for name in scaffold.names if name != worst]
+        kept = [p for p in graph.agreeing if worst not in (p.a, p.b)]
+        if len(remaining) < 2 or not kept:
+            raise Refused("no two cameras agree on one path", refused)
+        group = components(remaining, kept)[0]
+        graph = _graph(prepared, group, kept)
+        scaffold, unplaced = grow(prepared.cameras, graph, prepared.rows, prepared.labels)
+        refused |= unplaced
+    order = {name: refused[name] for name in [*prepared.refused, *names] if name in refused}
+    warnings = tuple(
+        f"pair {pair.a}–{pair.b} contradicts the other pairs and was set aside" for pair in graph.contradicting
+    )
+    return Solution(scaffold, tuple(pairs), order, prepared, "joint", warnings)
+
+
+def _graph(prepared: Prepared, group: list[str], pairs: list[PairSolution]) -> ClockGraph:
+    inside = [pair for pair in pairs if pair.a in group and pair.b in group]
+    return average_clocks(group, inside, {name: prepared.cameras[name].tracks for name in group})
+
+
+def _fits(scaffold: Scaffold, name: str) -> bool:
+    share, count = agreement(scaffold, name)
+    return share >= _LEAST_AGREEMENT and count >= _LEAST_ROWS
+
+
+def _adjust_all(scaffold: Scaffold, tell: Progress) -> Scaffold:
+    """The final adjustment, with the lens freed where the data clearly ask for it."""
+    tell("adjusting", 0.75)
+    problem, state, _ = adjust(scaffold.problem, scaffold.state)
+    tell("adjusting the lenses", 0.85)
+    freed = replace(problem, freedom=replace(problem.freedom, lens=True))
+    freed_problem, freed_state, _ = adjust(freed, state, rounds=3)
+    if _prefers(freed_problem, freed_state, problem, state):
+        problem, state = freed_problem, freed_state
+    return replace_solution(scaffold, problem, state)
+
+
+def replace_solution(scaffold: Scaffold, problem: Problem, state: State) -> Scaffold:
+    """The scaffold with another problem and state."""
+    return Scaffold(scaffold.names, scaffold.labels, problem, state)
+
+
+def _prefers(freed: Problem, freed_state: State, fixed: Problem, fixed_state: State) -> bool:
+    """Whether focal length and k1 are worth their parameters (Bayesian information criterion).
+
+    The robust likelihood of all rows under each answer's own noise decides.
+    """
+    rows = sum(len(part.time) for part in fixed.rows)
+    gain = _deviance(fixed, fixed_state) - _deviance(freed, freed_state)
+    return gain > 2 * len(fixed_state.cameras) * np.log(max(rows, 2))
+
+
+def _deviance(problem: Problem, state: State) -> float:
+    from hub.poses.adjust import residual_norms
+
+    total = 0.0
+    for part in problem.rows:
+        norms = residual_norms(part, state.cameras[part.camera], state.trajectories[part.label])
+        norms = norms[np.isfinite(norms)]
+        sigma = float(state.sigma[part.camera])
+        total += float(np.minimum((norms / sigma) ** 2, 25.0).sum()) + 4.0 * len(norms) * np.log(sigma)
+    return total
+
+
+def _why_nothing(pairs: list[PairSolution], refused: dict[str, str]) -> str:
+    if not pairs:
+        told = "; ".join(f"{name}: {reason}" for name, reason in refused.items())
+        return f"fewer than two cameras have usable observations ({told})" if told else "one camera only: a pair is needed"
+    told = "; ".join(f"{pair.a}–{pair.b}: {pair.status}" for pair in pairs[:6])
+    return f"no pair of cameras could be tied together ({told})"
+
+
+def _pair_reasons(names: list[str], pairs: list[PairSolution]) -> dict[str, str]:
+    return {
+        name: "; ".join(f"with {p.b if p.a == name else p.a}: {p.status}" for p in pairs if name in (p.a, p.b))
+        or "no other camera to compare with"
+        for name in names
+    }
+
+
+def _why_alone(name: str, groups: list[list[str]], pairs: list[PairSolution]) -> str:
+    mine = next(group for group in groups if name in group)
+    tried = "; ".join(
+        f"with {p.b if p.a == name else p.a}: {p.status}" for p in pairs if name in (p.a, p.b) and not p.solved
+    )
+    if len(mine) > 1:
+        return f"tied only to {', '.join(other for other in mine if other != name)}, not to the rest ({tried})"
+    return f"could not be tied to any camera ({tried})"
+
+
+def span_of(rows: list[Rows]) -> tuple[float, float]:
+    """First and last used camera time of some rows, less the epoch."""
+    times = np.concatenate([part.time[part.use] for part in rows])
+    return (float(times.min()), float(times.max())) if len(times) else (0.0, 0.0)
+
+
+def used_times(problem: Problem, state: State, label: int) -> list[Floats]:
+    """Sorted internal reference times of the rows that count, one array a camera."""
+    out: list[Floats] = []
+    for number, camera in enumerate(state.cameras):
+        mine = [r.time[r.use] for r in problem.rows if r.camera == number and r.label == label]
+        joined = np.concatenate(mine) if mine else np.zeros(0)
+        out.append(np.sort(camera.reference_time(joined)))
+    return out
+
+
+__all__ = ["Freedom", "Prepared", "Progress", "Solution", "calibrate", "prepare", "solve_network", "solve_pairs"]

@@ -1,0 +1,335 @@
+"""One adjustment of everything: 3-D spline, poses, time maps, and where asked focal length and k1.
+
+Levenberg-Marquardt on the reprojection error of the raw rows (every row at its own time: METHODS A.6),
+with a motion prior on the spline's third differences whose strength comes from the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hub.poses.linear import (
+    BorderedSystem,
+    add_path_blocks,
+    border_block,
+    path_gradient,
+    solve,
+    third_difference_band,
+    third_differences,
+)
+from hub.poses.problem import CAMERA_PARAMETERS, FOCAL, K1, OFFSET, RATE, CameraState, Problem, Rows, State, Trajectory
+from protocols.geometry import so3
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.pose import Pose
+from protocols.geometry.types import Floats
+
+_WIDTH = 4.0  # Cauchy width in sigma of the 2-D residual: nearly efficient for Gaussian noise
+_CUT = 5.0  # rows beyond this many sigma are false detections
+_LEAST_SIGMA = 0.05  # px
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionPrior:
+    """Weights (m,) of the squared third differences, one array a label."""
+
+    weights: tuple[Floats, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linearised:
+    """Rows of one camera and label at a state: residual (n, 2), derivatives, place in the spline."""
+
+    residual: Floats
+    by_point: Floats
+    by_camera: Floats
+    index: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+    weights: Floats
+    valid: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+
+
+def adjust(
+    problem: Problem,
+    state: State,
+    *,
+    iterations: int = 40,
+    rounds: int = 4,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[Problem, State, MotionPrior]:
+    """Solve: robust rounds first, then the rows that fit with full weight.
+
+    Returns the problem with the rows that count marked, the state, and the motion prior used.
+    """
+    prior = motion_prior(problem, state, first=True)
+    robust = True
+    for turn in range(rounds):
+        last = turn == rounds - 1
+        state = _minimise(problem, state, prior, robust, iterations if last else max(4, iterations // 3))
+        state = replace(state, sigma=noise(problem, state))
+        prior = motion_prior(problem, state)
+        if turn >= rounds - 2:
+            problem = mark_inliers(problem, state)
+            robust = False
+        if progress is not None:
+            progress(f"adjustment {turn + 1}/{rounds}: {float(np.median(state.sigma)):.2f} px")
+    state = _minimise(problem, state, prior, robust, iterations)
+    return problem, replace(state, sigma=noise(problem, state)), prior
+
+
+def predict(rows: Rows, camera: CameraState, path: Trajectory) -> Floats:
+    """Pixels (n, 2) at which the camera should have seen the point; NaN where the path is not known."""
+    points = path.at(camera.reference_time(rows.time))
+    return camera.intrinsics.project(camera.pose.camera_from_world(points))
+
+
+def residual_norms(rows: Rows, camera: CameraState, path: Trajectory) -> Floats:
+    """Distances (n,) [px] of rows from their predictions; NaN where the path is not known."""
+    return np.asarray(np.linalg.norm(predict(rows, camera, path) - rows.pixels, axis=1))
+
+
+def noise(problem: Problem, state: State) -> Floats:
+    """Robust noise (cameras,) of one pixel coordinate from the median residual."""
+    sigma = state.sigma.copy()
+    for camera in range(len(state.cameras)):
+        parts = [
+            residual_norms(rows, state.cameras[camera], state.trajectories[rows.label])[rows.use]
+            for rows in problem.rows
+            if rows.camera == camera
+        ]
+        values = np.concatenate(parts) if parts else np.zeros(0)
+        values = values[np.isfinite(values)]
+        if len(values) >= 8:
+            sigma[camera] = max(_LEAST_SIGMA, float(np.median(values)) / 1.1774)
+    return sigma
+
+
+def mark_inliers(problem: Problem, state: State) -> Problem:
+    """The problem with only those rows in use that lie within the cut."""
+    out = []
+    for rows in problem.rows:
+        norms = residual_norms(rows, state.cameras[rows.camera], state.trajectories[rows.label])
+        with np.errstate(invalid="ignore"):
+            out.append(rows.using(norms < _CUT * state.sigma[rows.camera]))
+    return replace(problem, rows=tuple(out))
+
+
+def motion_prior(problem: Problem, state: State, first: bool = False) -> MotionPrior:
+    """Strength of the motion prior from the third differences where at least two cameras see.
+
+    first: before the path can be trusted, only a whisper that closes holes.
+    """
+    weights = []
+    for label, path in enumerate(state.trajectories):
+        size = path.basis.size
+        count = len(path.basis.interval_starts())
+        differences = third_differences(path.basis, path.control)
+        seen = np.zeros((len(state.cameras), size), dtype=np.bool_)
+        for rows in problem.rows:
+            if rows.label == label:
+                index, _, inside = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[rows.use]))
+                seen[rows.camera, index[inside]] = True
+        both = seen.sum(axis=0)[path.basis.interval_starts()] >= 2
+        chosen = differences[both] if both.sum() >= 4 else differences
+        variance = float(np.mean(chosen**2)) if len(chosen) else 1.0
+        scale = float(np.median(np.ptp(path.control, axis=0))) or 1.0
+        variance = max(variance, (1e-6 * scale) ** 2)
+        weights.append(np.full(count, (1e-3 if first else 1.0) / variance))
+    return MotionPrior(tuple(weights))
+
+
+def linearise(rows: Rows, camera: CameraState, path: Trajectory, nominal: Intrinsics) -> Linearised:
+    """Residuals of the used rows and their derivatives by the point (n, 2, 3) and the camera (n, 2, 10)."""
+    time = rows.time[rows.use]
+    reference = camera.reference_time(time)
+    index, weights, inside = path.basis.weights(reference)
+    _, speeds, _ = path.basis.weights(reference, 1)
+    control = path.control
+    point = sum(weights[:, k, None] * control[index + k] for k in range(4))
+    velocity = sum(speeds[:, k, None] * control[index + k] for k in range(4))
+    local = (point - camera.pose.position) @ camera.pose.rotation.T
+    z = local[:, 2]
+    valid = inside & (z > 1e-9)
+    safe = np.where(valid, z, 1.0)
+    flat = np.where(valid[:, None], local[:, :2] / safe[:, None], 0.0)
+    lens = camera.intrinsics
+    projected = lens.project_normalised(flat)
+    slope = lens.pixel_jacobian(flat)
+    squash = np.zeros((len(time), 2, 3))
+    squash[:, 0, 0] = squash[:, 1, 1] = 1.0 / safe
+    squash[:, :, 2] = -flat / safe[:, None]
+    by_local = slope @ squash
+    by_point = by_local @ camera.pose.rotation
+    by_camera = np.zeros((len(time), 2, CAMERA_PARAMETERS))
+    by_camera[:, :, :3] = -by_local @ so3.hat(local)
+    by_camera[:, :, 3:6] = -by_point
+    along = np.einsum("nij,nj->ni", by_point, velocity)
+    by_camera[:, :, OFFSET] = along
+    by_camera[:, :, RATE] = along * (time - camera.centre)[:, None]
+    centre = lens.matrix[:2, 2]
+    by_camera[:, :, FOCAL] = projected - centre
+    radius2 = (flat**2).sum(axis=1)
+    if lens.fisheye:
+        radius = np.sqrt(radius2)
+        angle = np.arctan(radius)
+        by_camera[:, :, K1] = flat * (angle**3 / np.maximum(radius, 1e-12))[:, None] * np.diag(lens.matrix)[:2]
+    else:
+        by_camera[:, :, K1] = (flat * radius2[:, None]) @ lens.matrix[:2, :2].T
+    return Linearised(projected - rows.pixels[rows.use], by_point, by_camera, index, weights, valid)
+
+
+def build_system(
+    problem: Problem, state: State, prior: MotionPrior, robust: bool
+) -> tuple[BorderedSystem, float]:
+    """Normal equations over all labels' control points and the free camera parameters, and the cost."""
+    sizes = [3 * path.basis.size for path in state.trajectories]
+    bases = np.r_[0, np.cumsum(sizes)].astype(int)
+    columns = problem.free_columns()
+    width = len(state.cameras) * CAMERA_PARAMETERS
+    system = BorderedSystem(
+        np.zeros((12, bases[-1])), np.zeros((bases[-1], len(columns))), np.zeros((width, width)),
+        np.zeros(bases[-1]), np.zeros(width),
+    )
+    place = np.full(width, -1)
+    place[columns] = np.arange(len(columns))
+    cost = 0.0
+    for label, path in enumerate(state.trajectories):
+        part = slice(bases[label], bases[label + 1])
+        band, gradient, value = _motion_terms(path, prior.weights[label])
+        system.band[:, part] += band
+        system.gradient_path[part] += gradient
+        cost += value
+    for rows in problem.rows:
+        part = slice(bases[rows.label], bases[rows.label + 1])
+        line = linearise(rows, state.cameras[rows.camera], state.trajectories[rows.label], problem.nominal[rows.camera])
+        variance = state.sigma[rows.camera] ** 2
+        squared = (line.residual**2).sum(axis=1) / variance
+        if robust:
+            ratio = squared / _WIDTH**2
+            weight = np.where(line.valid, 1.0 / (1.0 + ratio), 0.0) / variance
+            losses = _WIDTH**2 * np.log1p(ratio)
+        else:
+            weight = np.where(line.valid, 1.0, 0.0) / variance
+            losses = squared
+        # A point behind the camera or off the path costs what a gross outlier does, and pulls nothing.
+        gross = _WIDTH**2 * np.log1p((100.0 / _WIDTH) ** 2) if robust else 100.0**2
+        cost += float(np.where(line.valid, losses, gross).sum())
+        weighted = line.by_point * weight[:, None, None]
+        blocks = line.by_point.transpose(0, 2, 1) @ weighted
+        add_path_blocks(system.band[:, part], line.index, line.weights, blocks)
+        pull = (weighted * line.residual[:, :, None]).sum(axis=1)
+        system.gradient_path[part] += path_gradient(line.index, line.weights, pull, sizes[rows.label])
+        base = rows.camera * CAMERA_PARAMETERS
+        mine = slice(base, base + CAMERA_PARAMETERS)
+        flat = line.by_camera.reshape(-1, CAMERA_PARAMETERS)
+        flat_weight = np.repeat(weight, 2)
+        system.corner[mine, mine] += (flat * flat_weight[:, None]).T @ flat
+        system.gradient_cameras[mine] += (flat * flat_weight[:, None]).T @ line.residual.reshape(-1)
+        free = place[mine] >= 0
+        if free.any() and len(line.index):
+            cross = weighted.transpose(0, 2, 1) @ line.by_camera[:, :, free]
+            system.border[part, place[mine][free]] += border_block(line.index, line.weights, cross, sizes[rows.label])
+    cost += _add_camera_priors(problem, state, system)
+    system.corner = system.corner[np.ix_(columns, columns)]
+    system.gradient_cameras = system.gradient_cameras[columns]
+    return system, cost
+
+
+def _motion_terms(path: Trajectory, weight: Floats) -> tuple[Floats, Floats, float]:
+    band = third_difference_band(path.basis, weight)
+    differences = third_differences(path.basis, path.control)
+    pulls = weight[:, None] * differences
+    index = path.basis.interval_starts()
+    rows = np.tile(np.array([-1.0, 3.0, -3.0, 1.0]), (len(index), 1))
+    gradient = path_gradient(index, rows, pulls, 3 * path.basis.size)
+    return band, gradient, float((pulls * differences).sum())
+
+
+def _add_camera_priors(problem: Problem, state: State, system: BorderedSystem) -> float:
+    """Priors on rate and lens, on the diagonal of the cameras' corner; their cost."""
+    freedom, cost = problem.freedom, 0.0
+    for camera, (now, nominal) in enumerate(zip(state.cameras, problem.nominal, strict=True)):
+        base = camera * CAMERA_PARAMETERS
+        terms = [(RATE, now.rate - 1.0, freedom.rate_std)]
+        if freedom.lens:
+            terms.append((FOCAL, float(np.log(now.intrinsics.focal / nominal.focal)), freedom.focal_std))
+            terms.append((K1, float(now.intrinsics.distortions[0] - nominal.distortions[0]), freedom.k1_std))
+        for column, value, std in terms:
+            system.corner[base + column, base + column] += 1.0 / std**2
+            system.gradient_cameras[base + column] += value / std**2
+            cost += (value / std) ** 2
+    return cost
+
+
+def gauge_tangent(problem: Problem, state: State) -> Floats | None:
+    """Orthonormal directions (p, q) in which the free camera parameters may move without touching the gauge.
+
+    Held: pose of the first anchor, distance between the two anchors. None where poses are fixed.
+    """
+    if not problem.freedom.pose:
+        return None
+    columns = problem.free_columns()
+    first, second = problem.anchors
+    width = len(state.cameras) * CAMERA_PARAMETERS
+    held = np.zeros((7, width))
+    held[np.arange(6), first * CAMERA_PARAMETERS + np.arange(6)] = 1.0
+    apart = state.cameras[second].pose.position - state.cameras[first].pose.position
+    apart = apart / np.linalg.norm(apart)
+    held[6, second * CAMERA_PARAMETERS + 3 : second * CAMERA_PARAMETERS + 6] = apart
+    _, _, vt = np.linalg.svd(held[:, columns])
+    return np.asarray(vt[7:].T)
+
+
+def moved(problem: Problem, state: State, path_step: Floats, camera_step: Floats) -> State:
+    """The state after a step of the free parameters."""
+    full = np.zeros(len(state.cameras) * CAMERA_PARAMETERS)
+    full[problem.free_columns()] = camera_step
+    cameras = tuple(
+        _moved_camera(camera, full[i * CAMERA_PARAMETERS : (i + 1) * CAMERA_PARAMETERS])
+        for i, camera in enumerate(state.cameras)
+    )
+    paths, at = [], 0
+    for path in state.trajectories:
+        size = 3 * path.basis.size
+        paths.append(replace(path, control=path.control + path_step[at : at + size].reshape(-1, 3)))
+        at += size
+    return replace(state, cameras=cameras, trajectories=tuple(paths))
+
+
+def _moved_camera(camera: CameraState, step: Floats) -> CameraState:
+    pose = Pose(so3.exp(step[:3]) @ camera.pose.rotation, camera.pose.position + step[3:6])
+    lens = camera.intrinsics
+    if step[FOCAL] != 0.0 or step[K1] != 0.0:
+        matrix = lens.matrix.copy()
+        matrix[:2, :2] *= np.exp(step[FOCAL])
+        distortions = lens.distortions.copy()
+        distortions[0] += step[K1]
+        lens = Intrinsics(lens.width, lens.height, matrix, distortions, lens.fisheye)
+    return replace(
+        camera, pose=pose, intrinsics=lens, offset=camera.offset + float(step[OFFSET]), rate=camera.rate + float(step[RATE])
+    )
+
+
+def _minimise(problem: Problem, state: State, prior: MotionPrior, robust: bool, iterations: int) -> State:
+    damping = 1e-4
+    system, cost = build_system(problem, state, prior, robust)
+    for _ in range(iterations):
+        try:
+            path_step, camera_step = solve(system, damping, gauge_tangent(problem, state))
+        except np.linalg.LinAlgError:
+            damping *= 10.0
+            continue
+        trial = moved(problem, state, path_step, camera_step)
+        trial_system, trial_cost = build_system(problem, trial, prior, robust)
+        if np.isfinite(trial_cost) and trial_cost < cost:
+            gain = cost - trial_cost
+            state, system, cost = trial, trial_system, trial_cost
+            damping = max(damping / 10.0, 1e-12)
+            if gain < 1e-7 * cost:
+                break
+        else:
+            damping = max(damping * 10.0, 1e-8)
+            if damping > 1e6:
+                break
+    return state

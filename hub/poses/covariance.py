@@ -1,0 +1,158 @@
+"""Covariances of the adjustment's answers, in the gauge in which they are published."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hub.poses.adjust import MotionPrior, build_system
+from hub.poses.linear import BAND, eliminate
+from hub.poses.problem import CAMERA_PARAMETERS, OFFSET, RATE, Problem, State
+from hub.splines import SUPPORT
+from protocols.geometry import so3
+from protocols.geometry.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Covariance:
+    """Joint covariance of all camera parameters, and what is needed for the path's.
+
+    cameras: (10 n, 10 n), zero where a parameter was held. carried: (3 m, p) A⁻¹ B over the free columns.
+    free: (p, p) covariance of the free columns. blocks: (k, 24, 24) blocks of A⁻¹ about the diagonal.
+    """
+
+    cameras: Floats
+    carried: Floats
+    free: Floats
+    blocks: Floats
+
+
+def covariance(problem: Problem, state: State, prior: MotionPrior, references: Floats | None = None) -> Covariance:
+    """Covariance at the solution.
+
+    references: (10 n, 10 n) information of surveyed positions, attitudes and distances. Gauge directions
+    that they leave open are held by convention: the first camera's pose and the first baseline.
+    """
+    system, _ = build_system(problem, state, prior, robust=False)
+    parts = eliminate(system)
+    columns = problem.free_columns()
+    information = parts.reduced
+    held = None
+    if problem.freedom.pose:
+        known = np.zeros((len(state.cameras) * CAMERA_PARAMETERS,) * 2) if references is None else references
+        information = information + known[np.ix_(columns, columns)]
+        held = _held_rows(state, known)[:, columns]
+    if held is not None and len(held):
+        _, _, vt = np.linalg.svd(held)
+        tangent = vt[len(held) :].T
+        free = tangent @ np.linalg.inv(tangent.T @ information @ tangent) @ tangent.T
+    elif len(columns):
+        free = np.linalg.inv(information)
+    else:
+        free = np.zeros((0, 0))
+    width = len(state.cameras) * CAMERA_PARAMETERS
+    full = np.zeros((width, width))
+    full[np.ix_(columns, columns)] = free
+    return Covariance(full, parts.carried, free, _inverse_blocks(system.band))
+
+
+def gauge_generators(state: State) -> Floats:
+    """(10 n, 7): how all cameras move under a small translation, rotation and scaling of the world."""
+    rows = []
+    for camera in state.cameras:
+        block = np.zeros((CAMERA_PARAMETERS, 7))
+        block[3:6, :3] = np.eye(3)
+        block[:3, 3:6] = -camera.pose.rotation
+        block[3:6, 3:6] = -so3.hat(camera.pose.position)
+        block[3:6, 6] = camera.pose.position
+        rows.append(block)
+    return np.concatenate(rows)
+
+
+def _held_rows(state: State, references: Floats) -> Floats:
+    """Constraint rows (q, 10 n) on the gauge directions that the references leave open."""
+    generators = gauge_generators(state)
+    default = np.zeros((7, len(generators)))
+    default[np.arange(6), np.arange(6)] = 1.0
+    apart = state.cameras[1].pose.position - state.cameras[0].pose.position
+    apart = apart / np.linalg.norm(apart)
+    default[6, 3:6] = -apart
+    default[6, CAMERA_PARAMETERS + 3 : CAMERA_PARAMETERS + 6] = apart
+    # Generators scaled to unit effect, so that "known" has one meaning for all seven.
+    scaled = generators / np.linalg.norm(generators, axis=0)
+    known = scaled.T @ references @ scaled
+    values, vectors = np.linalg.eigh(known)
+    opened = vectors[:, values < 1e-6 * max(float(values[-1]), 1e-30)] if values[-1] > 0 else np.eye(7)
+    return np.asarray(opened.T @ np.linalg.inv(default @ scaled) @ default)
+
+
+def time_map_std(cov: Covariance, state: State, camera: int, reference: int) -> float:
+    """Std [s] of the camera's map onto the reference camera's clock, in the middle of its observed span."""
+    if camera == reference:
+        return 0.0
+    now, base = state.cameras[camera], state.cameras[reference]
+    row = np.zeros(len(cov.cameras))
+    row[camera * CAMERA_PARAMETERS + OFFSET] = 1.0
+    at = float(base.camera_time(np.array([now.offset]))[0])
+    row[reference * CAMERA_PARAMETERS + OFFSET] -= 1.0
+    row[reference * CAMERA_PARAMETERS + RATE] -= at - base.centre
+    return float(np.sqrt(max(row @ cov.cameras @ row, 0.0)) / base.rate)
+
+
+def position_std(cov: Covariance, camera: int) -> Floats:
+    """Std (3,) of the camera's position."""
+    begin = camera * CAMERA_PARAMETERS + 3
+    return np.asarray(np.sqrt(np.maximum(np.diag(cov.cameras)[begin : begin + 3], 0.0)))
+
+
+def path_std(cov: Covariance, state: State, label: int, time: Floats) -> Floats:
+    """Std (n,) of one axis of a path's position at internal reference times (n,)."""
+    base = 3 * sum(path.basis.size for path in state.trajectories[:label])
+    index, weights, _ = state.trajectories[label].basis.weights(time)
+    first = base + 3 * index
+    block, inside = first // BAND, first % BAND
+    out = np.zeros(len(time))
+    for axis in range(3):
+        for a in range(SUPPORT):
+            for b in range(SUPPORT):
+                values = cov.blocks[block, inside + 3 * a + axis, inside + 3 * b + axis]
+                out += weights[:, a] * weights[:, b] * values
+        carried = sum(weights[:, a, None] * cov.carried[first + 3 * a + axis] for a in range(SUPPORT))
+        out += np.einsum("ni,ij,nj->n", carried, cov.free, carried)
+    return np.asarray(np.sqrt(np.maximum(out / 3.0, 0.0)))
+
+
+def _inverse_blocks(band: Floats) -> Floats:
+    """Blocks (k, 24, 24) of the inverse of a banded matrix about its diagonal, by block recursion.
+
+    Block i covers rows 12 i … 12 i + 23: every 12 neighbouring rows lie in one of them.
+    """
+    size = band.shape[1]
+    count = -(-size // BAND)
+    diagonal = np.tile(np.eye(BAND), (count, 1, 1))
+    above = np.zeros((count, BAND, BAND))
+    for distance in range(BAND):
+        column = np.arange(distance, size)
+        row = column - distance
+        values = band[BAND - 1 - distance, distance:]
+        same = row // BAND == column // BAND
+        diagonal[row[same] // BAND, row[same] % BAND, column[same] % BAND] = values[same]
+        diagonal[row[same] // BAND, column[same] % BAND, row[same] % BAND] = values[same]
+        above[row[~same] // BAND, row[~same] % BAND, column[~same] % BAND] = values[~same]
+    diagonal += 1e-12 * float(band[-1].max(initial=1.0)) * np.eye(BAND)
+    pivots = np.empty_like(diagonal)
+    pivots[0] = np.linalg.inv(diagonal[0])
+    for i in range(1, count):
+        pivots[i] = np.linalg.inv(diagonal[i] - above[i - 1].T @ pivots[i - 1] @ above[i - 1])
+    out = np.zeros((count, 2 * BAND, 2 * BAND))
+    last = pivots[-1]
+    out[-1, :BAND, :BAND] = last
+    for i in range(count - 2, -1, -1):
+        carry = pivots[i] @ above[i]
+        corner = -carry @ last
+        now = pivots[i] - corner @ carry.T
+        out[i, :BAND, :BAND], out[i, BAND:, BAND:] = now, last
+        out[i, :BAND, BAND:], out[i, BAND:, :BAND] = corner, corner.T
+        last = now
+    return out

@@ -1,0 +1,225 @@
+"""Where the world is: gauge and scale from what the rig knows (positions, attitudes, distances, up).
+
+Nothing known: the first camera is the world and the first baseline is 1. ``up`` alone turns the world so
+that z points up: ``up = [x, y, z]`` is a direction in the first camera's axes unless poses are known, a
+camera's name means that camera is levelled (its -y axis points up).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hub.poses.problem import CAMERA_PARAMETERS, State
+from protocols.errors import Refused
+from protocols.geometry import so3
+from protocols.geometry.pose import Pose, Similarity, fit_similarity
+from protocols.geometry.types import Floats
+from protocols.session.rig import Rig
+
+_EXACT = 1e-4  # std of a reference without one, relative to the size of the rig
+_UP_STD = 0.01  # rad
+_FAR = 8.0  # sigma: references that contradict each other by more are told
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gauge:
+    """The similarity to the published world, and what the references say.
+
+    scale: "metric" or "arbitrary". information: (10 n, 10 n) of the references in the published world.
+    warnings: references that don't fit the others.
+    """
+
+    similarity: Similarity
+    scale: str
+    information: Floats
+    warnings: tuple[str, ...]
+
+
+def fix_gauge(rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
+    """Find the published world for solved cameras ``names`` with ``poses`` in the internal one."""
+    known = [(i, rig.cameras[name]) for i, name in enumerate(names)]
+    positions = [(i, camera.position) for i, camera in known if camera.position is not None]
+    rotations = [(i, camera.rotation) for i, camera in known if camera.rotation is not None]
+    distances = [(names.index(a), names.index(b), d) for a, b, d in rig.distances if a in names and b in names]
+    base = _default(rig, names, poses)
+    apart = [poses[a].position - poses[b].position for a, b, _ in distances]
+    metric = len(positions) >= 2 or bool(distances)
+    if not metric and not positions and not rotations:
+        width = CAMERA_PARAMETERS * len(names)
+        return Gauge(base, "arbitrary", np.zeros((width, width)), ())
+    scale = base.scale
+    if len(positions) >= 2:
+        scale = _ratio([p for _, p in positions], [poses[i].position for i, _ in positions])
+    elif distances:
+        scale = float(np.median([d / np.linalg.norm(v) for (_, _, d), v in zip(distances, apart, strict=True)]))
+    starts = _starts(rotations, positions, poses, scale, base)
+    residual = _residuals(rig, names, poses, positions, rotations, distances)
+    best = min((_descend(start, residual, metric) for start in starts), key=lambda item: item[1])[0]
+    final = residual(best, True)
+    warnings = []
+    if len(final) > 7 and float(np.sqrt(np.mean(final**2))) > _FAR:
+        warnings.append(
+            f"the rig's references disagree with each other or the cameras by {np.abs(final).max():.0f} sigma: check them"
+        )
+    return Gauge(best, "metric" if metric else "arbitrary", _information(rig, names, poses, best), tuple(warnings))
+
+
+def _default(rig: Rig, names: list[str], poses: list[Pose]) -> Similarity:
+    """First camera = world, first baseline = 1, or z up where up is known."""
+    first = poses[0]
+    rotation = first.rotation
+    up = rig.up
+    if up is not None:
+        if isinstance(up, str):
+            if up not in names:
+                raise Refused(f"up names {up}, which could not be solved")
+            upward = poses[names.index(up)].rotation.T @ np.array([0.0, -1.0, 0.0])
+        else:
+            upward = first.rotation.T @ up
+        ahead = first.rotation[2] - upward * (first.rotation[2] @ upward)
+        if np.linalg.norm(ahead) < 1e-6:
+            ahead = first.rotation[1] - upward * (first.rotation[1] @ upward)
+        ahead = ahead / np.linalg.norm(ahead)
+        rotation = np.stack([np.cross(ahead, upward), ahead, upward])  # x right, y ahead, z up
+    scale = 1.0 / float(np.linalg.norm(poses[1].position - first.position)) if len(poses) > 1 else 1.0
+    return Similarity(scale, rotation, -scale * rotation @ first.position)
+
+
+def _ratio(target: list[Floats], source: list[Floats]) -> float:
+    t, s = np.array(target), np.array(source)
+    return float(np.linalg.norm(t - t.mean(0)) / max(float(np.linalg.norm(s - s.mean(0))), 1e-12))
+
+
+def _starts(
+    rotations: list[tuple[int, Floats]],
+    positions: list[tuple[int, Floats]],
+    poses: list[Pose],
+    scale: float,
+    base: Similarity,
+) -> list[Similarity]:
+    """Similarities to begin from: by attitudes, by positions, by the default turned about."""
+    turns = [poses[i].rotation for i, _ in rotations]
+    guesses = [known.T @ turn for (_, known), turn in zip(rotations, turns, strict=True)] or [base.rotation]
+    source = np.array([poses[i].position for i, _ in positions]).reshape(-1, 3)
+    target = np.array([p for _, p in positions]).reshape(-1, 3)
+    if len(positions) >= 3:
+        guesses.append(fit_similarity(source, target).rotation)
+    if len(positions) >= 2:
+        line = so3.taking(source[1] - source[0], target[1] - target[0])
+        axis = (target[1] - target[0]) / max(float(np.linalg.norm(target[1] - target[0])), 1e-12)
+        guesses += [so3.exp(angle * axis) @ line for angle in np.linspace(0, 2 * np.pi, 6, endpoint=False)]
+    out = []
+    for rotation in guesses:
+        if len(positions):
+            shift = target.mean(0) - scale * rotation @ source.mean(0)
+        else:
+            shift = -scale * rotation @ poses[0].position
+        out.append(Similarity(scale, rotation, shift))
+    return out
+
+
+def _residuals(
+    rig: Rig,
+    names: list[str],
+    poses: list[Pose],
+    positions: list[tuple[int, Floats]],
+    rotations: list[tuple[int, Floats]],
+    distances: list[tuple[int, int, float]],
+) -> Callable[[Similarity, bool], Floats]:
+    """Residuals of all references in sigma; with the flag, the real ones only (no regulariser)."""
+
+    def residual(s: Similarity, real: bool) -> Floats:
+        size = s.scale * _extent(poses)
+        out: list[Floats] = []
+        for i, known in positions:
+            std = rig.cameras[names[i]].position_std
+            out.append((s.points(poses[i].position[None])[0] - known) / (_EXACT * size if std is None else std))
+        for i, known in rotations:
+            std = rig.cameras[names[i]].rotation_std
+            turned = poses[i].rotation @ s.rotation.T
+            out.append(so3.log(turned @ known.T) / (_EXACT if std is None else std))
+        for a, b, length in distances:
+            apart = s.scale * float(np.linalg.norm(poses[a].position - poses[b].position))
+            out.append(np.array([(apart - length) / (_EXACT * length)]))
+        if isinstance(rig.up, str) and rig.up in names:
+            level = s.rotation @ poses[names.index(rig.up)].rotation.T @ np.array([0.0, -1.0, 0.0])
+            out.append(np.cross(level, [0.0, 0.0, 1.0])[:2] / _UP_STD)
+        values = np.concatenate(out) if out else np.zeros(0)
+        return values if real else values
+
+    return residual
+
+
+def _descend(start: Similarity, residual: Callable[[Similarity, bool], Floats], metric: bool) -> tuple[Similarity, float]:
+    """Gauss-Newton over the similarity; directions that nothing fixes stay where they began."""
+    now = start
+    cost = float((residual(now, True) ** 2).sum())
+    for _ in range(30):
+        value = residual(now, True)
+        jacobian = np.empty((len(value), 7))
+        for k in range(7):
+            step = np.zeros(7)
+            step[k] = 1e-6
+            jacobian[:, k] = (residual(_stepped(now, step), True) - residual(_stepped(now, -step), True)) / 2e-6
+        if not metric:
+            jacobian[:, 6] = 0.0
+        step = -np.linalg.lstsq(jacobian, value, rcond=1e-9)[0]
+        trial = _stepped(now, step)
+        trial_cost = float((residual(trial, True) ** 2).sum())
+        shrink = 1.0
+        while trial_cost > cost and shrink > 1e-3:
+            shrink *= 0.5
+            trial = _stepped(now, shrink * step)
+            trial_cost = float((residual(trial, True) ** 2).sum())
+        if trial_cost >= cost * (1.0 - 1e-10):
+            break
+        now, cost = trial, trial_cost
+    return now, cost
+
+
+def _stepped(s: Similarity, step: Floats) -> Similarity:
+    turn = so3.exp(step[3:6])
+    size = s.scale * float(np.exp(np.clip(step[6], -2.0, 2.0)))
+    # Shift and rotation are in units of the scene, so that one rank tolerance serves all.
+    return Similarity(size, turn @ s.rotation, s.shift + step[:3] * s.scale)
+
+
+def _extent(poses: list[Pose]) -> float:
+    centres = np.array([pose.position for pose in poses])
+    return max(float(np.linalg.norm(np.ptp(centres, axis=0))), 1e-9)
+
+
+def _information(rig: Rig, names: list[str], poses: list[Pose], s: Similarity) -> Floats:
+    """Information (10 n, 10 n) of the references about the cameras' parameters in the published world."""
+    width = CAMERA_PARAMETERS * len(names)
+    out = np.zeros((width, width))
+    size = s.scale * _extent(poses)
+    for i, name in enumerate(names):
+        camera, base = rig.cameras[name], i * CAMERA_PARAMETERS
+        if camera.position is not None:
+            std = np.full(3, _EXACT * size) if camera.position_std is None else camera.position_std
+            out[base + 3 + np.arange(3), base + 3 + np.arange(3)] += 1.0 / std**2
+        if camera.rotation is not None:
+            std = np.full(3, _EXACT) if camera.rotation_std is None else camera.rotation_std
+            out[base + np.arange(3), base + np.arange(3)] += 1.0 / std**2
+    for a, b, length in rig.distances:
+        if a in names and b in names:
+            i, j = names.index(a), names.index(b)
+            apart = s.points(poses[j].position[None])[0] - s.points(poses[i].position[None])[0]
+            row = np.zeros(width)
+            row[i * CAMERA_PARAMETERS + 3 : i * CAMERA_PARAMETERS + 6] = -apart / np.linalg.norm(apart)
+            row[j * CAMERA_PARAMETERS + 3 : j * CAMERA_PARAMETERS + 6] = apart / np.linalg.norm(apart)
+            out += np.outer(row, row) / (_EXACT * length) ** 2
+    return out
+
+
+def transform_state(state: State, s: Similarity) -> State:
+    """The whole state in the published world."""
+    from dataclasses import replace
+
+    cameras = tuple(replace(camera, pose=s.pose(camera.pose)) for camera in state.cameras)
+    paths = tuple(replace(path, control=s.points(path.control)) for path in state.trajectories)
+    return replace(state, cameras=cameras, trajectories=paths)

@@ -1,0 +1,125 @@
+"""What the joint adjustment knows and what it looks for: plain data, no algorithm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hub.splines import SplineBasis
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.pose import Pose
+from protocols.geometry.types import Bools, Floats, Ints
+
+CAMERA_PARAMETERS = 10
+"""Columns of one camera: rotation 0..2, position 3..5, offset 6, rate 7, log focal length 8, k1 9."""
+OFFSET, RATE, FOCAL, K1 = 6, 7, 8, 9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraState:
+    """One camera's estimate: pose, intrinsics and time map.
+
+    The time map is kept about ``centre``, a time in the middle of what the camera saw, so that offset and
+    rate hardly depend on each other: ``t = rate * (t_camera - centre) + offset`` with t the internal
+    reference time [s] and t_camera less the camera's epoch.
+    """
+
+    intrinsics: Intrinsics
+    pose: Pose
+    rate: float
+    offset: float
+    centre: float
+
+    def reference_time(self, time: Floats) -> Floats:
+        """Internal reference times (n,) of camera times (n,) less the epoch."""
+        return np.asarray(self.rate * (time - self.centre) + self.offset)
+
+    def camera_time(self, reference: Floats) -> Floats:
+        """Camera times (n,) less the epoch of internal reference times (n,)."""
+        return np.asarray((reference - self.offset) / self.rate + self.centre)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Observations of one label by one camera.
+
+    camera, label: indices. time: (n,) on the camera's clock less its epoch [s]. pixels: (n, 2) distorted.
+    use: (n,) rows that count.
+    """
+
+    camera: int
+    label: int
+    time: Floats
+    pixels: Floats
+    use: Bools
+
+    def using(self, use: Bools) -> Rows:
+        """The same rows with other ones counting."""
+        return replace(self, use=use)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """The 3-D path of one label: a spline on the internal reference time. control: (size, 3)."""
+
+    basis: SplineBasis
+    control: Floats
+
+    def at(self, time: Floats, derivative: int = 0) -> Floats:
+        """Positions (n, 3) or a derivative; NaN outside the stretches."""
+        return self.basis.evaluate(self.control, time, derivative)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Everything that the adjustment moves. sigma: (cameras,) noise of one pixel coordinate."""
+
+    cameras: tuple[CameraState, ...]
+    trajectories: tuple[Trajectory, ...]
+    sigma: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Freedom:
+    """What may move, and priors.
+
+    pose, clock, lens: whether poses, time maps, and focal length with k1 are estimated.
+    focal_std: prior std of log focal length. k1_std: prior std of k1. rate_std: prior std of a rate.
+    """
+
+    pose: bool = True
+    clock: bool = True
+    lens: bool = False
+    focal_std: float = 0.01
+    k1_std: float = 0.02
+    rate_std: float = 5e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """Observations and what is fixed.
+
+    rows: all observations. nominal: intrinsics as given (priors of the lens). clock_reference: index of the
+    camera whose clock is the internal time. anchors: two cameras whose pose and distance fix the gauge.
+    freedom: what may move.
+    """
+
+    rows: tuple[Rows, ...]
+    nominal: tuple[Intrinsics, ...]
+    clock_reference: int
+    anchors: tuple[int, int]
+    freedom: Freedom = field(default_factory=Freedom)
+
+    def free_columns(self) -> Ints:
+        """Indices of the free camera parameters in the stacked vector of CAMERA_PARAMETERS each."""
+        columns: list[int] = []
+        for camera in range(len(self.nominal)):
+            base = camera * CAMERA_PARAMETERS
+            if self.freedom.pose:
+                columns += range(base, base + 6)
+            if self.freedom.clock and camera != self.clock_reference:
+                columns += [base + OFFSET, base + RATE]
+            if self.freedom.lens:
+                columns += [base + FOCAL, base + K1]
+        return np.array(columns, dtype=np.int64)

@@ -1,0 +1,229 @@
+"""From the internal solution to what users get: published gauge and clock, stds, trajectory, pair reports."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hub.poses import covariance as cov
+from hub.poses.adjust import motion_prior, predict, residual_norms
+from hub.poses.gauge import fix_gauge, transform_state
+from hub.poses.problem import Problem, State
+from hub.timing.pair import PairSolution
+from hub.timing.two_view import RelativePose, fundamental_from
+from protocols.clocks import TimeMap
+from protocols.geometry.types import Floats
+from protocols.session.calibration import Calibration, CameraCalibration, PairReport, TrajectoryTable
+from protocols.session.rig import Rig
+from protocols.version import VERSION
+
+if TYPE_CHECKING:
+    from hub.calibrate import Solution
+
+SEEN_WITHIN = 0.2
+"""A time counts as seen by a camera if it saw the point this near [s]."""
+
+
+def publish(rig: Rig, solution: Solution) -> Calibration:
+    """Everything in the rig's world and units, on the reference camera's clock."""
+    scaffold = solution.scaffold
+    # The rig's order decides which camera is the reference and the first baseline.
+    order = [scaffold.names.index(name) for name in rig.cameras if name in scaffold.names]
+    names = [scaffold.names[i] for i in order]
+    problem, state = _reordered(scaffold.problem, scaffold.state, order)
+    gauge = fix_gauge(rig, names, [camera.pose for camera in state.cameras])
+    state = transform_state(state, gauge.similarity)
+    covariance = cov.covariance(problem, state, motion_prior(problem, state), gauge.information)
+    reference = _reference(rig, names)
+    epochs = [solution.prepared.epochs[name] for name in names]
+    base = state.cameras[reference]
+    maps = []
+    for camera, epoch in zip(state.cameras, epochs, strict=True):
+        rate = camera.rate / base.rate
+        # reference clock = epoch + centre + (internal - offset) / rate of the reference camera
+        at_centre = (camera.offset - base.offset) / base.rate + base.centre + epochs[reference]
+        maps.append(TimeMap(rate, at_centre - rate * (camera.centre + epoch)))
+    maps[reference] = TimeMap(1.0, 0.0)
+    cameras = {
+        name: CameraCalibration(
+            name=name,
+            intrinsics=state.cameras[i].intrinsics,
+            pose=state.cameras[i].pose,
+            time_map=maps[i],
+            time_offset_std=_map_std(problem, state, covariance, i, reference),
+            position_std=cov.position_std(covariance, i),
+            rms_px=_rms(problem, state, i),
+        )
+        for i, name in enumerate(names)
+    }
+    return Calibration(
+        cameras=cameras,
+        reference=names[reference],
+        scale=gauge.scale,
+        units=rig.units,
+        solver=solution.solver,
+        version=VERSION,
+        refused=solution.refused,
+        trajectories=tuple(
+            _table(problem, state, covariance, label, name, base.camera_time, epochs[reference], _rate_hz(rig, problem, names))
+            for label, name in enumerate(scaffold.labels)
+        ),
+        pairs=tuple(_pair_report(pair, rig, cameras, problem, state, names, solution) for pair in solution.pairs),
+        warnings=solution.warnings + gauge.warnings,
+        residuals={name: _residual_rows(problem, state, i, epochs[i]) for i, name in enumerate(names)},
+    )
+
+
+def _reference(rig: Rig, names: list[str]) -> int:
+    wanted = rig.metadata.get("reference")
+    return names.index(wanted) if wanted in names else 0
+
+
+def _reordered(problem: Problem, state: State, order: list[int]) -> tuple[Problem, State]:
+    place = {old: new for new, old in enumerate(order)}
+    moved = replace(
+        problem,
+        rows=tuple(replace(rows, camera=place[rows.camera]) for rows in problem.rows),
+        nominal=tuple(problem.nominal[i] for i in order),
+        clock_reference=place[problem.clock_reference],
+        anchors=(place[problem.anchors[0]], place[problem.anchors[1]]),
+    )
+    return moved, replace(state, cameras=tuple(state.cameras[i] for i in order), sigma=state.sigma[order])
+
+
+def _map_std(problem: Problem, state: State, covariance: cov.Covariance, camera: int, reference: int) -> float:
+    return cov.time_map_std(covariance, state, camera, reference) if problem.freedom.clock else 0.0
+
+
+def _rms(problem: Problem, state: State, camera: int) -> float:
+    parts = [
+        residual_norms(rows, state.cameras[camera], state.trajectories[rows.label])[rows.use]
+        for rows in problem.rows
+        if rows.camera == camera
+    ]
+    norms = np.concatenate(parts) if parts else np.zeros(0)
+    norms = norms[np.isfinite(norms)]
+    return float(np.sqrt(np.mean(norms**2))) if len(norms) else 0.0
+
+
+def _residual_rows(problem: Problem, state: State, camera: int, epoch: float) -> Floats:
+    parts = []
+    for rows in problem.rows:
+        if rows.camera == camera:
+            predicted = predict(rows, state.cameras[camera], state.trajectories[rows.label])
+            good = rows.use & np.isfinite(predicted).all(axis=1)
+            parts.append(
+                np.column_stack([rows.time[good] + epoch, rows.pixels[good], (rows.pixels - predicted)[good]])
+            )
+    return np.concatenate(parts) if parts else np.zeros((0, 5))
+
+
+def _rate_hz(rig: Rig, problem: Problem, names: list[str]) -> float:
+    """The fastest camera's frame rate: nominal, or as its rows come."""
+    rates = [rig.cameras[name].fps for name in names]
+    for rows in problem.rows:
+        if rates[rows.camera] <= 0 and len(rows.time) > 2:
+            rates[rows.camera] = 1.0 / float(np.median(np.diff(rows.time)))
+    return max([rate for rate in rates if np.isfinite(rate)], default=30.0) or 30.0
+
+
+def supported(problem: Problem, state: State, label: int, time: Floats) -> Floats:
+    """How many cameras saw the point within SEEN_WITHIN of internal reference times (n,)."""
+    count = np.zeros(len(time))
+    for number, camera in enumerate(state.cameras):
+        mine = [r.time[r.use] for r in problem.rows if r.camera == number and r.label == label]
+        joined = np.concatenate(mine) if mine else np.zeros(0)
+        if len(joined) < 2:
+            continue
+        seen = np.sort(camera.reference_time(joined))
+        after = np.clip(np.searchsorted(seen, time), 1, len(seen) - 1)
+        count += np.minimum(np.abs(seen[after] - time), np.abs(time - seen[after - 1])) <= SEEN_WITHIN
+    return count
+
+
+def _table(problem, state, covariance, label, name, to_reference, epoch, rate_hz):  # type: ignore[no-untyped-def]
+    path = state.trajectories[label]
+    begins, basis = path.basis.starts, path.basis
+    ends = begins + basis.intervals * basis.spacing
+    # A grid on the reference camera's clock, so that two runs on one log sample the same instants.
+    first, last = to_reference(np.array([begins[0], ends[-1]]))
+    ticks = np.arange(np.ceil((first + epoch) * rate_hz), np.floor((last + epoch) * rate_hz) + 1) / rate_hz
+    base = state.cameras[0]
+    internal = _internal(state, to_reference, ticks - epoch)
+    position = path.at(internal)
+    good = np.isfinite(position).all(axis=1) & (supported(problem, state, label, internal) >= 2)
+    del base
+    return TrajectoryTable(name, ticks[good], position[good], cov.path_std(covariance, state, label, internal[good]))
+
+
+def _internal(state: State, to_reference, time: Floats) -> Floats:  # type: ignore[no-untyped-def]
+    """Internal times of reference-camera times (the map is affine: two points tell it)."""
+    zero, one = to_reference(np.array([0.0, 1.0]))
+    return np.asarray((time - zero) / (one - zero))
+
+
+def _pair_report(
+    pair: PairSolution,
+    rig: Rig,
+    cameras: dict[str, CameraCalibration],
+    problem: Problem,
+    state: State,
+    names: list[str],
+    solution: Solution,
+) -> PairReport:
+    """What is known of a pair: from the joint solution where both cameras are in it, else from the pair."""
+    fit = pair.fit
+    a, b = cameras.get(pair.a), cameras.get(pair.b)
+    middle = _middle_of_overlap(problem, state, names, pair)
+    if a is not None and b is not None and middle is not None:
+        base = state.cameras[names.index(next(iter(cameras)))]
+        del base
+        epochs = solution.prepared.epochs
+        time_a = float(state.cameras[names.index(pair.a)].camera_time(np.array([middle]))[0]) + epochs[pair.a]
+        time_b = float(state.cameras[names.index(pair.b)].camera_time(np.array([middle]))[0]) + epochs[pair.b]
+        turn = b.pose.rotation @ a.pose.rotation.T
+        apart = b.pose.rotation @ (a.pose.position - b.pose.position)
+        relative = RelativePose(turn, apart / max(float(np.linalg.norm(apart)), 1e-12))
+        return PairReport(
+            cameras=(pair.a, pair.b),
+            status=pair.status,
+            lag_s=time_a - time_b,
+            clock_rate=b.time_map.clock_rate / a.time_map.clock_rate,
+            fundamental=fundamental_from(relative, a.intrinsics.matrix, b.intrinsics.matrix),
+            inliers=None if fit is None else fit.inliers,
+            rms_px=None if fit is None or not np.isfinite(fit.sigma_px) else fit.sigma_px,
+        )
+    if fit is None or not pair.solved:
+        return PairReport((pair.a, pair.b), pair.status)
+    epochs = solution.prepared.epochs
+    time_b = (fit.middle - fit.offset) / fit.rate
+    lens_a, lens_b = rig.cameras[pair.a].intrinsics, rig.cameras[pair.b].intrinsics
+    matrix = None
+    if lens_a is not None and lens_b is not None:
+        matrix = fundamental_from(fit.pose, lens_a.matrix, lens_b.matrix)
+    return PairReport(
+        (pair.a, pair.b),
+        pair.status,
+        fit.middle + epochs[pair.a] - time_b - epochs[pair.b],
+        fit.rate,
+        matrix,
+        fit.inliers,
+        fit.sigma_px,
+    )
+
+
+def _middle_of_overlap(problem: Problem, state: State, names: list[str], pair: PairSolution) -> float | None:
+    spans = []
+    for name in (pair.a, pair.b):
+        if name not in names:
+            return None
+        number = names.index(name)
+        times = [r.time[r.use] for r in problem.rows if r.camera == number]
+        joined = np.concatenate(times) if times else np.zeros(0)
+        if not len(joined):
+            return None
+        spans.append(state.cameras[number].reference_time(np.array([joined.min(), joined.max()])))
+    begin, end = max(spans[0][0], spans[1][0]), min(spans[0][1], spans[1][1])
+    return float(0.5 * (begin + end))

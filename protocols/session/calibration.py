@@ -1,0 +1,185 @@
+"""A calibration: what `calibrate` and the hub answer, and calibration.toml, trajectory.csv."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from protocols.clocks import TimeMap
+from protocols.errors import InputError
+from protocols.files import write_atomically
+from protocols.geometry import so3
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.pose import Pose
+from protocols.geometry.types import Floats
+from protocols.session.rig import Rig, read_rig, read_toml
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraCalibration:
+    """One solved camera.
+
+    time_map: reference clock from camera clock. time_offset_std: std [s] of that map in the middle of the
+    camera's observed span. position_std: (3,) [rig units]. rms_px: root mean square reprojection error.
+    """
+
+    name: str
+    intrinsics: Intrinsics
+    pose: Pose
+    time_map: TimeMap
+    time_offset_std: float
+    position_std: Floats
+    rms_px: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairReport:
+    """One pair of cameras, as in result.json.
+
+    lag_s: t_a - t_b of one instant, at mid-overlap [s]. clock_rate: t_a's rate against t_b. fundamental:
+    (3, 3), undistorted pixels, norm 1, ``m_aᵀ F m_b = 0``, None where unknown. inliers: share, 0..1.
+    """
+
+    cameras: tuple[str, str]
+    status: str
+    lag_s: float | None = None
+    clock_rate: float | None = None
+    fundamental: Floats | None = None
+    inliers: float | None = None
+    rms_px: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrajectoryTable:
+    """The 3-D path of one label. time: (n,) reference clock [s]; position: (n, 3); std: (n,) of one axis."""
+
+    label: str
+    time: Floats
+    position: Floats
+    std: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """Everything that `calibrate` writes.
+
+    reference: camera whose clock is the reference. scale: "metric" or "arbitrary" (then the first camera is
+    the world and the first baseline is 1). refused: reasons by camera. cpu_seconds: of the solver.
+    residuals: per camera (n, 5): camera time, u, v, and the residual du, dv [px] of the rows that count.
+    """
+
+    cameras: dict[str, CameraCalibration]
+    reference: str
+    scale: str
+    units: str
+    solver: str
+    version: str
+    refused: dict[str, str] = field(default_factory=dict)
+    trajectories: tuple[TrajectoryTable, ...] = ()
+    pairs: tuple[PairReport, ...] = ()
+    warnings: tuple[str, ...] = ()
+    cpu_seconds: float = 0.0
+    residuals: dict[str, Floats] = field(default_factory=dict)
+
+
+def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
+    """The content of calibration.toml: rig.toml's tables with the answers added."""
+    tables: dict[str, Any] = {}
+    metadata = {
+        **rig.metadata,
+        "units": calibration.units,
+        "reference": calibration.reference,
+        "scale": calibration.scale,
+        "solver": calibration.solver,
+        "version": calibration.version,
+    }
+    for name, camera in calibration.cameras.items():
+        lens = camera.intrinsics
+        table = dict(rig.cameras[name].table) if name in rig.cameras else {}
+        # A surveyed position stays an input: the answer is the translation, and two that differ by the
+        # survey's error would contradict each other.
+        for key in ("position", "position_std", "rotation_std"):
+            table.pop(key, None)
+        table |= {
+            "name": name,
+            "size": [lens.width, lens.height],
+            "matrix": lens.matrix.tolist(),
+            "distortions": lens.distortions.tolist(),
+            "rotation": camera.pose.rodrigues.tolist(),
+            "translation": camera.pose.translation.tolist(),
+            "time_offset": camera.time_map.time_offset,
+            "clock_rate": camera.time_map.clock_rate,
+            "time_offset_std": camera.time_offset_std,
+            "position_std": camera.position_std.tolist(),
+            "rms_px": camera.rms_px,
+        }
+        if lens.fisheye:
+            table["fisheye"] = True
+        tables[name] = table
+    if calibration.refused:
+        metadata["refused"] = dict(calibration.refused)
+    tables["metadata"] = metadata
+    return tables
+
+
+def write_calibration(file: Path, calibration: Calibration, rig: Rig) -> None:
+    """Write calibration.toml; it loads in aniposelib as it is."""
+    write_atomically(file, tomli_w.dumps(_plain(calibration_tables(calibration, rig))))
+
+
+def write_trajectory(file: Path, calibration: Calibration) -> None:
+    """Write trajectory.csv: time,x,y,z,std[,label] on the reference clock; label where there are several."""
+    several = len(calibration.trajectories) > 1
+    lines = ["time,x,y,z,std,label" if several else "time,x,y,z,std"]
+    for table in calibration.trajectories:
+        tail = f",{table.label}" if several else ""
+        for t, (x, y, z), std in zip(table.time, table.position, table.std, strict=True):
+            lines.append(f"{t:.17g},{x:.17g},{y:.17g},{z:.17g},{std:.17g}{tail}")
+    write_atomically(file, "\n".join(lines) + "\n")
+
+
+def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
+    """Read calibration.toml (also aniposelib's, without clocks): the rig in it and the solved cameras.
+
+    Raises InputError where intrinsics, rotation or translation are missing.
+    """
+    rig = read_rig(file)
+    values, _ = read_toml(file, "calibration")
+    cameras: dict[str, CameraCalibration] = {}
+    for name, camera in rig.cameras.items():
+        table = values[name]
+        if camera.intrinsics is None or camera.rotation is None or camera.position is None:
+            raise InputError(
+                f"[{name}] has no matrix, rotation or translation", file=file, remedy="use a complete calibration"
+            )
+        rate, offset = table.get("clock_rate", 1.0), table.get("time_offset", 0.0)
+        if not all(isinstance(v, int | float) and np.isfinite(v) for v in (rate, offset)) or rate <= 0:
+            raise InputError(f"[{name}] clock_rate or time_offset is not a number", file=file, remedy="correct it")
+        std = table.get("position_std", [0.0, 0.0, 0.0])
+        cameras[name] = CameraCalibration(
+            name=name,
+            intrinsics=camera.intrinsics,
+            pose=Pose(so3.nearest(camera.rotation), camera.position),
+            time_map=TimeMap(float(rate), float(offset)),
+            time_offset_std=float(table.get("time_offset_std", 0.0)),
+            position_std=np.broadcast_to(np.array(std, dtype=np.float64), (3,)).copy(),
+            rms_px=float(table.get("rms_px", 0.0)),
+        )
+    return rig, cameras
+
+
+def _plain(value: Any) -> Any:
+    """Only what TOML can hold: numbers of numpy become Python's; -0.0 becomes 0.0."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items() if item is not None}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float):
+        return value + 0.0
+    return value
