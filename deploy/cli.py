@@ -1,5 +1,90 @@
-"""The `syncline` command."""
+"""The `syncline` command: the table of commands, and how errors leave the process.
+
+Commands are imported when they are called, so that `--help` costs a fraction of a second.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+# One thread a process: the solvers' matrices are small, agents share a board's cores, and sums that
+# don't depend on the number of cores make the same bytes everywhere. Must stand before numpy is loaded.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+from cyclopts import App, CycloptsError
+from cyclopts.exceptions import UnknownCommandError
+
+from protocols.errors import EXIT_BUG, EXIT_DONE, EXIT_INPUT, SynclineError
+from protocols.version import VERSION
+
+# name, where it lives, one line for the overview
+COMMANDS: tuple[tuple[str, str, str], ...] = (
+    ("demo", "deploy.commands.demo:demo", "The main job on one machine, on simulated cameras."),
+    ("simulate", "deploy.commands.simulate:simulate", "Write a session of a shipped scene."),
+    (
+        "calibrate",
+        "deploy.commands.calibrate:calibrate",
+        "Timing and poses of all cameras of a session or log.",
+    ),
+    ("camera", "deploy.commands.agents:camera", "Camera agent: detect and publish."),
+    ("hub", "deploy.commands.agents:hub", "Hub agent: gather, calibrate, track."),
+    ("record", "deploy.commands.agents:record", "Recorder: everything on the bus into a log."),
+    ("replay", "deploy.commands.logs:replay", "Play a log back onto the bus."),
+    ("info", "deploy.commands.logs:info", "What is in a log or a session."),
+)
 
 
-def main() -> None:
-    """Placeholder replaced by the command line application."""
+def build_app() -> App:
+    """The command line application."""
+    app = App(
+        name="syncline",
+        help="Turn cameras that share no clock into one measuring instrument.\n\n"
+        "Try `syncline demo`, or `syncline calibrate SESSION --out out`.",
+        version=VERSION,
+        help_format="plaintext",
+        default_parameter=None,
+    )
+    for name, place, text in COMMANDS:
+        app.command(place, name=name, help=text)
+    return app
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status: 0 done, 1 bug, 2 bad use or input, 3 refused."""
+    try:
+        result = build_app()(
+            list(sys.argv[1:] if arguments is None else arguments), exit_on_error=False, print_error=False
+        )
+    except SynclineError as error:
+        print(f"syncline: {error}", file=sys.stderr)
+        return error.exit_status
+    except CycloptsError as error:
+        text = " ".join(str(error).split())
+        command = "" if isinstance(error, UnknownCommandError) else _command_of(arguments)
+        print(f"syncline: {text}; see `syncline {command}--help`", file=sys.stderr)
+        return EXIT_INPUT
+    except KeyboardInterrupt:
+        print("syncline: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The reader of our output went away (a pager, head): nothing is wrong.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_DONE
+    return result if isinstance(result, int) else EXIT_DONE
+
+
+def _command_of(arguments: Sequence[str] | None) -> str:
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    return f"{words[0]} " if words and words[0] in {name for name, _, _ in COMMANDS} else ""
+
+
+def main() -> NoReturn:
+    """Entry point of the console script."""
+    sys.exit(run())
+
+
+__all__ = ["EXIT_BUG", "build_app", "main", "run"]

@@ -11,16 +11,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hub.poses.adjust import adjust
+from hub.poses.adjust import adjust, noise, residual_norms
 from hub.poses.graph import ClockGraph, average_clocks, components
-from hub.poses.initialise import Camera, Scaffold, agreement, grow
+from hub.poses.initialise import Camera, Scaffold, agreement, grow, place_known
 from hub.poses.problem import Freedom, Problem, Rows, State
 from hub.publish import publish
 from hub.timing.pair import PairSolution, solve_pair
+from hub.timing.paper_pairs import paper_pair
 from hub.timing.tracks import smooth_track
+from hub.timing.two_view import relative_pose
 from protocols.errors import Refused
-from protocols.geometry.types import Floats
-from protocols.session.calibration import Calibration
+from protocols.session.calibration import Calibration, CameraCalibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
@@ -52,17 +53,32 @@ class Solution:
     prepared: Prepared
     solver: str
     warnings: tuple[str, ...] = field(default=())
+    known: dict[str, CameraCalibration] | None = None
+    """Poses that were given and stay: then their world is the published one."""
 
 
-def calibrate(rig: Rig, observations: Observations, progress: Progress | None = None) -> Calibration:
-    """Timing and poses of all cameras from what they saw, with no guess (solver "joint").
+def calibrate(
+    rig: Rig,
+    observations: Observations,
+    progress: Progress | None = None,
+    *,
+    solver: str = "joint",
+    known: dict[str, CameraCalibration] | None = None,
+) -> Calibration:
+    """Timing and poses of all cameras from what they saw, with no guess.
 
+    solver: "joint", or "paper" (the paper's alternating method: no adjustment, same frame rates, lags of
+    a few frames). known: intrinsics and poses that are given; then only timing and paths are sought.
     Raises Refused, with a reason for every camera, where fewer than two can be tied together.
     """
     tell = progress or (lambda text, share: None)
     prepared = prepare(rig, observations)
-    pairs = solve_pairs(prepared, tell)
-    solution = solve_network(prepared, pairs, tell)
+    if known is not None:
+        solution = solve_known(prepared, known, tell)
+    elif solver == "paper":
+        solution = solve_paper(prepared, paper_pairs(prepared, observations, tell), tell)
+    else:
+        solution = solve_network(prepared, solve_pairs(prepared, tell), tell)
     tell("covariances", 0.95)
     return publish(rig, solution)
 
@@ -110,6 +126,24 @@ def solve_pairs(prepared: Prepared, tell: Progress) -> list[PairSolution]:
     return pairs
 
 
+def paper_pairs(prepared: Prepared, observations: Observations, tell: Progress) -> list[PairSolution]:
+    """All pairs by the paper's method."""
+    pairs = []
+    todo = list(itertools.combinations(prepared.cameras, 2))
+    for done, (a, b) in enumerate(todo):
+        tell(f"pair {a}–{b}", 0.05 + 0.7 * done / max(len(todo), 1))
+        first, second = prepared.cameras[a], prepared.cameras[b]
+        pairs.append(
+            paper_pair(
+                (first.tracks, second.tracks),
+                (observations.by_label(a), observations.by_label(b)),
+                (first.intrinsics, second.intrinsics),
+                (a, b),
+            )
+        )
+    return pairs
+
+
 def solve_network(prepared: Prepared, pairs: list[PairSolution], tell: Progress) -> Solution:
     """From pairs to one adjusted network; cameras that don't fit are refused by name."""
     refused = dict(prepared.refused)
@@ -146,6 +180,48 @@ def solve_network(prepared: Prepared, pairs: list[PairSolution], tell: Progress)
     return Solution(scaffold, tuple(pairs), order, prepared, "joint", warnings)
 
 
+def solve_paper(prepared: Prepared, pairs: list[PairSolution], tell: Progress) -> Solution:
+    """Network from the paper's pairs: clocks averaged, poses by resection, nothing adjusted."""
+    refused = dict(prepared.refused)
+    names = list(prepared.cameras)
+    solved = [pair for pair in pairs if pair.solved]
+    if not solved:
+        raise Refused(_why_nothing(pairs, refused), refused | _pair_reasons(names, pairs))
+    groups = components(names, solved)
+    refused |= {name: _why_alone(name, groups, pairs) for name in set(names) - set(groups[0])}
+    graph = _graph(prepared, groups[0], solved)
+    tell("placing", 0.8)
+    scaffold, unplaced = grow(prepared.cameras, graph, prepared.rows, prepared.labels, freedom=None)
+    scaffold.state = replace(scaffold.state, sigma=noise(scaffold.problem, scaffold.state))
+    return Solution(scaffold, tuple(pairs), refused | unplaced, prepared, "paper")
+
+
+def solve_known(prepared: Prepared, known: dict[str, CameraCalibration], tell: Progress) -> Solution:
+    """Only clocks and paths: intrinsics and poses are given and stay as they are."""
+    refused = dict(prepared.refused)
+    for name in [name for name in prepared.cameras if name not in known]:
+        refused[name] = "not in the known calibration"
+    cameras = {name: camera for name, camera in prepared.cameras.items() if name in known}
+    inside = replace(prepared, cameras=cameras)
+    pairs = []
+    todo = list(itertools.combinations(cameras, 2))
+    for done, (a, b) in enumerate(todo):
+        tell(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
+        relative = relative_pose(known[a].pose, known[b].pose)
+        pairs.append(solve_pair(cameras[a].tracks, cameras[b].tracks, (a, b), known=relative))
+    solved = [pair for pair in pairs if pair.solved]
+    if not solved:
+        raise Refused(_why_nothing(pairs, refused), refused | _pair_reasons(list(cameras), pairs))
+    groups = components(list(cameras), solved)
+    refused |= {name: _why_alone(name, groups, pairs) for name in set(cameras) - set(groups[0])}
+    graph = _graph(inside, groups[0], solved)
+    tell("adjusting", 0.75)
+    poses = {name: known[name].pose for name in groups[0]}
+    scaffold = place_known(cameras, graph, prepared.rows, prepared.labels, poses)
+    problem, state, _ = adjust(scaffold.problem, scaffold.state)
+    return Solution(replace_solution(scaffold, problem, state), tuple(pairs), refused, inside, "joint", known=known)
+
+
 def _graph(prepared: Prepared, group: list[str], pairs: list[PairSolution]) -> ClockGraph:
     inside = [pair for pair in pairs if pair.a in group and pair.b in group]
     return average_clocks(group, inside, {name: prepared.cameras[name].tracks for name in group})
@@ -180,12 +256,10 @@ def _prefers(freed: Problem, freed_state: State, fixed: Problem, fixed_state: St
     """
     rows = sum(len(part.time) for part in fixed.rows)
     gain = _deviance(fixed, fixed_state) - _deviance(freed, freed_state)
-    return gain > 2 * len(fixed_state.cameras) * np.log(max(rows, 2))
+    return bool(gain > 2 * len(fixed_state.cameras) * np.log(max(rows, 2)))
 
 
 def _deviance(problem: Problem, state: State) -> float:
-    from hub.poses.adjust import residual_norms
-
     total = 0.0
     for part in problem.rows:
         norms = residual_norms(part, state.cameras[part.camera], state.trajectories[part.label])
@@ -198,7 +272,9 @@ def _deviance(problem: Problem, state: State) -> float:
 def _why_nothing(pairs: list[PairSolution], refused: dict[str, str]) -> str:
     if not pairs:
         told = "; ".join(f"{name}: {reason}" for name, reason in refused.items())
-        return f"fewer than two cameras have usable observations ({told})" if told else "one camera only: a pair is needed"
+        return (
+            f"fewer than two cameras have usable observations ({told})" if told else "one camera only: a pair is needed"
+        )
     told = "; ".join(f"{pair.a}–{pair.b}: {pair.status}" for pair in pairs[:6])
     return f"no pair of cameras could be tied together ({told})"
 
@@ -221,20 +297,13 @@ def _why_alone(name: str, groups: list[list[str]], pairs: list[PairSolution]) ->
     return f"could not be tied to any camera ({tried})"
 
 
-def span_of(rows: list[Rows]) -> tuple[float, float]:
-    """First and last used camera time of some rows, less the epoch."""
-    times = np.concatenate([part.time[part.use] for part in rows])
-    return (float(times.min()), float(times.max())) if len(times) else (0.0, 0.0)
-
-
-def used_times(problem: Problem, state: State, label: int) -> list[Floats]:
-    """Sorted internal reference times of the rows that count, one array a camera."""
-    out: list[Floats] = []
-    for number, camera in enumerate(state.cameras):
-        mine = [r.time[r.use] for r in problem.rows if r.camera == number and r.label == label]
-        joined = np.concatenate(mine) if mine else np.zeros(0)
-        out.append(np.sort(camera.reference_time(joined)))
-    return out
-
-
-__all__ = ["Freedom", "Prepared", "Progress", "Solution", "calibrate", "prepare", "solve_network", "solve_pairs"]
+__all__ = [
+    "Freedom",
+    "Prepared",
+    "Progress",
+    "Solution",
+    "calibrate",
+    "prepare",
+    "solve_network",
+    "solve_pairs",
+]

@@ -9,10 +9,10 @@ import numpy as np
 
 from hub.poses import covariance as cov
 from hub.poses.adjust import motion_prior, predict, residual_norms
-from hub.poses.gauge import fix_gauge, transform_state
+from hub.poses.gauge import fix_gauge, given_world, transform_state
 from hub.poses.problem import Problem, State
 from hub.timing.pair import PairSolution
-from hub.timing.two_view import RelativePose, fundamental_from
+from hub.timing.two_view import fundamental_from, relative_pose
 from protocols.clocks import TimeMap
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, CameraCalibration, PairReport, TrajectoryTable
@@ -33,17 +33,20 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
     order = [scaffold.names.index(name) for name in rig.cameras if name in scaffold.names]
     names = [scaffold.names[i] for i in order]
     problem, state = _reordered(scaffold.problem, scaffold.state, order)
-    gauge = fix_gauge(rig, names, [camera.pose for camera in state.cameras])
-    state = transform_state(state, gauge.similarity)
+    if solution.known is None:
+        gauge = fix_gauge(rig, names, [camera.pose for camera in state.cameras])
+        state = transform_state(state, gauge.similarity)
+    else:
+        gauge = given_world(len(names))
     covariance = cov.covariance(problem, state, motion_prior(problem, state), gauge.information)
     reference = _reference(rig, names)
     epochs = [solution.prepared.epochs[name] for name in names]
     base = state.cameras[reference]
     maps = []
     for camera, epoch in zip(state.cameras, epochs, strict=True):
-        rate = camera.rate / base.rate
+        rate = float(camera.rate / base.rate)
         # reference clock = epoch + centre + (internal - offset) / rate of the reference camera
-        at_centre = (camera.offset - base.offset) / base.rate + base.centre + epochs[reference]
+        at_centre = float((camera.offset - base.offset) / base.rate + base.centre + epochs[reference])
         maps.append(TimeMap(rate, at_centre - rate * (camera.centre + epoch)))
     maps[reference] = TimeMap(1.0, 0.0)
     cameras = {
@@ -53,7 +56,9 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
             pose=state.cameras[i].pose,
             time_map=maps[i],
             time_offset_std=_map_std(problem, state, covariance, i, reference),
-            position_std=cov.position_std(covariance, i),
+            position_std=cov.position_std(covariance, i)
+            if solution.known is None
+            else solution.known[name].position_std,
             rms_px=_rms(problem, state, i),
         )
         for i, name in enumerate(names)
@@ -67,7 +72,16 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
         version=VERSION,
         refused=solution.refused,
         trajectories=tuple(
-            _table(problem, state, covariance, label, name, base.camera_time, epochs[reference], _rate_hz(rig, problem, names))
+            _table(
+                problem,
+                state,
+                covariance,
+                label,
+                name,
+                reference,
+                epochs[reference],
+                _rate_hz(rig, problem, names),
+            )
             for label, name in enumerate(scaffold.labels)
         ),
         pairs=tuple(_pair_report(pair, rig, cameras, problem, state, names, solution) for pair in solution.pairs),
@@ -114,9 +128,7 @@ def _residual_rows(problem: Problem, state: State, camera: int, epoch: float) ->
         if rows.camera == camera:
             predicted = predict(rows, state.cameras[camera], state.trajectories[rows.label])
             good = rows.use & np.isfinite(predicted).all(axis=1)
-            parts.append(
-                np.column_stack([rows.time[good] + epoch, rows.pixels[good], (rows.pixels - predicted)[good]])
-            )
+            parts.append(np.column_stack([rows.time[good] + epoch, rows.pixels[good], (rows.pixels - predicted)[good]]))
     return np.concatenate(parts) if parts else np.zeros((0, 5))
 
 
@@ -143,25 +155,28 @@ def supported(problem: Problem, state: State, label: int, time: Floats) -> Float
     return count
 
 
-def _table(problem, state, covariance, label, name, to_reference, epoch, rate_hz):  # type: ignore[no-untyped-def]
+def _table(
+    problem: Problem,
+    state: State,
+    covariance: cov.Covariance,
+    label: int,
+    name: str,
+    reference: int,
+    epoch: float,
+    rate_hz: float,
+) -> TrajectoryTable:
+    """The path of one label at ``rate_hz`` on the reference camera's clock, where two cameras saw it."""
+    base = state.cameras[reference]
     path = state.trajectories[label]
     begins, basis = path.basis.starts, path.basis
     ends = begins + basis.intervals * basis.spacing
     # A grid on the reference camera's clock, so that two runs on one log sample the same instants.
-    first, last = to_reference(np.array([begins[0], ends[-1]]))
+    first, last = base.camera_time(np.array([begins[0], ends[-1]]))
     ticks = np.arange(np.ceil((first + epoch) * rate_hz), np.floor((last + epoch) * rate_hz) + 1) / rate_hz
-    base = state.cameras[0]
-    internal = _internal(state, to_reference, ticks - epoch)
+    internal = base.reference_time(ticks - epoch)
     position = path.at(internal)
     good = np.isfinite(position).all(axis=1) & (supported(problem, state, label, internal) >= 2)
-    del base
     return TrajectoryTable(name, ticks[good], position[good], cov.path_std(covariance, state, label, internal[good]))
-
-
-def _internal(state: State, to_reference, time: Floats) -> Floats:  # type: ignore[no-untyped-def]
-    """Internal times of reference-camera times (the map is affine: two points tell it)."""
-    zero, one = to_reference(np.array([0.0, 1.0]))
-    return np.asarray((time - zero) / (one - zero))
 
 
 def _pair_report(
@@ -177,15 +192,11 @@ def _pair_report(
     fit = pair.fit
     a, b = cameras.get(pair.a), cameras.get(pair.b)
     middle = _middle_of_overlap(problem, state, names, pair)
-    if a is not None and b is not None and middle is not None:
-        base = state.cameras[names.index(next(iter(cameras)))]
-        del base
+    if pair.fundamental is None and a is not None and b is not None and middle is not None:
         epochs = solution.prepared.epochs
         time_a = float(state.cameras[names.index(pair.a)].camera_time(np.array([middle]))[0]) + epochs[pair.a]
         time_b = float(state.cameras[names.index(pair.b)].camera_time(np.array([middle]))[0]) + epochs[pair.b]
-        turn = b.pose.rotation @ a.pose.rotation.T
-        apart = b.pose.rotation @ (a.pose.position - b.pose.position)
-        relative = RelativePose(turn, apart / max(float(np.linalg.norm(apart)), 1e-12))
+        relative = relative_pose(a.pose, b.pose)
         return PairReport(
             cameras=(pair.a, pair.b),
             status=pair.status,
@@ -196,12 +207,12 @@ def _pair_report(
             rms_px=None if fit is None or not np.isfinite(fit.sigma_px) else fit.sigma_px,
         )
     if fit is None or not pair.solved:
-        return PairReport((pair.a, pair.b), pair.status)
+        return PairReport((pair.a, pair.b), pair.status, fundamental=pair.fundamental)
     epochs = solution.prepared.epochs
     time_b = (fit.middle - fit.offset) / fit.rate
     lens_a, lens_b = rig.cameras[pair.a].intrinsics, rig.cameras[pair.b].intrinsics
-    matrix = None
-    if lens_a is not None and lens_b is not None:
+    matrix = pair.fundamental
+    if matrix is None and lens_a is not None and lens_b is not None:
         matrix = fundamental_from(fit.pose, lens_a.matrix, lens_b.matrix)
     return PairReport(
         (pair.a, pair.b),

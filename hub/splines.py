@@ -105,9 +105,7 @@ def normal_bands(index: Ints, weights: Floats, row_weight: Floats, size: int) ->
     return bands
 
 
-def fit_spline(
-    basis: SplineBasis, time: Floats, values: Floats, row_weight: Floats, stiffness: float = 1e-6
-) -> Floats:
+def fit_spline(basis: SplineBasis, time: Floats, values: Floats, row_weight: Floats, stiffness: float = 1e-6) -> Floats:
     """Weighted least-squares control points (size, d) of ``values`` (n, d) at ``time`` (n,).
 
     stiffness: weight of squared third differences relative to one row; only closes empty intervals.

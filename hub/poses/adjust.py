@@ -20,7 +20,18 @@ from hub.poses.linear import (
     third_difference_band,
     third_differences,
 )
-from hub.poses.problem import CAMERA_PARAMETERS, FOCAL, K1, OFFSET, RATE, CameraState, Problem, Rows, State, Trajectory
+from hub.poses.problem import (
+    CAMERA_PARAMETERS,
+    FOCAL,
+    K1,
+    OFFSET,
+    RATE,
+    CameraState,
+    Problem,
+    Rows,
+    State,
+    Trajectory,
+)
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
@@ -179,17 +190,18 @@ def linearise(rows: Rows, camera: CameraState, path: Trajectory, nominal: Intrin
     return Linearised(projected - rows.pixels[rows.use], by_point, by_camera, index, weights, valid)
 
 
-def build_system(
-    problem: Problem, state: State, prior: MotionPrior, robust: bool
-) -> tuple[BorderedSystem, float]:
+def build_system(problem: Problem, state: State, prior: MotionPrior, robust: bool) -> tuple[BorderedSystem, float]:
     """Normal equations over all labels' control points and the free camera parameters, and the cost."""
     sizes = [3 * path.basis.size for path in state.trajectories]
     bases = np.r_[0, np.cumsum(sizes)].astype(int)
     columns = problem.free_columns()
     width = len(state.cameras) * CAMERA_PARAMETERS
     system = BorderedSystem(
-        np.zeros((12, bases[-1])), np.zeros((bases[-1], len(columns))), np.zeros((width, width)),
-        np.zeros(bases[-1]), np.zeros(width),
+        np.zeros((12, bases[-1])),
+        np.zeros((bases[-1], len(columns))),
+        np.zeros((width, width)),
+        np.zeros(bases[-1]),
+        np.zeros(width),
     )
     place = np.full(width, -1)
     place[columns] = np.arange(len(columns))
@@ -307,7 +319,11 @@ def _moved_camera(camera: CameraState, step: Floats) -> CameraState:
         distortions[0] += step[K1]
         lens = Intrinsics(lens.width, lens.height, matrix, distortions, lens.fisheye)
     return replace(
-        camera, pose=pose, intrinsics=lens, offset=camera.offset + float(step[OFFSET]), rate=camera.rate + float(step[RATE])
+        camera,
+        pose=pose,
+        intrinsics=lens,
+        offset=camera.offset + float(step[OFFSET]),
+        rate=camera.rate + float(step[RATE]),
     )
 
 

@@ -97,7 +97,7 @@ def time_map_std(cov: Covariance, state: State, camera: int, reference: int) -> 
     at = float(base.camera_time(np.array([now.offset]))[0])
     row[reference * CAMERA_PARAMETERS + OFFSET] -= 1.0
     row[reference * CAMERA_PARAMETERS + RATE] -= at - base.centre
-    return float(np.sqrt(max(row @ cov.cameras @ row, 0.0)) / base.rate)
+    return float(np.sqrt(max(float(row @ cov.cameras @ row), 0.0)) / base.rate)
 
 
 def position_std(cov: Covariance, camera: int) -> Floats:

@@ -8,7 +8,7 @@ camera's name means that camera is levelled (its -y axis points up).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -58,13 +58,19 @@ def fix_gauge(rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
     starts = _starts(rotations, positions, poses, scale, base)
     residual = _residuals(rig, names, poses, positions, rotations, distances)
     best = min((_descend(start, residual, metric) for start in starts), key=lambda item: item[1])[0]
-    final = residual(best, True)
+    final = residual(best)
     warnings = []
     if len(final) > 7 and float(np.sqrt(np.mean(final**2))) > _FAR:
         warnings.append(
             f"the rig's references disagree with each other or the cameras by {np.abs(final).max():.0f} sigma: check them"
         )
     return Gauge(best, "metric" if metric else "arbitrary", _information(rig, names, poses, best), tuple(warnings))
+
+
+def given_world(cameras: int) -> Gauge:
+    """The world of poses that were given: nothing is moved."""
+    width = CAMERA_PARAMETERS * cameras
+    return Gauge(Similarity(1.0, np.eye(3), np.zeros(3)), "metric", np.zeros((width, width)), ())
 
 
 def _default(rig: Rig, names: list[str], poses: list[Pose]) -> Similarity:
@@ -128,10 +134,10 @@ def _residuals(
     positions: list[tuple[int, Floats]],
     rotations: list[tuple[int, Floats]],
     distances: list[tuple[int, int, float]],
-) -> Callable[[Similarity, bool], Floats]:
+) -> Callable[[Similarity], Floats]:
     """Residuals of all references in sigma; with the flag, the real ones only (no regulariser)."""
 
-    def residual(s: Similarity, real: bool) -> Floats:
+    def residual(s: Similarity) -> Floats:
         size = s.scale * _extent(poses)
         out: list[Floats] = []
         for i, known in positions:
@@ -147,33 +153,32 @@ def _residuals(
         if isinstance(rig.up, str) and rig.up in names:
             level = s.rotation @ poses[names.index(rig.up)].rotation.T @ np.array([0.0, -1.0, 0.0])
             out.append(np.cross(level, [0.0, 0.0, 1.0])[:2] / _UP_STD)
-        values = np.concatenate(out) if out else np.zeros(0)
-        return values if real else values
+        return np.concatenate(out) if out else np.zeros(0)
 
     return residual
 
 
-def _descend(start: Similarity, residual: Callable[[Similarity, bool], Floats], metric: bool) -> tuple[Similarity, float]:
+def _descend(start: Similarity, residual: Callable[[Similarity], Floats], metric: bool) -> tuple[Similarity, float]:
     """Gauss-Newton over the similarity; directions that nothing fixes stay where they began."""
     now = start
-    cost = float((residual(now, True) ** 2).sum())
+    cost = float((residual(now) ** 2).sum())
     for _ in range(30):
-        value = residual(now, True)
+        value = residual(now)
         jacobian = np.empty((len(value), 7))
         for k in range(7):
             step = np.zeros(7)
             step[k] = 1e-6
-            jacobian[:, k] = (residual(_stepped(now, step), True) - residual(_stepped(now, -step), True)) / 2e-6
+            jacobian[:, k] = (residual(_stepped(now, step)) - residual(_stepped(now, -step))) / 2e-6
         if not metric:
             jacobian[:, 6] = 0.0
-        step = -np.linalg.lstsq(jacobian, value, rcond=1e-9)[0]
+        step = np.asarray(-np.linalg.lstsq(jacobian, value, rcond=1e-9)[0], np.float64)
         trial = _stepped(now, step)
-        trial_cost = float((residual(trial, True) ** 2).sum())
+        trial_cost = float((residual(trial) ** 2).sum())
         shrink = 1.0
         while trial_cost > cost and shrink > 1e-3:
             shrink *= 0.5
             trial = _stepped(now, shrink * step)
-            trial_cost = float((residual(trial, True) ** 2).sum())
+            trial_cost = float((residual(trial) ** 2).sum())
         if trial_cost >= cost * (1.0 - 1e-10):
             break
         now, cost = trial, trial_cost
@@ -218,8 +223,6 @@ def _information(rig: Rig, names: list[str], poses: list[Pose], s: Similarity) -
 
 def transform_state(state: State, s: Similarity) -> State:
     """The whole state in the published world."""
-    from dataclasses import replace
-
     cameras = tuple(replace(camera, pose=s.pose(camera.pose)) for camera in state.cameras)
     paths = tuple(replace(path, control=s.points(path.control)) for path in state.trajectories)
     return replace(state, cameras=cameras, trajectories=paths)

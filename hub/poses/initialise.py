@@ -17,6 +17,7 @@ from hub.poses.problem import CameraState, Freedom, Problem, Rows, State, Trajec
 from hub.splines import SplineBasis, fit_spline, stretches
 from hub.timing.pair import PairSolution, evidence
 from hub.timing.tracks import SmoothTrack
+from protocols.errors import Refused
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
@@ -54,17 +55,19 @@ def grow(
     rows: dict[str, list[Rows]],
     labels: list[str],
     progress: Callable[[str], None] | None = None,
+    freedom: Freedom | None = Freedom(),  # noqa: B008 - frozen
 ) -> tuple[Scaffold, dict[str, str]]:
     """Place all cameras of one connected graph; returns the solution and the refused, with reasons.
 
-    rows: raw observations by camera, label indices into ``labels``.
+    rows: raw observations by camera, label indices into ``labels``. freedom: what the adjustment after each
+    step may move; None = no adjustment (the paper's solver).
     """
     placed: dict[str, CameraState] = {}
     refused: dict[str, str] = {}
     seed = max(graph.agreeing, key=_seed_quality)
     placed |= _seed(cameras, graph, seed)
     anchors = (seed.a, seed.b)
-    scaffold = _settle(cameras, placed, rows, labels, anchors)
+    scaffold = settle(cameras, placed, rows, labels, anchors, freedom)
     waiting = [name for name in graph.clocks if name not in placed]
     while waiting:
         spreads = {name: _common_spread(cameras[name], graph, scaffold) for name in waiting}
@@ -78,7 +81,7 @@ def grow(
             continue
         current = dict(zip(scaffold.names, scaffold.state.cameras, strict=True))
         current[name] = state
-        scaffold = _settle(cameras, current, rows, labels, anchors)
+        scaffold = settle(cameras, current, rows, labels, anchors, freedom)
     return scaffold, refused
 
 
@@ -103,14 +106,28 @@ def _seed(cameras: dict[str, Camera], graph: ClockGraph, pair: PairSolution) -> 
     }
 
 
-def _settle(
+def place_known(
+    cameras: dict[str, Camera],
+    graph: ClockGraph,
+    rows: dict[str, list[Rows]],
+    labels: list[str],
+    poses: dict[str, Pose],
+) -> Scaffold:
+    """The cameras of a graph at given poses; only time maps and paths are adjusted."""
+    placed = {name: _camera_state(cameras[name], graph, poses[name]) for name in graph.clocks}
+    names = list(placed)
+    return settle(cameras, placed, rows, labels, (names[0], names[1]), Freedom(pose=False))
+
+
+def settle(
     cameras: dict[str, Camera],
     placed: dict[str, CameraState],
     rows: dict[str, list[Rows]],
     labels: list[str],
     anchors: tuple[str, str],
+    freedom: Freedom | None,
 ) -> Scaffold:
-    """Triangulate the paths from the placed cameras and adjust briefly."""
+    """Triangulate the paths from the placed cameras and adjust briefly. Raises Refused without any path."""
     names = [name for name in cameras if name in placed]
     states = [placed[name] for name in names]
     trajectories, used = [], []
@@ -131,10 +148,13 @@ def _settle(
         nominal=tuple(cameras[name].intrinsics for name in names),
         clock_reference=names.index(anchors[0]),
         anchors=(names.index(anchors[0]), names.index(anchors[1])),
-        freedom=Freedom(),
+        freedom=freedom or Freedom(),
     )
-    start = State(tuple(states), tuple(trajectories), np.full(len(names), 2.0))
-    problem, state, _ = adjust(problem, start, iterations=12, rounds=2)
+    state = State(tuple(states), tuple(trajectories), np.full(len(names), 2.0))
+    if not used:
+        raise Refused("no part of the path is seen by two cameras from directions that differ enough")
+    if freedom is not None:
+        problem, state, _ = adjust(problem, state, iterations=12, rounds=2)
     return Scaffold(names, [labels[label] for label in used], problem, state)
 
 
@@ -185,7 +205,7 @@ def linear_triangulation(seeing: list[tuple[CameraState, SmoothTrack]], time: Fl
     rays = []
     for state, track in seeing:
         seen = track.at(state.camera_time(time))
-        there = np.isfinite(seen).all(axis=1)
+        there: Bools = np.isfinite(seen).all(axis=1)
         local = np.column_stack([np.where(there[:, None], seen, 0.0), np.ones(len(time))])
         ray = local @ state.pose.rotation
         ray /= np.linalg.norm(ray, axis=1)[:, None]
@@ -276,7 +296,8 @@ def _resect(camera: Camera, graph: ClockGraph, scaffold: Scaffold) -> CameraStat
     )
     if not found or inliers is None or len(inliers) < max(_LEAST_PNP, 0.4 * len(pick)):
         return None
-    return replace(clock, pose=Pose.from_rodrigues(rotation.ravel(), translation.ravel()))
+    rodrigues, shift = (np.asarray(vector, np.float64).ravel() for vector in (rotation, translation))
+    return replace(clock, pose=Pose.from_rodrigues(rodrigues, shift))
 
 
 def agreement(scaffold: Scaffold, name: str) -> tuple[float, int]:

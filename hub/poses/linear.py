@@ -90,9 +90,7 @@ THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])
 def third_differences(basis: SplineBasis, control: Floats) -> Floats:
     """(m, 3) third differences of the control points of every knot interval."""
     index = basis.interval_starts()
-    return np.asarray(
-        sum(coefficient * control[index + k] for k, coefficient in enumerate(THIRD_DIFFERENCE))
-    )
+    return np.asarray(sum(coefficient * control[index + k] for k, coefficient in enumerate(THIRD_DIFFERENCE)))
 
 
 @dataclass(slots=True, eq=False)

@@ -11,11 +11,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hub.timing import two_view
+from hub.timing.refine import Noise, PointPairs, Refined, refine
 from hub.timing.scan import PairMoments, candidates, grid_track, scan_lags
 from hub.timing.tracks import SmoothTrack
 from hub.timing.two_view import RelativePose
-from protocols.geometry import so3
 from protocols.geometry.types import Bools, Floats
+
+_LEAST_SAMPLES = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +78,8 @@ class PairSolution:
     status: str
     fit: PairFit | None = None
     others: tuple[PairFit, ...] = field(default=())
+    fundamental: Floats | None = None
+    """(3, 3) of undistorted pixels, ``m_aᵀ F m_b = 0``, where the method found it directly."""
 
     @property
     def solved(self) -> bool:
@@ -88,10 +92,12 @@ def solve_pair(
     tracks_b: dict[str, SmoothTrack],
     names: tuple[str, str],
     settings: PairSettings | None = None,
+    known: RelativePose | None = None,
 ) -> PairSolution:
     """Find lag, rate and relative pose of two cameras from the labels that both saw.
 
-    tracks_a, tracks_b: by label; all tracks of one camera share one epoch.
+    tracks_a, tracks_b: by label; all tracks of one camera share one epoch. known: the relative pose, where
+    it is given: then only lag and rate are sought.
     """
     s = settings or PairSettings()
     labels = [label for label in tracks_a if label in tracks_b]
@@ -105,12 +111,13 @@ def solve_pair(
     moments = PairMoments(grid_track(a, step, s.sigma_px), grid_track(b, step, s.sigma_px))
     if float(moments.support.max(initial=0.0)) < s.least_support:
         return PairSolution(*names, "the point hardly moves while both could have seen it")
-    scan = scan_lags(moments, s.least_support)
+    scan = scan_lags(moments, s.least_support, None if known is None else known.essential.T)
     chosen = candidates(scan, s.per_stratum, s.at_most)
     fits: list[PairFit] = []
     for index in chosen:
-        start = moments.fundamental(int(index)).T  # s_b' E s_a
-        fit = _refine_candidate(a, b, float(scan.offset[index]), float(scan.cost[index]), start, s)
+        offset, cost = float(scan.offset[index]), float(scan.cost[index])
+        start = moments.fundamental(int(index)).T if known is None else None  # s_b' E s_a
+        fit = _refine_candidate(a, b, offset, cost, start, known, s)
         if fit is not None:
             fits.append(fit)
     if not fits:
@@ -137,7 +144,7 @@ def _distinct(fits: list[PairFit]) -> list[PairFit]:
 
 def evidence(fit: PairFit) -> float:
     """What speaks for an alignment: seconds of agreeing motion, less where little of the overlap agrees."""
-    return fit.support * fit.inliers * fit.front / np.sqrt(1.0 + fit.sigma_px)
+    return float(fit.support * fit.inliers * fit.front / np.sqrt(1.0 + fit.sigma_px))
 
 
 def _judge(names: tuple[str, str], fits: list[PairFit], s: PairSettings) -> PairSolution:
@@ -160,29 +167,52 @@ def _judge(names: tuple[str, str], fits: list[PairFit], s: PairSettings) -> Pair
 
 
 def _refine_candidate(
-    a: SmoothTrack, b: SmoothTrack, offset: float, cost: float, start: Floats, s: PairSettings
+    a: SmoothTrack,
+    b: SmoothTrack,
+    offset: float,
+    cost: float,
+    start: Floats | None,
+    known: RelativePose | None,
+    s: PairSettings,
 ) -> PairFit | None:
-    """Refine one lag from the moments' matrix and from five-point hypotheses; the best wins."""
+    """Refine one lag from the moments' matrix and from five-point hypotheses; the best wins.
+
+    One start is not enough: one clean session in ten ends in a wrong minimum of the essential matrix,
+    with the time right and the rotation tens of degrees off.
+    """
     sample = _Samples(a, b, offset, s)
-    if sample.count < 12:
+    if sample.count < _LEAST_SAMPLES:
         return None
-    here_a, here_b = sample.at(1.0, offset)
-    both = np.isfinite(here_b).all(axis=1)
-    if both.sum() < 12:
-        return None
-    here_a, here_b = here_a[both], here_b[both]
-    threshold = s.sigma_px * np.sqrt(max(cost, 1.0)) * 3.0 / min(a.focal, b.focal)
-    starts = [two_view.decompose(start, here_a, here_b)]
-    for seed in range(2):
-        starts += two_view.five_point(here_a, here_b, threshold, seed)
-    best: tuple[float, float, float, RelativePose] | None = None
+    scale = float(np.sqrt(max(cost, 1.0)))
+    if known is not None:
+        starts = [known]
+    else:
+        here_a, here_b = sample.at(1.0, offset)
+        both = np.isfinite(here_b).all(axis=1)
+        if both.sum() < _LEAST_SAMPLES or start is None:
+            return None
+        here_a, here_b = here_a[both], here_b[both]
+        threshold = 3.0 * s.sigma_px * scale / min(a.focal, b.focal)
+        starts = [two_view.decompose(start, here_a, here_b)]
+        for seed in range(2):
+            starts += two_view.five_point(here_a, here_b, threshold, seed)
+    noise = Noise(s.sigma_px / a.focal, s.sigma_px / b.focal, s.rate_std)
+    best: Refined | None = None
     for pose in starts:
-        fit = sample.refine(pose, offset, np.sqrt(max(cost, 1.0)))
-        if fit is not None and (best is None or fit[0] < best[0]):
+        fit = refine(sample, pose, sample.centre - offset, scale, noise, fixed_pose=known is not None)
+        if fit is not None and (best is None or fit.cost < best.cost):
             best = fit
     if best is None:
         return None
-    return sample.judge(*best)
+    rate = 1.0 / best.slowness
+    return sample.judge(best.cost, rate, sample.centre - rate * best.middle, best.pose)
+
+
+def judge_alignment(
+    a: SmoothTrack, b: SmoothTrack, offset: float, pose: RelativePose, settings: PairSettings | None = None
+) -> PairFit:
+    """The absolute figures of an alignment ``t_a = t_b + offset`` that another method found."""
+    return _Samples(a, b, offset, settings or PairSettings()).judge(0.0, 1.0, offset, pose)
 
 
 class _Samples:
@@ -206,87 +236,12 @@ class _Samples:
         """Points of a (n, 2) and of b (n, 2; NaN in its gaps) under ``t_a = rate t_b + offset``."""
         return self.points, self.b.at((self.time - offset) / rate)
 
-    def refine(self, pose: RelativePose, offset: float, scale: float) -> tuple[float, float, float, RelativePose] | None:
-        """Reweighted Levenberg-Marquardt over rotation, direction, lag and rate: (cost, rate, offset, pose).
-
-        scale: residual over noise to begin with; the robust weight narrows from there.
-        """
-        sigma_a, sigma_b = self.s.sigma_px / self.a.focal, self.s.sigma_px / self.b.focal
-        # t_b = slowness * (t_a - centre) + middle decorrelates rate and lag.
-        slowness, middle = 1.0, self.centre - offset
-        damping, cost = 1e-3, np.inf
-        width = 3.0 * max(scale, 1.0)
-        system: tuple[Floats, Floats, float] | None = None
-        for _ in range(25):
-            if system is None:
-                system = self._system(pose, slowness, middle, width, sigma_a, sigma_b)
-                if system is None:
-                    return None
-                cost = system[2]
-            normal, gradient, _ = system
-            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-9), -gradient)
-            turned = so3.exp(step[:3]) @ pose.rotation
-            direction = pose.direction + two_view.tangent_basis(pose.direction) @ step[3:5]
-            trial_pose = RelativePose(turned, direction / np.linalg.norm(direction))
-            trial = self._system(trial_pose, slowness + step[6], middle + step[5], width, sigma_a, sigma_b)
-            if trial is not None and trial[2] < cost:
-                gain = cost - trial[2]
-                pose, slowness, middle = trial_pose, slowness + step[6], middle + step[5]
-                damping = max(damping / 5.0, 1e-9)
-                narrower = max(2.0, 0.6 * width)
-                if gain < 1e-4 * cost and narrower == width:
-                    cost = trial[2]
-                    break
-                if narrower != width:
-                    width, system = narrower, None
-                else:
-                    cost, system = trial[2], trial
-            else:
-                damping *= 6.0
-                if damping > 1e4:
-                    if width == 2.0:
-                        break
-                    width, damping, system = max(2.0, 0.5 * width), 1e-3, None
-        if not (0.5 < slowness < 2.0):
-            return None
-        rate = 1.0 / slowness
-        return cost, rate, self.centre - rate * middle, pose
-
-    def _system(
-        self, pose: RelativePose, slowness: float, middle: float, width: float, sigma_a: float, sigma_b: float
-    ) -> tuple[Floats, Floats, float] | None:
-        """Normal matrix (7, 7), gradient (7,) and mean robust cost; None without overlap."""
-        time_b = slowness * (self.time - self.centre) + middle
+    def __call__(self, slowness: float, middle: float) -> PointPairs:
+        lever = self.time - self.centre
+        time_b = slowness * lever + middle
         b = self.b.at(time_b)
-        there = np.isfinite(b).all(axis=1)
-        if there.sum() < 12:
-            return None
-        a, b, lever = self.points[there], b[there], (self.time - self.centre)[there]
-        speed = self.b.at(time_b[there], 1)
-        essential = pose.essential
-        ha, hb = two_view.homogeneous(a), two_view.homogeneous(b)
-        turned = ha @ pose.rotation.T
-        line_b, line_a = ha @ essential.T, hb @ essential
-        variance = sigma_b**2 * (line_b[:, :2] ** 2).sum(1) + sigma_a**2 * (line_a[:, :2] ** 2).sum(1)
-        over = 1.0 / np.sqrt(np.maximum(variance, 1e-30))
-        residual = (hb * line_b).sum(1) * over
-        jacobian = np.empty((len(a), 7))
-        across = np.cross(hb, pose.direction)  # s_bᵀ [t]x
-        jacobian[:, :3] = np.cross(turned, across)
-        jacobian[:, 3:5] = np.cross(turned, hb) @ two_view.tangent_basis(pose.direction)
-        jacobian[:, 5] = (line_b[:, :2] * speed).sum(1)
-        jacobian[:, 6] = jacobian[:, 5] * lever
-        jacobian *= over[:, None]
-        ratio = (residual / width) ** 2
-        weight = 1.0 / (1.0 + ratio)
-        weighted = jacobian * weight[:, None]
-        normal = weighted.T @ jacobian
-        gradient = weighted.T @ residual
-        prior = 1.0 / self.s.rate_std**2
-        normal[6, 6] += prior
-        gradient[6] += prior * (slowness - 1.0)
-        cost = float((width**2 * np.log1p(ratio)).sum()) + float(prior * (slowness - 1.0) ** 2)
-        return normal, gradient, cost / len(a)
+        there = np.isfinite(b[:, 0])
+        return PointPairs(self.points[there], b[there], self.b.at(time_b[there], 1), lever[there])
 
     def judge(self, cost: float, rate: float, offset: float, pose: RelativePose) -> PairFit:
         """Absolute figures of an alignment, over the samples where both move."""

@@ -42,10 +42,10 @@ def grid_track(track: SmoothTrack, step: float, sigma_px: float) -> GridTrack:
     """Sample a track every ``step`` seconds; sigma_px: the noise to reckon with."""
     begin = float(np.floor(track.basis.starts[0] / step) * step)
     end = float(track.basis.starts[-1] + track.basis.intervals[-1] * track.basis.spacing)
-    time = begin + step * np.arange(int(np.ceil((end - begin) / step)) + 1)
+    time = begin + step * np.arange(int(np.ceil((end - begin) / step)) + 1, dtype=np.float64)
     points = track.at(time)
     speed = np.linalg.norm(track.at(time, 1), axis=1) * track.focal
-    there = np.isfinite(points).all(axis=1)
+    there: Bools = np.isfinite(points).all(axis=1)
     weight = np.where(there, speed / (speed + _SLOW_PX), 0.0)
     points = np.where(there[:, None], points, 0.0)
     total = max(float(weight.sum()), 1e-9)
@@ -78,8 +78,8 @@ class PairMoments:
         spectra_a, spectra_b = rfft(_monomials(a), length), rfft(_monomials(b), length)
         # c[lag] = sum_n a[n] b[n + lag], for lag = -(n_a - 1) … n_b - 1
         product = np.conj(spectra_a)[:, None, :] * spectra_b[None, :, :]
-        correlation = irfft(product, length)
-        self.lags: Ints = np.arange(-(n_a - 1), n_b)
+        correlation = np.asarray(irfft(product, length), dtype=np.float64)
+        self.lags: Ints = np.arange(-(n_a - 1), n_b, dtype=np.int64)
         self.moments: Floats = correlation[:, :, self.lags % length]
         self.offset: Floats = a.begin - b.begin - self.lags * a.step
         self.support: Floats = np.maximum(self.moments[5, 5], 0.0) * a.step
@@ -107,7 +107,17 @@ class PairMoments:
             lower = np.linalg.inv(np.linalg.cholesky(norm[:, :8, :8] + 1e-14 * np.eye(8)))
             white = lower @ reduced @ lower.transpose(0, 2, 1)
             out[begin : begin + _CHUNK] = np.linalg.eigvalsh(white)[:, 0]
-        return np.maximum(out, 0.0)
+        return np.asarray(np.maximum(out, 0.0))
+
+    def costs_of(self, which: Ints, matrix: Floats) -> Floats:
+        """Mean squared distance over noise (m,) that a known ``m_aᵀ F m_b = 0`` leaves at chosen lags."""
+        theta = (np.linalg.inv(self.a.transform).T @ matrix @ np.linalg.inv(self.b.transform)).reshape(9)
+        out = np.empty(len(which))
+        for begin in range(0, len(which), _CHUNK):
+            part = which[begin : begin + _CHUNK]
+            moment, norm = self.matrices(part)
+            out[begin : begin + _CHUNK] = (moment @ theta @ theta) / np.maximum(norm @ theta @ theta, 1e-30)
+        return np.asarray(np.maximum(out, 0.0))
 
     def fundamental(self, which: int) -> Floats:
         """The best matrix (3, 3) at one lag, in normalised coordinates: ``m_aᵀ F m_b = 0``, norm 1."""
@@ -126,12 +136,15 @@ def _monomials(track: GridTrack) -> Floats:
     return np.stack([track.weight * s[:, i] * s[:, j] for i, j in _PAIRS])
 
 
-def scan_lags(moments: PairMoments, least_support: float) -> Scan:
-    """Cost at every lag with at least ``least_support`` seconds of common motion."""
+def scan_lags(moments: PairMoments, least_support: float, known: Floats | None = None) -> Scan:
+    """Cost at every lag with at least ``least_support`` seconds of common motion.
+
+    known: (3, 3) ``m_aᵀ F m_b = 0`` of normalised points, where the geometry is given.
+    """
     cost = np.full(len(moments.lags), np.inf)
     which = np.flatnonzero(moments.support >= least_support)
     if len(which):
-        cost[which] = moments.costs(which)
+        cost[which] = moments.costs(which) if known is None else moments.costs_of(which, known)
     return Scan(moments.offset, moments.support, cost)
 
 

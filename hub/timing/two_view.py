@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from protocols.geometry import so3
+from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
 
 
@@ -34,6 +35,15 @@ class RelativePose:
     def inverse(self) -> RelativePose:
         """The pose of a from b."""
         return RelativePose(self.rotation.T, -self.rotation.T @ self.direction)
+
+
+def relative_pose(a: Pose, b: Pose) -> RelativePose:
+    """The relative pose of two placed cameras. Raises ValueError if they stand in one point."""
+    apart = b.rotation @ (a.position - b.position)
+    length = float(np.linalg.norm(apart))
+    if length < 1e-12:
+        raise ValueError("two cameras in one point have no epipolar geometry")
+    return RelativePose(b.rotation @ a.rotation.T, apart / length)
 
 
 def homogeneous(points: Floats) -> Floats:

@@ -154,7 +154,9 @@ def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
         table = values[name]
         if camera.intrinsics is None or camera.rotation is None or camera.position is None:
             raise InputError(
-                f"[{name}] has no matrix, rotation or translation", file=file, remedy="use a complete calibration"
+                f"[{name}] has no matrix, rotation or translation",
+                file=file,
+                remedy="use a complete calibration",
             )
         rate, offset = table.get("clock_rate", 1.0), table.get("time_offset", 0.0)
         if not all(isinstance(v, int | float) and np.isfinite(v) for v in (rate, offset)) or rate <= 0:

@@ -48,6 +48,10 @@ class Observations:
         """The camera's tracks, one a label."""
         return [track for (name, _), track in self.tracks.items() if name == camera]
 
+    def by_label(self, camera: str) -> dict[str, Track]:
+        """The camera's tracks by label."""
+        return {track.label: track for track in self.of_camera(camera)}
+
     @property
     def cameras(self) -> list[str]:
         """Cameras with at least one row."""
@@ -136,7 +140,14 @@ def gather_tracks(
     c = np.array([camera_ids[name] for name in cameras], dtype=np.int64)
     k = np.array([label_ids[name] for name in labels], dtype=np.int64)
     sorting = np.lexsort((frame, time, k, c))
-    c, k, frame, time, pixels, size = c[sorting], k[sorting], frame[sorting], time[sorting], pixels[sorting], size[sorting]
+    c, k, frame, time, pixels, size = (
+        c[sorting],
+        k[sorting],
+        frame[sorting],
+        time[sorting],
+        pixels[sorting],
+        size[sorting],
+    )
     line = None if lines is None else np.array(lines)[sorting]
     starts = np.flatnonzero(np.r_[True, (np.diff(c) != 0) | (np.diff(k) != 0)])
     ends = np.r_[starts[1:], len(c)]
@@ -152,7 +163,13 @@ def gather_tracks(
 
 
 def _check_repeats(
-    camera: str, label: str, frame: Ints, time: Floats, line: Ints | None, file: Path | None, warnings: list[str]
+    camera: str,
+    label: str,
+    frame: Ints,
+    time: Floats,
+    line: Ints | None,
+    file: Path | None,
+    warnings: list[str],
 ) -> None:
     same_time = np.flatnonzero(np.diff(time) == 0)
     where = f"camera {camera}, label {label}" if label != DEFAULT_LABEL else f"camera {camera}"
@@ -184,7 +201,10 @@ def _check_width(rows: list[list[str]], lines: list[int], last: int, file: Path)
     for row, line in zip(rows, lines, strict=True):
         if len(row) <= last:
             raise InputError(
-                f"{len(row)} columns where the first line has more", file=file, line=line, remedy="complete the row"
+                f"{len(row)} columns where the first line has more",
+                file=file,
+                line=line,
+                remedy="complete the row",
             )
 
 

@@ -146,7 +146,9 @@ def read_rig(file: Path) -> Rig:
     for name, table in values.items():
         if not isinstance(table, dict):
             raise InputError(
-                f"{name} = … stands outside a camera's table", file=file, remedy="put it under [camera] or [metadata]"
+                f"{name} = … stands outside a camera's table",
+                file=file,
+                remedy="put it under [camera] or [metadata]",
             )
         camera = _read_camera(_Table(table, name, file, text))
         cameras[camera.name] = camera

@@ -1,0 +1,117 @@
+"""The fundamental matrix of two uncalibrated views by maximum likelihood (7 degrees of freedom).
+
+``F = U diag(cos a, sin a, 0) Vᵀ`` with rotations U, V, so that rank 2 and norm 1 hold at every step;
+convention ``m_aᵀ F m_b = 0`` (eq. 5 of the paper on timing).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from protocols.errors import Refused
+from protocols.geometry import so3
+from protocols.geometry.types import Floats
+
+_LEAST_PAIRS = 8
+
+
+def conditioner(points: Floats) -> Floats:
+    """(3, 3) transform that centres pixels (n, 2) and scales them to unit variance (Hartley)."""
+    centre = points.mean(axis=0)
+    spread = max(float(np.sqrt(((points - centre) ** 2).mean())), 1e-12)
+    return np.array([[1 / spread, 0, -centre[0] / spread], [0, 1 / spread, -centre[1] / spread], [0, 0, 1.0]])
+
+
+def eight_point(a: Floats, b: Floats) -> Floats:
+    """Rank-2 matrix (3, 3), norm 1, from >= 8 pairs of points (n, 2): smallest singular vector, then rank 2."""
+    if len(a) < _LEAST_PAIRS:
+        raise Refused(f"{len(a)} point pairs; a fundamental matrix needs {_LEAST_PAIRS}")
+    ta, tb = conditioner(a), conditioner(b)
+    ha = np.column_stack([a, np.ones(len(a))]) @ ta.T
+    hb = np.column_stack([b, np.ones(len(b))]) @ tb.T
+    rows = (ha[:, :, None] * hb[:, None, :]).reshape(-1, 9)
+    _, _, vt = np.linalg.svd(rows, full_matrices=len(a) < 9)
+    u, d, wt = np.linalg.svd(vt[-1].reshape(3, 3))
+    matrix = ta.T @ ((u * np.array([d[0], d[1], 0.0])) @ wt) @ tb
+    return np.asarray(matrix / np.linalg.norm(matrix))
+
+
+def maximum_likelihood(a: Floats, b: Floats, start: Floats | None = None, iterations: int = 50) -> Floats:
+    """F (3, 3), norm 1, that minimises the Sampson distance of pairs of points (n, 2).
+
+    start: (3, 3); default the eight-point solution. Raises Refused for fewer than 8 pairs.
+    """
+    first = eight_point(a, b) if start is None else start
+    # Work in conditioned pixels with one common scale, so that the Sampson distance keeps its meaning.
+    ta, tb = _similarity(a), _similarity(b)
+    inverse_scale = ta[0, 0] / tb[0, 0]
+    ha = np.column_stack([a, np.ones(len(a))]) @ ta.T
+    hb = np.column_stack([b, np.ones(len(b))]) @ tb.T
+    u, d, vt = np.linalg.svd(np.linalg.inv(ta).T @ first @ np.linalg.inv(tb))
+    u, vt = u * np.sign(np.linalg.det(u)), vt * np.sign(np.linalg.det(vt))
+    angle = float(np.arctan2(d[1], d[0]))
+    damping = 1e-3
+    residual, jacobian = _residuals(u, vt, angle, ha, hb, inverse_scale)
+    cost = float(residual @ residual)
+    for _ in range(iterations):
+        normal = jacobian.T @ jacobian
+        step: Floats = np.asarray(
+            np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), -jacobian.T @ residual), np.float64
+        )
+        trial = (so3.exp(step[:3]) @ u, vt @ so3.exp(-step[3:6]), angle + float(step[6]))
+        new_residual, new_jacobian = _residuals(*trial, ha, hb, inverse_scale)
+        new_cost = float(new_residual @ new_residual)
+        if new_cost < cost:
+            gain = cost - new_cost
+            (u, vt, angle), residual, jacobian, cost = trial, new_residual, new_jacobian, new_cost
+            damping = max(damping / 10.0, 1e-12)
+            if gain < 1e-12 * max(cost, 1e-300):
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e8:
+                break
+    matrix = ta.T @ _compose(u, vt, angle) @ tb
+    return np.asarray(matrix / np.linalg.norm(matrix))
+
+
+def epipolar_lines(matrix: Floats, a: Floats) -> Floats:
+    """Lines (n, 3) in image b, ``lᵀ m_b = 0``, of points a (n, 2); first two entries are a unit normal."""
+    lines = np.column_stack([a, np.ones(len(a))]) @ matrix
+    return np.asarray(lines / np.maximum(np.linalg.norm(lines[:, :2], axis=1), 1e-300)[:, None])
+
+
+def line_distances(lines: Floats, points: Floats) -> Floats:
+    """Signed distances (n,) of points (n, 2) from unit-normal lines (n, 3) [px]."""
+    return np.asarray((lines[:, :2] * points).sum(axis=1) + lines[:, 2])
+
+
+def _similarity(points: Floats) -> Floats:
+    return conditioner(points)
+
+
+def _compose(u: Floats, vt: Floats, angle: float) -> Floats:
+    return np.asarray((u * np.array([np.cos(angle), np.sin(angle), 0.0])) @ vt)
+
+
+def _residuals(
+    u: Floats, vt: Floats, angle: float, ha: Floats, hb: Floats, inverse_scale: float
+) -> tuple[Floats, Floats]:
+    """Sampson residuals (n,) and their derivative (n, 7) with the denominators' change included."""
+
+    def value(matrix: Floats) -> Floats:
+        la, lb = hb @ matrix.T, ha @ matrix
+        # Image a's pixels were scaled by another factor than b's: weigh them back to one pixel.
+        variance = (la[:, :2] ** 2).sum(1) * inverse_scale**2 + (lb[:, :2] ** 2).sum(1)
+        return np.asarray((ha * la).sum(1) / np.sqrt(np.maximum(variance, 1e-300)))
+
+    jacobian = np.empty((len(ha), 7))
+    step = 1e-6
+    for k in range(3):
+        turn = so3.exp(step * np.eye(3)[k])
+        jacobian[:, k] = (value(_compose(turn @ u, vt, angle)) - value(_compose(turn.T @ u, vt, angle))) / (2 * step)
+        ahead, behind = _compose(u, vt @ turn.T, angle), _compose(u, vt @ turn, angle)
+        jacobian[:, 3 + k] = (value(ahead) - value(behind)) / (2 * step)
+    ahead, behind = _compose(u, vt, angle + step), _compose(u, vt, angle - step)
+    jacobian[:, 6] = (value(ahead) - value(behind)) / (2 * step)
+    return value(_compose(u, vt, angle)), jacobian

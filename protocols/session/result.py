@@ -1,0 +1,140 @@
+"""result.json: the whole answer of `calibrate`, or of its refusal, for scripts."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from protocols.files import write_atomically
+from protocols.session.calibration import Calibration, PairReport, TrajectoryTable, calibration_tables
+from protocols.session.rig import Rig
+from protocols.version import VERSION
+
+TRAJECTORY_FILE = "trajectory.csv"
+
+
+def result_document(calibration: Calibration, rig: Rig, *, command: str = "") -> dict[str, Any]:
+    """The content of result.json of a solved session; keys always come in the same order.
+
+    Lengths are in the rig's units, times in seconds. ``cameras`` holds calibration.toml's tables plus
+    position (camera centre in the world), clock_rate_ppm and rows_used; ``trajectory`` sums up
+    trajectory.csv. What has no value, or no finite one, is None.
+    """
+    tables = calibration_tables(calibration, rig)
+    metadata = tables.pop("metadata")
+    metadata["refused"] = dict(calibration.refused)
+    for name, camera in calibration.cameras.items():
+        residuals = calibration.residuals.get(name)
+        tables[name]["position"] = camera.pose.position
+        tables[name]["clock_rate_ppm"] = 1e6 * (camera.time_map.clock_rate - 1.0)
+        tables[name]["rows_used"] = None if residuals is None else len(residuals)
+    return _document(
+        status="solved",
+        reason=None,
+        command=command,
+        metadata=metadata,
+        cameras=tables,
+        trajectory={
+            "file": TRAJECTORY_FILE,
+            "labels": [_summary(table) for table in calibration.trajectories],
+        },
+        pairs=[_pair(pair) for pair in calibration.pairs],
+        warnings=list(calibration.warnings),
+        cpu_seconds=calibration.cpu_seconds,
+    )
+
+
+def refusal_document(
+    reason: str,
+    refused: dict[str, str],
+    rig: Rig,
+    *,
+    command: str = "",
+    solver: str = "joint",
+    cpu_seconds: float = 0.0,
+    pairs: Iterable[PairReport] = (),
+    warnings: Iterable[str] = (),
+) -> dict[str, Any]:
+    """The content of result.json where nothing could be solved: the same keys, and why.
+
+    refused: reasons by camera.
+    """
+    metadata = {
+        **rig.metadata,
+        "units": rig.units,
+        "reference": None,
+        "scale": None,
+        "solver": solver,
+        "version": VERSION,
+        "refused": dict(refused),
+    }
+    return _document(
+        status="refused",
+        reason=reason,
+        command=command,
+        metadata=metadata,
+        cameras={},
+        trajectory={"file": None, "labels": []},
+        pairs=[_pair(pair) for pair in pairs],
+        warnings=list(warnings),
+        cpu_seconds=cpu_seconds,
+    )
+
+
+def result_text(document: dict[str, Any]) -> str:
+    """Strict JSON (no NaN, no Infinity) whose floats read back bit for bit."""
+    return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def write_result(file: Path, document: dict[str, Any]) -> None:
+    """Write result.json. Raises InputError where the folder cannot be written."""
+    write_atomically(file, result_text(document))
+
+
+def _document(**values: Any) -> dict[str, Any]:
+    return {key: _plain(value) for key, value in values.items()}
+
+
+def _pair(pair: PairReport) -> dict[str, Any]:
+    return {
+        "cameras": list(pair.cameras),
+        "lag_s": pair.lag_s,
+        "clock_rate": pair.clock_rate,
+        "fundamental": None if pair.fundamental is None else np.asarray(pair.fundamental).ravel(),
+        "inliers": pair.inliers,
+        "rms_px": pair.rms_px,
+        "status": pair.status,
+    }
+
+
+def _summary(table: TrajectoryTable) -> dict[str, Any]:
+    there = len(table.time) > 0
+    return {
+        "label": table.label,
+        "rows": len(table.time),
+        "first_time": table.time[0] if there else None,
+        "last_time": table.time[-1] if there else None,
+        "median_std": np.median(table.std) if there else None,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Only what JSON can hold: arrays become lists, numbers of numpy Python's, not finite ones None."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float):
+        return value + 0.0 if math.isfinite(value) else None  # -0.0 becomes 0.0
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    return str(value)  # a date or a path in the rig's own keys
