@@ -5,6 +5,7 @@ Commands are imported when they are called, so that `--help` costs a fraction of
 
 from __future__ import annotations
 
+import difflib
 import os
 import sys
 from collections.abc import Sequence
@@ -15,11 +16,11 @@ from typing import NoReturn
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-from cyclopts import App, CycloptsError
-from cyclopts.exceptions import UnknownCommandError
+from cyclopts import App, CycloptsError  # noqa: E402
+from cyclopts.exceptions import UnknownCommandError  # noqa: E402
 
-from protocols.errors import EXIT_BUG, EXIT_DONE, EXIT_INPUT, SynclineError
-from protocols.version import VERSION
+from protocols.errors import EXIT_BUG, EXIT_DONE, EXIT_INPUT, SynclineError  # noqa: E402
+from protocols.version import VERSION  # noqa: E402
 
 # name, where it lives, one line for the overview
 COMMANDS: tuple[tuple[str, str, str], ...] = (
@@ -63,7 +64,10 @@ def run(arguments: Sequence[str] | None = None) -> int:
         print(f"syncline: {error}", file=sys.stderr)
         return error.exit_status
     except CycloptsError as error:
-        text = " ".join(str(error).split())
+        if isinstance(error, UnknownCommandError):
+            text = _unknown_command(arguments)
+        else:
+            text = " ".join(str(error).split()).rstrip(".")
         command = "" if isinstance(error, UnknownCommandError) else _command_of(arguments)
         print(f"syncline: {text}; see `syncline {command}--help`", file=sys.stderr)
         return EXIT_INPUT
@@ -75,6 +79,14 @@ def run(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_DONE
     return result if isinstance(result, int) else EXIT_DONE
+
+
+def _unknown_command(arguments: Sequence[str] | None) -> str:
+    # Cyclopts' own text would import every command to suggest one.
+    words = [word for word in (sys.argv[1:] if arguments is None else arguments) if not word.startswith("-")]
+    word = words[0] if words else ""
+    close = difflib.get_close_matches(word, [name for name, _, _ in COMMANDS], 1)
+    return f"there is no command {word!r}" + (f": did you mean {close[0]}?" if close else "")
 
 
 def _command_of(arguments: Sequence[str] | None) -> str:

@@ -54,9 +54,7 @@ class Topic:
         return f"syncline/{valid_id(site, 'site')}/{self.key.format(id='*')}"
 
 
-OBSERVATION = Topic(
-    "observation", "camera/{id}/observation", "Observation", 30.0, True, Delivery.RELIABLE, 8192, 2.0
-)
+OBSERVATION = Topic("observation", "camera/{id}/observation", "Observation", 30.0, True, Delivery.RELIABLE, 8192, 2.0)
 CAMERA_INFO = Topic("camera_info", "camera/{id}/info", "CameraInfo", 0.5, True, Delivery.LATEST, 256, 10.0)
 RIG_INFO = Topic("rig_info", "hub/{id}/rig", "RigInfo", 0.1, True, Delivery.LATEST, 16, 60.0)
 CALIBRATION = Topic("calibration", "hub/{id}/calibration", "Calibration", 0.5, True, Delivery.LATEST, 64, 0.0)

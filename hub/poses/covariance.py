@@ -103,7 +103,9 @@ def time_map_std(cov: Covariance, state: State, camera: int, reference: int) -> 
 def position_std(cov: Covariance, camera: int) -> Floats:
     """Std (3,) of the camera's position."""
     begin = camera * CAMERA_PARAMETERS + 3
-    return np.asarray(np.sqrt(np.maximum(np.diag(cov.cameras)[begin : begin + 3], 0.0)))
+    variance = np.diag(cov.cameras)[begin : begin + 3]
+    # What the gauge holds comes out of the null space as 1e-30: it is exactly known by definition.
+    return np.asarray(np.sqrt(np.where(variance > 1e-20 * float(np.diag(cov.cameras).max(initial=0.0)), variance, 0.0)))
 
 
 def path_std(cov: Covariance, state: State, label: int, time: Floats) -> Floats:

@@ -142,11 +142,11 @@ def _residuals(
         out: list[Floats] = []
         for i, known in positions:
             std = rig.cameras[names[i]].position_std
-            out.append((s.points(poses[i].position[None])[0] - known) / (_EXACT * size if std is None else std))
+            out.append((s.points(poses[i].position[None])[0] - known) / _sigma(std, _EXACT * size))
         for i, known in rotations:
             std = rig.cameras[names[i]].rotation_std
             turned = poses[i].rotation @ s.rotation.T
-            out.append(so3.log(turned @ known.T) / (_EXACT if std is None else std))
+            out.append(so3.log(turned @ known.T) / _sigma(std, _EXACT))
         for a, b, length in distances:
             apart = s.scale * float(np.linalg.norm(poses[a].position - poses[b].position))
             out.append(np.array([(apart - length) / (_EXACT * length)]))
@@ -192,6 +192,11 @@ def _stepped(s: Similarity, step: Floats) -> Similarity:
     return Similarity(size, turn @ s.rotation, s.shift + step[:3] * s.scale)
 
 
+def _sigma(std: Floats | None, exact: float) -> Floats:
+    """Std (3,) of a reference; one that is not told, or 0, counts as exact."""
+    return np.full(3, exact) if std is None else np.where(std > 0, std, exact)
+
+
 def _extent(poses: list[Pose]) -> float:
     centres = np.array([pose.position for pose in poses])
     return max(float(np.linalg.norm(np.ptp(centres, axis=0))), 1e-9)
@@ -205,10 +210,10 @@ def _information(rig: Rig, names: list[str], poses: list[Pose], s: Similarity) -
     for i, name in enumerate(names):
         camera, base = rig.cameras[name], i * CAMERA_PARAMETERS
         if camera.position is not None:
-            std = np.full(3, _EXACT * size) if camera.position_std is None else camera.position_std
+            std = _sigma(camera.position_std, _EXACT * size)
             out[base + 3 + np.arange(3), base + 3 + np.arange(3)] += 1.0 / std**2
         if camera.rotation is not None:
-            std = np.full(3, _EXACT) if camera.rotation_std is None else camera.rotation_std
+            std = _sigma(camera.rotation_std, _EXACT)
             out[base + np.arange(3), base + np.arange(3)] += 1.0 / std**2
     for a, b, length in rig.distances:
         if a in names and b in names:

@@ -205,7 +205,7 @@ def linear_triangulation(seeing: list[tuple[CameraState, SmoothTrack]], time: Fl
     rays = []
     for state, track in seeing:
         seen = track.at(state.camera_time(time))
-        there: Bools = np.isfinite(seen).all(axis=1)
+        there = np.asarray(np.isfinite(seen).all(axis=1))
         local = np.column_stack([np.where(there[:, None], seen, 0.0), np.ones(len(time))])
         ray = local @ state.pose.rotation
         ray /= np.linalg.norm(ray, axis=1)[:, None]

@@ -190,8 +190,9 @@ def path_share(calibration: Calibration, observations: Observations) -> tuple[fl
         both = shared_spans(seen)
         wanted += length(both)
         if label in tables:
-            there = [spans(tables[label].time, 0.1)]
-            covered += length(shared_spans([both, *there], at_least=2, reach=0.0))
+            time = tables[label].time
+            step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+            covered += length(shared_spans([both, spans(time, max(0.1, 2.5 * step))], reach=0.0))
     return (covered / wanted if wanted > 0 else 0.0), wanted
 
 

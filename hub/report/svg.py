@@ -40,6 +40,11 @@ def short(value: float | None, *, sign: bool = False, figures: int = 3) -> str:
     return number(value, digits, sign=sign)
 
 
+def whole(value: int) -> str:
+    """A whole number with its thousands set apart."""
+    return f"{value:,}".replace(",", THIN)
+
+
 def at(value: float) -> str:
     """A coordinate inside a drawing, to a tenth of a pixel."""
     text = f"{value:.1f}"
@@ -63,6 +68,12 @@ def ticks(low: float, high: float, about: int = 6) -> list[float]:
     first = math.ceil(low / step - 1e-9)
     last = math.floor(high / step + 1e-9)
     return [index * step for index in range(first, last + 1)]
+
+
+def round_below(value: float) -> float:
+    """The largest of 1, 2, 5, 10, … that is no more than ``value`` > 0."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(factor * power for factor in (5, 2, 1) if factor * power <= value * (1 + 1e-9))
 
 
 def tick_text(value: float, values: list[float]) -> str:
@@ -91,10 +102,7 @@ def text(x: float, y: float, content: str, kind: str = "", anchor: str = "start"
 
 def drawing(width: float, height: float, parts: Iterable[str], label: str) -> str:
     """A whole drawing that scales with its column; label: what a reader who can't see it is told."""
-    return (
-        f'<svg viewBox="0 0 {at(width)} {at(height)}" style="max-width:{at(width)}px" role="img" '
-        f'aria-label="{esc(label)}">{"".join(parts)}</svg>'
-    )
+    return f'<svg viewBox="0 0 {at(width)} {at(height)}" role="img" aria-label="{esc(label)}">{"".join(parts)}</svg>'
 
 
 def time_axis(

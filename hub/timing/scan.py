@@ -45,7 +45,7 @@ def grid_track(track: SmoothTrack, step: float, sigma_px: float) -> GridTrack:
     time = begin + step * np.arange(int(np.ceil((end - begin) / step)) + 1, dtype=np.float64)
     points = track.at(time)
     speed = np.linalg.norm(track.at(time, 1), axis=1) * track.focal
-    there: Bools = np.isfinite(points).all(axis=1)
+    there = np.asarray(np.isfinite(points).all(axis=1))
     weight = np.where(there, speed / (speed + _SLOW_PX), 0.0)
     points = np.where(there[:, None], points, 0.0)
     total = max(float(weight.sum()), 1e-9)
@@ -81,8 +81,8 @@ class PairMoments:
         correlation = np.asarray(irfft(product, length), dtype=np.float64)
         self.lags: Ints = np.arange(-(n_a - 1), n_b, dtype=np.int64)
         self.moments: Floats = correlation[:, :, self.lags % length]
-        self.offset: Floats = a.begin - b.begin - self.lags * a.step
-        self.support: Floats = np.maximum(self.moments[5, 5], 0.0) * a.step
+        self.offset: Floats = np.asarray(a.begin - b.begin - self.lags * a.step, dtype=np.float64)
+        self.support: Floats = np.asarray(np.maximum(self.moments[5, 5], 0.0) * a.step, dtype=np.float64)
 
     def matrices(self, which: Ints) -> tuple[Floats, Floats]:
         """Moment matrices (m, 9, 9) and Taubin's normalisation (m, 9, 9) of chosen lags, per sample."""

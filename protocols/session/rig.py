@@ -105,14 +105,14 @@ class _Table:
         return array
 
     def std(self, key: str, what: str) -> Floats | None:
-        """A positive number, or three."""
+        """A number >= 0, or three; 0 = exactly known."""
         value = self.values.get(key)
         if value is None:
             return None
         table = self if isinstance(value, list) else _Table({key: [value] * 3}, self.where, self.file, self.text)
         array = table.numbers(key, 3, what)
-        if array is not None and not (array > 0).all():
-            raise self.fail(key, f"{key} must be positive", f"give {key} = {what}")
+        if array is not None and not (array >= 0).all():
+            raise self.fail(key, f"{key} is negative", f"give {key} = {what}; 0 means exactly known")
         return array
 
 

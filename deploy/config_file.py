@@ -1,0 +1,172 @@
+"""Reads a configuration file into its struct, with errors that name file, line, key and remedy."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import msgspec
+
+from protocols.errors import InputError
+
+_Config = TypeVar("_Config", bound=msgspec.Struct)
+
+
+class Source(str):
+    """Where a video comes from: a file, a URL such as rtsp://…, or a camera's number or device file."""
+
+    __slots__ = ()
+
+
+_PLACE = re.compile(r" - at `\$\.?(?P<path>[^`]*)`\Z")
+_UNKNOWN = re.compile(r"Object contains unknown field `(?P<key>[^`]*)`\Z")
+_MISSING = re.compile(r"Object missing required field `(?P<key>[^`]*)`\Z")
+
+
+def load(path: Path | str, kind: type[_Config]) -> _Config:
+    """Read a TOML file as ``kind``.
+
+    Relative paths in it are taken from the file's own folder. Raises InputError with file, line (as far
+    as it can be told), key and remedy.
+    """
+    file = Path(path)
+    try:
+        text = file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(
+            f"cannot be read: {error.strerror or error}", file=file, remedy="check the name of the file"
+        ) from None
+    except UnicodeDecodeError:
+        raise InputError("is not UTF-8 text", file=file, remedy="give a TOML file") from None
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise _syntax_error(file, text, str(error)) from None
+    bad = _not_finite(table, "")
+    if bad:
+        raise InputError(f"{bad} is not finite", file=file, line=_line(text, bad), remedy="give a number")
+    folder = file.resolve().parent
+    try:
+        return msgspec.convert(table, kind, dec_hook=lambda wanted, value: _from_text(wanted, value, folder))
+    except msgspec.ValidationError as error:
+        raise _content_error(file, text, kind, str(error)) from None
+
+
+def effective_toml(config: msgspec.Struct) -> str:
+    """The configuration with every default filled in, as TOML that ``load`` reads back to the same."""
+    import tomli_w
+
+    return tomli_w.dumps(_without_none(msgspec.to_builtins(config, enc_hook=str)))
+
+
+def _from_text(wanted: type, value: object, folder: Path) -> object:
+    if not isinstance(value, str) or not value:
+        raise ValueError(f"Expected a text that is not empty, got {value!r}")
+    if wanted is Path:
+        return folder / Path(value).expanduser()
+    if wanted is Source:
+        elsewhere = "://" in value or value.isdigit()
+        return Source(value if elsewhere else folder / Path(value).expanduser())
+    raise NotImplementedError(f"no reader for {wanted}")
+
+
+def _without_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_none(inner) for key, inner in value.items() if inner is not None}
+    if isinstance(value, list | tuple):
+        return [_without_none(inner) for inner in value]
+    return value
+
+
+def _not_finite(value: object, path: str) -> str:
+    """The dotted path of the first number that is not finite; "" if there is none."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return path
+    inner: list[tuple[str, object]] = []
+    if isinstance(value, dict):
+        inner = [(f"{path}.{key}" if path else str(key), item) for key, item in value.items()]
+    elif isinstance(value, list):
+        inner = [(f"{path}[{index}]", item) for index, item in enumerate(value)]
+    return next((bad for name, item in inner if (bad := _not_finite(item, name))), "")
+
+
+def _syntax_error(file: Path, text: str, message: str) -> InputError:
+    found = re.search(r" \(at (?:line (\d+), column \d+|end of document)\)\Z", message)
+    line = None
+    if found:
+        line = int(found[1]) if found[1] else len(text.splitlines())
+        message = message[: found.start()]
+    return InputError(f"is not TOML: {message}", file=file, line=line, remedy="correct the line")
+
+
+def _content_error(file: Path, text: str, kind: type[msgspec.Struct], message: str) -> InputError:
+    """One line from the validator's message, which ends in the path of what it speaks of."""
+    path = ""
+    place = _PLACE.search(message)
+    if place:
+        path, message = place["path"], message[: place.start()]
+    unknown, missing = _UNKNOWN.match(message), _MISSING.match(message)
+    if unknown:
+        key = f"{path}.{unknown['key']}" if path else unknown["key"]
+        known = _keys(kind, path)
+        close = difflib.get_close_matches(unknown["key"], known, 1)
+        remedy = f"did you mean {close[0]}?" if close else f"use one of {', '.join(known)}"
+        return InputError(f"unknown key {key}", file=file, line=_line(text, key), remedy=remedy)
+    if missing:
+        where = f" in [{path}]" if path else ""
+        remedy = f"add {missing['key']} = …"
+        return InputError(f"{missing['key']} is missing{where}", file=file, line=_line(text, path), remedy=remedy)
+    if not path:
+        # A struct's own check has no path, but begins with the key that it speaks of.
+        first = re.match(r"\w+", message)
+        line = _line(text, first[0]) if first and first[0] in _keys(kind, "") else None
+        return InputError(message, file=file, line=line, remedy="" if ";" in message else "correct it")
+    choices = get_args(_type_of(kind, path))
+    if message.startswith("Invalid enum value") and choices:
+        remedy = f"use one of {', '.join(map(str, choices))}"
+    else:
+        remedy = "correct it"
+    what = f"{path}: {message[0].lower()}{message[1:]}".replace("`", "")
+    return InputError(what, file=file, line=_line(text, path), remedy=remedy)
+
+
+def _keys(kind: type[msgspec.Struct], path: str) -> list[str]:
+    """The keys that the table at a dotted path may have; none if it is no table."""
+    wanted = _type_of(kind, path)
+    for option in (wanted, *get_args(wanted)):
+        if isinstance(option, type) and issubclass(option, msgspec.Struct):
+            return [field.encode_name for field in msgspec.structs.fields(option)]
+    return []
+
+
+def _type_of(kind: type[msgspec.Struct], path: str) -> Any:
+    """The declared type of the value at a dotted path; None where there is none."""
+    wanted: Any = kind
+    for name in path.split(".") if path else []:
+        options = [item for item in (wanted, *get_args(wanted)) if isinstance(item, type)]
+        structs = [item for item in options if issubclass(item, msgspec.Struct)]
+        fields = {field.encode_name: field.type for field in msgspec.structs.fields(structs[0])} if structs else {}
+        wanted = fields.get(name)
+    return wanted
+
+
+def _line(text: str, path: str) -> int | None:
+    """The line of a dotted key, as far as a plain scan can tell; None if it is not found."""
+    path = re.sub(r"\[[^\]]*\]", "", path)
+    if not path:
+        return None
+    table, _, key = path.rpartition(".")
+    current = ""
+    for number, row in enumerate(text.splitlines(), 1):
+        header = re.match(r"\s*\[+\s*([^\]]*?)\s*\]+", row)
+        if header:
+            current = header[1]
+            if current == path:
+                return number
+        elif current == table and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*[=.]", row):
+            return number
+    return None

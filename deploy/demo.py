@@ -1,0 +1,202 @@
+"""The demo's processes: one per camera, a hub and a recorder, over a loopback router, on simulated devices."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tomli_w
+
+from protocols.bus.router import Router, free_endpoint
+from protocols.bus.settings import BusConfig
+from protocols.bus.zenoh_bus import open_bus
+from protocols.catalogue import CALIBRATION, OBSERVATION
+from protocols.errors import InputError, Refused
+from protocols.messages import syncline_pb2 as pb
+
+LOG = "demo.mcap"
+_STARTING_S = 20.0
+_STOPPING_S = 40.0
+_MINE = ("config", "logs", LOG, "calibration.toml", "trajectory.csv", "result.json", "report.html")
+
+
+@dataclass(slots=True)
+class Live:
+    """What the demo shows while it runs."""
+
+    elapsed: float = 0.0
+    observations: dict[str, int] = field(default_factory=dict)
+    detections: dict[str, int] = field(default_factory=dict)
+    status: str = "starting"
+    first_calibration_s: float | None = None
+    calibration: pb.Calibration | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DemoSettings:
+    """What to run. scene, seed, cameras: the world; seconds: how long it is filmed."""
+
+    scene: str
+    seed: int
+    cameras: int
+    seconds: float
+    out: Path
+
+
+class Fleet:
+    """The demo's processes, started together and stopped in order."""
+
+    def __init__(self, settings: DemoSettings) -> None:
+        self.settings = settings
+        self.out = settings.out.resolve()
+        self.names = [f"cam{i}" for i in range(settings.cameras)]
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._endpoint = free_endpoint()
+        self._site = "demo"
+
+    def run(self, show: Callable[[Live], None]) -> Live:
+        """Film for the set time; ``show`` is told twice a second. Raises Refused if an agent dies."""
+        self._clean()
+        configs = self._write_configs()
+        live = Live()
+        bus_config = BusConfig(mode="client", connect=(self._endpoint,))
+        with Router(self._endpoint), open_bus(self._site, bus_config, timeout_s=10.0) as bus:
+            observations, calibrations = bus.subscribe(OBSERVATION), bus.subscribe(CALIBRATION)
+            try:
+                # Recorder and hub first, so that they hear everything from the first frame.
+                for name in ("recorder", "hub", *self.names):
+                    self._start(name, configs[name])
+                began = time.monotonic()
+                first: float | None = None
+                while first is None or time.monotonic() - first < self.settings.seconds:
+                    observations.wait(0.2)
+                    for received in observations.drain():
+                        assert isinstance(received.message, pb.Observation)
+                        name = received.message.camera
+                        live.observations[name] = live.observations.get(name, 0) + 1
+                        seen = len(received.message.detections) > 0
+                        live.detections[name] = live.detections.get(name, 0) + seen
+                    if first is None and len(live.observations) == len(self.names):
+                        first = time.monotonic()
+                    for received in calibrations.drain():
+                        assert isinstance(received.message, pb.Calibration)
+                        live.calibration = received.message
+                        solved = received.message.status == "solved"
+                        if solved and live.first_calibration_s is None:
+                            live.first_calibration_s = time.monotonic() - (first or began)
+                        live.status = _status(received.message)
+                    live.elapsed = 0.0 if first is None else time.monotonic() - first
+                    self._check_alive()
+                    if first is None and time.monotonic() - began > _STARTING_S:
+                        missing = [name for name in self.names if name not in live.observations]
+                        raise Refused(f"no frame from {', '.join(missing)} within {_STARTING_S:.0f} s; see {self.out}/logs")
+                    show(live)
+                live.status = "stopping the cameras"
+                show(live)
+                for name in self.names:
+                    self._stop(name)
+                live.status = "last calibration with everything seen"
+                show(live)
+                self._stop("hub")
+                self._stop("recorder")
+            finally:
+                for process in self._processes.values():
+                    if process.poll() is None:
+                        process.kill()
+                        process.wait()
+        return live
+
+    def _clean(self) -> None:
+        """Make the folder, taking away only what an earlier demo wrote."""
+        if self.out.exists() and not self.out.is_dir():
+            raise InputError("not a folder", file=self.out, remedy="choose another --out")
+        foreign = [path.name for path in self.out.iterdir() if path.name not in _MINE] if self.out.exists() else []
+        if foreign:
+            raise InputError(
+                f"holds other files ({', '.join(sorted(foreign)[:3])})", file=self.out, remedy="choose another --out"
+            )
+        for name in _MINE:
+            path = self.out / name
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+        try:
+            (self.out / "config").mkdir(parents=True)
+            (self.out / "logs").mkdir()
+        except OSError as error:
+            raise InputError(f"cannot be made: {error.strerror}", file=self.out, remedy="choose another --out") from None
+
+    def _write_configs(self) -> dict[str, Path]:
+        """One configuration file an agent, as a user would write it."""
+        bus = {"mode": "client", "connect": [self._endpoint]}
+        world = {
+            "scene": self.settings.scene,
+            "seed": self.settings.seed,
+            "cameras": self.settings.cameras,
+            "start_unix_s": time.time(),
+        }
+        tables: dict[str, dict[str, object]] = {
+            "recorder": {"id": "recorder", "site": self._site, "out": str(self.out / LOG), "bus": bus},
+            "hub": {
+                "id": "hub",
+                "site": self._site,
+                "out": str(self.out),
+                "window_s": self.settings.seconds + 60.0,
+                "interval_s": 3.0,
+                "bus": bus,
+            },
+        }
+        for name in self.names:
+            tables[name] = {"id": name, "site": self._site, "driver": "simulated", "simulated": world, "bus": bus}
+        files = {}
+        for name, table in tables.items():
+            files[name] = self.out / "config" / f"{name}.toml"
+            files[name].write_text(tomli_w.dumps(table), encoding="utf-8")
+        return files
+
+    def _start(self, name: str, config: Path) -> None:
+        role = {"recorder": "record", "hub": "hub"}.get(name, "camera")
+        with (self.out / "logs" / f"{name}.txt").open("wb") as log:
+            self._processes[name] = subprocess.Popen(
+                [sys.executable, "-m", "deploy", role, str(config)],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+            )
+
+    def _stop(self, name: str) -> None:
+        process = self._processes[name]
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+        try:
+            status = process.wait(_STOPPING_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise Refused(f"{name} did not stop within {_STOPPING_S:.0f} s; see {self.out}/logs/{name}.txt") from None
+        if status != 0:
+            raise Refused(f"{name} ended with status {status}: {self._last_line(name)}")
+
+    def _check_alive(self) -> None:
+        for name, process in self._processes.items():
+            if process.poll() is not None:
+                raise Refused(f"{name} ended with status {process.returncode}: {self._last_line(name)}")
+
+    def _last_line(self, name: str) -> str:
+        lines = (self.out / "logs" / f"{name}.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        return lines[-1] if lines else "it said nothing"
+
+
+def _status(message: pb.Calibration) -> str:
+    if message.status == "solved":
+        offsets = [camera.time_offset_std for camera in message.cameras]
+        return f"{len(message.cameras)} cameras calibrated, offsets ± {1e3 * max(offsets, default=0.0):.2f} ms"
+    return f"{message.status}: {message.reason}"

@@ -1,0 +1,171 @@
+"""What a log holds, for a person and for a machine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from protocols.catalogue import OBSERVATION
+from protocols.clocks import NANOSECONDS
+from protocols.log.reader import LogReader
+from protocols.messages import syncline_pb2 as pb
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+
+@dataclass(frozen=True, slots=True)
+class TopicDescription:
+    """One key of the log. topic and agent are empty for a channel that is not of the catalogue.
+
+    rate_hz: messages a second between its first and its last, 0 for fewer than two. first_s, last_s:
+    from the log's beginning.
+    """
+
+    key: str
+    topic: str
+    agent: str
+    count: int
+    rate_hz: float
+    first_s: float
+    last_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class CameraDescription:
+    """One boot of one camera. missing: observations that its sequence numbers say are not in the log."""
+
+    camera: str
+    boot_id: str
+    observations: int
+    detections: int
+    missing: int
+
+
+@dataclass(frozen=True, slots=True)
+class AttachmentDescription:
+    """One stored file."""
+
+    name: str
+    media_type: str
+    bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class LogDescription:
+    """A log. begin_ns: Unix time of its first message; damage: "" or what is wrong with the file."""
+
+    path: str
+    bytes: int
+    begin_ns: int
+    duration_s: float
+    messages: int
+    damage: str
+    topics: tuple[TopicDescription, ...]
+    cameras: tuple[CameraDescription, ...]
+    rejected: dict[str, int]
+    metadata: dict[str, dict[str, str]]
+    attachments: tuple[AttachmentDescription, ...]
+
+
+@dataclass(slots=True)
+class _Boot:
+    observations: int = 0
+    detections: int = 0
+    first: int = 2**64
+    last: int = -1
+
+    def missing(self) -> int:
+        return max(0, self.last - self.first + 1 - self.observations)
+
+
+def describe_log(path: Path | str) -> LogDescription:
+    """Read a whole log and summarise it. Raises InputError for a file that is none."""
+    reader = LogReader(path)
+    summary = reader.summary()
+    boots: dict[tuple[str, str], _Boot] = {}
+    for logged in reader.messages([OBSERVATION]):
+        message = logged.message
+        assert isinstance(message, pb.Observation)
+        boot = boots.setdefault((message.camera, message.boot_id), _Boot())
+        boot.observations += 1
+        boot.detections += len(message.detections)
+        boot.first = min(boot.first, message.sequence)
+        boot.last = max(boot.last, message.sequence)
+    rejected = dict(reader.counters)
+    return LogDescription(
+        path=str(path),
+        bytes=Path(path).stat().st_size,
+        begin_ns=summary.first_ns,
+        duration_s=(summary.last_ns - summary.first_ns) / NANOSECONDS,
+        messages=summary.messages,
+        damage=summary.reason,
+        topics=tuple(
+            TopicDescription(
+                key=entry.key,
+                topic=entry.address.topic.name if entry.address else "",
+                agent=entry.address.agent if entry.address else "",
+                count=entry.count,
+                rate_hz=_rate(entry.count, entry.last_ns - entry.first_ns),
+                first_s=(entry.first_ns - summary.first_ns) / NANOSECONDS,
+                last_s=(entry.last_ns - summary.first_ns) / NANOSECONDS,
+            )
+            for entry in summary.topics
+        ),
+        cameras=tuple(
+            CameraDescription(camera, boot_id, boot.observations, boot.detections, boot.missing())
+            for (camera, boot_id), boot in boots.items()
+        ),
+        rejected=rejected,
+        metadata=reader.metadata(),
+        attachments=tuple(
+            AttachmentDescription(item.name, item.media_type, len(item.data)) for item in reader.attachments()
+        ),
+    )
+
+
+def as_table(description: LogDescription) -> RenderableType:
+    """The description as a rich renderable."""
+    from rich.console import Group
+    from rich.markup import escape
+    from rich.table import Table
+
+    begin = datetime.fromtimestamp(description.begin_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    head = (
+        f"{escape(description.path)}: {description.messages} messages, {description.duration_s:.1f} s from "
+        f"{begin}, {description.bytes / 1e6:.2f} MB"
+    )
+    topics = Table("key", "messages", "Hz", "from s", "to s", box=None, header_style="bold")
+    for entry in description.topics:
+        topics.add_row(
+            entry.key,
+            str(entry.count),
+            f"{entry.rate_hz:.1f}",
+            f"{entry.first_s:.1f}",
+            f"{entry.last_s:.1f}",
+        )
+    parts: list[RenderableType] = [head]
+    if description.damage:
+        parts.append(f"[red]damaged: {escape(description.damage)}[/red]")
+    if description.messages:
+        parts.append(topics)
+    if description.cameras:
+        cameras = Table("camera", "boot", "observations", "detections", "missing", box=None, header_style="bold")
+        for camera in description.cameras:
+            cameras.add_row(
+                camera.camera,
+                camera.boot_id[:8],
+                str(camera.observations),
+                str(camera.detections),
+                str(camera.missing),
+            )
+        parts.append(cameras)
+    parts += [f"{escape(item.name)}: {item.bytes} bytes, {item.media_type}" for item in description.attachments]
+    parts += [f"[red]{count} messages not used: {reason}[/red]" for reason, count in description.rejected.items()]
+    return Group(*parts)
+
+
+def _rate(count: int, span_ns: int) -> float:
+    return (count - 1) * NANOSECONDS / span_ns if count > 1 and span_ns > 0 else 0.0

@@ -1,0 +1,26 @@
+"""Progress of long work on standard error, so that standard output stays clean for pipes and --json."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def progress_bar(title: str, quiet: bool = False) -> Iterator[Callable[[str, float], None]]:
+    """A bar told by ``tell(text, share)``, share 0..1; nothing is drawn where nobody looks."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda text, share: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(title, total=1.0)
+
+        def tell(text: str, share: float) -> None:
+            progress.update(task, completed=share, description=f"{title}: {text}")
+
+        yield tell

@@ -1,0 +1,106 @@
+"""Writes a session of a simulated world: what a user's folder looks like, with the truth beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from edge import scenes
+from edge.scenes.session import SimulatedTracks, simulated_session
+from protocols.errors import InputError
+from protocols.files import write_atomically
+from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
+from protocols.session.observations import DEFAULT_LABEL, gather_tracks
+
+TRUTH_CALIBRATION, TRUTH_TRAJECTORY = "truth_calibration.toml", "truth_trajectory.csv"
+_TRUTH_HZ = 50.0
+
+
+def write_simulated_session(
+    scene_name: str,
+    out: Path,
+    *,
+    seconds: float,
+    cameras: int | None,
+    seed: int,
+    noise_px: float,
+    outliers: float,
+    drops: float | None,
+) -> dict[str, Any]:
+    """Film a scene and write the session folder; returns counts. Raises InputError."""
+    scene = scenes.get(scene_name, seed, cameras)
+    filmed = simulated_session(
+        scene, seconds, seed, pixel_noise=noise_px, outlier_fraction=outliers, drop_fraction=drops
+    )
+    rows = sum(len(track) for track in filmed.tracks.values())
+    if not rows:
+        raise InputError("no camera saw the marker", remedy="film longer or take another seed")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made: {error.strerror}", file=out, remedy="choose another --out") from None
+    tables = _rig_tables(filmed, scene_name)
+    write_rig(out / RIG_FILE, tables)
+    write_observations(out / OBSERVATIONS_FILE, _observations(filmed))
+    write_atomically(out / TRUTH_CALIBRATION, tomli_w.dumps(_truth_tables(filmed, tables)))
+    _write_truth_trajectory(out / TRUTH_TRAJECTORY, filmed)
+    return {"scene": scene_name, "seed": seed, "cameras": len(scene.cameras), "rows": rows, "seconds": seconds}
+
+
+def _rig_tables(filmed: SimulatedTracks, name: str) -> dict[str, Any]:
+    tables: dict[str, Any] = {"metadata": {"name": name, "units": "m"}}
+    for camera in filmed.cameras:
+        lens = camera.intrinsics
+        tables[camera.name] = {
+            "name": camera.name,
+            "size": [lens.width, lens.height],
+            "fps": camera.fps,
+            "matrix": lens.matrix.tolist(),
+            "distortions": lens.distortions.tolist(),
+        }
+    return tables
+
+
+def _observations(filmed: SimulatedTracks) -> Any:
+    tracks = list(filmed.tracks.values())
+    names = [track.camera for track in tracks for _ in range(len(track))]
+    return gather_tracks(
+        names,
+        [DEFAULT_LABEL] * len(names),
+        np.concatenate([track.frame for track in tracks]),
+        np.concatenate([track.time for track in tracks]),
+        np.concatenate([track.pixels for track in tracks]),
+        np.concatenate([track.size for track in tracks]),
+        order=[camera.name for camera in filmed.cameras],
+    )
+
+
+def _truth_tables(filmed: SimulatedTracks, rig: dict[str, Any]) -> dict[str, Any]:
+    """calibration.toml as it should come out, in the scene's own world and in metres."""
+    reference = filmed.cameras[0].name
+    tables: dict[str, Any] = {"metadata": {**rig["metadata"], "reference": reference, "scale": "metric"}}
+    for camera in filmed.cameras:
+        time_map = filmed.true_time_map(camera.name, reference)
+        tables[camera.name] = {
+            **rig[camera.name],
+            "rotation": camera.pose.rodrigues.tolist(),
+            "translation": camera.pose.translation.tolist(),
+            "time_offset": time_map.time_offset,
+            "clock_rate": time_map.clock_rate,
+        }
+    return tables
+
+
+def _write_truth_trajectory(file: Path, filmed: SimulatedTracks) -> None:
+    """time,x,y,z on the first camera's clock."""
+    first = filmed.cameras[0]
+    true_time = np.arange(filmed.start, filmed.end, 1.0 / _TRUTH_HZ)
+    epoch = first.clock.epoch_ns / 1e9
+    camera_time = epoch + first.clock.rate * true_time
+    position = filmed.scene.marker_position(true_time)
+    lines = ["time,x,y,z"]
+    lines += [f"{t:.17g},{x:.17g},{y:.17g},{z:.17g}" for t, (x, y, z) in zip(camera_time, position, strict=True)]
+    write_atomically(file, "\n".join(lines) + "\n")

@@ -1,0 +1,275 @@
+"""The camera agent: frames in, observations out.
+
+A thin loop around a device and a detector. Frames are taken and looked at in the caller's thread; messages go out by
+a thread of their own, so that nothing the bus does can hold up a capture.
+"""
+
+from __future__ import annotations
+
+import math
+import queue
+import threading
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable
+
+from google.protobuf.message import Message
+
+from edge.detectors.base import Detection, Detector
+from edge.devices.base import Device, Frame
+from protocols.bus.base import Bus, Publisher
+from protocols.catalogue import CAMERA_INFO, OBSERVATION, STATUS, Topic
+from protocols.clocks import NANOSECONDS
+from protocols.gate import SCHEMA_VERSION
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.rig import RigCamera
+from protocols.version import VERSION
+
+ROLE = "camera"
+_READ_TIMEOUT_S = 0.1  # how long a stop may wait for a silent camera
+_INFO_PERIOD_S = 2.0
+_STATUS_PERIOD_S = 1.0
+_SILENT_S = 2.0  # without a frame for this long the agent calls itself degraded
+_OUTBOX = 1024
+_FLUSH_S = 2.0
+
+
+class CameraAgent:
+    """One camera on the bus.
+
+    device: is opened by ``run`` and closed after it. camera: its id. now_ns: a monotonic clock for rates and latencies;
+    it never stamps an observation. known: what the rig file knows of this camera beforehand. boot_id: a new one
+    each time the process starts, by default.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        detector: Detector,
+        bus: Bus,
+        camera: str,
+        *,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        known: RigCamera | None = None,
+        boot_id: str | None = None,
+    ) -> None:
+        self._device = device
+        self._detector = detector
+        self._bus = bus
+        self._camera = camera
+        self._now_ns = now_ns
+        self._known = known
+        self.boot_id = uuid.uuid4().hex if boot_id is None else boot_id
+        self._sequence = 0
+        self._last_frame: int | None = None
+        self._recent: deque[tuple[int, float]] = deque(maxlen=300)  # (arrival, latency) of the last frames
+        self.frames = 0
+        self.dropped = 0
+        self.detections = 0
+        self.empty = 0
+
+    def run(self, stop: threading.Event) -> None:
+        """Publish until ``stop`` is set or the device has ended.
+
+        Raises InputError where the device cannot be opened, BusDead where the bus has died.
+        """
+        self._device.open()
+        try:
+            with self._bus.announce(ROLE, self._camera, self.boot_id), _Outbox(self._bus, self._camera) as outbox:
+                self._loop(stop, outbox)
+        finally:
+            self._device.close()
+
+    def _loop(self, stop: threading.Event, outbox: _Outbox) -> None:
+        status_sequence = 0
+        next_info = next_status = arrived = self._now_ns()
+        while not (stop.is_set() or self._device.ended):
+            frame = self._device.read(_READ_TIMEOUT_S)
+            now = self._now_ns()
+            if frame is not None:
+                arrived = now
+                outbox.put(OBSERVATION, self._observe(frame))
+                self._recent.append((arrived, (self._now_ns() - arrived) / NANOSECONDS))
+            if now >= next_info:
+                outbox.put(CAMERA_INFO, self._info())
+                next_info = now + round(_INFO_PERIOD_S * NANOSECONDS)
+            if now >= next_status:
+                silent = (now - arrived) / NANOSECONDS
+                state, text = ("running", "") if silent < _SILENT_S else ("degraded", f"no frame for {silent:.0f} s")
+                outbox.put(STATUS, self._status(state, text, status_sequence, outbox))
+                status_sequence += 1
+                next_status = now + round(_STATUS_PERIOD_S * NANOSECONDS)
+        text = "the recording has ended" if self._device.ended and not stop.is_set() else "stopped"
+        outbox.put(STATUS, self._status("stopping", text, status_sequence, outbox))
+
+    def _observe(self, frame: Frame) -> pb.Observation:
+        """The message of one frame, also when nothing is seen in it."""
+        if self._last_frame is not None and frame.frame > self._last_frame + 1:
+            self.dropped += frame.frame - self._last_frame - 1
+        self._last_frame = frame.frame
+        self.frames += 1
+        found = [detection for detection in self._detector.detect(frame.image) if _usable(detection)]
+        self.detections += len(found)
+        self.empty += not found
+        message = pb.Observation(
+            schema_version=SCHEMA_VERSION,
+            camera=self._camera,
+            boot_id=self.boot_id,
+            sequence=self._sequence,
+            frame=frame.frame,
+            device_time_ns=frame.device_time_ns,
+            exposure_ns=frame.exposure_ns,
+            detections=[_detection(detection) for detection in found],
+        )
+        self._sequence += 1
+        return message
+
+    def _info(self) -> pb.CameraInfo:
+        info = self._device.info
+        message = pb.CameraInfo(
+            schema_version=SCHEMA_VERSION,
+            camera=self._camera,
+            boot_id=self.boot_id,
+            width=info.width,
+            height=info.height,
+            fps=info.fps,
+            driver=info.driver,
+            clock=info.clock,
+            readout_s=info.readout_s,
+        )
+        known = self._known
+        lens = info.intrinsics if known is None or known.intrinsics is None else known.intrinsics
+        if lens is not None:
+            message.matrix.extend(lens.matrix.ravel().tolist())
+            message.distortions.extend(lens.distortions.tolist())
+            message.fisheye = lens.fisheye
+        if known is not None:
+            add_known(message, known)
+        return message
+
+    def _status(self, state: str, text: str, sequence: int, outbox: _Outbox) -> pb.AgentStatus:
+        counters = {
+            "frames": self.frames,
+            "dropped": self.dropped,
+            "published": outbox.sent,
+            "unpublished": outbox.lost,
+            "detections": self.detections,
+            "empty": self.empty,
+        }
+        gauges = {"fps": 0.0, "latency_s": 0.0}
+        if len(self._recent) > 1:
+            span = (self._recent[-1][0] - self._recent[0][0]) / NANOSECONDS
+            gauges["fps"] = (len(self._recent) - 1) / span if span > 0 else 0.0
+            gauges["latency_s"] = sorted(latency for _, latency in self._recent)[len(self._recent) // 2]
+        return pb.AgentStatus(
+            schema_version=SCHEMA_VERSION,
+            agent=self._camera,
+            role=ROLE,
+            boot_id=self.boot_id,
+            sequence=sequence,
+            state=state,
+            message=text,
+            counters=counters,
+            gauges=gauges,
+            version=VERSION,
+        )
+
+
+class _Outbox:
+    """Hands messages to the bus in a thread of its own; when full it loses the newest, and counts it.
+
+    sent, lost: observations that went out, and that did not. An observation that is lost leaves a gap in the
+    sequence, so that its receivers know too.
+    """
+
+    def __init__(self, bus: Bus, camera: str) -> None:
+        self._bus, self._camera = bus, camera
+        self._queue: queue.Queue[tuple[Topic, Message] | None] = queue.Queue(_OUTBOX)
+        self._thread = threading.Thread(target=self._run, name=f"outbox {camera}", daemon=True)
+        self._error: Exception | None = None
+        self.sent = 0
+        self.lost = 0
+
+    def put(self, topic: Topic, message: Message) -> None:
+        """Never waits. Raises what the bus has raised."""
+        if self._error is not None:
+            raise self._error
+        try:
+            self._queue.put_nowait((topic, message))
+        except queue.Full:
+            self.lost += topic is OBSERVATION
+
+    def __enter__(self) -> _Outbox:
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Send what is left, within 2 s."""
+        try:
+            self._queue.put(None, timeout=_FLUSH_S)
+            self._thread.join(_FLUSH_S)
+        except queue.Full:
+            pass  # the bus hangs; the thread is a daemon and the process may end
+        if kind is None and self._error is not None:
+            raise self._error
+
+    def _run(self) -> None:
+        publishers: dict[str, Publisher] = {}
+        try:
+            for topic in (OBSERVATION, CAMERA_INFO, STATUS):
+                publishers[topic.name] = self._bus.publisher(topic, self._camera)
+            while (item := self._queue.get()) is not None:
+                topic, message = item
+                publishers[topic.name].put(message)
+                self.sent += topic is OBSERVATION
+        except Exception as error:  # noqa: BLE001 - it belongs to the thread that runs the agent
+            self._error = error
+
+
+def run_camera_agent(
+    device: Device,
+    detector: Detector,
+    bus: Bus,
+    camera: str,
+    stop: threading.Event,
+    now_ns: Callable[[], int] = time.monotonic_ns,
+    *,
+    known: RigCamera | None = None,
+    boot_id: str | None = None,
+) -> CameraAgent:
+    """Run an agent to its end and return it with its counts; see ``CameraAgent`` for the arguments."""
+    agent = CameraAgent(device, detector, bus, camera, now_ns=now_ns, known=known, boot_id=boot_id)
+    agent.run(stop)
+    return agent
+
+
+def add_known(message: pb.CameraInfo, known: RigCamera) -> None:
+    """Enter what a rig file knows of a camera's pose; lengths are in the rig's units."""
+    for field, values in (
+        (message.position, known.position),
+        (message.position_std, known.position_std),
+        (message.rotation_std, known.rotation_std),
+    ):
+        if values is not None:
+            field.extend(values.tolist())
+    if known.rotation is not None:
+        from protocols.geometry import so3
+
+        message.rotation.extend(so3.log(known.rotation).tolist())
+
+
+def _usable(detection: Detection) -> bool:
+    """A detector's slip must not reach the bus, where it would cost the whole frame."""
+    return math.isfinite(detection.u) and math.isfinite(detection.v) and math.isfinite(detection.size)
+
+
+def _detection(detection: Detection) -> pb.Detection:
+    message = pb.Detection(
+        u=detection.u, v=detection.v, size=detection.size, score=detection.score, label=detection.label
+    )
+    if detection.colour is not None:
+        message.colour.red, message.colour.green, message.colour.blue = detection.colour
+    if detection.covariance is not None:
+        message.covariance.extend(detection.covariance)
+    return message

@@ -1,0 +1,198 @@
+"""Finds one ball of a known colour and measures its centre to a small part of a pixel.
+
+A coarse pass classifies every second pixel by colour; each blob is then measured at full resolution. There the
+question is no longer which pixels are the target's but how much of each is: its coverage, from the local colours of
+target and background (``_coverage``). The centroid of coverage is unbiased under motion blur (a smeared ball's
+centroid is where the ball was on average) and does not follow the shading, as a centroid of brightness would.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from edge.detectors.base import Detection
+from edge.detectors.colour import ColourModel, codes, taught
+from edge.detectors.outline import measure_outline
+from protocols.errors import InputError
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Bools, Floats
+
+_STEP = 2  # of the coarse pass [px]
+_CANDIDATES = 6  # blobs that are measured, largest first
+_MIN_AREA = 6.0  # px²: below, colour noise looks like that
+_MAX_SHARE = 0.2  # of the image: above, it is a wall
+_MIN_SCORE = 0.35
+_BOX = cv2.getStructuringElement(cv2.MORPH_RECT, (3, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerModel:
+    """What the marker looks like: its colour model, and the label its detections carry."""
+
+    colours: ColourModel
+    label: str = "marker"
+
+    @classmethod
+    def default(cls) -> MarkerModel:
+        """The orange ball of the shipped scenes; a matt orange table-tennis ball is near it."""
+        return cls.of_colour(246, 112, 22)
+
+    @classmethod
+    def of_colour(cls, red: float, green: float, blue: float, label: str = "marker") -> MarkerModel:
+        """A matt ball of this sRGB colour (0..255) in full light."""
+        return cls(ColourModel.of_hue((blue, green, red)), label)
+
+    def to_table(self) -> dict[str, Any]:
+        """As plain values for a TOML table."""
+        return {"label": self.label, **self.colours.to_table()}
+
+    @classmethod
+    def from_table(cls, table: dict[str, Any]) -> MarkerModel:
+        """The inverse of ``to_table``. Raises InputError where the table is no marker model."""
+        return cls(ColourModel.from_table(table), str(table.get("label", "marker")))
+
+
+def teach(image: npt.NDArray[np.uint8], box: tuple[float, float, float, float], label: str = "marker") -> MarkerModel:
+    """A model from one picture and a box around the marker in it.
+
+    image: (H, W, 3) BGR. box: x, y (top left), width, height [px]; it may include some background. Pixels inside
+    are examples of the target, pixels outside of everything else; colours inside that are common outside
+    too are background. Raises InputError where the box leaves the image or holds nothing of its own colour.
+    """
+    height, width = image.shape[:2]
+    x, y, w, h = box
+    if not (w >= 2 and h >= 2 and x >= -0.5 and y >= -0.5 and x + w <= width + 0.5 and y + h <= height + 0.5):
+        raise InputError(
+            f"the box {x:g},{y:g},{w:g},{h:g} does not lie in the {width}x{height} image",
+            remedy="give x,y,width,height in pixels, x and y of the top left",
+        )
+    rows, columns = np.mgrid[:height, :width]
+
+    def within(grow: float) -> Bools:
+        across = np.abs(columns - (x + 0.5 * w - 0.5)) < 0.5 * w + grow
+        return np.asarray(across & (np.abs(rows - (y + 0.5 * h - 0.5)) < 0.5 * h + grow))
+
+    # A gap between inside and outside: a box is rarely drawn to the pixel.
+    return MarkerModel(taught(image, within(0.0), ~within(2.0 + 0.1 * max(w, h))), label)
+
+
+class MarkerDetector:
+    """Finds the marker in single pictures.
+
+    model: what it looks like. intrinsics: where given, the centre is corrected from that of the ball's
+    outline to the projection of its centre, which differ by perspective (``_outline_to_centre``).
+    most: how many blobs at the most are reported, best first; one marker is one.
+    min_size, max_size: diameters [px] outside of which a blob is not the marker.
+    """
+
+    def __init__(
+        self,
+        model: MarkerModel | None = None,
+        intrinsics: Intrinsics | None = None,
+        *,
+        most: int = 1,
+        min_size: float = 0.0,
+        max_size: float = math.inf,
+    ) -> None:
+        self._model = MarkerModel.default() if model is None else model
+        self._table = self._model.colours.table()
+        self._intrinsics = intrinsics
+        self._most = most
+        self._sizes = min_size, max_size
+
+    def detect(self, image: npt.NDArray[np.uint8]) -> list[Detection]:
+        coarse = self._table[codes(image[::_STEP, ::_STEP])]
+        if not coarse.any():
+            return []
+        linked = cv2.dilate(coarse, _BOX)
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(linked, connectivity=8)
+        pixels = np.bincount(labels[coarse > 0], minlength=count)
+        pixels[0] = 0
+        found = []
+        for index in np.argsort(pixels)[::-1][:_CANDIDATES]:
+            if pixels[index] * _STEP * _STEP > _MAX_SHARE * image.shape[0] * image.shape[1] or not pixels[index]:
+                continue
+            left, top, width, height = (int(value) * _STEP for value in stats[index, :4])
+            detection = self._measure(image, left, top, width, height)
+            if detection is not None:
+                found.append(detection)
+        found.sort(key=lambda one: one.score * one.size, reverse=True)
+        return found[: self._most]
+
+    def _measure(self, image: npt.NDArray[np.uint8], left: int, top: int, width: int, height: int) -> Detection | None:
+        """Measure the blob whose coarse bounding box is given [px]; None where it is no ball."""
+        margin = 2 * _STEP
+        x0, y0 = max(left - margin, 0), max(top - margin, 0)
+        patch = image[y0 : top + height + margin, x0 : left + width + margin]
+        mask = _main_blob(self._table[codes(patch)])
+        if mask is None:
+            return None
+        moments = cv2.moments(mask, binaryImage=True)
+        area = moments["m00"]
+        if area < _MIN_AREA:
+            return None
+        first = np.array([x0 + moments["m10"] / area, y0 + moments["m01"] / area])
+        outline = measure_outline(image, first, np.sqrt(area / np.pi))
+        if outline is None or not self._sizes[0] <= outline.diameter <= self._sizes[1]:
+            return None
+        reach = 0.5 * outline.diameter
+        size = np.array([image.shape[1], image.shape[0]])
+        if (outline.centre < reach).any() or (outline.centre > size - 1 - reach).any():
+            return None  # cut by the image's border, it has lost its centre
+        score = outline.agreement * _solidity(moments)
+        if score < _MIN_SCORE or not 0.5 < area / (np.pi * reach * reach) < 2.0:
+            return None
+        centre, covariance = outline.centre, outline.covariance
+        if self._intrinsics is not None:
+            centre = _outline_to_centre(centre, outline.diameter, self._intrinsics)
+        blue, green, red = patch[mask > 0].mean(axis=0)
+        return Detection(
+            u=float(centre[0]),
+            v=float(centre[1]),
+            size=outline.diameter,
+            score=score,
+            label=self._model.label,
+            colour=(round(float(red)), round(float(green)), round(float(blue))),
+            covariance=(float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])),
+        )
+
+
+def _main_blob(mask: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8] | None:
+    """The largest connected part of a mask (h, w), its holes filled (a glint is part of the ball)."""
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not contours:
+        return None
+    largest = max(contours, key=len)
+    filled = np.zeros_like(mask)
+    cv2.drawContours(filled, [largest], -1, 1, thickness=cv2.FILLED)
+    return filled
+
+
+def _solidity(moments: dict[str, float]) -> float:
+    """How well a blob fills the ellipse of its own second moments, 0..1; 1 for discs and smeared discs."""
+    area = moments["m00"]
+    spread = np.array([[moments["mu20"], moments["mu11"]], [moments["mu11"], moments["mu02"]]]) / area
+    ellipse = 4.0 * np.pi * np.sqrt(np.linalg.det(spread + np.eye(2) / 12.0))
+    return float(min(area / ellipse, 1.0))
+
+
+def _outline_to_centre(centre: Floats, size: float, lens: Intrinsics) -> Floats:
+    """From the centre (2,) [px] of a ball's outline to the projection of the ball's centre.
+
+    The image plane cuts the cone around a ball of angular radius a in an ellipse whose centre lies farther from the
+    principal point than the ball's centre, by 1 / (1 - tan²(a) / cos²(b)) at the angle b off the axis.
+    """
+    x, y = lens.unproject(centre[None])[0]
+    jacobian = lens.pixel_jacobian(np.array([[x, y]]))[0]
+    secant2 = 1.0 + x * x + y * y
+    # size ≈ 2 r/z · sqrt(sec b) in normalised units
+    ratio2 = (0.5 * size) ** 2 / abs(np.linalg.det(jacobian)) / np.sqrt(secant2)
+    if not np.isfinite(ratio2):
+        return centre
+    return np.asarray(centre - jacobian @ np.array([x, y]) * ratio2)

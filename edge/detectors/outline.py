@@ -1,0 +1,217 @@
+"""Measures the outline of a ball to a small part of a pixel, and from it centre, size and their uncertainty.
+
+Rays run outward from the centre. On each, the colour just inside and the colour just outside are known, and every
+sample between is a mixture of the two; the length of ray that is covered tells where the rim is. This needs no
+threshold, so it is not drawn towards the light, and a rim smeared by motion still has its middle where the
+rim was at mid-exposure. An ellipse-like curve is then fitted robustly to the rims of all rays: where something of a
+similar colour touches the ball, those rays are outvoted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from protocols.geometry.types import Floats
+
+_RAYS = 48
+_STEP = 0.5  # px between samples of a ray
+_PASSES = 3
+_PIXEL_STD = 6.0  # of a colour about the mixture of its two ends, by noise and texture [8-bit steps]
+_SHADE_STD = 0.2  # relative: how much shading and texture brighten or darken either end along a ray
+_SHADE_RIDGE = 2.5
+_OUTER_BAND = 3.0  # px beyond the rim from which the background's colour is taken
+_FLOOR_PX = 0.03  # std of the centre that remains without noise or texture,
+_FLOOR_SHADE = 0.003  # and its share of the radius: shading that the model of a matt ball does not tell,
+_FLOOR_SMEAR = 0.015  # and its share of a smeared rim's width
+_CORRELATION = 2.0  # px along the rim within which rays err together
+
+_ANGLE = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
+_DIRECTION = np.column_stack([np.cos(_ANGLE), np.sin(_ANGLE)])
+_DESIGN = np.column_stack([np.ones(_RAYS), np.cos(_ANGLE), np.sin(_ANGLE), np.cos(2.0 * _ANGLE), np.sin(2.0 * _ANGLE)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outline:
+    """centre: (2,) [px of the image]. diameter: of the disc of equal area [px]. covariance: (2, 2) of the centre
+    [px²]. agreement: share of rays that agree with the fitted curve, 0..1. eccentricity: largest deviation of
+    the curve from a circle, relative to its radius. smear: width of the rim where it is widest [px].
+    """
+
+    centre: Floats
+    diameter: float
+    covariance: Floats
+    agreement: float
+    eccentricity: float
+    smear: float
+
+
+def measure_outline(image: npt.NDArray[np.uint8], centre: Floats, radius: float) -> Outline | None:
+    """Fit the outline of a blob in an image (H, W, 3) BGR.
+
+    centre (2,), radius: of the blob, to about a third of its radius [px]. None where the fit runs away or leaves
+    the image.
+    """
+    centre = np.asarray(centre, dtype=np.float64).copy()
+    shape = np.array([radius, 0.0, 0.0])  # mean radius and its second harmonic
+    width = np.full(_RAYS, 1.0 + 0.5 * radius)  # of the rim; generous until it has been seen
+    weight = np.ones(_RAYS)
+    residual = np.zeros(_RAYS)
+    spread = 0.0
+    for index in range(_PASSES):
+        rim = _DESIGN[:, [0, 3, 4]] @ shape
+        half = np.minimum(1.25 + 0.6 * width, 0.75 * rim + 1.0)
+        offset, seen = _rims(image, centre, rim, half)
+        if offset is None:
+            return None
+        correction, weight, residual, spread = _fit(offset, np.maximum(seen, 1.5))
+        limit = 0.5 * shape[0]
+        if index == 0 and np.abs(correction).max() > limit + 1.0:
+            return None
+        centre += np.clip(correction[1:3], -limit, limit)
+        shape += np.clip(correction[[0, 3, 4]], -limit, limit)
+        if not (1.0 < shape[0] < 3.0 * radius + 3.0) or np.hypot(*(centre)) > 1e6:
+            return None
+        width = _opposite_mean(seen)
+    rim = _DESIGN[:, [0, 3, 4]] @ shape
+    covariance = _covariance(weight, spread, width, float(shape[0]))
+    return Outline(
+        centre=centre,
+        diameter=float(2.0 * np.sqrt(np.mean(rim * rim))),
+        covariance=covariance,
+        agreement=float(np.mean(np.abs(residual) < max(0.2 * shape[0], 0.75))),
+        eccentricity=float(np.hypot(shape[1], shape[2]) / shape[0]),
+        smear=float(width.max()),
+    )
+
+
+def _rims(image: npt.NDArray[np.uint8], centre: Floats, rim: Floats, half: Floats) -> tuple[Floats | None, Floats]:
+    """Where the rim is on each ray, relative to ``rim`` (n,) [px], and how wide (n,) [px].
+
+    half: (n,) half-width of the part of a ray that may be mixed [px].
+    """
+    reach = float(half.max()) + _OUTER_BAND
+    inner = float(rim.max())
+    along = np.arange(-inner, reach + _STEP, _STEP)  # relative to the rim
+    radius = rim[:, None] + along
+    x = (centre[0] + radius * _DIRECTION[:, :1]).astype(np.float32)
+    y = (centre[1] + radius * _DIRECTION[:, 1:]).astype(np.float32)
+    # A crop makes the sampling independent of the image's size (and of OpenCV's limit of 32767).
+    left, top = max(int(x.min()) - 1, 0), max(int(y.min()) - 1, 0)
+    right, bottom = int(x.max()) + 3, int(y.max()) + 3
+    crop = image[top:bottom, left:right]
+    if crop.shape[0] < 4 or crop.shape[1] < 4:
+        return None, half
+    samples = cv2.remap(crop, x - left, y - top, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    colour = samples.astype(np.float64)
+    pure = along <= -half[:, None]
+    pure |= radius < 0.4 * rim[:, None]  # of a ball smeared by its own diameter the middle is the best there is
+    front = _shaded(colour, radius / rim[:, None], pure & (radius > 0.0))
+    beyond = (along >= half[:, None]) & (along <= half[:, None] + _OUTER_BAND)
+    behind = _band_mean(colour, beyond, 1)
+    cover = np.clip(_mixture(colour, front, behind[:, None]), -0.25, 1.25)
+    # The end samples count by the part of their step that lies within the mixed stretch.
+    share = np.clip((half[:, None] - np.abs(along)) / _STEP + 0.5, 0.0, 1.0) * _STEP
+    covered = (cover * share).sum(axis=1)
+    mixed = (np.clip(cover * (1.0 - cover), 0.0, None) * share).sum(axis=1)
+    return covered - 0.5 * share.sum(axis=1), 6.0 * mixed  # a ramp of width w holds w / 6
+
+
+def _mixture(colour: Floats, front: Floats, behind: Floats) -> Floats:
+    """Share of ``front`` in colours (…, 3) mixed of front and behind.
+
+    Least squares for ``colour = p front + q behind`` with p + q near 1, share = p / (p + q): brightness of the
+    ball (shading) and of the background (texture) may stray along the ray without moving the rim.
+    """
+    loose = (_PIXEL_STD / _SHADE_STD) ** 2
+    ff = (front * front).sum(axis=-1) + loose
+    bb = (behind * behind).sum(axis=-1) + loose
+    fb = (front * behind).sum(axis=-1) + loose
+    fc = (front * colour).sum(axis=-1) + loose
+    bc = (behind * colour).sum(axis=-1) + loose
+    p, q = bb * fc - fb * bc, ff * bc - fb * fc
+    return np.asarray(p / np.maximum(p + q, 0.2 * (ff * bb - fb * fb) + 1e-6))
+
+
+def _shaded(colour: Floats, depth: Floats, pure: npt.NDArray[np.bool_]) -> Floats:
+    """The ball's own colour (n, m, 3) at all samples, from those that show nothing else.
+
+    colour: (n, m, 3). depth: (n, m) distance from the centre in radii. pure: (n, m). A matt sphere in directed
+    and ambient light is as bright as a linear function of its normal (x, y, sqrt(1 - x² - y²)); that is fitted
+    to each channel, robustly, because a glint is not matt.
+    """
+    inside = np.clip(depth, 0.0, 1.0)
+    x, y = inside * _DIRECTION[:, :1], inside * _DIRECTION[:, 1:]
+    basis = np.stack([np.ones_like(x), x, y, np.sqrt(np.maximum(1.0 - inside * inside, 0.0))], axis=-1)
+    known, values = basis[pure], colour[pure]
+    # Samples crowd towards the centre of the fan of rays: each counts by the area that it stands for.
+    area = depth[pure]
+    weight = area
+    # Without much of the ball to see, the tilts stay small: 2.5 px² of samples for each of them.
+    ridge = np.diag([1e-6, 1.0, 1.0, 1.0]) * _SHADE_RIDGE
+    model = np.zeros((4, 3))
+    for _ in range(3):
+        weighted = known * weight[:, None]
+        model = np.linalg.solve(weighted.T @ known + ridge, weighted.T @ values)
+        stray = np.abs(values - known @ model).max(axis=1)
+        scale = 2.0 * float(np.median(stray)) + 1.0
+        weight = area / (1.0 + (stray / scale) ** 2) ** 2
+    return np.asarray(basis @ model)
+
+
+def _band_mean(colour: Floats, band: npt.NDArray[np.bool_], rays: int) -> Floats:
+    """Mean colour (n, 3) over a band (n, m) of each ray's samples (n, m, 3) and of ``rays`` rays to either side."""
+    share = band.astype(np.float64)
+    total = np.einsum("nmk,nm->nk", colour, share)
+    count = share.sum(axis=1)
+    total, count = _around(total, rays), _around(count[:, None], rays)
+    return np.asarray(total / np.maximum(count, 1e-9))
+
+
+def _around(values: Floats, rays: int) -> Floats:
+    """Sums (n, k) over each ray and ``rays`` to either side, around the circle."""
+    padded = np.concatenate([values[-rays:], values, values[:rays]])
+    sums = np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), padded]), axis=0)
+    return np.asarray(sums[2 * rays + 1 :] - sums[: -2 * rays - 1])
+
+
+def _opposite_mean(width: Floats) -> Floats:
+    """Rim widths (n,) smoothed, and made equal on opposite sides: motion smears both alike."""
+    both = 0.5 * (width + np.roll(width, _RAYS // 2))
+    return np.asarray(_around(both[:, None], 2)[:, 0] / 5.0)
+
+
+def _fit(offset: Floats, width: Floats) -> tuple[Floats, Floats, Floats, float]:
+    """Robust fit of mean, first and second harmonic to rim offsets (n,) [px]; wide rims are less certain.
+
+    Returns the five coefficients, the weights (n,), the residuals (n,) [px] and their robust std for a rim of
+    mean width.
+    """
+    prior = width.mean() / width
+    weight = prior
+    coefficients = np.zeros(5)
+    spread = 0.0
+    residual = offset
+    for _ in range(5):
+        weighted = _DESIGN * weight[:, None]
+        coefficients = np.linalg.solve(weighted.T @ _DESIGN + 1e-9 * np.eye(5), weighted.T @ offset)
+        residual = offset - _DESIGN @ coefficients
+        scaled = residual * np.sqrt(prior)
+        # 5 of the 48 residuals are fitted away.
+        spread = 1.4826 * float(np.median(np.abs(scaled))) * np.sqrt(_RAYS / (_RAYS - 5.0)) + 1e-4
+        weight = prior / (1.0 + (scaled / (2.0 * spread)) ** 2) ** 2
+    return coefficients, weight, residual, spread
+
+
+def _covariance(weight: Floats, spread: float, width: Floats, radius: float) -> Floats:
+    """Covariance (2, 2) of the centre [px²] from the scatter of the rims about the curve."""
+    prior = width.mean() / np.maximum(width, 1.5)
+    together = max(1.0, _CORRELATION * _RAYS / (2.0 * np.pi * radius))
+    effective = np.minimum(weight, prior)
+    information = (_DESIGN * effective[:, None]).T @ _DESIGN
+    covariance = np.linalg.inv(information + 1e-9 * np.eye(5))[1:3, 1:3]
+    floor = _FLOOR_PX**2 + (_FLOOR_SHADE * radius) ** 2 + (_FLOOR_SMEAR * float(width.max())) ** 2
+    return np.asarray(spread**2 * together * covariance + floor * np.eye(2))

@@ -1,0 +1,115 @@
+"""What every simulated world is: cameras with true clocks and poses, and a way to draw what they see.
+
+World axes: z up, metres, the floor at z = 0. Time: the world's true time [s], which no camera knows.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from protocols.clocks import NANOSECONDS, TimeMap
+from protocols.errors import InputError
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.pose import Pose
+from protocols.geometry.types import Floats
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedClock:
+    """A camera's own clock.
+
+    epoch_ns: what it shows at true time 0. rate: its seconds per true second (1 + drift).
+    stamp_noise_s: std of the error with which a moment is stamped.
+    """
+
+    epoch_ns: int
+    rate: float = 1.0
+    stamp_noise_s: float = 50e-6
+
+    def device_time_ns(self, true_time: float) -> int:
+        """What the clock shows at a true time [s].
+
+        In whole nanoseconds from the epoch on: a Unix time as a float would be coarse by a quarter
+        of a microsecond.
+        """
+        return self.epoch_ns + round(self.rate * true_time * NANOSECONDS)
+
+    def true_time(self, device_time_ns: int) -> float:
+        """The true time [s] at which the clock shows ``device_time_ns``."""
+        return (device_time_ns - self.epoch_ns) / NANOSECONDS / self.rate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedCamera:
+    """One camera of a world: where it stands, how it sees, when it fires.
+
+    fps: on its own clock. exposure_s: shutter time. readout_s: first to last row (0 = global shutter).
+    jitter_s: std by which a capture really strays from the regular grid (and is stamped truthfully).
+    drop_fraction: share of frames that the device never delivers. start_s: true time of its first frame in
+    an offline session.
+    """
+
+    name: str
+    intrinsics: Intrinsics
+    pose: Pose
+    fps: float
+    clock: SimulatedClock
+    exposure_s: float = 0.008
+    readout_s: float = 0.0
+    jitter_s: float = 0.002
+    drop_fraction: float = 0.02
+    start_s: float = 0.0
+
+    def capture_times(
+        self, start: float, first: int, count: int, rng: np.random.Generator, jitter_s: float | None = None
+    ) -> Floats:
+        """True mid-exposure times (count,) [s] of frames ``first`` … of a recording that begins at ``start``.
+
+        jitter_s: instead of the camera's own.
+        """
+        period = 1.0 / (self.fps * self.clock.rate)
+        limit = 0.3 * period  # frames keep their order
+        jitter = np.clip(rng.normal(0.0, self.jitter_s if jitter_s is None else jitter_s, count), -limit, limit)
+        return np.asarray(start + (first + np.arange(count)) * period + jitter)
+
+
+class Renderer(ABC):
+    """Draws what one camera sees."""
+
+    @abstractmethod
+    def render(self, true_time: float) -> npt.NDArray[np.uint8]:
+        """The image (H, W, 3) uint8 BGR exposed around ``true_time`` [s] (mid-exposure, middle row)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene(ABC):
+    """A simulated world; a pure function of its name, seed and number of cameras.
+
+    A new kind of world derives from this, says how its cameras see it, and is entered in the registry.
+    """
+
+    name: str
+    seed: int
+    cameras: tuple[SimulatedCamera, ...]
+
+    def camera(self, name: str) -> SimulatedCamera:
+        """The camera of this name. Raises InputError where there is none."""
+        for camera in self.cameras:
+            if camera.name == name:
+                return camera
+        names = ", ".join(camera.name for camera in self.cameras)
+        raise InputError(f"scene {self.name} has no camera {name!r}", remedy=f"use one of {names}")
+
+    def true_time_map(self, camera: str, reference_camera: str) -> TimeMap:
+        """The truth that timing looks for: ``t_reference = clock_rate * t_camera + time_offset`` [s]."""
+        clock, reference = self.camera(camera).clock, self.camera(reference_camera).clock
+        rate = reference.rate / clock.rate
+        return TimeMap(rate, reference.epoch_ns / NANOSECONDS - rate * (clock.epoch_ns / NANOSECONDS))
+
+    @abstractmethod
+    def renderer(self, camera: str, rng: np.random.Generator) -> Renderer:
+        """Draws frames of one camera; ``rng`` gives the sensor noise."""

@@ -1,0 +1,117 @@
+"""The hub agent: a thin loop between the bus and the live estimator."""
+
+from __future__ import annotations
+
+import threading
+import time
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+
+from google.protobuf.message import Message
+
+from hub.live import LiveHub
+from protocols.bus.base import Bus
+from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, RIG_INFO, STATUS, TRACK
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.rig import Rig
+from protocols.version import VERSION
+
+ROLE = "hub"
+_TICK_S = 0.05
+_STATUS_S = 1.0
+_RIG_S = 5.0
+
+
+def run_hub(
+    hub: LiveHub,
+    bus: Bus,
+    agent: str,
+    stop: threading.Event,
+    *,
+    rig: Rig | None = None,
+    solved: Callable[[LiveHub], None] | None = None,
+    boot_id: str | None = None,
+) -> None:
+    """Gather, solve and publish until ``stop`` is set; then solve once more with all that came.
+
+    solved: called after every solve that gave an answer or a refusal (to write files).
+    """
+    boot = boot_id or uuid.uuid4().hex
+    subscriptions = [bus.subscribe(topic) for topic in (CAMERA_INFO, OBSERVATION)]
+    publishers = {
+        "Calibration": bus.publisher(CALIBRATION, agent),
+        "Track": bus.publisher(TRACK, agent, rate_hz=200.0),
+        "RigInfo": bus.publisher(RIG_INFO, agent),
+        "AgentStatus": bus.publisher(STATUS, agent),
+    }
+    sequence, next_status, next_rig = 0, 0.0, 0.0
+
+    def publish(messages: list[Message]) -> None:
+        for message in messages:
+            publishers[message.DESCRIPTOR.name].put(message)
+
+    try:
+        with bus.announce(ROLE, agent, boot):
+            while True:
+                last = stop.is_set()
+                for subscription in subscriptions:
+                    for received in subscription.drain():
+                        hub.handle(received.message)
+                now = time.monotonic()
+                before = hub.counters["solved"] + hub.counters["refused"]
+                publish(hub.tick(now, final=last))
+                if solved is not None and hub.counters["solved"] + hub.counters["refused"] > before:
+                    solved(hub)
+                if rig is not None and now >= next_rig:
+                    next_rig = now + _RIG_S
+                    publish([rig_message(rig)])
+                if now >= next_status or last:
+                    next_status = now + _STATUS_S
+                    publish([status_message(hub, agent, boot, sequence, [s.counters for s in subscriptions])])
+                    sequence += 1
+                if last:
+                    break
+                stop.wait(_TICK_S)
+    finally:
+        for publisher in publishers.values():
+            publisher.close()
+        for subscription in subscriptions:
+            subscription.close()
+
+
+def rig_message(rig: Rig) -> pb.RigInfo:
+    """What fixes gauge and scale, for the log."""
+    message = pb.RigInfo(schema_version=1, units=rig.units, clock=rig.clock)
+    for a, b, distance in rig.distances:
+        message.distances.append(pb.RigInfo.Distance(camera_a=a, camera_b=b, distance=distance))
+    if isinstance(rig.up, str):
+        message.up_camera = rig.up
+    elif rig.up is not None:
+        message.up.extend(rig.up.tolist())
+    reference = rig.metadata.get("reference")
+    if isinstance(reference, str):
+        message.reference_camera = reference
+    return message
+
+
+def status_message(
+    hub: LiveHub, agent: str, boot: str, sequence: int, counters: Sequence[Mapping[str, int]]
+) -> pb.AgentStatus:
+    """The hub's health: what it counted, and one line for a person."""
+    solved = hub.calibration is not None
+    message = pb.AgentStatus(
+        schema_version=1,
+        agent=agent,
+        role=ROLE,
+        boot_id=boot,
+        sequence=sequence,
+        state="running" if solved else "starting",
+        message=f"{len(hub.calibration.cameras)} cameras calibrated" if hub.calibration else hub.missing() or "solving",
+        version=VERSION,
+    )
+    for name, count in hub.counters.items():
+        message.counters[name] = count
+    for counts in counters:
+        for name, count in counts.items():
+            message.counters[name] = message.counters[name] + count
+    return message

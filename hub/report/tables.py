@@ -1,0 +1,150 @@
+"""The report's tables: cameras, pairs, refused cameras, provenance."""
+
+from __future__ import annotations
+
+import platform
+from importlib import metadata
+
+import numpy as np
+
+from hub.report.measures import Usage
+from hub.report.pair_graph import edge_kind
+from hub.report.remedies import remedy_for
+from hub.report.svg import THIN, esc, number, short, whole
+from hub.report.verdict import half_interval_ms
+from protocols.geometry.types import Floats
+from protocols.session.calibration import Calibration
+from protocols.session.rig import Rig
+
+_LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "plotly")
+_MOST_OPEN = 30  # more pairs than this are folded away
+_SIGNS = {"agrees": "✓ agrees", "contradicts": "≠ contradicts the others", "refused": "✕"}
+
+
+def table(head: list[str], rows: list[list[str]], *, numeric: int = 0, kind: str = "") -> str:
+    """A table of ready HTML cells; the columns from ``numeric`` on are aligned right (0: none)."""
+    top = "".join(f"<th{_numeric(i, numeric)}>{cell}</th>" for i, cell in enumerate(head))
+    body = "".join(
+        "<tr>" + "".join(f"<td{_numeric(i, numeric)}>{cell}</td>" for i, cell in enumerate(row)) + "</tr>"
+        for row in rows
+    )
+    return f'<div class="wide"><table class="{kind}"><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _numeric(column: int, first: int) -> str:
+    return ' class="n"' if 0 < first <= column else ""
+
+
+def cameras(calibration: Calibration, used: dict[str, Usage]) -> str:
+    """One row a camera: its clock, its place, and how well it fits."""
+    unit = calibration.units if calibration.scale == "metric" else "first baseline = 1"
+    head = [
+        "Camera",
+        "Clock offset <small>s, ± ms (95 %)</small>",
+        "Clock rate <small>ppm</small>",
+        f"Position <small>{esc(unit)}, ± std</small>",
+        "Residual <small>px rms</small>",
+        "Rows used",
+    ]
+    rows = []
+    for name, camera in calibration.cameras.items():
+        reference = name == calibration.reference
+        half = half_interval_ms(camera)
+        offset = number(camera.time_map.time_offset, 6, sign=not reference)
+        around = '<small class="quiet">reference</small>' if reference else f"± {short(half, figures=2)}"
+        ppm = 1e6 * (camera.time_map.clock_rate - 1.0)
+        total = used[name].total
+        rows.append(
+            [
+                f"<b>{esc(name)}</b>",
+                f'{offset} <span class="pm">{around}</span>',
+                number(ppm, 1, sign=not reference),
+                _position(camera.pose.position, camera.position_std),
+                number(camera.rms_px, 2),
+                f"{whole(used[name].used)} / {whole(total)} <small>({100 * used[name].share:.0f}{THIN}%)</small>",
+            ]
+        )
+    return table(head, rows, numeric=1, kind="cameras")
+
+
+def _position(position: Floats, std: Floats) -> str:
+    worst = float(np.max(std))
+    size = float(np.linalg.norm(position))
+    if not np.isfinite(worst) or worst < 1e-9 * max(size, 1.0):
+        digits, around = 3, "fixed"
+    else:
+        # Two figures of the uncertainty are told, and the position to the same place.
+        digits = int(np.clip(1 - np.floor(np.log10(worst)), 0, 6))
+        around = f"± {worst:.{digits}f}"
+    place = ", ".join(number(value, digits) for value in position)
+    return f'{place} <span class="pm">{around}</span>'
+
+
+def pairs(calibration: Calibration) -> str:
+    """One row a pair: lag at the middle of the overlap, rate, and how it was judged."""
+    if not calibration.pairs:
+        return ""
+    head = [
+        "Pair",
+        "Verdict",
+        "Lag <small>s</small>",
+        "Rate <small>ppm</small>",
+        "Agree <small>%</small>",
+        "Noise <small>px</small>",
+    ]
+    rows = []
+    for pair in calibration.pairs:
+        kind = edge_kind(calibration, pair)
+        verdict = _SIGNS[kind] + (f" {esc(pair.status)}" if kind == "refused" else "")
+        ppm = None if pair.clock_rate is None else 1e6 * (pair.clock_rate - 1.0)
+        rows.append(
+            [
+                f"{esc(pair.cameras[0])}–{esc(pair.cameras[1])}",
+                verdict,
+                number(pair.lag_s, 4, sign=True),
+                number(ppm, 1, sign=True),
+                number(None if pair.inliers is None else 100 * pair.inliers, 0),
+                number(pair.rms_px, 2),
+            ]
+        )
+    inner = table(head, rows, numeric=2, kind="pairs")
+    if len(rows) <= _MOST_OPEN:
+        return inner
+    return f"<details><summary>All {len(rows)} pairs</summary>{inner}</details>"
+
+
+def refused(reasons: dict[str, str], counts: dict[str, int]) -> str:
+    """One row a refused camera: what it gave, why it was refused, what to do."""
+    rows = [
+        [f"<b>{esc(name)}</b>", whole(counts.get(name, 0)), esc(reason), code(_capital(remedy_for(reason)))]
+        for name, reason in reasons.items()
+    ]
+    return table(["Camera", "Rows", "Why", "What to do"], rows, kind="refused")
+
+
+def code(text: str) -> str:
+    """Escaped text in which what stands between backticks is set as code."""
+    parts = esc(text).split("`")
+    return "".join(f"<code>{part}</code>" if index % 2 else part for index, part in enumerate(parts))
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def provenance(facts: dict[str, str], rig: Rig, command: str) -> str:
+    """Where the report comes from: what was run, on what, with which versions."""
+    versions = [f"Python {platform.python_version()}"]
+    for name in _LIBRARIES:
+        try:
+            versions.append(f"{name} {metadata.version(name)}")
+        except metadata.PackageNotFoundError:
+            continue
+    rows = {
+        **({"Command": f"<code>{esc(command)}</code>"} if command else {}),
+        **{key: esc(value) for key, value in facts.items() if value},
+        **({"Rig": f"<code>{esc(rig.file)}</code>"} if rig.file is not None else {}),
+        "Made with": esc(", ".join(versions)),
+    }
+    items = "".join(f"<dt>{esc(key)}</dt><dd>{value}</dd>" for key, value in rows.items())
+    return f'<dl class="facts">{items}</dl>'

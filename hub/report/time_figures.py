@@ -1,0 +1,159 @@
+"""Figures over time: offsets with their intervals, residuals as the session went on, who saw the point when."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hub.report import measures
+from hub.report.measures import Span, Usage
+from hub.report.svg import THIN, drawing, line, number, points, rect, short, text, tick_text, ticks, time_axis
+from hub.report.verdict import half_interval_ms
+from protocols.geometry.types import Floats
+from protocols.session.calibration import Calibration
+from protocols.session.observations import Observations
+
+_WIDTH, _LEFT, _RIGHT = 1000.0, 130.0, 16.0
+_MOST_SPANS = 400  # drawn a camera; a recording of hours has more
+_TIME_BINS, _ROWS_A_BIN = 250, 8  # no more than so many bins; rows in one for its quantiles to mean anything
+
+
+def offset_intervals(calibration: Calibration, used: dict[str, Usage]) -> str:
+    """Each camera's offset with its 95 % interval, drawn around the estimate on one scale in milliseconds."""
+    names = list(calibration.cameras)
+    halves = {name: half_interval_ms(calibration.cameras[name]) for name in names}
+    finite = [half for half in halves.values() if np.isfinite(half)]
+    reach = 1.15 * max([*finite, 0.05])
+    left, right = 270.0, 210.0
+    inner, row = _WIDTH - left - right, 30.0
+    height = row * len(names) + 44
+
+    def x(ms: float) -> float:
+        return left + inner * (0.5 + 0.5 * ms / reach)
+
+    bottom = row * len(names) + 8
+    parts = []
+    values = ticks(-reach, reach, 8)
+    for value in values:
+        parts.append(line(x(value), 4, x(value), bottom, "zero" if abs(value) < 1e-12 else "grid"))
+        parts.append(text(x(value), bottom + 15, tick_text(value, values), "tick", "middle"))
+    parts.append(text(x(0), bottom + 31, "milliseconds around the estimate", "tick", "middle"))
+    for index, name in enumerate(names):
+        y = 8 + row * (index + 0.5)
+        camera, half = calibration.cameras[name], halves[name]
+        parts.append(text(0, y + 4, name, "rowname"))
+        parts.append(
+            text(left - 20, y + 4, f"{number(camera.time_map.time_offset, 6, sign=True)}{THIN}s", "figure", "end")
+        )
+        if name == calibration.reference:
+            parts.append(f'<path class="diamond" d="M{x(0) - 6:.1f} {y:.1f}l6 -6 6 6 -6 6z"/>')
+            parts.append(text(_WIDTH - right + 16, y + 4, "reference: exact", "tick"))
+            continue
+        if not np.isfinite(half):
+            parts.append(text(_WIDTH - right + 16, y + 4, "unknown", "tick"))
+            continue
+        parts.append(line(x(-half), y, x(half), y, "whisker"))
+        parts += [line(x(side), y - 6, x(side), y + 6, "whisker") for side in (-half, half)]
+        parts.append(f'<circle class="estimate" cx="{x(0):.1f}" cy="{y:.1f}" r="4.5"/>')
+        interval = 1e3 * used[name].interval
+        share = f" ({100 * half / interval:.1f}{THIN}% of a frame)" if interval > 0 else ""
+        parts.append(text(_WIDTH - right + 16, y + 4, f"±{THIN}{short(half, figures=2)}{THIN}ms{share}", "tick"))
+    return drawing(_WIDTH, height, parts, "Time offset of each camera with its 95 % interval")
+
+
+def residuals_over_time(calibration: Calibration) -> str:
+    """Median residual and the band of the middle 80 %, one strip a camera, on the reference clock."""
+    series: dict[str, tuple[Floats, Floats]] = {}
+    for name, camera in calibration.cameras.items():
+        rows = calibration.residuals.get(name)
+        if rows is not None and len(rows):
+            order = np.argsort(rows[:, 0], kind="stable")
+            clock = camera.time_map
+            time = clock.clock_rate * rows[order, 0] + clock.time_offset
+            series[name] = time, np.hypot(rows[order, 3], rows[order, 4])
+    if not series:
+        return ""
+    low = min(time[0] for time, _ in series.values())
+    high = max(max(time[-1] for time, _ in series.values()), low + 1e-3)
+    top = max(float(np.quantile(norms, 0.98)) for _, norms in series.values())
+    top = max(top, 1e-3) * 1.1
+    strip, gap = (72.0, 22.0) if len(series) <= 8 else (40.0, 12.0)
+    height = (strip + gap) * len(series) - gap + 52
+    inner = _WIDTH - _LEFT - _RIGHT
+    parts = time_axis(low, high, _LEFT, inner, 8, height - 38)
+    for index, (name, (time, norms)) in enumerate(series.items()):
+        base = (strip + gap) * index + strip + 8
+        values = ticks(0, top, 3 if strip > 60 else 1)
+        for value in values:
+            y = base - strip * value / top
+            parts.append(line(_LEFT, y, _WIDTH - _RIGHT, y, "grid"))
+            parts.append(text(_LEFT - 8, y + 4, tick_text(value, values), "tick", "end"))
+        parts.append(text(0, base - strip / 2 + 4, name, "rowname"))
+        parts += _band(time, norms, low, high, base, strip, top)
+    parts.append(text(_LEFT + inner / 2, height - 6, "seconds on the reference clock", "tick", "middle"))
+    return drawing(_WIDTH, height, parts, "Residual of each camera over time")
+
+
+def _band(time: Floats, norms: Floats, low: float, high: float, base: float, strip: float, top: float) -> list[str]:
+    """Band and median of one camera, broken where it saw nothing."""
+    cells = int(np.clip(len(time) / _ROWS_A_BIN, 20, _TIME_BINS))
+    width = (high - low) / cells
+    number_of = np.clip(((time - low) / width).astype(np.int64), 0, cells - 1)
+    bins, starts = np.unique(number_of, return_index=True)
+    levels = np.array([np.quantile(part, [0.1, 0.5, 0.9]) for part in np.split(norms, starts[1:])])
+    inner = _WIDTH - _LEFT - _RIGHT
+    x = _LEFT + inner * (bins + 0.5) / cells
+    y = base - strip * np.minimum(levels / top, 1.0)
+    out = []
+    for run in np.split(np.arange(len(bins)), np.flatnonzero(np.diff(bins) > 1 + 0.5 / width) + 1):
+        if len(run) == 1:
+            out.append(line(x[run[0]], y[run[0], 0], x[run[0]], y[run[0], 2], "bandline"))
+            out.append(line(x[run[0]] - 1, y[run[0], 1], x[run[0]] + 1, y[run[0], 1], "median"))
+            continue
+        around = points(np.r_[x[run], x[run][::-1]], np.r_[y[run, 0], y[run, 2][::-1]])
+        out.append(f'<polygon class="band" points="{around}"/>')
+        out.append(f'<polyline class="median" points="{points(x[run], y[run, 1])}"/>')
+    return out
+
+
+def time_line(calibration: Calibration, observations: Observations) -> str:
+    """Who saw the point when, when two cameras did, and where there is a path, on the reference clock."""
+    seen = measures.seen_on_reference(calibration, observations)
+    rows: list[tuple[str, list[Span], str]] = [(name, stretches, "bar") for name, stretches in seen.items()]
+    rows.append(("two or more", measures.shared_spans(list(seen.values())), "bar both"))
+    path = [table.time for table in calibration.trajectories if len(table.time)]
+    if path:
+        step = max(float(np.median(np.diff(time))) if len(time) > 1 else 0.1 for time in path)
+        rows.append(("3-D path", measures.spans(np.concatenate(path), max(0.1, 2.5 * step)), "bar path"))
+    return _bars(rows, "seconds on the reference clock", "Who saw the point when")
+
+
+def own_time_lines(rows: dict[str, Floats]) -> str:
+    """Who saw the point when, each camera on its own clock from its first row; rows: time, u, v of each."""
+    bars: list[tuple[str, list[Span], str]] = [
+        (name, measures.spans(seen[:, 0] - seen[:, 0].min()) if len(seen) else [], "bar") for name, seen in rows.items()
+    ]
+    return _bars(bars, "seconds since each camera’s own first row", "When each camera saw the point")
+
+
+def _bars(rows: list[tuple[str, list[Span], str]], axis: str, label: str) -> str:
+    every = [span for _, stretches, _ in rows for span in stretches]
+    if not every:
+        return ""
+    low = min(begin for begin, _ in every)
+    high = max(max(end for _, end in every), low + 1e-3)
+    row, inner = 26.0, _WIDTH - _LEFT - _RIGHT - 60
+    bottom = row * len(rows) + 4
+    height = bottom + 38
+    parts = time_axis(low, high, _LEFT, inner, 0, bottom)
+    for index, (name, stretches, kind) in enumerate(rows):
+        y = row * index + 5
+        parts.append(text(0, y + 13, name, "rowname"))
+        parts.append(line(_LEFT, y + 9, _LEFT + inner, y + 9, "grid"))
+        chosen = [stretches[i] for i in measures.thinned(len(stretches), _MOST_SPANS)]
+        for begin, end in chosen:
+            x = _LEFT + inner * (begin - low) / (high - low)
+            width = max(inner * (end - begin) / (high - low), 1.2)
+            parts.append(rect(x, y, width, 18, kind, f"{name}: {begin:.2f} s to {end:.2f} s"))
+        parts.append(text(_WIDTH - _RIGHT, y + 13, f"{short(measures.length(stretches))}{THIN}s", "tick", "end"))
+    parts.append(text(_LEFT + inner / 2, height - 6, axis, "tick", "middle"))
+    return drawing(_WIDTH, height, parts, label)

@@ -1,0 +1,118 @@
+"""Opens Zenoh sessions: every setting that the measurements asked for, and one-line errors."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import zenoh
+
+from protocols.bus.base import BusDead, BusStopped
+from protocols.bus.settings import BusConfig
+from protocols.errors import InputError
+
+MAX_MESSAGE_SIZE = 4 * 1024 * 1024
+LEASE_MS = 2000
+"""A frozen process counts as gone after this; a killed one at once."""
+_ATTEMPT_MS = 500
+_PAUSE_S = 0.1
+
+
+@contextmanager
+def zenoh_call(what: str) -> Iterator[None]:
+    """Turn Zenoh's failures into BusDead.
+
+    A panic in its Rust code arrives as PanicException, which is no Exception and whose class cannot be
+    imported; the session is of no use after it.
+    """
+    try:
+        yield
+    except zenoh.ZError as error:
+        raise BusDead(f"{what}: {one_line(error)}") from error
+    except BaseException as error:
+        if type(error).__name__ == "PanicException":
+            raise BusDead(f"{what}: the transport panicked: {one_line(error)}") from error
+        raise
+
+
+def one_line(error: BaseException) -> str:
+    """A Zenoh error without the places in its source code, at most 200 characters."""
+    text = re.sub(r"\s*at \S+\.rs:\d+\.?", "", str(error))
+    return " ".join(text.split())[:200]
+
+
+def release(*declared: Any) -> None:
+    """Undeclare what was declared; None, or what is gone already, is no error."""
+    for thing in declared:
+        if thing is not None:
+            with suppress(BusDead), zenoh_call("undeclare"):
+                thing.undeclare()
+
+
+def close_session(session: Any) -> None:
+    """Close a session; one that is closed or dead already is no error."""
+    with suppress(BusDead), zenoh_call("close"):
+        session.close()
+
+
+def open_session(
+    config: BusConfig, *, stop: Callable[[], bool] | None = None, timeout_s: float | None = None
+) -> zenoh.Session:
+    """Open one session.
+
+    A peer opens at once and keeps looking for the others; a client needs its router, so this waits for
+    it until ``stop()`` (raises BusStopped) or ``timeout_s`` (raises InputError). Raises InputError for
+    endpoints that cannot be used.
+    """
+    connect, listen = config.endpoints()
+    settings = _settings(config, connect, listen)
+    began = time.monotonic()
+    while True:
+        if stop is not None and stop():
+            raise BusStopped("stopped before the bus was open")
+        try:
+            with zenoh_call("open"):
+                return zenoh.open(settings)
+        except BusDead as error:
+            reason = str(error).removeprefix("open: ")
+            if config.mode != "client":
+                raise InputError(
+                    f"bus: {reason}", remedy=f"check connect = {list(connect)} and listen = {list(listen)}"
+                ) from None
+        if timeout_s is not None and time.monotonic() - began >= timeout_s:
+            raise InputError(
+                f"bus: no router answers at {', '.join(connect)} ({reason})",
+                remedy="start one there, or correct connect",
+            )
+        # Zenoh's own endless wait ignores signals: so short attempts, and the stop condition between.
+        time.sleep(_PAUSE_S)
+
+
+def _settings(config: BusConfig, connect: tuple[str, ...], listen: tuple[str, ...]) -> zenoh.Config:
+    client = config.mode == "client"
+    values: dict[str, Any] = {
+        "mode": config.mode,
+        "connect/endpoints": list(connect),
+        "connect/timeout_ms": _ATTEMPT_MS if client else -1,
+        "connect/exit_on_failure": client,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
+        "listen/endpoints": list(listen),
+        "scouting/multicast/enabled": config.multicast,
+        # How long opening waits for others to be found: of use only where they are searched for.
+        "scouting/delay": 500 if config.multicast else 0,
+        "timestamping/enabled": True,  # the advanced publisher needs it
+        "transport/shared_memory/enabled": False,
+        "transport/link/rx/max_message_size": MAX_MESSAGE_SIZE,
+        "transport/link/tx/lease": LEASE_MS,
+        # Else idle sockets lock out others for ten seconds.
+        "transport/unicast/accept_pending": 2000,
+        "transport/unicast/accept_timeout": 2000,
+    }
+    settings = zenoh.Config()
+    for key, value in values.items():
+        settings.insert_json5(key, json.dumps(value))
+    return settings

@@ -1,0 +1,73 @@
+"""How a process reaches the others: the ``[bus]`` table of every agent's configuration."""
+
+from __future__ import annotations
+
+import re
+from typing import Literal
+
+import msgspec
+
+from protocols.errors import InputError
+
+LOOPBACK_ROUTER = "tcp/127.0.0.1:7447"
+"""Where a router listens, and where others look for one, when nothing else is said."""
+LOOPBACK_ANY_PORT = "tcp/127.0.0.1:0"
+EVERY_INTERFACE = "tcp/[::]:0"
+
+_ENDPOINT = re.compile(r"tcp/(?P<host>\[[0-9a-fA-F:.%]+\]|[A-Za-z0-9._-]+):(?P<port>[0-9]{1,5})\Z")
+
+
+class BusConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Mode and endpoints of one Zenoh session.
+
+    mode: "peer" talks to others directly, "client" through a router only, "router" is one.
+    connect, listen: endpoints such as "tcp/192.168.1.5:7447". With neither, a peer or a client looks
+        for a router at LOOPBACK_ROUTER, and a router listens there.
+    multicast: find other peers on the local network by multicast; then a peer that names no listen
+        endpoint listens on every interface.
+    """
+
+    mode: Literal["peer", "client", "router"] = "peer"
+    connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = ()
+    multicast: bool = False
+
+    def endpoints(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """(connect, listen) with the defaults filled in; raises InputError for a bad combination."""
+        for endpoint in self.connect:
+            _check(endpoint, lowest_port=1)
+        for endpoint in self.listen:
+            _check(endpoint, lowest_port=0)
+        if self.mode == "client":
+            if self.listen:
+                raise InputError("bus: a client cannot listen", remedy='use mode = "peer", or remove listen')
+            return self.connect or (LOOPBACK_ROUTER,), ()
+        if self.mode == "router":
+            return self.connect, self.listen or (LOOPBACK_ROUTER,)
+        if self.listen:
+            return self.connect, self.listen
+        if self.multicast:
+            return self.connect, (EVERY_INTERFACE,)
+        connect = self.connect or (LOOPBACK_ROUTER,)
+        if not all(is_loopback(endpoint) for endpoint in connect):
+            # Zenoh 1.10 routers do not relay between two peers: without an address of its own this
+            # process would connect, look healthy and hear nothing.
+            raise InputError(
+                "bus: a peer that connects beyond this machine needs an address that others can reach",
+                remedy='set listen, e.g. ["tcp/192.168.1.20:7447"], or mode = "client"',
+            )
+        return connect, (LOOPBACK_ANY_PORT,)
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Whether an endpoint stays on this machine."""
+    found = _ENDPOINT.match(endpoint)
+    host = found["host"] if found else ""
+    return host in ("localhost", "[::1]") or host.startswith("127.")
+
+
+def _check(endpoint: str, *, lowest_port: int) -> None:
+    """Refuse what Zenoh would accept and then retry in silence for ever."""
+    found = _ENDPOINT.match(endpoint)
+    if not found or not lowest_port <= int(found["port"]) <= 65_535:
+        raise InputError(f"bus: {endpoint!r} is not an endpoint", remedy='write it like "tcp/127.0.0.1:7447"')

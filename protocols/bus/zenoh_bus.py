@@ -1,0 +1,261 @@
+"""The bus over Zenoh. See ``protocols.bus.base`` for the contract and the README for the reasons."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Any, Self, TypeAlias
+
+import zenoh
+import zenoh.ext
+import zenoh.handlers
+from google.protobuf.message import Message
+
+from protocols.bus.backfill import Backfill
+from protocols.bus.base import AgentEvent, BusDead, Received
+from protocols.bus.delivery import cache_size
+from protocols.bus.inbox import Inbox, Roll, subscription_key
+from protocols.bus.session import close_session, open_session, release, zenoh_call
+from protocols.bus.settings import BusConfig
+from protocols.catalogue import Delivery, Topic, liveliness_key, valid_id
+from protocols.gate import encode
+
+HEARTBEAT_S = 0.5
+"""How soon a subscriber learns that the last message before a silence is missing."""
+_POLL_S = 0.005
+_FETCH_S = 2.0
+
+_Source: TypeAlias = tuple[str, int]
+"""A publisher as Zenoh names it: session and entity."""
+
+
+class ZenohPublisher:
+    """See ``protocols.bus.base.Publisher``."""
+
+    def __init__(self, session: zenoh.Session, topic: Topic, key: str, rate_hz: float | None, block: bool) -> None:
+        self._message = topic.message
+        self._session = session
+        self._key = key
+        self._matcher: Any = None  # its stub has the type of matching_status wrong
+        reliable = topic.delivery is Delivery.RELIABLE
+        congestion = zenoh.CongestionControl.BLOCK if block else zenoh.CongestionControl.DROP
+        with zenoh_call(f"declare {key}"):
+            self._publisher = zenoh.ext.declare_advanced_publisher(
+                session,
+                key,
+                encoding=zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(f"syncline.v1.{topic.message}"),
+                congestion_control=congestion,
+                cache=zenoh.ext.CacheConfig(max_samples=cache_size(topic, rate_hz)),
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None)
+                if reliable
+                else None,
+                publisher_detection=True,
+            )
+
+    def put(self, message: Message) -> None:
+        """Publish one message."""
+        if message.DESCRIPTOR.name != self._message:
+            raise TypeError(f"{message.DESCRIPTOR.name} on a topic of {self._message}")
+        payload = encode(message)
+        with zenoh_call(f"put {self._key}"):
+            self._publisher.put(payload)
+
+    def wait_matched(self, timeout_s: float) -> bool:
+        """Poll for a matching subscriber."""
+        deadline = time.monotonic() + timeout_s
+        with zenoh_call(f"match {self._key}"):
+            if self._matcher is None:
+                # An advanced publisher cannot tell; a plain one beside it can.
+                self._matcher = self._session.declare_publisher(self._key)
+            while not self._matcher.matching_status.matching:
+                if time.monotonic() >= deadline:
+                    return False
+                time.sleep(_POLL_S)
+        return True
+
+    def close(self) -> None:
+        """Undeclare; closing twice, or after the session, is no error."""
+        release(self._matcher, self._publisher)
+
+
+class ZenohSubscription:
+    """See ``protocols.bus.base.Subscription``."""
+
+    def __init__(self, session: zenoh.Session, topic: Topic, key: str, clock_ns: Callable[[], int]) -> None:
+        self._session = session
+        self._inbox = Inbox(topic, clock_ns)
+        self._reliable = topic.delivery is Delivery.RELIABLE
+        self._backfill: Backfill[_Source] = Backfill(self._inbox.push, self._fetch)
+        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+        with zenoh_call(f"subscribe {key}"):
+            self._subscriber: zenoh.ext.AdvancedSubscriber[None] = zenoh.ext.declare_advanced_subscriber(
+                session,
+                key,
+                self._take,
+                # No max_samples: it would also cap what is recovered after an outage.
+                history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
+                recovery=recovery if self._reliable else None,
+            )
+            self._misses: zenoh.ext.SampleMissListener[None] | None = (
+                self._subscriber.sample_miss_listener(self._miss) if self._reliable else None
+            )
+
+    # All callbacks run on threads of Zenoh's: an exception there is printed and swallowed, and a slow
+    # one starves the whole session. So they only enqueue.
+    def _take(self, sample: zenoh.Sample) -> None:
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        source = sample.source_info
+        if source is None or not self._reliable:
+            self._inbox.push(str(sample.key_expr), sample.payload.to_bytes())
+        else:
+            name = (str(source.source_id.zid), source.source_id.eid)
+            self._backfill.take(name, source.source_sn, str(sample.key_expr), sample.payload.to_bytes())
+
+    def _miss(self, miss: zenoh.ext.Miss) -> None:
+        self._inbox.lose(miss.nb)
+
+    def _fetch(self, key: str, source: _Source, first: int) -> None:
+        """Ask one publisher's cache for what came before message ``first``."""
+
+        def answer(reply: zenoh.Reply) -> None:
+            sample = reply.ok
+            if sample is not None and sample.source_info is not None:
+                number = sample.source_info.source_sn
+                self._backfill.answer(source, number, str(sample.key_expr), sample.payload.to_bytes())
+
+        try:
+            with zenoh_call(f"fetch {key}"):
+                self._session.get(
+                    f"{key}/@adv/pub/{source[0]}/{source[1]}/**?_sn=..{first - 1}",
+                    zenoh.handlers.Callback(answer, drop=lambda: self._backfill.finish(source)),
+                    consolidation=zenoh.ConsolidationMode.NONE,
+                    accept_replies=zenoh.ReplyKeyExpr.ANY,
+                    timeout=_FETCH_S,
+                )
+        except BusDead:
+            self._backfill.finish(source)
+
+    def drain(self) -> list[Received]:
+        """Everything since the last call."""
+        self._backfill.release_overdue()
+        return self._inbox.drain()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for something to drain."""
+        return self._inbox.wait(timeout_s)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """See the contract."""
+        return self._inbox.counters
+
+    def close(self) -> None:
+        """Undeclare: a process with an open callback never exits."""
+        release(self._misses, self._subscriber)
+
+
+class ZenohWatch:
+    """See ``protocols.bus.base.AgentWatch``."""
+
+    def __init__(self, session: zenoh.Session, site: str) -> None:
+        self._roll = Roll()
+        key = f"syncline/{site}/alive/**"
+        with zenoh_call(f"watch {key}"):
+            self._subscriber: zenoh.Subscriber[None] = session.liveliness().declare_subscriber(
+                key, self._take, history=True
+            )
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        self._roll.mark(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+    def drain(self) -> list[AgentEvent]:
+        """Changes since the last call."""
+        return self._roll.drain()
+
+    def close(self) -> None:
+        """Undeclare."""
+        release(self._subscriber)
+
+
+class ZenohBus:
+    """See ``protocols.bus.base.Bus``. Made by ``open_bus``."""
+
+    def __init__(self, session: zenoh.Session, site: str, clock_ns: Callable[[], int]) -> None:
+        self._session = session
+        self._site = valid_id(site, "site")
+        self._clock_ns = clock_ns
+        self._declared: list[ZenohPublisher | ZenohSubscription | ZenohWatch] = []
+
+    @property
+    def site(self) -> str:
+        """The site whose keys this bus uses."""
+        return self._site
+
+    def publisher(
+        self, topic: Topic, agent: str, *, rate_hz: float | None = None, block: bool = False
+    ) -> ZenohPublisher:
+        """Declare a publisher; see the contract."""
+        key = topic.key_for(self._site, agent)
+        publisher = ZenohPublisher(self._session, topic, key, rate_hz, block)
+        self._declared.append(publisher)
+        return publisher
+
+    def subscribe(self, topic: Topic, agent: str = "*") -> ZenohSubscription:
+        """Subscribe to one agent or to all."""
+        key = subscription_key(topic, self._site, agent)
+        subscription = ZenohSubscription(self._session, topic, key, self._clock_ns)
+        self._declared.append(subscription)
+        return subscription
+
+    @contextmanager
+    def announce(self, role: str, agent: str, boot_id: str) -> Iterator[None]:
+        """Hold a liveliness token while the context is open."""
+        key = liveliness_key(self._site, role, agent, boot_id)
+        with zenoh_call(f"announce {key}"):
+            token = self._session.liveliness().declare_token(key)
+        try:
+            yield
+        finally:
+            release(token)
+
+    def watch_agents(self) -> ZenohWatch:
+        """Watch all agents of the site come and go."""
+        watch = ZenohWatch(self._session, self._site)
+        self._declared.append(watch)
+        return watch
+
+    def close(self) -> None:
+        """Undeclare everything and close the session."""
+        while self._declared:
+            self._declared.pop().close()
+        close_session(self._session)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def open_bus(
+    site: str,
+    config: BusConfig | None = None,
+    *,
+    stop: Callable[[], bool] | None = None,
+    timeout_s: float | None = None,
+    clock_ns: Callable[[], int] = time.time_ns,
+) -> ZenohBus:
+    """Connect to the others of ``site``.
+
+    stop: asked while a client waits for its router; True raises BusStopped.
+    timeout_s: how long a client waits for its router before InputError; None waits for ever.
+    clock_ns: stamps arrivals (Unix, ns).
+    Raises InputError, in one line, for a site or an endpoint that cannot be used.
+    """
+    valid_id(site, "site")
+    return ZenohBus(open_session(config or BusConfig(), stop=stop, timeout_s=timeout_s), site, clock_ns)

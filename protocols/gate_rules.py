@@ -1,0 +1,275 @@
+"""What a well-formed message of each kind looks like: ranges, counts, lengths, ids.
+
+One function a message. Each raises Rejected at the first thing that is wrong, so that no estimator
+ever sees a number that is not finite or an array of the wrong length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from enum import Enum
+from math import inf, isfinite
+from typing import Any
+
+from protocols.catalogue import valid_id
+from protocols.errors import InputError
+from protocols.messages import syncline_pb2 as pb
+
+SCHEMA_VERSION = 1
+
+MAX_DETECTIONS = 4096
+MAX_CAMERAS = 1024
+MAX_NUMBERS = 256
+MAX_PIXEL = 1e6
+"""A detection may lie outside the image (a predicted one does), but not a million pixels away."""
+MAX_IMAGE_SIDE = 65_535
+MAX_FPS = 100_000.0
+MAX_LABEL = 64
+MAX_TEXT = 4096
+
+
+class Reason(Enum):
+    """Why a message was not let in; the value is the counter's name after ``rejected.``."""
+
+    OVERSIZED = "oversized"
+    GARBLED = "garbled"
+    SCHEMA_VERSION = "schema_version"
+    NOT_FINITE = "not_finite"
+    OUT_OF_RANGE = "out_of_range"
+    BAD_LENGTH = "bad_length"
+    TOO_MANY = "too_many"
+    BAD_ID = "bad_id"
+    BAD_TEXT = "bad_text"
+    WRONG_SENDER = "wrong_sender"
+    UNKNOWN_KEY = "unknown_key"
+
+
+class Rejected(Exception):
+    """A message that must not be used. The caller counts ``reason``; ``detail`` is for a person."""
+
+    def __init__(self, reason: Reason, detail: str) -> None:
+        self.reason = reason
+        self.detail = detail
+        super().__init__(f"{reason.value}: {detail}")
+
+
+def check(message: Any) -> None:
+    """Raise Rejected unless every field of a catalogue message is usable."""
+    if message.schema_version != SCHEMA_VERSION:
+        raise Rejected(
+            Reason.SCHEMA_VERSION,
+            f"schema version {message.schema_version}, this build reads {SCHEMA_VERSION}",
+        )
+    _RULES[message.DESCRIPTOR.name](message)
+
+
+def _number(value: float, name: str, low: float = -inf, high: float = inf) -> None:
+    if not isfinite(value):
+        raise Rejected(Reason.NOT_FINITE, f"{name} is {value}")
+    if not low <= value <= high:
+        raise Rejected(Reason.OUT_OF_RANGE, f"{name} is {value}")
+
+
+def _positive(value: float, name: str, high: float = inf) -> None:
+    _number(value, name, 0.0, high)
+    if value == 0.0:
+        raise Rejected(Reason.OUT_OF_RANGE, f"{name} is 0")
+
+
+def _vector(values: Sequence[float], name: str, lengths: tuple[int, ...], low: float = -inf) -> None:
+    if len(values) not in lengths:
+        raise Rejected(Reason.BAD_LENGTH, f"{name} has {len(values)} numbers")
+    for value in values:
+        _number(value, name, low)
+
+
+def _count(things: Sequence[object], name: str, most: int) -> None:
+    if len(things) > most:
+        raise Rejected(Reason.TOO_MANY, f"{len(things)} {name}, at most {most}")
+
+
+def _id(text: str, name: str, *, optional: bool = False) -> None:
+    if optional and not text:
+        return
+    try:
+        valid_id(text, name)
+    except InputError as error:
+        raise Rejected(Reason.BAD_ID, error.what) from None
+
+
+def _text(text: str, name: str, most: int = MAX_TEXT) -> None:
+    # Labels end in CSV files and terminals, so control characters stay outside.
+    if len(text) > most or not _printable(text):
+        raise Rejected(Reason.BAD_TEXT, f"{name} is longer than {most} or has control characters")
+
+
+def _printable(text: str) -> bool:
+    return text.isprintable() or all(letter >= " " and not "\x7f" <= letter <= "\x9f" for letter in text)
+
+
+def _one_of(text: str, name: str, allowed: frozenset[str]) -> None:
+    if text not in allowed:
+        raise Rejected(Reason.BAD_TEXT, f"{name} is {text[:40]!r}")
+
+
+def _distinct(names: Iterable[str], what: str) -> None:
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise Rejected(Reason.BAD_ID, f"{what} {name!r} twice")
+        seen.add(name)
+
+
+def _covariance_2d(covariance: Sequence[float], name: str) -> None:
+    _vector(covariance, name, (0, 3))
+    if covariance:
+        uu, uv, vv = covariance
+        # The slack lets a rank-one covariance pass after rounding.
+        if uu < 0.0 or vv < 0.0 or uv * uv > uu * vv * (1.0 + 1e-9) + 1e-12:
+            raise Rejected(Reason.OUT_OF_RANGE, f"{name} is not a covariance")
+
+
+def _intrinsics(message: Any) -> None:
+    _vector(message.matrix, "matrix", (0, 9))
+    if message.matrix and not (message.matrix[0] > 0.0 and message.matrix[4] > 0.0):
+        raise Rejected(Reason.OUT_OF_RANGE, "a focal length is not positive")
+    _vector(message.distortions, "distortions", (0, 4) if message.fisheye else (0, 4, 5))
+
+
+def _detection(detection: pb.Detection) -> None:
+    _number(detection.u, "u", -MAX_PIXEL, MAX_PIXEL)
+    _number(detection.v, "v", -MAX_PIXEL, MAX_PIXEL)
+    _number(detection.size, "size", 0.0, MAX_PIXEL)
+    _number(detection.score, "score", 0.0, 1.0)
+    if detection.label:
+        _text(detection.label, "label", MAX_LABEL)
+    if detection.HasField("colour"):
+        colour = detection.colour
+        if max(colour.red, colour.green, colour.blue) > 255:
+            raise Rejected(Reason.OUT_OF_RANGE, "a colour is above 255")
+    if detection.covariance:
+        _covariance_2d(detection.covariance, "covariance")
+
+
+def _observation(message: pb.Observation) -> None:
+    _id(message.camera, "camera")
+    _id(message.boot_id, "boot id")
+    if message.exposure_ns < 0:
+        raise Rejected(Reason.OUT_OF_RANGE, "exposure is negative")
+    _count(message.detections, "detections", MAX_DETECTIONS)
+    for detection in message.detections:
+        _detection(detection)
+
+
+def _camera_info(message: pb.CameraInfo) -> None:
+    _id(message.camera, "camera")
+    _id(message.boot_id, "boot id")
+    _number(message.width, "width", 1, MAX_IMAGE_SIDE)
+    _number(message.height, "height", 1, MAX_IMAGE_SIDE)
+    _number(message.fps, "fps", 0.0, MAX_FPS)  # 0: the device does not say
+    _intrinsics(message)
+    _text(message.driver, "driver", MAX_LABEL)
+    _text(message.clock, "clock", MAX_LABEL)
+    _vector(message.position, "position", (0, 3))
+    _vector(message.rotation, "rotation", (0, 3))
+    _vector(message.position_std, "position_std", (0, 3), low=0.0)
+    _vector(message.rotation_std, "rotation_std", (0, 3), low=0.0)
+    _number(message.readout_s, "readout_s", 0.0, 10.0)
+
+
+_UNITS = frozenset({"m", "cm", "mm"})
+_CLOCKS = frozenset({"independent", "shared"})
+
+
+def _rig_info(message: pb.RigInfo) -> None:
+    _one_of(message.units, "units", _UNITS)
+    _one_of(message.clock, "clock", _CLOCKS)
+    _count(message.distances, "distances", MAX_CAMERAS)
+    for distance in message.distances:
+        _id(distance.camera_a, "camera")
+        _id(distance.camera_b, "camera")
+        _distinct((distance.camera_a, distance.camera_b), "distance names")
+        _positive(distance.distance, "distance")
+    _vector(message.up, "up", (0, 3))
+    if message.up and not any(message.up):
+        raise Rejected(Reason.OUT_OF_RANGE, "up has no direction")
+    _id(message.up_camera, "up camera", optional=True)
+    _id(message.reference_camera, "reference camera", optional=True)
+
+
+def _camera_calibration(camera: pb.CameraCalibration) -> None:
+    _id(camera.camera, "camera")
+    _vector(camera.rotation, "rotation", (3,))
+    _vector(camera.translation, "translation", (3,))
+    _number(camera.time_offset, "time_offset")
+    _positive(camera.clock_rate, "clock_rate")
+    _number(camera.time_offset_std, "time_offset_std", 0.0)
+    _vector(camera.position_std, "position_std", (0, 3), low=0.0)
+    _number(camera.rms_px, "rms_px", 0.0)
+    _intrinsics(camera)
+    _id(camera.boot_id, "boot id", optional=True)
+
+
+_STATUS = frozenset({"solved", "refused", "collecting"})
+_SCALES = frozenset({"metric", "arbitrary"})
+
+
+def _calibration(message: pb.Calibration) -> None:
+    _one_of(message.status, "status", _STATUS)
+    _text(message.reason, "reason")
+    solved = message.status == "solved"
+    if solved or message.scale:
+        _one_of(message.scale, "scale", _SCALES)
+    if solved or message.units:
+        _one_of(message.units, "units", _UNITS)
+    _id(message.reference_camera, "reference camera", optional=not solved)
+    _text(message.solver, "solver", MAX_LABEL)
+    _count(message.cameras, "cameras", MAX_CAMERAS)
+    _count(message.refused, "refused cameras", MAX_CAMERAS)
+    for camera in message.cameras:
+        _camera_calibration(camera)
+    for refusal in message.refused:
+        _id(refusal.camera, "camera")
+        _text(refusal.reason, "reason")
+    _distinct([c.camera for c in message.cameras] + [r.camera for r in message.refused], "camera")
+
+
+_TRACK_STATES = frozenset({"tentative", "confirmed", "coasting", "lost"})
+
+
+def _track(message: pb.Track) -> None:
+    _text(message.label, "label", MAX_LABEL)
+    _one_of(message.state, "state", _TRACK_STATES)
+    _vector(message.position, "position", (3,))
+    _vector(message.velocity, "velocity", (0, 3))
+    _vector(message.position_covariance, "position_covariance", (0, 9))
+    if message.position_covariance and min(message.position_covariance[::4]) < 0.0:
+        raise Rejected(Reason.OUT_OF_RANGE, "a variance is negative")
+
+
+_AGENT_STATES = frozenset({"starting", "running", "degraded", "stopping"})
+
+
+def _agent_status(message: pb.AgentStatus) -> None:
+    _id(message.agent, "agent")
+    _id(message.role, "role")
+    _id(message.boot_id, "boot id")
+    _one_of(message.state, "state", _AGENT_STATES)
+    _text(message.message, "message")
+    _text(message.version, "version", MAX_LABEL)
+    for numbers in (message.counters, message.gauges):
+        if len(numbers) > MAX_NUMBERS:
+            raise Rejected(Reason.TOO_MANY, f"{len(numbers)} numbers, at most {MAX_NUMBERS}")
+        for name, value in numbers.items():
+            _text(name, "a number's name", MAX_LABEL)
+            _number(value, "a counter or gauge")
+
+
+_RULES: dict[str, Callable[[Any], None]] = {
+    "Observation": _observation,
+    "CameraInfo": _camera_info,
+    "RigInfo": _rig_info,
+    "Calibration": _calibration,
+    "Track": _track,
+    "AgentStatus": _agent_status,
+}

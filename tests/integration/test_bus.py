@@ -1,0 +1,434 @@
+"""Both buses keep the same promises: the one in memory, and Zenoh over real sockets on loopback."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+
+import pytest
+
+from protocols.bus.base import AgentEvent, Bus, BusDead, BusStopped, Publisher, Received, Subscription
+from protocols.bus.delivery import cache_size
+from protocols.bus.memory import MemoryBus, MemoryHub
+from protocols.bus.router import Router, free_endpoint
+from protocols.bus.settings import BusConfig
+from protocols.bus.zenoh_bus import open_bus
+from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, RIG_INFO, STATUS, Topic
+from protocols.errors import InputError
+from protocols.gate import Rejected
+from tests.samples import calibration, camera_info, eventually, observation, rig_info
+
+Connect = Callable[..., Bus]
+
+
+@pytest.fixture(params=["memory", "zenoh client", "zenoh peer"])
+def connect(request: pytest.FixtureRequest) -> Iterator[Connect]:
+    """Makes connections to one network; each stands for a process. All are closed at the end."""
+    with ExitStack() as stack:
+        if request.param == "memory":
+            hub = MemoryHub()
+
+            def make(site: str = "local") -> Bus:
+                return stack.enter_context(MemoryBus(hub, site))
+
+        else:
+            endpoint = free_endpoint()
+            stack.enter_context(Router(endpoint))
+            mode = "client" if request.param == "zenoh client" else "peer"
+
+            def make(site: str = "local") -> Bus:
+                config = BusConfig(mode=mode, connect=(endpoint,))  # type: ignore[arg-type]
+                return stack.enter_context(open_bus(site, config, timeout_s=10.0))
+
+        yield make
+
+
+def collect(subscription: Subscription, count: int, timeout_s: float = 10.0) -> list[Received]:
+    """Drain until ``count`` messages are there or the time is up."""
+    received: list[Received] = []
+
+    def enough() -> bool:
+        received.extend(subscription.drain())
+        return len(received) >= count
+
+    eventually(enough, timeout_s)
+    return received
+
+
+def sequences(received: list[Received]) -> list[int]:
+    return [item.message.sequence for item in received]  # type: ignore[attr-defined]
+
+
+def matched(publisher: Publisher) -> Publisher:
+    assert publisher.wait_matched(10.0), "nobody subscribed"
+    return publisher
+
+
+def test_messages_arrive_equal_and_in_order(connect: Connect) -> None:
+    sending, receiving = connect(), connect()
+    subscription = receiving.subscribe(OBSERVATION)
+    publishers = {camera: matched(sending.publisher(OBSERVATION, camera)) for camera in ("cam0", "cam1")}
+    for index in range(300):
+        for camera, publisher in publishers.items():
+            publisher.put(observation(camera, index))
+    received = collect(subscription, 600)
+    for camera in publishers:
+        own = [item for item in received if item.agent == camera]
+        assert [item.message for item in own] == [observation(camera, index) for index in range(300)]
+    assert {item.topic for item in received} == {OBSERVATION}
+    arrivals = [item.arrival_ns for item in received]
+    assert arrivals == sorted(arrivals)
+    assert subscription.counters == {"received": 600, "dropped": 0, "lost": 0}
+
+
+def test_who_comes_late_to_a_reliable_topic_gets_its_history_in_order(connect: Connect) -> None:
+    publisher = connect().publisher(OBSERVATION, "cam0")
+    for index in range(200):
+        publisher.put(observation("cam0", index))
+    late = connect().subscribe(OBSERVATION)
+    collected = collect(late, 200)
+    assert sequences(collected) == list(range(200))
+    for index in range(200, 210):
+        publisher.put(observation("cam0", index))
+    assert sequences(collect(late, 10)) == list(range(200, 210))
+    assert late.counters["lost"] == 0
+
+
+def test_history_reaches_back_as_far_as_the_cache(connect: Connect) -> None:
+    """A minute and a half of one camera is kept; older messages are gone, in silence and by design."""
+    assert cache_size(OBSERVATION) == 2700
+    assert cache_size(OBSERVATION, rate_hz=120.0) == 10_800
+    publisher = connect().publisher(OBSERVATION, "cam0")
+    for index in range(3000):
+        publisher.put(observation("cam0", index, points=0))
+    received = sequences(collect(connect().subscribe(OBSERVATION), 2700))
+    assert received == list(range(300, 3000))
+
+
+def test_who_comes_late_to_a_latest_topic_gets_only_the_last(connect: Connect) -> None:
+    publisher = connect().publisher(CALIBRATION, "hub")
+    for revision in range(1, 6):
+        publisher.put(calibration(revision))
+    late = connect().subscribe(CALIBRATION)
+    assert [item.message for item in collect(late, 1)] == [calibration(5)]
+    publisher.put(calibration(6))
+    assert [item.message for item in collect(late, 1)] == [calibration(6)]
+
+
+def test_a_publisher_that_comes_late_is_found(connect: Connect) -> None:
+    subscription = connect().subscribe(CAMERA_INFO)
+    for camera in ("cam0", "cam1"):
+        connect().publisher(CAMERA_INFO, camera).put(camera_info(camera))
+    assert {item.agent for item in collect(subscription, 2)} == {"cam0", "cam1"}
+
+
+def test_a_camera_that_starts_again_is_heard_again(connect: Connect) -> None:
+    subscription = connect().subscribe(OBSERVATION)
+    for boot in ("boot-1", "boot-2"):
+        with connect() as bus:
+            publisher = matched(bus.publisher(OBSERVATION, "cam0"))
+            for index in range(5):
+                publisher.put(observation("cam0", index, boot))
+            received = collect(subscription, 5)
+            assert [item.message for item in received] == [observation("cam0", i, boot) for i in range(5)]
+
+
+def test_a_subscription_to_one_agent_hears_no_other(connect: Connect) -> None:
+    sending, receiving = connect(), connect()
+    one, everyone = receiving.subscribe(OBSERVATION, "cam1"), receiving.subscribe(OBSERVATION)
+    for camera in ("cam0", "cam1"):
+        sending.publisher(OBSERVATION, camera).put(observation(camera))
+    assert len(collect(everyone, 2)) == 2
+    assert [item.agent for item in collect(one, 1)] == ["cam1"]
+    assert one.drain() == []
+
+
+def test_sites_do_not_hear_each_other(connect: Connect) -> None:
+    here, there = connect("yard"), connect("hall")
+    subscription = here.subscribe(OBSERVATION)
+    watch = here.watch_agents()
+    with there.announce("camera", "cam9", "boot-1"), here.announce("camera", "cam0", "boot-1"):
+        there.publisher(OBSERVATION, "cam0").put(observation("cam0", 1))
+        here.publisher(OBSERVATION, "cam0").put(observation("cam0", 2))
+        assert sequences(collect(subscription, 1)) == [2]
+        events: list[AgentEvent] = []
+        assert eventually(lambda: bool(events.extend(watch.drain()) or events))
+        assert [event.agent for event in events] == ["cam0"]
+
+
+def test_nobody_subscribes_is_told(connect: Connect) -> None:
+    sending, receiving = connect(), connect()
+    publisher = sending.publisher(OBSERVATION, "cam0")
+    began = time.monotonic()
+    assert not publisher.wait_matched(0.2)
+    assert time.monotonic() - began >= 0.2
+    receiving.subscribe(OBSERVATION)
+    assert publisher.wait_matched(10.0)
+
+
+def test_waiting_ends_with_a_message_or_with_the_time(connect: Connect) -> None:
+    subscription = connect().subscribe(OBSERVATION)
+    assert not subscription.wait(0.05)
+    connect().publisher(OBSERVATION, "cam0").put(observation("cam0"))
+    assert subscription.wait(10.0)
+    assert len(subscription.drain()) == 1
+    assert not subscription.wait(0.0)
+
+
+def test_a_message_in_anothers_name_and_a_bad_one_are_counted_not_delivered(connect: Connect) -> None:
+    subscription = connect().subscribe(OBSERVATION)
+    publisher = matched(connect().publisher(OBSERVATION, "cam0"))
+    broken = observation("cam0", 1)
+    broken.detections[0].size = -1.0
+    for message in (observation("cam1", 0), broken, observation("cam0", 2)):
+        publisher.put(message)
+    assert sequences(collect(subscription, 1)) == [2]
+    assert subscription.counters == {
+        "received": 1,
+        "dropped": 0,
+        "lost": 0,
+        "rejected.wrong_sender": 1,
+        "rejected.out_of_range": 1,
+    }
+
+
+def test_a_full_queue_drops_the_oldest_and_counts(connect: Connect) -> None:
+    subscription = connect().subscribe(RIG_INFO)
+    publisher = matched(connect().publisher(RIG_INFO, "hub"))
+    for index in range(RIG_INFO.queue + 14):
+        publisher.put(rig_info(distance=index + 1.0))
+    assert eventually(lambda: subscription.counters["dropped"] == 14)
+    received = [item.message for item in subscription.drain()]
+    assert received == [rig_info(distance=index + 1.0) for index in range(14, RIG_INFO.queue + 14)]
+
+
+def test_a_message_that_may_not_be_sent_is_refused_at_the_sender(connect: Connect) -> None:
+    publisher = connect().publisher(OBSERVATION, "cam0")
+    with pytest.raises(TypeError, match="CameraInfo on a topic of Observation"):
+        publisher.put(camera_info())
+    with pytest.raises(Rejected, match="oversized"):
+        publisher.put(observation(points=20_000))
+
+
+@pytest.mark.parametrize("bad", ["Cam0", "cam/0", "cam?", "**", ""])
+def test_an_id_that_could_poison_a_router_never_reaches_it(connect: Connect, bad: str) -> None:
+    bus = connect()
+    for declare in (
+        lambda: bus.publisher(OBSERVATION, bad),
+        lambda: bus.subscribe(OBSERVATION, bad),
+        lambda: bus.announce("camera", bad, "boot-1").__enter__(),
+        lambda: bus.announce("camera", "cam0", bad).__enter__(),
+        lambda: connect(bad),
+    ):
+        with pytest.raises(InputError, match="is not usable"):
+            declare()
+
+
+def test_agents_are_seen_coming_and_going_boot_by_boot(connect: Connect) -> None:
+    first, second, watching = connect(), connect(), connect()
+    events: list[AgentEvent] = []
+
+    def seen(*expected: AgentEvent) -> bool:
+        return eventually(lambda: bool(events.extend(watch.drain()) or events == list(expected)))
+
+    def camera(boot: str, alive: bool) -> AgentEvent:
+        return AgentEvent("camera", "cam0", boot, alive)
+
+    with first.announce("camera", "cam0", "boot-1"):
+        watch = watching.watch_agents()
+        assert seen(camera("boot-1", True)), "who was there before is told of"
+        with second.announce("camera", "cam0", "boot-2"):
+            assert seen(camera("boot-1", True), camera("boot-2", True)), "two boots of one id are two agents"
+        assert seen(camera("boot-1", True), camera("boot-2", True), camera("boot-2", False))
+    assert eventually(lambda: bool(events.extend(watch.drain()) or events[-1] == camera("boot-1", False)))
+    assert len(events) == 4
+
+
+def test_closing_a_bus_takes_its_agents_and_publishers_with_it(connect: Connect) -> None:
+    going, staying = connect(), connect()
+    watch = staying.watch_agents()
+    alive = going.announce("camera", "cam0", "boot-1")
+    alive.__enter__()
+    going.publisher(CALIBRATION, "hub").put(calibration())
+    events: list[AgentEvent] = []
+    assert eventually(lambda: bool(events.extend(watch.drain()) or len(events) == 1))
+    going.close()
+    going.close()
+    assert eventually(lambda: bool(events.extend(watch.drain()) or len(events) == 2))
+    assert [event.alive for event in events] == [True, False]
+    with pytest.raises(BusDead):
+        going.publisher(OBSERVATION, "cam0")
+    assert not staying.subscribe(CALIBRATION).wait(0.2)
+
+
+def test_a_closed_subscription_receives_nothing_more(connect: Connect) -> None:
+    subscription = connect().subscribe(OBSERVATION)
+    publisher = matched(connect().publisher(OBSERVATION, "cam0"))
+    publisher.put(observation("cam0", 0))
+    assert subscription.wait(10.0)
+    subscription.close()
+    subscription.close()
+    publisher.put(observation("cam0", 1))
+    assert sequences(collect(subscription, 2, timeout_s=0.2)) == [0]
+
+
+def test_what_cannot_be_recovered_is_counted_exactly() -> None:
+    """A flood far beyond the cache: every message is received, dropped by the queue, or counted as lost."""
+    endpoint, total = free_endpoint(), 20_000
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(OBSERVATION)
+        publisher = matched(sending.publisher(OBSERVATION, "cam0"))
+        for index in range(total):
+            publisher.put(observation("cam0", index))
+        received: list[Received] = []
+
+        def accounted() -> bool:
+            received.extend(subscription.drain())
+            counters = subscription.counters
+            return len(received) + counters["lost"] + counters["dropped"] == total
+
+        assert eventually(accounted), (len(received), subscription.counters)
+        assert sequences(received) == sorted(set(sequences(received)))
+        assert sequences(received)[-1] == total - 1
+
+
+def test_an_outage_of_the_router_loses_nothing() -> None:
+    """Observations put while the router is down arrive after it is back, in order."""
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    router = Router(endpoint)
+    with open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(OBSERVATION)
+        publisher = matched(sending.publisher(OBSERVATION, "cam0"))
+        for index in range(20):
+            publisher.put(observation("cam0", index))
+        received = collect(subscription, 20)
+        router.close()
+        assert eventually(lambda: not publisher.wait_matched(0.0))
+        for index in range(20, 60):
+            publisher.put(observation("cam0", index))
+        with Router(endpoint):
+            assert matched(publisher)
+            publisher.put(observation("cam0", 60))
+            received += collect(subscription, 41, timeout_s=15.0)
+            assert sequences(received) == list(range(61))
+            assert subscription.counters["lost"] == 0
+
+
+AGENT = """
+import sys, time
+from protocols.bus.settings import BusConfig
+from protocols.bus.zenoh_bus import open_bus
+with open_bus("local", BusConfig(mode="client", connect=(sys.argv[1],)), timeout_s=10.0) as bus:
+    with bus.announce("camera", "cam0", "boot-1"):
+        print("ready", flush=True)
+        sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("end", ["kill -9", "in order"])
+def test_an_agents_end_is_seen_at_once(end: str) -> None:
+    endpoint = free_endpoint()
+    with Router(endpoint), open_bus("local", BusConfig(mode="client", connect=(endpoint,))) as bus:
+        watch = bus.watch_agents()
+        events: list[AgentEvent] = []
+        agent = subprocess.Popen(
+            [sys.executable, "-c", AGENT, endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        try:
+            assert agent.stdout is not None
+            assert agent.stdin is not None
+            assert agent.stdout.readline() == "ready\n"
+            assert eventually(lambda: bool(events.extend(watch.drain()) or events))
+            assert events == [AgentEvent("camera", "cam0", "boot-1", True)]
+            began = time.monotonic()
+            if end == "kill -9":
+                agent.send_signal(signal.SIGKILL)
+            else:
+                agent.stdin.close()
+            assert eventually(lambda: bool(events.extend(watch.drain()) or len(events) == 2))
+            assert time.monotonic() - began < 1.5
+            assert events[1] == AgentEvent("camera", "cam0", "boot-1", False)
+            assert agent.wait(10.0) == (-signal.SIGKILL if end == "kill -9" else 0)
+        finally:
+            agent.kill()
+            agent.wait()
+            for pipe in (agent.stdin, agent.stdout):
+                assert pipe is not None
+                pipe.close()
+
+
+def test_a_client_waits_for_its_router() -> None:
+    endpoint = free_endpoint()
+    opened: list[Bus] = []
+    config = BusConfig(mode="client", connect=(endpoint,))
+    opening = threading.Thread(target=lambda: opened.append(open_bus("local", config, timeout_s=20.0)))
+    opening.start()
+    opening.join(0.3)
+    assert opening.is_alive(), "there is no router yet"
+    with Router(endpoint):
+        opening.join(10.0)
+        assert len(opened) == 1
+        opened[0].close()
+
+
+def test_a_client_without_a_router_gives_up_when_told_to() -> None:
+    config = BusConfig(mode="client", connect=(free_endpoint(),))
+    with pytest.raises(
+        InputError, match=r"no router answers at tcp/127.0.0.1:[0-9]+ .*; start one there"
+    ) as error:
+        open_bus("local", config, timeout_s=0.2)
+    assert "\n" not in str(error.value)
+    asked: list[None] = []
+
+    def stop() -> bool:
+        asked.append(None)
+        return len(asked) > 2
+
+    with pytest.raises(BusStopped):
+        open_bus("local", config, stop=stop)
+
+
+def test_an_address_that_is_taken_is_told_in_one_line() -> None:
+    endpoint = free_endpoint()
+    with (
+        Router(endpoint),
+        pytest.raises(InputError, match=r"Address already in use.*; check connect = ") as error,
+    ):
+        Router(endpoint)
+    assert "\n" not in str(error.value)
+    assert ".rs:" not in str(error.value)
+
+
+def test_a_panic_in_the_transport_is_fatal_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zenoh's panics are no Exception, so a plain ``except Exception`` would let them through."""
+    panic = type("PanicException", (BaseException,), {})
+
+    class Panicking:
+        def put(self, payload: bytes) -> None:
+            raise panic("called `Option::unwrap()` on a `None` value")
+
+        def undeclare(self) -> None:
+            raise panic("again")
+
+    endpoint = free_endpoint()
+    with Router(endpoint), open_bus("local", BusConfig(mode="client", connect=(endpoint,))) as bus:
+        publisher = bus.publisher(OBSERVATION, "cam0")
+        monkeypatch.setattr(publisher, "_publisher", Panicking())
+        with pytest.raises(BusDead, match="the transport panicked"):
+            publisher.put(observation("cam0"))
+        publisher.close()
+
+
+def test_every_topic_can_be_declared(connect: Connect) -> None:
+    bus = connect()
+    for topic in (OBSERVATION, STATUS):
+        assert isinstance(topic, Topic)
+        bus.publisher(topic, "cam0", rate_hz=120.0, block=True).close()
+        bus.subscribe(topic).close()

@@ -1,0 +1,153 @@
+"""One valid message of every kind, with every field set, and a wait that polls."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from google.protobuf.message import Message
+
+from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, RIG_INFO, STATUS, TRACK, Topic
+from protocols.messages import syncline_pb2 as pb
+
+MATRIX = [600.0, 0.0, 319.5, 0.0, 600.0, 239.5, 0.0, 0.0, 1.0]
+
+
+def observation(
+    camera: str = "cam0", sequence: int = 0, boot_id: str = "boot-1", points: int = 1
+) -> pb.Observation:
+    """One frame in which ``points`` markers were detected."""
+    detection = pb.Detection(
+        u=320.5,
+        v=240.25,
+        size=12.5,
+        score=0.75,
+        label="marker",
+        colour=pb.Colour(red=255, green=64),
+        covariance=[0.25, 0.01, 0.5],
+    )
+    return pb.Observation(
+        schema_version=1,
+        camera=camera,
+        boot_id=boot_id,
+        sequence=sequence,
+        frame=sequence + 7,
+        device_time_ns=-5 + 33_333_333 * sequence,
+        exposure_ns=8_000_000,
+        detections=[detection] * points,
+    )
+
+
+def camera_info(camera: str = "cam0") -> pb.CameraInfo:
+    """A calibrated camera at a known place."""
+    return pb.CameraInfo(
+        schema_version=1,
+        camera=camera,
+        boot_id="boot-1",
+        width=640,
+        height=480,
+        fps=30.0,
+        matrix=MATRIX,
+        distortions=[0.1, -0.05, 0.001, 0.002, 0.01],
+        driver="simulated",
+        clock="device",
+        position=[1.0, 2.0, 3.0],
+        rotation=[0.1, 0.2, 0.3],
+        position_std=[0.01, 0.01, 0.01],
+        rotation_std=[0.01, 0.01, 0.01],
+        readout_s=0.02,
+    )
+
+
+def rig_info(distance: float = 3.42) -> pb.RigInfo:
+    """A rig whose scale comes from one distance."""
+    between = pb.RigInfo.Distance(camera_a="cam0", camera_b="cam1", distance=distance)
+    return pb.RigInfo(
+        schema_version=1,
+        units="m",
+        clock="independent",
+        distances=[between],
+        up=[0.0, 0.0, 1.0],
+        up_camera="cam0",
+        reference_camera="cam0",
+    )
+
+
+def calibration(revision: int = 1) -> pb.Calibration:
+    """One camera solved, one refused."""
+    solved = pb.CameraCalibration(
+        camera="cam0",
+        rotation=[0.1, 0.2, 0.3],
+        translation=[1.0, 2.0, 3.0],
+        time_offset=-12.5,
+        clock_rate=1.00001,
+        time_offset_std=1e-4,
+        position_std=[0.01, 0.02, 0.03],
+        rms_px=0.4,
+        matrix=MATRIX,
+        distortions=[0.1, 0.0, 0.0, 0.0],
+        fisheye=True,
+        boot_id="boot-1",
+    )
+    return pb.Calibration(
+        schema_version=1,
+        revision=revision,
+        status="solved",
+        reason="enough was seen",
+        reference_camera="cam0",
+        scale="metric",
+        units="m",
+        solver="joint",
+        cameras=[solved],
+        refused=[pb.Refusal(camera="cam1", reason="nothing moved in its view")],
+    )
+
+
+def track(sequence: int = 0) -> pb.Track:
+    """One confirmed track."""
+    return pb.Track(
+        schema_version=1,
+        sequence=sequence,
+        label="marker",
+        state="confirmed",
+        reference_time_ns=1_000_000_000,
+        position=[1.0, 2.0, 3.0],
+        velocity=[0.1, 0.2, 0.3],
+        position_covariance=[0.1, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.1],
+    )
+
+
+def status(agent: str = "cam0", sequence: int = 0) -> pb.AgentStatus:
+    """A healthy camera agent."""
+    return pb.AgentStatus(
+        schema_version=1,
+        agent=agent,
+        role="camera",
+        boot_id="boot-1",
+        sequence=sequence,
+        state="running",
+        message="all is well – über alles",
+        counters={"published": 10.0, "refused.blurred": 2.0},
+        gauges={"fps": 29.97},
+        version="0.1.0",
+    )
+
+
+SAMPLES: dict[Topic, Callable[[], Message]] = {
+    OBSERVATION: observation,
+    CAMERA_INFO: camera_info,
+    RIG_INFO: rig_info,
+    CALIBRATION: calibration,
+    TRACK: track,
+    STATUS: status,
+}
+
+
+def eventually(condition: Callable[[], bool], timeout_s: float = 10.0) -> bool:
+    """Poll until the condition holds; False when the time is up."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() >= deadline:
+            return False
+        time.sleep(0.005)
+    return True

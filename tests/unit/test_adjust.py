@@ -1,0 +1,330 @@
+"""The adjustment's algebra: derivatives against differences, sparse against dense, gauge really held."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hub.poses import linear
+from hub.poses.adjust import (
+    MotionPrior,
+    adjust,
+    build_system,
+    gauge_tangent,
+    linearise,
+    moved,
+    residual_norms,
+)
+from hub.poses.covariance import _inverse_blocks
+from hub.poses.linear import BAND, BorderedSystem, eliminate, solve
+from hub.poses.problem import (
+    CAMERA_PARAMETERS,
+    FOCAL,
+    K1,
+    OFFSET,
+    RATE,
+    CameraState,
+    Freedom,
+    Problem,
+    Rows,
+    State,
+    Trajectory,
+)
+from hub.splines import SplineBasis, fit_spline
+from protocols.geometry.types import Floats
+from tests.rigs import random_lens, random_path, random_poses
+
+
+def world(seed: int = 0, labels: int = 2, lens: bool = True, shake: float = 0.0) -> tuple[Problem, State, MotionPrior]:
+    """Three cameras (the last a fisheye) that see two paths of 6 s with 0.5 px of noise; the true state, shaken."""
+    rng = np.random.default_rng(seed)
+    lenses = [random_lens(rng), random_lens(rng), random_lens(rng, fisheye=True)]
+    cameras = [
+        CameraState(lens_, pose, 1.0 + rng.normal(0, 1e-4), 3.0 + rng.normal(0, 0.3), 3.0)
+        for lens_, pose in zip(lenses, random_poses(rng, 3), strict=True)
+    ]
+    paths, rows = [], []
+    for label in range(labels):
+        basis = SplineBasis.over(np.array([-1.0]), np.array([7.0]), 0.4)
+        grid = np.arange(-1, 7, 0.02)
+        control = fit_spline(basis, grid, random_path(rng).at(grid), np.ones(len(grid)))
+        paths.append(Trajectory(basis, control))
+        for camera, state in enumerate(cameras):
+            time = np.sort(rng.uniform(0.8, 5.2, 60))
+            seen = state.intrinsics.project(state.pose.camera_from_world(paths[label].at(state.reference_time(time))))
+            use = rng.random(60) > 0.1
+            rows.append(Rows(camera, label, time, seen + rng.normal(0, 0.5, seen.shape), use))
+    problem = Problem(tuple(rows), tuple(lenses), 0, (0, 1), Freedom(lens=lens))
+    state = State(tuple(cameras), tuple(paths), np.full(3, 0.5))
+    size = sum(3 * path.basis.size for path in paths)
+    step = rng.normal(0, shake, size), rng.normal(0, shake, len(problem.free_columns()))
+    prior = MotionPrior(tuple(np.full(len(path.basis.interval_starts()), 30.0) for path in paths))
+    return problem, moved(problem, state, *step), prior
+
+
+def nudged(camera: CameraState, column: int, by: float) -> CameraState:
+    """One camera parameter moved, through the function that the solver itself uses."""
+    problem = Problem((), (camera.intrinsics,) * 2, 1, (0, 1), Freedom(lens=True))
+    both = State((camera, camera), (), np.ones(2))
+    columns = problem.free_columns().tolist()
+    step = np.zeros(len(columns))
+    step[columns.index(column)] = by
+    return moved(problem, both, np.zeros(0), step).cameras[0]
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+@pytest.mark.parametrize("column", range(CAMERA_PARAMETERS))
+def test_every_camera_derivative_is_a_difference(lens: str, column: int) -> None:
+    problem, state, _ = world(1, shake=0.01)
+    which = 2 if lens == "fisheye" else 1
+    rows, camera = next(r for r in problem.rows if r.camera == which), state.cameras[which]
+    path = state.trajectories[rows.label]
+    line = linearise(rows, camera, path, problem.nominal[which])
+    assert line.valid.all()
+    step = 1e-6
+    ahead, behind = (
+        linearise(rows, nudged(camera, column, sign * step), path, problem.nominal[which]).residual
+        for sign in (1, -1)
+    )
+    expected = (ahead - behind) / (2 * step)
+    assert np.abs(expected).max() > 1e-3
+    np.testing.assert_allclose(line.by_camera[:, :, column], expected, rtol=2e-5, atol=2e-3)
+
+
+@pytest.mark.parametrize("which", [0, 2])
+def test_the_derivative_by_the_point_is_a_difference(which: int) -> None:
+    problem, state, _ = world(2)
+    rows, camera = next(r for r in problem.rows if r.camera == which), state.cameras[which]
+    path = state.trajectories[rows.label]
+    line = linearise(rows, camera, path, problem.nominal[which])
+    for axis in range(3):
+        step = np.zeros(3)
+        step[axis] = 1e-6
+        ahead, behind = (
+            linearise(rows, camera, replace(path, control=path.control + s * step), problem.nominal[which])
+            for s in (1, -1)
+        )
+        difference = (ahead.residual - behind.residual) / 2e-6
+        np.testing.assert_allclose(line.by_point[:, :, axis], difference, rtol=1e-5, atol=1e-3)
+
+
+def test_a_fisheye_point_on_the_axis_has_derivatives() -> None:
+    problem, state, _ = world(3)
+    camera = state.cameras[2]
+    basis = SplineBasis.over(np.array([0.0]), np.array([6.0]), 1.0)
+    ahead = camera.pose.world_from_camera(np.array([[0.0, 0.0, 4.0]]))
+    path = Trajectory(basis, np.repeat(ahead, basis.size, axis=0))
+    rows = Rows(2, 0, np.array([2.5, 3.0]), np.zeros((2, 2)), np.ones(2, dtype=bool))
+    line = linearise(rows, camera, path, problem.nominal[2])
+    assert np.isfinite(line.by_camera).all()
+    assert np.isfinite(line.residual).all()
+
+
+def test_a_point_behind_the_camera_is_not_valid_and_not_nan() -> None:
+    problem, state, prior = world(3)
+    camera = state.cameras[1]
+    behind = replace(camera, pose=replace(camera.pose, position=camera.pose.position * -1.0))
+    cameras = (state.cameras[0], behind, state.cameras[2])
+    line = linearise(problem.rows[1], behind, state.trajectories[0], problem.nominal[1])
+    assert not line.valid.any()
+    system, cost = build_system(problem, replace(state, cameras=cameras), prior, robust=True)
+    assert np.isfinite(cost)
+    for part in (system.band, system.border, system.corner, system.gradient_path, system.gradient_cameras):
+        assert np.isfinite(part).all()
+
+
+@pytest.mark.parametrize("robust", [True, False])
+def test_the_gradient_is_half_the_slope_of_the_cost(robust: bool) -> None:
+    problem, state, prior = world(4, shake=2e-3)
+    system, _ = build_system(problem, state, prior, robust)
+    rng = np.random.default_rng(0)
+    path_size, width = len(system.gradient_path), len(system.gradient_cameras)
+    directions = [(rng.normal(0, 1, path_size), np.zeros(width))]
+    directions += [(np.zeros(path_size), row) for row in np.eye(width)]
+    for path_step, camera_step in directions:
+        size = 1e-6
+        ahead, behind = (
+            build_system(problem, moved(problem, state, s * size * path_step, s * size * camera_step), prior, robust)[1]
+            for s in (1, -1)
+        )
+        slope = 0.5 * (ahead - behind) / (2 * size)
+        ours = system.gradient_path @ path_step + system.gradient_cameras @ camera_step
+        assert ours == pytest.approx(slope, rel=2e-4, abs=1e-2 + 1e-4 * abs(ours))
+
+
+def dense(system: BorderedSystem) -> Floats:
+    size = system.band.shape[1]
+    full = np.zeros((size, size))
+    for distance in range(BAND):
+        rows = np.arange(size - distance)
+        values = system.band[BAND - 1 - distance, distance:]
+        full[rows, rows + distance] = full[rows + distance, rows] = values
+    return np.block([[full, system.border], [system.border.T, system.corner]])
+
+
+def test_the_banded_normal_matrix_is_that_of_the_rows() -> None:
+    problem, state, prior = world(5)
+    system, _ = build_system(problem, state, MotionPrior(tuple(0 * w for w in prior.weights)), robust=False)
+    columns = problem.free_columns()
+    sizes = [3 * path.basis.size for path in state.trajectories]
+    blocks = []
+    for rows in problem.rows:
+        line = linearise(rows, state.cameras[rows.camera], state.trajectories[rows.label], problem.nominal[rows.camera])
+        jacobian = np.zeros((len(line.index), 2, sum(sizes) + 3 * CAMERA_PARAMETERS))
+        for n, first in enumerate(line.index):
+            for k in range(4):
+                at = sum(sizes[: rows.label]) + 3 * (first + k)
+                jacobian[n, :, at : at + 3] = line.weights[n, k] * line.by_point[n]
+        at = sum(sizes) + rows.camera * CAMERA_PARAMETERS
+        jacobian[:, :, at : at + CAMERA_PARAMETERS] = line.by_camera
+        blocks.append(jacobian.reshape(-1, jacobian.shape[2]) / 0.5)
+    full = np.concatenate(blocks)[:, np.r_[np.arange(sum(sizes)), sum(sizes) + columns]]
+    normal = full.T @ full
+    ours = dense(system)
+    for column, _ in enumerate(columns):  # the priors stand on the diagonal only
+        at = sum(sizes) + column
+        normal[at, at] = ours[at, at]
+    np.testing.assert_allclose(ours, normal, rtol=1e-8, atol=1e-6 * np.abs(normal).max())
+
+
+def test_the_priors_add_their_information() -> None:
+    problem, state, prior = world(5)
+    loose = replace(problem, freedom=Freedom(lens=True, rate_std=1e9, focal_std=1e9, k1_std=1e9))
+    with_priors, _ = build_system(problem, state, prior, robust=False)
+    without, _ = build_system(loose, state, prior, robust=False)
+    gained = np.diag(with_priors.corner - without.corner)
+    freedom = problem.freedom
+    for value, column in zip(gained, problem.free_columns(), strict=True):
+        std = {RATE: freedom.rate_std, FOCAL: freedom.focal_std, K1: freedom.k1_std}.get(column % 10)
+        assert value == pytest.approx(0.0 if std is None else std**-2, rel=1e-3, abs=1e-3)
+
+
+@pytest.mark.parametrize("damping", [0.0, 1e-3])
+def test_the_bordered_solution_is_the_dense_one(damping: float) -> None:
+    problem, state, prior = world(6, shake=1e-3)
+    system, _ = build_system(problem, state, prior, robust=True)
+    tangent = gauge_tangent(problem, state)
+    assert tangent is not None
+    path, cameras = solve(system, damping, tangent)
+    full, size = dense(system), system.band.shape[1]
+    full += damping * np.diag(np.diag(full))
+    lift = np.block([[np.eye(size), np.zeros((size, tangent.shape[1]))], [np.zeros((len(tangent), size)), tangent]])
+    right = -np.r_[system.gradient_path, system.gradient_cameras]
+    expected = lift @ np.linalg.solve(lift.T @ full @ lift, lift.T @ right)
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(np.r_[path, cameras], expected, rtol=1e-4, atol=1e-5 * scale)
+
+
+def test_without_free_cameras_only_the_path_moves() -> None:
+    problem, state, prior = world(6, shake=1e-3)
+    fixed = replace(problem, freedom=Freedom(pose=False, clock=False, lens=False))
+    assert gauge_tangent(fixed, state) is None
+    system, before = build_system(fixed, state, prior, robust=False)
+    path, cameras = solve(system, 0.0, None)
+    assert len(cameras) == 0
+    assert build_system(fixed, moved(fixed, state, path, cameras), prior, robust=False)[1] < before
+
+
+def test_inverse_blocks_are_those_of_the_dense_inverse() -> None:
+    problem, state, prior = world(7)
+    system, _ = build_system(problem, state, prior, robust=False)
+    size = system.band.shape[1]
+    inverse = np.linalg.inv(dense(system)[:size, :size])
+    blocks = _inverse_blocks(system.band)
+    padded = np.zeros((BAND * (len(blocks) + 1),) * 2)
+    padded[:size, :size] = inverse
+    for i, block in enumerate(blocks):
+        part = slice(BAND * i, BAND * i + 2 * BAND)
+        inside = np.arange(BAND * i, BAND * i + 2 * BAND) < size
+        mask = np.outer(inside, inside)
+        np.testing.assert_allclose(block[mask], padded[part, part][mask], rtol=1e-3, atol=1e-4 * np.abs(inverse).max())
+
+
+def test_the_schur_complement_is_the_dense_one() -> None:
+    problem, state, prior = world(8)
+    system, _ = build_system(problem, state, prior, robust=False)
+    parts = eliminate(system)
+    size = system.band.shape[1]
+    full = dense(system)
+    expected = full[size:, size:] - full[size:, :size] @ np.linalg.solve(full[:size, :size], full[:size, size:])
+    np.testing.assert_allclose(parts.reduced, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
+
+
+def test_border_blocks_take_rows_in_any_order() -> None:
+    rng = np.random.default_rng(0)
+    index, weights = rng.integers(0, 20, 50), rng.random((50, 4))
+    blocks = rng.normal(size=(50, 3, 5))
+    out = linear.border_block(index, weights, blocks, 3 * 24)
+    expected = np.zeros((24, 3, 5))
+    for n in range(50):
+        for k in range(4):
+            expected[index[n] + k] += weights[n, k] * blocks[n]
+    np.testing.assert_allclose(out, expected.reshape(-1, 5), atol=1e-12)
+
+
+def test_the_tangent_keeps_the_gauge() -> None:
+    problem, state, _ = world(9)
+    tangent = gauge_tangent(problem, state)
+    assert tangent is not None
+    np.testing.assert_allclose(tangent.T @ tangent, np.eye(tangent.shape[1]), atol=1e-12)
+    assert tangent.shape == (len(problem.free_columns()), len(problem.free_columns()) - 7)
+    rng = np.random.default_rng(0)
+    step = tangent @ rng.normal(0, 1e-5, tangent.shape[1])
+    size = sum(3 * path.basis.size for path in state.trajectories)
+    after = moved(problem, state, np.zeros(size), step)
+    first, second = problem.anchors
+    np.testing.assert_array_equal(after.cameras[first].pose.rotation, state.cameras[first].pose.rotation)
+    np.testing.assert_allclose(after.cameras[first].pose.position, state.cameras[first].pose.position, atol=1e-18)
+    apart = [
+        np.linalg.norm(s.cameras[second].pose.position - s.cameras[first].pose.position) for s in (state, after)
+    ]
+    assert apart[1] == pytest.approx(apart[0], abs=1e-9)
+    assert after.cameras[0].offset == state.cameras[0].offset
+
+
+def test_the_adjustment_holds_the_scale_over_many_steps() -> None:
+    """The held distance must not creep: the motion prior likes a small world."""
+    problem, state, _ = world(10, lens=False, shake=3e-3)
+    first, second = problem.anchors
+    before = np.linalg.norm(state.cameras[second].pose.position - state.cameras[first].pose.position)
+    _, after, _ = adjust(problem, state)
+    now = np.linalg.norm(after.cameras[second].pose.position - after.cameras[first].pose.position)
+    assert now == pytest.approx(before, rel=1e-3)
+
+
+def test_the_adjustment_finds_the_truth_from_a_shaken_state() -> None:
+    problem, start, _ = world(11, lens=False, shake=5e-3)
+    _, truth, _ = world(11, lens=False)
+    solved, state, _ = adjust(problem, start)
+    for rows in solved.rows:
+        norms = residual_norms(rows, state.cameras[rows.camera], state.trajectories[rows.label])
+        assert np.median(norms) < 1.0
+    gap = [c.offset - t.offset for c, t in zip(state.cameras, truth.cameras, strict=True)]
+    assert np.abs(gap).max() < 5e-3
+    np.testing.assert_allclose(state.sigma, 0.5, rtol=0.25)
+
+
+def test_false_rows_are_marked_and_honest_ones_used() -> None:
+    problem, start, _ = world(12, labels=1, lens=False, shake=1e-3)
+    rng = np.random.default_rng(1)
+    spoilt, false = [], []
+    for rows in problem.rows:
+        wrong = rng.random(len(rows.time)) < 0.1
+        pixels = rows.pixels + np.where(wrong[:, None], rng.uniform(40, 200, rows.pixels.shape), 0.0)
+        spoilt.append(replace(rows, pixels=pixels, use=np.ones(len(wrong), dtype=bool)))
+        false.append(wrong)
+    solved, _, _ = adjust(replace(problem, rows=tuple(spoilt)), start)
+    for rows, wrong in zip(solved.rows, false, strict=True):
+        assert not rows.use[wrong].any()
+        assert rows.use[~wrong].mean() > 0.95
+
+
+def test_the_time_offset_column_is_the_velocity() -> None:
+    """A later clock moves the point along its path: the unit is pixels a second."""
+    problem, state, _ = world(13)
+    rows, camera = problem.rows[0], state.cameras[0]
+    line = linearise(rows, camera, state.trajectories[0], problem.nominal[0])
+    lever = (rows.time[rows.use] - camera.centre)[:, None]
+    np.testing.assert_allclose(line.by_camera[:, :, RATE], line.by_camera[:, :, OFFSET] * lever, atol=1e-9)

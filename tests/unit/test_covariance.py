@@ -1,0 +1,152 @@
+"""The stds that are published are the errors that happen: Monte Carlo against the estimate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from hub.calibrate import calibrate
+from hub.poses import covariance as cov
+from hub.poses.adjust import MotionPrior, adjust
+from hub.poses.problem import CAMERA_PARAMETERS, CameraState, Problem, Rows, State, Trajectory
+from hub.splines import SplineBasis, fit_spline
+from protocols.geometry.types import Floats
+from tests.rigs import random_lens, random_path, random_poses, simulate
+
+RUNS, SECONDS = 40, 12.0
+
+
+@dataclass(frozen=True)
+class Errors:
+    """(runs, n) errors over their published stds."""
+
+    offset: Floats
+    position: Floats
+    path: Floats
+
+
+@pytest.fixture(scope="module")
+def errors() -> Errors:
+    """Three cameras, each run with fresh noise and another rig, adjusted from near the truth.
+
+    Gauge as published: the first camera held, the first baseline held.
+    """
+    offset, position, path_errors = [], [], []
+    for run in range(RUNS):
+        rng = np.random.default_rng(1000 + run)
+        lenses = [random_lens(rng) for _ in range(3)]
+        cameras = tuple(
+            CameraState(lens, pose, 1.0, rng.normal(0, 0.2) + SECONDS / 2, SECONDS / 2)
+            for lens, pose in zip(lenses, random_poses(rng, 3), strict=True)
+        )
+        basis = SplineBasis.over(np.array([-1.0]), np.array([SECONDS + 1]), 0.25)
+        grid = np.arange(-1, SECONDS + 1, 0.02)
+        path = Trajectory(basis, fit_spline(basis, grid, random_path(rng).at(grid), np.ones(len(grid))))
+        rows = []
+        for i, camera in enumerate(cameras):
+            time = np.sort(rng.uniform(0, SECONDS, 300))
+            seen = camera.intrinsics.project(camera.pose.camera_from_world(path.at(camera.reference_time(time))))
+            rows.append(Rows(i, 0, time, seen + rng.normal(0, 0.5, seen.shape), np.ones(300, dtype=bool)))
+        truth = State(cameras, (path,), np.full(3, 0.5))
+        problem = Problem(tuple(rows), tuple(lenses), 0, (0, 1))
+        problem, state, prior = adjust(problem, truth, rounds=2, iterations=8)
+        found = cov.covariance(problem, state, prior)
+        for i in (1, 2):
+            std = cov.time_map_std(found, state, i, 0)
+            offset.append((state.cameras[i].offset - cameras[i].offset) / std)
+        std3 = cov.position_std(found, 2)
+        position.append((state.cameras[2].pose.position - cameras[2].pose.position) / std3)
+        at = np.array([3.1, 6.0, 8.7])
+        std1 = cov.path_std(found, state, 0, at)
+        path_errors.append(((state.trajectories[0].at(at) - path.at(at)) / std1[:, None]).ravel())
+    return Errors(np.array(offset), np.array(position).ravel(), np.array(path_errors).ravel())
+
+
+@pytest.mark.parametrize("what", ["offset", "position", "path"])
+def test_errors_are_as_large_as_their_stds_say(errors: Errors, what: str) -> None:
+    z = getattr(errors, what)
+    assert np.isfinite(z).all()
+    assert 0.7 < np.sqrt(np.mean(z**2)) < 1.4
+    assert np.mean(np.abs(z) > 4) < 0.02
+
+
+@pytest.mark.parametrize("what", ["offset", "position"])
+def test_errors_have_no_preferred_side(errors: Errors, what: str) -> None:
+    z = getattr(errors, what)
+    assert abs(z.mean()) < 4 / np.sqrt(len(z) / 2)
+
+
+@pytest.fixture(scope="module")
+def solved() -> tuple[Problem, State, MotionPrior]:
+    rng = np.random.default_rng(7)
+    lenses = [random_lens(rng) for _ in range(3)]
+    cameras = tuple(
+        CameraState(lens, pose, 1.0, 3.0, 3.0) for lens, pose in zip(lenses, random_poses(rng, 3), strict=True)
+    )
+    basis = SplineBasis.over(np.array([0.0]), np.array([6.0]), 0.3)
+    grid = np.arange(0, 6, 0.02)
+    path = Trajectory(basis, fit_spline(basis, grid, random_path(rng).at(grid), np.ones(len(grid))))
+    rows = []
+    for i, camera in enumerate(cameras):
+        time = np.sort(rng.uniform(0, 6, 150))
+        seen = camera.intrinsics.project(camera.pose.camera_from_world(path.at(time)))
+        rows.append(Rows(i, 0, time, seen + rng.normal(0, 0.5, seen.shape), np.ones(150, dtype=bool)))
+    return adjust(Problem(tuple(rows), tuple(lenses), 0, (0, 1)), State(cameras, (path,), np.full(3, 0.5)))
+
+
+def test_the_held_parameters_have_no_variance(solved: tuple[Problem, State, MotionPrior]) -> None:
+    found = cov.covariance(*solved)
+    np.testing.assert_allclose(np.diag(found.cameras)[:6], 0, atol=1e-12)
+    assert cov.time_map_std(found, solved[1], 0, 0) == 0.0
+    apart = solved[1].cameras[1].pose.position - solved[1].cameras[0].pose.position
+    apart /= np.linalg.norm(apart)
+    block = found.cameras[CAMERA_PARAMETERS + 3 : CAMERA_PARAMETERS + 6, CAMERA_PARAMETERS + 3 : CAMERA_PARAMETERS + 6]
+    assert apart @ block @ apart < 1e-12
+
+
+def test_twice_the_noise_is_twice_the_std(solved: tuple[Problem, State, MotionPrior]) -> None:
+    problem, state, prior = solved
+    quarter = MotionPrior(tuple(0.25 * w for w in prior.weights))
+    loose = replace(problem, freedom=replace(problem.freedom, rate_std=2 * problem.freedom.rate_std))
+    one = cov.covariance(problem, state, prior)
+    two = cov.covariance(loose, replace(state, sigma=2 * state.sigma), quarter)
+    np.testing.assert_allclose(cov.position_std(two, 2), 2 * cov.position_std(one, 2), rtol=1e-3)
+    assert cov.time_map_std(two, state, 1, 0) == pytest.approx(2 * cov.time_map_std(one, state, 1, 0), rel=1e-3)
+
+
+def test_the_std_between_two_cameras_is_the_same_both_ways(solved: tuple[Problem, State, MotionPrior]) -> None:
+    found = cov.covariance(*solved)
+    there, back = (cov.time_map_std(found, solved[1], *pair) for pair in ((1, 2), (2, 1)))
+    assert there == pytest.approx(back, rel=0.05)
+
+
+def test_references_that_fix_every_camera_bound_every_std(solved: tuple[Problem, State, MotionPrior]) -> None:
+    problem, state, prior = solved
+    known = np.zeros((3 * CAMERA_PARAMETERS,) * 2)
+    for i in range(3):
+        at = i * CAMERA_PARAMETERS + 3 + np.arange(3)
+        known[at, at] = 1.0 / 0.01**2
+    found = cov.covariance(problem, state, prior, known)
+    stds = np.array([cov.position_std(found, i) for i in range(3)])
+    assert (stds <= 0.0101).all()
+    assert (stds > 1e-4).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_stds_of_the_whole_line_are_sane(seed: int) -> None:
+    session = simulate(700 + seed, 3, 20)
+    found = calibrate(session.rig, session.observations())
+    for name, camera in list(found.cameras.items())[1:]:
+        error = abs(session.clock_error(name, found.reference, camera.time_map))
+        assert 2e-5 < camera.time_offset_std < 1e-3
+        assert error < 4.5 * camera.time_offset_std
+
+
+def test_the_path_is_less_sure_at_its_ends(solved: tuple[Problem, State, MotionPrior]) -> None:
+    problem, state, prior = solved
+    found = cov.covariance(problem, state, prior)
+    stds = cov.path_std(found, state, 0, np.array([0.02, 3.0, 5.98]))
+    assert stds[1] < stds[0]
+    assert stds[1] < stds[2]

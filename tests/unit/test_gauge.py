@@ -1,0 +1,267 @@
+"""Where the world is: each kind of reference fixes what it can, and no more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hub.poses.gauge import fix_gauge
+from protocols.errors import Refused
+from protocols.geometry import so3
+from protocols.geometry.pose import Pose, Similarity
+from protocols.geometry.types import Floats
+from protocols.session.rig import Rig, RigCamera
+from tests.rigs import random_poses
+
+NAMES = ["cam0", "cam1", "cam2", "cam3"]
+
+
+def world(seed: int, count: int = 4) -> tuple[list[Pose], list[Pose], Similarity]:
+    """True poses, the same ones as the solver sees them, and the similarity between."""
+    rng = np.random.default_rng(seed)
+    truth = random_poses(rng, count)
+    turn, shift, scale = so3.exp(rng.normal(0, 1.5, 3)), rng.normal(0, 3, 3), float(rng.uniform(0.1, 10))
+    inward = Similarity(1 / scale, turn, shift)
+    back = Similarity(scale, turn.T, -scale * turn.T @ shift)
+    return truth, [inward.pose(pose) for pose in truth], back
+
+
+def rig(cameras: dict[str, dict[str, Floats]], count: int = 4, **metadata: object) -> Rig:
+    table = {name: RigCamera(name, (1280, 720), **cameras.get(name, {})) for name in NAMES[:count]}  # type: ignore[arg-type]
+    return replace(Rig(table), **metadata)  # type: ignore[arg-type]
+
+
+def same(found: Similarity, truth: Similarity, tolerance: float = 1e-6) -> None:
+    assert found.scale == pytest.approx(truth.scale, rel=tolerance)
+    np.testing.assert_allclose(found.rotation, truth.rotation, atol=tolerance)
+    np.testing.assert_allclose(found.shift, truth.shift, atol=tolerance * 30 * max(1.0, truth.scale))
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("count", [3, 4])
+def test_known_positions_recover_any_similarity(seed: int, count: int) -> None:
+    truth, internal, similarity = world(seed)
+    known = {name: {"position": pose.position} for name, pose in zip(NAMES[:count], truth, strict=False)}
+    gauge = fix_gauge(rig(known), NAMES, internal)
+    same(gauge.similarity, similarity)
+    assert gauge.scale == "metric"
+    assert not gauge.warnings
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_two_positions_and_a_rotation_are_enough(seed: int) -> None:
+    truth, internal, similarity = world(seed)
+    known = {"cam1": {"position": truth[1].position, "rotation": truth[1].rotation}}
+    known["cam3"] = {"position": truth[3].position}
+    gauge = fix_gauge(rig(known), NAMES, internal)
+    same(gauge.similarity, similarity)
+    assert gauge.scale == "metric"
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_one_pose_and_a_distance_are_enough(seed: int) -> None:
+    truth, internal, similarity = world(seed)
+    known = {"cam2": {"position": truth[2].position, "rotation": truth[2].rotation}}
+    apart = float(np.linalg.norm(truth[0].position - truth[3].position))
+    gauge = fix_gauge(rig(known, distances=(("cam0", "cam3", apart),)), NAMES, internal)
+    same(gauge.similarity, similarity)
+    assert gauge.scale == "metric"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_pose_alone_fixes_all_but_the_scale(seed: int) -> None:
+    truth, internal, _ = world(seed)
+    known = {"cam2": {"position": truth[2].position, "rotation": truth[2].rotation}}
+    gauge = fix_gauge(rig(known), NAMES, internal)
+    moved = [gauge.similarity.pose(pose) for pose in internal]
+    assert gauge.scale == "arbitrary"
+    np.testing.assert_allclose(moved[2].position, truth[2].position, atol=1e-6)
+    np.testing.assert_allclose(moved[2].rotation, truth[2].rotation, atol=1e-6)
+    assert np.linalg.norm(moved[1].position - moved[0].position) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_distance_alone_gives_the_scale_in_the_first_cameras_world(seed: int) -> None:
+    truth, internal, similarity = world(seed)
+    apart = float(np.linalg.norm(truth[1].position - truth[2].position))
+    gauge = fix_gauge(rig({}, distances=(("cam1", "cam2", apart),)), NAMES, internal)
+    assert gauge.scale == "metric"
+    assert gauge.similarity.scale == pytest.approx(similarity.scale)
+    first = gauge.similarity.pose(internal[0])
+    np.testing.assert_allclose(first.rotation, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(first.position, 0, atol=1e-9)
+
+
+def test_several_distances_are_averaged() -> None:
+    truth, internal, similarity = world(1)
+    pairs = [(0, 1), (1, 2), (0, 2)]
+    lengths = [
+        (NAMES[a], NAMES[b], float(np.linalg.norm(truth[a].position - truth[b].position)) * factor)
+        for (a, b), factor in zip(pairs, (1.001, 1.0, 0.999), strict=True)
+    ]
+    gauge = fix_gauge(rig({}, distances=tuple(lengths)), NAMES, internal)
+    assert gauge.similarity.scale == pytest.approx(similarity.scale, rel=8e-4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_known_makes_the_first_camera_the_world_and_the_first_baseline_one(seed: int) -> None:
+    _, internal, _ = world(seed)
+    gauge = fix_gauge(rig({}), NAMES, internal)
+    moved = [gauge.similarity.pose(pose) for pose in internal]
+    np.testing.assert_allclose(moved[0].rotation, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(moved[0].position, 0, atol=1e-9)
+    assert np.linalg.norm(moved[1].position) == pytest.approx(1.0)
+    assert gauge.scale == "arbitrary"
+    assert not gauge.information.any()
+    assert not gauge.warnings
+
+
+@pytest.mark.parametrize("name", ["cam0", "cam2"])
+def test_a_levelled_camera_says_where_up_is(name: str) -> None:
+    _, internal, _ = world(2)
+    gauge = fix_gauge(rig({}, up=name), NAMES, internal)
+    pose = gauge.similarity.pose(internal[NAMES.index(name)])
+    np.testing.assert_allclose(pose.rotation.T @ [0, -1, 0], [0, 0, 1], atol=1e-9)
+    first = gauge.similarity.pose(internal[0])
+    np.testing.assert_allclose(first.position, 0, atol=1e-9)
+    assert np.linalg.det(gauge.similarity.rotation) == pytest.approx(1.0)
+
+
+def test_up_as_a_vector_of_the_first_camera_turns_the_world_upright() -> None:
+    _, internal, _ = world(3)
+    up = np.array([0.1, -0.9, 0.2]) / np.linalg.norm([0.1, -0.9, 0.2])
+    gauge = fix_gauge(rig({}, up=up), NAMES, internal)
+    pose = gauge.similarity.pose(internal[0])
+    np.testing.assert_allclose(pose.rotation.T @ up, [0, 0, 1], atol=1e-9)
+
+
+def test_up_and_a_distance_make_a_metric_upright_world() -> None:
+    truth, internal, similarity = world(4)
+    apart = float(np.linalg.norm(truth[0].position - truth[1].position))
+    gauge = fix_gauge(rig({}, up="cam1", distances=(("cam0", "cam1", apart),)), NAMES, internal)
+    assert gauge.similarity.scale == pytest.approx(similarity.scale)
+    level = gauge.similarity.pose(internal[1]).rotation.T @ [0, -1, 0]
+    np.testing.assert_allclose(level, [0, 0, 1], atol=1e-6)
+
+
+def test_two_positions_and_a_levelled_camera_leave_nothing_open() -> None:
+    """The turn about the line between the two is what the levelled camera tells."""
+    truth, internal, similarity = world(5)
+    level = truth[2].rotation
+    level = np.stack([level[0], [0, 0, -1.0], np.cross(level[0], [0, 0, -1.0])])
+    truth[2] = Pose(so3.nearest(level), truth[2].position)
+    inward = Similarity(1 / similarity.scale, similarity.rotation.T, -similarity.rotation.T @ similarity.shift / similarity.scale)
+    internal = [inward.pose(pose) for pose in truth]
+    known = {"cam0": {"position": truth[0].position}, "cam1": {"position": truth[1].position}}
+    gauge = fix_gauge(rig(known, up="cam2"), NAMES, internal)
+    same(gauge.similarity, similarity, 1e-4)
+
+
+def test_two_positions_and_an_up_vector_leave_nothing_open() -> None:
+    """up = [0, 0, 1] with surveyed positions: the surveyor's z."""
+    truth, internal, _ = world(5)
+    known = {"cam0": {"position": truth[0].position}, "cam1": {"position": truth[1].position}}
+    gauge = fix_gauge(rig(known, up=np.array([0.0, 0.0, 1.0])), NAMES, internal)
+    moved = [gauge.similarity.pose(pose) for pose in internal]
+    for i in (0, 1):
+        np.testing.assert_allclose(moved[i].position, truth[i].position, atol=1e-6)
+
+
+def test_a_levelled_camera_that_was_not_solved_is_refused() -> None:
+    _, internal, _ = world(2)
+    with pytest.raises(Refused, match="cam3"):
+        fix_gauge(rig({}, up="cam3"), NAMES[:3], internal[:3])
+
+
+def test_references_of_cameras_that_were_not_solved_do_no_harm() -> None:
+    truth, internal, similarity = world(6)
+    known = {name: {"position": pose.position} for name, pose in zip(NAMES, truth, strict=True)}
+    known["cam3"] = {"position": np.array([99.0, 0, 0])}
+    gauge = fix_gauge(rig(known, distances=(("cam0", "cam3", 5.0),)), NAMES[:3], internal[:3])
+    same(gauge.similarity, similarity)
+
+
+def test_positions_that_contradict_each_other_are_told() -> None:
+    truth, internal, _ = world(7)
+    known = {name: {"position": pose.position} for name, pose in zip(NAMES, truth, strict=True)}
+    known["cam2"] = {"position": truth[2].position + [0.5, 0, 0]}
+    gauge = fix_gauge(rig(known), NAMES, internal)
+    assert gauge.warnings
+
+
+def test_a_contradicting_distance_is_told() -> None:
+    truth, internal, _ = world(8)
+    known = {name: {"position": pose.position} for name, pose in zip(NAMES, truth, strict=True)}
+    apart = float(np.linalg.norm(truth[0].position - truth[1].position))
+    gauge = fix_gauge(rig(known, distances=(("cam0", "cam1", 1.2 * apart),)), NAMES, internal)
+    assert gauge.warnings
+
+
+def test_two_positions_whose_distance_is_contradicted_are_told() -> None:
+    truth, internal, _ = world(8)
+    known = {name: {"position": pose.position} for name, pose in zip(NAMES[:2], truth, strict=False)}
+    apart = float(np.linalg.norm(truth[0].position - truth[1].position))
+    gauge = fix_gauge(rig(known, distances=(("cam0", "cam1", 1.2 * apart),)), NAMES, internal)
+    assert gauge.warnings
+
+
+def test_small_survey_errors_within_their_stds_are_no_contradiction() -> None:
+    truth, internal, _ = world(9)
+    rng = np.random.default_rng(0)
+    known = {
+        name: {"position": pose.position + rng.normal(0, 0.01, 3), "position_std": np.full(3, 0.01)}
+        for name, pose in zip(NAMES, truth, strict=True)
+    }
+    gauge = fix_gauge(rig(known), NAMES, internal)
+    assert not gauge.warnings
+
+
+def test_the_surer_position_counts_more() -> None:
+    truth, internal, _ = world(10)
+    known = {
+        name: {"position": pose.position, "position_std": np.full(3, 0.001)}
+        for name, pose in zip(NAMES, truth, strict=True)
+    }
+    known["cam1"] = {"position": truth[1].position + 0.3, "position_std": np.full(3, 1.0)}
+    gauge = fix_gauge(rig(known), NAMES, internal)
+    for pose, there in zip(internal, truth, strict=True):
+        np.testing.assert_allclose(gauge.similarity.pose(pose).position, there.position, atol=2e-3)
+
+
+def test_the_unit_of_length_makes_no_difference() -> None:
+    truth, internal, similarity = world(11)
+    known = {name: {"position": 1000 * pose.position} for name, pose in zip(NAMES, truth, strict=True)}
+    found = fix_gauge(rig(known), NAMES, internal).similarity
+    assert found.scale == pytest.approx(1000 * similarity.scale, rel=1e-6)
+    np.testing.assert_allclose(found.shift, 1000 * similarity.shift, rtol=1e-5, atol=1e-2)
+
+
+def test_cameras_in_a_line_do_not_mirror_the_world() -> None:
+    """Three surveyed cameras on one wall: the turn about the wall is open, the rest is not."""
+    truth, _, _ = world(12)
+    line = [Pose(pose.rotation, np.array([float(i), 0.0, 0.0])) for i, pose in enumerate(truth)]
+    inward = Similarity(0.3, so3.exp(np.array([0.4, 1.0, -2.0])), np.array([1.0, 2, 3]))
+    known = {name: {"position": pose.position} for name, pose in zip(NAMES, line, strict=True)}
+    gauge = fix_gauge(rig(known), NAMES, [inward.pose(pose) for pose in line])
+    assert np.linalg.det(gauge.similarity.rotation) == pytest.approx(1.0)
+    for pose in line:
+        moved = gauge.similarity.pose(inward.pose(pose))
+        np.testing.assert_allclose(moved.position, pose.position, atol=1e-6)
+
+
+def test_one_position_alone_moves_the_world_and_keeps_the_first_camera_level_with_it() -> None:
+    _, internal, _ = world(13)
+    gauge = fix_gauge(rig({"cam1": {"position": np.array([5.0, 6.0, 7.0])}}), NAMES, internal)
+    moved = [gauge.similarity.pose(pose) for pose in internal]
+    np.testing.assert_allclose(moved[1].position, [5, 6, 7], atol=1e-6)
+    assert gauge.scale == "arbitrary"
+
+
+def test_two_positions_at_one_place_are_not_a_scale() -> None:
+    """A typing mistake must not end in a division by zero or a point-sized world."""
+    _, internal, _ = world(14)
+    known = {"cam0": {"position": np.zeros(3)}, "cam1": {"position": np.zeros(3)}}
+    gauge = fix_gauge(rig(known), NAMES, internal)
+    assert gauge.warnings or gauge.scale == "arbitrary"

@@ -1,0 +1,162 @@
+"""Two cameras that know nothing of each other: lag, rate and pose, or an honest refusal."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hub.timing.pair import PairSolution, solve_pair
+from hub.timing.tracks import SmoothTrack, smooth_track
+from protocols.geometry import so3
+from tests.rigs import Path, Session, random_path, simulate
+
+
+def tracks(session: Session, name: str) -> dict[str, SmoothTrack]:
+    lens = session.rig.cameras[name].intrinsics
+    assert lens is not None
+    mine = session.observations().of_camera(name)
+    epoch = min(float(track.time[0]) for track in mine)
+    found = {t.label: smooth_track(t.time, lens.unproject(t.pixels), lens.focal, epoch) for t in mine}
+    return {label: track for label, track in found.items() if track is not None}
+
+
+def solve(session: Session, a: str = "cam0", b: str = "cam1") -> PairSolution:
+    return solve_pair(tracks(session, a), tracks(session, b), (a, b))
+
+
+def lag_error(session: Session, found: PairSolution) -> float:
+    """Error [s] of the time of b at the middle of the overlap, for an instant that a knows."""
+    assert found.fit is not None
+    epochs = {n: min(float(t.time[0]) for t in session.observations().of_camera(n)) for n in (found.a, found.b)}
+    shown_a = found.fit.middle + epochs[found.a]
+    true = session.clocks[found.a].reference_from_camera(shown_a)  # type: ignore[arg-type]
+    shown_b = session.clocks[found.b].camera_from_reference(true)
+    return float((found.fit.middle - found.fit.offset) / found.fit.rate + epochs[found.b] - shown_b)
+
+
+def turn_error(session: Session, found: PairSolution) -> float:
+    """Error [degrees] of the relative rotation."""
+    assert found.fit is not None
+    truth = session.poses[found.b].rotation @ session.poses[found.a].rotation.T
+    return float(np.rad2deg(so3.angle_between(found.fit.pose.rotation, so3.nearest(truth))))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_pair_of_random_cameras_is_solved(seed: int) -> None:
+    session = simulate(seed, 2, 30)
+    found = solve(session)
+    assert found.solved, found.status
+    assert abs(lag_error(session, found)) < 5e-3
+    assert turn_error(session, found) < 0.5
+    assert found.fit is not None
+    truth = session.poses["cam1"].rotation @ (session.poses["cam0"].position - session.poses["cam1"].position)
+    assert np.dot(found.fit.pose.direction, truth) / np.linalg.norm(truth) > np.cos(np.deg2rad(0.7))
+
+
+@pytest.mark.parametrize("seed", range(20, 24))
+def test_outliers_and_drops_are_endured(seed: int) -> None:
+    session = simulate(seed, 2, 40, outliers=0.1, drops=0.2)
+    found = solve(session)
+    assert found.solved, found.status
+    assert abs(lag_error(session, found)) < 5e-3
+    assert turn_error(session, found) < 1.0
+
+
+@pytest.mark.parametrize("fps", [(50.0, 25.0), (30.0, 15.0), (12.0, 60.0)])
+def test_frame_rates_may_differ(fps: tuple[float, float]) -> None:
+    session = simulate(5, 2, 30, fps=fps)
+    found = solve(session)
+    assert found.solved, found.status
+    assert abs(lag_error(session, found)) < 5e-3
+
+
+def test_the_rate_is_found_over_a_long_track() -> None:
+    session = simulate(6, 2, 120, ppm=400)
+    found = solve(session)
+    assert found.solved, found.status
+    assert found.fit is not None
+    truth = session.clocks["cam1"].clock_rate / session.clocks["cam0"].clock_rate
+    assert found.fit.rate == pytest.approx(truth, abs=3e-5)
+
+
+def test_the_same_pair_the_other_way_round_says_the_same() -> None:
+    session = simulate(7, 2, 30)
+    there, back = solve(session), solve(session, "cam1", "cam0")
+    assert there.solved
+    assert back.solved
+    assert there.fit is not None
+    assert back.fit is not None
+    assert there.fit.offset == pytest.approx(-back.fit.offset, abs=3e-3)
+    assert np.rad2deg(so3.angle_between(there.fit.pose.rotation, back.fit.pose.rotation.T)) < 0.3
+
+
+def test_the_answer_is_the_same_twice() -> None:
+    session = simulate(8, 2, 30, outliers=0.1)
+    one, two = solve(session), solve(session)
+    assert one.fit is not None
+    assert two.fit is not None
+    assert one.fit.offset == two.fit.offset
+    np.testing.assert_array_equal(one.fit.pose.rotation, two.fit.pose.rotation)
+
+
+def test_the_label_both_saw_is_the_one_used() -> None:
+    session = simulate(9, 2, 30, labels={"mine": (0,), "ours": (0, 1), "theirs": (1,)})
+    found = solve(session)
+    assert found.solved, found.status
+    assert abs(lag_error(session, found)) < 5e-3
+
+
+def test_no_common_label_is_refused() -> None:
+    found = solve(simulate(9, 2, 20, labels={"mine": (0,), "theirs": (1,)}))
+    assert not found.solved
+    assert "label" in found.status
+
+
+def test_a_still_marker_is_refused() -> None:
+    still = random_path(np.random.default_rng(0))
+    still = Path(still.frequency, still.phase, 0 * still.amplitude)
+    found = solve(simulate(10, 2, 30, path=still))
+    assert not found.solved
+    assert "moves" in found.status
+
+
+@pytest.mark.parametrize("seed", range(30, 42))
+def test_tracks_of_different_things_are_refused(seed: int) -> None:
+    found = solve(simulate(seed, 2, 30, strangers=(1,)))
+    assert not found.solved, f"accepted with {found.fit}"
+
+
+@pytest.mark.parametrize("seed", range(50, 54))
+def test_a_wrong_half_is_refused_or_the_lag_is_right(seed: int) -> None:
+    """One second of overlap is not enough for anybody."""
+    session = simulate(seed, 2, 30, late=0, windows=[(0, 15.5), (14.5, 30)])
+    found = solve(session)
+    assert not found.solved or abs(lag_error(session, found)) < 5e-3
+
+
+def test_no_overlap_at_all_is_refused() -> None:
+    assert not solve(simulate(55, 2, 40, late=0, windows=[(0, 19), (21, 40)])).solved
+
+
+def test_a_motion_that_repeats_itself_is_refused_as_ambiguous() -> None:
+    path = random_path(np.random.default_rng(1))
+    path = Path(np.full((5, 3), 0.25), path.phase, path.amplitude)
+    session = simulate(56, 2, 40, path=path)
+    found = solve(session)
+    assert not found.solved or abs(lag_error(session, found)) < 5e-3
+
+
+def test_a_refusal_says_why() -> None:
+    found = solve(simulate(31, 2, 30, strangers=(1,)))
+    assert found.status != "ok"
+    assert len(found.status) > 15
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_motion_in_a_plane_is_refused_or_right(seed: int) -> None:
+    """Two views of a plane have two relative poses: one of them may not be passed off as the answer."""
+    path = random_path(np.random.default_rng(seed))
+    path = Path(path.frequency, path.phase, path.amplitude * [1.0, 1.0, 0.0])
+    session = simulate(60 + seed, 2, 30, path=path)
+    found = solve(session)
+    assert not found.solved or turn_error(session, found) < 2.0

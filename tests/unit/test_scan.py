@@ -1,0 +1,165 @@
+"""The scan over all lags: its FFT sums are plain sums, and the truth is among its candidates."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hub.timing.scan import GridTrack, PairMoments, Scan, candidates, grid_track, scan_lags
+from hub.timing.tracks import SmoothTrack, smooth_track
+from protocols.geometry.types import Floats
+from tests.rigs import Session, simulate
+
+STEP, SIGMA_PX = 0.05, 0.5
+
+
+def smooth(session: Session) -> list[SmoothTrack]:
+    out = []
+    for name, camera in session.rig.cameras.items():
+        (track,) = session.observations().of_camera(name)
+        assert camera.intrinsics is not None
+        found = smooth_track(track.time, camera.intrinsics.unproject(track.pixels), camera.intrinsics.focal)
+        assert found is not None
+        out.append(found)
+    return out
+
+
+def true_offset(session: Session, a: SmoothTrack, b: SmoothTrack) -> float:
+    """t_a - t_b of one instant in the middle, on the tracks' shifted times."""
+    true = float(session.clocks["cam0"].reference_from_camera(session.middle("cam0")))  # type: ignore[arg-type]
+    shown = [float(session.clocks[n].camera_from_reference(true)) for n in ("cam0", "cam1")]  # type: ignore[arg-type]
+    return (shown[0] - a.epoch) - (shown[1] - b.epoch)
+
+
+def random_grid(seed: int, count: int) -> GridTrack:
+    rng = np.random.default_rng(seed)
+    weight = rng.random(count) * (rng.random(count) > 0.2)
+    return GridTrack(rng.normal(), STEP, rng.normal(size=(count, 2)), weight, 1e-3, np.eye(3))
+
+
+def direct_moments(a: GridTrack, b: GridTrack, lag: int) -> Floats:
+    """Sum over samples n of w_a w_b (s_a ⊗ s_b)(s_a ⊗ s_b)ᵀ with b taken at n + lag."""
+    out = np.zeros((9, 9))
+    for n in range(len(a.weight)):
+        if 0 <= n + lag < len(b.weight):
+            product = np.kron(np.r_[a.points[n], 1.0], np.r_[b.points[n + lag], 1.0])
+            out += a.weight[n] * b.weight[n + lag] * np.outer(product, product)
+    return out
+
+
+@pytest.mark.parametrize(("n_a", "n_b"), [(40, 40), (25, 60), (60, 13)])
+def test_the_fft_moments_are_direct_sums(n_a: int, n_b: int) -> None:
+    a, b = random_grid(1, n_a), random_grid(2, n_b)
+    moments = PairMoments(a, b)
+    assert moments.lags[0] == -(n_a - 1)
+    assert moments.lags[-1] == n_b - 1
+    for which in (3, n_a // 2, n_a - 1, n_a + 3, n_a + n_b - 5):
+        lag = int(moments.lags[which])
+        direct = direct_moments(a, b, lag)
+        matrix, _ = moments.matrices(np.array([which]))
+        assert moments.support[which] == pytest.approx(direct[8, 8] * STEP, abs=1e-9)
+        np.testing.assert_allclose(matrix[0] * direct[8, 8], direct, atol=1e-9)
+
+
+def test_the_offset_of_a_lag_is_the_time_between_the_samples() -> None:
+    a, b = random_grid(3, 30), random_grid(4, 30)
+    moments = PairMoments(a, b)
+    for which in (5, 29, 50):
+        lag = int(moments.lags[which])
+        n = max(0, -lag)
+        time_a, time_b = a.begin + STEP * n, b.begin + STEP * (n + lag)
+        assert moments.offset[which] == pytest.approx(time_a - time_b)
+
+
+def test_the_normalisation_is_the_variance_of_the_epipolar_product() -> None:
+    """Taubin: the variance of s_aᵀ F s_b under noise, to first order, by differences."""
+    a, b = random_grid(5, 30), random_grid(6, 30)
+    moments = PairMoments(a, b)
+    which = 29  # lag 0
+    _, norm = moments.matrices(np.array([which]))
+    f = np.random.default_rng(0).normal(size=9)
+    total, weights = 0.0, 0.0
+    for n in range(30):
+        w = a.weight[n] * b.weight[n]
+        sa, sb = np.r_[a.points[n], 1.0], np.r_[b.points[n], 1.0]
+        matrix = f.reshape(3, 3)
+        gradient_a, gradient_b = (matrix @ sb)[:2], (matrix.T @ sa)[:2]
+        total += w * (a.sigma**2 * gradient_a @ gradient_a + b.sigma**2 * gradient_b @ gradient_b)
+        weights += w
+    assert f @ norm[0] @ f == pytest.approx(total / weights, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_at_the_true_lag_the_cost_is_the_noise_and_elsewhere_more(seed: int) -> None:
+    session = simulate(seed, 2, 30)
+    a, b = smooth(session)
+    fine = STEP / 8  # half a step of motion is less than the noise
+    scan = scan_lags(PairMoments(grid_track(a, fine, SIGMA_PX), grid_track(b, fine, SIGMA_PX)), 1.0)
+    at = int(np.argmin(np.abs(scan.offset - true_offset(session, a, b))))
+    near = float(np.min(scan.cost[at - 1 : at + 2]))
+    assert near < 3.0
+    usual = float(np.median(scan.cost[scan.support > 0.5 * scan.support.max()]))
+    assert near < 0.03 * usual
+
+
+@pytest.mark.parametrize("seed", range(10, 18))
+def test_the_true_lag_is_among_the_candidates(seed: int) -> None:
+    session = simulate(seed, 2, 25, outliers=0.05 * (seed % 2), drops=0.1)
+    a, b = smooth(session)
+    scan = scan_lags(PairMoments(grid_track(a, STEP, SIGMA_PX), grid_track(b, STEP, SIGMA_PX)), 1.0)
+    chosen = scan.offset[candidates(scan, 3, 10)]
+    assert len(chosen) <= 10
+    assert np.min(np.abs(chosen - true_offset(session, a, b))) < STEP
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_short_overlap_of_long_tracks_is_still_a_candidate(seed: int) -> None:
+    session = simulate(seed, 2, 60, windows=[(0, 35), (22, 60)], late=0)
+    a, b = smooth(session)
+    scan = scan_lags(PairMoments(grid_track(a, STEP, SIGMA_PX), grid_track(b, STEP, SIGMA_PX)), 1.0)
+    chosen = scan.offset[candidates(scan, 3, 10)]
+    truth = session.clocks["cam0"].camera_from_reference(  # type: ignore[arg-type]
+        session.clocks["cam1"].reference_from_camera(session.middle("cam1"))  # type: ignore[arg-type]
+    ) - (a.epoch + session.middle("cam1") - b.epoch)
+    assert np.min(np.abs(chosen - float(truth))) < STEP
+
+
+def test_the_best_matrix_at_the_true_lag_fits_the_tracks() -> None:
+    session = simulate(1, 2, 30, noise=0.2)
+    a, b = smooth(session)
+    moments = PairMoments(grid_track(a, STEP, SIGMA_PX), grid_track(b, STEP, SIGMA_PX))
+    offset = true_offset(session, a, b)
+    at = int(np.argmin(np.abs(moments.offset - offset)))
+    f = moments.fundamental(at)
+    assert np.linalg.norm(f) == pytest.approx(1.0)
+    here, there = a.at(a.time), b.at(a.time - moments.offset[at])
+    both = np.isfinite(there).all(axis=1)
+    sa, sb = np.column_stack([here, np.ones(len(here))])[both], np.column_stack([there, np.ones(len(here))])[both]
+    lines = sa @ f
+    distance = np.abs((lines * sb).sum(axis=1)) / np.linalg.norm(lines[:, :2], axis=1) * b.focal
+    assert np.median(distance) < 10  # the grid of lags is coarse: up to half a step of motion
+
+
+def test_a_still_track_supports_no_lag() -> None:
+    time = np.arange(0, 20, 1 / 30)
+    rng = np.random.default_rng(0)
+    still = smooth_track(time, rng.normal(0, 5e-4, (600, 2)), 1000.0)
+    (moving, _) = smooth(simulate(2, 2, 20))
+    assert still is not None
+    moments = PairMoments(grid_track(still, STEP, SIGMA_PX), grid_track(moving, STEP, SIGMA_PX))
+    assert moments.support.max() < 3.0
+    assert not np.isfinite(scan_lags(moments, 5.0).cost).any()
+
+
+def test_candidates_come_from_every_octave_of_support() -> None:
+    support = np.r_[np.full(50, 3.0), np.full(50, 30.0)]
+    cost = np.full(100, 1000.0)
+    cost[20], cost[70], cost[90] = 5.0, 10.0, 500.0
+    chosen = candidates(Scan(np.arange(100.0), support, cost), 2, 10)
+    assert {20, 70} <= set(chosen.tolist())
+    assert chosen[0] == 70  # more support speaks for it
+
+
+def test_no_support_has_no_candidate() -> None:
+    scan = Scan(np.arange(5.0), np.zeros(5), np.full(5, np.inf))
+    assert len(candidates(scan, 3, 10)) == 0

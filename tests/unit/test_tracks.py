@@ -1,0 +1,201 @@
+"""A raw track becomes a smooth one: lies thrown out, noise measured, gaps kept."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hub.timing.tracks import SmoothTrack, neighbour_test, smooth_track
+from protocols.geometry.types import Floats
+from tests.rigs import random_path
+
+FOCAL = 1000.0
+
+
+def track(seed: int, seconds: float = 30.0, fps: float = 30.0, noise_px: float = 0.5) -> tuple[Floats, Floats, Floats]:
+    """Time (n,), noisy and true normalised points (n, 2), moving by some hundred pixels a second."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0, seconds, 1 / fps) + rng.normal(0, 1e-4, round(seconds * fps))
+    truth = 0.3 * random_path(rng).at(time)[:, :2]
+    return time, truth + rng.normal(0, noise_px / FOCAL, truth.shape), truth
+
+
+def smoothed(time: Floats, points: Floats, epoch: float | None = None) -> SmoothTrack:
+    found = smooth_track(time, points, FOCAL, epoch)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("noise_px", [0.3, 1.0, 3.0])
+def test_the_noise_is_measured_within_fifteen_percent(seed: int, noise_px: float) -> None:
+    time, points, _ = track(seed, noise_px=noise_px)
+    assert smoothed(time, points).sigma_px == pytest.approx(noise_px, rel=0.15)
+
+
+@pytest.mark.parametrize("fps", [10.0, 25.0, 60.0])
+def test_the_noise_is_measured_at_any_frame_rate(fps: float) -> None:
+    time, points, _ = track(1, seconds=60, fps=fps, noise_px=0.8)
+    assert smoothed(time, points).sigma_px == pytest.approx(0.8, rel=0.15)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_smoothing_brings_points_nearer_to_the_truth(seed: int) -> None:
+    time, points, truth = track(seed, noise_px=1.0)
+    found = smoothed(time, points).at(time - time[0])
+    error = np.sqrt(np.nanmean((found - truth) ** 2)) * FOCAL
+    assert error < 0.6
+
+
+def test_the_speed_is_the_slope_of_the_track() -> None:
+    time, points, truth = track(2, noise_px=0.2)
+    found = smoothed(time, points).at(time - time[0], 1)
+    slope = np.gradient(truth, time, axis=0)
+    inner = slice(30, -30)
+    scale = np.abs(slope).max()
+    assert np.sqrt(np.mean((found - slope)[inner] ** 2)) < 0.03 * scale
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2, 0.35])
+def test_false_detections_are_dropped_and_honest_ones_kept(share: float) -> None:
+    time, points, _ = track(3, seconds=40)
+    rng = np.random.default_rng(9)
+    false = rng.random(len(time)) < share
+    points[false] = rng.uniform(-0.6, 0.6, (int(false.sum()), 2))
+    inlier = smoothed(time, points).inlier
+    far = false.copy()
+    assert inlier[far].mean() < 0.05
+    assert inlier[~false].mean() > 0.95 if share < 0.3 else inlier[~false].mean() > 0.8
+
+
+def test_a_false_detection_that_stands_still_is_dropped() -> None:
+    """A lamp in the background that the detector takes for the marker now and then."""
+    time, points, truth = track(4, seconds=40)
+    false = np.random.default_rng(1).random(len(time)) < 0.15
+    points[false] = [0.2, 0.1]
+    far = false & (np.linalg.norm(truth - [0.2, 0.1], axis=1) * FOCAL > 20)
+    assert smoothed(time, points).inlier[far].mean() < 0.05
+
+
+def test_gaps_are_kept_apart() -> None:
+    time, points, _ = track(5, seconds=20)
+    keep = (time < 8) | (time > 9.5)
+    found = smoothed(time[keep], points[keep])
+    assert np.isnan(found.at(np.array([8.5, 9.0]) - found.epoch)).all()
+    assert np.isfinite(found.at(np.array([7.8, 9.7]) - found.epoch)).all()
+    assert len(found.basis.starts) == 2
+
+
+def test_a_few_dropped_frames_are_bridged() -> None:
+    time, points, truth = track(6, seconds=20)
+    keep = np.ones(len(time), dtype=bool)
+    keep[200:204] = False
+    found = smoothed(time[keep], points[keep])
+    error = np.linalg.norm(found.at(time[200:204] - found.epoch) - truth[200:204], axis=1) * FOCAL
+    assert error.max() < 3
+
+
+def test_labels_on_every_fourth_frame_make_one_track() -> None:
+    """Interpolating tools label at 7.5 per second: gaps are of the labels' interval, not of 0.2 s."""
+    time, points, truth = track(7, seconds=40)
+    time, points, truth = time[::8], points[::8], truth[::8]  # 3.75 a second: 0.27 s apart
+    found = smoothed(time, points)
+    assert len(found.basis.starts) == 1
+    assert found.inlier.mean() > 0.95
+
+
+def test_straight_labels_between_keyframes_are_not_thrown_out() -> None:
+    """Labels drawn linearly between hand-set ones have no noise at all, and kinks."""
+    time, _, truth = track(8, seconds=40)
+    keys = np.arange(0, len(time), 12)
+    points = np.column_stack([np.interp(time, time[keys], truth[keys, d]) for d in range(2)])
+    found = smoothed(time, points)
+    assert found.inlier.mean() > 0.8
+    assert found.sigma_px >= 0.05
+
+
+def test_the_epoch_costs_no_precision() -> None:
+    time, points, _ = track(9)
+    near, far = smoothed(time, points), smoothed(time + 1.7e9, points)
+    assert far.epoch == time[0] + 1.7e9
+    np.testing.assert_allclose(far.time, near.time, atol=5e-7)
+    assert far.sigma == pytest.approx(near.sigma, rel=1e-3)
+
+
+def test_an_epoch_of_zero_is_an_epoch() -> None:
+    time, points, _ = track(9)
+    found = smoothed(time + 5.0, points, epoch=0.0)
+    assert found.epoch == 0.0
+    assert found.time[0] > 4.9
+
+
+def test_rows_without_direction_are_left_out() -> None:
+    time, points, _ = track(10)
+    points[::7] = np.nan
+    found = smoothed(time, points)
+    assert not found.inlier[::7].any()
+    assert found.inlier.mean() > 0.8
+    assert len(found.time) == found.inlier.sum()
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 7])
+def test_a_handful_of_rows_is_no_track(count: int) -> None:
+    time, points, _ = track(11)
+    assert smooth_track(time[:count], points[:count], FOCAL) is None
+
+
+def test_nothing_but_nan_is_no_track() -> None:
+    time, points, _ = track(11)
+    assert smooth_track(time, points * np.nan, FOCAL) is None
+
+
+def test_rows_scattered_over_minutes_are_no_track() -> None:
+    rng = np.random.default_rng(0)
+    time = np.sort(np.concatenate([[k * 60, k * 60 + 0.03] for k in range(10)]))
+    found = smooth_track(time, rng.normal(0, 0.1, (20, 2)), FOCAL)
+    assert found is None or np.isnan(found.at(np.array([30.0]))).all()
+
+
+def test_pure_noise_does_not_pass_for_a_good_track() -> None:
+    rng = np.random.default_rng(0)
+    time = np.arange(0, 20, 1 / 30)
+    found = smooth_track(time, rng.uniform(-0.5, 0.5, (600, 2)), FOCAL)
+    assert found is None or found.sigma_px > 20 or found.inlier.mean() < 0.4
+
+
+def test_a_still_point_is_a_good_track() -> None:
+    rng = np.random.default_rng(0)
+    time = np.arange(0, 20, 1 / 30)
+    found = smoothed(time, 0.1 + rng.normal(0, 0.5 / FOCAL, (600, 2)))
+    assert found.sigma_px == pytest.approx(0.5, rel=0.15)
+    assert found.inlier.mean() > 0.98
+
+
+def test_identical_points_are_a_track_without_noise() -> None:
+    found = smoothed(np.arange(0, 20, 1 / 30), np.full((600, 2), 0.1))
+    assert found.inlier.all()
+    np.testing.assert_allclose(found.at(np.array([3.3, 10.0])), 0.1, atol=1e-6)
+
+
+def test_the_callers_arrays_are_left_alone() -> None:
+    time, points, _ = track(12)
+    before = time.copy(), points.copy()
+    smooth_track(time, points, FOCAL)
+    np.testing.assert_array_equal(time, before[0])
+    np.testing.assert_array_equal(points, before[1])
+
+
+def test_the_neighbour_test_survives_forty_percent_of_lies() -> None:
+    time, points, _ = track(13, seconds=60)
+    rng = np.random.default_rng(2)
+    false = rng.random(len(time)) < 0.4
+    points[false] = rng.uniform(-0.6, 0.6, (int(false.sum()), 2))
+    good = neighbour_test(time, points, floor=1.5 / FOCAL)
+    assert good[~false].mean() > 0.6
+    assert good[false].mean() < 0.15
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_the_neighbour_test_takes_any_number_of_rows(count: int) -> None:
+    time, points, _ = track(14)
+    assert neighbour_test(time[:count], points[:count], 1e-3).shape == (count,)
