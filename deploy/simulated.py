@@ -13,7 +13,8 @@ from edge.scenes.session import SimulatedTracks, simulated_session
 from protocols.errors import InputError
 from protocols.files import write_atomically
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
-from protocols.session.observations import DEFAULT_LABEL, gather_tracks
+from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks
+from protocols.session.rig import Rig, RigCamera
 
 TRUTH_CALIBRATION, TRUTH_TRAJECTORY = "truth_calibration.toml", "truth_trajectory.csv"
 _TRUTH_HZ = 50.0
@@ -44,7 +45,7 @@ def write_simulated_session(
         raise InputError(f"cannot be made: {error.strerror}", file=out, remedy="choose another --out") from None
     tables = _rig_tables(filmed, scene_name)
     write_rig(out / RIG_FILE, tables)
-    write_observations(out / OBSERVATIONS_FILE, _observations(filmed))
+    write_observations(out / OBSERVATIONS_FILE, observations_of(filmed))
     write_atomically(out / TRUTH_CALIBRATION, tomli_w.dumps(_truth_tables(filmed, tables)))
     _write_truth_trajectory(out / TRUTH_TRAJECTORY, filmed)
     return {"scene": scene_name, "seed": seed, "cameras": len(scene.cameras), "rows": rows, "seconds": seconds}
@@ -64,7 +65,20 @@ def _rig_tables(filmed: SimulatedTracks, name: str) -> dict[str, Any]:
     return tables
 
 
-def _observations(filmed: SimulatedTracks) -> Any:
+def rig_of(filmed: SimulatedTracks) -> Rig:
+    """The rig of a simulated world: its cameras' lenses, and nothing of where they stand."""
+    return Rig(
+        {
+            camera.name: RigCamera(
+                camera.name, (camera.intrinsics.width, camera.intrinsics.height), camera.fps, camera.intrinsics
+            )
+            for camera in filmed.cameras
+        }
+    )
+
+
+def observations_of(filmed: SimulatedTracks) -> Observations:
+    """What the cameras of a simulated world reported, as a session's observations."""
     tracks = list(filmed.tracks.values())
     names = [track.camera for track in tracks for _ in range(len(track))]
     return gather_tracks(

@@ -11,14 +11,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hub.points import sampled_track
 from hub.poses.adjust import adjust, noise, residual_norms
-from hub.poses.graph import ClockGraph, average_clocks, components
+from hub.poses.graph import ClockGraph, ClockGuess, average_clocks, components
 from hub.poses.initialise import Camera, Scaffold, agreement, grow, place_known
 from hub.poses.problem import Freedom, Problem, Rows, State
 from hub.publish import publish
 from hub.timing.pair import PairSolution, solve_pair
 from hub.timing.paper_pairs import paper_pair
-from hub.timing.tracks import smooth_track
+from hub.timing.shared import solve_shared_pair
+from hub.timing.tracks import Track, smooth_only, smooth_track
 from hub.timing.two_view import relative_pose
 from protocols.errors import Refused
 from protocols.session.calibration import Calibration, CameraCalibration
@@ -41,6 +43,7 @@ class Prepared:
     epochs: dict[str, float]
     labels: list[str]
     refused: dict[str, str]
+    shared_clock: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,6 +93,7 @@ def prepare(rig: Rig, observations: Observations) -> Prepared:
     rows: dict[str, list[Rows]] = {}
     epochs: dict[str, float] = {}
     labels = observations.labels
+    start = min((float(track.time[0]) for track in observations.tracks.values()), default=0.0)
     for name, rig_camera in rig.cameras.items():
         tracks = observations.of_camera(name)
         if not tracks:
@@ -99,10 +103,16 @@ def prepare(rig: Rig, observations: Observations) -> Prepared:
         if lens is None:
             refused[name] = "no intrinsics (matrix and distortions in rig.toml): run `syncline intrinsics`"
             continue
-        epoch = min(float(track.time[0]) for track in tracks)
-        smooth, mine = {}, []
+        epoch = start if rig.shared_clock else min(float(track.time[0]) for track in tracks)
+        smooth: dict[str, Track] = {}
+        mine = []
         for track in tracks:
-            cleaned = smooth_track(track.time, lens.unproject(track.pixels), lens.focal, epoch)
+            normalised = lens.unproject(track.pixels)
+            cleaned: Track | None
+            if rig.shared_clock:
+                cleaned = sampled_track(track.time, normalised, lens.focal, epoch)
+            else:
+                cleaned = smooth_track(track.time, normalised, lens.focal, epoch)
             if cleaned is None:
                 continue
             smooth[track.label] = cleaned
@@ -112,7 +122,7 @@ def prepare(rig: Rig, observations: Observations) -> Prepared:
             refused[name] = f"too few connected observations ({sum(len(track) for track in tracks)} rows)"
             continue
         cameras[name], rows[name], epochs[name] = Camera(name, lens, smooth), mine, epoch
-    return Prepared(cameras, rows, epochs, labels, refused)
+    return Prepared(cameras, rows, epochs, labels, refused, rig.shared_clock)
 
 
 def solve_pairs(prepared: Prepared, tell: Progress) -> list[PairSolution]:
@@ -122,7 +132,12 @@ def solve_pairs(prepared: Prepared, tell: Progress) -> list[PairSolution]:
     pairs = []
     for done, (a, b) in enumerate(todo):
         tell(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
-        pairs.append(solve_pair(prepared.cameras[a].tracks, prepared.cameras[b].tracks, (a, b)))
+        tracks_a, tracks_b = prepared.cameras[a].tracks, prepared.cameras[b].tracks
+        pairs.append(
+            solve_shared_pair(tracks_a, tracks_b, (a, b))
+            if prepared.shared_clock
+            else solve_pair(smooth_only(tracks_a), smooth_only(tracks_b), (a, b))
+        )
     return pairs
 
 
@@ -135,7 +150,7 @@ def paper_pairs(prepared: Prepared, observations: Observations, tell: Progress) 
         first, second = prepared.cameras[a], prepared.cameras[b]
         pairs.append(
             paper_pair(
-                (first.tracks, second.tracks),
+                (smooth_only(first.tracks), smooth_only(second.tracks)),
                 (observations.by_label(a), observations.by_label(b)),
                 (first.intrinsics, second.intrinsics),
                 (a, b),
@@ -155,7 +170,14 @@ def solve_network(prepared: Prepared, pairs: list[PairSolution], tell: Progress)
     for name in set(names) - set(groups[0]):
         refused[name] = _why_alone(name, groups, pairs)
     graph = _graph(prepared, groups[0], solved)
-    scaffold, unplaced = grow(prepared.cameras, graph, prepared.rows, prepared.labels, lambda t: tell(t, 0.6))
+    scaffold, unplaced = grow(
+        prepared.cameras,
+        graph,
+        prepared.rows,
+        prepared.labels,
+        lambda t: tell(t, 0.6),
+        Freedom(clock=not prepared.shared_clock),
+    )
     refused |= unplaced
     while True:
         scaffold = _adjust_all(scaffold, tell)
@@ -171,7 +193,9 @@ def solve_network(prepared: Prepared, pairs: list[PairSolution], tell: Progress)
             raise Refused("no two cameras agree on one path", refused)
         group = components(remaining, kept)[0]
         graph = _graph(prepared, group, kept)
-        scaffold, unplaced = grow(prepared.cameras, graph, prepared.rows, prepared.labels)
+        scaffold, unplaced = grow(
+            prepared.cameras, graph, prepared.rows, prepared.labels, freedom=Freedom(clock=not prepared.shared_clock)
+        )
         refused |= unplaced
     order = {name: refused[name] for name in [*prepared.refused, *names] if name in refused}
     warnings = tuple(
@@ -207,8 +231,11 @@ def solve_known(prepared: Prepared, known: dict[str, CameraCalibration], tell: P
     todo = list(itertools.combinations(cameras, 2))
     for done, (a, b) in enumerate(todo):
         tell(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
+        if prepared.shared_clock:
+            pairs.append(solve_shared_pair(cameras[a].tracks, cameras[b].tracks, (a, b)))
+            continue
         relative = relative_pose(known[a].pose, known[b].pose)
-        pairs.append(solve_pair(cameras[a].tracks, cameras[b].tracks, (a, b), known=relative))
+        pairs.append(solve_pair(smooth_only(cameras[a].tracks), smooth_only(cameras[b].tracks), (a, b), known=relative))
     solved = [pair for pair in pairs if pair.solved]
     if not solved:
         raise Refused(_why_nothing(pairs, refused), refused | _pair_reasons(list(cameras), pairs))
@@ -217,13 +244,15 @@ def solve_known(prepared: Prepared, known: dict[str, CameraCalibration], tell: P
     graph = _graph(inside, groups[0], solved)
     tell("adjusting", 0.75)
     poses = {name: known[name].pose for name in groups[0]}
-    scaffold = place_known(cameras, graph, prepared.rows, prepared.labels, poses)
+    scaffold = place_known(cameras, graph, prepared.rows, prepared.labels, poses, not prepared.shared_clock)
     problem, state, _ = adjust(scaffold.problem, scaffold.state)
     return Solution(replace_solution(scaffold, problem, state), tuple(pairs), refused, inside, "joint", known=known)
 
 
 def _graph(prepared: Prepared, group: list[str], pairs: list[PairSolution]) -> ClockGraph:
     inside = [pair for pair in pairs if pair.a in group and pair.b in group]
+    if prepared.shared_clock:
+        return ClockGraph({name: ClockGuess(1.0, 0.0, 0.0) for name in group}, tuple(inside), ())
     return average_clocks(group, inside, {name: prepared.cameras[name].tracks for name in group})
 
 

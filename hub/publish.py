@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hub.points import SAME_TIME, PointBasis
 from hub.poses import covariance as cov
 from hub.poses.adjust import motion_prior, predict, residual_norms
 from hub.poses.gauge import fix_gauge, given_world, transform_state
@@ -143,6 +144,8 @@ def _rate_hz(rig: Rig, problem: Problem, names: list[str]) -> float:
 
 def supported(problem: Problem, state: State, label: int, time: Floats) -> Floats:
     """How many cameras saw the point within SEEN_WITHIN of internal reference times (n,)."""
+    # A point of a shared clock is seen at its instant or not at all.
+    within = SAME_TIME if isinstance(state.trajectories[label].basis, PointBasis) else SEEN_WITHIN
     count = np.zeros(len(time))
     for number, camera in enumerate(state.cameras):
         mine = [r.time[r.use] for r in problem.rows if r.camera == number and r.label == label]
@@ -151,7 +154,7 @@ def supported(problem: Problem, state: State, label: int, time: Floats) -> Float
             continue
         seen = np.sort(camera.reference_time(joined))
         after = np.clip(np.searchsorted(seen, time), 1, len(seen) - 1)
-        count += np.minimum(np.abs(seen[after] - time), np.abs(time - seen[after - 1])) <= SEEN_WITHIN
+        count += np.minimum(np.abs(seen[after] - time), np.abs(time - seen[after - 1])) <= within
     return count
 
 
@@ -168,11 +171,12 @@ def _table(
     """The path of one label at ``rate_hz`` on the reference camera's clock, where two cameras saw it."""
     base = state.cameras[reference]
     path = state.trajectories[label]
-    begins, basis = path.basis.starts, path.basis
-    ends = begins + basis.intervals * basis.spacing
-    # A grid on the reference camera's clock, so that two runs on one log sample the same instants.
-    first, last = base.camera_time(np.array([begins[0], ends[-1]]))
-    ticks = np.arange(np.ceil((first + epoch) * rate_hz), np.floor((last + epoch) * rate_hz) + 1) / rate_hz
+    if isinstance(path.basis, PointBasis):
+        ticks = base.camera_time(path.basis.instants) + epoch
+    else:
+        # A grid on the reference camera's clock, so that two runs on one log sample the same instants.
+        first, last = base.camera_time(np.array([path.basis.begin, path.basis.end]))
+        ticks = np.arange(np.ceil((first + epoch) * rate_hz), np.floor((last + epoch) * rate_hz) + 1) / rate_hz
     internal = base.reference_time(ticks - epoch)
     position = path.at(internal)
     good = np.isfinite(position).all(axis=1) & (supported(problem, state, label, internal) >= 2)

@@ -43,6 +43,16 @@ class SplineBasis:
         return int(self.intervals.sum() + 3 * len(self.intervals))
 
     @property
+    def begin(self) -> float:
+        """First time of the first stretch [s]."""
+        return float(self.starts[0])
+
+    @property
+    def end(self) -> float:
+        """Last time of the last stretch [s]."""
+        return float(self.starts[-1] + self.intervals[-1] * self.spacing)
+
+    @property
     def offsets(self) -> Ints:
         """(s,) index of each stretch's first control point."""
         return np.asarray(np.r_[0, np.cumsum(self.intervals + 3)[:-1]].astype(np.int64))

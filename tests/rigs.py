@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from protocols.clocks import TimeMap
+from protocols.clocks import CameraTime, ReferenceTime, TimeMap
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
@@ -68,9 +68,7 @@ class Session:
     def csv(self) -> str:
         """The rows as observations.csv."""
         lines = ["camera,frame,time,u,v,label"]
-        for c, k, f, t, (u, v) in zip(
-            self.camera, self.label, self.frame, self.time, self.pixels, strict=True
-        ):
+        for c, k, f, t, (u, v) in zip(self.camera, self.label, self.frame, self.time, self.pixels, strict=True):
             lines.append(f"{c},{f},{t:.17g},{u:.17g},{v:.17g},{k}")
         return "\n".join(lines) + "\n"
 
@@ -79,13 +77,22 @@ class Session:
         mine = self.time[[name == camera for name in self.camera]]
         return float(0.5 * (mine.min() + mine.max()))
 
-    def clock_error(self, camera: str, reference: str, found: TimeMap) -> float:
-        """How far off [s] a found map onto the reference camera's clock is, in the middle of the camera's span.
+    def true_time(self, camera: str, shown: float) -> float:
+        """The true time [s] at which the camera's clock shows ``shown``."""
+        return self.clocks[camera].reference_from_camera(CameraTime(shown))
 
-        In the camera's own seconds about its epoch, so that a Unix time costs the check no digits.
-        """
+    def shown(self, camera: str, true: float) -> float:
+        """What the camera's clock shows at a true time [s]."""
+        return self.clocks[camera].camera_from_reference(ReferenceTime(true))
+
+    def truth_at(self, label: str, camera: str, shown: Floats) -> Floats:
+        """True positions (n, 3) of a label at times (n,) of the camera's clock."""
+        return self.paths[label].at(np.array([self.true_time(camera, float(t)) for t in shown]))
+
+    def clock_error(self, camera: str, reference: str, found: TimeMap) -> float:
+        """How far off [s] a found map onto the reference camera's clock is, in the middle of the camera's span."""
         middle = self.middle(camera)
-        truth = self.clocks[reference].camera_from_reference(self.clocks[camera].reference_from_camera(middle))  # type: ignore[arg-type]
+        truth = self.shown(reference, self.true_time(camera, middle))
         return float(found.clock_rate * middle + found.time_offset - truth)
 
     def turn_error(self, found: Mapping[str, Pose]) -> float:
@@ -95,9 +102,7 @@ class Session:
         errors = []
         for name in names[1:]:
             truth = self.poses[name].rotation @ self.poses[first].rotation.T
-            errors.append(
-                so3.angle_between(found[name].rotation @ found[first].rotation.T, so3.nearest(truth))
-            )
+            errors.append(so3.angle_between(found[name].rotation @ found[first].rotation.T, so3.nearest(truth)))
         return max(errors)
 
 
@@ -200,7 +205,7 @@ def simulate(
         np.concatenate([part[2] for part in parts]),
         np.concatenate([part[3] for part in parts]),
         np.concatenate([part[4] for part in parts]),
-        {name: pose for name, pose in zip(names, poses, strict=True)},
+        dict(zip(names, poses, strict=True)),
         clocks,
         paths,
     )

@@ -13,9 +13,7 @@ from protocols.messages import syncline_pb2 as pb
 MATRIX = [600.0, 0.0, 319.5, 0.0, 600.0, 239.5, 0.0, 0.0, 1.0]
 
 
-def observation(
-    camera: str = "cam0", sequence: int = 0, boot_id: str = "boot-1", points: int = 1
-) -> pb.Observation:
+def observation(camera: str = "cam0", sequence: int = 0, boot_id: str = "boot-1", points: int = 1) -> pb.Observation:
     """One frame in which ``points`` markers were detected."""
     detection = pb.Detection(
         u=320.5,

@@ -11,6 +11,8 @@ from cyclopts import Parameter
 from protocols.errors import EXIT_DONE, EXIT_REFUSED, InputError
 
 if TYPE_CHECKING:
+    from rich.live import Live as RichLive
+
     from deploy.demo import Live
 
 
@@ -76,7 +78,7 @@ class _display:  # noqa: N801 - reads as a verb where it is used
     def __init__(self, seconds: float, names: list[str], quiet: bool) -> None:
         self._seconds, self._names, self._quiet = seconds, names, quiet
         self._printed = -10.0
-        self._live = None
+        self._live: RichLive | None = None
 
     def __enter__(self):  # type: ignore[no-untyped-def]
         if not self._quiet and sys.stdout.isatty():

@@ -26,6 +26,11 @@ _TO_METRIC = np.array([[0.114, 0.587, 0.299], [0.5, -0.331, -0.169], [-0.081, -0
     [[_LUMA_WEIGHT], [1.6], [1.6]]
 )
 _REJECT = 30.0
+# A palette that stands for everything that is not the target: hues [°], saturations, values.
+_TURNS = tuple(float(turn) for turn in range(0, 360, 14))
+_STRENGTHS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+_VALUES = (0.08, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
+_APART = 28.0  # from the target's examples, in the metric: what is farther away may be called something else
 _COMMON = 0.25  # a colour is no target if it is this common outside the box against inside
 
 
@@ -90,16 +95,14 @@ class ColourModel:
                 remedy="use a brightly coloured ball, or teach the detector from a picture",
             )
         grid = [
-            (hue + turn, strength, value)
-            for turn in np.arange(0.0, 360.0, 14.0)
-            for strength in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-            for value in (0.08, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
+            ((float(hue) + turn) % 360.0, strength, value)
+            for turn in _TURNS
+            for strength in _STRENGTHS
+            for value in _VALUES
             if turn or strength < 0.6 * saturation
         ]
-        palette = np.array(grid, dtype=np.float32)
-        palette[:, 0] %= 360.0
-        other = cv2.cvtColor(palette[None], cv2.COLOR_HSV2BGR)[0].astype(np.float64) * 255.0
-        return cls(np.clip(np.concatenate([shades, glints]), 0, 255), np.clip(other, 0, 255))
+        other = _from_hsv(grid)
+        return cls(np.clip(np.concatenate([shades, glints]), 0, 255), other)
 
 
 def codes(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint16]:
@@ -122,17 +125,31 @@ def taught(image: npt.NDArray[np.uint8], inside: npt.NDArray[np.bool_], outside:
     shape = (_CELLS,) * 3
     within = _smooth(np.bincount(code[inside], minlength=_CELLS**3).reshape(shape) / max(int(inside.sum()), 1))
     beyond = _smooth(np.bincount(code[outside], minlength=_CELLS**3).reshape(shape) / max(int(outside.sum()), 1))
-    # Compare counts of pixels, not shares: a box of 20 px beside 300,000 px of background.
+    # Compare counts of pixels, not shares: a box of 400 px beside 300,000 px of background.
     share = max(int(outside.sum()), 1) / max(int(inside.sum()), 1)
     is_target = (within > 0) & (beyond * share < _COMMON * within) & (beyond < _COMMON * within)
-    target = _examples(within * is_target, floor=0.1 / max(int(inside.sum()), 1))
+    # The rim's pixels mix target and background; only what lies inside of it is an example of the target.
+    blob = inside & is_target.ravel()[code]
+    core = cv2.erode(blob.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    pure = core if core.sum() >= 9 else blob
+    cells = np.bincount(code[pure], minlength=_CELLS**3).reshape(shape) * is_target
+    target = _examples(cells.astype(np.float64))
     if not len(target):
         raise InputError(
             "nothing in the taught box has a colour of its own",
             remedy="draw the box closely around the target, and choose a target whose colour is rare in the scene",
         )
-    other = _examples(np.where(is_target, 0.0, beyond + within), floor=0.0)
-    return ColourModel(target, other)
+    seen = _examples(np.where(is_target, 0.0, beyond))
+    # One picture does not show all that other cameras will see: a palette stands for the rest.
+    palette = _from_hsv([(h, s, v) for h in _TURNS for s in _STRENGTHS for v in _VALUES])
+    return ColourModel(target, np.concatenate([seen, palette[_nearest(palette, target) > _APART]]))
+
+
+def _from_hsv(colours: list[tuple[float, float, float]]) -> Floats:
+    """BGR 0..255 (n, 3) of hue [°], saturation and value 0..1."""
+    hsv = np.array(colours, dtype=np.float32)[None]
+    bgr = np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR), dtype=np.float64)[0]
+    return np.asarray(np.clip(bgr * 255.0, 0.0, 255.0))
 
 
 def _nearest(colours: Floats, examples: Floats) -> Floats:
@@ -158,10 +175,10 @@ def _smooth(histogram: Floats) -> Floats:
     return out
 
 
-def _examples(weight: Floats, floor: float) -> Floats:
+def _examples(weight: Floats) -> Floats:
     """The most frequent colours (n, 3) BGR of a histogram (32, 32, 32)."""
     flat = weight.ravel()
     order = np.argsort(flat)[::-1][:_MAX_EXAMPLES]
-    order = order[flat[order] > floor]
+    order = order[flat[order] > 0.0]
     cells = np.stack(np.unravel_index(order, weight.shape), axis=-1)
     return np.asarray((cells + 0.5) * (256 / _CELLS) - 0.5)

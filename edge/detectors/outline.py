@@ -18,6 +18,7 @@ import numpy.typing as npt
 from protocols.geometry.types import Floats
 
 _RAYS = 48
+_FEWEST = 20  # samples of the ball alone
 _STEP = 0.5  # px between samples of a ray
 _PASSES = 3
 _PIXEL_STD = 6.0  # of a colour about the mixture of its two ends, by noise and texture [8-bit steps]
@@ -27,6 +28,7 @@ _OUTER_BAND = 3.0  # px beyond the rim from which the background's colour is tak
 _FLOOR_PX = 0.03  # std of the centre that remains without noise or texture,
 _FLOOR_SHADE = 0.003  # and its share of the radius: shading that the model of a matt ball does not tell,
 _FLOOR_SMEAR = 0.015  # and its share of a smeared rim's width
+_SHARP = 2.5  # px that noise and sampling make of a sharp rim
 _CORRELATION = 2.0  # px along the rim within which rays err together
 
 _ANGLE = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
@@ -109,7 +111,10 @@ def _rims(image: npt.NDArray[np.uint8], centre: Floats, rim: Floats, half: Float
     colour = samples.astype(np.float64)
     pure = along <= -half[:, None]
     pure |= radius < 0.4 * rim[:, None]  # of a ball smeared by its own diameter the middle is the best there is
-    front = _shaded(colour, radius / rim[:, None], pure & (radius > 0.0))
+    pure &= radius > 0.0
+    if pure.sum() < _FEWEST:
+        return None, half
+    front = _shaded(colour, radius / rim[:, None], pure)
     beyond = (along >= half[:, None]) & (along <= half[:, None] + _OUTER_BAND)
     behind = _band_mean(colour, beyond, 1)
     cover = np.clip(_mixture(colour, front, behind[:, None]), -0.25, 1.25)
@@ -213,5 +218,5 @@ def _covariance(weight: Floats, spread: float, width: Floats, radius: float) -> 
     effective = np.minimum(weight, prior)
     information = (_DESIGN * effective[:, None]).T @ _DESIGN
     covariance = np.linalg.inv(information + 1e-9 * np.eye(5))[1:3, 1:3]
-    floor = _FLOOR_PX**2 + (_FLOOR_SHADE * radius) ** 2 + (_FLOOR_SMEAR * float(width.max())) ** 2
+    floor = _FLOOR_PX**2 + (_FLOOR_SHADE * radius) ** 2 + (_FLOOR_SMEAR * max(float(width.max()) - _SHARP, 0.0)) ** 2
     return np.asarray(spread**2 * together * covariance + floor * np.eye(2))

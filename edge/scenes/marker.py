@@ -25,7 +25,7 @@ _FIELD = Surroundings(
     exposure_s=0.004,
     mixed_fps=True,
 )
-_STREAMS = {"cameras": 0, "path": 1, "background": 2}  # one random stream for each part of a world
+_STREAMS = {"cameras": 0, "path": 1}  # one random stream for each part of a world; the background has 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +78,7 @@ class MarkerScene(Scene):
     def renderer(self, camera: str, rng: np.random.Generator) -> Renderer:
         from edge.scenes.rendering import MarkerRenderer  # OpenCV is only needed to draw
 
-        return MarkerRenderer(self, camera, rng, np.random.default_rng([self.seed, _STREAMS["background"]]))
+        return MarkerRenderer(self, camera, rng)
 
 
 def marker_room(seed: int, cameras: int, mixed_fps: bool = False) -> MarkerScene:

@@ -21,6 +21,7 @@ from protocols.geometry.types import Floats
 if TYPE_CHECKING:
     from edge.scenes.marker import MarkerScene
 
+BACKGROUND_STREAM = 2  # beside the streams of cameras (0) and path (1)
 _NOISE_STD = 3.0  # of a small sensor indoors, in 8-bit steps
 _PEDESTAL = 20  # the noise is stored with it, so that one saturating 8-bit addition applies it
 _BANK_MARGIN = 96  # px by which the noise picture exceeds the image: 9216 different crops
@@ -32,8 +33,8 @@ _AMBIENT, _DIFFUSE, _GLINT = 0.62, 0.42, 0.35
 class MarkerRenderer(Renderer):
     """Pictures of a marker scene from one camera.
 
-    noise_rng: sensor noise. background_rng: the furniture; the same for all cameras of a scene.
-    noise_std: of the sensor noise [8-bit steps].
+    noise_rng: sensor noise. noise_std: its std [8-bit steps]. The furniture comes from the scene's own seed, so that
+    all cameras see the same.
     """
 
     def __init__(
@@ -41,7 +42,6 @@ class MarkerRenderer(Renderer):
         scene: MarkerScene,
         camera: str,
         noise_rng: np.random.Generator,
-        background_rng: np.random.Generator,
         noise_std: float = _NOISE_STD,
     ) -> None:
         self._scene = scene
@@ -49,7 +49,7 @@ class MarkerRenderer(Renderer):
         self._name = camera
         self._rng = noise_rng
         lens = self._camera.intrinsics
-        self._background = self._draw_background(background_rng)
+        self._background = self._draw_background(np.random.default_rng([scene.seed, BACKGROUND_STREAM]))
         # Room for the pedestal below 0; above 255 the addition saturates as a sensor does.
         self._dimmed = np.maximum(self._background, _PEDESTAL) - np.uint8(_PEDESTAL)
         shape = (lens.height + _BANK_MARGIN, lens.width + _BANK_MARGIN, 3)

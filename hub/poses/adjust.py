@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hub.points import PointBasis
 from hub.poses.linear import (
     BorderedSystem,
     add_path_blocks,
@@ -101,8 +102,14 @@ def residual_norms(rows: Rows, camera: CameraState, path: Trajectory) -> Floats:
 
 
 def noise(problem: Problem, state: State) -> Floats:
-    """Robust noise (cameras,) of one pixel coordinate from the median residual."""
+    """Robust noise (cameras,) of one pixel coordinate from the median residual.
+
+    Separate points take up three of the few coordinates that see each of them: there one noise is shared
+    (told apart, it would all be put on one camera) and corrected for what the points have absorbed.
+    """
     sigma = state.sigma.copy()
+    if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
+        return np.full(len(sigma), _pooled_noise(problem, state))
     for camera in range(len(state.cameras)):
         parts = [
             residual_norms(rows, state.cameras[camera], state.trajectories[rows.label])[rows.use]
@@ -116,6 +123,23 @@ def noise(problem: Problem, state: State) -> Floats:
     return sigma
 
 
+def _pooled_noise(problem: Problem, state: State) -> float:
+    parts, points = [], 0
+    for label, path in enumerate(state.trajectories):
+        seen = np.zeros(path.basis.size, dtype=np.bool_)
+        for rows in problem.rows:
+            if rows.label == label:
+                norms = residual_norms(rows, state.cameras[rows.camera], path)
+                good = rows.use & np.isfinite(norms)
+                parts.append(norms[good])
+                index = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[good]))[0]
+                seen[index] = True
+        points += int(seen.sum())
+    norms = np.concatenate(parts)
+    left = max(2 * len(norms) - 3 * points, 0.05 * len(norms))
+    return max(_LEAST_SIGMA, float(np.median(norms)) / 1.1774 * float(np.sqrt(2 * len(norms) / left)))
+
+
 def mark_inliers(problem: Problem, state: State) -> Problem:
     """The problem with only those rows in use that lie within the cut."""
     out = []
@@ -123,7 +147,23 @@ def mark_inliers(problem: Problem, state: State) -> Problem:
         norms = residual_norms(rows, state.cameras[rows.camera], state.trajectories[rows.label])
         with np.errstate(invalid="ignore"):
             out.append(rows.using(norms < _CUT * state.sigma[rows.camera]))
-    return replace(problem, rows=tuple(out))
+    return replace(problem, rows=tuple(_without_single_views(out, state)))
+
+
+def _without_single_views(parts: list[Rows], state: State) -> list[Rows]:
+    """Separate points need two cameras each: one ray alone leaves the point free along it."""
+    out = list(parts)
+    for label, path in enumerate(state.trajectories):
+        if not isinstance(path.basis, PointBasis):
+            continue
+        mine = [i for i, rows in enumerate(out) if rows.label == label]
+        places = {i: path.basis.locate(state.cameras[out[i].camera].reference_time(out[i].time))[0] for i in mine}
+        count = np.zeros(path.basis.size)
+        for i in mine:
+            count += np.bincount(places[i][out[i].use], minlength=path.basis.size) > 0
+        for i in mine:
+            out[i] = out[i].using(out[i].use & (count[places[i]] >= 2))
+    return out
 
 
 def motion_prior(problem: Problem, state: State, first: bool = False) -> MotionPrior:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from hub.timing.pair import PairSolution, evidence
-from hub.timing.tracks import SmoothTrack
+from hub.timing.tracks import Track
 from protocols.geometry.types import Floats
 
 _CONTRADICTION = 0.15  # s: a pair whose lag is that far from what the others say is set aside
@@ -51,7 +52,7 @@ def components(names: list[str], pairs: list[PairSolution]) -> list[list[str]]:
 
 
 def average_clocks(
-    names: list[str], pairs: list[PairSolution], tracks: dict[str, dict[str, SmoothTrack]]
+    names: list[str], pairs: list[PairSolution], tracks: Mapping[str, Mapping[str, Track]]
 ) -> ClockGraph:
     """L1 average of the pairs' time maps over one connected component (reweighted least squares).
 
@@ -74,7 +75,7 @@ def average_clocks(
     return ClockGraph(clocks, tuple(kept), tuple(out))
 
 
-def _middle(tracks: dict[str, SmoothTrack]) -> float:
+def _middle(tracks: Mapping[str, Track]) -> float:
     begin = min(float(track.time[0]) for track in tracks.values())
     end = max(float(track.time[-1]) for track in tracks.values())
     return 0.5 * (begin + end)

@@ -5,24 +5,27 @@ METHODS A, step 6. Each step is checked by the adjustment, so that a later camer
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from hub.points import PointBasis, SampledTrack, common_instants
 from hub.poses.adjust import adjust, residual_norms
 from hub.poses.graph import ClockGraph
 from hub.poses.problem import CameraState, Freedom, Problem, Rows, State, Trajectory
 from hub.splines import SplineBasis, fit_spline, stretches
 from hub.timing.pair import PairSolution, evidence
-from hub.timing.tracks import SmoothTrack
+from hub.timing.tracks import Track
 from protocols.errors import Refused
+from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
 
 _LEAST_PARALLAX = 0.02  # rad: rays closer than that triangulate nothing
+_LEAST_BEARING = 0.05  # rad between two directions that intersect
 _PNP_POINTS = 400
 _PNP_PX = 8.0
 _LEAST_PNP = 12
@@ -36,7 +39,7 @@ class Camera:
 
     name: str
     intrinsics: Intrinsics
-    tracks: dict[str, SmoothTrack]
+    tracks: Mapping[str, Track]
 
 
 @dataclass(slots=True, eq=False)
@@ -75,7 +78,7 @@ def grow(
         waiting.remove(name)
         if progress is not None:
             progress(f"placing {name}")
-        state = _resect(cameras[name], graph, scaffold)
+        state = _resect(cameras[name], graph, scaffold) or _intersect_bearings(cameras[name], graph, scaffold)
         if state is None:
             refused[name] = "its view of the path agrees with no position (too little seen together with the others)"
             continue
@@ -112,11 +115,12 @@ def place_known(
     rows: dict[str, list[Rows]],
     labels: list[str],
     poses: dict[str, Pose],
+    clock: bool = True,
 ) -> Scaffold:
     """The cameras of a graph at given poses; only time maps and paths are adjusted."""
     placed = {name: _camera_state(cameras[name], graph, poses[name]) for name in graph.clocks}
     names = list(placed)
-    return settle(cameras, placed, rows, labels, (names[0], names[1]), Freedom(pose=False))
+    return settle(cameras, placed, rows, labels, (names[0], names[1]), Freedom(pose=False, clock=clock))
 
 
 def settle(
@@ -175,6 +179,8 @@ def triangulate(
     ]
     if len(seeing) < 2:
         return None
+    if all(isinstance(track, SampledTrack) for _, track in seeing):
+        return _separate_points(seeing)
     begin = min(float(state.reference_time(track.time[:1])[0]) for state, track in seeing)
     end = max(float(state.reference_time(track.time[-1:])[0]) for state, track in seeing)
     time = np.arange(begin, end, _GRID)
@@ -195,7 +201,19 @@ def triangulate(
     return Trajectory(basis, control)
 
 
-def linear_triangulation(seeing: list[tuple[CameraState, SmoothTrack]], time: Floats) -> tuple[Floats, Bools]:
+def _separate_points(seeing: list[tuple[CameraState, Track]]) -> Trajectory | None:
+    """The path of a shared clock: one point for every instant that two cameras fix."""
+    instants = common_instants([state.reference_time(track.time) for state, track in seeing])
+    points, good = linear_triangulation(seeing, instants)
+    if good.sum() < _LEAST_PNP:
+        return None
+    basis = PointBasis(instants[good])
+    return Trajectory(
+        basis, np.vstack([points[good], np.repeat(points[good][-1:], basis.size - int(good.sum()), axis=0)])
+    )
+
+
+def linear_triangulation(seeing: list[tuple[CameraState, Track]], time: Floats) -> tuple[Floats, Bools]:
     """Points (n, 3) at reference times and which of them two cameras fix, in front of both.
 
     Least squares over the distances to the rays, which needs no start and no depth.
@@ -298,6 +316,34 @@ def _resect(camera: Camera, graph: ClockGraph, scaffold: Scaffold) -> CameraStat
         return None
     rodrigues, shift = (np.asarray(vector, np.float64).ravel() for vector in (rotation, translation))
     return replace(clock, pose=Pose.from_rodrigues(rodrigues, shift))
+
+
+def _intersect_bearings(camera: Camera, graph: ClockGraph, scaffold: Scaffold) -> CameraState | None:
+    """Pose of one more camera from its pairs alone, where no point is seen by three cameras.
+
+    Each pair with a placed camera gives the rotation and the direction in which the new one lies; two
+    directions that differ fix its position, and with it the scale of what it sees.
+    """
+    matrix, right, turns, weights = np.zeros((3, 3)), np.zeros(3), [], []
+    for pair in graph.agreeing:
+        if pair.fit is None or camera.name not in (pair.a, pair.b):
+            continue
+        other = pair.b if pair.a == camera.name else pair.a
+        if other not in scaffold.names:
+            continue
+        base = scaffold.state.cameras[scaffold.names.index(other)].pose
+        relative = pair.fit.pose if pair.a == other else pair.fit.pose.inverse()
+        ahead = -base.rotation.T @ relative.rotation.T @ relative.direction
+        weight = evidence(pair.fit)
+        across = weight * (np.eye(3) - np.outer(ahead, ahead))
+        matrix += across
+        right += across @ base.position
+        turns.append(weight * relative.rotation @ base.rotation)
+        weights.append(weight)
+    if len(turns) < 2 or np.linalg.eigvalsh(matrix)[0] < (1.0 - np.cos(_LEAST_BEARING)) * min(weights):
+        return None
+    clock = _in_scaffold_time(_camera_state(camera, graph, Pose.identity()), graph, scaffold)
+    return replace(clock, pose=Pose(so3.nearest(np.sum(turns, axis=0)), np.linalg.solve(matrix, right)))
 
 
 def agreement(scaffold: Scaffold, name: str) -> tuple[float, int]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from hub.points import PointBasis
 from hub.splines import SUPPORT, SplineBasis
 from protocols.geometry.types import Floats, Ints
 
@@ -75,7 +76,7 @@ def border_block(index: Ints, weights: Floats, blocks: Floats, size: int) -> Flo
     return np.asarray(out.reshape(-1, width)[:size])
 
 
-def third_difference_band(basis: SplineBasis, weight: Floats) -> Floats:
+def third_difference_band(basis: SplineBasis | PointBasis, weight: Floats) -> Floats:
     """Band of the motion prior sum weight_i |third difference_i|² over knot intervals; weight (m,)."""
     band = np.zeros((BAND, 3 * basis.size))
     index = basis.interval_starts()
@@ -87,7 +88,7 @@ def third_difference_band(basis: SplineBasis, weight: Floats) -> Floats:
 THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])
 
 
-def third_differences(basis: SplineBasis, control: Floats) -> Floats:
+def third_differences(basis: SplineBasis | PointBasis, control: Floats) -> Floats:
     """(m, 3) third differences of the control points of every knot interval."""
     index = basis.interval_starts()
     return np.asarray(sum(coefficient * control[index + k] for k, coefficient in enumerate(THIRD_DIFFERENCE)))

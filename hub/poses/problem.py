@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hub.points import PointBasis
 from hub.splines import SplineBasis
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
@@ -61,9 +62,9 @@ class Rows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """The 3-D path of one label: a spline on the internal reference time. control: (size, 3)."""
+    """The 3-D path of one label on the internal reference time: a spline, or separate points. control: (size, 3)."""
 
-    basis: SplineBasis
+    basis: SplineBasis | PointBasis
     control: Floats
 
     def at(self, time: Floats, derivative: int = 0) -> Floats:

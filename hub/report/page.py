@@ -161,7 +161,8 @@ def _key_figures(calibration: Calibration, rig: Rig, observations: Observations,
         square = sum(used[name].used * camera.rms_px**2 for name, camera in calibration.cameras.items())
         keys.append((f"{number((square / rows) ** 0.5, 2)}{THIN}px", f"rms residual of {whole(rows)} rows"))
     if seconds > 0:
-        keys.append((f"{100 * share:.0f}{THIN}%", f"of {short(seconds)} s that two cameras saw have a 3-D path"))
+        time = f"the {short(seconds)} s" if len(calibration.trajectories) < 2 else "the time"
+        keys.append((f"{100 * share:.0f}{THIN}%", f"of {time} that two cameras saw has a 3-D path"))
     keys.append(
         (UNIT_WORDS.get(calibration.units, calibration.units), "unit of length, from the rig’s references")
         if calibration.scale == "metric"

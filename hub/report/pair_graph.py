@@ -46,7 +46,7 @@ def pair_graph(calibration: Calibration) -> str:
             labels.append(rect(x - half, y - 10, 2 * half, 20, "paper") + text(x, y + 4.5, lag, "", "middle"))
     nodes = [_node(name, *place[i], name in calibration.refused) for i, name in enumerate(names)]
     told = f"{len(tied)} of {len(pairs)} pairs of {len(names)} cameras were tied together"
-    return drawing(width, height, [*parts, *labels, *nodes], told)
+    return drawing(width, height, [*parts, *labels, *nodes], told, most=width)
 
 
 def is_matrix(calibration: Calibration) -> bool:
@@ -75,9 +75,9 @@ def _matrix(calibration: Calibration, names: list[str], pairs: list[PairReport])
         for row, column in ((i, j), (j, i)):
             x, y = left + cell * (column + 0.5), 10 + cell * (row + 0.5)
             parts.append(f"<g>{tip}{_sign(kind, x, y, 0.27 * cell)}</g>")
-    return drawing(
-        left + size + 10, size + left + 20, parts, f"How {len(pairs)} pairs of {len(names)} cameras were judged"
-    )
+    wide = left + size + 10
+    told = f"How {len(pairs)} pairs of {len(names)} cameras were judged"
+    return drawing(wide, size + left + 20, parts, told, most=wide)
 
 
 def _sign(kind: str, x: float, y: float, radius: float) -> str:

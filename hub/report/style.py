@@ -12,7 +12,7 @@ section{background:#fff;border:1px solid var(--line);border-radius:10px;padding:
 h1{font-size:26px;line-height:1.2;margin:0 0 6px;letter-spacing:-.01em}
 h2{font-size:18px;margin:0 0 4px;letter-spacing:-.005em}
 h3{font-size:13px;margin:20px 0 6px;color:var(--soft);font-weight:600;text-transform:uppercase;letter-spacing:.06em}
-p{margin:0 0 12px;max-width:78ch}
+p{margin:0 0 12px;max-width:78ch;break-inside:avoid}
 p.lead{color:var(--soft)}
 small{font-size:12px;color:var(--soft);font-weight:400}
 .quiet{color:var(--soft)}
@@ -100,17 +100,22 @@ dl.facts{display:grid;grid-template-columns:max-content 1fr;gap:5px 22px;margin:
 dl.facts dt{color:var(--soft)}dl.facts dd{margin:0;overflow-wrap:anywhere}
 dl.words dt{font-weight:600;margin-top:8px}dl.words dd{margin:0 0 2px;max-width:82ch}
 summary{cursor:pointer;font-weight:600}
-@media (max-width:760px){.columns,.graph,.views,.maps.two{grid-template-columns:1fr}section{padding:18px 16px}}
+@media screen and (max-width:760px){.columns,.graph,.views,.maps.two{grid-template-columns:1fr}
+section{padding:18px 16px}}
 @media print{
 @page{margin:14mm}
 body{background:#fff;font-size:11.5px}
 section{border:0;border-top:1px solid #999;border-radius:0;padding:12px 0;margin:0}
 section.verdict{border-left-width:8px;padding-left:14px;border-top:0}
 header.top,main{max-width:none;padding:0}
-h2,h3{break-after:avoid}
-tr,svg,.keys div,li{break-inside:avoid}
+h1{font-size:20px}h2{font-size:15px}
+h2,h3,p.lead,p.legend{break-after:avoid}
+table{font-size:10.5px}small{font-size:9px}
+td,th{padding:3px 8px 3px 0}td.n,th.n{padding:3px 0 3px 8px}
+.wide{overflow:visible}
+.keys{grid-template-columns:repeat(5,1fr);gap:6px}.keys b{font-size:16px}.keys span{font-size:10px}
+tr,svg,.keys div,li,.graph,.views{break-inside:avoid}
 .screen{display:none!important}
-.graph{grid-template-columns:1fr}
 .maps{grid-template-columns:1fr 1fr}
 *{-webkit-print-color-adjust:exact;print-color-adjust:exact}
 }

@@ -100,9 +100,14 @@ def text(x: float, y: float, content: str, kind: str = "", anchor: str = "start"
     return f'<text{style}{place} x="{at(x)}" y="{at(y)}">{esc(content)}</text>'
 
 
-def drawing(width: float, height: float, parts: Iterable[str], label: str) -> str:
-    """A whole drawing that scales with its column; label: what a reader who can't see it is told."""
-    return f'<svg viewBox="0 0 {at(width)} {at(height)}" role="img" aria-label="{esc(label)}">{"".join(parts)}</svg>'
+def drawing(width: float, height: float, parts: Iterable[str], label: str, most: float = 0.0) -> str:
+    """A whole drawing that scales with its column, up to ``most`` pixels wide (0: any).
+
+    label: what a reader who can't see it is told.
+    """
+    limit = f' style="max-width:{at(most)}px"' if most else ""
+    frame = f'<svg viewBox="0 0 {at(width)} {at(height)}"{limit} role="img" aria-label="{esc(label)}">'
+    return f"{frame}{''.join(parts)}</svg>"
 
 
 def time_axis(

@@ -106,6 +106,10 @@ def half_interval_ms(camera: CameraCalibration) -> float:
     return 1e3 * INTERVAL_95 * camera.time_offset_std
 
 
+def _ppm(camera: CameraCalibration) -> float:
+    return 1e6 * (camera.time_map.clock_rate - 1.0)
+
+
 def contradicts(calibration: Calibration, pair: PairReport) -> bool:
     """Whether the pair was set aside because the others contradict it."""
     names = {f"{pair.cameras[0]}–{pair.cameras[1]}", f"{pair.cameras[1]}–{pair.cameras[0]}"}
@@ -133,8 +137,11 @@ def _timing(calibration: Calibration, rig: Rig, used: dict[str, Usage]) -> list[
     if rig.shared_clock:
         return [Finding("good", "The cameras share one clock, as the rig says: no offsets were sought.")]
     others = [camera for name, camera in calibration.cameras.items() if name != calibration.reference]
-    out, worst = [], 0.0
-    for camera in others:
+    # A clock at an impossible rate is told of below; its interval means nothing.
+    sane = [camera for camera in others if abs(_ppm(camera)) <= _WRONG_PPM]
+    out: list[Finding] = []
+    worst = 0.0
+    for camera in sane:
         half, interval = half_interval_ms(camera), 1e3 * used[camera.name].interval
         if half <= max(_EXACT_MS, _GOOD_SHARE_OF_FRAME * interval):
             worst = max(worst, half)
@@ -149,10 +156,10 @@ def _timing(calibration: Calibration, rig: Rig, used: dict[str, Usage]) -> list[
                 f"{camera.name}: record longer while the point moves fast and changes direction in its view.",
             )
         )
-    if not out and others:
-        out.append(
-            Finding("good", f"Clocks are known to ±{THIN}{short(worst, figures=2)}{THIN}ms or better (95{THIN}%).")
-        )
+    if not out and sane:
+        who = "Clocks are" if len(sane) == len(others) else "The other clocks are"
+        told = f"{who} known to ±{THIN}{short(worst, figures=2)}{THIN}ms or better (95{THIN}%)."
+        out.append(Finding("good", told))
     return out
 
 
@@ -161,7 +168,7 @@ def _rates(calibration: Calibration, rig: Rig) -> list[Finding]:
         return []
     out = []
     for name, camera in calibration.cameras.items():
-        ppm = 1e6 * (camera.time_map.clock_rate - 1.0)
+        ppm = _ppm(camera)
         if abs(ppm) > _WRONG_PPM:
             out.append(
                 Finding(
@@ -282,7 +289,8 @@ def _path(calibration: Calibration, observations: Observations) -> list[Finding]
     share, seconds = measures.path_share(calibration, observations)
     if seconds <= 0:
         return []
-    text = f"The 3-D path covers {100 * share:.0f} % of the {short(seconds)}{THIN}s in which two cameras saw a point."
+    time = f"the {short(seconds)}{THIN}s" if len(observations.labels) < 2 else "the time"
+    text = f"The 3-D path covers {100 * share:.0f} % of {time} in which two cameras saw a point."
     level: Level = "good" if share >= _GOOD_PATH else "note" if share >= _POOR_PATH else "attention"
     todo = (
         ""

@@ -6,10 +6,13 @@ generalised cross-validation.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
+from hub.points import SampledTrack
 from hub.splines import SplineBasis, fit_spline, stretches
 from protocols.geometry.types import Bools, Floats
 
@@ -57,6 +60,10 @@ class SmoothTrack:
     def span(self) -> float:
         """Seconds from the first to the last inlier."""
         return float(self.time[-1] - self.time[0])
+
+
+Track: TypeAlias = SmoothTrack | SampledTrack
+"""A track of either kind: smooth for independent clocks, sampled for a shared one."""
 
 
 def smooth_track(time: Floats, normalised: Floats, focal: float, epoch: float | None = None) -> SmoothTrack | None:
@@ -165,3 +172,8 @@ def _in_stretches(t: Floats, inlier: Bools, gap: float) -> Bools:
         if len(part) >= _LEAST_POINTS:
             out[part] = True
     return out
+
+
+def smooth_only(tracks: Mapping[str, Track]) -> dict[str, SmoothTrack]:
+    """The smooth ones of a camera's tracks, by label."""
+    return {label: track for label, track in tracks.items() if isinstance(track, SmoothTrack)}

@@ -154,9 +154,7 @@ class LogReader:
             first[key] = min(first.get(key, raw.log_time_ns), raw.log_time_ns)
             last[key] = max(last.get(key, raw.log_time_ns), raw.log_time_ns)
         return LogSummary(
-            topics=tuple(
-                TopicSummary(key, parse_key(key), count[key], first[key], last[key]) for key in count
-            ),
+            topics=tuple(TopicSummary(key, parse_key(key), count[key], first[key], last[key]) for key in count),
             messages=count.total(),
             first_ns=min(first.values(), default=0),
             last_ns=max(last.values(), default=0),
@@ -172,9 +170,7 @@ class LogReader:
     ) -> None:
         """Nothing stays open between scans."""
 
-    def _messages(
-        self, wanted: set[str] | None, start_ns: int | None, end_ns: int | None
-    ) -> Iterator[Logged]:
+    def _messages(self, wanted: set[str] | None, start_ns: int | None, end_ns: int | None) -> Iterator[Logged]:
         counts: Counter[str] = Counter()
         self._counts = counts
         for key, raw in self._raw_messages():

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
 import pytest
 
-from protocols.bus.base import AgentEvent, Bus, BusDead, BusStopped, Publisher, Received, Subscription
+from protocols.bus.base import AgentEvent, Bus, BusDead
 from protocols.bus.delivery import cache_size
 from protocols.bus.memory import MemoryBus, MemoryHub
 from protocols.bus.router import Router, free_endpoint
@@ -21,6 +17,7 @@ from protocols.bus.zenoh_bus import open_bus
 from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, RIG_INFO, STATUS, Topic
 from protocols.errors import InputError
 from protocols.gate import Rejected
+from tests.integration.receiving import collect, matched, sequences
 from tests.samples import calibration, camera_info, eventually, observation, rig_info
 
 Connect = Callable[..., Bus]
@@ -46,27 +43,6 @@ def connect(request: pytest.FixtureRequest) -> Iterator[Connect]:
                 return stack.enter_context(open_bus(site, config, timeout_s=10.0))
 
         yield make
-
-
-def collect(subscription: Subscription, count: int, timeout_s: float = 10.0) -> list[Received]:
-    """Drain until ``count`` messages are there or the time is up."""
-    received: list[Received] = []
-
-    def enough() -> bool:
-        received.extend(subscription.drain())
-        return len(received) >= count
-
-    eventually(enough, timeout_s)
-    return received
-
-
-def sequences(received: list[Received]) -> list[int]:
-    return [item.message.sequence for item in received]  # type: ignore[attr-defined]
-
-
-def matched(publisher: Publisher) -> Publisher:
-    assert publisher.wait_matched(10.0), "nobody subscribed"
-    return publisher
 
 
 def test_messages_arrive_equal_and_in_order(connect: Connect) -> None:
@@ -275,155 +251,6 @@ def test_a_closed_subscription_receives_nothing_more(connect: Connect) -> None:
     subscription.close()
     publisher.put(observation("cam0", 1))
     assert sequences(collect(subscription, 2, timeout_s=0.2)) == [0]
-
-
-def test_what_cannot_be_recovered_is_counted_exactly() -> None:
-    """A flood far beyond the cache: every message is received, dropped by the queue, or counted as lost."""
-    endpoint, total = free_endpoint(), 20_000
-    config = BusConfig(mode="client", connect=(endpoint,))
-    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
-        subscription = receiving.subscribe(OBSERVATION)
-        publisher = matched(sending.publisher(OBSERVATION, "cam0"))
-        for index in range(total):
-            publisher.put(observation("cam0", index))
-        received: list[Received] = []
-
-        def accounted() -> bool:
-            received.extend(subscription.drain())
-            counters = subscription.counters
-            return len(received) + counters["lost"] + counters["dropped"] == total
-
-        assert eventually(accounted), (len(received), subscription.counters)
-        assert sequences(received) == sorted(set(sequences(received)))
-        assert sequences(received)[-1] == total - 1
-
-
-def test_an_outage_of_the_router_loses_nothing() -> None:
-    """Observations put while the router is down arrive after it is back, in order."""
-    endpoint = free_endpoint()
-    config = BusConfig(mode="client", connect=(endpoint,))
-    router = Router(endpoint)
-    with open_bus("local", config) as sending, open_bus("local", config) as receiving:
-        subscription = receiving.subscribe(OBSERVATION)
-        publisher = matched(sending.publisher(OBSERVATION, "cam0"))
-        for index in range(20):
-            publisher.put(observation("cam0", index))
-        received = collect(subscription, 20)
-        router.close()
-        assert eventually(lambda: not publisher.wait_matched(0.0))
-        for index in range(20, 60):
-            publisher.put(observation("cam0", index))
-        with Router(endpoint):
-            assert matched(publisher)
-            publisher.put(observation("cam0", 60))
-            received += collect(subscription, 41, timeout_s=15.0)
-            assert sequences(received) == list(range(61))
-            assert subscription.counters["lost"] == 0
-
-
-AGENT = """
-import sys, time
-from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-with open_bus("local", BusConfig(mode="client", connect=(sys.argv[1],)), timeout_s=10.0) as bus:
-    with bus.announce("camera", "cam0", "boot-1"):
-        print("ready", flush=True)
-        sys.stdin.read()
-"""
-
-
-@pytest.mark.parametrize("end", ["kill -9", "in order"])
-def test_an_agents_end_is_seen_at_once(end: str) -> None:
-    endpoint = free_endpoint()
-    with Router(endpoint), open_bus("local", BusConfig(mode="client", connect=(endpoint,))) as bus:
-        watch = bus.watch_agents()
-        events: list[AgentEvent] = []
-        agent = subprocess.Popen(
-            [sys.executable, "-c", AGENT, endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
-        try:
-            assert agent.stdout is not None
-            assert agent.stdin is not None
-            assert agent.stdout.readline() == "ready\n"
-            assert eventually(lambda: bool(events.extend(watch.drain()) or events))
-            assert events == [AgentEvent("camera", "cam0", "boot-1", True)]
-            began = time.monotonic()
-            if end == "kill -9":
-                agent.send_signal(signal.SIGKILL)
-            else:
-                agent.stdin.close()
-            assert eventually(lambda: bool(events.extend(watch.drain()) or len(events) == 2))
-            assert time.monotonic() - began < 1.5
-            assert events[1] == AgentEvent("camera", "cam0", "boot-1", False)
-            assert agent.wait(10.0) == (-signal.SIGKILL if end == "kill -9" else 0)
-        finally:
-            agent.kill()
-            agent.wait()
-            for pipe in (agent.stdin, agent.stdout):
-                assert pipe is not None
-                pipe.close()
-
-
-def test_a_client_waits_for_its_router() -> None:
-    endpoint = free_endpoint()
-    opened: list[Bus] = []
-    config = BusConfig(mode="client", connect=(endpoint,))
-    opening = threading.Thread(target=lambda: opened.append(open_bus("local", config, timeout_s=20.0)))
-    opening.start()
-    opening.join(0.3)
-    assert opening.is_alive(), "there is no router yet"
-    with Router(endpoint):
-        opening.join(10.0)
-        assert len(opened) == 1
-        opened[0].close()
-
-
-def test_a_client_without_a_router_gives_up_when_told_to() -> None:
-    config = BusConfig(mode="client", connect=(free_endpoint(),))
-    with pytest.raises(
-        InputError, match=r"no router answers at tcp/127.0.0.1:[0-9]+ .*; start one there"
-    ) as error:
-        open_bus("local", config, timeout_s=0.2)
-    assert "\n" not in str(error.value)
-    asked: list[None] = []
-
-    def stop() -> bool:
-        asked.append(None)
-        return len(asked) > 2
-
-    with pytest.raises(BusStopped):
-        open_bus("local", config, stop=stop)
-
-
-def test_an_address_that_is_taken_is_told_in_one_line() -> None:
-    endpoint = free_endpoint()
-    with (
-        Router(endpoint),
-        pytest.raises(InputError, match=r"Address already in use.*; check connect = ") as error,
-    ):
-        Router(endpoint)
-    assert "\n" not in str(error.value)
-    assert ".rs:" not in str(error.value)
-
-
-def test_a_panic_in_the_transport_is_fatal_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Zenoh's panics are no Exception, so a plain ``except Exception`` would let them through."""
-    panic = type("PanicException", (BaseException,), {})
-
-    class Panicking:
-        def put(self, payload: bytes) -> None:
-            raise panic("called `Option::unwrap()` on a `None` value")
-
-        def undeclare(self) -> None:
-            raise panic("again")
-
-    endpoint = free_endpoint()
-    with Router(endpoint), open_bus("local", BusConfig(mode="client", connect=(endpoint,))) as bus:
-        publisher = bus.publisher(OBSERVATION, "cam0")
-        monkeypatch.setattr(publisher, "_publisher", Panicking())
-        with pytest.raises(BusDead, match="the transport panicked"):
-            publisher.put(observation("cam0"))
-        publisher.close()
 
 
 def test_every_topic_can_be_declared(connect: Connect) -> None:

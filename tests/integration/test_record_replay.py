@@ -221,9 +221,7 @@ def test_replay_stops_when_told_to(tmp_path: Path) -> None:
     stop = threading.Event()
     with MemoryBus(MemoryHub()) as bus:
         began = time.monotonic()
-        sent = replay(
-            source, bus, stop=stop, wait_s=0.0, progress=lambda n, at: stop.set() if n >= 6 else None
-        )
+        sent = replay(source, bus, stop=stop, wait_s=0.0, progress=lambda n, at: stop.set() if n >= 6 else None)
     assert sent == 6
     assert time.monotonic() - began < 5.0
 
@@ -237,9 +235,7 @@ def test_replay_stops_when_told_to(tmp_path: Path) -> None:
         ({"topics": ["images"]}, "no topic 'images'"),
     ],
 )
-def test_a_replay_that_makes_no_sense_is_refused(
-    tmp_path: Path, arguments: dict[str, float], message: str
-) -> None:
+def test_a_replay_that_makes_no_sense_is_refused(tmp_path: Path, arguments: dict[str, float], message: str) -> None:
     source = source_log(tmp_path / "a.mcap", count=1)
     with MemoryBus(MemoryHub()) as bus, pytest.raises(InputError, match=message):
         replay(source, bus, **arguments)  # type: ignore[arg-type]
@@ -251,9 +247,7 @@ def test_a_log_is_described_with_what_is_missing(tmp_path: Path) -> None:
         log.attach("rig.toml", "application/toml", b"x = 1")
         for boot in ("boot-1", "boot-2"):
             for index in (0, 1, 2, 5):
-                log.write(
-                    OBSERVATION, "cam0", "local", observation("cam0", index, boot, points=2), index * SECOND
-                )
+                log.write(OBSERVATION, "cam0", "local", observation("cam0", index, boot, points=2), index * SECOND)
     description = describe_log(path)
     (topic,) = description.topics
     assert (topic.topic, topic.agent, topic.count, topic.last_s) == ("observation", "cam0", 8, 5.0)

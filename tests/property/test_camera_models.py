@@ -79,7 +79,7 @@ def test_fisheye_is_opencv(lens: Intrinsics, directions: Floats) -> None:
 def test_pinhole_unprojects_as_opencv_does(lens: Intrinsics, seen: Floats) -> None:
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
     oracle = cv2.undistortPoints(seen[:, None], lens.matrix, lens.distortions, None, None, None, criteria)
-    oracle = oracle.reshape(-1, 2)
+    oracle = np.asarray(oracle, dtype=np.float64).reshape(-1, 2)
     back = cv2.projectPoints(_ahead(oracle, 1.0), np.zeros(3), np.zeros(3), lens.matrix, lens.distortions)[0]
     good = np.abs(back.reshape(-1, 2) - seen).max(axis=1) < 1e-6  # OpenCV's own iteration can fail
     np.testing.assert_allclose(lens.unproject(seen)[good], oracle[good], atol=1e-7)
@@ -94,9 +94,7 @@ def test_the_jacobian_is_the_derivative(lens: Intrinsics, directions: Floats) ->
 
 
 @given(pinholes, normals, st.floats(0.0, 10.0))
-def test_a_point_behind_or_beside_a_pinhole_has_no_pixel(
-    lens: Intrinsics, where: Floats, depth: float
-) -> None:
+def test_a_point_behind_or_beside_a_pinhole_has_no_pixel(lens: Intrinsics, where: Floats, depth: float) -> None:
     assert np.isnan(lens.project(np.column_stack([where, np.full(len(where), -depth)]))).all()
 
 
@@ -121,9 +119,7 @@ def test_a_pixel_outside_the_fold_of_a_barrel_has_no_direction(k1: float) -> Non
 
 @settings(max_examples=60)
 @given(st.floats(-0.6, -0.2), st.floats(0.0, 0.25), st.floats(0, 2 * np.pi), st.floats(0.0, 2.0))
-def test_unproject_answers_from_the_first_branch_or_not_at_all(
-    k1: float, k2: float, turn: float, far: float
-) -> None:
+def test_unproject_answers_from_the_first_branch_or_not_at_all(k1: float, k2: float, turn: float, far: float) -> None:
     lens = Intrinsics(W, H, _matrix(900, 1, 640, 360), np.array([k1, k2, 0, 0, 0]))
     pixel = np.array([[640 + 900 * far * np.cos(turn), 360 + 900 * far * np.sin(turn)]])
     found = lens.unproject(pixel)

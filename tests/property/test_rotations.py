@@ -140,15 +140,11 @@ def test_taking_a_direction_to_its_opposite_is_half_a_turn(a: Floats) -> None:
 def test_a_pose_and_its_rodrigues_form_are_one(w: Floats, position: Floats, point: Floats) -> None:
     pose = Pose(so3.exp(w), position)
     again = Pose.from_rodrigues(pose.rodrigues, pose.translation)
-    np.testing.assert_allclose(
-        again.camera_from_world(point[None]), pose.camera_from_world(point[None]), atol=1e-7
-    )
+    np.testing.assert_allclose(again.camera_from_world(point[None]), pose.camera_from_world(point[None]), atol=1e-7)
     np.testing.assert_allclose(
         pose.camera_from_world(point[None])[0], pose.rotation @ point + pose.translation, atol=1e-12
     )
-    np.testing.assert_allclose(
-        pose.world_from_camera(pose.camera_from_world(point[None]))[0], point, atol=1e-12
-    )
+    np.testing.assert_allclose(pose.world_from_camera(pose.camera_from_world(point[None]))[0], point, atol=1e-12)
 
 
 @settings(max_examples=40)

@@ -51,9 +51,9 @@ def world(seed: int = 0, labels: int = 2, lens: bool = True, shake: float = 0.0)
         grid = np.arange(-1, 7, 0.02)
         control = fit_spline(basis, grid, random_path(rng).at(grid), np.ones(len(grid)))
         paths.append(Trajectory(basis, control))
-        for camera, state in enumerate(cameras):
+        for camera, eye in enumerate(cameras):
             time = np.sort(rng.uniform(0.8, 5.2, 60))
-            seen = state.intrinsics.project(state.pose.camera_from_world(paths[label].at(state.reference_time(time))))
+            seen = eye.intrinsics.project(eye.pose.camera_from_world(paths[label].at(eye.reference_time(time))))
             use = rng.random(60) > 0.1
             rows.append(Rows(camera, label, time, seen + rng.normal(0, 0.5, seen.shape), use))
     problem = Problem(tuple(rows), tuple(lenses), 0, (0, 1), Freedom(lens=lens))
@@ -85,8 +85,7 @@ def test_every_camera_derivative_is_a_difference(lens: str, column: int) -> None
     assert line.valid.all()
     step = 1e-6
     ahead, behind = (
-        linearise(rows, nudged(camera, column, sign * step), path, problem.nominal[which]).residual
-        for sign in (1, -1)
+        linearise(rows, nudged(camera, column, sign * step), path, problem.nominal[which]).residual for sign in (1, -1)
     )
     expected = (ahead - behind) / (2 * step)
     assert np.abs(expected).max() > 1e-3
@@ -150,7 +149,7 @@ def test_the_gradient_is_half_the_slope_of_the_cost(robust: bool) -> None:
             for s in (1, -1)
         )
         slope = 0.5 * (ahead - behind) / (2 * size)
-        ours = system.gradient_path @ path_step + system.gradient_cameras @ camera_step
+        ours = float(system.gradient_path @ path_step + system.gradient_cameras @ camera_step)
         assert ours == pytest.approx(slope, rel=2e-4, abs=1e-2 + 1e-4 * abs(ours))
 
 
@@ -277,9 +276,7 @@ def test_the_tangent_keeps_the_gauge() -> None:
     first, second = problem.anchors
     np.testing.assert_array_equal(after.cameras[first].pose.rotation, state.cameras[first].pose.rotation)
     np.testing.assert_allclose(after.cameras[first].pose.position, state.cameras[first].pose.position, atol=1e-18)
-    apart = [
-        np.linalg.norm(s.cameras[second].pose.position - s.cameras[first].pose.position) for s in (state, after)
-    ]
+    apart = [np.linalg.norm(s.cameras[second].pose.position - s.cameras[first].pose.position) for s in (state, after)]
     assert apart[1] == pytest.approx(apart[0], abs=1e-9)
     assert after.cameras[0].offset == state.cameras[0].offset
 

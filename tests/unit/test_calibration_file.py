@@ -65,9 +65,7 @@ def answer(rig: Rig) -> Calibration:
             np.array([0.1, 0.2, 0.3]) / 3,
             0.7,
         )
-    return Calibration(
-        cameras, "cam0", "metric", "cm", "joint", "0.1.0", refused={"lost": 'no "lens": told\nso'}
-    )
+    return Calibration(cameras, "cam0", "metric", "cm", "joint", "0.1.0", refused={"lost": 'no "lens": told\nso'})
 
 
 @pytest.fixture
@@ -157,9 +155,9 @@ def test_aniposelib_projects_as_we_do(written: Path, rig: Rig) -> None:
         camera = truth.cameras[name]
         point = camera.pose.world_from_camera(np.array([[0.3, -0.2, 2.0], [-0.1, 0.1, 3.0]]))
         project = cv2.fisheye.projectPoints if table["fisheye"] else cv2.projectPoints
-        seen = project(
-            point[:, None], table["rotation"], table["translation"], table["matrix"], table["distortions"]
-        )[0]
+        seen = project(point[:, None], table["rotation"], table["translation"], table["matrix"], table["distortions"])[
+            0
+        ]
         ours = camera.intrinsics.project(camera.pose.camera_from_world(point))
         np.testing.assert_allclose(ours, seen.reshape(-1, 2), atol=1e-6)
 

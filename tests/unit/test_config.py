@@ -84,9 +84,7 @@ def test_the_effective_configuration_reads_back_to_the_same(
     # A path that was left to its default is the one thing that depends on where the file lies.
     if kind is not RecorderConfig:
         assert load(write(elsewhere, printed), kind) == config
-    assert load(write(tmp_path, printed), kind) == msgspec.structs.replace(
-        config, **_resolved(config, tmp_path)
-    )
+    assert load(write(tmp_path, printed), kind) == msgspec.structs.replace(config, **_resolved(config, tmp_path))
 
 
 def _resolved(config: msgspec.Struct, folder: Path) -> dict[str, Path]:

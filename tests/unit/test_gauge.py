@@ -146,21 +146,30 @@ def test_up_and_a_distance_make_a_metric_upright_world() -> None:
     np.testing.assert_allclose(level, [0, 0, 1], atol=1e-6)
 
 
-def test_two_positions_and_a_levelled_camera_leave_nothing_open() -> None:
-    """The turn about the line between the two is what the levelled camera tells."""
-    truth, internal, similarity = world(5)
-    level = truth[2].rotation
-    level = np.stack([level[0], [0, 0, -1.0], np.cross(level[0], [0, 0, -1.0])])
-    truth[2] = Pose(so3.nearest(level), truth[2].position)
-    inward = Similarity(1 / similarity.scale, similarity.rotation.T, -similarity.rotation.T @ similarity.shift / similarity.scale)
-    internal = [inward.pose(pose) for pose in truth]
+def levelled(pose: Pose) -> Pose:
+    """The same camera with its right axis horizontal and its down axis straight down."""
+    right = np.array([pose.rotation[0, 0], pose.rotation[0, 1], 0.0])
+    right, down = right / np.linalg.norm(right), np.array([0.0, 0.0, -1.0])
+    return Pose(np.stack([right, down, np.cross(right, down)]), pose.position)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("same_height", [False, True])
+def test_two_positions_and_a_levelled_camera_leave_nothing_open(seed: int, same_height: bool) -> None:
+    """The turn about the line between the two is what the levelled camera tells: upright, not upside down."""
+    truth, _, similarity = world(seed)
+    truth[2] = levelled(truth[2])
+    if same_height:
+        truth = [Pose(pose.rotation, pose.position * [1.0, 1.0, 0.0]) for pose in truth]
+    turn = similarity.rotation.T
+    inward = Similarity(1 / similarity.scale, turn, -turn @ similarity.shift / similarity.scale)
     known = {"cam0": {"position": truth[0].position}, "cam1": {"position": truth[1].position}}
-    gauge = fix_gauge(rig(known, up="cam2"), NAMES, internal)
+    gauge = fix_gauge(rig(known, up="cam2"), NAMES, [inward.pose(pose) for pose in truth])
     same(gauge.similarity, similarity, 1e-4)
 
 
-def test_two_positions_and_an_up_vector_leave_nothing_open() -> None:
-    """up = [0, 0, 1] with surveyed positions: the surveyor's z."""
+def test_an_up_vector_does_not_disturb_surveyed_positions() -> None:
+    """up = [0, 0, 1] with surveyed positions is the surveyor's z."""
     truth, internal, _ = world(5)
     known = {"cam0": {"position": truth[0].position}, "cam1": {"position": truth[1].position}}
     gauge = fix_gauge(rig(known, up=np.array([0.0, 0.0, 1.0])), NAMES, internal)

@@ -26,9 +26,7 @@ from tests.samples import SAMPLES, observation, status
 SECOND = 1_000_000_000
 
 
-def write_log(
-    path: Path, count: int = 200, metadata: Mapping[str, Mapping[str, str]] | None = None
-) -> list[Logged]:
+def write_log(path: Path, count: int = 200, metadata: Mapping[str, Mapping[str, str]] | None = None) -> list[Logged]:
     """Two cameras and a status now and then; log times not in order, as clocks are set."""
     written: list[Logged] = []
     with LogWriter(path, metadata) as log:
@@ -127,9 +125,7 @@ def test_the_schemas_in_the_log_are_enough_to_read_it(tmp_path: Path) -> None:
     written = write_log(tmp_path / "a.mcap", count=20)
     decoded: list[bytes] = []
     with (tmp_path / "a.mcap").open("rb") as stream:
-        for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages(
-            log_time_order=False
-        ):
+        for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False):
             assert schema is not None
             assert (schema.encoding, channel.message_encoding) == ("protobuf", "protobuf")
             pool = descriptor_pool.DescriptorPool()
@@ -156,9 +152,7 @@ def test_a_place_that_cannot_be_written_is_told_in_one_line(tmp_path: Path) -> N
     assert "\n" not in str(error.value)
 
 
-def test_a_full_disk_is_told_and_leaves_a_readable_log(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_told_and_leaves_a_readable_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.mcap"
     log = LogWriter(path)
     for index in range(100):
@@ -214,9 +208,7 @@ def test_chunks_are_small_enough_to_lose_little(tmp_path: Path) -> None:
     write_log(tmp_path / "a.mcap", count=5000)
     with open_log(tmp_path / "a.mcap") as stream:
         sizes = [
-            struct.unpack_from("<QQQ", frame.content)[2]
-            for frame in frames(stream, Damage())
-            if frame.opcode == CHUNK
+            struct.unpack_from("<QQQ", frame.content)[2] for frame in frames(stream, Damage()) if frame.opcode == CHUNK
         ]
     assert len(sizes) > 5
     assert max(sizes) < CHUNK_SIZE + 1000

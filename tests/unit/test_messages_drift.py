@@ -19,9 +19,7 @@ def serialised_descriptor(module: Path) -> bytes:
     calls = [
         node.args[0]
         for node in ast.walk(ast.parse(module.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Call)
-        and isinstance(node.func, ast.Attribute)
-        and node.func.attr == "AddSerializedFile"
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "AddSerializedFile"
     ]
     assert len(calls) == 1
     value = ast.literal_eval(calls[0])

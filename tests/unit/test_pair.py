@@ -29,8 +29,7 @@ def lag_error(session: Session, found: PairSolution) -> float:
     assert found.fit is not None
     epochs = {n: min(float(t.time[0]) for t in session.observations().of_camera(n)) for n in (found.a, found.b)}
     shown_a = found.fit.middle + epochs[found.a]
-    true = session.clocks[found.a].reference_from_camera(shown_a)  # type: ignore[arg-type]
-    shown_b = session.clocks[found.b].camera_from_reference(true)
+    shown_b = session.shown(found.b, session.true_time(found.a, shown_a))
     return float((found.fit.middle - found.fit.offset) / found.fit.rate + epochs[found.b] - shown_b)
 
 

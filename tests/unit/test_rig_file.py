@@ -95,7 +95,9 @@ def test_position_that_contradicts_translation_is_told(tmp_path: Path) -> None:
 
 def test_a_camera_at_the_origin_may_say_so_twice(tmp_path: Path) -> None:
     text = f"{CAM0}rotation = [0.1, 0.2, 0]\ntranslation = [0.0, 0.0, 0.0]\nposition = [0.0, 0.0, 0.0]\n"
-    np.testing.assert_allclose(read(tmp_path, text).cameras["cam0"].position, 0, atol=1e-12)
+    position = read(tmp_path, text).cameras["cam0"].position
+    assert position is not None
+    np.testing.assert_allclose(position, 0, atol=1e-12)
 
 
 @pytest.mark.parametrize("position", ["[-1.002, -2.0, -3.0]", "[-1.0, -2.0, -3.5]"])
@@ -194,9 +196,7 @@ def test_what_is_no_toml_is_told(tmp_path: Path, text: str, line: int | None) ->
         ('name = "cam0"', 'name = "other"', 2, "name"),
     ],
 )
-def test_a_wrong_value_is_told_with_its_line(
-    tmp_path: Path, old: str, new: str, line: int, word: str
-) -> None:
+def test_a_wrong_value_is_told_with_its_line(tmp_path: Path, old: str, new: str, line: int, word: str) -> None:
     told(tmp_path, CAM0.replace(old, new), line, "cam0", word)
 
 

@@ -26,8 +26,8 @@ def smooth(session: Session) -> list[SmoothTrack]:
 
 def true_offset(session: Session, a: SmoothTrack, b: SmoothTrack) -> float:
     """t_a - t_b of one instant in the middle, on the tracks' shifted times."""
-    true = float(session.clocks["cam0"].reference_from_camera(session.middle("cam0")))  # type: ignore[arg-type]
-    shown = [float(session.clocks[n].camera_from_reference(true)) for n in ("cam0", "cam1")]  # type: ignore[arg-type]
+    true = session.true_time("cam1", session.middle("cam1"))
+    shown = [session.shown(name, true) for name in ("cam0", "cam1")]
     return (shown[0] - a.epoch) - (shown[1] - b.epoch)
 
 
@@ -118,10 +118,7 @@ def test_a_short_overlap_of_long_tracks_is_still_a_candidate(seed: int) -> None:
     a, b = smooth(session)
     scan = scan_lags(PairMoments(grid_track(a, STEP, SIGMA_PX), grid_track(b, STEP, SIGMA_PX)), 1.0)
     chosen = scan.offset[candidates(scan, 3, 10)]
-    truth = session.clocks["cam0"].camera_from_reference(  # type: ignore[arg-type]
-        session.clocks["cam1"].reference_from_camera(session.middle("cam1"))  # type: ignore[arg-type]
-    ) - (a.epoch + session.middle("cam1") - b.epoch)
-    assert np.min(np.abs(chosen - float(truth))) < STEP
+    assert np.min(np.abs(chosen - true_offset(session, a, b))) < STEP
 
 
 def test_the_best_matrix_at_the_true_lag_fits_the_tracks() -> None:

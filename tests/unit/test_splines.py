@@ -45,9 +45,7 @@ def test_a_derivative_is_the_slope_of_the_one_before(basis: SplineBasis, derivat
     time, step = times(basis, 200), 1e-6
     low, high = basis.starts, basis.starts + basis.intervals * basis.spacing
     clear = np.array([np.min(np.abs(np.r_[low, high] - t)) > 1e-3 for t in time])
-    slope = basis.evaluate(control, time + step, derivative - 1) - basis.evaluate(
-        control, time - step, derivative - 1
-    )
+    slope = basis.evaluate(control, time + step, derivative - 1) - basis.evaluate(control, time - step, derivative - 1)
     np.testing.assert_allclose(
         basis.evaluate(control, time, derivative)[clear], (slope / (2 * step))[clear], rtol=1e-5, atol=1e-3
     )
@@ -105,9 +103,7 @@ def test_rows_outside_a_stretch_pull_nothing(basis: SplineBasis) -> None:
     time = times(basis, 200)
     values = np.sin(time)[:, None]
     plain = fit_spline(basis, time, values, np.ones(200))
-    more = fit_spline(
-        basis, np.r_[time, 1.5, -99.0, 50.0], np.r_[values, [[1e6]] * 3], np.ones(203), stiffness=1e-6
-    )
+    more = fit_spline(basis, np.r_[time, 1.5, -99.0, 50.0], np.r_[values, [[1e6]] * 3], np.ones(203), stiffness=1e-6)
     np.testing.assert_allclose(plain, more, atol=1e-9)
 
 

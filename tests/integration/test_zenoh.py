@@ -1,0 +1,193 @@
+"""What only the bus over Zenoh can show: floods, outages, killed processes, addresses, panics."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+import zenoh
+
+from protocols.bus.base import AgentEvent, Bus, BusDead, BusStopped, Received
+from protocols.bus.router import Router, free_endpoint
+from protocols.bus.settings import BusConfig
+from protocols.bus.zenoh_bus import ZenohSubscription, open_bus
+from protocols.catalogue import OBSERVATION
+from protocols.errors import InputError
+from tests.integration.receiving import collect, matched, sequences
+from tests.samples import eventually, observation
+
+
+def test_a_history_that_begins_in_the_middle_is_made_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zenoh 1.10.2 sometimes delivers a late joiner's history from the middle on, and counts no loss."""
+    take = ZenohSubscription._take
+
+    def from_the_middle(self: ZenohSubscription, sample: zenoh.Sample) -> None:
+        if sample.source_info is not None and sample.source_info.source_sn >= 60:
+            take(self, sample)
+
+    monkeypatch.setattr(ZenohSubscription, "_take", from_the_middle)
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        publishers = {camera: sending.publisher(OBSERVATION, camera) for camera in ("cam0", "cam1")}
+        for index in range(100):
+            for camera, publisher in publishers.items():
+                publisher.put(observation(camera, index))
+        subscription = receiving.subscribe(OBSERVATION)
+        received = collect(subscription, 200)
+        for camera, publisher in publishers.items():
+            own = [item for item in received if item.agent == camera]
+            assert sequences(own) == list(range(100))
+            publisher.put(observation(camera, 100))
+        assert sequences(collect(subscription, 2)) == [100, 100]
+
+
+def test_what_cannot_be_recovered_is_counted_exactly() -> None:
+    """A flood far beyond the cache: every message is received, dropped by the queue, or counted as lost."""
+    endpoint, total = free_endpoint(), 20_000
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(OBSERVATION)
+        publisher = matched(sending.publisher(OBSERVATION, "cam0"))
+        for index in range(total):
+            publisher.put(observation("cam0", index))
+        received: list[Received] = []
+
+        def accounted() -> bool:
+            received.extend(subscription.drain())
+            counters = subscription.counters
+            return len(received) + counters["lost"] + counters["dropped"] == total
+
+        assert eventually(accounted), (len(received), subscription.counters)
+        assert sequences(received) == sorted(set(sequences(received)))
+        assert sequences(received)[-1] == total - 1
+
+
+def test_an_outage_of_the_router_loses_nothing() -> None:
+    """Observations put while the router is down arrive after it is back, in order."""
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    router = Router(endpoint)
+    with open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(OBSERVATION)
+        publisher = matched(sending.publisher(OBSERVATION, "cam0"))
+        for index in range(20):
+            publisher.put(observation("cam0", index))
+        received = collect(subscription, 20)
+        router.close()
+        assert eventually(lambda: not publisher.wait_matched(0.0))
+        for index in range(20, 60):
+            publisher.put(observation("cam0", index))
+        with Router(endpoint):
+            assert matched(publisher)
+            publisher.put(observation("cam0", 60))
+            received += collect(subscription, 41, timeout_s=15.0)
+            assert sequences(received) == list(range(61))
+            assert subscription.counters["lost"] == 0
+
+
+AGENT = """
+import sys, time
+from protocols.bus.settings import BusConfig
+from protocols.bus.zenoh_bus import open_bus
+with open_bus("local", BusConfig(mode="client", connect=(sys.argv[1],)), timeout_s=10.0) as bus:
+    with bus.announce("camera", "cam0", "boot-1"):
+        print("ready", flush=True)
+        sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("end", ["kill -9", "in order"])
+def test_an_agents_end_is_seen_at_once(end: str) -> None:
+    endpoint = free_endpoint()
+    with Router(endpoint), open_bus("local", BusConfig(mode="client", connect=(endpoint,))) as bus:
+        watch = bus.watch_agents()
+        events: list[AgentEvent] = []
+        agent = subprocess.Popen(
+            [sys.executable, "-c", AGENT, endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        try:
+            assert agent.stdout is not None
+            assert agent.stdin is not None
+            assert agent.stdout.readline() == "ready\n"
+            assert eventually(lambda: bool(events.extend(watch.drain()) or events))
+            assert events == [AgentEvent("camera", "cam0", "boot-1", True)]
+            began = time.monotonic()
+            if end == "kill -9":
+                agent.send_signal(signal.SIGKILL)
+            else:
+                agent.stdin.close()
+            assert eventually(lambda: bool(events.extend(watch.drain()) or len(events) == 2))
+            assert time.monotonic() - began < 1.5
+            assert events[1] == AgentEvent("camera", "cam0", "boot-1", False)
+            assert agent.wait(10.0) == (-signal.SIGKILL if end == "kill -9" else 0)
+        finally:
+            agent.kill()
+            agent.wait()
+            for pipe in (agent.stdin, agent.stdout):
+                assert pipe is not None
+                pipe.close()
+
+
+def test_a_client_waits_for_its_router() -> None:
+    endpoint = free_endpoint()
+    opened: list[Bus] = []
+    config = BusConfig(mode="client", connect=(endpoint,))
+    opening = threading.Thread(target=lambda: opened.append(open_bus("local", config, timeout_s=20.0)))
+    opening.start()
+    opening.join(0.3)
+    assert opening.is_alive(), "there is no router yet"
+    with Router(endpoint):
+        opening.join(10.0)
+        assert len(opened) == 1
+        opened[0].close()
+
+
+def test_a_client_without_a_router_gives_up_when_told_to() -> None:
+    config = BusConfig(mode="client", connect=(free_endpoint(),))
+    with pytest.raises(InputError, match=r"no router answers at tcp/127.0.0.1:[0-9]+ .*; start one there") as error:
+        open_bus("local", config, timeout_s=0.2)
+    assert "\n" not in str(error.value)
+    asked: list[None] = []
+
+    def stop() -> bool:
+        asked.append(None)
+        return len(asked) > 2
+
+    with pytest.raises(BusStopped):
+        open_bus("local", config, stop=stop)
+
+
+def test_an_address_that_is_taken_is_told_in_one_line() -> None:
+    endpoint = free_endpoint()
+    with (
+        Router(endpoint),
+        pytest.raises(InputError, match=r"Address already in use.*; check connect = ") as error,
+    ):
+        Router(endpoint)
+    assert "\n" not in str(error.value)
+    assert ".rs:" not in str(error.value)
+
+
+def test_a_panic_in_the_transport_is_fatal_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zenoh's panics are no Exception, so a plain ``except Exception`` would let them through."""
+    panic = type("PanicException", (BaseException,), {})
+
+    class Panicking:
+        def put(self, payload: bytes) -> None:
+            raise panic("called `Option::unwrap()` on a `None` value")
+
+        def undeclare(self) -> None:
+            raise panic("again")
+
+    endpoint = free_endpoint()
+    with Router(endpoint), open_bus("local", BusConfig(mode="client", connect=(endpoint,))) as bus:
+        publisher = bus.publisher(OBSERVATION, "cam0")
+        monkeypatch.setattr(publisher, "_publisher", Panicking())
+        with pytest.raises(BusDead, match="the transport panicked"):
+            publisher.put(observation("cam0"))
+        publisher.close()

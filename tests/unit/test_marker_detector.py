@@ -1,0 +1,185 @@
+"""The marker detector against rendered pictures whose truth is known."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from edge import scenes
+from edge.detectors.colour import ColourModel, codes
+from edge.detectors.marker import MarkerDetector, MarkerModel, teach
+from edge.scenes.marker import MarkerScene
+from protocols.errors import InputError
+from tests.bench.marker_detector import Result, measure
+
+
+@pytest.fixture(scope="module")
+def room() -> Result:
+    """Three worlds of three cameras, noise 4, motion blur of up to 9 px."""
+    return measure("marker", seeds=range(3), frames=20, noise=4.0)
+
+
+def without_marker(scene: MarkerScene) -> MarkerScene:
+    """The same furniture, and the ball 500 m above it."""
+    return dataclasses.replace(scene, path=dataclasses.replace(scene.path, centre=np.array([0.0, 0.0, 500.0])))
+
+
+def test_finds_the_ball_in_every_frame_and_nothing_else(room: Result) -> None:
+    assert room.frames > 150
+    assert room.missed == 0
+    assert room.false == 0
+
+
+def test_centre_is_right_to_a_tenth_of_a_pixel(room: Result) -> None:
+    assert room.rms < 0.1
+    assert np.median(np.hypot(*room.error.T)) < 0.07
+    assert np.abs(room.error.mean(axis=0)).max() < 0.03  # not drawn towards the light
+
+
+def test_motion_blur_does_not_shift_the_centre(room: Result) -> None:
+    smeared = room.smear > 2.0
+    assert smeared.sum() > 40
+    assert np.sqrt(np.mean(room.error[smeared] ** 2)) < 0.12
+
+
+def test_covariance_matches_the_errors(room: Result) -> None:
+    assert 0.5 < room.nees.mean() < 2.0
+    assert np.mean(room.nees < 3.0) > 0.9  # exp(-3) = 5 % of a Gaussian's are above
+
+
+def test_size_is_the_diameter_of_the_disc_of_equal_area(room: Result) -> None:
+    assert room.size_ratio.mean() == pytest.approx(1.0, abs=0.01)
+    assert room.size_ratio.std() < 0.02
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_look_alikes_are_not_the_marker(seed: int) -> None:
+    scene = without_marker(scenes.get("marker", seed, cameras=4))
+    for camera in scene.cameras:
+        renderer = scene.renderer(camera.name, np.random.default_rng(seed))
+        assert MarkerDetector().detect(renderer.render(0.0)) == []
+
+
+def ball(width: int, height: int, u: float, v: float, radius: float, background: int = 120) -> np.ndarray:
+    """A flat orange disc, drawn 8 times as large and averaged down."""
+    fine = np.full((height * 8, width * 8, 3), background, np.uint8)
+    y, x = np.mgrid[: height * 8, : width * 8]
+    fine[np.hypot((x + 0.5) / 8 - 0.5 - u, (y + 0.5) / 8 - 0.5 - v) <= radius] = (22, 112, 246)
+    return np.rint(fine.reshape(height, 8, width, 8, 3).mean(axis=(1, 3))).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("u", "v", "radius"), [(40.0, 30.0, 4.0), (41.37, 28.81, 6.5), (60.5, 50.25, 12.0)])
+def test_pixel_convention_is_that_of_pixel_centres(u: float, v: float, radius: float) -> None:
+    (found,) = MarkerDetector().detect(ball(128, 96, u, v, radius))
+    assert (found.u, found.v) == (pytest.approx(u, abs=0.03), pytest.approx(v, abs=0.03))
+    assert found.size == pytest.approx(2 * radius, rel=0.02)
+    assert found.colour == (pytest.approx(246, abs=30), pytest.approx(112, abs=20), pytest.approx(22, abs=30))
+
+
+def test_a_ball_cut_by_the_border_is_not_reported() -> None:
+    assert MarkerDetector().detect(ball(128, 96, 3.0, 40.0, 8.0)) == []
+    assert MarkerDetector().detect(ball(128, 96, 60.0, 93.0, 8.0)) == []
+
+
+@pytest.mark.parametrize("level", [0, 90, 255])
+def test_even_pictures_hold_no_marker(level: int) -> None:
+    assert MarkerDetector().detect(np.full((48, 64, 3), level, np.uint8)) == []
+
+
+def test_a_wall_in_the_markers_colour_is_no_marker() -> None:
+    assert MarkerDetector().detect(np.full((96, 128, 3), (22, 112, 246), np.uint8)) == []
+
+
+def test_odd_and_tiny_images_are_taken() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (61, 83, 3), dtype=np.uint8)
+    for height, width in ((61, 83), (1, 1), (2, 3), (5, 1)):
+        assert isinstance(MarkerDetector().detect(noise[:height, :width]), list)
+
+
+def test_sizes_outside_of_the_limits_are_left_out() -> None:
+    image = ball(128, 96, 60.0, 48.0, 8.0)
+    assert MarkerDetector(min_size=20.0).detect(image) == []
+    assert MarkerDetector(max_size=10.0).detect(image) == []
+    assert len(MarkerDetector(min_size=10.0, max_size=20.0).detect(image)) == 1
+
+
+def test_taught_from_one_picture_it_finds_the_ball_from_other_cameras() -> None:
+    scene = scenes.get("marker", 1)
+    pixel, size = scene.seen_by("cam0", np.array([3.0]))
+    side = 1.6 * size[0]  # a box that includes background
+    image = scene.renderer("cam0", np.random.default_rng(0)).render(3.0)
+    model = teach(image, (pixel[0, 0] - side / 2, pixel[0, 1] - side / 2, side, side))
+    detector = MarkerDetector(model)
+    errors = []
+    for camera in ("cam0", "cam1", "cam2"):
+        renderer = scene.renderer(camera, np.random.default_rng(5))
+        for moment in np.linspace(1.0, 30.0, 10):
+            truth = scene.seen_by(camera, np.array([moment]))[0][0]
+            for found in detector.detect(renderer.render(moment)):
+                errors.append(np.hypot(found.u - truth[0], found.v - truth[1]))
+    assert len(errors) >= 25  # of 30; a few are out of the picture
+    assert max(errors) < 1.0
+
+
+def test_teaching_refuses_a_box_without_a_colour_of_its_own() -> None:
+    with pytest.raises(InputError, match="colour of its own"):
+        teach(np.full((60, 80, 3), 128, np.uint8), (20, 20, 10, 10))
+    with pytest.raises(InputError, match="does not lie in"):
+        teach(np.full((60, 80, 3), 128, np.uint8), (75, 20, 10, 10))
+
+
+def test_a_model_survives_its_table() -> None:
+    model = MarkerModel.of_colour(40, 90, 220, label="blue")
+    again = MarkerModel.from_table(model.to_table())
+    assert again.label == "blue"
+    agree = model.colours.table() == again.colours.table()
+    assert agree.mean() > 0.999  # colours are rounded to whole numbers
+    assert model.colours.table().any()
+
+
+def test_bad_models_are_told() -> None:
+    with pytest.raises(InputError, match="no colour model"):
+        ColourModel.from_table({"target": "orange"})
+    with pytest.raises(InputError, match="hardly a hue"):
+        MarkerModel.of_colour(200, 200, 200)
+
+
+def test_classification_is_that_of_the_nearest_example() -> None:
+    model = ColourModel(np.array([[20.0, 110.0, 240.0]]), np.array([[20.0, 110.0, 200.0]]))
+    table = model.table()
+    pixels = np.array([[[20, 110, 236], [20, 110, 206], [200, 110, 20]]], np.uint8)
+    assert table[codes(pixels)].tolist() == [[1, 0, 0]]  # nearest target, nearest other, far from both
+
+
+def test_the_outlines_centre_is_corrected_to_the_balls() -> None:
+    """A large ball far off the axis: the ellipse's centre is measurably not the projection of the ball's centre."""
+    scene = dataclasses.replace(scenes.get("marker", 3), marker_radius=0.1)
+    lens = scene.camera("cam0").intrinsics
+    with_lens, without = MarkerDetector(intrinsics=lens), MarkerDetector()
+    renderer = scene.renderer("cam0", np.random.default_rng(0))
+    before, after = [], []
+    for moment in np.linspace(0.5, 60.0, 60):
+        truth, _ = scene.seen_by("cam0", np.array([moment]))
+        off_axis = truth[0] - lens.matrix[:2, 2]
+        if not 150 < np.hypot(*off_axis):
+            continue
+        image = renderer.render(moment)
+        outward = off_axis / np.hypot(*off_axis)
+        for found, corrected in zip(without.detect(image), with_lens.detect(image), strict=True):
+            before.append(outward @ (np.array([found.u, found.v]) - truth[0]))
+            after.append(outward @ (np.array([corrected.u, corrected.v]) - truth[0]))
+    assert len(before) > 5
+    assert np.median(before) > 0.1
+    assert abs(np.median(after)) < 0.5 * np.median(before)
+
+
+def test_detection_does_not_write_to_the_picture() -> None:
+    image = ball(128, 96, 60.0, 48.0, 8.0)
+    copy = image.copy()
+    image.flags.writeable = False
+    MarkerDetector().detect(image)
+    assert (image == copy).all()
+    assert cv2.countNonZero(image[..., 0]) > 0
