@@ -145,7 +145,7 @@ def _refine(shift: float, time: Floats, position: Floats, truth_time: Floats, tr
         fitted = fit_similarity(estimate[there], truth[there])
         return fitted, np.linalg.norm(fitted.points(estimate[there]) - truth[there], axis=1), there
 
-    def cost(parameters: Floats) -> float:
+    def cost(parameters: Any) -> float:
         found = solve(parameters)
         if found is None or abs(parameters[1]) > RATE_WITHIN * extent:
             return 1e9
