@@ -23,6 +23,9 @@ def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event) -> int:
     from edge.camera_agent import run_camera_agent
     from edge.detectors.marker import MarkerDetector
 
+    import cv2
+
+    cv2.setNumThreads(1)  # one core a camera: several agents share a board
     known = _known_camera(config)
     device = make_device(config, None if known is None else known.intrinsics)
     lens = device.info.intrinsics if config.driver == "simulated" else None if known is None else known.intrinsics

@@ -70,7 +70,7 @@ class SimulatedConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=
 
     scene: str = "marker"
     seed: Seed = 0
-    cameras: Annotated[int, Meta(ge=1, le=64)] = 4
+    cameras: Annotated[int, Meta(ge=2, le=64)] = 4
     duration_s: Seconds | None = None
     start_unix_s: Annotated[float, Meta(ge=0.0)] | None = None
 

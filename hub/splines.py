@@ -59,13 +59,15 @@ class SplineBasis:
 
     def locate(self, time: Floats) -> tuple[Ints, Floats, Bools]:
         """First control point (n,), place in the knot interval (n,) in [0, 1], and inside a stretch (n,)."""
+        known = np.isfinite(time)
+        time = np.where(known, time, self.starts[0])
         stretch = np.searchsorted(self.starts, time, side="right") - 1
-        inside = stretch >= 0
+        inside = known & (stretch >= 0)
         stretch = np.maximum(stretch, 0)
         place = (time - self.starts[stretch]) / self.spacing
         count = self.intervals[stretch]
         inside &= place <= count + 1e-9
-        interval = np.clip(np.floor(place).astype(np.int64), 0, count - 1)
+        interval = np.clip(np.floor(place), 0, count - 1).astype(np.int64)
         return self.offsets[stretch] + interval, place - interval, inside
 
     def weights(self, time: Floats, derivative: int = 0) -> tuple[Ints, Floats, Bools]:

@@ -206,6 +206,9 @@ def linearise(rows: Rows, camera: CameraState, path: Trajectory, nominal: Intrin
     flat = np.where(valid[:, None], local[:, :2] / safe[:, None], 0.0)
     lens = camera.intrinsics
     projected = lens.project_normalised(flat)
+    valid &= np.isfinite(projected).all(axis=1)
+    flat = np.where(valid[:, None], flat, 0.0)
+    projected = np.where(valid[:, None], projected, lens.matrix[:2, 2])
     slope = lens.pixel_jacobian(flat)
     squash = np.zeros((len(time), 2, 3))
     squash[:, 0, 0] = squash[:, 1, 1] = 1.0 / safe

@@ -46,12 +46,13 @@ def fix_gauge(rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
     distances = [(names.index(a), names.index(b), d) for a, b, d in rig.distances if a in names and b in names]
     base = _default(rig, names, poses)
     apart = [poses[a].position - poses[b].position for a, b, _ in distances]
-    metric = len(positions) >= 2 or bool(distances)
+    apart_known = float(np.linalg.norm(np.ptp([p for _, p in positions], axis=0))) if len(positions) >= 2 else 0.0
+    metric = apart_known > 0.0 or bool(distances)
     if not metric and not positions and not rotations:
         width = CAMERA_PARAMETERS * len(names)
         return Gauge(base, "arbitrary", np.zeros((width, width)), ())
     scale = base.scale
-    if len(positions) >= 2:
+    if apart_known > 0.0:
         scale = _ratio([p for _, p in positions], [poses[i].position for i, _ in positions])
     elif distances:
         scale = float(np.median([d / np.linalg.norm(v) for (_, _, d), v in zip(distances, apart, strict=True)]))
@@ -60,7 +61,7 @@ def fix_gauge(rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
     best = min((_descend(start, residual, metric) for start in starts), key=lambda item: item[1])[0]
     final = residual(best)
     warnings = []
-    if len(final) > 7 and float(np.sqrt(np.mean(final**2))) > _FAR:
+    if len(final) and float(np.sqrt(np.mean(final**2))) > _FAR:
         warnings.append(
             f"the rig's references disagree with each other or the cameras by {np.abs(final).max():.0f} sigma: check them"
         )
@@ -113,7 +114,7 @@ def _starts(
     target = np.array([p for _, p in positions]).reshape(-1, 3)
     if len(positions) >= 3:
         guesses.append(fit_similarity(source, target).rotation)
-    if len(positions) >= 2:
+    if len(positions) >= 2 and np.linalg.norm(target[1] - target[0]) > 0.0:
         line = so3.taking(source[1] - source[0], target[1] - target[0])
         axis = (target[1] - target[0]) / max(float(np.linalg.norm(target[1] - target[0])), 1e-12)
         guesses += [so3.exp(angle * axis) @ line for angle in np.linspace(0, 2 * np.pi, 6, endpoint=False)]
@@ -152,7 +153,8 @@ def _residuals(
             out.append(np.array([(apart - length) / (_EXACT * length)]))
         if isinstance(rig.up, str) and rig.up in names:
             level = s.rotation @ poses[names.index(rig.up)].rotation.T @ np.array([0.0, -1.0, 0.0])
-            out.append(np.cross(level, [0.0, 0.0, 1.0])[:2] / _UP_STD)
+            # The whole difference, not the cross product: upside down must not look level.
+            out.append((level - np.array([0.0, 0.0, 1.0])) / _UP_STD)
         return np.concatenate(out) if out else np.zeros(0)
 
     return residual

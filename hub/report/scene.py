@@ -121,7 +121,7 @@ def scene_script(scene: Scene) -> str:
             "markers+text",
             "cameras",
             text=[f"<b>{_markup(name)}</b>" for name in names],
-            textposition="top center",
+            textposition="bottom center",
             textfont={"color": _NAVY, "size": 14},
             marker={"color": _NAVY, "size": 4},
             hovertemplate="%{text}<br>%{x:.3g}, %{y:.3g}, %{z:.3g}<extra></extra>",
@@ -147,7 +147,8 @@ def scene_script(scene: Scene) -> str:
         "paper_bgcolor": "#fff",
         "font": {"family": "system-ui, sans-serif", "color": "#223"},
     }
-    config = {"displaylogo": False, "responsive": True, "modeBarButtonsToRemove": ["toImage", "resetCameraLastSave3d"]}
+    buttons = ["zoom3d", "pan3d", "orbitRotation", "tableRotation", "resetCameraDefault3d"]  # none that leaves the page
+    config = {"displaylogo": False, "responsive": True, "modeBarButtons": [buttons]}
     arguments = ",".join(_script_safe(part) for part in (data, layout, config))
     return f'Plotly.newPlot("{DIV}",{arguments});'
 

@@ -42,6 +42,13 @@ class PairSettings:
     """Image speed [px/s] from which a sample counts as moving."""
     accept_support: float = 2.0
     accept_inliers: float = 0.6
+    """Of the common motion, where there is plenty of it."""
+    strict_inliers: float = 0.95
+    """… and where there is hardly any: seven parameters and a search over all lags fit a few seconds of anything."""
+    plenty: float = 12.0
+    hardly: float = 4.0
+    """Seconds of agreeing motion that count as plenty and as hardly any."""
+    largest_rate: float = 5e-3
     accept_in_front: float = 0.95
     accept_ratio: float = 0.5
 
@@ -147,6 +154,12 @@ def evidence(fit: PairFit) -> float:
     return float(fit.support * fit.inliers * fit.front / np.sqrt(1.0 + fit.sigma_px))
 
 
+def needed_inliers(fit: PairFit, s: PairSettings) -> float:
+    """The share of the common motion that must agree: the less motion there is, the more of it."""
+    short = float(np.clip((s.plenty - fit.support) / (s.plenty - s.hardly), 0.0, 1.0))
+    return s.accept_inliers + short * (s.strict_inliers - s.accept_inliers)
+
+
 def _judge(names: tuple[str, str], fits: list[PairFit], s: PairSettings) -> PairSolution:
     best = fits[0]
     others = tuple(fits[1:4])
@@ -155,7 +168,9 @@ def _judge(names: tuple[str, str], fits: list[PairFit], s: PairSettings) -> Pair
         reason = f"only {best.support:.1f} s of motion agree (of {best.moving_overlap:.1f} s)"
     elif best.sigma_px > s.largest_sigma_px:
         reason = f"the best alignment leaves {best.sigma_px:.1f} px"
-    elif best.inliers < s.accept_inliers:
+    elif abs(best.rate - 1.0) > s.largest_rate:
+        reason = f"the best alignment needs a clock that is {1e6 * abs(best.rate - 1.0):.0f} ppm off"
+    elif best.inliers < needed_inliers(best, s):
         reason = f"only {100 * best.inliers:.0f} % of the common motion agrees with one geometry"
     elif best.front < s.accept_in_front:
         reason = "the best geometry puts points behind a camera"

@@ -14,6 +14,7 @@ from protocols.geometry.types import Floats
 
 _NEWTON_STEPS = 20
 _NEWTON_TOLERANCE = 1e-12
+_WIDEST = 100.0  # normalised coordinates: 89.4 degrees off the axis
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,6 +31,15 @@ class Intrinsics:
     matrix: Floats
     distortions: Floats = field(default_factory=lambda: np.zeros(5))
     fisheye: bool = False
+    fold: float = field(init=False, default=float("inf"))
+    """Where the radial model turns back: normalised radius, or for fisheye the angle [rad]. There is no image beyond."""
+
+    def __post_init__(self) -> None:
+        if not self.fisheye and len(self.distortions) == 4:  # OpenCV's short form: k3 = 0
+            object.__setattr__(self, "distortions", np.r_[self.distortions, 0.0])
+        radial = self.distortions if self.fisheye else self.distortions[[0, 1, 4]]
+        slope = np.r_[1.0, radial * (3.0 + 2.0 * np.arange(len(radial)))]
+        object.__setattr__(self, "fold", _first_fold(slope))
 
     @property
     def focal(self) -> float:
@@ -37,13 +47,16 @@ class Intrinsics:
         return float(0.5 * (self.matrix[0, 0] + self.matrix[1, 1]))
 
     def project(self, points: Floats) -> Floats:
-        """Distorted pixels (n, 2) of points (n, 3) in camera axes; NaN where z <= 0 (pinhole)."""
+        """Distorted pixels (n, 2) of points (n, 3) in camera axes; NaN where z <= 0 (pinhole) or beyond the fold."""
         points = np.asarray(points, dtype=np.float64)
         if self.fisheye:
             return self._to_pixels(self._distort_fisheye(points))
         z = points[:, 2]
         safe = np.where(z > 0, z, np.nan)
-        return self._to_pixels(self.distort(points[:, :2] / safe[:, None])[0])
+        normalised = points[:, :2] / safe[:, None]
+        with np.errstate(invalid="ignore"):
+            inside = np.hypot(normalised[:, 0], normalised[:, 1]) < self.fold
+        return self._to_pixels(np.where(inside[:, None], self.distort(normalised)[0], np.nan))
 
     def project_normalised(self, normalised: Floats) -> Floats:
         """Distorted pixels (n, 2) of undistorted normalised coordinates (n, 2)."""
@@ -59,6 +72,8 @@ class Intrinsics:
         y = (pixels[:, 1] - a[1, 2]) / a[1, 1]
         x = (pixels[:, 0] - a[0, 2] - a[0, 1] * y) / a[0, 0]
         distorted = np.column_stack([x, y])
+        # Nothing that far aside is an image; left in, it would only overflow.
+        distorted[~(np.abs(distorted).max(axis=1) < _WIDEST)] = np.nan
         if self.fisheye:
             return self._undistort_fisheye(distorted)
         return self._undistort(distorted)
@@ -115,10 +130,10 @@ class Intrinsics:
             estimate = estimate - step
             if not np.nanmax(np.abs(step), initial=0.0) > _NEWTON_TOLERANCE:
                 break
-        value, jacobian = self.distort(estimate)
-        # A root behind the fold of the polynomial is no inverse: there the determinant is negative.
+        value, _ = self.distort(estimate)
+        # A root behind the fold of the polynomial is no inverse, even where it is well behaved again.
         with np.errstate(invalid="ignore"):
-            good = (np.abs(value - distorted).max(axis=1) < 1e-9) & (np.linalg.det(jacobian) > 0)
+            good = (np.abs(value - distorted).max(axis=1) < 1e-9) & (np.hypot(*estimate.T) < self.fold)
         return np.where(good[:, None], estimate, np.nan)
 
     def _distort_fisheye(self, points: Floats) -> Floats:
@@ -127,7 +142,8 @@ class Intrinsics:
         t2 = theta * theta
         k1, k2, k3, k4 = self.distortions
         bent = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-        scale = np.where(radius > 1e-12, bent / np.where(radius > 1e-12, radius, 1.0), 1.0 / points[:, 2])
+        bent = np.where(theta < self.fold, bent, np.nan)
+        scale = np.where(radius > 1e-12, bent / np.where(radius > 1e-12, radius, 1.0), 1.0 / np.where(points[:, 2] > 0, points[:, 2], np.nan))
         return np.asarray(points[:, :2] * scale[:, None])
 
     def _undistort_fisheye(self, distorted: Floats) -> Floats:
@@ -140,6 +156,18 @@ class Intrinsics:
             slope = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
             theta = theta - value / np.where(slope > 1e-6, slope, np.nan)
         with np.errstate(invalid="ignore"):
-            good = (theta >= 0) & (theta < np.pi / 2 - 1e-3)
+            again = theta * (1.0 + theta**2 * (k1 + theta**2 * (k2 + theta**2 * (k3 + theta**2 * k4))))
+            good = (theta >= 0) & (theta < min(np.pi / 2 - 1e-3, self.fold)) & (np.abs(again - bent) < 1e-9)
         scale = np.where(bent > 1e-12, np.tan(theta) / np.where(bent > 1e-12, bent, 1.0), 1.0)
         return np.where(good[:, None], distorted * scale[:, None], np.nan)
+
+
+def _first_fold(slope: Floats) -> float:
+    """Radius up to which a radial distortion grows: the first zero of its slope.
+
+    slope: coefficients of 1, r², r⁴, … of the slope. inf where it always grows.
+    """
+    slope = np.where(np.abs(slope) > 1e-12, slope, 0.0)
+    roots = np.roots(np.trim_zeros(slope[::-1], "f"))
+    real = roots[(np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots), 1.0)) & (roots.real > 0)].real
+    return float(np.sqrt(real.min())) if len(real) else float("inf")

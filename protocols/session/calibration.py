@@ -136,10 +136,15 @@ def write_trajectory(file: Path, calibration: Calibration) -> None:
     several = len(calibration.trajectories) > 1
     lines = ["time,x,y,z,std,label" if several else "time,x,y,z,std"]
     for table in calibration.trajectories:
-        tail = f",{table.label}" if several else ""
+        tail = f",{csv_cell(table.label)}" if several else ""
         for t, (x, y, z), std in zip(table.time, table.position, table.std, strict=True):
             lines.append(f"{t:.17g},{x:.17g},{y:.17g},{z:.17g},{std:.17g}{tail}")
     write_atomically(file, "\n".join(lines) + "\n")
+
+
+def csv_cell(text: str) -> str:
+    """A label as a CSV cell."""
+    return f'"{text.replace(chr(34), chr(34) * 2)}"' if any(c in text for c in ',"\n\r') else text
 
 
 def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
@@ -150,8 +155,9 @@ def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
     rig = read_rig(file)
     values, _ = read_toml(file, "calibration")
     cameras: dict[str, CameraCalibration] = {}
+    tables = {table.get("name", key): table for key, table in values.items() if isinstance(table, dict)}
     for name, camera in rig.cameras.items():
-        table = values[name]
+        table = tables[name]
         if camera.intrinsics is None or camera.rotation is None or camera.position is None:
             raise InputError(
                 f"[{name}] has no matrix, rotation or translation",
@@ -161,15 +167,19 @@ def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
         rate, offset = table.get("clock_rate", 1.0), table.get("time_offset", 0.0)
         if not all(isinstance(v, int | float) and np.isfinite(v) for v in (rate, offset)) or rate <= 0:
             raise InputError(f"[{name}] clock_rate or time_offset is not a number", file=file, remedy="correct it")
-        std = table.get("position_std", [0.0, 0.0, 0.0])
+        std = camera.position_std
+        figures = {key: table.get(key, 0.0) for key in ("time_offset_std", "rms_px")}
+        for key, value in figures.items():
+            if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value < np.inf:
+                raise InputError(f"[{name}] {key} is not a number >= 0", file=file, remedy="correct it")
         cameras[name] = CameraCalibration(
             name=name,
             intrinsics=camera.intrinsics,
             pose=Pose(so3.nearest(camera.rotation), camera.position),
             time_map=TimeMap(float(rate), float(offset)),
-            time_offset_std=float(table.get("time_offset_std", 0.0)),
-            position_std=np.broadcast_to(np.array(std, dtype=np.float64), (3,)).copy(),
-            rms_px=float(table.get("rms_px", 0.0)),
+            time_offset_std=float(figures["time_offset_std"]),
+            position_std=np.zeros(3) if std is None else std,
+            rms_px=float(figures["rms_px"]),
         )
     return rig, cameras
 

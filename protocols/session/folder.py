@@ -10,6 +10,7 @@ import tomli_w
 
 from protocols.errors import InputError
 from protocols.files import write_atomically
+from protocols.session.calibration import csv_cell
 from protocols.session.observations import Observations, read_observations
 from protocols.session.rig import Rig, read_rig
 
@@ -50,6 +51,6 @@ def write_observations(file: Path, observations: Observations) -> None:
             if sized:
                 cells.append(f"{size:.17g}" if np.isfinite(size) else "")
             if labelled:
-                cells.append(track.label)
+                cells.append(csv_cell(track.label))
             lines.append(",".join(cells))
     write_atomically(file, "\n".join(lines) + "\n")

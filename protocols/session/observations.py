@@ -15,6 +15,7 @@ from protocols.geometry.types import Floats, Ints
 
 REQUIRED = ("camera", "frame", "time", "u", "v")
 DEFAULT_LABEL = "marker"
+_LARGEST_FRAME = 2.0**53  # beyond, a number read as a float is no longer whole
 _REPEATS_ARE_NONSENSE = 0.1  # share of repeated frame numbers from which they are no numbering at all
 
 
@@ -39,7 +40,7 @@ class Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """All tracks by (camera, label), in the order of the rig and of the labels' first rows."""
+    """All tracks by (camera, label), in the order of the rig and then of the labels' names."""
 
     tracks: dict[tuple[str, str], Track]
     warnings: tuple[str, ...] = ()
@@ -77,9 +78,12 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
         raise InputError("this observations file does not exist", file=file, remedy="check the path") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot be read: {error}", file=file, remedy="save it as UTF-8 CSV") from None
-    reader = csv.reader(io.StringIO(text))
+    reader = csv.reader(io.StringIO(text), strict=True)
     header = [cell.strip() for cell in next(reader, [])]
     columns = {name: index for index, name in reversed(list(enumerate(header)))}
+    twice = [name for name in (*REQUIRED, "size", "label") if header.count(name) > 1]
+    if twice:
+        raise InputError(f"column {twice[0]} is named twice", file=file, line=1, remedy="keep one")
     missing = [name for name in REQUIRED if name not in columns]
     if missing:
         remedy = f"the first line must name {','.join(REQUIRED)}[,size][,label]"
@@ -88,7 +92,7 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
     lines: list[int] = []
     try:
         for row in reader:
-            if row and any(row):
+            if any(cell.strip() for cell in row):
                 rows.append(row)
                 lines.append(reader.line_num)
     except csv.Error as error:
@@ -97,7 +101,7 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
         raise InputError("no rows", file=file, line=1, remedy="record some observations first")
     _check_width(rows, lines, max(columns[name] for name in columns if name in (*REQUIRED, "size", "label")), file)
     numbers = {name: _column(rows, lines, columns[name], name, file) for name in ("time", "u", "v")}
-    frame = _column(rows, lines, columns["frame"], "frame", file)
+    frame = _frames(rows, lines, columns["frame"], file)
     size = np.full(len(rows), np.nan)
     if "size" in columns:
         size = _column(rows, lines, columns["size"], "size", file, empty=np.nan)
@@ -112,7 +116,7 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
     return gather_tracks(
         names,
         labels or [DEFAULT_LABEL] * len(rows),
-        frame.astype(np.int64),
+        frame,
         numbers["time"],
         np.column_stack([numbers["u"], numbers["v"]]),
         size,
@@ -136,7 +140,7 @@ def gather_tracks(
 ) -> Observations:
     """Sort rows into tracks. Raises InputError where two rows of one camera and label are of one time or frame."""
     camera_ids = {name: index for index, name in enumerate(dict.fromkeys([*order, *cameras]))}
-    label_ids = {name: index for index, name in enumerate(dict.fromkeys(labels))}
+    label_ids = {name: index for index, name in enumerate(sorted(set(labels)))}
     c = np.array([camera_ids[name] for name in cameras], dtype=np.int64)
     k = np.array([label_ids[name] for name in labels], dtype=np.int64)
     sorting = np.lexsort((frame, time, k, c))
@@ -185,7 +189,7 @@ def _check_repeats(
     repeated = int((counts - 1).sum())
     if not repeated:
         return
-    if repeated < _REPEATS_ARE_NONSENSE * len(frame) or len(frame) < 3:
+    if repeated <= max(1.0, _REPEATS_ARE_NONSENSE * len(frame)):
         twice = unique[counts > 1][0]
         at = np.flatnonzero(frame == twice)
         raise InputError(
@@ -230,6 +234,16 @@ def _column(
         what = f"{name} is {values[bad[0]]}"
         raise InputError(what, file=file, line=lines[bad[0]], remedy="remove the row: a point not seen has none")
     return values
+
+
+def _frames(rows: list[list[str]], lines: list[int], index: int, file: Path) -> Ints:
+    values = _column(rows, lines, index, "frame", file)
+    bad = np.flatnonzero((values != np.round(values)) | (np.abs(values) > _LARGEST_FRAME))
+    if len(bad):
+        raise InputError(
+            f"frame {rows[bad[0]][index].strip()} is not a whole number", file=file, line=lines[bad[0]], remedy="correct it"
+        )
+    return values.astype(np.int64)
 
 
 def _check_cameras(names: list[str], lines: list[int], known: list[str], file: Path) -> None:

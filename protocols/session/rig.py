@@ -75,8 +75,11 @@ class _Table:
         """The line of the table's header, or of ``key`` in it, as far as a plain scan can tell."""
         found: int | None = None
         header = re.compile(r"\s*\[\s*[\"']?" + re.escape(self.where) + r"[\"']?\s*\]")
-        inside = False
+        inside, depth = False, 0
         for number, row in enumerate(self.text.splitlines(), 1):
+            within_list, depth = depth > 0, max(0, depth + row.count("[") - row.count("]"))
+            if within_list:
+                continue
             if header.match(row):
                 inside, found = True, number
             elif inside and row.lstrip().startswith("[") and "=" not in row:
@@ -119,7 +122,7 @@ class _Table:
 def read_toml(file: Path, what: str = "file") -> tuple[dict[str, Any], str]:
     """The parsed TOML file and its text. Raises InputError with file, line and remedy."""
     try:
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise InputError(f"this {what} does not exist", file=file, remedy="check the path") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -141,7 +144,9 @@ def read_rig(file: Path) -> Rig:
     """
     values, text = read_toml(file, "rig file")
     metadata = values.pop("metadata", {})
-    meta = _Table(metadata if isinstance(metadata, dict) else {}, "metadata", file, text)
+    if not isinstance(metadata, dict):
+        raise InputError("metadata is not a table", file=file, remedy="write [metadata] and its keys below it")
+    meta = _Table(metadata, "metadata", file, text)
     cameras: dict[str, RigCamera] = {}
     for name, table in values.items():
         if not isinstance(table, dict):
@@ -155,7 +160,7 @@ def read_rig(file: Path) -> Rig:
     if not cameras:
         raise InputError("no camera in it", file=file, remedy="add a table per camera: [cam0] name, size, matrix, …")
     units = metadata.get("units", "m")
-    if units not in UNITS:
+    if not isinstance(units, str) or units not in UNITS:
         raise meta.fail("units", f"units = {units!r}", 'use "m", "cm" or "mm"')
     clock = metadata.get("clock", "independent")
     if clock not in CLOCKS:
@@ -168,7 +173,8 @@ def _read_distances(meta: _Table, cameras: dict[str, RigCamera]) -> tuple[tuple[
     distances = []
     rows = meta.values.get("distances", [])
     for row in rows if isinstance(rows, list) else [rows]:
-        if not (isinstance(row, list) and len(row) == 3 and isinstance(row[2], int | float)):
+        shape = isinstance(row, list) and len(row) == 3 and all(isinstance(name, str) for name in row[:2])
+        if not (shape and isinstance(row[2], int | float) and not isinstance(row[2], bool)):
             raise meta.fail("distances", f"distance {row!r} is not [camera, camera, length]", remedy)
         for name in row[:2]:
             if name not in cameras:
@@ -195,13 +201,15 @@ def _read_up(meta: _Table, cameras: dict[str, RigCamera]) -> Floats | str | None
 
 def _read_camera(table: _Table) -> RigCamera:
     name = table.values.get("name", table.where)
-    if name != table.where:
+    # aniposelib's own files call their tables cam_0, cam_1, … and put the camera's name inside.
+    theirs = isinstance(name, str) and re.fullmatch(r"cam_\d+", table.where) is not None
+    if name != table.where and not theirs:
         raise table.fail("name", f"name = {name!r} differs from the table's key", "make them the same")
     size = table.numbers("size", 2, "[width, height]")
     if size is None or not (size > 0).all() or not (size == size.round()).all():
         raise table.fail("size", "size is missing or not two whole numbers", "give size = [width, height] in pixels")
     fps = table.values.get("fps", 0.0)
-    if not isinstance(fps, int | float) or not math.isfinite(fps) or fps < 0:
+    if not isinstance(fps, int | float) or isinstance(fps, bool) or not math.isfinite(fps) or fps < 0:
         raise table.fail("fps", f"fps = {fps!r} is not a frame rate", "give fps = 30.0")
     width, height = int(size[0]), int(size[1])
     position, rotation = _read_pose(table)
@@ -214,14 +222,23 @@ def _read_camera(table: _Table) -> RigCamera:
         rotation=rotation,
         position_std=table.std("position_std", "a length, or three"),
         rotation_std=table.std("rotation_std", "radians, or three"),
-        body_from_camera=table.numbers("body_from_camera", (3, 3), "3x3"),
+        body_from_camera=_read_body(table),
         table=dict(table.values),
     )
 
 
+def _read_body(table: _Table) -> Floats | None:
+    matrix = table.numbers("body_from_camera", (3, 3), "a 3x3 rotation")
+    if matrix is not None and not (np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3) and np.linalg.det(matrix) > 0):
+        raise table.fail("body_from_camera", "body_from_camera is not a rotation", "give orthonormal rows, determinant 1")
+    return matrix
+
+
 def _read_intrinsics(table: _Table, width: int, height: int) -> Intrinsics | None:
     matrix = table.numbers("matrix", (3, 3), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    fisheye = bool(table.values.get("fisheye", False))
+    fisheye = table.values.get("fisheye", False)
+    if not isinstance(fisheye, bool):
+        raise table.fail("fisheye", f"fisheye = {fisheye!r}", "give true or false")
     if "distortions" in table.values and isinstance(table.values["distortions"], list):
         given = len(table.values["distortions"])
         if not fisheye and given == 4:  # OpenCV's shortest form: k3 = 0

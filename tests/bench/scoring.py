@@ -155,7 +155,7 @@ def _refine(shift: float, time: Floats, position: Floats, truth_time: Floats, tr
     start = np.zeros(2)
     for spread in (0.3, 0.03, 0.003):
         simplex = start + spread * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        options: dict[str, Any] = {"initial_simplex": simplex, "xatol": 1e-6, "fatol": 1e-8, "maxiter": 150}
+        options: Any = {"initial_simplex": simplex, "xatol": 1e-6, "fatol": 1e-8, "maxiter": 150}
         start = np.asarray(minimize(cost, start, method="Nelder-Mead", options=options).x)
     found = solve(start)
     if found is None or cost(start) >= 1e9:

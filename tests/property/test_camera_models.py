@@ -159,3 +159,12 @@ def test_no_rows_are_no_trouble() -> None:
         assert lens.project(np.zeros((0, 3))).shape == (0, 2)
         assert lens.unproject(np.zeros((0, 2))).shape == (0, 2)
         assert lens.pixel_jacobian(np.zeros((0, 2))).shape == (0, 2, 2)
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_absurd_pixels_have_no_direction_and_spoil_no_other(fisheye: bool) -> None:
+    """A detector that wrote 1e300 is an outlier, not a crash."""
+    lens = Intrinsics(W, H, _matrix(900, 1, 640, 360), np.array([-0.1, 0.02, 0, 0, 0][: 5 - fisheye]), fisheye)
+    found = lens.unproject(np.array([[640.0, 360.0], [1e300, 0], [-1e12, 1e12]]))
+    np.testing.assert_allclose(found[0], 0, atol=1e-12)
+    assert np.isnan(found[1:]).all()

@@ -47,7 +47,7 @@ def solved_session(
         error = random.normal(0.0, noise_px, (rows, 2))
         pixels = lens.project(pose.camera_from_world(path)) + error
         inside = ((pixels >= 0) & (pixels < [1280, 720])).all(axis=1)
-        told += [(name, i, seen[i], pixels[i]) for i in np.flatnonzero(inside)]
+        told += [(name, int(i), float(seen[i]), pixels[i]) for i in np.flatnonzero(inside)]
         rig_cameras[name] = RigCamera(name, (1280, 720), 30.0, lens, table={"name": name, "fps": 30.0, "model": "test"})
         if name != names[-1]:
             std = 0.0 if number == 0 else time_offset_std

@@ -239,6 +239,16 @@ def test_the_surer_position_counts_more() -> None:
         np.testing.assert_allclose(gauge.similarity.pose(pose).position, there.position, atol=2e-3)
 
 
+def test_a_std_of_zero_is_exact_and_not_infinite() -> None:
+    truth, internal, similarity = world(10)
+    known = {
+        name: {"position": pose.position, "position_std": np.zeros(3)} for name, pose in zip(NAMES, truth, strict=True)
+    }
+    gauge = fix_gauge(rig(known), NAMES, internal)
+    same(gauge.similarity, similarity)
+    assert np.isfinite(gauge.information).all()
+
+
 def test_the_unit_of_length_makes_no_difference() -> None:
     truth, internal, similarity = world(11)
     known = {name: {"position": 1000 * pose.position} for name, pose in zip(NAMES, truth, strict=True)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -133,7 +134,7 @@ def test_good_data_is_called_good() -> None:
         ({"rms_px": 0.4}, "good", "within a pixel or so"),
     ],
 )
-def test_each_grade_follows_from_the_figures(change: dict[str, float], level: str, words: str) -> None:
+def test_each_grade_follows_from_the_figures(change: dict[str, Any], level: str, words: str) -> None:
     calibration, _, _ = solved_session()
     cameras = {name: replace(camera, **change) for name, camera in calibration.cameras.items()}
     assert words in findings(replace(calibration, cameras=cameras), level)

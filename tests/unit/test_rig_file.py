@@ -117,6 +117,11 @@ def test_stds_may_be_one_number_or_three(tmp_path: Path) -> None:
     np.testing.assert_array_equal(camera.rotation_std, [0.1, 0.2, 0.3])
 
 
+def test_a_std_of_zero_is_exactly_known(tmp_path: Path) -> None:
+    camera = read(tmp_path, f"{CAM0}position = [0, 0, 0]\nposition_std = 0\n").cameras["cam0"]
+    np.testing.assert_array_equal(camera.position_std, [0.0] * 3)
+
+
 def test_up_is_a_unit_vector_or_a_camera(tmp_path: Path) -> None:
     vector = read(tmp_path, f"{CAM0}[metadata]\nup = [0, 0, 2.0]\n").up
     np.testing.assert_array_equal(vector, [0, 0, 1])
@@ -208,7 +213,6 @@ def test_a_wrong_value_is_told_with_its_line(tmp_path: Path, old: str, new: str,
         "position = 3",
         "rotation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]",
         "translation = [0, 0, 0]",
-        "position_std = 0",
         "position_std = -0.1",
         'position_std = "good"',
         "rotation_std = [0.1, 0.1]",

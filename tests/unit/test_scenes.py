@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge import scenes
+from edge.scenes import rendering
 from edge.scenes.base import SimulatedClock
-from edge.scenes.rendering import MarkerRenderer
 from edge.scenes.session import simulated_session
 from protocols.clocks import CameraTime
 from protocols.errors import InputError
@@ -121,19 +121,20 @@ def test_clocks_differ_in_epoch_and_drift() -> None:
     assert all(0 < abs(clock.rate - 1.0) <= 1e-4 for clock in clocks)
 
 
-def test_drawn_ball_is_where_and_as_large_as_the_truth_says() -> None:
-    """Coverage is read from a black ball on white without noise."""
-    scene = dataclasses.replace(scenes.get("marker", 3), marker_bgr=(0.0, 0.0, 0.0))
-    renderer = MarkerRenderer(scene, "cam0", np.random.default_rng(0), noise_std=0.0)
+def test_drawn_ball_is_where_and_as_large_as_the_truth_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Coverage is read from a black ball on white without noise or glint."""
+    for light, value in (("_GLINT", 0.0), ("_DIFFUSE", 0.0), ("_AMBIENT", 1.0)):
+        monkeypatch.setattr(rendering, light, value)
+    scene = dataclasses.replace(scenes.get("marker", 3), marker_bgr=(20.0, 20.0, 20.0))
+    renderer = rendering.MarkerRenderer(scene, "cam0", np.random.default_rng(0), noise_std=0.0)
     renderer._dimmed[:] = 215
-    renderer._light = np.zeros(3)
     rows, columns = np.mgrid[:480, :640]
     checked = 0
     for moment in np.linspace(0.0, 40.0, 60):
         pixels, size = scene.seen_by("cam0", np.array([moment]))
         if not (40 < pixels[0, 0] < 600 and 40 < pixels[0, 1] < 440):
             continue
-        cover = (235.0 - renderer.render(moment)[..., 0]) / 235.0
+        cover = (235.0 - renderer.render(moment)[..., 0]) / 215.0
         total = cover.sum()
         centroid = np.array([(cover * columns).sum(), (cover * rows).sum()]) / total
         shift = 0.02 + 1.2 * np.hypot(*(pixels[0] - 320)) * (0.5 * size[0] / 450) ** 2  # perspective of a sphere
@@ -149,7 +150,7 @@ def test_a_ball_behind_or_beside_the_camera_is_not_drawn() -> None:
     behind = camera.pose.world_from_camera(np.array([[0.0, 0.0, -2.0]]))[0]
     hidden = dataclasses.replace(scene, path=dataclasses.replace(scene.path, centre=behind, extent=np.full(3, 1e-3)))
     assert np.isnan(hidden.seen_by(camera.name, np.zeros(1))[0]).all()
-    renderer = MarkerRenderer(hidden, camera.name, np.random.default_rng(0), noise_std=0.0)
+    renderer = rendering.MarkerRenderer(hidden, camera.name, np.random.default_rng(0), noise_std=0.0)
     assert (renderer.render(0.0) == np.maximum(renderer._background, 20)).all()
 
 
