@@ -20,10 +20,10 @@ _DAY_S = 86_400.0
 
 def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event) -> int:
     """Run a camera agent until it is stopped or its recording ends."""
+    import cv2
+
     from edge.camera_agent import run_camera_agent
     from edge.detectors.marker import MarkerDetector
-
-    import cv2
 
     cv2.setNumThreads(1)  # one core a camera: several agents share a board
     known = _known_camera(config)

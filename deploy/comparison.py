@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from edge import scenes
-from protocols.geometry import so3
 from protocols.clocks import ReferenceTime
+from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.session.calibration import read_calibration
 
@@ -69,7 +69,15 @@ class Comparison:
 
         console = wide_console()
         table = Table(title="recovered against true", title_justify="left")
-        for column in ("camera", "true offset [s]", "recovered [s]", "error [ms]", "std [ms]", "rotation [°]", "direction [°]"):
+        for column in (
+            "camera",
+            "true offset [s]",
+            "recovered [s]",
+            "error [ms]",
+            "std [ms]",
+            "rotation [°]",
+            "direction [°]",
+        ):
             table.add_column(column, justify="left" if column == "camera" else "right")
         for c in self.cameras:
             table.add_row(
@@ -113,9 +121,7 @@ def compare_with_truth(folder: Path, scene_name: str, seed: int, cameras: int) -
         middle = found.time_map.camera_from_reference(now)
         true_offset = true_map.reference_from_camera(middle) - middle
         recovered = found.time_map.reference_from_camera(middle) - middle
-        turn = so3.angle_between(
-            found.pose.rotation @ base.rotation.T, truth.rotation @ base_truth.rotation.T
-        )
+        turn = so3.angle_between(found.pose.rotation @ base.rotation.T, truth.rotation @ base_truth.rotation.T)
         out.append(
             CameraError(
                 camera=camera.name,
@@ -124,7 +130,9 @@ def compare_with_truth(folder: Path, scene_name: str, seed: int, cameras: int) -
                 offset_error_ms=1e3 * (recovered - true_offset),
                 offset_std_ms=1e3 * found.time_offset_std,
                 rotation_error_deg=float(np.degrees(turn)),
-                direction_error_deg=0.0 if camera.name == reference else _direction(found.pose, base, truth, base_truth),
+                direction_error_deg=0.0
+                if camera.name == reference
+                else _direction(found.pose, base, truth, base_truth),
             )
         )
     return Comparison(tuple(out), tuple(c.name for c in scene.cameras if c.name not in solved))

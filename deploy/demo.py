@@ -96,7 +96,9 @@ class Fleet:
                     self._check_alive()
                     if first is None and time.monotonic() - began > _STARTING_S:
                         missing = [name for name in self.names if name not in live.observations]
-                        raise Refused(f"no frame from {', '.join(missing)} within {_STARTING_S:.0f} s; see {self.out}/logs")
+                        raise Refused(
+                            f"no frame from {', '.join(missing)} within {_STARTING_S:.0f} s; see {self.out}/logs"
+                        )
                     show(live)
                 live.status = "stopping the cameras"
                 show(live)
@@ -132,7 +134,9 @@ class Fleet:
             (self.out / "config").mkdir(parents=True)
             (self.out / "logs").mkdir()
         except OSError as error:
-            raise InputError(f"cannot be made: {error.strerror}", file=self.out, remedy="choose another --out") from None
+            raise InputError(
+                f"cannot be made: {error.strerror}", file=self.out, remedy="choose another --out"
+            ) from None
 
     def _write_configs(self) -> dict[str, Path]:
         """One configuration file an agent, as a user would write it."""

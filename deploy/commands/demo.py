@@ -26,7 +26,7 @@ def demo(
     seed: int = 1,
     json: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
-    """Film a simulated marker with cameras that share no clock, find their clocks and places, and compare with the truth.
+    """Film a simulated marker with cameras that share no clock, find clocks and places, compare with the truth.
 
     Cameras, hub and recorder are processes that talk over Zenoh on this machine. Ends with a table of recovered against
     true, the log demo.mcap and report.html in --out. Exit status 3 if the errors are larger than promised.
@@ -72,7 +72,7 @@ def demo(
     return EXIT_DONE if comparison.good else EXIT_REFUSED
 
 
-class _display:  # noqa: N801 - reads as a verb where it is used
+class _display:
     """Live progress: a bar, and what each camera has seen. On a terminal it redraws, elsewhere it prints lines."""
 
     def __init__(self, seconds: float, names: list[str], quiet: bool) -> None:

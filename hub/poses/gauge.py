@@ -62,8 +62,9 @@ def fix_gauge(rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
     final = residual(best)
     warnings = []
     if len(final) and float(np.sqrt(np.mean(final**2))) > _FAR:
+        worst = np.abs(final).max()
         warnings.append(
-            f"the rig's references disagree with each other or the cameras by {np.abs(final).max():.0f} sigma: check them"
+            f"the rig's references disagree with each other or the cameras by {worst:.0f} sigma: check them"
         )
     return Gauge(best, "metric" if metric else "arbitrary", _information(rig, names, poses, best), tuple(warnings))
 

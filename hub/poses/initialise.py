@@ -343,12 +343,20 @@ def _intersect_bearings(camera: Camera, graph: ClockGraph, scaffold: Scaffold) -
     if len(turns) < 2 or np.linalg.eigvalsh(matrix)[0] < (1.0 - np.cos(_LEAST_BEARING)) * min(weights):
         return None
     clock = _in_scaffold_time(_camera_state(camera, graph, Pose.identity()), graph, scaffold)
-    return replace(clock, pose=Pose(so3.nearest(np.sum(turns, axis=0)), np.linalg.solve(matrix, right)))
+    return replace(
+        clock, pose=Pose(so3.nearest(np.sum(turns, axis=0)), np.asarray(np.linalg.solve(matrix, right), np.float64))
+    )
 
 
 def agreement(scaffold: Scaffold, name: str) -> tuple[float, int]:
-    """Share of a placed camera's rows on the known path that fit within 5 sigma or 3 px, and how many."""
+    """Share of a placed camera's rows on the known path that fit within 5 sigma or 3 px, and how many.
+
+    A camera that saw something else has a large sigma of its own making: what counts is no more than three
+    times that of the other cameras.
+    """
     number = scaffold.names.index(name)
+    others = np.delete(scaffold.state.sigma, number)
+    sigma = min(float(scaffold.state.sigma[number]), 3.0 * float(np.median(others)))
     norms = [
         residual_norms(rows, scaffold.state.cameras[number], scaffold.state.trajectories[rows.label])
         for rows in scaffold.problem.rows
@@ -358,4 +366,4 @@ def agreement(scaffold: Scaffold, name: str) -> tuple[float, int]:
     values = values[np.isfinite(values)]
     if not len(values):
         return 0.0, 0
-    return float((values < max(3.0, 5.0 * float(scaffold.state.sigma[number]))).mean()), len(values)
+    return float((values < max(3.0, 5.0 * sigma)).mean()), len(values)

@@ -6,16 +6,17 @@ by reweighted Levenberg-Marquardt from several essential matrices, and an absolu
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from hub.timing import two_view
 from hub.timing.refine import Noise, PointPairs, Refined, refine
-from hub.timing.scan import PairMoments, candidates, grid_track, scan_lags
+from hub.timing.scan import PairMoments, Scan, candidates, grid_tracks, scan_lags, significance
 from hub.timing.tracks import SmoothTrack
 from hub.timing.two_view import RelativePose
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Ints
 
 _LEAST_SAMPLES = 12
 
@@ -48,7 +49,11 @@ class PairSettings:
     plenty: float = 12.0
     hardly: float = 4.0
     """Seconds of agreeing motion that count as plenty and as hardly any."""
-    largest_rate: float = 5e-3
+    largest_rate: float = 1e-2
+    accept_significance: float = 3.0
+    """Sigma by which the alignment's misfit must stand out from that of other lags with like support."""
+    flat_ratio: float = 3.0
+    """A plane that leaves less than this many times the epipolar residual explains the motion as well."""
     accept_in_front: float = 0.95
     accept_ratio: float = 0.5
 
@@ -60,7 +65,7 @@ class PairFit:
     cost: mean robust squared distance over the noise. sigma_px: robust residual [px].
     support: seconds of agreeing motion. inliers, front: fractions of the moving samples.
     moving_overlap: seconds in which both tracks exist and move. middle: time of a in the middle of them.
-    parallax: median angle [rad] between the two rays of a point.
+    parallax: median angle [rad] between the two rays of a point. flat_px: what one plane would leave [px].
     """
 
     rate: float
@@ -74,6 +79,7 @@ class PairFit:
     moving_overlap: float
     middle: float
     parallax: float
+    flat_px: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,12 +116,10 @@ def solve_pair(
     labels = [label for label in tracks_a if label in tracks_b]
     if not labels:
         return PairSolution(*names, "no label that both cameras saw")
-    # The label that moves most leads the scan; the refinement uses it too.
-    label = max(labels, key=lambda name: min(_moving(tracks_a[name], s), _moving(tracks_b[name], s)))
-    a, b = tracks_a[label], tracks_b[label]
-    span = max(a.span, b.span)
+    a, b = [tracks_a[label] for label in labels], [tracks_b[label] for label in labels]
+    span = max(max(track.basis.end for track in one) - min(track.basis.begin for track in one) for one in (a, b))
     step = s.step if span > 60 else s.step / 1.5
-    moments = PairMoments(grid_track(a, step, s.sigma_px), grid_track(b, step, s.sigma_px))
+    moments = PairMoments(grid_tracks(a, step, s.sigma_px), grid_tracks(b, step, s.sigma_px))
     if float(moments.support.max(initial=0.0)) < s.least_support:
         return PairSolution(*names, "the point hardly moves while both could have seen it")
     scan = scan_lags(moments, s.least_support, None if known is None else known.essential.T)
@@ -129,14 +133,13 @@ def solve_pair(
             fits.append(fit)
     if not fits:
         return PairSolution(*names, "no alignment of the two tracks agrees with any geometry")
-    return _judge(names, _distinct(fits), s)
+    ordered = _distinct(fits)
+    return _judge(names, ordered, _significance(scan, ordered[0], s), s)
 
 
-def _moving(track: SmoothTrack, s: PairSettings) -> float:
-    """Seconds in which the track moves."""
-    speed = np.linalg.norm(track.at(track.time, 1), axis=1) * track.focal
-    interval = float(np.median(np.diff(track.time)))
-    return float((speed > s.moving_px).sum()) * interval
+def _significance(scan: Scan, fit: PairFit, s: PairSettings) -> float | None:
+    lag = fit.middle - (fit.middle - fit.offset) / fit.rate  # of the middle of the motion
+    return significance(scan, lag, (fit.sigma_px / s.sigma_px) ** 2)
 
 
 def _distinct(fits: list[PairFit]) -> list[PairFit]:
@@ -160,7 +163,7 @@ def needed_inliers(fit: PairFit, s: PairSettings) -> float:
     return s.accept_inliers + short * (s.strict_inliers - s.accept_inliers)
 
 
-def _judge(names: tuple[str, str], fits: list[PairFit], s: PairSettings) -> PairSolution:
+def _judge(names: tuple[str, str], fits: list[PairFit], stands_out: float | None, s: PairSettings) -> PairSolution:
     best = fits[0]
     others = tuple(fits[1:4])
     second = evidence(others[0]) / max(evidence(best), 1e-12) if others else 0.0
@@ -174,6 +177,17 @@ def _judge(names: tuple[str, str], fits: list[PairFit], s: PairSettings) -> Pair
         reason = f"only {100 * best.inliers:.0f} % of the common motion agrees with one geometry"
     elif best.front < s.accept_in_front:
         reason = "the best geometry puts points behind a camera"
+    elif best.flat_px < s.flat_ratio * max(best.sigma_px, s.sigma_px):
+        reason = "the motion lies in one plane (or the cameras stand in one place), which leaves the geometry open"
+    elif stands_out is None and best.support < s.hardly:
+        reason = (
+            f"the recordings overlap too little ({best.moving_overlap:.1f} s of motion) to tell one lag from another"
+        )
+    elif stands_out is not None and stands_out < s.accept_significance:
+        reason = (
+            f"other lags fit nearly as well (the best stands out by {stands_out:.1f} sigma of {s.accept_significance:.1f} "
+            "needed): too little or too regular common motion, or two different things"
+        )
     elif second > s.accept_ratio:
         reason = f"two alignments are about as good ({best.offset:.2f} s and {others[0].offset:.2f} s)"
     else:
@@ -182,8 +196,8 @@ def _judge(names: tuple[str, str], fits: list[PairFit], s: PairSettings) -> Pair
 
 
 def _refine_candidate(
-    a: SmoothTrack,
-    b: SmoothTrack,
+    a: Sequence[SmoothTrack],
+    b: Sequence[SmoothTrack],
     offset: float,
     cost: float,
     start: Floats | None,
@@ -207,11 +221,11 @@ def _refine_candidate(
         if both.sum() < _LEAST_SAMPLES or start is None:
             return None
         here_a, here_b = here_a[both], here_b[both]
-        threshold = 3.0 * s.sigma_px * scale / min(a.focal, b.focal)
+        threshold = 3.0 * s.sigma_px * scale / min(a[0].focal, b[0].focal)
         starts = [two_view.decompose(start, here_a, here_b)]
         for seed in range(2):
             starts += two_view.five_point(here_a, here_b, threshold, seed)
-    noise = Noise(s.sigma_px / a.focal, s.sigma_px / b.focal, s.rate_std)
+    noise = Noise(s.sigma_px / a[0].focal, s.sigma_px / b[0].focal, s.rate_std)
     best: Refined | None = None
     for pose in starts:
         fit = refine(sample, pose, sample.centre - offset, scale, noise, fixed_pose=known is not None)
@@ -227,57 +241,89 @@ def judge_alignment(
     a: SmoothTrack, b: SmoothTrack, offset: float, pose: RelativePose, settings: PairSettings | None = None
 ) -> PairFit:
     """The absolute figures of an alignment ``t_a = t_b + offset`` that another method found."""
-    return _Samples(a, b, offset, settings or PairSettings()).judge(0.0, 1.0, offset, pose)
+    return _Samples([a], [b], offset, settings or PairSettings()).judge(0.0, 1.0, offset, pose)
+
+
+def _flat_px(a: Floats, b: Floats) -> float:
+    """What the best plane leaves [px], in the direction in which it leaves less: seen edge-on, it magnifies noise."""
+    return min(two_view.homography_residual(a, b), two_view.homography_residual(b, a))
 
 
 class _Samples:
-    """Samples of one alignment: the inliers of a at their own times, b by its spline."""
+    """Samples of one alignment, all labels together: the inliers of a at their own times, b by its splines.
 
-    def __init__(self, a: SmoothTrack, b: SmoothTrack, offset: float, s: PairSettings) -> None:
+    a, b: tracks of the same labels in the same order.
+    """
+
+    def __init__(self, a: Sequence[SmoothTrack], b: Sequence[SmoothTrack], offset: float, s: PairSettings) -> None:
         self.a, self.b, self.s = a, b, s
+        parts = [self._rows(one, other, offset) for one, other in zip(a, b, strict=True)]
+        share = min(1.0, s.samples / max(sum(len(rows) for rows in parts), 1))
+        # The same share of every label, spread over its time.
+        thinned = [
+            rows[np.linspace(0, len(rows) - 1, round(share * len(rows))).round().astype(np.int64)] for rows in parts
+        ]
+        self.label = np.concatenate([np.full(len(rows), k) for k, rows in enumerate(thinned)])
+        self.time = np.concatenate([one.time[rows] for one, rows in zip(a, thinned, strict=True)])
+        self.points = np.concatenate([one.points[rows] for one, rows in zip(a, thinned, strict=True)])
+        self.speed = np.concatenate(
+            [np.linalg.norm(one.at(one.time[rows], 1), axis=1) for one, rows in zip(a, thinned, strict=True)]
+        )
+        self.count = len(self.time)
+        self.centre = float(np.median(self.time)) if self.count else 0.0
+        intervals = [float(np.median(np.diff(one.time))) for one in a]
+        rows_a_second = self.count / max(sum(len(rows) * t for rows, t in zip(parts, intervals, strict=True)), 1e-9)
+        self.seconds_a_sample = len(a) ** -0.5 / max(rows_a_second, 1e-9)
+
+    def _rows(self, a: SmoothTrack, b: SmoothTrack, offset: float) -> Ints:
         margin = 0.5
-        b_end = float(b.basis.starts[-1] + b.basis.intervals[-1] * b.basis.spacing)
-        inside = (a.time - offset > b.basis.starts[0] - margin) & (a.time - offset < b_end + margin)
+        inside = (a.time - offset > b.basis.begin - margin) & (a.time - offset < b.basis.end + margin)
         speed = np.linalg.norm(a.at(a.time, 1), axis=1) * a.focal
-        rows = np.flatnonzero(inside & (speed > 0.5 * s.moving_px))
-        if len(rows) > s.samples:
-            rows = rows[np.linspace(0, len(rows) - 1, s.samples).round().astype(np.int64)]
-        self.time = a.time[rows]
-        self.points = a.points[rows]
-        self.count = len(rows)
-        self.centre = float(np.median(self.time)) if len(rows) else 0.0
+        return np.flatnonzero(inside & (speed > 0.5 * self.s.moving_px))
+
+    def of_b(self, time: Floats, derivative: int = 0) -> Floats:
+        """Points of b (n, 2), or their derivative, at b's times (n,) of the samples; NaN in gaps."""
+        if len(self.b) == 1:
+            return self.b[0].at(time, derivative)
+        out = np.full((len(time), 2), np.nan)
+        for k, track in enumerate(self.b):
+            mine = self.label == k
+            out[mine] = track.at(time[mine], derivative)
+        return out
 
     def at(self, rate: float, offset: float) -> tuple[Floats, Floats]:
         """Points of a (n, 2) and of b (n, 2; NaN in its gaps) under ``t_a = rate t_b + offset``."""
-        return self.points, self.b.at((self.time - offset) / rate)
+        return self.points, self.of_b((self.time - offset) / rate)
 
     def __call__(self, slowness: float, middle: float) -> PointPairs:
         lever = self.time - self.centre
         time_b = slowness * lever + middle
-        b = self.b.at(time_b)
+        b = self.of_b(time_b)
         there = np.isfinite(b[:, 0])
-        return PointPairs(self.points[there], b[there], self.b.at(time_b[there], 1), lever[there])
+        speed = self.of_b(time_b, 1)
+        return PointPairs(self.points[there], b[there], speed[there], lever[there])
 
     def judge(self, cost: float, rate: float, offset: float, pose: RelativePose) -> PairFit:
         """Absolute figures of an alignment, over the samples where both move."""
         a, b = self.at(rate, offset)
         there = np.isfinite(b).all(axis=1)
-        speed_b = np.linalg.norm(self.b.at((self.time - offset) / rate, 1), axis=1) * self.b.focal
-        speed_a = np.linalg.norm(self.a.at(self.time, 1), axis=1) * self.a.focal
+        focal_a, focal_b = self.a[0].focal, self.b[0].focal
+        speed_b = np.linalg.norm(self.of_b((self.time - offset) / rate, 1), axis=1) * focal_b
+        speed_a = self.speed * focal_a
         with np.errstate(invalid="ignore"):
             moving: Bools = there & (speed_a > self.s.moving_px) & (speed_b > self.s.moving_px)
         count = int(moving.sum())
         if count < 8:
             return PairFit(rate, offset, pose, cost, np.inf, 0.0, 0.0, 0.0, 0.0, self.centre, 0.0)
-        sigma_a, sigma_b = self.s.sigma_px / self.a.focal, self.s.sigma_px / self.b.focal
+        sigma_a, sigma_b = self.s.sigma_px / focal_a, self.s.sigma_px / focal_b
         distance = np.abs(two_view.sampson(pose.essential, a[moving], b[moving], sigma_a, sigma_b))
         sigma_px = float(np.median(distance)) / 0.6745 * self.s.sigma_px
         # A track's own noise counts for what it is; a wrong geometry must not hide behind it.
-        limit = max(3.0 * max(self.a.sigma_px, self.b.sigma_px, self.s.sigma_px), 3.0) / self.s.sigma_px
+        own = max(float(np.median([track.sigma_px for track in tracks])) for tracks in (self.a, self.b))
+        limit = max(3.0 * own, 3.0) / self.s.sigma_px
         close = distance < limit
         front = two_view.in_front(pose, a[moving][close], b[moving][close])
-        interval = self._seconds_a_sample()
-        seconds = float(count) * interval
+        seconds = float(count) * self.seconds_a_sample
         inliers = float(close.mean())
         share = float(front.mean()) if len(front) else 0.0
         rays_a, rays_b = two_view.homogeneous(a[moving]) @ pose.rotation.T, two_view.homogeneous(b[moving])
@@ -294,8 +340,5 @@ class _Samples:
             moving_overlap=seconds,
             middle=float(np.median(self.time[moving])),
             parallax=float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))),
+            flat_px=_flat_px(a[moving][close] * focal_a, b[moving][close] * focal_b),
         )
-
-    def _seconds_a_sample(self) -> float:
-        gaps = np.diff(self.time)
-        return float(np.median(gaps)) if len(gaps) else 0.0

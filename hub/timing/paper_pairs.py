@@ -38,7 +38,7 @@ def paper_pair(
         (start_a, step_a), (start_b, step_b) = intervals
         if abs(step_a / step_b - 1.0) > _SAME_RATE:
             raise Refused(
-                f"frame rates differ ({1 / step_a:.2f} and {1 / step_b:.2f} a second), which the paper's method excludes"
+                f"frame rates differ ({1 / step_a:.2f} and {1 / step_b:.2f} a second): not for the paper's method"
             )
         first = int(min(frames[0].min(), frames[1].min()))
         length = int(max(frames[0].max(), frames[1].max())) - first + 1

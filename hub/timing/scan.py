@@ -7,6 +7,7 @@ squared epipolar distance, in units of the noise, that the best fundamental matr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,15 +19,18 @@ from protocols.geometry.types import Bools, Floats, Ints
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _PAIR_OF = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _SLOW_PX = 20.0  # px/s: image speed at which a moment counts half
+_OWN_LAGS = 1.0  # s about an alignment that are no other alignment
+_LEAST_ALIKE = 20
+_COST_FLOOR = 0.25  # of squared noise: smoothing can do better than the noise, but that tells nothing
 _CHUNK = 4096  # lags per batch of eigenvalue problems
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GridTrack:
-    """A track on a regular grid of the camera's time, in coordinates centred and scaled for conditioning.
+    """One camera's tracks on a regular grid of its time, in coordinates centred and scaled for conditioning.
 
-    begin: time of the first sample [s]. step: [s]. points: (n, 2). weight: (n,) 0 where there is no track,
-    near 0 where it stands still, up to 1 where it moves. sigma: noise in the scaled coordinates.
+    begin: time of the first sample [s]. step: [s]. points: (labels, n, 2). weight: (labels, n) 0 where there is
+    no track, near 0 where it stands still, up to 1 where it moves. sigma: noise in the scaled coordinates.
     transform: (3, 3), scaled from normalised homogeneous coordinates.
     """
 
@@ -38,21 +42,25 @@ class GridTrack:
     transform: Floats
 
 
-def grid_track(track: SmoothTrack, step: float, sigma_px: float) -> GridTrack:
-    """Sample a track every ``step`` seconds; sigma_px: the noise to reckon with."""
-    begin = float(np.floor(track.basis.starts[0] / step) * step)
-    end = float(track.basis.starts[-1] + track.basis.intervals[-1] * track.basis.spacing)
+def grid_tracks(tracks: Sequence[SmoothTrack], step: float, sigma_px: float) -> GridTrack:
+    """Sample one camera's tracks, one a label, every ``step`` seconds; sigma_px: the noise to reckon with."""
+    begin = float(np.floor(min(track.basis.begin for track in tracks) / step) * step)
+    end = max(track.basis.end for track in tracks)
     time = begin + step * np.arange(int(np.ceil((end - begin) / step)) + 1, dtype=np.float64)
-    points = track.at(time)
-    speed = np.linalg.norm(track.at(time, 1), axis=1) * track.focal
-    there = np.asarray(np.isfinite(points).all(axis=1))
-    weight = np.where(there, speed / (speed + _SLOW_PX), 0.0)
-    points = np.where(there[:, None], points, 0.0)
+    points = np.stack([track.at(time) for track in tracks])
+    focal = tracks[0].focal
+    speed = np.stack([np.linalg.norm(track.at(time, 1), axis=1) for track in tracks]) * focal
+    there = np.asarray(np.isfinite(points).all(axis=2))
+    # Several labels are rarely independent: together they count as the root of their number.
+    share = len(tracks) ** -0.25  # a moment has a's weight times b's
+    weight = np.where(there, share * speed / (speed + _SLOW_PX), 0.0)
+    points = np.where(there[:, :, None], points, 0.0)
     total = max(float(weight.sum()), 1e-9)
-    centre = weight @ points / total
-    spread = np.sqrt(max(float(weight @ ((points - centre) ** 2).sum(axis=1)) / total / 2.0, 1e-12))
+    centre = (weight[:, :, None] * points).sum(axis=(0, 1)) / total
+    variance = float((weight * ((points - centre) ** 2).sum(axis=2)).sum()) / total / 2.0
+    spread = np.sqrt(max(variance, 1e-12))
     transform = np.array([[1 / spread, 0, -centre[0] / spread], [0, 1 / spread, -centre[1] / spread], [0, 0, 1.0]])
-    return GridTrack(begin, step, (points - centre) / spread, weight, sigma_px / track.focal / spread, transform)
+    return GridTrack(begin, step, (points - centre) / spread, weight, sigma_px / focal / spread, transform)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,11 +81,13 @@ class PairMoments:
 
     def __init__(self, a: GridTrack, b: GridTrack) -> None:
         self.a, self.b = a, b
-        n_a, n_b = len(a.weight), len(b.weight)
+        n_a, n_b = a.weight.shape[1], b.weight.shape[1]
         length = next_fast_len(n_a + n_b, real=True)
         spectra_a, spectra_b = rfft(_monomials(a), length), rfft(_monomials(b), length)
         # c[lag] = sum_n a[n] b[n + lag], for lag = -(n_a - 1) … n_b - 1
-        product = np.conj(spectra_a)[:, None, :] * spectra_b[None, :, :]
+        product = np.zeros((len(_PAIRS), len(_PAIRS), length // 2 + 1), dtype=np.complex128)
+        for of_a, of_b in zip(spectra_a, spectra_b, strict=True):
+            product += np.conj(of_a)[:, None, :] * of_b[None, :, :]
         correlation = np.asarray(irfft(product, length), dtype=np.float64)
         self.lags: Ints = np.arange(-(n_a - 1), n_b, dtype=np.int64)
         self.moments: Floats = correlation[:, :, self.lags % length]
@@ -132,8 +142,10 @@ class PairMoments:
 
 
 def _monomials(track: GridTrack) -> Floats:
-    s = np.column_stack([track.points, np.ones(len(track.points))])
-    return np.stack([track.weight * s[:, i] * s[:, j] for i, j in _PAIRS])
+    """(labels, 6, n): weight times the six products of the homogeneous coordinates."""
+    x, y = track.points[:, :, 0], track.points[:, :, 1]
+    s = (x, y, np.ones_like(x))
+    return np.stack([track.weight * s[i] * s[j] for i, j in _PAIRS], axis=1)
 
 
 def scan_lags(moments: PairMoments, least_support: float, known: Floats | None = None) -> Scan:
@@ -146,6 +158,26 @@ def scan_lags(moments: PairMoments, least_support: float, known: Floats | None =
     if len(which):
         cost[which] = moments.costs(which) if known is None else moments.costs_of(which, known)
     return Scan(moments.offset, moments.support, cost)
+
+
+def significance(scan: Scan, offset: float, achieved: float) -> float | None:
+    """How far the misfit of one alignment stands out from that of all others of like support, in their sigma.
+
+    A search over many lags finds some that fit little motion well; this asks the data themselves how well a
+    wrong lag fits. achieved: squared distance over noise after refinement. None where too few lags compare.
+    """
+    index = int(np.argmin(np.abs(scan.offset - offset)))
+    support = scan.support[index]
+    alike = (scan.support > 0.7 * support) & (scan.support < 1.4 * support) & np.isfinite(scan.cost)
+    alike &= np.abs(scan.offset - offset) > _OWN_LAGS
+    if alike.sum() < _LEAST_ALIKE:
+        return None
+    others = np.log(scan.cost[alike] + _COST_FLOOR)
+    middle = float(np.median(others))
+    spread = (middle - float(np.quantile(others, 0.05))) / 1.645
+    near = scan.cost[max(index - 1, 0) : index + 2].min()
+    own = float(np.log(min(float(near), achieved) + _COST_FLOOR))
+    return (middle - own) / max(spread, 1e-6)
 
 
 def candidates(scan: Scan, per_stratum: int, at_most: int) -> Ints:

@@ -86,6 +86,41 @@ def decompose(essential: Floats, a: Floats, b: Floats) -> RelativePose:
     return max(options, key=lambda option: int(in_front(option, a, b).sum()))
 
 
+def homography_residual(a: Floats, b: Floats) -> float:
+    """Robust distance (sigma of one coordinate, units of b) that the best homography leaves from a to b.
+
+    Near the noise, it says that all points lie in one plane or the cameras stand in one place: then the
+    essential matrix is not determined. a, b: (n, 2), n >= 8; nan for fewer.
+    """
+    if len(a) < 8:
+        return float("nan")
+    scale_a, scale_b = _conditioner(a), _conditioner(b)
+    ha, hb = homogeneous(a) @ scale_a.T, homogeneous(b) @ scale_b.T
+    weight = np.ones(len(a))
+    distance = np.zeros(len(a))
+    for _ in range(4):
+        rows = np.concatenate(
+            [
+                np.hstack([ha, np.zeros_like(ha), -hb[:, :1] * ha]) * weight[:, None],
+                np.hstack([np.zeros_like(ha), ha, -hb[:, 1:2] * ha]) * weight[:, None],
+            ]
+        )
+        homography = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, 3)
+        moved = ha @ homography.T
+        depth = np.where(np.abs(moved[:, 2]) > 1e-12, moved[:, 2], 1e-12)
+        distance = np.linalg.norm(moved[:, :2] / depth[:, None] - hb[:, :2], axis=1)
+        # The algebraic error grows with the depth; divided out, rows count by distance in the image.
+        weight = 1.0 / np.abs(depth) / (1.0 + (distance / max(3.0 * float(np.median(distance)), 1e-12)) ** 2)
+        weight /= weight.max()
+    return float(np.median(distance)) / 1.1774 / float(scale_b[0, 0])
+
+
+def _conditioner(points: Floats) -> Floats:
+    centre = points.mean(axis=0)
+    spread = max(float(np.sqrt(((points - centre) ** 2).mean())), 1e-12)
+    return np.array([[1 / spread, 0, -centre[0] / spread], [0, 1 / spread, -centre[1] / spread], [0, 0, 1.0]])
+
+
 def five_point(a: Floats, b: Floats, threshold: float, seed: int, subset: int = 300) -> list[RelativePose]:
     """Poses from five-point RANSAC (OpenCV) over random subsets of the pairs; deterministic in ``seed``.
 

@@ -32,7 +32,7 @@ class Intrinsics:
     distortions: Floats = field(default_factory=lambda: np.zeros(5))
     fisheye: bool = False
     fold: float = field(init=False, default=float("inf"))
-    """Where the radial model turns back: normalised radius, or for fisheye the angle [rad]. There is no image beyond."""
+    """Where the radial model turns back: normalised radius, for fisheye the angle [rad]. Beyond is no image."""
 
     def __post_init__(self) -> None:
         if not self.fisheye and len(self.distortions) == 4:  # OpenCV's short form: k3 = 0
@@ -143,7 +143,8 @@ class Intrinsics:
         k1, k2, k3, k4 = self.distortions
         bent = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
         bent = np.where(theta < self.fold, bent, np.nan)
-        scale = np.where(radius > 1e-12, bent / np.where(radius > 1e-12, radius, 1.0), 1.0 / np.where(points[:, 2] > 0, points[:, 2], np.nan))
+        on_axis = 1.0 / np.where(points[:, 2] > 0, points[:, 2], np.nan)
+        scale = np.where(radius > 1e-12, bent / np.where(radius > 1e-12, radius, 1.0), on_axis)
         return np.asarray(points[:, :2] * scale[:, None])
 
     def _undistort_fisheye(self, distorted: Floats) -> Floats:

@@ -15,6 +15,7 @@ from protocols.geometry.types import Floats, Ints
 
 REQUIRED = ("camera", "frame", "time", "u", "v")
 DEFAULT_LABEL = "marker"
+_FARTHEST_PIXEL = 1e6
 _LARGEST_FRAME = 2.0**53  # beyond, a number read as a float is no longer whole
 _REPEATS_ARE_NONSENSE = 0.1  # share of repeated frame numbers from which they are no numbering at all
 
@@ -101,6 +102,11 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
         raise InputError("no rows", file=file, line=1, remedy="record some observations first")
     _check_width(rows, lines, max(columns[name] for name in columns if name in (*REQUIRED, "size", "label")), file)
     numbers = {name: _column(rows, lines, columns[name], name, file) for name in ("time", "u", "v")}
+    for name in ("u", "v"):
+        far = np.flatnonzero(np.abs(numbers[name]) > _FARTHEST_PIXEL)
+        if len(far):
+            what = f"{name} {numbers[name][far[0]]:g} is no pixel"
+            raise InputError(what, file=file, line=lines[far[0]], remedy="correct or remove the row")
     frame = _frames(rows, lines, columns["frame"], file)
     size = np.full(len(rows), np.nan)
     if "size" in columns:
@@ -241,7 +247,10 @@ def _frames(rows: list[list[str]], lines: list[int], index: int, file: Path) -> 
     bad = np.flatnonzero((values != np.round(values)) | (np.abs(values) > _LARGEST_FRAME))
     if len(bad):
         raise InputError(
-            f"frame {rows[bad[0]][index].strip()} is not a whole number", file=file, line=lines[bad[0]], remedy="correct it"
+            f"frame {rows[bad[0]][index].strip()} is not a whole number",
+            file=file,
+            line=lines[bad[0]],
+            remedy="correct it",
         )
     return values.astype(np.int64)
 

@@ -230,7 +230,9 @@ def _read_camera(table: _Table) -> RigCamera:
 def _read_body(table: _Table) -> Floats | None:
     matrix = table.numbers("body_from_camera", (3, 3), "a 3x3 rotation")
     if matrix is not None and not (np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3) and np.linalg.det(matrix) > 0):
-        raise table.fail("body_from_camera", "body_from_camera is not a rotation", "give orthonormal rows, determinant 1")
+        raise table.fail(
+            "body_from_camera", "body_from_camera is not a rotation", "give orthonormal rows, determinant 1"
+        )
     return matrix
 
 

@@ -133,6 +133,13 @@ def test_a_wrong_half_is_refused_or_the_lag_is_right(seed: int) -> None:
     assert not found.solved or abs(lag_error(session, found)) < 5e-3
 
 
+@pytest.mark.parametrize("seed", [200, 201, 204, 207])
+def test_three_seconds_in_common_are_refused_or_right(seed: int) -> None:
+    session = simulate(seed, 2, 30, late=0, windows=[(0, 16.5), (13.5, 30)])
+    found = solve(session)
+    assert not found.solved or (abs(lag_error(session, found)) < 10e-3 and turn_error(session, found) < 6.0)
+
+
 def test_no_overlap_at_all_is_refused() -> None:
     assert not solve(simulate(55, 2, 40, late=0, windows=[(0, 19), (21, 40)])).solved
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hub.timing.scan import GridTrack, PairMoments, Scan, candidates, grid_track, scan_lags
+from hub.timing.scan import GridTrack, PairMoments, Scan, candidates, grid_tracks, scan_lags
 from hub.timing.tracks import SmoothTrack, smooth_track
 from protocols.geometry.types import Floats
 from tests.rigs import Session, simulate
 
-STEP, SIGMA_PX = 0.05, 0.5
+STEP, SIGMA_PX, LABELS = 0.05, 0.5, 2
 
 
 def smooth(session: Session) -> list[SmoothTrack]:
@@ -33,17 +33,18 @@ def true_offset(session: Session, a: SmoothTrack, b: SmoothTrack) -> float:
 
 def random_grid(seed: int, count: int) -> GridTrack:
     rng = np.random.default_rng(seed)
-    weight = rng.random(count) * (rng.random(count) > 0.2)
-    return GridTrack(rng.normal(), STEP, rng.normal(size=(count, 2)), weight, 1e-3, np.eye(3))
+    weight = rng.random((LABELS, count)) * (rng.random((LABELS, count)) > 0.2)
+    return GridTrack(rng.normal(), STEP, rng.normal(size=(LABELS, count, 2)), weight, 1e-3, np.eye(3))
 
 
 def direct_moments(a: GridTrack, b: GridTrack, lag: int) -> Floats:
     """Sum over samples n of w_a w_b (s_a ⊗ s_b)(s_a ⊗ s_b)ᵀ with b taken at n + lag."""
     out = np.zeros((9, 9))
-    for n in range(len(a.weight)):
-        if 0 <= n + lag < len(b.weight):
-            product = np.kron(np.r_[a.points[n], 1.0], np.r_[b.points[n + lag], 1.0])
-            out += a.weight[n] * b.weight[n + lag] * np.outer(product, product)
+    for k in range(LABELS):
+        for n in range(a.weight.shape[1]):
+            if 0 <= n + lag < b.weight.shape[1]:
+                product = np.kron(np.r_[a.points[k, n], 1.0], np.r_[b.points[k, n + lag], 1.0])
+                out += a.weight[k, n] * b.weight[k, n + lag] * np.outer(product, product)
     return out
 
 
@@ -79,9 +80,9 @@ def test_the_normalisation_is_the_variance_of_the_epipolar_product() -> None:
     _, norm = moments.matrices(np.array([which]))
     f = np.random.default_rng(0).normal(size=9)
     total, weights = 0.0, 0.0
-    for n in range(30):
-        w = a.weight[n] * b.weight[n]
-        sa, sb = np.r_[a.points[n], 1.0], np.r_[b.points[n], 1.0]
+    for k, n in np.ndindex(LABELS, 30):
+        w = a.weight[k, n] * b.weight[k, n]
+        sa, sb = np.r_[a.points[k, n], 1.0], np.r_[b.points[k, n], 1.0]
         matrix = f.reshape(3, 3)
         gradient_a, gradient_b = (matrix @ sb)[:2], (matrix.T @ sa)[:2]
         total += w * (a.sigma**2 * gradient_a @ gradient_a + b.sigma**2 * gradient_b @ gradient_b)
@@ -94,7 +95,7 @@ def test_at_the_true_lag_the_cost_is_the_noise_and_elsewhere_more(seed: int) -> 
     session = simulate(seed, 2, 30)
     a, b = smooth(session)
     fine = STEP / 8  # half a step of motion is less than the noise
-    scan = scan_lags(PairMoments(grid_track(a, fine, SIGMA_PX), grid_track(b, fine, SIGMA_PX)), 1.0)
+    scan = scan_lags(PairMoments(grid_tracks([a], fine, SIGMA_PX), grid_tracks([b], fine, SIGMA_PX)), 1.0)
     at = int(np.argmin(np.abs(scan.offset - true_offset(session, a, b))))
     near = float(np.min(scan.cost[at - 1 : at + 2]))
     assert near < 3.0
@@ -106,7 +107,7 @@ def test_at_the_true_lag_the_cost_is_the_noise_and_elsewhere_more(seed: int) -> 
 def test_the_true_lag_is_among_the_candidates(seed: int) -> None:
     session = simulate(seed, 2, 25, outliers=0.05 * (seed % 2), drops=0.1)
     a, b = smooth(session)
-    scan = scan_lags(PairMoments(grid_track(a, STEP, SIGMA_PX), grid_track(b, STEP, SIGMA_PX)), 1.0)
+    scan = scan_lags(PairMoments(grid_tracks([a], STEP, SIGMA_PX), grid_tracks([b], STEP, SIGMA_PX)), 1.0)
     chosen = scan.offset[candidates(scan, 3, 10)]
     assert len(chosen) <= 10
     assert np.min(np.abs(chosen - true_offset(session, a, b))) < STEP
@@ -116,7 +117,7 @@ def test_the_true_lag_is_among_the_candidates(seed: int) -> None:
 def test_a_short_overlap_of_long_tracks_is_still_a_candidate(seed: int) -> None:
     session = simulate(seed, 2, 60, windows=[(0, 35), (22, 60)], late=0)
     a, b = smooth(session)
-    scan = scan_lags(PairMoments(grid_track(a, STEP, SIGMA_PX), grid_track(b, STEP, SIGMA_PX)), 1.0)
+    scan = scan_lags(PairMoments(grid_tracks([a], STEP, SIGMA_PX), grid_tracks([b], STEP, SIGMA_PX)), 1.0)
     chosen = scan.offset[candidates(scan, 3, 10)]
     assert np.min(np.abs(chosen - true_offset(session, a, b))) < STEP
 
@@ -124,7 +125,7 @@ def test_a_short_overlap_of_long_tracks_is_still_a_candidate(seed: int) -> None:
 def test_the_best_matrix_at_the_true_lag_fits_the_tracks() -> None:
     session = simulate(1, 2, 30, noise=0.2)
     a, b = smooth(session)
-    moments = PairMoments(grid_track(a, STEP, SIGMA_PX), grid_track(b, STEP, SIGMA_PX))
+    moments = PairMoments(grid_tracks([a], STEP, SIGMA_PX), grid_tracks([b], STEP, SIGMA_PX))
     offset = true_offset(session, a, b)
     at = int(np.argmin(np.abs(moments.offset - offset)))
     f = moments.fundamental(at)
@@ -143,7 +144,7 @@ def test_a_still_track_supports_no_lag() -> None:
     still = smooth_track(time, rng.normal(0, 5e-4, (600, 2)), 1000.0)
     (moving, _) = smooth(simulate(2, 2, 20))
     assert still is not None
-    moments = PairMoments(grid_track(still, STEP, SIGMA_PX), grid_track(moving, STEP, SIGMA_PX))
+    moments = PairMoments(grid_tracks([still], STEP, SIGMA_PX), grid_tracks([moving], STEP, SIGMA_PX))
     assert moments.support.max() < 3.0
     assert not np.isfinite(scan_lags(moments, 5.0).cost).any()
 

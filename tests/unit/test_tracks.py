@@ -77,6 +77,16 @@ def test_a_false_detection_that_stands_still_is_dropped() -> None:
     assert smoothed(time, points).inlier[far].mean() < 0.05
 
 
+def test_a_detection_some_sigma_off_is_dropped_where_the_track_is_good() -> None:
+    time, points, _ = track(5, seconds=40, noise_px=0.5)
+    false = np.zeros(len(time), dtype=bool)
+    false[20::25] = True
+    points[false] += 6.0 / FOCAL  # 12 sigma in each coordinate, and never two in a row
+    inlier = smoothed(time, points).inlier
+    assert inlier[false].mean() < 0.05
+    assert inlier[~false].mean() > 0.97
+
+
 def test_gaps_are_kept_apart() -> None:
     time, points, _ = track(5, seconds=20)
     keep = (time < 8) | (time > 9.5)
