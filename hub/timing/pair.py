@@ -185,8 +185,8 @@ def _judge(names: tuple[str, str], fits: list[PairFit], stands_out: float | None
         )
     elif stands_out is not None and stands_out < s.accept_significance:
         reason = (
-            f"other lags fit nearly as well (the best stands out by {stands_out:.1f} sigma of {s.accept_significance:.1f} "
-            "needed): too little or too regular common motion, or two different things"
+            f"other lags fit nearly as well (the best stands out by {stands_out:.1f} sigma, needed are "
+            f"{s.accept_significance:.1f}): too little or too regular common motion, or two different things"
         )
     elif second > s.accept_ratio:
         reason = f"two alignments are about as good ({best.offset:.2f} s and {others[0].offset:.2f} s)"
