@@ -39,36 +39,42 @@ COMMANDS: tuple[tuple[str, str, str], ...] = (
 )
 
 
-def build_app() -> App:
-    """The command line application."""
+def build_app(called: str = "") -> App:
+    """The command line application.
+
+    called: the command about to run: its help is its docstring, while the others, which the overview only
+    lists, keep their one line here and are not imported.
+    """
     app = App(
         name="syncline",
         help="Turn cameras that share no clock into one measuring instrument.\n\n"
         "Try `syncline demo`, or `syncline calibrate SESSION --out out`.",
         version=VERSION,
         help_format="plaintext",
-        default_parameter=None,
+        result_action="return_value",
     )
     for name, place, text in COMMANDS:
-        app.command(place, name=name, help=text)
+        if name == called:
+            app.command(place, name=name)
+        else:
+            app.command(place, name=name, help=text)
     return app
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status: 0 done, 1 bug, 2 bad use or input, 3 refused."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        result = build_app()(
-            list(sys.argv[1:] if arguments is None else arguments), exit_on_error=False, print_error=False
-        )
+        result = build_app(words[0] if words else "")(words, exit_on_error=False, print_error=False)
     except SynclineError as error:
         print(f"syncline: {error}", file=sys.stderr)
         return error.exit_status
     except CycloptsError as error:
         if isinstance(error, UnknownCommandError):
-            text = _unknown_command(arguments)
+            text = _unknown_command(words)
         else:
             text = " ".join(str(error).split()).rstrip(".")
-        command = "" if isinstance(error, UnknownCommandError) else _command_of(arguments)
+        command = "" if isinstance(error, UnknownCommandError) else _command_of(words)
         print(f"syncline: {text}; see `syncline {command}--help`", file=sys.stderr)
         return EXIT_INPUT
     except KeyboardInterrupt:
@@ -81,16 +87,14 @@ def run(arguments: Sequence[str] | None = None) -> int:
     return result if isinstance(result, int) else EXIT_DONE
 
 
-def _unknown_command(arguments: Sequence[str] | None) -> str:
+def _unknown_command(arguments: Sequence[str]) -> str:
     # Cyclopts' own text would import every command to suggest one.
-    words = [word for word in (sys.argv[1:] if arguments is None else arguments) if not word.startswith("-")]
-    word = words[0] if words else ""
+    word = next((word for word in arguments if not word.startswith("-")), "")
     close = difflib.get_close_matches(word, [name for name, _, _ in COMMANDS], 1)
     return f"there is no command {word!r}" + (f": did you mean {close[0]}?" if close else "")
 
 
-def _command_of(arguments: Sequence[str] | None) -> str:
-    words = list(sys.argv[1:] if arguments is None else arguments)
+def _command_of(words: Sequence[str]) -> str:
     return f"{words[0]} " if words and words[0] in {name for name, _, _ in COMMANDS} else ""
 
 

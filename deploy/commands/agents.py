@@ -14,7 +14,7 @@ from protocols.errors import EXIT_DONE
 PrintConfig = Annotated[bool, Parameter(negative="")]
 
 
-def camera(config: Path, *, print_config: PrintConfig = False) -> int:
+def camera(config: Path, /, *, print_config: PrintConfig = False) -> int:
     """Run a camera agent: open the device, detect, publish time-stamped observations.
 
     Example: syncline camera cam0.toml
@@ -35,7 +35,7 @@ def camera(config: Path, *, print_config: PrintConfig = False) -> int:
     return _with_bus(settings, lambda bus, stop: start_camera(settings, bus, stop))
 
 
-def hub(config: Path, *, print_config: PrintConfig = False) -> int:
+def hub(config: Path, /, *, print_config: PrintConfig = False) -> int:
     """Run the hub: gather what the cameras see, find when they fired and where they stand, publish it.
 
     Example: syncline hub hub.toml
@@ -56,7 +56,7 @@ def hub(config: Path, *, print_config: PrintConfig = False) -> int:
     return _with_bus(settings, lambda bus, stop: start_hub(settings, bus, stop))
 
 
-def record(config: Path, *, print_config: PrintConfig = False) -> int:
+def record(config: Path, /, *, print_config: PrintConfig = False) -> int:
     """Record everything on the site's bus into an MCAP log.
 
     Example: syncline record recorder.toml

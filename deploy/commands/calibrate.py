@@ -21,6 +21,7 @@ from protocols.session.rig import Rig
 
 def calibrate(
     session: Path,
+    /,
     *,
     out: Path,
     observations: Path | None = None,

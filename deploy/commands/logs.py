@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from protocols.errors import EXIT_DONE, InputError
 
 
-def info(path: Path, *, json: Annotated[bool, Parameter(negative="")] = False) -> int:
+def info(path: Path, /, *, json: Annotated[bool, Parameter(negative="")] = False) -> int:
     """Show what is in a log (topics, counts, times, damage) or in a session folder.
 
     Example: syncline info demo-out/demo.mcap
@@ -45,6 +45,7 @@ def info(path: Path, *, json: Annotated[bool, Parameter(negative="")] = False) -
 
 def replay(
     log: Path,
+    /,
     *,
     rate: str = "1",
     start: float = 0.0,

@@ -12,6 +12,7 @@ from protocols.errors import EXIT_DONE, InputError
 
 def simulate(
     scene: str,
+    /,
     *,
     out: Path,
     seconds: float = 60.0,
