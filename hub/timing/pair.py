@@ -125,16 +125,35 @@ def solve_pair(
     scan = scan_lags(moments, s.least_support, None if known is None else known.essential.T)
     chosen = candidates(scan, s.per_stratum, s.at_most)
     fits: list[PairFit] = []
+    good: tuple[float, float] | None = None  # evidence and scan cost of the best trustworthy fit so far
     for index in chosen:
         offset, cost = float(scan.offset[index]), float(scan.cost[index])
+        if good is not None and _hopeless(float(scan.support[index]), cost, *good, s):
+            continue
         start = moments.fundamental(int(index)).T if known is None else None  # s_b' E s_a
         fit = _refine_candidate(a, b, offset, cost, start, known, s)
-        if fit is not None:
-            fits.append(fit)
+        if fit is None:
+            continue
+        fits.append(fit)
+        if _sound(fit, s) and (good is None or evidence(fit) > good[0]):
+            good = (evidence(fit), cost)
     if not fits:
         return PairSolution(*names, "no alignment of the two tracks agrees with any geometry")
     ordered = _distinct(fits)
     return _judge(names, ordered, _significance(scan, ordered[0], s), s)
+
+
+def _sound(fit: PairFit, s: PairSettings) -> bool:
+    return fit.inliers > 0.8 and fit.front > s.accept_in_front and fit.sigma_px < 4.0 * s.sigma_px
+
+
+def _hopeless(support: float, cost: float, best_evidence: float, best_cost: float, s: PairSettings) -> bool:
+    """Whether a candidate can neither win over a sound fit nor make it doubtful, so that refining it is idle.
+
+    Its evidence is at most the seconds in which both move; and what leaves tens of times the misfit of the
+    sound one is not brought down to it by a lag between two steps of the grid.
+    """
+    return 1.5 * support < s.accept_ratio * best_evidence or cost > 25.0 * max(best_cost, 4.0)
 
 
 def _significance(scan: Scan, fit: PairFit, s: PairSettings) -> float | None:
