@@ -52,7 +52,15 @@ def _draw_frame(axes, scene: MarkerScene, filmed: SimulatedTracks, name: str, co
     axes.plot(*track.pixels[behind].T, color=colour, lw=1.6)
     axes.set_axis_off()
     stamp = track.time[np.searchsorted(track.true_time, SHOWN)]
-    axes.text(12, 46, f"{name}: {stamp:.3f} s", color="white", fontsize=8.5, family="monospace")
+    axes.text(
+        12,
+        46,
+        f"{name}: {stamp:.3f} s",
+        color="white",
+        fontsize=8.5,
+        family="monospace",
+        bbox={"color": "#00000088", "pad": 2},
+    )
 
 
 def _draw_world(axes, scene: MarkerScene, calibration: Calibration, colours: list[str]) -> None:  # type: ignore[no-untyped-def]
