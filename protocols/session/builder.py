@@ -25,7 +25,8 @@ class _Boot:
 
     rows: deque[tuple[int, int, float, float, float, str]] = field(default_factory=deque)
     seen: set[int] = field(default_factory=set)
-    last_ns: int = 0
+    last_ns: int = -(2**63)
+    """Clocks may count from anywhere, also below zero."""
     frames: int = 0
 
 
