@@ -71,7 +71,7 @@ def _from_text(wanted: type, value: object, folder: Path) -> object:
     if wanted is Source:
         elsewhere = "://" in value or value.isdigit()
         return Source(value if elsewhere else folder / Path(value).expanduser())
-    raise NotImplementedError(f"no reader for {wanted}")
+    raise TypeError(f"no reader for {wanted}")
 
 
 def _without_none(value: Any) -> Any:

@@ -75,6 +75,8 @@ def calibrate(
     Raises Refused, with a reason for every camera, where fewer than two can be tied together.
     """
     tell = progress or (lambda text, share: None)
+    if known is not None:
+        rig = with_known_lenses(rig, known)
     prepared = prepare(rig, observations)
     if known is not None:
         solution = solve_known(prepared, known, tell)
@@ -84,6 +86,15 @@ def calibrate(
         solution = solve_network(prepared, solve_pairs(prepared, tell), tell)
     tell("covariances", 0.95)
     return publish(rig, solution)
+
+
+def with_known_lenses(rig: Rig, known: dict[str, CameraCalibration]) -> Rig:
+    """The rig with the intrinsics of a known calibration, which may have been refined since."""
+    cameras = {
+        name: replace(camera, intrinsics=known[name].intrinsics) if name in known else camera
+        for name, camera in rig.cameras.items()
+    }
+    return replace(rig, cameras=cameras)
 
 
 def prepare(rig: Rig, observations: Observations) -> Prepared:
@@ -162,42 +173,26 @@ def paper_pairs(prepared: Prepared, observations: Observations, tell: Progress) 
 def solve_network(prepared: Prepared, pairs: list[PairSolution], tell: Progress) -> Solution:
     """From pairs to one adjusted network; cameras that don't fit are refused by name."""
     refused = dict(prepared.refused)
-    names = list(prepared.cameras)
-    solved = [pair for pair in pairs if pair.solved]
-    if not solved:
-        raise Refused(_why_nothing(pairs, refused), refused | _pair_reasons(names, pairs))
-    groups = components(names, solved)
-    for name in set(names) - set(groups[0]):
-        refused[name] = _why_alone(name, groups, pairs)
-    graph = _graph(prepared, groups[0], solved)
-    scaffold, unplaced = grow(
-        prepared.cameras,
-        graph,
-        prepared.rows,
-        prepared.labels,
-        lambda t: tell(t, 0.6),
-        Freedom(clock=not prepared.shared_clock),
-    )
-    refused |= unplaced
+    freedom = Freedom(clock=not prepared.shared_clock)
+    graph = _connect(prepared, list(prepared.cameras), pairs, refused)
     while True:
+        scaffold, unplaced = grow(
+            prepared.cameras, graph, prepared.rows, prepared.labels, lambda text: tell(text, 0.6), freedom
+        )
+        refused |= unplaced
         scaffold = _adjust_all(scaffold, tell)
         bad = [name for name in scaffold.names if not _fits(scaffold, name)]
         if not bad:
             break
+        # The worst one goes, and what it may have spoilt is made again without it.
         worst = min(bad, key=lambda name: agreement(scaffold, name)[0])
         share, count = agreement(scaffold, worst)
         refused[worst] = f"only {100 * share:.0f} % of its {count} observations fit the path that the others see"
         remaining = [name for name in scaffold.names if name != worst]
-        kept = [p for p in graph.agreeing if worst not in (p.a, p.b)]
-        if len(remaining) < 2 or not kept:
+        if len(remaining) < 2:
             raise Refused("no two cameras agree on one path", refused)
-        group = components(remaining, kept)[0]
-        graph = _graph(prepared, group, kept)
-        scaffold, unplaced = grow(
-            prepared.cameras, graph, prepared.rows, prepared.labels, freedom=Freedom(clock=not prepared.shared_clock)
-        )
-        refused |= unplaced
-    order = {name: refused[name] for name in [*prepared.refused, *names] if name in refused}
+        graph = _connect(prepared, remaining, list(graph.agreeing), refused)
+    order = {name: refused[name] for name in [*prepared.refused, *prepared.cameras] if name in refused}
     warnings = tuple(
         f"pair {pair.a}–{pair.b} contradicts the other pairs and was set aside" for pair in graph.contradicting
     )
@@ -207,13 +202,7 @@ def solve_network(prepared: Prepared, pairs: list[PairSolution], tell: Progress)
 def solve_paper(prepared: Prepared, pairs: list[PairSolution], tell: Progress) -> Solution:
     """Network from the paper's pairs: clocks averaged, poses by resection, nothing adjusted."""
     refused = dict(prepared.refused)
-    names = list(prepared.cameras)
-    solved = [pair for pair in pairs if pair.solved]
-    if not solved:
-        raise Refused(_why_nothing(pairs, refused), refused | _pair_reasons(names, pairs))
-    groups = components(names, solved)
-    refused |= {name: _why_alone(name, groups, pairs) for name in set(names) - set(groups[0])}
-    graph = _graph(prepared, groups[0], solved)
+    graph = _connect(prepared, list(prepared.cameras), pairs, refused)
     tell("placing", 0.8)
     scaffold, unplaced = grow(prepared.cameras, graph, prepared.rows, prepared.labels, freedom=None)
     scaffold.state = replace(scaffold.state, sigma=noise(scaffold.problem, scaffold.state))
@@ -236,24 +225,29 @@ def solve_known(prepared: Prepared, known: dict[str, CameraCalibration], tell: P
             continue
         relative = relative_pose(known[a].pose, known[b].pose)
         pairs.append(solve_pair(smooth_only(cameras[a].tracks), smooth_only(cameras[b].tracks), (a, b), known=relative))
-    solved = [pair for pair in pairs if pair.solved]
-    if not solved:
-        raise Refused(_why_nothing(pairs, refused), refused | _pair_reasons(list(cameras), pairs))
-    groups = components(list(cameras), solved)
-    refused |= {name: _why_alone(name, groups, pairs) for name in set(cameras) - set(groups[0])}
-    graph = _graph(inside, groups[0], solved)
+    graph = _connect(inside, list(cameras), pairs, refused)
     tell("adjusting", 0.75)
-    poses = {name: known[name].pose for name in groups[0]}
+    poses = {name: known[name].pose for name in graph.clocks}
     scaffold = place_known(cameras, graph, prepared.rows, prepared.labels, poses, not prepared.shared_clock)
     problem, state, _ = adjust(scaffold.problem, scaffold.state)
     return Solution(replace_solution(scaffold, problem, state), tuple(pairs), refused, inside, "joint", known=known)
 
 
-def _graph(prepared: Prepared, group: list[str], pairs: list[PairSolution]) -> ClockGraph:
-    inside = [pair for pair in pairs if pair.a in group and pair.b in group]
+def _connect(prepared: Prepared, names: list[str], pairs: list[PairSolution], refused: dict[str, str]) -> ClockGraph:
+    """The largest group of ``names`` that solved pairs tie together; the others are entered in ``refused``.
+
+    Raises Refused, with every camera's reason, where no pair is solved.
+    """
+    solved = [pair for pair in pairs if pair.solved and pair.a in names and pair.b in names]
+    if not solved:
+        raise Refused(_why_nothing(pairs, refused), refused | _pair_reasons(names, pairs))
+    groups = components(names, solved)
+    for name in set(names) - set(groups[0]):
+        refused[name] = _why_alone(name, groups, pairs)
+    inside = [pair for pair in solved if pair.a in groups[0] and pair.b in groups[0]]
     if prepared.shared_clock:
-        return ClockGraph({name: ClockGuess(1.0, 0.0, 0.0) for name in group}, tuple(inside), ())
-    return average_clocks(group, inside, {name: prepared.cameras[name].tracks for name in group})
+        return ClockGraph({name: ClockGuess(1.0, 0.0, 0.0) for name in groups[0]}, tuple(inside), ())
+    return average_clocks(groups[0], inside, {name: prepared.cameras[name].tracks for name in groups[0]})
 
 
 def _fits(scaffold: Scaffold, name: str) -> bool:

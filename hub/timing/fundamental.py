@@ -43,7 +43,7 @@ def maximum_likelihood(a: Floats, b: Floats, start: Floats | None = None, iterat
     """
     first = eight_point(a, b) if start is None else start
     # Work in conditioned pixels with one common scale, so that the Sampson distance keeps its meaning.
-    ta, tb = _similarity(a), _similarity(b)
+    ta, tb = conditioner(a), conditioner(b)
     inverse_scale = ta[0, 0] / tb[0, 0]
     ha = np.column_stack([a, np.ones(len(a))]) @ ta.T
     hb = np.column_stack([b, np.ones(len(b))]) @ tb.T
@@ -84,10 +84,6 @@ def epipolar_lines(matrix: Floats, a: Floats) -> Floats:
 def line_distances(lines: Floats, points: Floats) -> Floats:
     """Signed distances (n,) of points (n, 2) from unit-normal lines (n, 3) [px]."""
     return np.asarray((lines[:, :2] * points).sum(axis=1) + lines[:, 2])
-
-
-def _similarity(points: Floats) -> Floats:
-    return conditioner(points)
 
 
 def _compose(u: Floats, vt: Floats, angle: float) -> Floats:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from hub.timing.fundamental import conditioner
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
@@ -94,7 +95,7 @@ def homography_residual(a: Floats, b: Floats) -> float:
     """
     if len(a) < 8:
         return float("nan")
-    scale_a, scale_b = _conditioner(a), _conditioner(b)
+    scale_a, scale_b = conditioner(a), conditioner(b)
     ha, hb = homogeneous(a) @ scale_a.T, homogeneous(b) @ scale_b.T
     weight = np.ones(len(a))
     distance = np.zeros(len(a))
@@ -113,12 +114,6 @@ def homography_residual(a: Floats, b: Floats) -> float:
         weight = 1.0 / np.abs(depth) / (1.0 + (distance / max(3.0 * float(np.median(distance)), 1e-12)) ** 2)
         weight /= weight.max()
     return float(np.median(distance)) / 1.1774 / float(scale_b[0, 0])
-
-
-def _conditioner(points: Floats) -> Floats:
-    centre = points.mean(axis=0)
-    spread = max(float(np.sqrt(((points - centre) ** 2).mean())), 1e-12)
-    return np.array([[1 / spread, 0, -centre[0] / spread], [0, 1 / spread, -centre[1] / spread], [0, 0, 1.0]])
 
 
 def five_point(a: Floats, b: Floats, threshold: float, seed: int, subset: int = 300) -> list[RelativePose]:
