@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from deploy.config import CameraConfig, HubConfig, SimulatedConfig
@@ -20,17 +22,20 @@ _DAY_S = 86_400.0
 
 def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event) -> int:
     """Run a camera agent until it is stopped or its recording ends."""
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # a source that doesn't open is told by us, in one line
     import cv2
 
     from edge.camera_agent import run_camera_agent
-    from edge.detectors.marker import MarkerDetector
+    from edge.detectors.marker import MarkerDetector, MarkerModel
 
     cv2.setNumThreads(1)  # one core a camera: several agents share a board
     known = _known_camera(config)
     device = make_device(config, None if known is None else known.intrinsics)
     lens = device.info.intrinsics if config.driver == "simulated" else None if known is None else known.intrinsics
     marker = config.marker
+    model = MarkerModel.default() if marker.colour is None else MarkerModel.of_colour(*marker.colour)
     detector = MarkerDetector(
+        replace(model, label=marker.label),
         intrinsics=lens,
         min_size=marker.min_size or 0.0,
         max_size=marker.max_size or math.inf,
@@ -61,7 +66,7 @@ def write_last(hub: object, out: Path) -> None:
         return
     rig, observations = hub.session
     if hub.refusal is not None:
-        write_refusal(out, hub.refusal, rig, observations, "syncline hub", 0.0)
+        write_refusal(out, hub.refusal, rig, observations, "syncline hub")
     elif hub.calibration is not None:
         write_outputs(out, hub.calibration, rig, observations, "syncline hub")
 

@@ -52,6 +52,7 @@ def build_app(called: str = "") -> App:
         version=VERSION,
         help_format="plaintext",
         result_action="return_value",
+        suppress_keyboard_interrupt=False,
     )
     for name, place, text in COMMANDS:
         if name == called:
@@ -84,6 +85,11 @@ def run(arguments: Sequence[str] | None = None) -> int:
         # The reader of our output went away (a pager, head): nothing is wrong.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_DONE
+    except OSError as error:
+        # A full disk, a name that is too long, rights: the machine's state, not a bug.
+        place = f"{error.filename}: " if error.filename else ""
+        print(f"syncline: {place}{error.strerror or error}; check the path, the disk and its rights", file=sys.stderr)
+        return EXIT_INPUT
     return result if isinstance(result, int) else EXIT_DONE
 
 

@@ -44,7 +44,9 @@ def load(path: Path | str, kind: type[_Config]) -> _Config:
         raise InputError("is not UTF-8 text", file=file, remedy="give a TOML file") from None
     try:
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (RecursionError, OverflowError):
+        raise InputError("nested or numbered beyond all measure", file=file, remedy="write a plain TOML file") from None
+    except ValueError as error:
         raise _syntax_error(file, text, str(error)) from None
     bad = _not_finite(table, "")
     if bad:

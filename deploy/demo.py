@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FrameType
 
 import tomli_w
 
@@ -19,6 +20,7 @@ from protocols.bus.settings import BusConfig
 from protocols.bus.zenoh_bus import open_bus
 from protocols.catalogue import CALIBRATION, OBSERVATION
 from protocols.errors import InputError, Refused
+from protocols.files import check_folder
 from protocols.messages import syncline_pb2 as pb
 
 LOG = "demo.mcap"
@@ -66,6 +68,9 @@ class Fleet:
         self._clean()
         configs = self._write_configs()
         live = Live()
+        # Ended from outside, the demo must take its agents along: as after Ctrl-C, ``finally`` does it.
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, _interrupt)
         bus_config = BusConfig(mode="client", connect=(self._endpoint,))
         with Router(self._endpoint), open_bus(self._site, bus_config, timeout_s=10.0) as bus:
             observations, calibrations = bus.subscribe(OBSERVATION), bus.subscribe(CALIBRATION)
@@ -117,20 +122,14 @@ class Fleet:
 
     def _clean(self) -> None:
         """Make the folder, taking away only what an earlier demo wrote."""
-        if self.out.exists() and not self.out.is_dir():
-            raise InputError("not a folder", file=self.out, remedy="choose another --out")
-        foreign = [path.name for path in self.out.iterdir() if path.name not in _MINE] if self.out.exists() else []
-        if foreign:
-            raise InputError(
-                f"holds other files ({', '.join(sorted(foreign)[:3])})", file=self.out, remedy="choose another --out"
-            )
-        for name in _MINE:
-            path = self.out / name
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
+        check_folder(self.out)
         try:
+            for name in _MINE:
+                path = self.out / name
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink(missing_ok=True)
             (self.out / "config").mkdir(parents=True)
             (self.out / "logs").mkdir()
         except OSError as error:
@@ -197,6 +196,10 @@ class Fleet:
     def _last_line(self, name: str) -> str:
         lines = (self.out / "logs" / f"{name}.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
         return lines[-1] if lines else "it said nothing"
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
 
 
 def _status(message: pb.Calibration) -> str:

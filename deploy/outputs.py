@@ -8,31 +8,39 @@ from pathlib import Path
 from typing import Any
 
 from hub.report import build_report
-from protocols.errors import Refused
-from protocols.files import write_atomically
-from protocols.session.calibration import Calibration, write_calibration, write_trajectory
+from protocols.errors import InputError, Refused
+from protocols.files import write_together
+from protocols.session.calibration import Calibration, calibration_text, trajectory_text
 from protocols.session.observations import Observations
-from protocols.session.result import refusal_document, result_document
+from protocols.session.result import refusal_document, result_document, result_text
 from protocols.session.rig import Rig
 
 CALIBRATION, TRAJECTORY, RESULT, REPORT = "calibration.toml", "trajectory.csv", "result.json", "report.html"
 
 
 def remove_outputs(out: Path) -> None:
-    """Take away an earlier answer: beside a refusal it would look like the present one."""
+    """Take away an earlier answer: beside a refusal it would look like the present one. Raises InputError."""
     for name in (CALIBRATION, TRAJECTORY):
-        (out / name).unlink(missing_ok=True)
+        try:
+            (out / name).unlink(missing_ok=True)
+        except OSError as error:
+            what = f"cannot be removed: {error.strerror}"
+            raise InputError(what, file=out / name, remedy="choose another --out") from None
 
 
 def write_outputs(
     out: Path, calibration: Calibration, rig: Rig, observations: Observations, command: str, echo_json: bool = False
 ) -> None:
-    """All four outputs, each whole or not there."""
+    """All four outputs, or none of them. Raises InputError."""
     document = result_document(calibration, rig, command=command)
-    write_calibration(out / CALIBRATION, calibration, rig)
-    write_trajectory(out / TRAJECTORY, calibration)
-    write_atomically(out / RESULT, json.dumps(document, indent=2, allow_nan=False) + "\n")
-    write_atomically(out / REPORT, build_report(calibration, rig, observations, command))
+    write_together(
+        {
+            out / CALIBRATION: calibration_text(calibration, rig),
+            out / TRAJECTORY: trajectory_text(calibration),
+            out / RESULT: result_text(document),
+            out / REPORT: build_report(calibration, rig, observations, command),
+        }
+    )
     if echo_json:
         print(json.dumps(document, allow_nan=False))
     else:
@@ -45,22 +53,43 @@ def write_refusal(
     rig: Rig,
     observations: Observations,
     command: str,
-    cpu_seconds: float,
+    *,
+    solver: str = "joint",
+    cpu_seconds: float = 0.0,
+    warnings: tuple[str, ...] = (),
     echo_json: bool = False,
 ) -> None:
-    """result.json and report.html of a session that has no answer."""
-    document = refusal_document(refusal.reason, refusal.cameras, rig, command=command, cpu_seconds=cpu_seconds)
-    write_atomically(out / RESULT, json.dumps(document, indent=2, allow_nan=False) + "\n")
-    write_atomically(out / REPORT, build_report(refusal, rig, observations, command))
+    """result.json and report.html of a session that has no answer; an earlier answer is removed."""
+    remove_outputs(out)
+    document = refusal_document(
+        refusal.reason,
+        refusal.cameras,
+        rig,
+        command=command,
+        solver=solver,
+        cpu_seconds=cpu_seconds,
+        warnings=warnings,
+    )
+    write_together(
+        {out / RESULT: result_text(document), out / REPORT: build_report(refusal, rig, observations, command)}
+    )
     if echo_json:
         print(json.dumps(document, allow_nan=False))
 
 
-def wide_console() -> Any:
-    """A console that never squeezes a table below what its figures need."""
+def wide_console(markup: bool = False) -> Any:
+    """A console that never squeezes a table below what its figures need.
+
+    markup: off, so that "[ms]" in a heading and brackets in a user's names are shown and not obeyed.
+    """
     from rich.console import Console
 
-    return Console(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else 140)
+    class _Console(Console):
+        def on_broken_pipe(self) -> None:
+            """Let the command line end it quietly: whoever read our output went away."""
+            raise BrokenPipeError
+
+    return _Console(file=sys.stdout, highlight=False, markup=markup, width=None if sys.stdout.isatty() else 140)
 
 
 def print_summary(calibration: Calibration, out: Path) -> None:

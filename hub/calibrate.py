@@ -20,10 +20,10 @@ from hub.publish import publish
 from hub.timing.pair import PairSolution, solve_pair
 from hub.timing.paper_pairs import paper_pair
 from hub.timing.shared import solve_shared_pair
-from hub.timing.tracks import Track, smooth_only, smooth_track
+from hub.timing.tracks import Track, smooth_only, smooth_track, without_jumps
 from hub.timing.two_view import relative_pose
 from protocols.errors import Refused
-from protocols.session.calibration import Calibration, CameraCalibration
+from protocols.session.calibration import Calibration, Known
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
@@ -43,7 +43,9 @@ class Prepared:
     epochs: dict[str, float]
     labels: list[str]
     refused: dict[str, str]
+    order: tuple[str, ...]
     shared_clock: bool = False
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +58,7 @@ class Solution:
     prepared: Prepared
     solver: str
     warnings: tuple[str, ...] = field(default=())
-    known: dict[str, CameraCalibration] | None = None
+    known: Known | None = None
     """Poses that were given and stay: then their world is the published one."""
 
 
@@ -66,7 +68,7 @@ def calibrate(
     progress: Progress | None = None,
     *,
     solver: str = "joint",
-    known: dict[str, CameraCalibration] | None = None,
+    known: Known | None = None,
 ) -> Calibration:
     """Timing and poses of all cameras from what they saw, with no guess.
 
@@ -88,10 +90,10 @@ def calibrate(
     return publish(rig, solution)
 
 
-def with_known_lenses(rig: Rig, known: dict[str, CameraCalibration]) -> Rig:
+def with_known_lenses(rig: Rig, known: Known) -> Rig:
     """The rig with the intrinsics of a known calibration, which may have been refined since."""
     cameras = {
-        name: replace(camera, intrinsics=known[name].intrinsics) if name in known else camera
+        name: replace(camera, intrinsics=known.cameras[name].intrinsics) if name in known.cameras else camera
         for name, camera in rig.cameras.items()
     }
     return replace(rig, cameras=cameras)
@@ -105,8 +107,11 @@ def prepare(rig: Rig, observations: Observations) -> Prepared:
     epochs: dict[str, float] = {}
     labels = observations.labels
     start = min((float(track.time[0]) for track in observations.tracks.values()), default=0.0)
+    warnings: list[str] = []
     for name, rig_camera in rig.cameras.items():
-        tracks = observations.of_camera(name)
+        tracks, jump = without_jumps(observations.of_camera(name))
+        if jump:
+            warnings.append(f"{name}: {jump}")
         if not tracks:
             refused[name] = "no observations"
             continue
@@ -133,7 +138,7 @@ def prepare(rig: Rig, observations: Observations) -> Prepared:
             refused[name] = f"too few connected observations ({sum(len(track) for track in tracks)} rows)"
             continue
         cameras[name], rows[name], epochs[name] = Camera(name, lens, smooth), mine, epoch
-    return Prepared(cameras, rows, epochs, labels, refused, rig.shared_clock)
+    return Prepared(cameras, rows, epochs, labels, refused, tuple(rig.cameras), rig.shared_clock, tuple(warnings))
 
 
 def solve_pairs(prepared: Prepared, tell: Progress) -> list[PairSolution]:
@@ -153,7 +158,9 @@ def solve_pairs(prepared: Prepared, tell: Progress) -> list[PairSolution]:
 
 
 def paper_pairs(prepared: Prepared, observations: Observations, tell: Progress) -> list[PairSolution]:
-    """All pairs by the paper's method."""
+    """All pairs by the paper's method. Raises Refused for a shared clock, where there is no lag to find."""
+    if prepared.shared_clock:
+        raise Refused('the paper\'s method finds lags, and clock = "shared" says there are none', {})
     pairs = []
     todo = list(itertools.combinations(prepared.cameras, 2))
     for done, (a, b) in enumerate(todo):
@@ -192,11 +199,10 @@ def solve_network(prepared: Prepared, pairs: list[PairSolution], tell: Progress)
         if len(remaining) < 2:
             raise Refused("no two cameras agree on one path", refused)
         graph = _connect(prepared, remaining, list(graph.agreeing), refused)
-    order = {name: refused[name] for name in [*prepared.refused, *prepared.cameras] if name in refused}
     warnings = tuple(
         f"pair {pair.a}–{pair.b} contradicts the other pairs and was set aside" for pair in graph.contradicting
     )
-    return Solution(scaffold, tuple(pairs), order, prepared, "joint", warnings)
+    return Solution(scaffold, tuple(pairs), _ordered(refused, prepared), prepared, "joint", warnings)
 
 
 def solve_paper(prepared: Prepared, pairs: list[PairSolution], tell: Progress) -> Solution:
@@ -206,15 +212,16 @@ def solve_paper(prepared: Prepared, pairs: list[PairSolution], tell: Progress) -
     tell("placing", 0.8)
     scaffold, unplaced = grow(prepared.cameras, graph, prepared.rows, prepared.labels, freedom=None)
     scaffold.state = replace(scaffold.state, sigma=noise(scaffold.problem, scaffold.state))
-    return Solution(scaffold, tuple(pairs), refused | unplaced, prepared, "paper")
+    warning = "the paper's method adjusts nothing: its stds count independent noise only and are too small"
+    return Solution(scaffold, tuple(pairs), _ordered(refused | unplaced, prepared), prepared, "paper", (warning,))
 
 
-def solve_known(prepared: Prepared, known: dict[str, CameraCalibration], tell: Progress) -> Solution:
+def solve_known(prepared: Prepared, known: Known, tell: Progress) -> Solution:
     """Only clocks and paths: intrinsics and poses are given and stay as they are."""
     refused = dict(prepared.refused)
-    for name in [name for name in prepared.cameras if name not in known]:
+    for name in [name for name in prepared.cameras if name not in known.cameras]:
         refused[name] = "not in the known calibration"
-    cameras = {name: camera for name, camera in prepared.cameras.items() if name in known}
+    cameras = {name: camera for name, camera in prepared.cameras.items() if name in known.cameras}
     inside = replace(prepared, cameras=cameras)
     pairs = []
     todo = list(itertools.combinations(cameras, 2))
@@ -223,11 +230,11 @@ def solve_known(prepared: Prepared, known: dict[str, CameraCalibration], tell: P
         if prepared.shared_clock:
             pairs.append(solve_shared_pair(cameras[a].tracks, cameras[b].tracks, (a, b)))
             continue
-        relative = relative_pose(known[a].pose, known[b].pose)
+        relative = relative_pose(known.cameras[a].pose, known.cameras[b].pose)
         pairs.append(solve_pair(smooth_only(cameras[a].tracks), smooth_only(cameras[b].tracks), (a, b), known=relative))
     graph = _connect(inside, list(cameras), pairs, refused)
     tell("adjusting", 0.75)
-    poses = {name: known[name].pose for name in graph.clocks}
+    poses = {name: known.cameras[name].pose for name in graph.clocks}
     scaffold = place_known(cameras, graph, prepared.rows, prepared.labels, poses, not prepared.shared_clock)
     problem, state, _ = adjust(scaffold.problem, scaffold.state)
     return Solution(replace_solution(scaffold, problem, state), tuple(pairs), refused, inside, "joint", known=known)
@@ -240,14 +247,19 @@ def _connect(prepared: Prepared, names: list[str], pairs: list[PairSolution], re
     """
     solved = [pair for pair in pairs if pair.solved and pair.a in names and pair.b in names]
     if not solved:
-        raise Refused(_why_nothing(pairs, refused), refused | _pair_reasons(names, pairs))
+        raise Refused(_why_nothing(pairs, refused), _ordered(refused | _pair_reasons(names, pairs), prepared))
     groups = components(names, solved)
-    for name in set(names) - set(groups[0]):
+    for name in [name for name in names if name not in groups[0]]:
         refused[name] = _why_alone(name, groups, pairs)
     inside = [pair for pair in solved if pair.a in groups[0] and pair.b in groups[0]]
     if prepared.shared_clock:
         return ClockGraph({name: ClockGuess(1.0, 0.0, 0.0) for name in groups[0]}, tuple(inside), ())
     return average_clocks(groups[0], inside, {name: prepared.cameras[name].tracks for name in groups[0]})
+
+
+def _ordered(refused: dict[str, str], prepared: Prepared) -> dict[str, str]:
+    """Reasons in the rig's order."""
+    return {name: refused[name] for name in prepared.order if name in refused}
 
 
 def _fits(scaffold: Scaffold, name: str) -> bool:

@@ -38,7 +38,7 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
         gauge = fix_gauge(rig, names, [camera.pose for camera in state.cameras])
         state = transform_state(state, gauge.similarity)
     else:
-        gauge = given_world(len(names))
+        gauge = given_world(len(names), solution.known.scale)
     covariance = cov.covariance(problem, state, motion_prior(problem, state), gauge.information)
     reference = _reference(rig, names)
     epochs = [solution.prepared.epochs[name] for name in names]
@@ -59,7 +59,7 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
             time_offset_std=_map_std(problem, state, covariance, i, reference),
             position_std=cov.position_std(covariance, i)
             if solution.known is None
-            else solution.known[name].position_std,
+            else solution.known.cameras[name].position_std,
             rms_px=_rms(problem, state, i),
         )
         for i, name in enumerate(names)
@@ -86,7 +86,7 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
             for label, name in enumerate(scaffold.labels)
         ),
         pairs=tuple(_pair_report(pair, rig, cameras, problem, state, names, solution) for pair in solution.pairs),
-        warnings=solution.warnings + gauge.warnings,
+        warnings=solution.prepared.warnings + solution.warnings + gauge.warnings,
         residuals={name: _residual_rows(problem, state, i, epochs[i]) for i, name in enumerate(names)},
     )
 

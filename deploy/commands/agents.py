@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import sys
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,6 +13,7 @@ from cyclopts import Parameter
 
 from deploy.config import CameraConfig, HubConfig, RecorderConfig, effective_toml, load
 from deploy.signals import stop_on_signals
+from protocols.bus.settings import BusConfig
 from protocols.errors import EXIT_DONE
 
 PrintConfig = Annotated[bool, Parameter(negative="")]
@@ -89,7 +94,21 @@ def _with_bus(settings: Any, start: Any) -> int:
 
     stop = stop_on_signals()
     try:
-        with open_bus(settings.site, settings.bus, stop=stop.is_set) as bus:
+        with open_bus(settings.site, settings.bus, stop=_told_waiting(stop, settings.bus)) as bus:
             return int(start(bus, stop))
     except BusStopped:
         return EXIT_DONE
+
+
+def _told_waiting(stop: threading.Event, bus: BusConfig) -> Callable[[], bool]:
+    """The stop condition that is asked while a client waits for its router; after 2 s it says so, once."""
+    began, told = time.monotonic(), False
+
+    def stopped() -> bool:
+        nonlocal told
+        if not told and time.monotonic() - began > 2.0:
+            told = True
+            print(f"syncline: waiting for a router at {', '.join(bus.endpoints()[0])}", file=sys.stderr, flush=True)
+        return stop.is_set()
+
+    return stopped

@@ -11,11 +11,12 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from deploy.outputs import remove_outputs, write_outputs, write_refusal
+from deploy.outputs import write_outputs, write_refusal
 from deploy.progress import progress_bar
 from deploy.sessions import load_session
 from protocols.errors import EXIT_DONE, InputError, Refused
-from protocols.session.calibration import CameraCalibration, read_calibration
+from protocols.files import check_folder
+from protocols.session.calibration import Known, read_calibration
 from protocols.session.rig import Rig
 
 
@@ -54,12 +55,15 @@ def calibrate(
     seed
         Recorded with the result; the solvers draw nothing at random.
     """
+    check_folder(out)
     if solver == "distributed":
         raise InputError("--solver distributed is not in this version", remedy="use --solver joint")
     if from_known is not None and solver != "joint":
         raise InputError("--from-known goes with --solver joint", remedy="leave one of the two out")
     rig, seen, warnings = load_session(session, observations)
-    known = None if from_known is None else _known(from_known, rig)
+    known = None
+    if from_known is not None:
+        known, rig = _known(from_known, rig)
     command = shlex.join(["syncline", *sys.argv[1:]])
     from hub.calibrate import calibrate as solve
 
@@ -68,16 +72,19 @@ def calibrate(
         with progress_bar(f"calibrating {session.name}", quiet=json) as tell:
             result = solve(rig, seen, tell, solver=solver, known=known)
     except Refused as refusal:
-        remove_outputs(out)
-        write_refusal(out, refusal, rig, seen, command, time.process_time() - began, echo_json=json)
+        spent = time.process_time() - began
+        write_refusal(
+            out, refusal, rig, seen, command, solver=solver, cpu_seconds=spent, warnings=warnings, echo_json=json
+        )
         raise
     result = replace(result, cpu_seconds=time.process_time() - began, warnings=warnings + result.warnings)
     write_outputs(out, result, rig, seen, command, echo_json=json)
     return EXIT_DONE
 
 
-def _known(file: Path, rig: Rig) -> dict[str, CameraCalibration]:
-    _, cameras = read_calibration(file)
+def _known(file: Path, rig: Rig) -> tuple[Known, Rig]:
+    """The given poses, and the rig in their units: the answer's world is theirs."""
+    given, cameras = read_calibration(file)
     both = {name: camera for name, camera in cameras.items() if name in rig.cameras}
     if len(both) < 2:
         raise InputError(
@@ -85,4 +92,5 @@ def _known(file: Path, rig: Rig) -> dict[str, CameraCalibration]:
             file=file,
             remedy="use a calibration of this rig",
         )
-    return both
+    scale = str(given.metadata.get("scale", "metric"))
+    return Known(both, scale), replace(rig, units=given.units)

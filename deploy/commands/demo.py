@@ -54,6 +54,8 @@ def demo(
         raise InputError(f"--scene {scene} is not in this version", remedy="use --scene marker")
     if view:
         raise InputError("--view is not in this version", remedy="open report.html in --out when the demo has ended")
+    if seed < 0:
+        raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
     if not 2 <= cameras <= 20:
         raise InputError(f"--cameras {cameras} is out of range", remedy="give 2 to 20")
     if not 5.0 <= seconds <= 3600.0:

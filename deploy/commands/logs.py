@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -39,7 +40,7 @@ def info(path: Path, /, *, json: Annotated[bool, Parameter(negative="")] = False
         return EXIT_DONE
     from deploy.outputs import wide_console
 
-    wide_console().print(as_table(description))
+    wide_console(markup=True).print(as_table(description))
     return EXIT_DONE
 
 
@@ -83,6 +84,7 @@ def replay(
         raise InputError(f"--rate {rate!r} is not a speed", remedy="give 1, 2, 0.5, … or max")
     if start < 0.0:
         raise InputError("--start is negative", remedy="give seconds from the log's beginning")
+    from deploy.info import describe_log
     from deploy.replay import replay as play
     from deploy.signals import stop_on_signals
     from protocols.bus.base import BusStopped
@@ -95,5 +97,8 @@ def replay(
             count = play(log, bus, rate=speed, start_s=start, topics=topics, stop=stop)
     except BusStopped:
         count = 0
+    damage = describe_log(log).damage
+    if damage:
+        print(f"syncline: {log}: damaged: {damage}; only its good part was played", file=sys.stderr)
     print(f'{{"published": {count}}}' if json else f"{count} messages published")
     return EXIT_DONE

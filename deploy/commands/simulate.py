@@ -8,6 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from protocols.errors import EXIT_DONE, InputError
+from protocols.files import check_folder
 
 
 def simulate(
@@ -50,6 +51,11 @@ def simulate(
     json
         Print what was written as JSON.
     """
+    check_folder(out)
+    if seed < 0:
+        raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
+    if cameras is not None and not 2 <= cameras <= 64:
+        raise InputError(f"--cameras {cameras} is out of range", remedy="give 2 to 64")
     if not 1.0 <= seconds <= 7200.0:
         raise InputError(f"--seconds {seconds:g} is out of range", remedy="give 1 to 7200")
     if not 0.0 <= outliers < 1.0 or (drops is not None and not 0.0 <= drops < 1.0) or not 0.0 <= noise_px <= 50.0:

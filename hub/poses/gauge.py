@@ -22,6 +22,7 @@ from protocols.session.rig import Rig
 _EXACT = 1e-4  # std of a reference without one, relative to the size of the rig
 _UP_STD = 0.01  # rad
 _FAR = 8.0  # sigma: references that contradict each other by more are told
+_CONTRADICTION = 0.1  # … and refused if they are off by more than this share of the rig, or rad
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,9 +49,14 @@ def fix_gauge(rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
     apart = [poses[a].position - poses[b].position for a, b, _ in distances]
     apart_known = float(np.linalg.norm(np.ptp([p for _, p in positions], axis=0))) if len(positions) >= 2 else 0.0
     metric = apart_known > 0.0 or bool(distances)
-    if not metric and not positions and not rotations:
+    if not metric:
         width = CAMERA_PARAMETERS * len(names)
-        return Gauge(base, "arbitrary", np.zeros((width, width)), ())
+        told: tuple[str, ...] = ()
+        if positions or rotations:
+            told = (
+                "the rig's references fix no scale, so the first camera is the world: give two positions or a distance",
+            )
+        return Gauge(base, "arbitrary", np.zeros((width, width)), told)
     scale = base.scale
     if apart_known > 0.0:
         scale = _ratio([p for _, p in positions], [poses[i].position for i, _ in positions])
@@ -58,21 +64,45 @@ def fix_gauge(rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
         scale = float(np.median([d / np.linalg.norm(v) for (_, _, d), v in zip(distances, apart, strict=True)]))
     starts = _starts(rotations, positions, poses, scale, base)
     residual = _residuals(rig, names, poses, positions, rotations, distances)
-    best = min((_descend(start, residual, metric) for start in starts), key=lambda item: item[1])[0]
+    best = min((_descend(start, residual) for start in starts), key=lambda item: item[1])[0]
     final = residual(best)
     warnings = []
     if len(final) and float(np.sqrt(np.mean(final**2))) > _FAR:
-        worst = np.abs(final).max()
-        warnings.append(
-            f"the rig's references disagree with each other or the cameras by {worst:.0f} sigma: check them"
-        )
-    return Gauge(best, "metric" if metric else "arbitrary", _information(rig, names, poses, best), tuple(warnings))
+        worst, share = _worst_reference(names, poses, positions, rotations, distances, best)
+        if share > _CONTRADICTION:
+            raise Refused(f"the rig's references contradict each other or what was seen: worst is {worst}")
+        warnings.append(f"the rig's references disagree by more than their stds: worst is {worst}")
+    return Gauge(best, "metric", _information(rig, names, poses, best), tuple(warnings))
 
 
-def given_world(cameras: int) -> Gauge:
+def _worst_reference(
+    names: list[str],
+    poses: list[Pose],
+    positions: list[tuple[int, Floats]],
+    rotations: list[tuple[int, Floats]],
+    distances: list[tuple[int, int, float]],
+    s: Similarity,
+) -> tuple[str, float]:
+    """The reference that fits worst, in words, and how far off it is as a share of the rig's size (or rad)."""
+    size = s.scale * _extent(poses)
+    found: list[tuple[float, str]] = []
+    for i, known in positions:
+        off = float(np.linalg.norm(s.points(poses[i].position[None])[0] - known))
+        found.append((off / size, f"the position of {names[i]}, {off:.3g} off"))
+    for i, known in rotations:
+        turn = so3.angle_between(poses[i].rotation @ s.rotation.T, known)
+        found.append((turn, f"the rotation of {names[i]}, {np.degrees(turn):.3g} degrees off"))
+    for a, b, length in distances:
+        off = abs(s.scale * float(np.linalg.norm(poses[a].position - poses[b].position)) - length)
+        found.append((off / length, f"the distance {names[a]}–{names[b]}, {off:.3g} off"))
+    share, text = max(found, default=(0.0, "up"))
+    return text, share
+
+
+def given_world(cameras: int, scale: str) -> Gauge:
     """The world of poses that were given: nothing is moved."""
     width = CAMERA_PARAMETERS * cameras
-    return Gauge(Similarity(1.0, np.eye(3), np.zeros(3)), "metric", np.zeros((width, width)), ())
+    return Gauge(Similarity(1.0, np.eye(3), np.zeros(3)), scale, np.zeros((width, width)), ())
 
 
 def _default(rig: Rig, names: list[str], poses: list[Pose]) -> Similarity:
@@ -161,7 +191,7 @@ def _residuals(
     return residual
 
 
-def _descend(start: Similarity, residual: Callable[[Similarity], Floats], metric: bool) -> tuple[Similarity, float]:
+def _descend(start: Similarity, residual: Callable[[Similarity], Floats]) -> tuple[Similarity, float]:
     """Gauss-Newton over the similarity; directions that nothing fixes stay where they began."""
     now = start
     cost = float((residual(now) ** 2).sum())
@@ -172,8 +202,6 @@ def _descend(start: Similarity, residual: Callable[[Similarity], Floats], metric
             step = np.zeros(7)
             step[k] = 1e-6
             jacobian[:, k] = (residual(_stepped(now, step)) - residual(_stepped(now, -step))) / 2e-6
-        if not metric:
-            jacobian[:, 6] = 0.0
         step = np.asarray(-np.linalg.lstsq(jacobian, value, rcond=1e-9)[0], np.float64)
         trial = _stepped(now, step)
         trial_cost = float((residual(trial) ** 2).sum())

@@ -104,9 +104,7 @@ def _calibration_page(calibration: Calibration, rig: Rig, observations: Observat
     ]
     facts = {
         "Syncline": calibration.version,
-        "Solver": f"{calibration.solver}, {number(calibration.cpu_seconds, 2)} s of processor time"
-        if calibration.cpu_seconds > 0
-        else calibration.solver,
+        "Solver": calibration.solver,
         "Reference clock": calibration.reference,
         "Lengths": calibration.units if calibration.scale == "metric" else "arbitrary: the first baseline is 1",
     }

@@ -7,7 +7,7 @@ generalised cross-validation.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -15,7 +15,10 @@ import numpy as np
 from hub.points import SampledTrack
 from hub.splines import SplineBasis, fit_spline, stretches
 from protocols.geometry.types import Bools, Floats
+from protocols.session.observations import Track as RawTrack
 
+LONGEST_PAUSE = 43_200.0
+"""A longer gap [s] between two rows of a camera is a jump of its clock, not a pause."""
 SHORTEST_GAP = 0.2
 """Gaps [s] up to this are bridged by the spline at any frame rate."""
 GAP_INTERVALS = 3.2
@@ -96,6 +99,38 @@ def smooth_track(time: Floats, normalised: Floats, focal: float, epoch: float | 
     mask = np.zeros(len(time), dtype=np.bool_)
     mask[rows[inlier]] = True
     return SmoothTrack(origin, t[inlier], x[inlier], mask, basis, control, sigma, focal)
+
+
+def without_jumps(tracks: list[RawTrack]) -> tuple[list[RawTrack], str]:
+    """One camera's tracks without the rows before or after its clock jumped; and what was left out, or "".
+
+    A board that learns the time while it records (1970 to now) has two clocks in one recording. Nobody films
+    with a pause of half a day: a gap that long is a jump, and the part with most rows is kept.
+    """
+    if not tracks:
+        return tracks, ""
+    times = np.sort(np.concatenate([track.time for track in tracks]))
+    cuts = np.flatnonzero(np.diff(times) > LONGEST_PAUSE)
+    if len(cuts) == 0:
+        return tracks, ""
+    parts = np.split(times, cuts + 1)
+    kept = max(parts, key=len)
+    out = []
+    for track in tracks:
+        inside = (track.time >= kept[0]) & (track.time <= kept[-1])
+        if inside.any():
+            out.append(
+                replace(
+                    track,
+                    frame=track.frame[inside],
+                    time=track.time[inside],
+                    pixels=track.pixels[inside],
+                    size=track.size[inside],
+                )
+            )
+    lost = len(times) - len(kept)
+    jump = float(np.diff(times)[cuts].max())
+    return out, f"its clock jumps by {jump:.0f} s; {lost} of {len(times)} rows on the other side are left out"
 
 
 def neighbour_test(time: Floats, points: Floats, floor: float) -> Bools:

@@ -24,4 +24,5 @@ def session_from_log(file: Path) -> tuple[Rig, Observations, tuple[str, ...]]:
         raise InputError(
             f"no session in this log: {refusal.reason}", file=file, remedy="record cameras that see the marker"
         ) from None
-    return rig, observations, (reader.damage,) if reader.damage else ()
+    damage = (f"the log is damaged: {reader.damage}",) if reader.damage else ()
+    return rig, observations, damage + builder.warnings

@@ -71,6 +71,19 @@ class SessionBuilder:
         boots = self._boots.get(camera, {})
         return max(sorted(boots), key=lambda boot: len(boots[boot].rows), default="")
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What was left out of the session."""
+        told = []
+        for camera in sorted(self._boots):
+            kept = self.boot(camera)
+            lost = sum(len(boot.rows) for name, boot in self._boots[camera].items() if name != kept)
+            if lost:
+                told.append(
+                    f"{camera} was restarted, which begins a new clock: {lost} detections of other boots left out"
+                )
+        return tuple(told)
+
     def build(self) -> tuple[Rig, Observations]:
         """The session as it stands. Raises Refused where there is no camera or nothing was seen."""
         if not self._cameras:

@@ -18,6 +18,9 @@ from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.rig import Rig, read_rig, read_toml
 
+_ANSWERED = ("distances", "refused", "scale", "solver", "version", "reference")
+"""Metadata of rig.toml that the answer replaces."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCalibration:
@@ -34,6 +37,14 @@ class CameraCalibration:
     time_offset_std: float
     position_std: Floats
     rms_px: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Known:
+    """A calibration whose intrinsics and poses are kept. scale: "metric" or "arbitrary", as it says."""
+
+    cameras: dict[str, CameraCalibration]
+    scale: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,8 +100,10 @@ class Calibration:
 def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
     """The content of calibration.toml: rig.toml's tables with the answers added."""
     tables: dict[str, Any] = {}
+    # distances are in the scale now, and aniposelib's TOML reader breaks on lists of names and numbers.
+    kept = {key: value for key, value in rig.metadata.items() if key not in _ANSWERED}
     metadata = {
-        **rig.metadata,
+        **kept,
         "units": calibration.units,
         "reference": calibration.reference,
         "scale": calibration.scale,
@@ -126,20 +139,30 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
     return tables
 
 
+def calibration_text(calibration: Calibration, rig: Rig) -> str:
+    """calibration.toml; it loads in aniposelib as it is."""
+    return tomli_w.dumps(_plain(calibration_tables(calibration, rig)))
+
+
 def write_calibration(file: Path, calibration: Calibration, rig: Rig) -> None:
-    """Write calibration.toml; it loads in aniposelib as it is."""
-    write_atomically(file, tomli_w.dumps(_plain(calibration_tables(calibration, rig))))
+    """Write calibration.toml."""
+    write_atomically(file, calibration_text(calibration, rig))
 
 
 def write_trajectory(file: Path, calibration: Calibration) -> None:
-    """Write trajectory.csv: time,x,y,z,std[,label] on the reference clock; label where there are several."""
+    """Write trajectory.csv."""
+    write_atomically(file, trajectory_text(calibration))
+
+
+def trajectory_text(calibration: Calibration) -> str:
+    """trajectory.csv: time,x,y,z,std[,label] on the reference clock; label where there are several."""
     several = len(calibration.trajectories) > 1
     lines = ["time,x,y,z,std,label" if several else "time,x,y,z,std"]
     for table in calibration.trajectories:
         tail = f",{csv_cell(table.label)}" if several else ""
         for t, (x, y, z), std in zip(table.time, table.position, table.std, strict=True):
             lines.append(f"{t:.17g},{x:.17g},{y:.17g},{z:.17g},{std:.17g}{tail}")
-    write_atomically(file, "\n".join(lines) + "\n")
+    return "\n".join(lines) + "\n"
 
 
 def csv_cell(text: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from protocols.session.rig import Rig, read_rig
 
 RIG_FILE = "rig.toml"
 OBSERVATIONS_FILE = "observations.csv"
+_OUTSIDE = 0.01  # share of rows outside the image above which something is wrong
 
 
 def read_folder(folder: Path, observations: Path | None = None) -> tuple[Rig, Observations]:
@@ -31,7 +33,22 @@ def read_folder(folder: Path, observations: Path | None = None) -> tuple[Rig, Ob
             remedy="write one: a table per camera, see `syncline simulate`",
         )
     rig = read_rig(folder / RIG_FILE)
-    return rig, read_observations(observations or folder / OBSERVATIONS_FILE, rig.cameras)
+    found = read_observations(observations or folder / OBSERVATIONS_FILE, rig.cameras)
+    return rig, replace(found, warnings=found.warnings + outside_image(rig, found))
+
+
+def outside_image(rig: Rig, observations: Observations) -> tuple[str, ...]:
+    """Warnings of cameras with rows outside their image: a wrong size, or u and v swapped."""
+    told = []
+    for name, camera in rig.cameras.items():
+        pixels = np.concatenate([np.zeros((0, 2)), *(track.pixels for track in observations.of_camera(name))])
+        outside = int(((pixels < -1.0) | (pixels > np.array(camera.size))).any(axis=1).sum())
+        if outside > _OUTSIDE * len(pixels):
+            width, height = camera.size
+            told.append(
+                f"{name}: {outside} of {len(pixels)} rows lie outside its {width}x{height} image; check size, u, v"
+            )
+    return tuple(told)
 
 
 def write_rig(file: Path, tables: dict[str, Any]) -> None:

@@ -15,6 +15,7 @@ from protocols.geometry.types import Floats, Ints
 
 REQUIRED = ("camera", "frame", "time", "u", "v")
 DEFAULT_LABEL = "marker"
+_FARTHEST_TIME = 1e11  # s: 3,000 years; beyond, a float tells no microseconds
 _FARTHEST_PIXEL = 1e6
 _LARGEST_FRAME = 2.0**53  # beyond, a number read as a float is no longer whole
 _REPEATS_ARE_NONSENSE = 0.1  # share of repeated frame numbers from which they are no numbering at all
@@ -80,7 +81,10 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot be read: {error}", file=file, remedy="save it as UTF-8 CSV") from None
     reader = csv.reader(io.StringIO(text), strict=True)
-    header = [cell.strip() for cell in next(reader, [])]
+    try:
+        header = [cell.strip() for cell in next(reader, [])]
+    except csv.Error as error:
+        raise InputError(f"not CSV: {error}", file=file, line=1, remedy="save it as CSV") from None
     columns = {name: index for index, name in reversed(list(enumerate(header)))}
     twice = [name for name in (*REQUIRED, "size", "label") if header.count(name) > 1]
     if twice:
@@ -102,6 +106,10 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
         raise InputError("no rows", file=file, line=1, remedy="record some observations first")
     _check_width(rows, lines, max(columns[name] for name in columns if name in (*REQUIRED, "size", "label")), file)
     numbers = {name: _column(rows, lines, columns[name], name, file) for name in ("time", "u", "v")}
+    far = np.flatnonzero(np.abs(numbers["time"]) > _FARTHEST_TIME)
+    if len(far):
+        what = f"time {numbers['time'][far[0]]:g} is no time in seconds"
+        raise InputError(what, file=file, line=lines[far[0]], remedy="give seconds; Unix time is about 1.8e9")
     for name in ("u", "v"):
         far = np.flatnonzero(np.abs(numbers[name]) > _FARTHEST_PIXEL)
         if len(far):

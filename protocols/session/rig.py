@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import tomllib
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from protocols.geometry.types import Floats
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 CLOCKS = ("independent", "shared")
+_LARGEST = 1e12  # no length, angle or pixel of a rig comes near
 _AGREE = 1e-3  # relative: position and translation may differ by rounding, not by more
 
 
@@ -98,13 +98,13 @@ class _Table:
         remedy = f"give {key} = {what}"
         try:
             array = np.array(self.values[key], dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise self.fail(key, f"{key} is not a list of numbers", remedy) from None
         shape = (count,) if isinstance(count, int) else count
         if array.shape != shape:
             raise self.fail(key, f"{key} has shape {list(array.shape)}, not {list(shape)}", remedy)
-        if not np.isfinite(array).all():
-            raise self.fail(key, f"{key} is not finite", remedy)
+        if not np.isfinite(array).all() or np.abs(array).max(initial=0.0) > _LARGEST:
+            raise self.fail(key, f"{key} is not finite, or far too large", remedy)
         return array
 
     def std(self, key: str, what: str) -> Floats | None:
@@ -129,7 +129,9 @@ def read_toml(file: Path, what: str = "file") -> tuple[dict[str, Any], str]:
         raise InputError(f"cannot be read: {error}", file=file, remedy="check the file and its rights") from None
     try:
         return tomllib.loads(text), text
-    except tomllib.TOMLDecodeError as error:
+    except (RecursionError, OverflowError):
+        raise InputError("nested or numbered beyond all measure", file=file, remedy="write a plain TOML file") from None
+    except ValueError as error:
         message = str(error)
         place = re.search(r"at line (\d+)", message)
         line = int(place.group(1)) if place else len(text.splitlines()) or 1
@@ -156,6 +158,8 @@ def read_rig(file: Path) -> Rig:
                 remedy="put it under [camera] or [metadata]",
             )
         camera = _read_camera(_Table(table, name, file, text))
+        if camera.name in cameras:
+            raise InputError(f"two cameras are named {camera.name!r}", file=file, remedy="give each its own name")
         cameras[camera.name] = camera
     if not cameras:
         raise InputError("no camera in it", file=file, remedy="add a table per camera: [cam0] name, size, matrix, …")
@@ -165,6 +169,9 @@ def read_rig(file: Path) -> Rig:
     clock = metadata.get("clock", "independent")
     if clock not in CLOCKS:
         raise meta.fail("clock", f"clock = {clock!r}", 'use "independent" or "shared"')
+    reference = metadata.get("reference")
+    if reference is not None and (not isinstance(reference, str) or reference not in cameras):
+        raise meta.fail("reference", f"reference = {reference!r} is no camera", "use a camera of this file")
     return Rig(cameras, units, clock, _read_distances(meta, cameras), _read_up(meta, cameras), dict(metadata), file)
 
 
@@ -179,7 +186,7 @@ def _read_distances(meta: _Table, cameras: dict[str, RigCamera]) -> tuple[tuple[
         for name in row[:2]:
             if name not in cameras:
                 raise meta.fail("distances", f"distance to an unknown camera {name!r}", "use a camera of this file")
-        if not (math.isfinite(row[2]) and row[2] > 0) or row[0] == row[1]:
+        if not 0 < row[2] <= _LARGEST or row[0] == row[1]:
             raise meta.fail("distances", f"distance {row!r} is not a length between two cameras", remedy)
         distances.append((row[0], row[1], float(row[2])))
     return tuple(distances)
@@ -201,6 +208,8 @@ def _read_up(meta: _Table, cameras: dict[str, RigCamera]) -> Floats | str | None
 
 def _read_camera(table: _Table) -> RigCamera:
     name = table.values.get("name", table.where)
+    if not isinstance(name, str) or name != name.strip() or not name or '"' in name or name == "metadata":
+        raise table.fail("name", f"{name!r} is no name for a camera", "use letters, digits, - and _")
     # aniposelib's own files call their tables cam_0, cam_1, … and put the camera's name inside.
     theirs = isinstance(name, str) and re.fullmatch(r"cam_\d+", table.where) is not None
     if name != table.where and not theirs:
@@ -209,7 +218,7 @@ def _read_camera(table: _Table) -> RigCamera:
     if size is None or not (size > 0).all() or not (size == size.round()).all():
         raise table.fail("size", "size is missing or not two whole numbers", "give size = [width, height] in pixels")
     fps = table.values.get("fps", 0.0)
-    if not isinstance(fps, int | float) or isinstance(fps, bool) or not math.isfinite(fps) or fps < 0:
+    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 <= fps <= _LARGEST:
         raise table.fail("fps", f"fps = {fps!r} is not a frame rate", "give fps = 30.0")
     width, height = int(size[0]), int(size[1])
     position, rotation = _read_pose(table)

@@ -71,15 +71,27 @@ def test_one_pose_and_a_distance_are_enough(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_one_pose_alone_fixes_all_but_the_scale(seed: int) -> None:
+def test_one_pose_alone_fixes_no_scale_so_the_first_camera_is_the_world(seed: int) -> None:
+    """DESIGN: with an arbitrary scale the first camera is the world and the first baseline is 1."""
     truth, internal, _ = world(seed)
     known = {"cam2": {"position": truth[2].position, "rotation": truth[2].rotation}}
     gauge = fix_gauge(rig(known), NAMES, internal)
     moved = [gauge.similarity.pose(pose) for pose in internal]
     assert gauge.scale == "arbitrary"
-    np.testing.assert_allclose(moved[2].position, truth[2].position, atol=1e-6)
-    np.testing.assert_allclose(moved[2].rotation, truth[2].rotation, atol=1e-6)
+    assert any("no scale" in text for text in gauge.warnings)
+    np.testing.assert_allclose(moved[0].position, 0.0, atol=1e-9)
+    np.testing.assert_allclose(moved[0].rotation, np.eye(3), atol=1e-9)
     assert np.linalg.norm(moved[1].position - moved[0].position) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_pose_and_a_distance_fix_everything(seed: int) -> None:
+    truth, internal, similarity = world(seed)
+    known = {"cam2": {"position": truth[2].position, "rotation": truth[2].rotation}}
+    apart = float(np.linalg.norm(truth[0].position - truth[1].position))
+    gauge = fix_gauge(rig(known, distances=(("cam0", "cam1", apart),)), NAMES, internal)
+    assert gauge.scale == "metric"
+    same(gauge.similarity, similarity, 1e-6)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -268,14 +280,6 @@ def test_cameras_in_a_line_do_not_mirror_the_world() -> None:
     for pose in line:
         moved = gauge.similarity.pose(inward.pose(pose))
         np.testing.assert_allclose(moved.position, pose.position, atol=1e-6)
-
-
-def test_one_position_alone_moves_the_world_and_keeps_the_first_camera_level_with_it() -> None:
-    _, internal, _ = world(13)
-    gauge = fix_gauge(rig({"cam1": {"position": np.array([5.0, 6.0, 7.0])}}), NAMES, internal)
-    moved = [gauge.similarity.pose(pose) for pose in internal]
-    np.testing.assert_allclose(moved[1].position, [5, 6, 7], atol=1e-6)
-    assert gauge.scale == "arbitrary"
 
 
 def test_two_positions_at_one_place_are_not_a_scale() -> None:
