@@ -41,7 +41,10 @@ class PairSettings:
     """Prior on how far a clock's rate is from its nominal one."""
     moving_px: float = 20.0
     """Image speed [px/s] from which a sample counts as moving."""
-    accept_support: float = 2.0
+    accept_support: float = 4.0
+    """Seconds of agreeing motion below which nothing is answered: what fits there was up to 7 degrees off."""
+    unchecked_support: float = 8.0
+    """… and where too few other lags overlap alike to compare with."""
     accept_inliers: float = 0.6
     """Of the common motion, where there is plenty of it."""
     strict_inliers: float = 0.95
@@ -198,7 +201,7 @@ def _judge(names: tuple[str, str], fits: list[PairFit], stands_out: float | None
         reason = "the best geometry puts points behind a camera"
     elif best.flat_px < s.flat_ratio * max(best.sigma_px, s.sigma_px):
         reason = "the motion lies in one plane (or the cameras stand in one place), which leaves the geometry open"
-    elif stands_out is None and best.support < s.hardly:
+    elif stands_out is None and best.support < s.unchecked_support:
         reason = (
             f"the recordings overlap too little ({best.moving_overlap:.1f} s of motion) to tell one lag from another"
         )

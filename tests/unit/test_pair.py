@@ -137,7 +137,7 @@ def test_a_wrong_half_is_refused_or_the_lag_is_right(seed: int) -> None:
 def test_three_seconds_in_common_are_refused_or_right(seed: int) -> None:
     session = simulate(seed, 2, 30, late=0, windows=[(0, 16.5), (13.5, 30)])
     found = solve(session)
-    assert not found.solved or (abs(lag_error(session, found)) < 10e-3 and turn_error(session, found) < 6.0)
+    assert not found.solved or (abs(lag_error(session, found)) < 5e-3 and turn_error(session, found) < 3.0)
 
 
 def test_no_overlap_at_all_is_refused() -> None:
