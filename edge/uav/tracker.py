@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import StrEnum
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +19,7 @@ from protocols.geometry.types import Floats
 Image = npt.NDArray[np.uint8]
 
 
-class State(str, Enum):
+class State(StrEnum):
     """What is known of the target."""
 
     VISIBLE = "visible"
