@@ -31,6 +31,7 @@ COMMANDS: tuple[tuple[str, str, str], ...] = (
         "deploy.commands.calibrate:calibrate",
         "Timing and poses of all cameras of a session or log.",
     ),
+    ("track", "deploy.commands.track:track", "Follow one car from the air, also out of the picture."),
     ("camera", "deploy.commands.agents:camera", "Camera agent: detect and publish."),
     ("hub", "deploy.commands.agents:hub", "Hub agent: gather, calibrate, track."),
     ("record", "deploy.commands.agents:record", "Recorder: everything on the bus into a log."),

@@ -20,7 +20,7 @@ SUPPORT = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplineBasis:
-    """Cubic B-splines with knots every ``spacing`` seconds on each stretch.
+    """Cubic B-splines with knots every ``spacing`` seconds (``widths`` in truth) on each stretch.
 
     starts: (s,) first knot of each stretch [s]. intervals: (s,) knot intervals of each.
     """
@@ -28,6 +28,8 @@ class SplineBasis:
     spacing: float
     starts: Floats
     intervals: Ints
+    widths: Floats
+    """(s,) knot interval of each stretch [s]: ``spacing``, or a little less where a stretch is filled exactly."""
 
     @classmethod
     def over(cls, begins: Floats, ends: Floats, spacing: float) -> SplineBasis:
@@ -35,7 +37,13 @@ class SplineBasis:
         intervals = np.maximum(1, np.ceil((ends - begins) / spacing - 1e-9)).astype(np.int64)
         # A stretch that is no multiple of the spacing is covered evenly from both sides.
         starts = begins - 0.5 * (intervals * spacing - (ends - begins))
-        return cls(spacing, starts, intervals)
+        return cls(spacing, starts, intervals, np.full(len(starts), spacing))
+
+    @classmethod
+    def within(cls, begins: Floats, ends: Floats, spacing: float) -> SplineBasis:
+        """A basis whose stretches are exactly [begins[i], ends[i]], so that they may follow each other at once."""
+        intervals = np.maximum(1, np.ceil((ends - begins) / spacing - 1e-9)).astype(np.int64)
+        return cls(spacing, begins, intervals, np.maximum((ends - begins) / intervals, 1e-9))
 
     @property
     def size(self) -> int:
@@ -50,33 +58,37 @@ class SplineBasis:
     @property
     def end(self) -> float:
         """Last time of the last stretch [s]."""
-        return float(self.starts[-1] + self.intervals[-1] * self.spacing)
+        return float(self.starts[-1] + self.intervals[-1] * self.widths[-1])
 
     @property
     def offsets(self) -> Ints:
         """(s,) index of each stretch's first control point."""
         return np.asarray(np.r_[0, np.cumsum(self.intervals + 3)[:-1]].astype(np.int64))
 
-    def locate(self, time: Floats) -> tuple[Ints, Floats, Bools]:
-        """First control point (n,), place in the knot interval (n,) in [0, 1], and inside a stretch (n,)."""
+    def locate(self, time: Floats) -> tuple[Ints, Floats, Bools, Floats]:
+        """First control point (n,), place in the knot interval (n,) in [0, 1], inside a stretch (n,), width (n,)."""
         known = np.isfinite(time)
         time = np.where(known, time, self.starts[0])
         stretch = np.searchsorted(self.starts, time, side="right") - 1
         inside = known & (stretch >= 0)
         stretch = np.maximum(stretch, 0)
-        place = (time - self.starts[stretch]) / self.spacing
+        width = self.widths[stretch]
+        place = (time - self.starts[stretch]) / width
         count = self.intervals[stretch]
         inside &= place <= count + 1e-9
         interval = np.clip(np.floor(place), 0, count - 1).astype(np.int64)
-        return self.offsets[stretch] + interval, place - interval, inside
+        return self.offsets[stretch] + interval, place - interval, inside, width
 
     def weights(self, time: Floats, derivative: int = 0) -> tuple[Ints, Floats, Bools]:
         """First control point (n,), the 4 weights (n, 4), and whether inside a stretch (n,).
 
         derivative: 0 value, 1 first, 2 second derivative by time.
         """
-        index, u, inside = self.locate(time)
-        return index, basis_weights(u, derivative) / self.spacing**derivative, inside
+        index, u, inside, width = self.locate(time)
+        weights = basis_weights(u, derivative)
+        if derivative:
+            weights /= (width**derivative)[:, None]
+        return index, weights, inside
 
     def evaluate(self, control: Floats, time: Floats, derivative: int = 0) -> Floats:
         """Values (n, d) at ``time`` of the spline with ``control`` (size, d); NaN outside the stretches."""
@@ -86,6 +98,21 @@ class SplineBasis:
             values += weights[:, k, None] * control[index + k]
         values[~inside] = np.nan
         return values
+
+    def evaluate_both(self, control: Floats, time: Floats) -> tuple[Floats, Floats]:
+        """Values and first derivatives, (n, d) each, at ``time``; NaN outside the stretches."""
+        index, u, inside, width = self.locate(time)
+        rows = control[index[:, None] + np.arange(SUPPORT)]
+        values = np.einsum("nk,nkd->nd", basis_weights(u), rows)
+        slopes = np.einsum("nk,nkd->nd", basis_weights(u, 1), rows) / width[:, None]
+        if not inside.all():
+            values[~inside] = np.nan
+            slopes[~inside] = np.nan
+        return values, slopes
+
+    def scaled(self, factor: float) -> SplineBasis:
+        """The same basis on a time axis stretched by ``factor``."""
+        return SplineBasis(self.spacing * factor, self.starts * factor, self.intervals, self.widths * factor)
 
     def interval_starts(self) -> Ints:
         """(m,) first control point of every knot interval."""
@@ -136,9 +163,15 @@ def fit_spline(basis: SplineBasis, time: Floats, values: Floats, row_weight: Flo
     return np.asarray(solveh_banded(bands, target, check_finite=False))
 
 
-def stretches(time: Floats, longest_gap: float) -> tuple[Floats, Floats]:
-    """Begins and ends of the stretches of sorted ``time`` (n,) that no gap over ``longest_gap`` cuts."""
+def stretches(time: Floats, longest_gap: float, piece: Ints | None = None) -> tuple[Floats, Floats]:
+    """Begins and ends of the stretches of sorted ``time`` (n,) that no gap over ``longest_gap`` cuts.
+
+    piece: (n,) rising numbers; where they change, a stretch ends too.
+    """
     if len(time) == 0:
         return np.zeros(0), np.zeros(0)
-    cuts = np.flatnonzero(np.diff(time) > longest_gap)
+    apart = np.diff(time) > longest_gap
+    if piece is not None:
+        apart |= np.diff(piece) > 0
+    cuts = np.flatnonzero(apart)
     return time[np.r_[0, cuts + 1]], time[np.r_[cuts, len(time) - 1]]

@@ -1,7 +1,9 @@
-"""`syncline simulate`: a session of a shipped scene, with its truth beside it."""
+"""`syncline simulate`: a session of a shipped scene, or a flight over the town, with its truth beside it."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -10,50 +12,76 @@ from cyclopts import Parameter
 from protocols.errors import EXIT_DONE, InputError
 from protocols.files import check_folder
 
+_SECONDS, _NOISE_PX = 60.0, 0.5
+
 
 def simulate(
     scene: str,
     /,
     *,
     out: Path,
-    seconds: float = 60.0,
+    seconds: float | None = None,
     cameras: int | None = None,
     seed: int = 0,
-    noise_px: float = 0.5,
-    outliers: float = 0.0,
+    noise_px: float | None = None,
+    outliers: float | None = None,
     drops: float | None = None,
+    frames: int | None = None,
+    size: str | None = None,
+    telemetry_hz: float | None = None,
     json: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
     """Write a session of a simulated scene: rig.toml, observations.csv and the truth.
 
     The truth is in truth_calibration.toml and truth_trajectory.csv (true time of the first camera's clock).
 
+    Scene town:SCENARIO is a drone that follows a car and loses it: video.mp4, rig.toml, telemetry.csv and truth.csv
+    (the car in every frame, also out of the picture). Scenarios: exit-bend (the usual one), exit-straight,
+    turn-out-of-view, yaw, distractors, trees, bridge, lighting, off-road, partial, paper-3.3, paper-4.4.
+
     Example: syncline simulate marker --cameras 5 --seed 3 --out my-session
+
+    Example: syncline simulate town:exit-bend --frames 90 --seed 3 --out my-flight
 
     Parameters
     ----------
     scene
-        Name of the scene: marker (a room) or marker-outdoor (a field).
+        Name of the scene: marker (a room), marker-outdoor (a field), or town:SCENARIO (a flight).
     out
         Folder to write; made if need be.
     seconds
-        Length of the recording.
+        Length of the recording (default 60); not for town.
     cameras
-        Number of cameras, at least 2; default: the scene's own.
+        Number of cameras, at least 2; default: the scene's own; not for town.
     seed
         Same seed, same session.
     noise_px
-        Detector noise, std of each coordinate.
+        Detector noise, std of each coordinate (default 0.5); not for town.
     outliers
-        Share of false detections, 0 to 1.
+        Share of false detections, 0 to 1 (default 0); not for town.
     drops
-        Share of lost frames, 0 to 1; default: the scene's own.
+        Share of lost frames, 0 to 1; default: the scene's own; not for town.
+    frames
+        For how many frames the car is out of the picture; default: the scenario's own; only for town.
+    size
+        Of the picture, default 640x480; only for town.
+    telemetry_hz
+        Rate of the telemetry, 1 to 50 Hz (default 30); only for town.
     json
         Print what was written as JSON.
     """
     check_folder(out)
     if seed < 0:
         raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
+    marker = {"--seconds": seconds, "--cameras": cameras, "--noise-px": noise_px, "--outliers": outliers}
+    town = {"--frames": frames, "--size": size, "--telemetry-hz": telemetry_hz}
+    if scene.partition(":")[0] == "town":
+        _refuse(marker | {"--drops": drops}, scene)
+        return _fly(scene, out, seed, frames, size, 30.0 if telemetry_hz is None else telemetry_hz, json)
+    _refuse(town, scene)
+    seconds = _SECONDS if seconds is None else seconds
+    noise_px = _NOISE_PX if noise_px is None else noise_px
+    outliers = 0.0 if outliers is None else outliers
     if cameras is not None and not 2 <= cameras <= 64:
         raise InputError(f"--cameras {cameras} is out of range", remedy="give 2 to 64")
     if not 1.0 <= seconds <= 7200.0:
@@ -72,4 +100,38 @@ def simulate(
     else:
         print(f"{written['cameras']} cameras, {written['rows']} observations in {out}")
         print(f"next: syncline calibrate {out} --out {out}-result")
+    return EXIT_DONE
+
+
+def _refuse(options: Mapping[str, object], scene: str) -> None:
+    for option, value in options.items():
+        if value is not None:
+            raise InputError(f"{option} means nothing for scene {scene}", remedy="leave it out")
+
+
+def _fly(
+    scene: str, out: Path, seed: int, frames: int | None, size: str | None, telemetry_hz: float, as_json: bool
+) -> int:
+    wanted = re.fullmatch(r"(\d{1,5})x(\d{1,5})", "640x480" if size is None else size)
+    if wanted is None:
+        raise InputError(f"--size {size} is no size", remedy="give width x height, for example 1280x720")
+    if not 1.0 <= telemetry_hz <= 50.0:
+        raise InputError(f"--telemetry-hz {telemetry_hz:g} is out of range", remedy="give 1 to 50")
+    from deploy.simulated_flight import write_simulated_flight
+
+    pixels = int(wanted[1]), int(wanted[2])
+    written = write_simulated_flight(scene, out, seed=seed, frames=frames, size=pixels, rate_hz=telemetry_hz)
+    if as_json:
+        import json
+
+        print(json.dumps({"out": str(out), **written}))
+    else:
+        begin, end = written["out_of_picture"]
+        where = f"the car out of the picture in frames {begin} to {end - 1}" if end else "the car always in the picture"
+        print(f"{written['frames']} frames in {written['video']}, {where}")
+        target = ",".join(f"{value:g}" for value in written["target"])
+        print(
+            f"next: syncline track {written['video']} --target {target} --rig {out}/rig.toml "
+            f"--telemetry {out}/telemetry.csv --out {out}-result"
+        )
     return EXIT_DONE

@@ -179,7 +179,7 @@ def motion_prior(problem: Problem, state: State, first: bool = False) -> MotionP
         seen = np.zeros((len(state.cameras), size), dtype=np.bool_)
         for rows in problem.rows:
             if rows.label == label:
-                index, _, inside = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[rows.use]))
+                index, _, inside = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[rows.use]))[:3]
                 seen[rows.camera, index[inside]] = True
         both = seen.sum(axis=0)[path.basis.interval_starts()] >= 2
         chosen = differences[both] if both.sum() >= 4 else differences

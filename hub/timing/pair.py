@@ -1,106 +1,36 @@
-"""Two calibrated cameras that share no clock: lag, rate and relative pose, with no guess given.
+"""Two cameras that share no clock: lag, rate and geometry, with no guess given.
 
-METHODS A, steps 2 to 5: scan of all lags, candidates, refinement of (E, lag, rate) on the Sampson distance
-by reweighted Levenberg-Marquardt from several essential matrices, and an absolute test of the answer.
+METHODS A, steps 2 to 5: scan of all lags, candidates, refinement of (E or F, lag, rate) on the Sampson
+distance from several starts, and absolute tests of the answer. Where the plain scan finds nothing, it is
+made again for clock rates further from 1 and, where a track jumps, on the pieces between the jumps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from hub.timing import two_view
-from hub.timing.refine import Noise, PointPairs, Refined, refine
-from hub.timing.scan import PairMoments, Scan, candidates, grid_tracks, scan_lags, significance
+from hub.timing.alignment import PairFit, PairSettings, PairSolution, Samples, evidence
+from hub.timing.refine import WIDE, Noise, Refined, refine
+from hub.timing.scan import PairMoments, Scan, candidates, grid_tracks, scan_lags
+from hub.timing.significance import Chance, bandwidth, chance
 from hub.timing.tracks import SmoothTrack
-from hub.timing.two_view import RelativePose
-from protocols.geometry.types import Bools, Floats, Ints
+from hub.timing.two_view import Geometry, RelativePose, Uncalibrated
+from protocols.geometry.types import Floats
 
 _LEAST_SAMPLES = 12
-
-
-@dataclass(frozen=True, slots=True)
-class PairSettings:
-    """What the pair solver reckons with; the defaults hold on every rig."""
-
-    step: float = 0.05
-    """Grid of the scan [s]."""
-    least_support: float = 1.0
-    """Seconds in which both must move for a lag to be looked at."""
-    sigma_px: float = 0.5
-    """Noise that a good track has; scales the scan's costs."""
-    per_stratum: int = 3
-    at_most: int = 10
-    samples: int = 500
-    """Point pairs in the refinement of a candidate."""
-    largest_sigma_px: float = 6.0
-    """Lens errors included: beyond this an epipolar fit is no fit."""
-    rate_std: float = 2e-3
-    """Prior on how far a clock's rate is from its nominal one."""
-    moving_px: float = 20.0
-    """Image speed [px/s] from which a sample counts as moving."""
-    accept_support: float = 4.0
-    """Seconds of agreeing motion below which nothing is answered: what fits there was up to 7 degrees off."""
-    unchecked_support: float = 8.0
-    """… and where too few other lags overlap alike to compare with."""
-    accept_inliers: float = 0.6
-    """Of the common motion, where there is plenty of it."""
-    strict_inliers: float = 0.95
-    """… and where there is hardly any: seven parameters and a search over all lags fit a few seconds of anything."""
-    plenty: float = 12.0
-    hardly: float = 4.0
-    """Seconds of agreeing motion that count as plenty and as hardly any."""
-    largest_rate: float = 1e-2
-    accept_significance: float = 3.0
-    """Sigma by which the alignment's misfit must stand out from that of other lags with like support."""
-    flat_ratio: float = 3.0
-    """A plane that leaves less than this many times the epipolar residual explains the motion as well."""
-    accept_in_front: float = 0.95
-    accept_ratio: float = 0.5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PairFit:
-    """One refined alignment: ``t_a = rate * t_b + offset`` on the tracks' own (shifted) times.
-
-    cost: mean robust squared distance over the noise. sigma_px: robust residual [px].
-    support: seconds of agreeing motion. inliers, front: fractions of the moving samples.
-    moving_overlap: seconds in which both tracks exist and move. middle: time of a in the middle of them.
-    parallax: median angle [rad] between the two rays of a point. flat_px: what one plane would leave [px].
-    """
-
-    rate: float
-    offset: float
-    pose: RelativePose
-    cost: float
-    sigma_px: float
-    inliers: float
-    front: float
-    support: float
-    moving_overlap: float
-    middle: float
-    parallax: float
-    flat_px: float = float("nan")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PairSolution:
-    """What is known of a pair of cameras. ``status`` is "ok" or the reason of the refusal."""
-
-    a: str
-    b: str
-    status: str
-    fit: PairFit | None = None
-    others: tuple[PairFit, ...] = field(default=())
-    fundamental: Floats | None = None
-    """(3, 3) of undistorted pixels, ``m_aᵀ F m_b = 0``, where the method found it directly."""
-
-    @property
-    def solved(self) -> bool:
-        """Whether the fit can be relied on."""
-        return self.status == "ok"
+_STEPS = (0.01, 0.0125, 0.016, 0.02, 0.025, 0.033, 0.05)
+_FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
+_LABELLED_RATES = tuple(
+    sorted(
+        {round(a / b, 9) for a in _FRAME_RATES for b in _FRAME_RATES if 0.4 < a / b < 2.5 and a != b},
+        key=lambda rate: abs(np.log(rate)),
+    )
+)
+"""Ratios between the frame rates that cameras have: times made of frame numbers with a wrong one are off by these."""
 
 
 def solve_pair(
@@ -109,41 +39,229 @@ def solve_pair(
     names: tuple[str, str],
     settings: PairSettings | None = None,
     known: RelativePose | None = None,
+    *,
+    calibrated: bool = True,
+    labelled_rates: bool = False,
 ) -> PairSolution:
-    """Find lag, rate and relative pose of two cameras from the labels that both saw.
+    """Find lag, rate and geometry of two cameras from the labels that both saw.
 
     tracks_a, tracks_b: by label; all tracks of one camera share one epoch. known: the relative pose, where
-    it is given: then only lag and rate are sought.
+    it is given: then only lag and rate are sought. calibrated: whether both lenses are known; if not, the
+    tracks' normalised coordinates are those of any nominal lens and the answer is a fundamental matrix.
+    labelled_rates: whether to try, after rates near 1, those that a wrongly told frame rate would make.
     """
     s = settings or PairSettings()
     labels = [label for label in tracks_a if label in tracks_b]
     if not labels:
         return PairSolution(*names, "no label that both cameras saw")
-    a, b = [tracks_a[label] for label in labels], [tracks_b[label] for label in labels]
-    span = max(max(track.basis.end for track in one) - min(track.basis.begin for track in one) for one in (a, b))
-    step = s.step if span > 60 else s.step / 1.5
-    moments = PairMoments(grid_tracks(a, step, s.sigma_px), grid_tracks(b, step, s.sigma_px))
-    if float(moments.support.max(initial=0.0)) < s.least_support:
-        return PairSolution(*names, "the point hardly moves while both could have seen it")
-    scan = scan_lags(moments, s.least_support, None if known is None else known.essential.T)
-    chosen = candidates(scan, s.per_stratum, s.at_most)
-    fits: list[PairFit] = []
-    good: tuple[float, float] | None = None  # evidence and scan cost of the best trustworthy fit so far
-    for index in chosen:
-        offset, cost = float(scan.offset[index]), float(scan.cost[index])
-        if good is not None and _hopeless(float(scan.support[index]), cost, *good, s):
-            continue
-        start = moments.fundamental(int(index)).T if known is None else None  # s_b' E s_a
-        fit = _refine_candidate(a, b, offset, cost, start, known, s)
-        if fit is None:
-            continue
-        fits.append(fit)
-        if _sound(fit, s) and (good is None or evidence(fit) > good[0]):
-            good = (evidence(fit), cost)
-    if not fits:
-        return PairSolution(*names, "no alignment of the two tracks agrees with any geometry")
-    ordered = _distinct(fits)
-    return _judge(names, ordered, _significance(scan, ordered[0], s), s)
+    search = _Search([tracks_a[k] for k in labels], [tracks_b[k] for k in labels], s, known, calibrated, labelled_rates)
+    first: PairSolution | None = None
+    for rate in search.rates():
+        answer = search.at_rate(names, rate)
+        if answer.solved:
+            return answer
+        if first is None:
+            first = answer
+    assert first is not None
+    return first
+
+
+class _Search:
+    """One pair's tracks, and what is the same for every rate that is tried."""
+
+    def __init__(
+        self,
+        a: Sequence[SmoothTrack],
+        b: Sequence[SmoothTrack],
+        s: PairSettings,
+        known: RelativePose | None,
+        calibrated: bool,
+        labelled_rates: bool,
+    ) -> None:
+        self.labelled_rates = labelled_rates
+        self.a, self.b, self.s, self.known, self.calibrated = a, b, s, known, calibrated
+        self.step = _grid_step(a, b, s)
+        self.grid_a = grid_tracks(a, self.step, s.sigma_px)
+        self.tried = 0
+        self.bandwidth = min(max(bandwidth(track) for track in one) for one in (a, b))
+        self.span = min(max(t.basis.end for t in one) - min(t.basis.begin for t in one) for one in (a, b))
+
+    def rates(self) -> Iterator[float]:
+        """Clock rates worth a scan: 1, what a drift does to a long recording, and wrongly labelled frame rates."""
+        yield 1.0
+        # A scan at rate 1 sees a pair as long as the ends don't slip by more than a few steps.
+        slip = 0.15 / max(self.span, 1e-9)
+        if slip < 5e-3:
+            count = int(np.ceil(5e-3 / slip))
+            for k in range(1, count + 1):
+                yield 1.0 + k * slip
+                yield 1.0 - k * slip
+        if self.labelled_rates:
+            yield from _LABELLED_RATES
+
+    def at_rate(self, names: tuple[str, str], rate: float) -> PairSolution:
+        """Answer with b's clock taken to run ``rate`` times as fast: one scan, its candidates, the verdict."""
+        s, self.tried = self.s, self.tried + 1
+        b = list(self.b) if rate == 1.0 else [track.scaled(rate) for track in self.b]
+        moments = PairMoments(self.grid_a, grid_tracks(b, self.step, s.sigma_px))
+        if float(moments.support.max(initial=0.0)) < s.least_support:
+            return PairSolution(*names, "the point hardly moves while both could have seen it")
+        scan = scan_lags(moments, s.least_support, None if self.known is None else self.known.essential.T)
+        chances = _Chances(moments, scan, self.known, self.bandwidth)
+        fits: list[PairFit] = []
+        good: tuple[float, float] | None = None  # evidence and scan cost of the best trustworthy fit so far
+        for index in candidates(scan, s.per_stratum, s.at_most):
+            offset, cost = float(scan.offset[index]), float(scan.cost[index])
+            if good is not None and _hopeless(float(scan.support[index]), cost, *good, s):
+                continue
+            start = moments.fundamental(int(index)).T if self.known is None else None  # s_b' M s_a
+            fit = self._refine_candidate(b, offset, cost, start)
+            if fit is None:
+                continue
+            fit = replace(fit, log10_chance=chances.of(fit, s))
+            fits.append(fit)
+            if _sound(fit, s) and (good is None or evidence(fit) > good[0]):
+                good = (evidence(fit), cost)
+        if not fits:
+            return PairSolution(*names, "no alignment of the two tracks agrees with any geometry")
+        ordered = _distinct(fits, s)
+        answer = _judge(names, ordered, self._searched(scan, ordered[0]), s)
+        if answer.solved and answer.fit is not None:
+            answer = self._finish(answer, answer.fit, b)
+        if rate != 1.0 and answer.fit is not None:
+            answer = replace(answer, fit=replace(answer.fit, rate=answer.fit.rate * rate))
+        return answer
+
+    def _searched(self, scan: Scan, fit: PairFit) -> float:
+        """About how many independent alignments with as much common motion were looked at, rates included."""
+        alike = scan.support > 0.7 * fit.moving_overlap
+        return max(1.0, self.tried * float(alike.sum()) * self.step / self.s.distinct_alignments)
+
+    def _refine_candidate(
+        self, b: Sequence[SmoothTrack], offset: float, cost: float, start: Floats | None
+    ) -> PairFit | None:
+        """Refine one lag from the moments' matrix and, with known lenses, from five-point hypotheses; the best wins.
+
+        One start is not enough: one clean session in ten ends in a wrong minimum of the essential matrix,
+        with the time right and the rotation tens of degrees off.
+        """
+        s, a = self.s, self.a
+        few = Samples(a, b, offset, s, s.few)
+        if few.count < _LEAST_SAMPLES:
+            return None
+        scale = float(np.sqrt(max(cost, 1.0)))
+        noise = Noise(s.sigma_px / a[0].focal, s.sigma_px / b[0].focal, s.rate_std)
+        fixed = self.known is not None
+        best: Refined | None = None
+        for geometry in self._starts(few, b, offset, scale, start):
+            found = refine(few, geometry, few.centre - offset, scale, noise, fixed_geometry=fixed, iterations=14)
+            if found is not None and (best is None or found.cost < best.cost):
+                best = found
+        if best is None:
+            return None
+        rate = 1.0 / best.slowness
+        offset = few.centre - rate * best.middle
+        samples = Samples(a, b, offset, s, s.samples)
+        if samples.count < _LEAST_SAMPLES:
+            return None
+        if samples.count > few.count:
+            middle = best.middle + best.slowness * (samples.centre - few.centre)
+            again = refine(
+                samples, best.geometry, middle, np.sqrt(best.cost), noise, slowness=best.slowness, fixed_geometry=fixed
+            )
+            if again is None:
+                return None
+            best, rate = again, 1.0 / again.slowness
+            offset = samples.centre - rate * best.middle
+        return samples.judge(best.cost, rate, offset, best.geometry)
+
+    def _starts(
+        self, few: Samples, b: Sequence[SmoothTrack], offset: float, scale: float, start: Floats | None
+    ) -> list[Geometry]:
+        if self.known is not None:
+            return [self.known]
+        here_a, here_b = few.at(1.0, offset)
+        both = np.isfinite(here_b).all(axis=1)
+        if both.sum() < _LEAST_SAMPLES or start is None:
+            return []
+        if not self.calibrated:
+            return [Uncalibrated.of(start)]
+        here_a, here_b = here_a[both], here_b[both]
+        threshold = 3.0 * self.s.sigma_px * scale / min(self.a[0].focal, b[0].focal)
+        starts: list[Geometry] = [two_view.decompose(start, here_a, here_b)]
+        for seed in range(2):
+            starts += two_view.five_point(here_a, here_b, threshold, seed)
+        return starts
+
+    def _finish(self, answer: PairSolution, fit: PairFit, b: Sequence[SmoothTrack]) -> PairSolution:
+        """The answer with all samples, the tracks' own noise and hardly any robustness left, and its stds."""
+        s, a = self.s, self.a
+        samples = Samples(a, b, fit.offset, s, s.all_samples)
+        own = [max(float(np.median([t.sigma for t in one])), 0.1 / one[0].focal) for one in (a, b)]
+        misfit = max(1.0, fit.sigma_px / (0.5 * (own[0] * a[0].focal + own[1] * b[0].focal)))
+        noise = Noise(own[0] * misfit, own[1] * misfit, s.rate_std)
+        slowness = 1.0 / fit.rate
+        found = refine(
+            samples,
+            fit.geometry,
+            slowness * (samples.centre - fit.offset),
+            1.0,
+            noise,
+            slowness=slowness,
+            fixed_geometry=self.known is not None,
+            narrowest=WIDE,
+        )
+        if found is None:
+            return answer
+        covariance = np.linalg.pinv(found.normal, hermitian=True)
+        rate = 1.0 / found.slowness
+        last = samples.judge(found.cost, rate, samples.centre - rate * found.middle, found.geometry)
+        last = replace(
+            last,
+            log10_chance=fit.log10_chance,
+            lag_std=float(np.sqrt(max(covariance[-2, -2], 0.0))),
+            turn_std=float(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0)))
+            if isinstance(found.geometry, RelativePose) and self.known is None
+            else 0.0,
+        )
+        if last.lag_std > s.largest_lag_std:
+            return replace(
+                answer, status=f"the motion tells the lag only to {1e3 * last.lag_std:.0f} ms (std)", fit=last
+            )
+        if last.turn_std > s.largest_turn_std:
+            reason = f"the motion tells the relative rotation only to {np.rad2deg(last.turn_std):.1f}° (std)"
+            return replace(answer, status=reason, fit=last)
+        return replace(answer, fit=last)
+
+
+class _Chances:
+    """How well unrelated stretches fit, for the lengths that are asked for."""
+
+    def __init__(self, moments: PairMoments, scan: Scan, known: RelativePose | None, bandwidth: float) -> None:
+        self.moments, self.scan, self.known = moments, scan, None if known is None else known.essential.T
+        self.bandwidth = bandwidth
+        self.found: list[tuple[float, float, Chance | None]] = []
+
+    def of(self, fit: PairFit, s: PairSettings) -> float | None:
+        """log10 of the chance that unrelated stretches as long as this fit's support leave no more than it does."""
+        seconds = fit.moving_overlap
+        chosen = next(
+            (c for long, lag, c in self.found if 0.8 * long < seconds < 1.25 * long and abs(lag - fit.lag) < 0.5), None
+        )
+        if chosen is None:
+            chosen = chance(self.moments, self.scan, seconds, fit.lag, self.known)
+            self.found.append((seconds, fit.lag, chosen))
+        return None if chosen is None else chosen.log10_probability(fit.misfit, fit.inliers, self.bandwidth * seconds)
+
+
+def _grid_step(a: Sequence[SmoothTrack], b: Sequence[SmoothTrack], s: PairSettings) -> float:
+    """Step of the scan [s] in which the faster motion of the two goes a few pixels."""
+    fast = max(
+        float(np.quantile(np.linalg.norm(track.at(track.time, 1), axis=1), 0.9)) * track.focal for track in (*a, *b)
+    )
+    wanted = s.step_px / max(fast, 1e-9)
+    fitting = [step for step in _STEPS if s.finest_step <= step <= min(s.coarsest_step, wanted)]
+    return max(fitting, default=s.finest_step)
 
 
 def _sound(fit: PairFit, s: PairSettings) -> bool:
@@ -159,24 +277,23 @@ def _hopeless(support: float, cost: float, best_evidence: float, best_cost: floa
     return 1.5 * support < s.accept_ratio * best_evidence or cost > 25.0 * max(best_cost, 4.0)
 
 
-def _significance(scan: Scan, fit: PairFit, s: PairSettings) -> float | None:
-    lag = fit.middle - (fit.middle - fit.offset) / fit.rate  # of the middle of the motion
-    return significance(scan, lag, (fit.sigma_px / s.sigma_px) ** 2)
+def _distinct(fits: list[PairFit], s: PairSettings) -> list[PairFit]:
+    """Best first, alignments that are the same within 0.1 s once.
 
+    The best is the one that chance explains least; where the recordings are too short to tell, the one with
+    most evidence.
+    """
 
-def _distinct(fits: list[PairFit]) -> list[PairFit]:
-    """Best first, alignments that are the same within 0.1 s once."""
-    ordered = sorted(fits, key=lambda fit: -evidence(fit))
+    def merit(fit: PairFit) -> tuple[float, float]:
+        agreeing = fit.inliers * fit.front * (fit.support >= s.accept_support)
+        return (-(fit.log10_chance or 0.0) * agreeing, evidence(fit))
+
+    ordered = sorted(fits, key=merit, reverse=True)
     out: list[PairFit] = []
     for fit in ordered:
         if all(abs(fit.offset - other.offset) > 0.1 for other in out):
             out.append(fit)
     return out
-
-
-def evidence(fit: PairFit) -> float:
-    """What speaks for an alignment: seconds of agreeing motion, less where little of the overlap agrees."""
-    return float(fit.support * fit.inliers * fit.front / np.sqrt(1.0 + fit.sigma_px))
 
 
 def needed_inliers(fit: PairFit, s: PairSettings) -> float:
@@ -185,10 +302,15 @@ def needed_inliers(fit: PairFit, s: PairSettings) -> float:
     return s.accept_inliers + short * (s.strict_inliers - s.accept_inliers)
 
 
-def _judge(names: tuple[str, str], fits: list[PairFit], stands_out: float | None, s: PairSettings) -> PairSolution:
+def _judge(names: tuple[str, str], fits: list[PairFit], searched: float, s: PairSettings) -> PairSolution:
     best = fits[0]
     others = tuple(fits[1:4])
-    second = evidence(others[0]) / max(evidence(best), 1e-12) if others else 0.0
+    rivals = [fit for fit in others if _rivals(fit, best, s)]
+    second = max((evidence(fit) / max(evidence(best), 1e-12) for fit in rivals), default=0.0)
+    by_chance = None if best.log10_chance is None else best.log10_chance + np.log10(searched)
+    # Regular motion fits nearly as well a period later. That is settled by the noise where there is enough of
+    # it and nothing else comes near what the tracks' own noise leaves.
+    settled = not rivals and best.support >= s.unchecked_support and best.sigma_px <= s.exact * best.own_px
     if best.support < s.accept_support:
         reason = f"only {best.support:.1f} s of motion agree (of {best.moving_overlap:.1f} s)"
     elif best.sigma_px > s.largest_sigma_px:
@@ -201,166 +323,43 @@ def _judge(names: tuple[str, str], fits: list[PairFit], stands_out: float | None
         reason = "the best geometry puts points behind a camera"
     elif best.flat_px < s.flat_ratio * max(best.sigma_px, s.sigma_px):
         reason = "the motion lies in one plane (or the cameras stand in one place), which leaves the geometry open"
-    elif stands_out is None and best.support < s.unchecked_support:
+    elif by_chance is None and best.support < s.unchecked_support:
         reason = (
             f"the recordings overlap too little ({best.moving_overlap:.1f} s of motion) to tell one lag from another"
         )
-    elif stands_out is not None and stands_out < s.accept_significance:
+    elif by_chance is not None and by_chance > s.accept_log10_chance and not settled:
         reason = (
-            f"other lags fit nearly as well (the best stands out by {stands_out:.1f} sigma, needed are "
-            f"{s.accept_significance:.1f}): too little or too regular common motion, or two different things"
+            f"other lags fit nearly as well (one of them would by chance in {100 * min(1.0, 10.0**by_chance):.0f} % "
+            "of cases): too little or too regular common motion, or two different things"
         )
     elif second > s.accept_ratio:
-        reason = f"two alignments are about as good ({best.offset:.2f} s and {others[0].offset:.2f} s)"
+        rival = max(rivals, key=evidence)
+        reason = f"two alignments are about as good ({best.offset:.2f} s and {rival.offset:.2f} s)"
     else:
         return PairSolution(*names, "ok", best, others)
     return PairSolution(*names, reason, best, others)
 
 
-def _refine_candidate(
-    a: Sequence[SmoothTrack],
-    b: Sequence[SmoothTrack],
-    offset: float,
-    cost: float,
-    start: Floats | None,
-    known: RelativePose | None,
-    s: PairSettings,
-) -> PairFit | None:
-    """Refine one lag from the moments' matrix and from five-point hypotheses; the best wins.
-
-    One start is not enough: one clean session in ten ends in a wrong minimum of the essential matrix,
-    with the time right and the rotation tens of degrees off.
-    """
-    sample = _Samples(a, b, offset, s)
-    if sample.count < _LEAST_SAMPLES:
-        return None
-    scale = float(np.sqrt(max(cost, 1.0)))
-    if known is not None:
-        starts = [known]
+def _rivals(fit: PairFit, best: PairFit, s: PairSettings) -> bool:
+    """Whether another alignment comes near the best one: in what it leaves, and in how unlikely that is."""
+    if best.sigma_px <= s.exact * best.own_px and best.support >= s.unchecked_support:
+        # What is left is the tracks' own noise, row for row: then a little more is a lot less likely.
+        limit = s.worse_than_noise * best.sigma_px
     else:
-        here_a, here_b = sample.at(1.0, offset)
-        both = np.isfinite(here_b).all(axis=1)
-        if both.sum() < _LEAST_SAMPLES or start is None:
-            return None
-        here_a, here_b = here_a[both], here_b[both]
-        threshold = 3.0 * s.sigma_px * scale / min(a[0].focal, b[0].focal)
-        starts = [two_view.decompose(start, here_a, here_b)]
-        for seed in range(2):
-            starts += two_view.five_point(here_a, here_b, threshold, seed)
-    noise = Noise(s.sigma_px / a[0].focal, s.sigma_px / b[0].focal, s.rate_std)
-    best: Refined | None = None
-    for pose in starts:
-        fit = refine(sample, pose, sample.centre - offset, scale, noise, fixed_pose=known is not None)
-        if fit is not None and (best is None or fit.cost < best.cost):
-            best = fit
-    if best is None:
-        return None
-    rate = 1.0 / best.slowness
-    return sample.judge(best.cost, rate, sample.centre - rate * best.middle, best.pose)
+        limit = s.clearly_worse * max(best.sigma_px, s.sigma_px)
+    if fit.sigma_px > limit:
+        return False
+    if fit.log10_chance is None or best.log10_chance is None:
+        return True
+    return fit.log10_chance < best.log10_chance + s.clearly_likelier
 
 
 def judge_alignment(
     a: SmoothTrack, b: SmoothTrack, offset: float, pose: RelativePose, settings: PairSettings | None = None
 ) -> PairFit:
     """The absolute figures of an alignment ``t_a = t_b + offset`` that another method found."""
-    return _Samples([a], [b], offset, settings or PairSettings()).judge(0.0, 1.0, offset, pose)
+    s = settings or PairSettings()
+    return Samples([a], [b], offset, s, s.samples).judge(0.0, 1.0, offset, pose)
 
 
-def _flat_px(a: Floats, b: Floats) -> float:
-    """What the best plane leaves [px], in the direction in which it leaves less: seen edge-on, it magnifies noise."""
-    return min(two_view.homography_residual(a, b), two_view.homography_residual(b, a))
-
-
-class _Samples:
-    """Samples of one alignment, all labels together: the inliers of a at their own times, b by its splines.
-
-    a, b: tracks of the same labels in the same order.
-    """
-
-    def __init__(self, a: Sequence[SmoothTrack], b: Sequence[SmoothTrack], offset: float, s: PairSettings) -> None:
-        self.a, self.b, self.s = a, b, s
-        parts = [self._rows(one, other, offset) for one, other in zip(a, b, strict=True)]
-        share = min(1.0, s.samples / max(sum(len(rows) for rows in parts), 1))
-        # The same share of every label, spread over its time.
-        thinned = [
-            rows[np.linspace(0, len(rows) - 1, round(share * len(rows))).round().astype(np.int64)] for rows in parts
-        ]
-        self.label = np.concatenate([np.full(len(rows), k) for k, rows in enumerate(thinned)])
-        self.time = np.concatenate([one.time[rows] for one, rows in zip(a, thinned, strict=True)])
-        self.points = np.concatenate([one.points[rows] for one, rows in zip(a, thinned, strict=True)])
-        self.speed = np.concatenate(
-            [np.linalg.norm(one.at(one.time[rows], 1), axis=1) for one, rows in zip(a, thinned, strict=True)]
-        )
-        self.count = len(self.time)
-        self.centre = float(np.median(self.time)) if self.count else 0.0
-        intervals = [float(np.median(np.diff(one.time))) for one in a]
-        rows_a_second = self.count / max(sum(len(rows) * t for rows, t in zip(parts, intervals, strict=True)), 1e-9)
-        self.seconds_a_sample = len(a) ** -0.5 / max(rows_a_second, 1e-9)
-
-    def _rows(self, a: SmoothTrack, b: SmoothTrack, offset: float) -> Ints:
-        margin = 0.5
-        inside = (a.time - offset > b.basis.begin - margin) & (a.time - offset < b.basis.end + margin)
-        speed = np.linalg.norm(a.at(a.time, 1), axis=1) * a.focal
-        return np.flatnonzero(inside & (speed > 0.5 * self.s.moving_px))
-
-    def of_b(self, time: Floats, derivative: int = 0) -> Floats:
-        """Points of b (n, 2), or their derivative, at b's times (n,) of the samples; NaN in gaps."""
-        if len(self.b) == 1:
-            return self.b[0].at(time, derivative)
-        out = np.full((len(time), 2), np.nan)
-        for k, track in enumerate(self.b):
-            mine = self.label == k
-            out[mine] = track.at(time[mine], derivative)
-        return out
-
-    def at(self, rate: float, offset: float) -> tuple[Floats, Floats]:
-        """Points of a (n, 2) and of b (n, 2; NaN in its gaps) under ``t_a = rate t_b + offset``."""
-        return self.points, self.of_b((self.time - offset) / rate)
-
-    def __call__(self, slowness: float, middle: float) -> PointPairs:
-        lever = self.time - self.centre
-        time_b = slowness * lever + middle
-        b = self.of_b(time_b)
-        there = np.isfinite(b[:, 0])
-        speed = self.of_b(time_b, 1)
-        return PointPairs(self.points[there], b[there], speed[there], lever[there])
-
-    def judge(self, cost: float, rate: float, offset: float, pose: RelativePose) -> PairFit:
-        """Absolute figures of an alignment, over the samples where both move."""
-        a, b = self.at(rate, offset)
-        there = np.isfinite(b).all(axis=1)
-        focal_a, focal_b = self.a[0].focal, self.b[0].focal
-        speed_b = np.linalg.norm(self.of_b((self.time - offset) / rate, 1), axis=1) * focal_b
-        speed_a = self.speed * focal_a
-        with np.errstate(invalid="ignore"):
-            moving: Bools = there & (speed_a > self.s.moving_px) & (speed_b > self.s.moving_px)
-        count = int(moving.sum())
-        if count < 8:
-            return PairFit(rate, offset, pose, cost, np.inf, 0.0, 0.0, 0.0, 0.0, self.centre, 0.0)
-        sigma_a, sigma_b = self.s.sigma_px / focal_a, self.s.sigma_px / focal_b
-        distance = np.abs(two_view.sampson(pose.essential, a[moving], b[moving], sigma_a, sigma_b))
-        sigma_px = float(np.median(distance)) / 0.6745 * self.s.sigma_px
-        # A track's own noise counts for what it is; a wrong geometry must not hide behind it.
-        own = max(float(np.median([track.sigma_px for track in tracks])) for tracks in (self.a, self.b))
-        limit = max(3.0 * own, 3.0) / self.s.sigma_px
-        close = distance < limit
-        front = two_view.in_front(pose, a[moving][close], b[moving][close])
-        seconds = float(count) * self.seconds_a_sample
-        inliers = float(close.mean())
-        share = float(front.mean()) if len(front) else 0.0
-        rays_a, rays_b = two_view.homogeneous(a[moving]) @ pose.rotation.T, two_view.homogeneous(b[moving])
-        cosine = (rays_a * rays_b).sum(1) / np.linalg.norm(rays_a, axis=1) / np.linalg.norm(rays_b, axis=1)
-        return PairFit(
-            rate=rate,
-            offset=offset,
-            pose=pose,
-            cost=cost,
-            sigma_px=sigma_px,
-            inliers=inliers,
-            front=share,
-            support=seconds * inliers,
-            moving_overlap=seconds,
-            middle=float(np.median(self.time[moving])),
-            parallax=float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))),
-            flat_px=_flat_px(a[moving][close] * focal_a, b[moving][close] * focal_b),
-        )
+__all__ = ["PairFit", "PairSettings", "PairSolution", "evidence", "judge_alignment", "needed_inliers", "solve_pair"]

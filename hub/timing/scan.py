@@ -17,11 +17,9 @@ from hub.timing.tracks import SmoothTrack
 from protocols.geometry.types import Bools, Floats, Ints
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-_PAIR_OF = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+PAIR_OF = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+"""Which of the six monomials is the product of two homogeneous coordinates."""
 _SLOW_PX = 20.0  # px/s: image speed at which a moment counts half
-_OWN_LAGS = 1.0  # s about an alignment that are no other alignment
-_LEAST_ALIKE = 20
-_COST_FLOOR = 0.25  # of squared noise: smoothing can do better than the noise, but that tells nothing
 _CHUNK = 4096  # lags per batch of eigenvalue problems
 
 
@@ -83,7 +81,7 @@ class PairMoments:
         self.a, self.b = a, b
         n_a, n_b = a.weight.shape[1], b.weight.shape[1]
         length = next_fast_len(n_a + n_b, real=True)
-        spectra_a, spectra_b = rfft(_monomials(a), length), rfft(_monomials(b), length)
+        spectra_a, spectra_b = rfft(monomials(a), length), rfft(monomials(b), length)
         # c[lag] = sum_n a[n] b[n + lag], for lag = -(n_a - 1) … n_b - 1
         product = np.zeros((len(_PAIRS), len(_PAIRS), length // 2 + 1), dtype=np.complex128)
         for of_a, of_b in zip(spectra_a, spectra_b, strict=True):
@@ -98,13 +96,9 @@ class PairMoments:
         """Moment matrices (m, 9, 9) and Taubin's normalisation (m, 9, 9) of chosen lags, per sample."""
         total = np.maximum(self.moments[5, 5, which], 1e-9)
         c = np.moveaxis(self.moments[:, :, which] / total, -1, 0)
-        full = c[:, _PAIR_OF][:, :, :, _PAIR_OF]  # (m, i, j, k, l): sum a_i a_j b_k b_l
+        full = c[:, PAIR_OF][:, :, :, PAIR_OF]  # (m, i, j, k, l): sum a_i a_j b_k b_l
         moment = full.transpose(0, 1, 3, 2, 4).reshape(-1, 9, 9)
-        plane = np.diag([1.0, 1.0, 0.0])
-        bb, aa = full[:, 2, 2], full[:, :, :, 2, 2]
-        first = self.a.sigma**2 * np.einsum("ij,mkl->mikjl", plane, bb)
-        second = self.b.sigma**2 * np.einsum("mij,kl->mikjl", aa, plane)
-        return moment, (first + second).reshape(-1, 9, 9)
+        return moment, normalisation(full, self.a.sigma, self.b.sigma)
 
     def costs(self, which: Ints) -> Floats:
         """Smallest generalised eigenvalue (m,) at chosen lags: squared distance over noise."""
@@ -112,22 +106,17 @@ class PairMoments:
         for begin in range(0, len(which), _CHUNK):
             part = which[begin : begin + _CHUNK]
             moment, norm = self.matrices(part)
-            # The constant term is free: eliminate it, since its row of the normalisation is zero.
-            reduced = moment[:, :8, :8] - moment[:, :8, 8:] * moment[:, 8:, :8] / moment[:, 8:, 8:]
-            lower = np.linalg.inv(np.linalg.cholesky(norm[:, :8, :8] + 1e-14 * np.eye(8)))
-            white = lower @ reduced @ lower.transpose(0, 2, 1)
-            out[begin : begin + _CHUNK] = np.linalg.eigvalsh(white)[:, 0]
-        return np.asarray(np.maximum(out, 0.0))
+            out[begin : begin + _CHUNK] = eigen_costs(moment, norm)
+        return out
 
     def costs_of(self, which: Ints, matrix: Floats) -> Floats:
         """Mean squared distance over noise (m,) that a known ``m_aᵀ F m_b = 0`` leaves at chosen lags."""
-        theta = (np.linalg.inv(self.a.transform).T @ matrix @ np.linalg.inv(self.b.transform)).reshape(9)
+        theta = in_grid(matrix, self.a, self.b)
         out = np.empty(len(which))
         for begin in range(0, len(which), _CHUNK):
             part = which[begin : begin + _CHUNK]
-            moment, norm = self.matrices(part)
-            out[begin : begin + _CHUNK] = (moment @ theta @ theta) / np.maximum(norm @ theta @ theta, 1e-30)
-        return np.asarray(np.maximum(out, 0.0))
+            out[begin : begin + _CHUNK] = fixed_costs(*self.matrices(part), theta)
+        return out
 
     def fundamental(self, which: int) -> Floats:
         """The best matrix (3, 3) at one lag, in normalised coordinates: ``m_aᵀ F m_b = 0``, norm 1."""
@@ -141,7 +130,34 @@ class PairMoments:
         return np.asarray(matrix / np.linalg.norm(matrix))
 
 
-def _monomials(track: GridTrack) -> Floats:
+def normalisation(full: Floats, sigma_a: float, sigma_b: float) -> Floats:
+    """Taubin's normalisation (m, 9, 9) of moments ``full`` (m, 3, 3, 3, 3), sum of a_i a_j b_k b_l."""
+    plane = np.diag([1.0, 1.0, 0.0])
+    bb, aa = full[:, 2, 2], full[:, :, :, 2, 2]
+    first = sigma_a**2 * plane[None, :, None, :, None] * bb[:, None, :, None, :]
+    second = sigma_b**2 * aa[:, :, None, :, None] * plane[None, None, :, None, :]
+    return np.asarray((first + second).reshape(-1, 9, 9))
+
+
+def eigen_costs(moment: Floats, norm: Floats) -> Floats:
+    """Smallest generalised eigenvalues (m,) of moments (m, 9, 9) under a normalisation (m, 9, 9)."""
+    # The constant term is free: eliminate it, since its row of the normalisation is zero.
+    reduced = moment[:, :8, :8] - moment[:, :8, 8:] * moment[:, 8:, :8] / moment[:, 8:, 8:]
+    lower = np.linalg.inv(np.linalg.cholesky(norm[:, :8, :8] + 1e-14 * np.eye(8)))
+    return np.asarray(np.maximum(np.linalg.eigvalsh(lower @ reduced @ lower.transpose(0, 2, 1))[:, 0], 0.0))
+
+
+def fixed_costs(moment: Floats, norm: Floats, theta: Floats) -> Floats:
+    """Mean squared distances over noise (m,) that one matrix ``theta`` (9,) leaves."""
+    return np.asarray(np.maximum((moment @ theta @ theta) / np.maximum(norm @ theta @ theta, 1e-30), 0.0))
+
+
+def in_grid(matrix: Floats, a: GridTrack, b: GridTrack) -> Floats:
+    """The (9,) entries, in the grids' coordinates, of ``m_aᵀ F m_b = 0`` (3, 3) of normalised points."""
+    return np.asarray(np.linalg.inv(a.transform).T @ matrix @ np.linalg.inv(b.transform)).reshape(9)
+
+
+def monomials(track: GridTrack) -> Floats:
     """(labels, 6, n): weight times the six products of the homogeneous coordinates."""
     x, y = track.points[:, :, 0], track.points[:, :, 1]
     s = (x, y, np.ones_like(x))
@@ -158,26 +174,6 @@ def scan_lags(moments: PairMoments, least_support: float, known: Floats | None =
     if len(which):
         cost[which] = moments.costs(which) if known is None else moments.costs_of(which, known)
     return Scan(moments.offset, moments.support, cost)
-
-
-def significance(scan: Scan, offset: float, achieved: float) -> float | None:
-    """How far the misfit of one alignment stands out from that of all others of like support, in their sigma.
-
-    A search over many lags finds some that fit little motion well; this asks the data themselves how well a
-    wrong lag fits. achieved: squared distance over noise after refinement. None where too few lags compare.
-    """
-    index = int(np.argmin(np.abs(scan.offset - offset)))
-    support = scan.support[index]
-    alike = (scan.support > 0.7 * support) & (scan.support < 1.4 * support) & np.isfinite(scan.cost)
-    alike &= np.abs(scan.offset - offset) > _OWN_LAGS
-    if alike.sum() < _LEAST_ALIKE:
-        return None
-    others = np.log(scan.cost[alike] + _COST_FLOOR)
-    middle = float(np.median(others))
-    spread = (middle - float(np.quantile(others, 0.05))) / 1.645
-    near = scan.cost[max(index - 1, 0) : index + 2].min()
-    own = float(np.log(min(float(near), achieved) + _COST_FLOOR))
-    return (middle - own) / max(spread, 1e-6)
 
 
 def candidates(scan: Scan, per_stratum: int, at_most: int) -> Ints:

@@ -8,10 +8,9 @@ import numpy as np
 
 from hub.points import lookup
 from hub.timing import two_view
-from hub.timing.pair import PairFit, PairSettings, PairSolution
+from hub.timing.alignment import PairFit, PairSettings, PairSolution
 from hub.timing.refine import Noise, PointPairs, Refined, refine
 from hub.timing.tracks import Track
-from protocols.geometry.types import Floats
 
 _LEAST_COMMON = 12
 _CLOSE_PX = 3.0
@@ -54,13 +53,13 @@ def solve_shared_pair(
                 best = fit
     if best is None:
         return PairSolution(*names, "no geometry explains the rows of the same time")
-    distance = np.abs(two_view.sampson(best.pose.essential, a_points, b_points, noise.sigma_a, noise.sigma_b))
+    distance = np.abs(two_view.sampson(best.geometry.matrix, a_points, b_points, noise.sigma_a, noise.sigma_b))
     close = distance * s.sigma_px < _CLOSE_PX
-    front = two_view.in_front(best.pose, a_points[close], b_points[close])
+    front = two_view.in_front(best.geometry, a_points[close], b_points[close])
     result = PairFit(
         rate=1.0,
         offset=0.0,
-        pose=best.pose,
+        geometry=best.geometry,
         cost=best.cost,
         sigma_px=float(np.median(distance)) / 0.6745 * s.sigma_px,
         inliers=float(close.mean()),
@@ -68,7 +67,7 @@ def solve_shared_pair(
         support=float(close.sum()) / 10.0,
         moving_overlap=float(count) / 10.0,
         middle=float(np.median(time)),
-        parallax=_parallax(best.pose, a_points, b_points),
+        parallax=two_view.parallax(best.geometry, a_points, b_points),
     )
     if result.inliers < s.accept_inliers:
         reason = f"only {100 * result.inliers:.0f} % of the {count} common rows agree with one geometry"
@@ -76,9 +75,3 @@ def solve_shared_pair(
     if result.front < s.accept_in_front:
         return PairSolution(*names, "the best geometry puts points behind a camera", result)
     return PairSolution(*names, "ok", result)
-
-
-def _parallax(pose: two_view.RelativePose, a: Floats, b: Floats) -> float:
-    rays_a, rays_b = two_view.homogeneous(a) @ pose.rotation.T, two_view.homogeneous(b)
-    cosine = (rays_a * rays_b).sum(1) / np.linalg.norm(rays_a, axis=1) / np.linalg.norm(rays_b, axis=1)
-    return float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))

@@ -14,7 +14,7 @@ import numpy as np
 
 from hub.points import SampledTrack
 from hub.splines import SplineBasis, fit_spline, stretches
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Ints
 from protocols.session.observations import Track as RawTrack
 
 LONGEST_PAUSE = 43_200.0
@@ -24,8 +24,13 @@ SHORTEST_GAP = 0.2
 GAP_INTERVALS = 3.2
 """… and so are gaps of up to this many median intervals (labels on every fourth frame)."""
 _SPACINGS = (2.5, 4.0, 6.0, 9.0, 14.0)  # knot spacings tried, in median intervals
+_FINE_SPACING = 0.5  # where the widest of those is the best: knots twice as dense as the points, held by
+_FINE_STIFFNESS = (1e-2, 1e-1, 1.0)  # third differences, as strongly as cross-validation wants
+_STIFFNESS = 1e-3  # only closes empty intervals
 _SPACING_LIMITS = (0.06, 0.8)  # s
+_BRIDGED_SPACINGS = 1.5  # a pause in which so smooth a track can't have gone anywhere else
 _NEIGHBOURS = 4
+_JUMP = 3.0  # times the accelerations that a track's faster tenth shows
 _CUT = 4.0  # residuals beyond this many sigma are false detections
 _LEAST_POINTS = 4  # in a stretch
 _NEVER_SUSPECT_PX = 1.5
@@ -53,6 +58,14 @@ class SmoothTrack:
     def at(self, time: Floats, derivative: int = 0) -> Floats:
         """Smoothed normalised coordinates (n, 2) (or their derivative); NaN in gaps."""
         return self.basis.evaluate(self.control, time, derivative)
+
+    def point_and_speed(self, time: Floats) -> tuple[Floats, Floats]:
+        """Smoothed normalised coordinates and their speeds [1/s], (n, 2) each; NaN in gaps."""
+        return self.basis.evaluate_both(self.control, time)
+
+    def scaled(self, factor: float) -> SmoothTrack:
+        """The same track on a clock whose seconds are 1 / ``factor`` of these."""
+        return replace(self, time=self.time * factor, basis=self.basis.scaled(factor))
 
     @property
     def sigma_px(self) -> float:
@@ -85,17 +98,23 @@ def smooth_track(time: Floats, normalised: Floats, focal: float, epoch: float | 
     good = neighbour_test(t, x, floor=_NEVER_SUSPECT_PX / focal)
     interval = float(np.median(np.diff(t)))
     gap = max(SHORTEST_GAP, GAP_INTERVALS * interval)
-    best: tuple[float, SplineBasis, Floats, Bools, float] | None = None
+    jumps = _jumps(t, x, good)
+    best: _Fit | None = None
     for factor in _SPACINGS:
         spacing = float(np.clip(factor * interval, *_SPACING_LIMITS))
-        if best is not None and spacing == best[1].spacing:
+        if best is not None and spacing == best.basis.spacing:
             continue
-        fit = _robust_fit(t, x, good, spacing, gap, focal)
-        if fit is not None and (best is None or fit[0] < best[0]):
+        fit = _robust_fit(t, x, good, jumps, spacing, _STIFFNESS, gap, focal)
+        if fit is not None and (best is None or fit.score < best.score):
             best = fit
+    if best is not None and best.basis.spacing <= max(_SPACINGS[0] * interval, _SPACING_LIMITS[0]):
+        for stiffness in _FINE_STIFFNESS:
+            fit = _robust_fit(t, x, good, jumps, _FINE_SPACING * interval, stiffness, gap, focal)
+            if fit is not None and fit.score < best.score:
+                best = fit
     if best is None:
         return None
-    _, basis, control, inlier, sigma = best
+    basis, control, inlier, sigma = best.basis, best.control, best.inlier, best.sigma
     mask = np.zeros(len(time), dtype=np.bool_)
     mask[rows[inlier]] = True
     return SmoothTrack(origin, t[inlier], x[inlier], mask, basis, control, sigma, focal)
@@ -162,24 +181,57 @@ def neighbour_test(time: Floats, points: Floats, floor: float) -> Bools:
     return np.asarray(score <= limit)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """One spline through a track. score: generalised cross-validation [normalised coordinates squared]."""
+
+    score: float
+    basis: SplineBasis
+    control: Floats
+    inlier: Bools
+    sigma: float
+
+
+def _jumps(t: Floats, x: Floats, good: Bools) -> Floats:
+    """Times (k,) [s] between two points that no motion of this track joins: the detector took up another thing.
+
+    Seen from both sides: what extrapolation misses, taken as an acceleration, is far beyond the track's own.
+    """
+    rows = np.flatnonzero(good)
+    if len(rows) < 2 * _LEAST_POINTS:
+        return np.zeros(0)
+    t, x = t[rows], x[rows]
+    dt, step = np.diff(t), np.diff(x, axis=0)
+    speed = step / dt[:, None]
+    # Between i and i + 1: from the speed before, and from the speed after.
+    bend = np.linalg.norm(np.diff(speed, axis=0), axis=1) / (0.5 * (dt[1:] + dt[:-1]))
+    before, after = bend[:-1], bend[1:]  # of the inner steps 1 … n - 3
+    limit = _JUMP * float(np.quantile(bend, 0.9))
+    where = np.flatnonzero(np.minimum(before, after) > limit) + 1
+    return np.asarray(0.5 * (t[where] + t[where + 1]))
+
+
 def _robust_fit(
-    t: Floats, x: Floats, good: Bools, spacing: float, gap: float, focal: float
-) -> tuple[float, SplineBasis, Floats, Bools, float] | None:
-    """Spline by reweighting: (GCV score, basis, control, inliers, sigma)."""
+    t: Floats, x: Floats, good: Bools, jumps: Floats, spacing: float, stiffness: float, gap: float, focal: float
+) -> _Fit | None:
+    """Spline by reweighting, on stretches that neither long pauses nor jumps cut."""
     inlier = good.copy()
     basis, control, sigma = None, None, np.inf
+    gap = max(gap, _BRIDGED_SPACINGS * spacing)
+    piece = np.searchsorted(jumps, t)
     for step in range(6):
-        inlier &= _in_stretches(t, inlier, gap)
-        if inlier.sum() < 2 * _LEAST_POINTS:
+        inlier &= _in_stretches(t, inlier, gap, piece)
+        count = int(inlier.sum())
+        if count < 2 * _LEAST_POINTS:
             return None
-        begins, ends = stretches(t[inlier], gap)
-        basis = SplineBasis.over(begins, ends, spacing)
-        control = fit_spline(basis, t[inlier], x[inlier], np.ones(int(inlier.sum())), stiffness=1e-3)
+        begins, ends = stretches(t[inlier], gap, piece[inlier])
+        basis = SplineBasis.within(begins, ends, spacing)
+        control = fit_spline(basis, t[inlier], x[inlier], np.ones(count), stiffness=stiffness)
         residual = np.linalg.norm(basis.evaluate(control, t) - x, axis=1)
         counts = np.diff(np.searchsorted(t[inlier], np.r_[begins, np.inf]))
-        freedom = float(np.minimum(counts, basis.intervals + 3).sum())
-        n = float(inlier.sum())
-        left = max(n - freedom, 0.1 * n)
+        freedom = _freedom(counts, basis.intervals + 3, stiffness)
+        n = float(count)
+        left = max(n - freedom, 0.02 * n)
         # Median of a Rayleigh variable: 1.1774 sigma.
         sigma = max(_LEAST_SIGMA_PX / focal, float(np.median(residual[inlier])) / 1.1774 * np.sqrt(n / left))
         with np.errstate(invalid="ignore"):
@@ -191,19 +243,33 @@ def _robust_fit(
         return None
     squared = np.minimum(residual[inlier], _CUT * sigma) ** 2
     kept = float(inlier.sum())
-    score = float(squared.mean()) * (kept / max(kept - freedom, 0.05 * kept)) ** 2
+    score = float(squared.mean()) * (kept / max(kept - freedom, 0.02 * kept)) ** 2
     # A spacing that throws many points away is no better for fitting the rest.
     score *= (float(good.sum()) / kept) ** 2
-    return score, basis, control, inlier, sigma
+    return _Fit(score, basis, control, inlier, sigma)
 
 
-def _in_stretches(t: Floats, inlier: Bools, gap: float) -> Bools:
+def _freedom(points: Ints, controls: Ints, stiffness: float) -> float:
+    """Degrees of freedom of a fit: the trace of its smoother, by frequency as for evenly spaced points.
+
+    points, controls: (s,) of each stretch.
+    """
+    # A third difference passes |2 sin(w / 2)|^6. Where there are fewer points than controls, a track has no
+    # frequencies beyond the points' own; a control then shares in points / controls rows.
+    rows = np.minimum(points / controls, 1.0)[:, None]
+    phase = np.linspace(0.0, np.pi, 65)[1:] * rows
+    share = 1.0 / (1.0 + stiffness * (2.0 * np.sin(0.5 * phase)) ** 6 / np.maximum(points / controls, 1e-9)[:, None])
+    return float((np.minimum(points, controls) * share.mean(axis=1)).sum())
+
+
+def _in_stretches(t: Floats, inlier: Bools, gap: float, piece: Ints) -> Bools:
     """Inliers that hang together with at least a handful of others."""
     out = np.zeros(len(t), dtype=np.bool_)
     rows = np.flatnonzero(inlier)
     if len(rows) == 0:
         return out
-    for part in np.split(rows, np.flatnonzero(np.diff(t[rows]) > gap) + 1):
+    cut = (np.diff(t[rows]) > gap) | (np.diff(piece[rows]) > 0)
+    for part in np.split(rows, np.flatnonzero(cut) + 1):
         if len(part) >= _LEAST_POINTS:
             out[part] = True
     return out

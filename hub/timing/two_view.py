@@ -8,6 +8,7 @@ homogeneous points. The published fundamental matrix is the transpose way round,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -33,9 +34,65 @@ class RelativePose:
         """(3, 3), ``s_bᵀ E s_a = 0``."""
         return np.asarray(so3.hat(self.direction) @ self.rotation)
 
+    @property
+    def matrix(self) -> Floats:
+        """(3, 3), ``s_bᵀ M s_a = 0``: the essential matrix."""
+        return self.essential
+
+    def tangents(self) -> Floats:
+        """(5, 3, 3) derivatives of ``matrix`` by the steps of `moved`."""
+        axes, cross = two_axes_of(self.direction), so3.hat(self.direction)
+        turns = [cross @ so3.hat(axis) @ self.rotation for axis in np.eye(3)]
+        return np.stack(turns + [so3.hat(axis) @ self.rotation for axis in axes])
+
+    def moved(self, step: Floats) -> RelativePose:
+        """After a step (5,): a turn [rad], then the direction along its two tangents."""
+        direction = self.direction + step[3:5] @ two_axes_of(self.direction)
+        return RelativePose(so3.exp(step[:3]) @ self.rotation, direction / np.linalg.norm(direction))
+
     def inverse(self) -> RelativePose:
         """The pose of a from b."""
         return RelativePose(self.rotation.T, -self.rotation.T @ self.direction)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Uncalibrated:
+    """The fundamental matrix ``left diag(cos a, sin a, 0) right`` of two views with unknown lenses.
+
+    left, right: (3, 3) rotations. angle: [rad]. Rank 2 and norm 1 hold at every step.
+    """
+
+    left: Floats
+    right: Floats
+    angle: float
+
+    @classmethod
+    def of(cls, matrix: Floats) -> Uncalibrated:
+        """The nearest rank-2 matrix to (3, 3) ``s_bᵀ M s_a = 0``."""
+        u, d, vt = np.linalg.svd(matrix)
+        u, vt = u * np.sign(np.linalg.det(u)), vt * np.sign(np.linalg.det(vt))
+        return cls(u, vt, float(np.arctan2(d[1], d[0])))
+
+    @property
+    def matrix(self) -> Floats:
+        """(3, 3), ``s_bᵀ M s_a = 0``, norm 1."""
+        return np.asarray((self.left * np.array([np.cos(self.angle), np.sin(self.angle), 0.0])) @ self.right)
+
+    def tangents(self) -> Floats:
+        """(7, 3, 3) derivatives of ``matrix`` by the steps of `moved`."""
+        matrix = self.matrix
+        turns = [so3.hat(axis) @ matrix for axis in np.eye(3)] + [matrix @ so3.hat(axis) for axis in np.eye(3)]
+        along = (self.left * np.array([-np.sin(self.angle), np.cos(self.angle), 0.0])) @ self.right
+        return np.stack([*turns, along])
+
+    def moved(self, step: Floats) -> Uncalibrated:
+        """After a step (7,): turns of the left and of the right rotation [rad], and of the angle."""
+        left, right = so3.exp(step[:3]) @ self.left, self.right @ so3.exp(step[3:6])
+        return Uncalibrated(left, right, self.angle + float(step[6]))
+
+
+Geometry: TypeAlias = RelativePose | Uncalibrated
+"""What two views have in common: with known lenses a pose, without them a fundamental matrix."""
 
 
 def relative_pose(a: Pose, b: Pose) -> RelativePose:
@@ -71,11 +128,22 @@ def triangulate_midpoint(pose: RelativePose, a: Floats, b: Floats) -> tuple[Floa
     return (ab * bt - bb * at) / determinant, (aa * bt - ab * at) / determinant
 
 
-def in_front(pose: RelativePose, a: Floats, b: Floats) -> Bools:
-    """Which point pairs (n,) lie in front of both cameras."""
+def in_front(pose: Geometry, a: Floats, b: Floats) -> Bools:
+    """Which point pairs (n,) lie in front of both cameras; without lenses nothing says that one doesn't."""
+    if isinstance(pose, Uncalibrated):
+        return np.ones(len(a), dtype=np.bool_)
     depth_a, depth_b = triangulate_midpoint(pose, a, b)
     with np.errstate(invalid="ignore"):
         return np.asarray((depth_a > 0) & (depth_b > 0))
+
+
+def parallax(pose: Geometry, a: Floats, b: Floats) -> float:
+    """Median angle [rad] between the two rays of a point, a, b (n, 2) normalised; 0 without lenses."""
+    if isinstance(pose, Uncalibrated) or len(a) == 0:
+        return 0.0
+    rays_a, rays_b = homogeneous(a) @ pose.rotation.T, homogeneous(b)
+    cosine = (rays_a * rays_b).sum(1) / np.linalg.norm(rays_a, axis=1) / np.linalg.norm(rays_b, axis=1)
+    return float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 def decompose(essential: Floats, a: Floats, b: Floats) -> RelativePose:
@@ -144,17 +212,25 @@ def five_point(a: Floats, b: Floats, threshold: float, seed: int, subset: int = 
     return poses
 
 
-def fundamental_from(pose: RelativePose, matrix_a: Floats, matrix_b: Floats) -> Floats:
+def fundamental_from(pose: Geometry, matrix_a: Floats, matrix_b: Floats) -> Floats:
     """Fundamental matrix (3, 3) of undistorted pixels, ``m_aᵀ F m_b = 0``, Frobenius norm 1 (eqs. 4, 5)."""
-    f = np.linalg.inv(matrix_a).T @ pose.essential.T @ np.linalg.inv(matrix_b)
+    f = np.linalg.inv(matrix_a).T @ pose.matrix.T @ np.linalg.inv(matrix_b)
     f = f / np.linalg.norm(f)
     largest = np.unravel_index(int(np.argmax(np.abs(f))), f.shape)
     return np.asarray(f * np.sign(f[largest]))
 
 
+def two_axes_of(direction: Floats) -> Floats:
+    """Two unit vectors (2, 3) orthogonal to ``direction`` (3,) and to each other."""
+    x, y, z = (float(value) for value in direction)
+    # The axis least along the direction, crossed with it.
+    least = min(range(3), key=lambda k: abs((x, y, z)[k]))
+    first = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))[least]
+    length = (first[0] ** 2 + first[1] ** 2 + first[2] ** 2) ** 0.5
+    p, q, r = (value / length for value in first)
+    return np.array([[p, q, r], [y * r - z * q, z * p - x * r, x * q - y * p]])
+
+
 def tangent_basis(direction: Floats) -> Floats:
     """Two unit vectors (3, 2) orthogonal to ``direction`` (3,) and to each other."""
-    other = np.eye(3)[int(np.argmin(np.abs(direction)))]
-    first = np.cross(direction, other)
-    first /= np.linalg.norm(first)
-    return np.column_stack([first, np.cross(direction, first)])
+    return two_axes_of(direction).T

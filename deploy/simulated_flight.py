@@ -1,0 +1,120 @@
+"""Writes a flight over the simulated town: video, rig and telemetry as a user has them, and the truth beside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import tomli_w
+
+from edge.uav.tracker import Telemetry
+from edge.uav.world import scenarios
+from edge.uav.world.world import World
+from protocols.errors import InputError
+from protocols.files import write_together
+from protocols.geometry import so3
+from protocols.session.folder import RIG_FILE
+
+TOWN = "town"
+VIDEO_FILE, FRAMES_FOLDER, TELEMETRY_FILE, TRUTH_FILE = "video.mp4", "frames", "telemetry.csv", "truth.csv"
+_USUAL = "exit-bend"
+_CAMERA = "drone"
+_CODEC = "mp4v"  # MPEG-4 part 2: in every build of OpenCV with FFmpeg
+_JPEG_QUALITY = 95
+
+
+def write_simulated_flight(
+    scene: str, out: Path, *, seed: int, frames: int | None, size: tuple[int, int], rate_hz: float
+) -> dict[str, Any]:
+    """Fly a scenario and write its folder; returns counts, the target's first box and the telemetry's true offset.
+
+    scene: ``town`` or ``town:scenario``. frames: out of the picture. rate_hz: of the telemetry. Raises InputError.
+    """
+    world = scenarios.get(scene.partition(":")[2] or _USUAL, seed, size, frames)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        video = _write_video(world, out)
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror}", file=out, remedy="choose another --out") from None
+    samples = world.telemetry(rate_hz, time_offset=None)
+    write_together(
+        {
+            out / RIG_FILE: tomli_w.dumps(_rig(world)),
+            out / TELEMETRY_FILE: _telemetry(samples),
+            out / TRUTH_FILE: _truth(world),
+        }
+    )
+    box = world.truth(0).box
+    return {
+        "scene": f"{TOWN}:{world.name}",
+        "seed": seed,
+        "video": str(video),
+        "frames": world.length,
+        "out_of_picture": list(world.out),
+        "target": [round(value, 1) for value in (box.x, box.y, box.width, box.height)],
+        "telemetry_offset": world.time_offset,
+    }
+
+
+def _write_video(world: World, out: Path) -> Path:
+    """The video, or where OpenCV cannot encode one, a folder of JPEGs."""
+    partial = out / f".partial.{VIDEO_FILE}"
+    writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*_CODEC), world.fps, world.size)
+    if writer.isOpened():
+        for i in range(world.length):
+            writer.write(world.frame(i))
+        writer.release()
+        partial.replace(out / VIDEO_FILE)
+        return out / VIDEO_FILE
+    partial.unlink(missing_ok=True)
+    folder = out / FRAMES_FOLDER
+    folder.mkdir(exist_ok=True)
+    for i in range(world.length):
+        _, data = cv2.imencode(".jpg", world.frame(i), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+        (folder / f"{i:06d}.jpg").write_bytes(data.tobytes())
+    return folder
+
+
+def _rig(world: World) -> dict[str, Any]:
+    width, height = world.size
+    table = {
+        "name": _CAMERA,
+        "size": [width, height],
+        "fps": world.fps,
+        "matrix": world.lens.matrix.tolist(),
+        "distortions": world.lens.distortions.tolist(),
+        "body_from_camera": world.body_from_camera.tolist(),
+    }
+    return {_CAMERA: table, "metadata": {"name": f"{TOWN}:{world.name}", "units": "m"}}
+
+
+def _telemetry(samples: list[Telemetry]) -> str:
+    """time, quaternion ned_from_body, north, east, down; one row a sample."""
+    lines = ["time,qw,qx,qy,qz,north,east,down"]
+    for sample in samples:
+        turn = so3.log(sample.ned_from_body)
+        angle = float(np.linalg.norm(turn))
+        quaternion = np.r_[np.cos(0.5 * angle), 0.5 * np.sinc(0.5 * angle / np.pi) * turn]
+        place = np.full(3, np.nan) if sample.position is None else sample.position
+        lines.append(_row(sample.time, *quaternion, *place))
+    return "\n".join(lines) + "\n"
+
+
+def _truth(world: World) -> str:
+    """One row a frame; the camera's pose as centre (NED) and Rodrigues vector, camera from NED."""
+    lines = [
+        "frame,time,x,y,width,height,heading,inside,visible,north,east,speed,course,"
+        "camera_north,camera_east,camera_down,camera_rx,camera_ry,camera_rz"
+    ]
+    for i in range(world.length):
+        t = world.truth(i)
+        numbers = (t.time, t.x, t.y, t.width, t.height, t.heading, t.inside, t.visible)
+        ground = (t.north, t.east, t.speed, t.course)
+        lines.append(f"{i}," + _row(*numbers, *ground, *t.camera.position, *t.camera.rodrigues))
+    return "\n".join(lines) + "\n"
+
+
+def _row(*numbers: float) -> str:
+    return ",".join(f"{number:.17g}" for number in numbers)

@@ -1,0 +1,247 @@
+"""Offline tracking of one car: pictures and telemetry in, track.csv and hypotheses.csv out."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edge.devices.recording import IMAGE_SUFFIXES, Recording
+from edge.uav.tracker import Box, Estimate, Image, State, Telemetry, Tracker
+from protocols.clocks import NANOSECONDS
+from protocols.errors import InputError
+from protocols.geometry.types import Floats
+from protocols.session.rig import RigCamera, read_rig
+
+TRACK, HYPOTHESES, OVERLAY = "track.csv", "hypotheses.csv", "overlay.mp4"
+COLUMNS = ("frame", "time", "state", "x", "y", "width", "height", "heading", "std")
+GROUND_COLUMNS = ("north", "east", "speed", "course", "std_m")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_POSITION = ("north", "east", "down")
+_AHEAD_S = 0.6  # a file's samples are handed over that much early: the clocks may differ by half a second
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """One frame's answer. frame: 0-based index of the decoded frame. time: [s], 0 = the video's first frame."""
+
+    frame: int
+    time: float
+    estimate: Estimate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TelemetryFile:
+    """samples: by time, strictly increasing. left_out: rows that held no sample (NaN, no rotation, repeated time)."""
+
+    samples: tuple[Telemetry, ...]
+    left_out: int
+
+
+def parse_target(text: str) -> Box:
+    """The box of ``x,y,w,h``. Raises InputError."""
+    remedy = "give --target x,y,w,h in pixels, x,y the top left, as in 312,200,44,20"
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"--target {text!r} is not four numbers", remedy=remedy) from None
+    if len(values) != 4 or not all(math.isfinite(value) for value in values):
+        raise InputError(f"--target {text!r} is not four finite numbers", remedy=remedy)
+    if values[2] <= 0 or values[3] <= 0:
+        raise InputError(f"--target {text!r} has no width or height", remedy=remedy)
+    return Box(*values)
+
+
+def choose_camera(rig_file: Path, video: Path) -> RigCamera:
+    """The camera of a rig file that took this video: the only one, or the one of the video's name."""
+    rig = read_rig(rig_file)
+    if len(rig.cameras) == 1:
+        return next(iter(rig.cameras.values()))
+    if video.stem in rig.cameras:
+        return rig.cameras[video.stem]
+    names = ", ".join(rig.cameras)
+    raise InputError(f"knows cameras {names}, none named {video.stem}", file=rig_file, remedy="keep one of them")
+
+
+def read_telemetry(file: Path) -> TelemetryFile:
+    """Read telemetry.csv: time,qw,qx,qy,qz[,north,east,down]; the quaternion is ned_from_body.
+
+    Rows with NaN, empty cells, no rotation or a time already seen are left out and counted.
+    Raises InputError: file, line, what, remedy.
+    """
+    if file.suffix.lower() in (".tlog", ".mcap", ".bin"):
+        remedy = "export it to a telemetry.csv with time,qw,qx,qy,qz[,north,east,down]"
+        raise InputError(f"{file.suffix} telemetry can't be read by this version", file=file, remedy=remedy)
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError("this telemetry file does not exist", file=file, remedy="check the path") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read: {error}", file=file, remedy="save it as UTF-8 CSV") from None
+    reader = csv.reader(io.StringIO(text), strict=True)
+    try:
+        header = [cell.strip() for cell in next(reader, [])]
+        missing = [name for name in ("time", *_QUATERNION) if name not in header]
+        if missing:
+            remedy = "the first line must name time,qw,qx,qy,qz[,north,east,down]"
+            raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)
+        placed = all(name in header for name in _POSITION)
+        wanted = [header.index(name) for name in ("time", *_QUATERNION, *(_POSITION if placed else ()))]
+        found: list[Floats] = []
+        left_out = 0
+        for row in reader:
+            if not any(cell.strip() for cell in row):
+                continue
+            values = _numbers(row, wanted, file, reader.line_num)
+            if np.isfinite(values[:5]).all() and 0.5 < np.linalg.norm(values[1:5]) < 2.0:
+                found.append(values)
+            else:
+                left_out += 1
+    except csv.Error as error:
+        raise InputError(f"not CSV: {error}", file=file, line=reader.line_num, remedy="correct this row") from None
+    if not found:
+        raise InputError("no usable row", file=file, line=1, remedy="record telemetry with attitude quaternions")
+    table = np.array(found)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    fresh = np.r_[True, np.diff(table[:, 0]) > 0]
+    left_out += int((~fresh).sum())
+    return TelemetryFile(tuple(_sample(row) for row in table[fresh]), left_out)
+
+
+def _sample(row: Floats) -> Telemetry:
+    """A row: time, quaternion, and position if it is there."""
+    position = row[5:8].copy() if len(row) == 8 and np.isfinite(row[5:8]).all() else None
+    return Telemetry(float(row[0]), _rotation(row[1:5]), position)
+
+
+def _numbers(row: list[str], wanted: Sequence[int], file: Path, line: int) -> Floats:
+    """Some of a row's cells; empty ones are NaN."""
+    if len(row) <= max(wanted):
+        what = f"{len(row)} cells where {max(wanted) + 1} are needed"
+        raise InputError(what, file=file, line=line, remedy="correct this row")
+    values = []
+    for index in wanted:
+        cell = row[index].strip()
+        try:
+            values.append(float(cell) if cell else math.nan)
+        except ValueError:
+            remedy = "give a number, or leave it empty"
+            raise InputError(f"{cell!r} is not a number", file=file, line=line, remedy=remedy) from None
+    return np.array(values, dtype=np.float64)
+
+
+def _rotation(quaternion: Floats) -> Floats:
+    """ned_from_body (3, 3) of a quaternion w, x, y, z."""
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def check_clock(telemetry: TelemetryFile, file: Path, start: float, end: float) -> None:
+    """Raise InputError where no sample lies in the video's time: then its clock is another one."""
+    times = [sample.time for sample in telemetry.samples]
+    if times[0] > end + 1.0 or times[-1] < start - 1.0:
+        what = f"times {times[0]:.1f} to {times[-1]:.1f} s, but the video's are {start:.1f} to {end:.1f} s"
+        raise InputError(what, file=file, remedy="give times on the video's clock, 0 = its first frame")
+
+
+def count_frames(video: Path) -> int:
+    """Frames that a video or folder says it has; 0 where it does not tell."""
+    if video.is_dir():
+        return sum(1 for path in video.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    capture = cv2.VideoCapture(str(video))
+    count = capture.get(cv2.CAP_PROP_FRAME_COUNT) if capture.isOpened() else 0.0
+    capture.release()
+    return int(count) if math.isfinite(count) and 0 < count < 1e9 else 0
+
+
+def follow(
+    recording: Recording,
+    tracker: Tracker,
+    target: Box,
+    *,
+    start: int = 0,
+    telemetry: Sequence[Telemetry] = (),
+    show: Callable[[Image, Tracked], None] | None = None,
+    tell: Callable[[int], None] | None = None,
+) -> Iterator[Tracked]:
+    """Run a tracker over an opened recording, from frame ``start`` on.
+
+    show: called with every picture and its answer. tell: called with the index of every decoded frame.
+    Raises InputError where the recording ends before ``start``, and what the tracker says of the target.
+    """
+    waiting = iter(telemetry)
+    sample = next(waiting, None)
+    first: float | None = None
+    count = 0
+    while (frame := recording.read(0.0)) is not None:
+        moment = frame.device_time_ns / NANOSECONDS
+        first = moment if first is None else first
+        time = moment - first
+        if tell is not None:
+            tell(count)
+        if count >= start:
+            while sample is not None and sample.time <= time + _AHEAD_S:
+                tracker.handle_telemetry(sample)
+                sample = next(waiting, None)
+            if count == start:
+                estimate = tracker.begin(frame.image, time, target)
+            else:
+                estimate = tracker.handle_frame(frame.image, time)
+            tracked = Tracked(count, time, estimate)
+            if show is not None:
+                show(frame.image, tracked)
+            yield tracked
+        count += 1
+    if count <= start:
+        what = f"the video ends after {count} frames, before --start {start}"
+        raise InputError(what, remedy="give a smaller --start")
+
+
+def without_layers(row: Tracked) -> Tracked:
+    """The answer without what only overlays need."""
+    return replace(row, estimate=replace(row.estimate, particles=None, layers={}))
+
+
+def track_text(rows: Sequence[Tracked]) -> str:
+    """track.csv; the ground's columns only where any frame has them."""
+    metric = any(math.isfinite(row.estimate.north) for row in rows)
+    lines = [",".join(COLUMNS + (GROUND_COLUMNS if metric else ()))]
+    for row in rows:
+        e = row.estimate
+        lost = e.state is State.LOST
+        place = ["", ""] if lost else [_cell(e.x), _cell(e.y)]
+        cells = [str(row.frame), _cell(row.time), e.state.value, *place]
+        cells += [_cell(value) for value in (e.width, e.height, e.heading, e.std)]
+        if metric:
+            cells += [_cell(value) for value in (e.north, e.east, e.speed, e.course, e.std_m)]
+        lines.append(",".join(cells))
+    return "\n".join(lines) + "\n"
+
+
+def hypotheses_text(rows: Sequence[Tracked]) -> str:
+    """hypotheses.csv: the frames in which more than one place is held, the likeliest first."""
+    lines = ["frame,rank,weight,x,y"]
+    for row in rows:
+        ranked = sorted(row.estimate.hypotheses, key=lambda hypothesis: -hypothesis.weight)
+        if len(ranked) < 2:
+            continue
+        for rank, hypothesis in enumerate(ranked):
+            cells = (_cell(value) for value in (hypothesis.weight, hypothesis.x, hypothesis.y))
+            lines.append(",".join((str(row.frame), str(rank), *cells)))
+    return "\n".join(lines) + "\n"
+
+
+def _cell(value: float) -> str:
+    return f"{value:.17g}" if math.isfinite(value) else ""

@@ -1,0 +1,265 @@
+"""The cloud of particles: cars on the ground that drive freely while the target is seen and along ways while not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from edge.uav.ground.camera import transfer
+from edge.uav.ground.history import MotionFit
+from edge.uav.ground.ways import Way
+from edge.uav.particles import AdaptiveNumber, effective_sample_size, systematic
+from protocols.geometry.types import Floats, Ints
+
+FREE = -1
+"""Of a particle that follows no way."""
+_SIDEWAYS = 6.5  # acceleration that a driver accepts in a bend [units/s²]
+_FASTEST = 60.0
+_UNKNOWN_BEND = 0.008  # std of the curvature of road that was never seen [1/unit]
+_GOES_ON = 0.5  # of the acceleration at the last sighting
+_MOOD_S = 1.5  # how long a change of speed lasts
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """n cars. place: (n, 2) ground; heading, speed, acceleration, curvature: (n,); weights: (n,), sum 1.
+
+    way: (n,) index of the way that each follows, or FREE; along, across: (n,) its place on it.
+    """
+
+    place: Floats
+    heading: Floats
+    speed: Floats
+    acceleration: Floats
+    curvature: Floats
+    way: Ints
+    along: Floats
+    across: Floats
+    weights: Floats
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    def take(self, index: Ints) -> Cloud:
+        """The particles of an index (m,), of equal weight."""
+        return Cloud(
+            self.place[index],
+            self.heading[index],
+            self.speed[index],
+            self.acceleration[index],
+            self.curvature[index],
+            self.way[index],
+            self.along[index],
+            self.across[index],
+            np.full(len(index), 1.0 / len(index)),
+        )
+
+    def weighted(self, likelihood: Floats) -> Cloud:
+        """Eq. (2.1): weights times likelihoods (n,), normalised."""
+        weights = self.weights * likelihood
+        total = float(weights.sum())
+        if not (np.isfinite(total) and total > 1e-290):
+            return self
+        return replace(self, weights=weights / total)
+
+    def resampled(self, rng: np.random.Generator, number: AdaptiveNumber) -> Cloud:
+        """Low-variance resampling where the effective size fell below half; as many as the spread needs."""
+        n = len(self)
+        if effective_sample_size(self.weights) > 0.5 * n:
+            return self
+        chosen = systematic(self.weights, n, rng)
+        wanted = number.of(self.place[chosen])
+        if wanted != n:
+            chosen = systematic(self.weights, wanted, rng)
+        return self.take(chosen)
+
+    def free(self) -> Cloud:
+        """All off their ways."""
+        return replace(self, way=np.full(len(self), FREE))
+
+    def moved(self, new_from_old: Floats) -> Cloud:
+        """Into another ground frame."""
+        place = transfer(new_from_old, self.place)
+        ahead = transfer(new_from_old, self.place + 0.5 * np.column_stack([np.cos(self.heading), np.sin(self.heading)]))
+        step = ahead - place
+        scale = np.hypot(step[:, 0], step[:, 1]) / 0.5
+        return replace(
+            self,
+            place=place,
+            heading=np.arctan2(step[:, 1], step[:, 0]),
+            speed=self.speed * scale,
+            acceleration=self.acceleration * scale,
+            curvature=self.curvature / np.maximum(scale, 1e-6),
+            way=np.full(len(self), FREE),
+        )
+
+
+def scattered(place: Floats, std: float, count: int, rng: np.random.Generator) -> Cloud:
+    """A cloud about a place (2,) that knows nothing of the motion yet."""
+    zeros = np.zeros(count)
+    return Cloud(
+        place + rng.normal(0.0, std, (count, 2)),
+        rng.uniform(-np.pi, np.pi, count),
+        np.abs(rng.normal(0.0, 14.0, count)),
+        zeros,
+        zeros,
+        np.full(count, FREE),
+        zeros,
+        zeros,
+        np.full(count, 1.0 / count),
+    )
+
+
+def drawn(fit: MotionFit, place: Floats, std: float, count: int, rng: np.random.Generator) -> Cloud:
+    """A cloud about a place (2,) with the motion of a fit, as uncertain as the fit is."""
+    velocity = fit.velocity + rng.normal(0.0, fit.velocity_std, (count, 2))
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    heading = np.arctan2(velocity[:, 1], velocity[:, 0])
+    shrink = 1.0 / (1.0 + np.square(fit.acceleration_std / 2.0))
+    along = _GOES_ON * shrink * fit.along + rng.normal(0.0, min(fit.acceleration_std, 1.0), count)
+    curvature = np.full(count, fit.turn_rate / max(fit.speed, 2.0)) + rng.normal(0.0, 0.01, count)
+    return Cloud(
+        place + rng.normal(0.0, std, (count, 2)),
+        heading,
+        speed,
+        along,
+        np.clip(curvature, -0.15, 0.15),
+        np.full(count, FREE),
+        np.zeros(count),
+        np.zeros(count),
+        np.full(count, 1.0 / count),
+    )
+
+
+def driven(cloud: Cloud, dt: float, ways: list[Way], seen: bool, rng: np.random.Generator) -> Cloud:
+    """One step of eqs. (2.3) to (2.5) in ground units: place by speed and heading, both of which wander.
+
+    seen: while the target is seen it may do anything; while not, it keeps its speed but for slow changes.
+    """
+    n = len(cloud)
+    root = np.sqrt(max(dt, 1e-4))
+    fade = np.exp(-dt / (0.7 if seen else _MOOD_S))
+    acceleration = cloud.acceleration * fade
+    wander = 2.5 if seen else 0.8
+    speed = cloud.speed + acceleration * dt + wander * root * rng.normal(size=n)
+    speed = np.clip(speed, 0.0, _FASTEST)
+    free = cloud.way == FREE
+    swerve = cloud.curvature * np.exp(-dt / 1.2) + (0.0 if seen else 0.02 * root) * rng.normal(size=n)
+    curvature = np.where(free, swerve, cloud.curvature)
+    nimble = np.minimum(1.0, 0.1 + speed / 4.0)
+    turn = curvature * speed * dt + (0.4 if seen else 0.08) * root * nimble * rng.normal(size=n)
+    heading = cloud.heading + np.where(free, turn, 0.0)
+    middle = cloud.heading + 0.5 * np.where(free, turn, 0.0)
+    step = (speed * dt)[:, None] * np.column_stack([np.cos(middle), np.sin(middle)])
+    place = cloud.place + step + (0.04 if seen else 0.02) * rng.normal(size=(n, 2))
+    along = cloud.along + speed * dt
+    across = cloud.across + (0.0 if seen else 0.2) * root * rng.normal(size=n)
+    for k, way in enumerate(ways):
+        on = cloud.way == k
+        if not on.any():
+            continue
+        bend = np.abs(way.curvature(cloud.along[on] + 4.0))
+        limit = np.sqrt(_SIDEWAYS / np.maximum(bend, 1e-3))
+        excess = np.maximum(speed[on] - limit, 0.0)
+        speed[on] = speed[on] - np.minimum(excess, 3.5 * dt)
+        along[on] = cloud.along[on] + speed[on] * dt
+        # Past the known road nobody knows how it bends: each particle has its own idea.
+        past = np.maximum(along[on] - way.known, 0.0)
+        place[on], heading[on] = way.at(along[on], across[on] + 0.5 * curvature[on] * np.square(past))
+        heading[on] += curvature[on] * past
+    return Cloud(place, heading, speed, acceleration, curvature, cloud.way, along, across, cloud.weights)
+
+
+def on_ways(cloud: Cloud, ways: list[Way], share: float, rng: np.random.Generator) -> Cloud:
+    """Put a share of the particles on ways that begin where they are, each way by its weight."""
+    n = len(cloud)
+    start, heading = ways[0].points[0], ways[0].headings[0]
+    local = cloud.place - start
+    along = local @ np.array([np.cos(heading), np.sin(heading)])
+    across = local @ np.array([-np.sin(heading), np.cos(heading)])
+    edges = np.cumsum([way.weight for way in ways])
+    drawn_way = np.minimum(np.searchsorted(edges, rng.random(n)), len(ways) - 1)
+    free = rng.random(n) >= share
+    bend = np.where(free, cloud.curvature, rng.normal(0.0, _UNKNOWN_BEND, n))
+    return replace(cloud, way=np.where(free, FREE, drawn_way), along=along, across=across, curvature=bend)
+
+
+def rerouted(cloud: Cloud, old: list[Way], new: list[Way], rng: np.random.Generator) -> Cloud:
+    """Go over to ways that were traced again from the same start; a new way gets its share of who can still take it."""
+    follows = np.full(len(old), 0, dtype=np.int64)
+    claimed = np.zeros(len(new), bool)
+    for k, way in enumerate(old):
+        gaps = []
+        for other in new:
+            m = min(len(way.points), len(other.points))
+            gaps.append(float(np.linalg.norm(way.points[:m] - other.points[:m], axis=1).mean()))
+        follows[k] = int(np.argmin(gaps))
+        claimed[follows[k]] = True
+    way = np.where(cloud.way == FREE, FREE, follows[np.maximum(cloud.way, 0)])
+    for k, other in enumerate(new):
+        if claimed[k] or k == 0:
+            continue
+        base = new[0]
+        m = min(len(base.points), len(other.points))
+        apart = np.linalg.norm(base.points[:m] - other.points[:m], axis=1) > 2.0
+        leaves = float(np.argmax(apart)) * 1.5 if apart.any() else 0.0
+        can = (way == 0) & (cloud.along < leaves)
+        takes = can & (rng.random(len(cloud)) < other.weight / (other.weight + base.weight))
+        way = np.where(takes, k, way)
+    return replace(cloud, way=way)
+
+
+def pulled(cloud: Cloud, fit: MotionFit, ahead: float, strength: float, rng: np.random.Generator) -> Cloud:
+    """Motion drawn towards a fit, ``ahead`` seconds after it: an error at the exit grows linearly with time."""
+    velocity = fit.velocity + fit.acceleration * ahead + rng.normal(0.0, fit.velocity_std, (len(cloud), 2))
+    own = cloud.speed[:, None] * np.column_stack([np.cos(cloud.heading), np.sin(cloud.heading)])
+    mixed = own + strength * (velocity - own)
+    slow = float(np.hypot(*fit.velocity)) < 0.7
+    heading = cloud.heading if slow else np.arctan2(mixed[:, 1], mixed[:, 0])
+    return replace(cloud, speed=np.hypot(mixed[:, 0], mixed[:, 1]), heading=heading)
+
+
+def launched(cloud: Cloud, fit: MotionFit, ahead: float, count: int, rng: np.random.Generator) -> Cloud:
+    """The cloud that loses sight of its target: places as they are, motion of the fit, as uncertain as it is."""
+    chosen = cloud.take(systematic(cloud.weights, count, rng))
+    sent = drawn(fit, np.zeros(2), 0.0, count, rng)
+    if fit.speed < 0.7:
+        return replace(chosen, speed=sent.speed, acceleration=0.0 * sent.acceleration, way=sent.way)
+    acceleration = sent.acceleration + _moods(count, rng)
+    return replace(
+        chosen,
+        heading=sent.heading,
+        speed=np.maximum(sent.speed + sent.acceleration * ahead, 0.0),
+        acceleration=acceleration,
+        curvature=sent.curvature,
+        way=sent.way,
+    )
+
+
+def _moods(count: int, rng: np.random.Generator) -> Floats:
+    """What drivers do next (count,) [units/s²]: most go on, some change their speed, a few brake for a light."""
+    kind = rng.random(count)
+    changing, braking = rng.normal(0.0, 2.0, count), rng.uniform(-6.0, -1.0, count)
+    going = rng.normal(0.0, 0.3, count)
+    return np.where(kind < 0.68, going, np.where(kind < 0.92, changing, braking))
+
+
+def joined(
+    cloud: Cloud, place: Floats, motion: tuple[Floats, float], weight: float, rng: np.random.Generator
+) -> Cloud:
+    """The cloud with some particles instead of others: about a place (2,), with a velocity (2,) and its std."""
+    n = max(len(cloud) // 20, 8)
+    velocity = motion[0] + rng.normal(0.0, motion[1], (n, 2))
+    new = scattered(place, 0.3, n, rng)
+    speed, heading = np.hypot(velocity[:, 0], velocity[:, 1]), np.arctan2(velocity[:, 1], velocity[:, 0])
+    new = replace(new, speed=speed, heading=heading, weights=np.full(n, weight / n))
+    parts = ((getattr(cloud, f.name), getattr(new, f.name)) for f in fields(Cloud))
+    whole = Cloud(*(np.concatenate(pair) for pair in parts))
+    return replace(whole, weights=whole.weights / whole.weights.sum())
+
+
+def gathered(cloud: Cloud, place: Floats, std: float, rng: np.random.Generator) -> Cloud:
+    """The cloud of a target that was found again: about its place (2,), with the motion that led there."""
+    chosen = cloud.take(systematic(cloud.weights, len(cloud), rng))
+    return replace(chosen, place=place + rng.normal(0.0, std, (len(cloud), 2)), way=np.full(len(cloud), FREE))

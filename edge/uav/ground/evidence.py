@@ -1,0 +1,92 @@
+"""What a frame says about every particle: the candidates that were found, and that elsewhere none was."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge.uav.ground.appearance import Candidate
+from edge.uav.ground.cloud import Cloud
+from edge.uav.ground.tracklets import Tracklet
+from protocols.geometry.types import Floats
+
+_SLOPE, _MIDDLE = 14.0, 0.62  # of the log-likelihood ratio of target against clutter over the score
+_LEAST, _MOST = -6.0, 5.0
+_CLUTTER = 0.01  # candidates that are not the target [1/unit²]
+_BELIEVE = 0.7  # posterior of a candidate from which it is taken for the target
+_SCORE = 0.45  # and its least score; after a while unseen:
+_SCORE_AGAIN = 0.6
+_SHAPE_AGAIN = 0.45
+_PATIENT = 25.0  # most that one frame says for a place where it is found again: a look-alike soon drives elsewhere
+_UNKNOWN_MOTION = 3.0  # the same before its motion is known
+_MOTION_STD = 1.5  # of a particle's velocity, one coordinate [units/s]
+_CUT = 0.42  # least share of it in the picture
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """best: the candidate that is the target, or None. sureness: its posterior. likelihood: (n,) of the particles.
+
+    crowded: whether something similar stands beside it.
+    """
+
+    best: Candidate | None
+    sureness: float
+    likelihood: Floats | None
+    crowded: bool
+
+    @classmethod
+    def nothing(cls) -> Verdict:
+        """Nothing was looked at."""
+        return cls(None, 0.0, None, False)
+
+
+def judge(
+    cloud: Cloud,
+    candidates: Sequence[Candidate],
+    tracklets: Sequence[Tracklet],
+    chance: Floats,
+    noise: Callable[[float], float],
+    length: float,
+    again: bool,
+) -> Verdict:
+    """Weigh particles by candidates: p = 1 - c + c sum_j r_j N(z_j; x, R) / clutter.
+
+    chance: (n,) c, the chance that the target would have been found if it were at the particle. noise: std of a
+    sighting by the share that is seen. length: the target's. again: the target has been out of sight for a while:
+    one frame then says less, its shape must fit too, and it must be seen to move as the particles do.
+    """
+    gain = np.zeros((len(candidates), len(cloud)))
+    velocity = cloud.speed[:, None] * np.column_stack([np.cos(cloud.heading), np.sin(cloud.heading)])
+    for j, candidate in enumerate(candidates):
+        std = noise(candidate.seen) * (1.5 if again else 1.0) + (0.1 if again else 0.0)
+        squared = np.square(cloud.place - candidate.ground).sum(axis=1) / std**2
+        ratio = np.exp(np.clip(_SLOPE * (candidate.score - _MIDDLE), _LEAST, _MOST))
+        peak = 0.9 * ratio / (2 * np.pi * std**2) / _CLUTTER
+        if again:
+            motion = tracklets[j].velocity()
+            if motion is None:
+                peak = min(peak, _UNKNOWN_MOTION)
+            else:
+                peak = min(peak, _PATIENT)
+                off = velocity - motion[0]
+                squared = squared + np.square(off).sum(axis=1) / (motion[1] ** 2 + _MOTION_STD**2)
+        gain[j] = peak * np.exp(-0.5 * np.minimum(squared, 50.0))
+    none = 1.0 - chance
+    likelihood = none + gain.sum(axis=0)
+    if not len(candidates):
+        return Verdict(None, 0.0, likelihood, False)
+    mass = gain @ cloud.weights
+    posterior = mass / (mass.sum() + float(cloud.weights @ none))
+    k = int(np.argmax(posterior))
+    best = candidates[k]
+    crowded = any(
+        other is not best and other.score > 0.6 and np.linalg.norm(other.ground - best.ground) < 1.3 * length
+        for other in candidates
+    )
+    good = posterior[k] > _BELIEVE and best.score > (_SCORE_AGAIN if again else _SCORE) and best.seen > _CUT
+    if again:
+        good &= best.shape > _SHAPE_AGAIN and tracklets[k].age >= 3
+    return Verdict(best if good else None, float(posterior[k]), likelihood, crowded)

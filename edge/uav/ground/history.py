@@ -1,0 +1,136 @@
+"""Where the target was seen lately, and the motion that fits it: what the speed is pulled to."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge.uav.ground.camera import transfer
+from protocols.geometry.types import Floats
+
+_SPAN_S = 0.9
+_MOST = 40
+_RECENT_S = 0.5
+_BETTER = 0.4  # of a sighting's std is what differs from frame to frame; the rest is common to all
+_ACCELERATION_STD = 3.5  # of a car, along each axis [units/s²]
+_SPEED_STD = 15.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionFit:
+    """The target's motion at the last sighting.
+
+    position, velocity, acceleration: (2,) ground units and seconds. velocity_std, acceleration_std: of one
+    coordinate. residual: of the sightings, one coordinate. samples: how many.
+    """
+
+    time: float
+    position: Floats
+    velocity: Floats
+    acceleration: Floats
+    velocity_std: float
+    acceleration_std: float
+    residual: float
+    samples: int
+
+    @property
+    def speed(self) -> float:
+        return float(np.hypot(*self.velocity))
+
+    @property
+    def heading(self) -> float:
+        return float(np.arctan2(self.velocity[1], self.velocity[0]))
+
+    @property
+    def along(self) -> float:
+        """Acceleration along the heading."""
+        return float(self.acceleration @ self.velocity) / max(self.speed, 1e-6)
+
+    @property
+    def turn_rate(self) -> float:
+        """d heading / dt [rad/s]; 0 for what hardly moves."""
+        if self.speed < 1.0:
+            return 0.0
+        v, a = self.velocity, self.acceleration
+        return float(v[0] * a[1] - v[1] * a[0]) / self.speed**2
+
+
+class Sightings:
+    """Measured places of the target on the ground, the last second of them."""
+
+    def __init__(self) -> None:
+        self._times: deque[float] = deque(maxlen=_MOST)
+        self._places: deque[Floats] = deque(maxlen=_MOST)
+        self._stds: deque[float] = deque(maxlen=_MOST)
+        self._prior: tuple[Floats, float] | None = None
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def add(self, time: float, place: Floats, std: float) -> None:
+        """One sighting: (2,) ground, std of one coordinate."""
+        self._times.append(time)
+        self._places.append(np.asarray(place, dtype=np.float64))
+        self._stds.append(std)
+
+    def begin_anew(self, velocity: Floats, std: float) -> None:
+        """After a gap: only what is seen from now on counts, with a prior for the velocity (2,)."""
+        self._times.clear()
+        self._places.clear()
+        self._stds.clear()
+        self._prior = (np.asarray(velocity, dtype=np.float64), std)
+
+    def moved(self, new_from_old: Floats) -> None:
+        """Into another ground frame."""
+        if self._places:
+            places = transfer(new_from_old, np.array(self._places))
+            self._places = deque(list(places), maxlen=_MOST)
+        self._prior = None
+
+    def travelled(self) -> float:
+        """Distance between the first and the last sighting held."""
+        return float(np.linalg.norm(self._places[-1] - self._places[0])) if len(self._places) > 1 else 0.0
+
+    def places(self) -> Floats:
+        """(n, 2), the oldest first."""
+        return np.array(self._places).reshape(-1, 2)
+
+    def fit(self) -> MotionFit | None:
+        """Least squares of place, velocity and a modest acceleration over the last second; None with < 3."""
+        if len(self._times) < 3:
+            return None
+        times = np.array(self._times)
+        recent = times >= times[-1] - _SPAN_S
+        t = times[recent] - times[-1]
+        if len(t) < 3 or t[-1] - t[0] < 0.05:
+            return None
+        places = np.array(self._places)[recent]
+        stds = np.array(self._stds)[recent]
+        mean, spread = self._prior or (np.zeros(2), _SPEED_STD)
+        design = np.column_stack([np.ones_like(t), t, 0.5 * t * t])
+        information = np.diag([1e-8, 1.0 / spread**2, 1.0 / _ACCELERATION_STD**2])
+        right0 = np.zeros((3, 2))
+        right0[1] = mean / spread**2
+        # The newest count most: drivers brake and steer within a second.
+        stds = np.maximum(stds * _BETTER, 1e-3) * np.exp(-0.5 * t / _RECENT_S)
+        weight = 1.0 / np.square(stds)
+        for _ in range(3):
+            normal = (design * weight[:, None]).T @ design + information
+            solution = np.linalg.solve(normal, (design * weight[:, None]).T @ places + right0)
+            error = np.linalg.norm(design @ solution - places, axis=1)
+            weight = 1.0 / np.square(stds) / (1.0 + np.square(error / (3.0 * stds)))
+        residual = float(np.sqrt(0.5 * np.mean(np.square(error))))
+        inflate = max(1.0, float(np.sqrt(0.5 * np.mean(np.square(error / stds)))))
+        covariance = np.linalg.inv(normal) * inflate**2
+        return MotionFit(
+            float(times[-1]),
+            solution[0],
+            solution[1],
+            solution[2],
+            float(np.sqrt(covariance[1, 1])),
+            float(np.sqrt(covariance[2, 2])),
+            residual,
+            len(t),
+        )

@@ -1,0 +1,386 @@
+"""The default tracker: one car followed on the ground plane, also while it is out of the picture.
+
+Each frame: place the camera over the ground (``Placing``), look for the target where the cloud of particles expects
+it (``Target``), weigh the cloud by what was found and what was not (``evidence``), learn the road, say what is known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from edge.uav import particles as pf
+from edge.uav.ground import cloud as clouds
+from edge.uav.ground import footprint
+from edge.uav.ground.appearance import Candidate
+from edge.uav.ground.camera import transfer
+from edge.uav.ground.cloud import Cloud
+from edge.uav.ground.evidence import Verdict, judge
+from edge.uav.ground.history import MotionFit, Sightings
+from edge.uav.ground.outlook import Outlook
+from edge.uav.ground.placing import Placing
+from edge.uav.ground.road_map import RoadMap
+from edge.uav.ground.target import Target
+from edge.uav.ground.tracklets import Tracklet, Tracklets
+from edge.uav.tracker import Box, Estimate, Hypothesis, Image, State, Telemetry
+from protocols.errors import InputError
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Floats, Ints
+
+_SMALLEST_BOX = 4.0  # px
+_NUMBER = pf.AdaptiveNumber(cell=(0.6, 0.6), error=0.05, confidence=0.99, fewest=150, most=500)
+_FIRST_NUMBER = 400
+_PULL = 0.35  # of the motion towards the fit, a frame
+_ALIGN_AFTER = 0.6  # way travelled before the direction of motion counts, in target lengths
+_AGAIN = 3  # frames unseen after which finding the target is finding it again
+_ALIKE = 0.65  # mean score of a look-alike that is worth a thought
+_RECONSIDER = 0.02  # weight of the particles that it gets
+_ROAD_EVERY = 3  # frames between updates of the road map
+_TEACH_EVERY = 12
+_LOST_STD = 8.0  # in target lengths
+_LOST_AFTER_S = 15.0
+_CLUSTER = 0.7  # radius of what counts as one place, in target lengths
+
+
+class GroundTracker:
+    """One target. size: (width, height) [px]. lens, body_from_camera: the camera; without them telemetry is unused."""
+
+    def __init__(
+        self,
+        size: tuple[int, int],
+        lens: Intrinsics | None = None,
+        body_from_camera: Floats | None = None,
+        fps: float = 30.0,
+        seed: int = 0,
+    ) -> None:
+        self._size = size
+        self._fps = fps
+        self._rng = np.random.default_rng(seed)
+        self._placing = Placing(size, lens, body_from_camera)
+        self._began = False
+
+    def begin(self, image: Image, time: float, target: Box) -> Estimate:
+        """Learn the target from its first frame. Raises InputError for a box that can't be one."""
+        check_target(image, self._size, target)
+        placing = self._placing
+        small = placing.shrink(image)
+        placing.begin(small, time, target)
+        self._target = Target(image, placing, target)
+        place = self._target.place
+        self._time, self._frame = time, 0
+        self._road = RoadMap(place)
+        self._sightings = Sightings()
+        self._sightings.add(time, place, self._target.noise(1.0))
+        self._fit: MotionFit | None = None
+        self._outlook: Outlook | None = None
+        self._cloud = clouds.scattered(place, 0.03 * self._target.length, _FIRST_NUMBER, self._rng)
+        self._missed, self._found = 0, 1  # frames in a row without and with the target
+        self._tracklets = Tracklets()
+        self._seen_last = time
+        self._state = State.VISIBLE
+        self._trail: list[Floats] = [place]
+        self._began = True
+        self._learn_road(small, teach=True)
+        return self._estimate(time)
+
+    def handle_telemetry(self, sample: Telemetry) -> None:
+        """Take one sample; without lens and mounting it can't be used. Bad samples are left out."""
+        if self._placing.clock is not None:
+            self._placing.clock.add(sample)
+
+    def handle_frame(self, image: Image | None, time: float) -> Estimate:
+        """Follow into the next frame; ``None`` for a frame that could not be decoded."""
+        if not self._began:
+            raise RuntimeError("begin first")
+        dt = float(np.clip(time - self._time, 1e-3, 2.0)) if np.isfinite(time) else 1.0 / self._fps
+        self._time += dt
+        self._frame += 1
+        ways = self._outlook.ways if self._outlook is not None else []
+        self._cloud = clouds.driven(self._cloud, dt, ways, self._missed == 0, self._rng)
+        if image is None or image.shape[:2] != (self._size[1], self._size[0]):
+            self._placing.skip(dt)
+            self._not_seen()
+            return self._estimate(time)
+        small = self._placing.shrink(image)
+        keep_out = None
+        if self._missed == 0:
+            keep_out = self._placing.body_pixels(self._target.outline(self._target.place, self._heading, 1.4))
+        self._placing.update(small, self._time, dt, keep_out)
+        verdict = self._look(image, small)
+        best = verdict.best
+        if best is not None:
+            self._seen(image, best, verdict)
+        else:
+            self._not_seen()
+        if self._frame % _ROAD_EVERY == 0 and self._placing.blind == 0:
+            self._learn_road(small, teach=self._missed == 0 and self._frame % _TEACH_EVERY == 0)
+        estimate = self._estimate(time)
+        if self._missed == 0 and self._placing.clock is not None:
+            self._reroot(estimate)
+        return estimate
+
+    @property
+    def _heading(self) -> float:
+        return pf.circular_mean(self._cloud.heading, self._cloud.weights)
+
+    def _look(self, image: Image, small: Image) -> Verdict:
+        """Search where the cloud lies within the picture, and weigh the cloud by it."""
+        cloud, target, placing = self._cloud, self._target, self._placing
+        pixels = placing.body_pixels(cloud.place)
+        near = placing.plane.inside(pixels, -0.3 * target.length * target.scale)
+        share = float(cloud.weights[near].sum())
+        if share < 2e-3:
+            return Verdict.nothing()
+        here = np.flatnonzero(near)
+        weights = cloud.weights[here] / share
+        cluster = pf.densest_cluster(cloud.place[here], weights, 2.0 * target.length)
+        members = here[cluster.members]
+        candidates = self._search(image, members, wide=True)
+        rest = np.setdiff1d(here, members)
+        if len(rest) and cluster.weight < 0.97:
+            # What lies scattered is searched piece by piece, another piece each frame.
+            middle = self._rng.choice(rest)
+            aside = np.square(cloud.place[rest] - cloud.place[middle]).sum(axis=1) < (1.5 * target.length) ** 2
+            for found in self._search(image, rest[aside], wide=False):
+                if all(np.linalg.norm(found.ground - c.ground) > 0.4 * target.length for c in candidates):
+                    candidates.append(found)
+        # Until its motion is known, anywhere it can have gone in a frame will do.
+        slack = 0.2 * target.length if self._fit is None else 0.0
+        again = self._missed > _AGAIN
+        tracklets = self._tracklets.update(self._time, candidates)
+        if again and share > 0.5:
+            cloud = self._reconsider(cloud, tracklets)
+            pixels = placing.body_pixels(cloud.place)
+        verdict = judge(
+            cloud,
+            candidates,
+            tracklets,
+            self._chance(small, pixels),
+            lambda seen: target.noise(seen) + slack,
+            target.length,
+            again,
+        )
+        if verdict.likelihood is not None:
+            self._cloud = cloud.weighted(verdict.likelihood)
+        return verdict
+
+    def _reconsider(self, cloud: Cloud, tracklets: list[Tracklet]) -> Cloud:
+        """A few particles go where something like the target drives as it did, though the cloud is not there.
+
+        Only where the cloud should be seen and is not: then it is wrong, and a better place is worth a thought.
+        """
+        fit = self._fit
+        if fit is None or fit.speed < 1.0:
+            return cloud
+        for tracklet in tracklets:
+            motion = tracklet.velocity()
+            if motion is None or tracklet.age < 4 or tracklet.score < _ALIKE:
+                continue
+            speed = float(np.hypot(*motion[0]))
+            reach = 2.0 * self._target.length + 0.6 * fit.speed * (self._time - self._seen_last)
+            away = float(np.hypot(*(cloud.place - tracklet.places[-1]).T).min())
+            if not 0.4 * fit.speed < speed < 1.6 * fit.speed or away > reach:
+                continue
+            # Along the road there, or at least not back where it came from.
+            headings = cloud.heading[np.hypot(*(cloud.place - tracklet.places[-1]).T) < away + self._target.length]
+            course = np.arctan2(motion[0][1], motion[0][0])
+            if np.cos(headings - course).max() < 0.7:
+                continue
+            cloud = clouds.joined(cloud, tracklet.places[-1], motion, _RECONSIDER, self._rng)
+        return cloud
+
+    def _search(self, image: Image, members: Ints, wide: bool) -> list[Candidate]:
+        """Candidates about some of the particles."""
+        weights = self._cloud.weights[members] + 1e-12
+        weights = weights / weights.sum()
+        places = self._cloud.place[members]
+        middle = weights @ places
+        away = np.hypot(*(places - middle).T)
+        reach = float(np.quantile(away, 0.97)) if wide else 1.5 * self._target.length
+        angle = pf.circular_mean(self._cloud.heading[members], weights) if self._target.aligned else None
+        if wide:
+            self._target.follow_scale(middle)
+            if angle is not None:
+                self._target.angle = angle
+        return self._target.search(image, middle, 1.1 + reach / self._target.length, angle)
+
+    def _chance(self, small: Image, pixels: Floats) -> Floats:
+        """(n,) chance that the target would be found at image points (n, 2): 0 outside, little where it may hide."""
+        inside = self._placing.plane.inside(pixels, 2.0)
+        out = np.zeros(len(pixels))
+        if inside.any() and self._placing.blind == 0:
+            top = np.array([small.shape[1] - 1, small.shape[0] - 1])
+            at = np.clip((pixels[inside] / self._placing.factor).astype(int), 0, top)
+            colours = self._placing.light.undone(small[at[:, 1], at[:, 0]][None])[0]
+            open_road = self._road.ratios(colours) > -0.3 if self._road.ready else np.zeros(len(colours), bool)
+            out[inside] = np.where(open_road, 0.3, 0.03)
+        return out
+
+    def _seen(self, image: Image, best: Candidate, verdict: Verdict) -> None:
+        """The target is there: motion, place and looks follow it."""
+        target = self._target
+        again = self._missed > _AGAIN
+        if again:
+            self._cloud = clouds.gathered(self._cloud, best.ground, target.noise(best.seen), self._rng)
+            speed, heading = float(self._cloud.weights @ self._cloud.speed), self._heading
+            self._sightings.begin_anew(speed * np.array([np.cos(heading), np.sin(heading)]), 3.0)
+        self._missed, self._found = 0, self._found + 1
+        self._seen_last = self._time
+        self._outlook = None
+        self._cloud = self._cloud.free()
+        if best.seen > 0.93:
+            self._sightings.add(self._time, best.ground, target.noise(best.seen))
+            self._fit = self._sightings.fit() or self._fit
+        if self._fit is not None and not again:
+            ahead = min(self._time - self._fit.time, 0.5)
+            self._cloud = clouds.pulled(self._cloud, self._fit, ahead, _PULL, self._rng)
+        self._cloud = self._cloud.resampled(self._rng, _NUMBER)
+        target.place = self._cloud.weights @ self._cloud.place
+        if best.seen > 0.9 and np.linalg.norm(target.place - self._trail[-1]) > 0.5:
+            self._trail = [*self._trail[-60:], target.place]
+        if not target.aligned:
+            fit = self._fit
+            far = self._sightings.travelled() > _ALIGN_AFTER * target.length
+            if fit is not None and far and best.seen > 0.97 and fit.velocity_std < 0.15 * fit.speed:
+                target.align(image, fit)
+        elif verdict.sureness > 0.9 and not verdict.crowded and self._found > 3 and self._frame % 4 == 0:
+            if best.score > 0.75 and best.seen > 0.98:
+                target.study(image, best)
+
+    def _not_seen(self) -> None:
+        """It is not there: the cloud drives on, along the ways that the road offers."""
+        self._missed, self._found = self._missed + 1, 0
+        if self._outlook is None:
+            trail = np.array(self._trail[-25:])
+            self._outlook = Outlook(self._cloud, self._fit, self._time, self._road, trail)
+            self._cloud = self._outlook.begin(self._cloud, self._fit, self._time, self._road, self._rng)
+        else:
+            self._cloud = self._outlook.again(self._cloud, self._time, self._road, self._rng)
+        self._cloud = self._cloud.resampled(self._rng, _NUMBER)
+
+    def _learn_road(self, small: Image, teach: bool) -> None:
+        """Add the picture to the road map; ``teach``: first learn what road looks like beside the target."""
+        target, placing = self._target, self._placing
+        lit = placing.light.undone(small)
+        outline = target.outline(target.place, self._heading, 1.35)
+        if teach:
+            ring = [target.outline(target.place, self._heading, grown) for grown in (1.5, 1.8)]
+            edge = np.concatenate([_between(corners) for corners in ring])
+            behind = [p for p in self._trail[:-1] if np.linalg.norm(p - target.place) > 1.2 * target.length]
+            places = np.concatenate([edge, np.array(behind).reshape(-1, 2)])
+            pixels = placing.pixels(places)
+            pixels = pixels[placing.plane.inside(pixels, 2.0)]
+            at = np.clip((pixels / placing.factor).astype(int), 0, [small.shape[1] - 1, small.shape[0] - 1])
+            self._road.learn(lit[at[:, 1], at[:, 0]], lit[::4, ::4].reshape(-1, 3), 0.1)
+        self._road.update(lit, placing.factor, placing.plane, placing.matrix, outline if self._missed == 0 else None)
+
+    def _reroot(self, estimate: Estimate) -> None:
+        """Begin the ground frame anew where telemetry now gives a better one."""
+        box = Box(
+            estimate.x - 0.5 * estimate.width, estimate.y - 0.5 * estimate.height, estimate.width, estimate.height
+        )
+        root = self._placing.better_root(self._time, box)
+        if root is None:
+            return
+        change = np.linalg.inv(root.motion.matrix) @ self._placing.matrix
+        step = 0.5
+        near = transfer(change, self._target.place + step * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+        if not np.isfinite(near).all():
+            return
+        self._placing.take(root)
+        jacobian = np.column_stack([near[1] - near[0], near[2] - near[0]]) / step
+        self._target.moved(near[0], jacobian)
+        self._sightings.moved(change)
+        self._fit = self._sightings.fit()
+        self._cloud = self._cloud.moved(change)
+        self._tracklets.clear()
+        self._trail = [p for p in transfer(change, np.array(self._trail)) if np.isfinite(p).all()]
+        old, self._road = self._road, RoadMap(near[0])
+        self._road.take_colours(old)
+
+    def _estimate(self, time: float) -> Estimate:
+        """State, densest cluster, its spread, and the other clusters."""
+        cloud, target, placing = self._cloud, self._target, self._placing
+        groups = pf.clusters(cloud.place, cloud.weights, _CLUSTER * target.length)
+        main = groups[0]
+        weights = np.where(main.members, cloud.weights, 0.0)
+        weights = weights / weights.sum()
+        place = weights @ cloud.place
+        heading = pf.circular_mean(cloud.heading, weights)
+        speed = float(weights @ cloud.speed)
+        spread = pf.weighted_covariance(cloud.place, cloud.weights if self._missed else weights)
+        std_m = float(np.sqrt(0.5 * np.trace(spread)))
+        axes = footprint.local_axes(placing.plane, placing.body_matrix, place)
+        std = float(np.sqrt(0.5 * np.trace(axes @ spread @ axes.T)))
+        centre = placing.body_pixels(place[None])[0]
+        state = State.VISIBLE if self._missed == 0 else State.COASTING
+        unseen = self._time - self._seen_last
+        useless = std_m > _LOST_STD * target.length or unseen > _LOST_AFTER_S
+        if state is State.COASTING and (useless or not np.isfinite([*centre, std]).all()):
+            state = State.LOST
+        self._state = state
+        corners = placing.body_pixels(target.outline(place, heading))
+        size = corners.max(axis=0) - corners.min(axis=0)
+        ahead = axes @ np.array([np.cos(heading), np.sin(heading)])
+        moving = target.aligned and np.isfinite(ahead).all()
+        layers = {"tracks": placing.tracks, "road": placing.pixels(self._road.outline(place, 45.0))}
+        if self._outlook is not None:
+            for k, way in enumerate(self._outlook.ways):
+                layers[f"way {k}"] = placing.pixels(way.points)
+        common = Estimate(
+            time=time,
+            state=state,
+            x=float(centre[0]),
+            y=float(centre[1]),
+            width=float(size[0]),
+            height=float(size[1]),
+            heading=float(np.arctan2(ahead[1], ahead[0])) if moving else float("nan"),
+            std=std,
+            hypotheses=self._hypotheses(groups),
+            particles=placing.body_pixels(cloud.place),
+            layers=layers,
+        )
+        if state is State.LOST:
+            return replace(common, x=float("nan"), y=float("nan"), heading=float("nan"), hypotheses=())
+        if not placing.metric:
+            return common
+        course = float(np.arctan2(np.sin(heading), np.cos(heading))) if target.aligned else float("nan")
+        return replace(common, north=float(place[0]), east=float(place[1]), speed=speed, course=course, std_m=std_m)
+
+    def _hypotheses(self, groups: tuple[pf.Cluster, ...]) -> tuple[Hypothesis, ...]:
+        if len(groups) < 2:
+            return ()
+        total = sum(group.weight for group in groups)
+        places = self._placing.body_pixels(np.array([group.centre for group in groups]))
+        return tuple(
+            Hypothesis(group.weight / total, float(x), float(y)) for group, (x, y) in zip(groups, places, strict=True)
+        )
+
+
+def check_target(image: Image, size: tuple[int, int], target: Box) -> None:
+    """Raises InputError for a box that can't be a target, or a picture that isn't of this size."""
+    width, height = size
+    if image.ndim != 3 or image.shape[:2] != (height, width):
+        raise InputError(f"a picture of {image.shape[1]}x{image.shape[0]}, not {width}x{height}", remedy="check --rig")
+    values = (target.x, target.y, target.width, target.height)
+    text = ",".join(f"{value:g}" for value in values)
+    if not np.isfinite(values).all():
+        raise InputError(f"target {text} is not finite", remedy="give x,y,w,h in pixels")
+    if min(target.width, target.height) < _SMALLEST_BOX:
+        remedy = f"draw a box of at least {_SMALLEST_BOX:g} pixels a side round the car"
+        raise InputError(f"target {text} is too small to be recognised", remedy=remedy)
+    overlap_x = min(target.x + target.width, width) - max(target.x, 0.0)
+    overlap_y = min(target.y + target.height, height) - max(target.y, 0.0)
+    if min(overlap_x, overlap_y) <= 0 or overlap_x * overlap_y < 0.5 * target.width * target.height:
+        raise InputError(
+            f"target {text} is outside the image of {width}x{height}", remedy="give x,y,w,h of a car in the picture"
+        )
+    if target.width * target.height > 0.5 * width * height:
+        raise InputError(f"target {text} fills the image", remedy="draw the box round one car")
+
+
+def _between(corners: Floats) -> Floats:
+    """(16, 2) points along the sides of a quadrilateral (4, 2)."""
+    share = np.linspace(0.0, 1.0, 4, endpoint=False)[:, None]
+    return np.concatenate([a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])

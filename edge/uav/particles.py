@@ -1,0 +1,243 @@
+"""The particle filter itself: what is the same for every model of a target.
+
+A particle set is an array of states (n, d) with log-weights (n,). A ``Model`` says how one state becomes the next and
+how well a state explains an observation; everything here knows only those two. Nothing is changed in place, and all
+randomness comes from the generator that is passed in.
+
+Sources: low-variance (systematic) resampling and the effective sample size as in Doucet, Godsill, Andrieu, "On
+sequential Monte Carlo sampling methods" (2000); the adaptive number of particles as in Fox, "Adapting the sample size
+in particle filters through KLD-sampling" (2003). Equation numbers are those of the paper on following a car.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+from scipy.special import ndtri
+
+from protocols.geometry.types import Bools, Floats, Ints
+
+Observation_contra = TypeVar("Observation_contra", contravariant=True)
+Observation = TypeVar("Observation")
+
+
+class Model(Protocol[Observation_contra]):
+    """What a particle filter has to know of the thing that it follows."""
+
+    def propagate(self, states: Floats, rng: np.random.Generator) -> Floats:
+        """One draw from p(x_k | x_{k-1}) a particle: (n, d) -> (n, d)."""
+        ...
+
+    def log_likelihood(self, states: Floats, observation: Observation_contra) -> Floats:
+        """log p(y_k | x_k), up to a constant that is the same for all particles: (n, d) -> (n,)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Particles:
+    """A weighted sample. states: (n, d). log_weights: (n,), normalised: their exponentials add up to 1."""
+
+    states: Floats
+    log_weights: Floats
+
+    @classmethod
+    def evenly(cls, states: Floats) -> Particles:
+        """States (n, d) of equal weight; n of at least 1."""
+        return cls(states, np.full(len(states), -np.log(len(states))))
+
+    @property
+    def weights(self) -> Floats:
+        """(n,), adding up to 1."""
+        return np.asarray(np.exp(self.log_weights), dtype=np.float64)
+
+    def reweighted(self, log_likelihoods: Floats) -> Particles:
+        """The set after an observation: each weight times its likelihood (eq. 2.6), normalised (eq. 2.1)."""
+        return Particles(self.states, normalise(self.log_weights + log_likelihoods))
+
+    def resampled(self, rng: np.random.Generator, count: int | None = None) -> Particles:
+        """count (default: as many as there are) particles of equal weight, drawn in proportion to the weights."""
+        return Particles.evenly(self.states[systematic(self.weights, count or len(self.states), rng)])
+
+
+@dataclass(frozen=True, slots=True)
+class AdaptiveNumber:
+    """How many particles there shall be.
+
+    cell: (d,) widths of the cells in which the spread is counted, in the units of the state (inf: that coordinate
+    does not count). error: bound on the Kullback-Leibler distance between the sample and the posterior; it is kept
+    with probability confidence. fewest, most: the number stays between them.
+    """
+
+    cell: tuple[float, ...]
+    error: float = 0.05
+    confidence: float = 0.99
+    fewest: int = 100
+    most: int = 1000
+
+    def of(self, states: Floats) -> int:
+        """The number that a sample spread like states (n, d) needs."""
+        wanted = kld_number(occupied_cells(states, np.array(self.cell)), self.error, self.confidence)
+        return min(max(wanted, self.fewest), self.most)
+
+
+def normalise(log_weights: Floats) -> Floats:
+    """Eq. (2.1): log-weights (n,) whose exponentials add up to 1.
+
+    nan counts as weight 0. If no particle has any weight, all get the same: an observation that contradicts all of
+    them says nothing about which is right.
+    """
+    if not len(log_weights):
+        return log_weights
+    best = float(np.fmax.reduce(log_weights))
+    if not np.isfinite(best):
+        return np.full(len(log_weights), -np.log(len(log_weights)))
+    scaled = np.where(np.isnan(log_weights), -np.inf, log_weights - best)
+    return np.asarray(scaled - np.log(np.exp(scaled).sum()), dtype=np.float64)
+
+
+def systematic(weights: Floats, count: int, rng: np.random.Generator) -> Ints:
+    """Low-variance resampling: count indices, each index drawn count * weight times, rounded up or down, unbiased.
+
+    weights: (n,), adding up to 1.
+    """
+    positions = (np.arange(count) + rng.random()) / count
+    found = np.searchsorted(np.cumsum(weights), positions, side="right")
+    return np.asarray(np.minimum(found, len(weights) - 1), dtype=np.int64)
+
+
+def effective_sample_size(weights: Floats) -> float:
+    """1 / sum of squares: from 1 (one particle has all the weight) to n (all the same). weights add up to 1."""
+    return float(1.0 / np.square(weights).sum())
+
+
+def occupied_cells(states: Floats, cell: Floats) -> int:
+    """In how many cells of the given widths (d,) the states (n, d) lie; a width of inf leaves a coordinate out."""
+    index = np.floor(states[:, np.isfinite(cell)] / cell[np.isfinite(cell)]).astype(np.int64)
+    return len(np.unique(_keys(index))) if index.size else 1
+
+
+def kld_number(cells: int, error: float, confidence: float) -> int:
+    """Particles needed so that a sample over that many occupied cells is within error of the distribution.
+
+    Fox's bound (the Wilson-Hilferty approximation of the chi-square quantile): for k cells and the standard normal
+    quantile z of confidence, n = (k - 1) / (2 error) * (1 - 2 / (9 (k - 1)) + z sqrt(2 / (9 (k - 1))))^3. One cell
+    needs one particle.
+    """
+    if cells <= 1:
+        return 1
+    free = cells - 1.0
+    spread = 2.0 / (9.0 * free)
+    root = 1.0 - spread + np.sqrt(spread) * float(ndtri(confidence))
+    return int(np.ceil(free / (2.0 * error) * root**3))
+
+
+def step(
+    particles: Particles,
+    model: Model[Observation],
+    observation: Observation | None,
+    rng: np.random.Generator,
+    *,
+    resample_below: float = 0.5,
+    number: AdaptiveNumber | None = None,
+) -> Particles:
+    """One cycle: resample if need be, propagate, weigh. Gives the posterior as a weighted set.
+
+    observation: None predicts only. resample_below: resamples if the effective sample size is below this share of
+    the particles. With number, the size of the set follows its spread: it may change wherever there is resampling.
+    """
+    weights = particles.weights
+    if effective_sample_size(weights) < resample_below * len(weights):
+        chosen = systematic(weights, len(weights), rng)
+        if number is not None:
+            chosen = systematic(weights, number.of(particles.states[chosen]), rng)
+        particles = Particles.evenly(particles.states[chosen])
+    moved = Particles(model.propagate(particles.states, rng), particles.log_weights)
+    return moved if observation is None else moved.reweighted(model.log_likelihood(moved.states, observation))
+
+
+def weighted_mean(values: Floats, weights: Floats) -> Floats:
+    """(d,) of values (n, d); weights (n,) add up to 1."""
+    return np.asarray(weights @ values, dtype=np.float64)
+
+
+def weighted_covariance(values: Floats, weights: Floats) -> Floats:
+    """(d, d) about the weighted mean of values (n, d); weights (n,) add up to 1."""
+    centred = values - weights @ values
+    return np.asarray((centred * weights[:, None]).T @ centred, dtype=np.float64)
+
+
+def circular_mean(angles: Floats, weights: Floats) -> float:
+    """The mean direction [rad], in (-pi, pi], of angles (n,)."""
+    return float(np.arctan2(weights @ np.sin(angles), weights @ np.cos(angles)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cluster:
+    """Some of the particles. centre: (2,). weight: theirs together. members: (n,) which ones."""
+
+    centre: Floats
+    weight: float
+    members: Bools
+
+
+def densest_cluster(points: Floats, weights: Floats, radius: float) -> Cluster:
+    """The particles within radius of the place where the most weight lies together.
+
+    points: (n, 2); weights: (n,). Starts at the fullest block of three by three cells of width radius and moves its
+    centre to the mean of what is within radius until it rests (mean shift with a flat kernel).
+    """
+    index = np.floor(points / radius).astype(np.int64)
+    cells, inverse = np.unique(_keys(index), return_inverse=True)
+    mass = np.bincount(inverse, weights, minlength=len(cells))
+    around = np.zeros(len(cells))
+    for dx in (-1, 0, 1):
+        for dy in (-1, 0, 1):
+            wanted = cells + _key_step(dx, dy)
+            at = np.minimum(np.searchsorted(cells, wanted), len(cells) - 1)
+            around += np.where(cells[at] == wanted, mass[at], 0.0)
+    fullest = inverse == int(np.argmax(around + 1e-9 * mass))
+    centre = np.average(points[fullest], axis=0, weights=weights[fullest] + 1e-300)
+    members = fullest
+    for _ in range(10):
+        within = np.square(points - centre).sum(axis=1) <= radius * radius
+        if not weights[within].sum() > 0.0 or (within == members).all():
+            break
+        members = within
+        centre = weights[members] @ points[members] / weights[members].sum()
+    return Cluster(np.asarray(centre, dtype=np.float64), float(weights[members].sum()), members)
+
+
+def clusters(points: Floats, weights: Floats, radius: float, most: int = 4, least: float = 0.05) -> tuple[Cluster, ...]:
+    """Up to most separate clusters, heaviest found first, each of at least the weight least; at least one.
+
+    points: (n, 2); weights: (n,). After each, what is within twice radius of it is set aside.
+    """
+    found: list[Cluster] = []
+    left = np.ones(len(points), dtype=np.bool_)
+    while left.any() and len(found) < most:
+        here = np.flatnonzero(left)
+        part = densest_cluster(points[here], weights[here], radius)
+        if found and part.weight < least:
+            break
+        members = np.zeros(len(points), dtype=np.bool_)
+        members[here[part.members]] = True
+        found.append(Cluster(part.centre, part.weight, members))
+        left &= np.square(points - part.centre).sum(axis=1) > 4.0 * radius * radius
+        left &= ~members
+    return tuple(found)
+
+
+_STRIDES = (1, 1 << 21, 1 << 42, 1 << 52)  # a cell's coordinates side by side in one integer
+
+
+def _keys(index: Ints) -> Ints:
+    """One integer a cell of index (n, d). Cells more than 2**20 apart may share one: that is far beyond use."""
+    if index.shape[1] > len(_STRIDES):
+        return np.asarray(np.unique(index, axis=0, return_inverse=True)[1], dtype=np.int64).reshape(-1)
+    return np.asarray(index @ np.array(_STRIDES[: index.shape[1]], dtype=np.int64), dtype=np.int64)
+
+
+def _key_step(dx: int, dy: int) -> int:
+    return dx * _STRIDES[0] + dy * _STRIDES[1]

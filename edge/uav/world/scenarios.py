@@ -1,0 +1,157 @@
+"""The shipped flights over the town, by name: ``get("exit-bend", seed=3, frames=60)``."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge.uav.world import cars, exits, rides
+from edge.uav.world.flight import Flight
+from edge.uav.world.ground import Area
+from edge.uav.world.journey import FPS, View
+from edge.uav.world.noise import wander
+from edge.uav.world.rendering import Light
+from edge.uav.world.roads import LANE, Road
+from edge.uav.world.stage import Script, Stage, view
+from edge.uav.world.town import build
+from edge.uav.world.world import World, camera_poses
+from protocols.errors import InputError
+from protocols.geometry.types import Floats
+
+_FIRST_LOOK = 33  # frames at the beginning in which no house or tree hides the target
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """An entry of the registry. frames: how many by default, None: not to be chosen. about: one line."""
+
+    write: Callable[[Stage], Script]
+    frames: int | None
+    about: str
+
+
+SCENARIOS = {
+    "exit-straight": Scenario(exits.straight_road, 45, "out of the picture on a straight road"),
+    "exit-bend": Scenario(exits.bend, 60, "out of the picture round a bend"),
+    "turn-out-of-view": Scenario(exits.turn_out_of_view, 75, "turns off at a crossing while out of the picture"),
+    "yaw": Scenario(exits.yaw, 45, "out of the picture because the drone yaws"),
+    "distractors": Scenario(exits.distractors, 60, "out of the picture among cars of the same colour"),
+    "trees": Scenario(rides.trees, None, "under trees"),
+    "bridge": Scenario(rides.bridge, None, "under a bridge"),
+    "lighting": Scenario(rides.lighting, None, "the light changes"),
+    "off-road": Scenario(rides.off_road, None, "drives over grass"),
+    "partial": Scenario(rides.partial, 90, "cut in half by the picture's border"),
+    "paper-3.3": Scenario(rides.winding, None, "a winding road, a drone with a simple controller"),
+    "paper-4.4": Scenario(exits.town, 60, "crossings, buildings, many cars; the car turns, the drone does not"),
+}
+
+
+def get(name: str, seed: int, size: tuple[int, int] = (640, 480), frames: int | None = None) -> World:
+    """The world of a scenario; the same arguments always give the same one.
+
+    size: width, height [px]. frames: for how many frames (5 to 300) no part of the target is in the picture (of
+    ``partial``: for how many it rides on the border); None: the scenario's own number.
+    Raises InputError for an unknown name, a size or a number that makes no sense, frames where there is no exit.
+    """
+    if name not in SCENARIOS:
+        raise InputError(f"there is no scenario {name!r}", remedy=f"use one of {', '.join(SCENARIOS)}")
+    scenario = SCENARIOS[name]
+    if frames is not None and scenario.frames is None:
+        raise InputError(f"scenario {name} has no frames to choose", remedy="leave them out")
+    wanted = scenario.frames if frames is None else frames
+    if wanted is not None and not 5 <= wanted <= 300:
+        raise InputError(f"{wanted} frames out of the picture are out of range", remedy="give 5 to 300")
+    if not (160 <= size[0] <= 4096 and 120 <= size[1] <= 4096):
+        raise InputError(f"a picture of {size[0]}x{size[1]} is out of range", remedy="give 160x120 to 4096x4096")
+    if seed < 0:
+        raise InputError(f"seed {seed} is negative", remedy="give 0 or more")
+    rng = np.random.default_rng([seed, zlib.crc32(name.encode()), wanted or 0, *size])
+    colour = list(cars.COLOURS_BGR)[int(rng.integers(len(cars.COLOURS_BGR)))]
+    course, cruise = rng.uniform(-np.pi, np.pi), rng.uniform(8.0, 12.5)
+    stage = Stage(rng, view(rng, size), wanted or 0, colour, course, cruise)
+    return _produce(name, seed, stage, scenario.write(stage))
+
+
+def _produce(name: str, seed: int, stage: Stage, script: Script) -> World:
+    """Furnish the town that the flight sees, and let others drive in it."""
+    rng, n, camera = stage.rng, script.length, script.view
+    area = _seen(camera, script.flight, n)
+    target = script.motion.car(n, stage.bgr)
+    town = build(
+        rng,
+        area,
+        script.roads,
+        special=script.special,
+        keep_clear=script.keep_clear,
+        not_colour=stage.colour,
+        in_sight=_first_look(camera, script.flight, target),
+    )
+    doubles = [script.motion.car(n, stage.bgr, delay) for delay in script.followers_s]
+    traffic = [*doubles, *script.doubles]
+    traffic += _strangers(rng, script.roads, area, n, [target, *traffic], stage.colour, script.strangers)
+    gain = np.ones((n, 3)) if script.gain is None else script.gain
+    gain = gain * (1.0 + wander(rng, n, 1.0 / FPS, 0.02, 1.0)[:, None])
+    return World(
+        name=name,
+        seed=seed,
+        length=n,
+        fps=FPS,
+        lens=camera.lens,
+        body_from_camera=camera.body_from_camera,
+        flight=script.flight,
+        town=town,
+        target=target,
+        traffic=tuple(traffic),
+        light=Light(gain, script.clouds),
+    )
+
+
+def _first_look(camera: View, flight: Flight, target: cars.Car) -> list[tuple[Floats, Floats]]:
+    """The camera and the target's points while a tracker gets to know it."""
+    frames = np.arange(0, _FIRST_LOOK, 4)
+    _, position = camera_poses(flight, camera.body_from_camera, frames / FPS)
+    return list(zip(position, cars.grids(target.ground[frames], target.course[frames]), strict=True))
+
+
+def _seen(camera: View, flight: Flight, length: int) -> Area:
+    """The ground that any frame sees, with a margin."""
+    turned, position = camera_poses(flight, camera.body_from_camera, np.arange(0, length, 4) / FPS)
+    w, h = camera.lens.width, camera.lens.height
+    rays = np.linalg.inv(camera.lens.matrix) @ np.array([[0, 0, 1], [w, 0, 1], [w, h, 1], [0, h, 1.0]]).T
+    world = np.einsum("nji,jk->nki", turned, rays)
+    ground = position[:, None, :2] - position[:, None, 2:] * world[..., :2] / world[..., 2:]
+    low, high = ground.min(axis=(0, 1)) - 14.0, ground.max(axis=(0, 1)) + 14.0
+    return Area((float(low[0]), float(high[0])), (float(low[1]), float(high[1])))
+
+
+def _strangers(
+    rng: np.random.Generator, roads: list[Road], area: Area, n: int, known: list[cars.Car], not_colour: str, tries: int
+) -> list[cars.Car]:
+    """Other cars that drive about, none of them in the way of ``known`` ones or of each other."""
+    times = np.arange(n) / FPS
+    colours = [name for name in cars.COLOURS_BGR if name != not_colour]
+    out: list[cars.Car] = []
+    for road in roads:
+        for _ in range(tries):
+            back = -1.0 if rng.random() < 0.6 else 1.0
+            s = rng.uniform(road.centre.begin, road.centre.end) + back * rng.uniform(6.0, 13.0) * times
+            ground, course = road.centre.at(np.clip(s, road.centre.begin, road.centre.end), back * 0.5 * LANE)
+            colour = cars.COLOURS_BGR[colours[int(rng.integers(len(colours)))]]
+            new = cars.Car(ground, course if back > 0 else course + np.pi, colour)
+            if area.contains(ground).any() and _apart(new, [*known, *out]):
+                out.append(new)
+    return out
+
+
+def _apart(car: cars.Car, others: list[cars.Car]) -> bool:
+    """Whether a car never comes near another but in the opposite lane."""
+    for other in others:
+        gap = other.ground - car.ground
+        ahead = np.cos(other.course - car.course)
+        far = np.linalg.norm(gap, axis=1)
+        if (far < np.where(ahead < -0.9, 2.6, 8.0)).any():
+            return False
+    return True

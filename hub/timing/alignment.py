@@ -1,0 +1,250 @@
+"""An alignment of two tracks: its samples, its absolute figures, and what a solved or refused pair says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hub.timing import two_view
+from hub.timing.refine import PointPairs
+from hub.timing.tracks import SmoothTrack
+from hub.timing.two_view import Geometry, RelativePose
+from protocols.geometry.types import Bools, Floats, Ints
+
+
+@dataclass(frozen=True, slots=True)
+class PairSettings:
+    """What the pair solver reckons with; the defaults hold on every rig."""
+
+    finest_step: float = 0.01
+    coarsest_step: float = 0.05
+    """Grid of the scan [s], between these; …"""
+    step_px: float = 8.0
+    """… chosen so that the faster tenth of the motion goes about this far in a step [px]."""
+    least_support: float = 1.0
+    """Seconds in which both must move for a lag to be looked at."""
+    sigma_px: float = 0.5
+    """Noise that a good track has; scales the scan's costs."""
+    per_stratum: int = 3
+    at_most: int = 10
+    few: int = 160
+    """Point pairs in the choice among the starts of a candidate."""
+    samples: int = 500
+    """Point pairs in the refinement of a candidate."""
+    all_samples: int = 6000
+    """Point pairs in the last refinement of the alignment that is answered."""
+    largest_sigma_px: float = 6.0
+    """Lens errors included: beyond this an epipolar fit is no fit."""
+    rate_std: float = 2e-3
+    """Prior on how far a clock's rate is from its nominal one."""
+    moving_px: float = 20.0
+    """Image speed [px/s] from which a sample counts as moving."""
+    accept_support: float = 1.5
+    """Seconds of agreeing motion below which nothing is answered."""
+    unchecked_support: float = 8.0
+    """… and where the recordings are too short to tell how well unrelated stretches fit."""
+    accept_inliers: float = 0.6
+    """Of the common motion, where there is plenty of it."""
+    strict_inliers: float = 0.95
+    """… and where there is hardly any: seven parameters and a search over all lags fit a few seconds of anything."""
+    plenty: float = 12.0
+    hardly: float = 4.0
+    """Seconds of agreeing motion that count as plenty and as hardly any."""
+    largest_rate: float = 1e-2
+    accept_log10_chance: float = -1.3
+    """log10 of the chance that the best of all wrong lags fits as well."""
+    distinct_alignments: float = 0.3
+    """Seconds between lags whose misfits are independent."""
+    flat_ratio: float = 3.0
+    """A plane that leaves less than this many times the epipolar residual explains the motion as well."""
+    accept_in_front: float = 0.95
+    accept_ratio: float = 0.5
+    """Evidence of the second best alignment over that of the best; …"""
+    clearly_worse: float = 1.6
+    """… which doesn't count if it leaves this many times the residual, …"""
+    worse_than_noise: float = 1.4
+    """… this many times where the best one leaves no more than the noise, …"""
+    clearly_likelier: float = 3.0
+    """… or if chance makes it this many powers of ten more often."""
+    exact: float = 1.3
+    """What an alignment may leave over the tracks' own noise for the noise to explain it."""
+    largest_lag_std: float = 4e-3
+    """Least certainty [s] of the lag and …"""
+    largest_turn_std: float = 0.1
+    """… of the relative rotation [rad] that is worth an answer."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairFit:
+    """One refined alignment: ``t_a = rate * t_b + offset`` on the tracks' own (shifted) times.
+
+    cost: mean robust squared distance over the noise. sigma_px: robust residual [px].
+    support: seconds of agreeing motion. inliers, front: fractions of the moving samples.
+    moving_overlap: seconds in which both tracks exist and move. middle: time of a in the middle of them.
+    parallax: median angle [rad] between the two rays of a point (0 without lenses).
+    flat_px: what one plane would leave [px]. misfit: mean squared distance over the settings' noise of the
+    smoothed samples that agree. own_px: noise of the noisier camera's tracks. log10_chance: of one unrelated
+    stretch of such length fitting as well, None where the recordings are too short to tell. lag_std [s],
+    turn_std [rad]: of the last refinement.
+    """
+
+    rate: float
+    offset: float
+    geometry: Geometry
+    cost: float
+    sigma_px: float
+    inliers: float
+    front: float
+    support: float
+    moving_overlap: float
+    middle: float
+    parallax: float
+    flat_px: float = float("nan")
+    misfit: float = float("inf")
+    own_px: float = float("nan")
+    log10_chance: float | None = None
+    lag_std: float = float("nan")
+    turn_std: float = float("nan")
+
+    @property
+    def pose(self) -> RelativePose:
+        """The relative pose. Raises ValueError for a fit of cameras without known lenses."""
+        if not isinstance(self.geometry, RelativePose):
+            raise ValueError("cameras without intrinsics have no relative pose")
+        return self.geometry
+
+    @property
+    def lag(self) -> float:
+        """``t_a - t_b`` [s] at the middle of the common motion."""
+        return self.middle - (self.middle - self.offset) / self.rate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairSolution:
+    """What is known of a pair of cameras. ``status`` is "ok" or the reason of the refusal."""
+
+    a: str
+    b: str
+    status: str
+    fit: PairFit | None = None
+    others: tuple[PairFit, ...] = field(default=())
+    fundamental: Floats | None = None
+    """(3, 3) of undistorted pixels, ``m_aᵀ F m_b = 0``, where the method found it directly."""
+
+    @property
+    def solved(self) -> bool:
+        """Whether the fit can be relied on."""
+        return self.status == "ok"
+
+
+class Samples:
+    """Samples of one alignment, all labels together: the inliers of a at their own times, b by its splines.
+
+    a, b: tracks of the same labels in the same order. offset: about where they meet, ``t_a = t_b + offset``.
+    most: samples at most.
+    """
+
+    def __init__(
+        self, a: Sequence[SmoothTrack], b: Sequence[SmoothTrack], offset: float, settings: PairSettings, most: int
+    ) -> None:
+        self.a, self.b, self.s = a, b, settings
+        parts = [self._rows(one, other, offset) for one, other in zip(a, b, strict=True)]
+        share = min(1.0, most / max(sum(len(rows) for rows in parts), 1))
+        # The same share of every label, spread over its time.
+        thinned = [
+            rows[np.linspace(0, len(rows) - 1, round(share * len(rows))).round().astype(np.int64)] for rows in parts
+        ]
+        self.label = np.concatenate([np.full(len(rows), k) for k, rows in enumerate(thinned)])
+        self.time = np.concatenate([one.time[rows] for one, rows in zip(a, thinned, strict=True)])
+        self.points = np.concatenate([one.points[rows] for one, rows in zip(a, thinned, strict=True)])
+        self.count = len(self.time)
+        self.centre = float(np.median(self.time)) if self.count else 0.0
+        intervals = [float(np.median(np.diff(one.time))) for one in a]
+        rows_a_second = self.count / max(sum(len(rows) * t for rows, t in zip(parts, intervals, strict=True)), 1e-9)
+        self.seconds_a_sample = len(a) ** -0.5 / max(rows_a_second, 1e-9)
+
+    def _rows(self, a: SmoothTrack, b: SmoothTrack, offset: float) -> Ints:
+        margin = 0.5
+        inside = (a.time - offset > b.basis.begin - margin) & (a.time - offset < b.basis.end + margin)
+        speed = np.linalg.norm(a.at(a.time, 1), axis=1) * a.focal
+        return np.flatnonzero(inside & (speed > 0.5 * self.s.moving_px))
+
+    def of_b(self, time: Floats) -> tuple[Floats, Floats]:
+        """Points and speeds of b, (n, 2) each, at b's times (n,) of the samples; NaN in gaps."""
+        if len(self.b) == 1:
+            return self.b[0].point_and_speed(time)
+        points, speeds = np.full((len(time), 2), np.nan), np.full((len(time), 2), np.nan)
+        for k, track in enumerate(self.b):
+            mine = self.label == k
+            points[mine], speeds[mine] = track.point_and_speed(time[mine])
+        return points, speeds
+
+    def at(self, rate: float, offset: float) -> tuple[Floats, Floats]:
+        """Points of a (n, 2) and of b (n, 2; NaN in its gaps) under ``t_a = rate t_b + offset``."""
+        return self.points, self.of_b((self.time - offset) / rate)[0]
+
+    def __call__(self, slowness: float, middle: float) -> PointPairs:
+        lever = self.time - self.centre
+        b, speed = self.of_b(slowness * lever + middle)
+        there = np.isfinite(b[:, 0])
+        if there.all():
+            return PointPairs(self.points, b, speed, lever)
+        return PointPairs(self.points[there], b[there], speed[there], lever[there])
+
+    def judge(self, cost: float, rate: float, offset: float, geometry: Geometry) -> PairFit:
+        """Absolute figures of an alignment, over the samples where both move."""
+        a = self.points
+        b, speed = self.of_b((self.time - offset) / rate)
+        there = np.isfinite(b).all(axis=1)
+        focal_a, focal_b = self.a[0].focal, self.b[0].focal
+        speed_b = np.linalg.norm(speed, axis=1) * focal_b
+        speed_a = np.concatenate(
+            [
+                np.linalg.norm(track.at(self.time[self.label == k], 1), axis=1) * focal_a
+                for k, track in enumerate(self.a)
+            ]
+        )
+        with np.errstate(invalid="ignore"):
+            moving: Bools = there & (speed_a > self.s.moving_px) & (speed_b > self.s.moving_px)
+        count = int(moving.sum())
+        if count < 8:
+            return PairFit(rate, offset, geometry, cost, np.inf, 0.0, 0.0, 0.0, 0.0, self.centre, 0.0)
+        sigma_a, sigma_b = self.s.sigma_px / focal_a, self.s.sigma_px / focal_b
+        distance = np.abs(two_view.sampson(geometry.matrix, a[moving], b[moving], sigma_a, sigma_b))
+        smooth = np.concatenate([track.at(self.time[self.label == k]) for k, track in enumerate(self.a)])
+        smoothed = np.abs(two_view.sampson(geometry.matrix, smooth[moving], b[moving], sigma_a, sigma_b))
+        # A track's own noise counts for what it is; a wrong geometry must not hide behind it.
+        own = max(float(np.median([track.sigma_px for track in tracks])) for tracks in (self.a, self.b))
+        limit = max(3.0 * own, 3.0) / self.s.sigma_px
+        close = distance < limit
+        front = two_view.in_front(geometry, a[moving][close], b[moving][close])
+        seconds = float(count) * self.seconds_a_sample
+        inliers = float(close.mean())
+        return PairFit(
+            rate=rate,
+            offset=offset,
+            geometry=geometry,
+            cost=cost,
+            sigma_px=float(np.median(distance)) / 0.6745 * self.s.sigma_px,
+            inliers=inliers,
+            front=float(front.mean()) if len(front) else 0.0,
+            support=seconds * inliers,
+            moving_overlap=seconds,
+            middle=float(np.median(self.time[moving])),
+            parallax=two_view.parallax(geometry, a[moving], b[moving]),
+            own_px=own,
+            misfit=float((smoothed[close] ** 2).mean()) if close.any() else np.inf,
+            flat_px=_flat_px(a[moving][close] * focal_a, b[moving][close] * focal_b),
+        )
+
+
+def evidence(fit: PairFit) -> float:
+    """What speaks for an alignment: seconds of agreeing motion, less where little of the overlap agrees."""
+    return float(fit.support * fit.inliers * fit.front / np.sqrt(1.0 + fit.sigma_px))
+
+
+def _flat_px(a: Floats, b: Floats) -> float:
+    """What the best plane leaves [px], in the direction in which it leaves less: seen edge-on, it magnifies noise."""
+    return min(two_view.homography_residual(a, b), two_view.homography_residual(b, a))

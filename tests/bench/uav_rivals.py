@@ -1,0 +1,54 @@
+"""OpenCV's CSRT and KCF behind the trackers' interface. They need opencv-contrib, which only this bench uses."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import cv2
+
+from edge.uav.tracker import Box, Estimate, Image, State, Telemetry
+
+NAMES = ("csrt", "kcf")
+
+
+def available(name: str) -> bool:
+    """Whether this OpenCV has the tracker."""
+    return _maker(name) is not None
+
+
+def _maker(name: str) -> Any:
+    title = f"Tracker{name.upper()}_create"
+    return getattr(cv2, title, None) or getattr(getattr(cv2, "legacy", None), title, None)
+
+
+class Rival:
+    """One of OpenCV's trackers. It says ``visible`` as long as OpenCV reports success, else ``lost``."""
+
+    def __init__(self, name: str) -> None:
+        self._tracker = _maker(name)()
+
+    def begin(self, image: Image, time: float, target: Box) -> Estimate:
+        box = (round(target.x), round(target.y), round(target.width), round(target.height))
+        self._tracker.init(image, box)
+        return _estimate(time, True, box)
+
+    def handle_telemetry(self, sample: Telemetry) -> None:
+        """They have no use for it."""
+
+    def handle_frame(self, image: Image | None, time: float) -> Estimate:
+        if image is None:
+            return _estimate(time, False, (0.0, 0.0, 0.0, 0.0))
+        try:
+            found, box = self._tracker.update(image)
+        except cv2.error:  # a box that has left the picture altogether
+            found, box = False, (0.0, 0.0, 0.0, 0.0)
+        return _estimate(time, bool(found), box)
+
+
+def _estimate(time: float, found: bool, box: Any) -> Estimate:
+    x, y, w, h = (float(value) for value in box)
+    if not found:
+        x = y = w = h = math.nan
+    state = State.VISIBLE if found else State.LOST
+    return Estimate(time, state, x + (w - 1) / 2, y + (h - 1) / 2, w, h, math.nan, math.nan)

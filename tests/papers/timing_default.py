@@ -1,0 +1,39 @@
+"""The default pair method on the paper's own tracks, so that both stand in one table.
+
+It knows the focal length (the paper's method does not need it) and neither the lag nor the rate, which it fits.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hub.timing.pair import PairSolution, solve_pair
+from hub.timing.tracks import smooth_track
+from hub.timing.two_view import fundamental_from
+from tests.papers.timing_rig import FOCAL, Filmed, LagResult, evaluation_error
+
+
+def default_method(filmed: Filmed) -> LagResult:
+    """Cubic splines, scan of all lags, refinement (hub/timing/pair.py); a refusal keeps its best alignment's errors."""
+    tracks = [smooth_track(filmed.time, pixels / FOCAL, FOCAL) for pixels in (filmed.a, filmed.b)]
+    if tracks[0] is None or tracks[1] is None:
+        return LagResult(filmed.tau, float("nan"), float("nan"), "no track")
+    solution = solve_pair({"marker": tracks[0]}, {"marker": tracks[1]}, ("camera 1", "camera 2"))
+    if solution.fit is None:
+        return LagResult(filmed.tau, float("nan"), float("nan"), solution.status)
+    matrix = np.diag([FOCAL, FOCAL, 1.0])
+    fundamental = fundamental_from(solution.fit.pose, matrix, matrix)
+    return LagResult(
+        filmed.tau,
+        lag_of(solution) - filmed.tau,
+        evaluation_error(fundamental),
+        "" if solution.solved else solution.status,
+    )
+
+
+def lag_of(solution: PairSolution) -> float:
+    """By how much camera 1's clock is ahead of camera 2's in the middle of the common motion [s]."""
+    if solution.fit is None:
+        return float("nan")
+    fit = solution.fit
+    return float(fit.middle - (fit.middle - fit.offset) / fit.rate)

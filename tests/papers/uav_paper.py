@@ -1,0 +1,278 @@
+"""The figures of the paper on following a car, on the simulated town: pictures, and numbers beside them.
+
+``python -m tests.papers.uav_paper --out DIR`` draws figures 1 to 5 and 7 and writes numbers.txt. Section 3.3 (figure 1):
+a winding road, a drone that keeps the estimate in the middle; without and with the road. Section 4.1 (figures 2 to 5):
+the frame, its regions by colour, the road's shape, the regions corrected by it. Section 4.4 (figure 7): the town.
+The paper shows pictures only; the numbers are the means over several seeds of the same scenario.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edge.uav.models.paper import PaperTracker
+from edge.uav.models.plain import PlainTracker
+from edge.uav.paper import regions
+from edge.uav.tracker import Estimate, Image, State, Tracker
+from edge.uav.world import scenarios
+from edge.uav.world.world import World
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Floats
+
+WINDING, TOWN = "paper-3.3", "paper-4.4"
+NEAR = 20.0
+"""px: an estimate this near is right."""
+_CANVAS = 1.9  # the pictures show so many times what the camera sees
+_DIM = 0.55  # what the camera does not see is drawn darker
+_YELLOW, _CYAN, _RED, _GREEN, _WHITE = (0, 230, 255), (255, 200, 0), (40, 40, 255), (60, 230, 60), (255, 255, 255)
+
+Maker = Callable[[World, int], Tracker]
+
+
+def plain(world: World, seed: int) -> Tracker:
+    """Section 2."""
+    return PlainTracker(world.size, fps=world.fps, seed=seed)
+
+
+def road_steered(world: World, seed: int) -> PaperTracker:
+    """Section 3.2."""
+    return PaperTracker(world.size, fps=world.fps, seed=seed, section=3)
+
+
+def background_aware(world: World, seed: int) -> PaperTracker:
+    """Section 4.3."""
+    return PaperTracker(world.size, fps=world.fps, seed=seed)
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """How one run went. Shares 0..1, nan where there was no such frame.
+
+    seen_near: of the frames with the car in the picture, off by less than 20 px. out_near, out_car: of those with no
+    part of it in the picture, off by less than 20 px, or less than its length. false_visible: of those, called visible.
+    back: whether it was within 20 px in the last 20 frames' median, the car being in the picture then.
+    """
+
+    seen_near: float
+    out_near: float
+    out_car: float
+    false_visible: float
+    back: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """Estimates and errors (n,) [px] of a tracker over a world."""
+
+    world: World
+    estimates: list[Estimate]
+    errors: Floats
+
+    def score(self) -> Score:
+        truths = [self.world.truth(k) for k in range(self.world.length)]
+        inside = np.array([truth.inside for truth in truths])
+        length = np.array([max(truth.width, truth.height) for truth in truths])
+        claimed = np.array([estimate.state is State.VISIBLE for estimate in self.estimates])
+        errors = np.where(np.isnan(self.errors), np.inf, self.errors)
+        out, seen, tail = inside == 0.0, inside > 0.5, np.arange(len(inside)) >= len(inside) - 20
+        after = tail & seen
+        return Score(
+            _share(errors[seen] < NEAR),
+            _share(errors[out] < NEAR),
+            _share(errors[out] < length[out]),
+            _share(claimed[out]),
+            float(np.median(errors[after]) < NEAR) if after.any() else float("nan"),
+        )
+
+
+def run(world: World, tracker: Tracker, frames: int | None = None, look: Callable[[int], None] | None = None) -> Run:
+    """Follow the world's target from its first frame on. look is called with each frame's number, after it."""
+    truth = world.truth(0)
+    estimates = [tracker.begin(world.frame(0), world.time(0), truth.box)]
+    errors = [0.0]
+    for k in range(1, min(frames or world.length, world.length)):
+        estimates.append(tracker.handle_frame(world.frame(k), world.time(k)))
+        truth = world.truth(k)
+        errors.append(float(np.hypot(estimates[-1].x - truth.x, estimates[-1].y - truth.y)))
+        if look is not None:
+            look(k)
+    return Run(world, estimates, np.array(errors))
+
+
+def route(world: World, frame: int) -> Floats:
+    """The target's whole route (n, 2) in the pixels of one frame, nan behind the camera: the true course of its lane."""
+    pose = world.truth(frame).camera
+    ground = np.column_stack([world.target.ground[:, :2], np.zeros(len(world.target.ground))])
+    return world.lens.project((ground - pose.position) @ pose.rotation.T)
+
+
+def canvas(world: World, frame: int) -> tuple[Image, Floats]:
+    """What lies around the picture, drawn darker, with the picture framed; and where its pixel (0, 0) is (2,)."""
+    width, height = world.size
+    wide, high = int(width * _CANVAS), int(height * _CANVAS)
+    origin = np.array([(wide - width) // 2, (high - height) // 2], dtype=np.float64)
+    matrix = world.lens.matrix.copy()
+    matrix[:2, 2] += origin
+    around = replace(world, lens=Intrinsics(wide, high, matrix)).draw(frame)
+    result = (around * _DIM).astype(np.uint8)
+    x, y = origin.astype(int)
+    result[y : y + height, x : x + width] = world.frame(frame)
+    cv2.rectangle(result, (x - 1, y - 1), (x + width, y + height), _WHITE, 1)
+    return result, origin
+
+
+def drawn(world: World, frame: int, estimate: Estimate, title: str) -> Image:
+    """One panel: particles, road, estimate and truth on the canvas."""
+    image, origin = canvas(world, frame)
+    for name, points in estimate.layers.items():
+        line = np.rint((points + origin) * 8).astype(np.int32).reshape(-1, 1, 2)
+        cv2.polylines(image, [line], False, _YELLOW if "line" in name else _CYAN, 1, cv2.LINE_AA, 3)
+    if estimate.particles is not None:
+        for x, y in np.rint(estimate.particles + origin).astype(int):
+            cv2.circle(image, (int(x), int(y)), 2, _RED, -1)
+    truth = world.truth(frame)
+    cv2.circle(image, (round(truth.x + origin[0]), round(truth.y + origin[1])), 16, _GREEN, 2, cv2.LINE_AA)
+    error = float(np.hypot(estimate.x - truth.x, estimate.y - truth.y))
+    if np.isfinite(error):
+        at = (round(estimate.x + origin[0]), round(estimate.y + origin[1]))
+        cv2.drawMarker(image, at, _WHITE, cv2.MARKER_CROSS, 26, 2, cv2.LINE_AA)
+    text = f"{title}  frame {frame}  {estimate.state.value}  off by {error:.0f} px, std {estimate.std:.0f} px"
+    cv2.rectangle(image, (0, 0), (image.shape[1], 34), (0, 0, 0), -1)
+    cv2.putText(image, text, (10, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.7, _WHITE, 1, cv2.LINE_AA)
+    return image
+
+
+def figure_1(world: World, seed: int, frames: Sequence[int]) -> tuple[Image, list[str]]:
+    """Columns: (a) without, (b) with the road's shape. Rows: the frames."""
+    columns, lines = [], []
+    for title, maker in (("(a) colour only", plain), ("(b) with the road", road_steered)):
+        done = run(world, maker(world, seed))
+        columns.append(np.vstack([drawn(world, k, done.estimates[k], title) for k in frames]))
+        errors = ", ".join(f"frame {k}: {done.errors[k]:.0f} px" for k in frames)
+        lines.append(f"figure 1 {title}: off by {errors}")
+    return np.hstack(columns), lines
+
+
+def figures_2_to_5(world: World, frame: int, seed: int) -> tuple[dict[str, Image], list[str]]:
+    """The frame, its regions, the road's shape in it and the corrected regions."""
+    tracker = background_aware(world, seed)
+    run(world, tracker, frame + 1)
+    view = tracker.view
+    image = world.frame(frame)
+    size = world.size
+    shape = image.copy()
+    if view.course is not None:
+        known = view.course.points[view.course.known]
+        normal = np.column_stack([-np.sin(view.course.headings), np.cos(view.course.headings)])[view.course.known]
+        for side in (-view.course.half_width, 0.0, view.course.half_width):
+            line = np.rint((known + side * normal) * 8).astype(np.int32).reshape(-1, 1, 2)
+            cv2.polylines(shape, [line], False, _YELLOW if side else _CYAN, 2, cv2.LINE_AA, 3)
+    pictures = {
+        "figure-2.png": image,
+        "figure-3.png": cv2.resize(regions.COLOURS[view.labels], size, interpolation=cv2.INTER_NEAREST),
+        "figure-4.png": shape,
+        "figure-5.png": cv2.resize(regions.COLOURS[view.corrected], size, interpolation=cv2.INTER_NEAREST),
+    }
+    return pictures, [
+        f"figure 3, frame {frame}: {road_share(world, frame, view.labels):.0%} of the car's route in the picture is "
+        f"road; of all pixels {_shares(view.labels)}",
+        f"figure 4: the road's middle keeps its distance from the car's route to {lane_scatter(world, frame, tracker):.1f}"
+        " px (std within the picture)",
+        f"figure 5: {road_share(world, frame, view.corrected):.0%} of the car's route is road; of all pixels "
+        f"{_shares(view.corrected)}",
+    ]
+
+
+def road_share(world: World, frame: int, labels: regions.Labels) -> float:
+    """Share of the target's route within the picture that is labelled road."""
+    places = _seen_route(world, frame) / regions.SCALE
+    index = np.clip(np.rint(places).astype(int), 0, np.array(labels.shape[::-1]) - 1)
+    return float((labels[index[:, 1], index[:, 0]] == regions.ROAD).mean())
+
+
+def lane_scatter(world: World, frame: int, tracker: PaperTracker) -> float:
+    """Std [px] of the distance from the target's route in the picture to the road's middle: 0 if it is parallel."""
+    course = tracker.view.course
+    return float("nan") if course is None else float(course.nearest(_seen_route(world, frame))[0].std())
+
+
+def figure_7(world: World, seed: int, frames: Sequence[int]) -> tuple[Image, list[str]]:
+    """Four frames of the town."""
+    done = run(world, background_aware(world, seed))
+    panels = [drawn(world, k, done.estimates[k], "section 4") for k in frames]
+    errors = ", ".join(f"frame {k}: {done.errors[k]:.0f} px" for k in frames)
+    return np.vstack([np.hstack(panels[:2]), np.hstack(panels[2:])]), [f"figure 7: off by {errors}"]
+
+
+def table(scenario: str, makers: dict[str, Maker], seeds: Sequence[int]) -> list[str]:
+    """One line a model: the mean of its scores over seeds."""
+    lines = [
+        f"{scenario}, {len(seeds)} seeds".ljust(30) + "| in < 20 px | out < 20 px | out < 1 car | out, visible | back"
+    ]
+    for name, maker in makers.items():
+        scores = [run(world, maker(world, 0)).score() for world in (scenarios.get(scenario, seed) for seed in seeds)]
+        values = [
+            np.nanmean([getattr(score, part) for score in scores])
+            for part in ("seen_near", "out_near", "out_car", "false_visible", "back")
+        ]
+        lines.append(name.ljust(30) + " ".join(f"| {value:10.0%} " for value in values))
+    return lines
+
+
+def exit_frames(world: World) -> tuple[int, int, int]:
+    """Before the car leaves the picture, the middle of its absence, and after its return, for the figures."""
+    first, end = world.out
+    return max(first - 15, 1), (first + end) // 2, min(end + 15, world.length - 1)
+
+
+def main() -> None:
+    """Draw everything into --out."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--seed", type=int, default=0, help="of the worlds in the pictures")
+    parser.add_argument("--seeds", type=int, default=5, help="how many worlds the numbers are means of")
+    chosen = parser.parse_args()
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    winding, town = scenarios.get(WINDING, chosen.seed), scenarios.get(TOWN, chosen.seed)
+    before, _, _ = exit_frames(town)
+    pictures, lines = figures_2_to_5(town, min(40, before), chosen.seed)
+    pictures["figure-1.png"], first = figure_1(winding, chosen.seed, exit_frames(winding))
+    pictures["figure-7.png"], last = figure_7(town, chosen.seed, (min(40, before), *exit_frames(town)))
+    for name, picture in pictures.items():
+        if not cv2.imwrite(str(chosen.out / name), picture):
+            raise OSError(f"cannot write {chosen.out / name}")
+    makers: dict[str, Maker] = {
+        "section 2 (plain)": plain,
+        "section 3 (road)": road_steered,
+        "section 4 (paper)": background_aware,
+    }
+    numbers = first + lines + last
+    for scenario in (WINDING, TOWN):
+        numbers += ["", *table(scenario, makers, range(chosen.seeds))]
+    (chosen.out / "numbers.txt").write_text("\n".join(numbers) + "\n")
+    print("\n".join(numbers))
+
+
+def _seen_route(world: World, frame: int) -> Floats:
+    places = route(world, frame)
+    inside = ((places > 0.0) & (places < np.array(world.size) - 1.0)).all(axis=1)
+    return places[inside]
+
+
+def _share(mask: np.ndarray) -> float:
+    return float(mask.mean()) if len(mask) else float("nan")
+
+
+def _shares(labels: regions.Labels) -> str:
+    names = {regions.ROAD: "road", regions.OTHER: "other", regions.BUILDING: "building"}
+    return ", ".join(f"{(labels == label).mean():.0%} {name}" for label, name in names.items())
+
+
+if __name__ == "__main__":
+    main()
