@@ -13,6 +13,7 @@ import numpy as np
 from deploy.track import Tracked
 from edge.uav.tracker import State
 from protocols.errors import InputError
+from protocols.geometry.types import Bools, Floats
 
 NEAR_PX = 20.0
 _FOUND_FRAMES = 5
@@ -90,8 +91,8 @@ def score(rows: Sequence[Tracked], truth: dict[int, dict[str, float]], size: tup
     for name, good, where in shares:
         if where.any():
             scores[name] = float(good[where].mean())
-    waits = [_frames_to_find(int(last), half, error) for last in np.flatnonzero(out[:-1] & ~out[1:])]
-    waits = [wait for wait in waits if wait is not None]
+    ends = (int(last) for last in np.flatnonzero(out[:-1] & ~out[1:]))
+    waits = [wait for last in ends if (wait := _frames_to_find(last, half, error)) is not None]
     if waits:
         found = [wait for wait in waits if math.isfinite(wait)]
         scores |= {"exits": len(waits), "reacquired": len(found)}
@@ -100,7 +101,7 @@ def score(rows: Sequence[Tracked], truth: dict[int, dict[str, float]], size: tup
     return scores
 
 
-def _frames_to_find(last_out: int, half: np.ndarray, error: np.ndarray) -> float | None:
+def _frames_to_find(last_out: int, half: Bools, error: Floats) -> float | None:
     """Frames from half visible to five running within 20 px; inf if never within 60; None if never half visible."""
     again = np.flatnonzero(half[last_out:])
     if not len(again):

@@ -55,6 +55,10 @@ class PairSettings:
     largest_rate: float = 1e-2
     accept_log10_chance: float = -1.3
     """log10 of the chance that the best of all wrong lags fits as well."""
+    accept_pieces: float = 3.0
+    """Standard deviations by which a lag's agreeing seconds must stand out where the tracks jump, …"""
+    accept_pieces_support: float = 4.0
+    """… and how many of them there must be."""
     distinct_alignments: float = 0.3
     """Seconds between lags whose misfits are independent."""
     flat_ratio: float = 3.0
@@ -159,11 +163,23 @@ class Samples:
         self.label = np.concatenate([np.full(len(rows), k) for k, rows in enumerate(thinned)])
         self.time = np.concatenate([one.time[rows] for one, rows in zip(a, thinned, strict=True)])
         self.points = np.concatenate([one.points[rows] for one, rows in zip(a, thinned, strict=True)])
+        intervals = [float(np.median(np.diff(one.time))) for one in a]
+        seconds = sum(len(rows) * t for rows, t in zip(parts, intervals, strict=True))
+        self.seconds_a_sample = len(a) ** -0.5 * seconds / max(len(self.time), 1)
+        self._count()
+
+    def keep_near(self, matrix: Floats, rate: float, offset: float, pixels: float) -> None:
+        """Leave out what is further than ``pixels`` from ``s_bᵀ M s_a = 0`` (3, 3) under this time map."""
+        a, b = self.at(rate, offset)
+        sigma_a, sigma_b = 1.0 / self.a[0].focal, 1.0 / self.b[0].focal
+        with np.errstate(invalid="ignore"):
+            near = np.abs(two_view.sampson(matrix, a, b, sigma_a, sigma_b)) < pixels
+        self.label, self.time, self.points = self.label[near], self.time[near], self.points[near]
+        self._count()
+
+    def _count(self) -> None:
         self.count = len(self.time)
         self.centre = float(np.median(self.time)) if self.count else 0.0
-        intervals = [float(np.median(np.diff(one.time))) for one in a]
-        rows_a_second = self.count / max(sum(len(rows) * t for rows, t in zip(parts, intervals, strict=True)), 1e-9)
-        self.seconds_a_sample = len(a) ** -0.5 / max(rows_a_second, 1e-9)
 
     def _rows(self, a: SmoothTrack, b: SmoothTrack, offset: float) -> Ints:
         margin = 0.5

@@ -14,6 +14,7 @@ import numpy as np
 
 from hub.timing import two_view
 from hub.timing.alignment import PairFit, PairSettings, PairSolution, Samples, evidence
+from hub.timing.pieces import scan_pieces
 from hub.timing.refine import WIDE, Noise, Refined, refine
 from hub.timing.scan import PairMoments, Scan, candidates, grid_tracks, scan_lags
 from hub.timing.significance import Chance, bandwidth, chance
@@ -22,6 +23,11 @@ from hub.timing.two_view import Geometry, RelativePose, Uncalibrated
 from protocols.geometry.types import Floats
 
 _LEAST_SAMPLES = 12
+_PIECES_STEP = 0.033  # s: the scan in pieces is rough, and dear
+_NEAR_PX = 10.0  # what may belong to the geometry of the scan in pieces
+_MOSTLY_ONE = 0.85  # of a track's rows: with fewer on one path there may be another
+_OTHER_LAGS = 0.5  # s from the best: what is no part of it
+_LEAST_OTHER_LAGS = 3.0  # s
 _STEPS = (0.01, 0.0125, 0.016, 0.02, 0.025, 0.033, 0.05)
 _FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
 _LABELLED_RATES = tuple(
@@ -62,6 +68,8 @@ def solve_pair(
             return answer
         if first is None:
             first = answer
+    if search.jumps():
+        return search.in_pieces(names)
     assert first is not None
     return first
 
@@ -132,13 +140,59 @@ class _Search:
             answer = replace(answer, fit=replace(answer.fit, rate=answer.fit.rate * rate))
         return answer
 
+    def jumps(self) -> bool:
+        """Whether a track jumps, so that it may be made of several things; geometry that is given needs no pieces."""
+        torn = any(len(track.jumps) or track.inlier.mean() < _MOSTLY_ONE for track in (*self.a, *self.b))
+        return self.known is None and torn
+
+    def in_pieces(self, names: tuple[str, str]) -> PairSolution:
+        """Answer for tracks that follow something else now and then: the lag with most time that agrees."""
+        s, step = self.s, max(self.step, _PIECES_STEP)
+        moments = PairMoments(grid_tracks(self.a, step, s.sigma_px), grid_tracks(self.b, step, s.sigma_px))
+        scan = scan_pieces(moments, s.sigma_px, seed=0)
+        tried = scan.agreeing > 0
+        if not tried.any():
+            return PairSolution(*names, "the tracks jump, and no lag leaves enough of them in common")
+        best = int(np.argmax(scan.agreeing))
+        other = tried & (np.abs(moments.offset - moments.offset[best]) > _OTHER_LAGS)
+        if other.sum() * step < _LEAST_OTHER_LAGS:
+            return PairSolution(*names, "the tracks jump, and overlap too little to tell one lag from another")
+        usual, spread = float(scan.agreeing[other].mean()), float(scan.agreeing[other].std())
+        stands_out = (float(scan.agreeing[best]) - usual) / max(spread, 1e-6)
+        fits = []
+        for index in _peaks(moments.offset, scan.agreeing, s.at_most):
+            start = scan.matrix[index].T
+            fit = self._refine_candidate(
+                self.b, float(moments.offset[index]), float(scan.misfit[index]), start, pieces=True
+            )
+            if fit is not None:
+                fits.append(fit)
+        if not fits:
+            return PairSolution(*names, "no alignment of the pieces of the two tracks agrees with any geometry")
+        fits.sort(key=lambda fit: -fit.support * fit.front)
+        fit = fits[0]
+        second = max((rival.support for rival in fits[1:] if abs(rival.offset - fit.offset) > 0.1), default=0.0)
+        reason = _doubts(fit, s)
+        if reason:
+            pass
+        elif fit.support < s.accept_pieces_support:
+            reason = f"the tracks jump, and only {fit.support:.1f} s of them agree"
+        elif stands_out < s.accept_pieces or second > s.accept_ratio * fit.support:
+            reason = (
+                f"the tracks jump, and other lags fit nearly as well (the best agrees for {fit.support:.1f} s, the "
+                f"next for {second:.1f} s; the scan's best stands out by {stands_out:.1f} sigma)"
+            )
+        if reason:
+            return PairSolution(*names, reason, fit)
+        return self._finish(PairSolution(*names, "ok", fit), fit, self.b, pieces=True)
+
     def _searched(self, scan: Scan, fit: PairFit) -> float:
         """About how many independent alignments with as much common motion were looked at, rates included."""
         alike = scan.support > 0.7 * fit.moving_overlap
         return max(1.0, self.tried * float(alike.sum()) * self.step / self.s.distinct_alignments)
 
     def _refine_candidate(
-        self, b: Sequence[SmoothTrack], offset: float, cost: float, start: Floats | None
+        self, b: Sequence[SmoothTrack], offset: float, cost: float, start: Floats | None, *, pieces: bool = False
     ) -> PairFit | None:
         """Refine one lag from the moments' matrix and, with known lenses, from five-point hypotheses; the best wins.
 
@@ -146,7 +200,9 @@ class _Search:
         with the time right and the rotation tens of degrees off.
         """
         s, a = self.s, self.a
-        few = Samples(a, b, offset, s, s.few)
+        few = Samples(a, b, offset, s, s.samples if pieces else s.few)
+        if pieces and start is not None:
+            few.keep_near(start, 1.0, offset, _NEAR_PX)
         if few.count < _LEAST_SAMPLES:
             return None
         scale = float(np.sqrt(max(cost, 1.0)))
@@ -162,6 +218,8 @@ class _Search:
         rate = 1.0 / best.slowness
         offset = few.centre - rate * best.middle
         samples = Samples(a, b, offset, s, s.samples)
+        if pieces:
+            samples.keep_near(best.geometry.matrix, rate, offset, _NEAR_PX)
         if samples.count < _LEAST_SAMPLES:
             return None
         if samples.count > few.count:
@@ -193,10 +251,14 @@ class _Search:
             starts += two_view.five_point(here_a, here_b, threshold, seed)
         return starts
 
-    def _finish(self, answer: PairSolution, fit: PairFit, b: Sequence[SmoothTrack]) -> PairSolution:
+    def _finish(
+        self, answer: PairSolution, fit: PairFit, b: Sequence[SmoothTrack], *, pieces: bool = False
+    ) -> PairSolution:
         """The answer with all samples, the tracks' own noise and hardly any robustness left, and its stds."""
         s, a = self.s, self.a
         samples = Samples(a, b, fit.offset, s, s.all_samples)
+        if pieces:
+            samples.keep_near(fit.geometry.matrix, fit.rate, fit.offset, _NEAR_PX)
         own = [max(float(np.median([t.sigma for t in one])), 0.1 / one[0].focal) for one in (a, b)]
         misfit = max(1.0, fit.sigma_px / (0.5 * (own[0] * a[0].focal + own[1] * b[0].focal)))
         noise = Noise(own[0] * misfit, own[1] * misfit, s.rate_std)
@@ -311,18 +373,11 @@ def _judge(names: tuple[str, str], fits: list[PairFit], searched: float, s: Pair
     # Regular motion fits nearly as well a period later. That is settled by the noise where there is enough of
     # it and nothing else comes near what the tracks' own noise leaves.
     settled = not rivals and best.support >= s.unchecked_support and best.sigma_px <= s.exact * best.own_px
-    if best.support < s.accept_support:
-        reason = f"only {best.support:.1f} s of motion agree (of {best.moving_overlap:.1f} s)"
-    elif best.sigma_px > s.largest_sigma_px:
-        reason = f"the best alignment leaves {best.sigma_px:.1f} px"
-    elif abs(best.rate - 1.0) > s.largest_rate:
-        reason = f"the best alignment needs a clock that is {1e6 * abs(best.rate - 1.0):.0f} ppm off"
+    doubts = _doubts(best, s)
+    if doubts:
+        reason = doubts
     elif best.inliers < needed_inliers(best, s):
         reason = f"only {100 * best.inliers:.0f} % of the common motion agrees with one geometry"
-    elif best.front < s.accept_in_front:
-        reason = "the best geometry puts points behind a camera"
-    elif best.flat_px < s.flat_ratio * max(best.sigma_px, s.sigma_px):
-        reason = "the motion lies in one plane (or the cameras stand in one place), which leaves the geometry open"
     elif by_chance is None and best.support < s.unchecked_support:
         reason = (
             f"the recordings overlap too little ({best.moving_overlap:.1f} s of motion) to tell one lag from another"
@@ -338,6 +393,32 @@ def _judge(names: tuple[str, str], fits: list[PairFit], searched: float, s: Pair
     else:
         return PairSolution(*names, "ok", best, others)
     return PairSolution(*names, reason, best, others)
+
+
+def _peaks(offset: Floats, value: Floats, at_most: int) -> list[int]:
+    """Indices of the highest values, none within 0.15 s of a higher one."""
+    out: list[int] = []
+    for index in np.argsort(-value, kind="stable"):
+        if value[index] <= 0 or len(out) >= at_most:
+            break
+        if all(abs(offset[index] - offset[other]) > 0.15 for other in out):
+            out.append(int(index))
+    return out
+
+
+def _doubts(fit: PairFit, s: PairSettings) -> str:
+    """What speaks against an alignment taken by itself; "" for nothing."""
+    if fit.support < s.accept_support:
+        return f"only {fit.support:.1f} s of motion agree (of {fit.moving_overlap:.1f} s)"
+    if fit.sigma_px > s.largest_sigma_px:
+        return f"the best alignment leaves {fit.sigma_px:.1f} px"
+    if abs(fit.rate - 1.0) > s.largest_rate:
+        return f"the best alignment needs a clock that is {1e6 * abs(fit.rate - 1.0):.0f} ppm off"
+    if fit.front < s.accept_in_front:
+        return "the best geometry puts points behind a camera"
+    if fit.flat_px < s.flat_ratio * max(fit.sigma_px, s.sigma_px):
+        return "the motion lies in one plane (or the cameras stand in one place), which leaves the geometry open"
+    return ""
 
 
 def _rivals(fit: PairFit, best: PairFit, s: PairSettings) -> bool:

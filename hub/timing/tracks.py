@@ -7,7 +7,7 @@ generalised cross-validation.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -54,6 +54,8 @@ class SmoothTrack:
     control: Floats
     sigma: float
     focal: float
+    jumps: Floats = field(default_factory=lambda: np.zeros(0))
+    """(k,) times [s] at which the detector seems to have taken up another thing."""
 
     def at(self, time: Floats, derivative: int = 0) -> Floats:
         """Smoothed normalised coordinates (n, 2) (or their derivative); NaN in gaps."""
@@ -65,7 +67,7 @@ class SmoothTrack:
 
     def scaled(self, factor: float) -> SmoothTrack:
         """The same track on a clock whose seconds are 1 / ``factor`` of these."""
-        return replace(self, time=self.time * factor, basis=self.basis.scaled(factor))
+        return replace(self, time=self.time * factor, basis=self.basis.scaled(factor), jumps=self.jumps * factor)
 
     @property
     def sigma_px(self) -> float:
@@ -117,7 +119,7 @@ def smooth_track(time: Floats, normalised: Floats, focal: float, epoch: float | 
     basis, control, inlier, sigma = best.basis, best.control, best.inlier, best.sigma
     mask = np.zeros(len(time), dtype=np.bool_)
     mask[rows[inlier]] = True
-    return SmoothTrack(origin, t[inlier], x[inlier], mask, basis, control, sigma, focal)
+    return SmoothTrack(origin, t[inlier], x[inlier], mask, basis, control, sigma, focal, jumps)
 
 
 def without_jumps(tracks: list[RawTrack]) -> tuple[list[RawTrack], str]:

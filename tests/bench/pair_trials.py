@@ -75,7 +75,9 @@ class Regime:
     """Under what conditions a trial is made; times in seconds, shares of all rows.
 
     span: of each recording. late: camera b begins within ±late of a, or, with ``overlap``, so that exactly
-    that many seconds are common. second: share of a view in which the detector follows another thing.
+    that many seconds are common. ppm: largest error of a clock's rate. told_fps: frame rates from which the times
+    were made, if wrong ones. readout: of the rolling shutter [s]. second: share of a view in
+    which the detector follows another thing.
     paper_path: the paper's trajectory (a) before the paper's cameras.
     """
 
@@ -92,6 +94,7 @@ class Regime:
     slowest: float = 0.05
     fastest: float = 1.2
     readout: float = 0.0
+    told_fps: tuple[float, float] | None = None
     paper_path: bool = False
 
 
@@ -105,8 +108,12 @@ def make(regime: Regime, seed: int) -> Trial:
         poses, path = _random_rig(rng), _random_path(rng, r.slowest, r.fastest)
     other = _random_path(rng, r.slowest, r.fastest)
     drift = tuple(1.0 + 1e-6 * float(d) for d in rng.uniform(-r.ppm, r.ppm, 2))
+    if r.told_fps is not None:
+        drift = tuple(d * actual / told for d, actual, told in zip(drift, r.fps, r.told_fps, strict=True))
     epoch = tuple(float(e) for e in rng.choice([0.0, 1.7e9, 86_400.5, -250.0, 3.2e6], 2))
-    late = float(rng.uniform(-r.late, r.late)) if r.overlap is None else float(rng.choice([-1, 1])) * (r.span - r.overlap)
+    late = (
+        float(rng.uniform(-r.late, r.late)) if r.overlap is None else float(rng.choice([-1, 1])) * (r.span - r.overlap)
+    )
     style = int(rng.integers(3))  # of the second thing: own episodes a view, common episodes, single frames
     episodes = [_episodes(rng, r.span + 2 * abs(late), -abs(late), r.second) for _ in range(2)]
     views = []
@@ -139,7 +146,7 @@ def make(regime: Regime, seed: int) -> Trial:
 
 def stranger(trial: Trial, regime: Regime, seed: int) -> Trial:
     """The same trial, but camera b watched something else: nothing may be answered."""
-    other = make(regime, seed + 500_000)
+    other = make(replace(regime, paper_path=False), seed + 500_000)
     swapped = replace(trial, poses=(trial.poses[0], other.poses[1]))
     return replace(swapped, views=(trial.views[0], other.views[1]))
 
@@ -191,7 +198,9 @@ def geometry_error(trial: Trial, fundamental: Floats) -> float:
     ha, hb = np.column_stack([a, np.ones(len(a))]), np.column_stack([b, np.ones(len(b))])
     line_b, line_a = ha @ fundamental, hb @ fundamental.T
     value = np.abs((line_b * hb).sum(1))
-    return float(0.5 * (value / np.linalg.norm(line_b[:, :2], axis=1) + value / np.linalg.norm(line_a[:, :2], axis=1)).mean())
+    return float(
+        0.5 * (value / np.linalg.norm(line_b[:, :2], axis=1) + value / np.linalg.norm(line_a[:, :2], axis=1)).mean()
+    )
 
 
 def map_error(trial: Trial, rate: float, offset: float) -> tuple[float, float]:
@@ -261,6 +270,4 @@ def _paper_rig() -> tuple[Pose, Pose]:
 def _paper_a(time: Floats) -> Floats:
     """The paper's trajectory (a)."""
     swell = np.sin(np.pi / 11 * time)
-    return np.column_stack(
-        [18 * (time - 5.5), 140 * np.sin(np.pi * time) * swell, 100 * np.cos(np.pi * time) * swell]
-    )
+    return np.column_stack([18 * (time - 5.5), 140 * np.sin(np.pi * time) * swell, 100 * np.cos(np.pi * time) * swell])

@@ -1,8 +1,8 @@
 """The figures of the paper on following a car, on the simulated town: pictures, and numbers beside them.
 
-``python -m tests.papers.uav_paper --out DIR`` draws figures 1 to 5 and 7 and writes numbers.txt. Section 3.3 (figure 1):
-a winding road, a drone that keeps the estimate in the middle; without and with the road. Section 4.1 (figures 2 to 5):
-the frame, its regions by colour, the road's shape, the regions corrected by it. Section 4.4 (figure 7): the town.
+``python -m tests.papers.uav_paper --out DIR`` draws figures 1 to 5 and 7 and writes numbers.txt. Section 3.3 (figure
+1): a winding road, a drone that keeps the estimate in the middle; without and with the road. Section 4.1 (figures 2 to
+5): the frame, its regions by colour, the road's shape, the regions corrected by it. Section 4.4 (figure 7): the town.
 The paper shows pictures only; the numbers are the means over several seeds of the same scenario.
 """
 
@@ -106,7 +106,7 @@ def run(world: World, tracker: Tracker, frames: int | None = None, look: Callabl
 
 
 def route(world: World, frame: int) -> Floats:
-    """The target's whole route (n, 2) in the pixels of one frame, nan behind the camera: the true course of its lane."""
+    """The target's whole route (n, 2) in the pixels of one frame, nan behind the camera: its lane."""
     pose = world.truth(frame).camera
     ground = np.column_stack([world.target.ground[:, :2], np.zeros(len(world.target.ground))])
     return world.lens.project((ground - pose.position) @ pose.rotation.T)
@@ -173,17 +173,17 @@ def figures_2_to_5(world: World, frame: int, seed: int) -> tuple[dict[str, Image
         for side in (-view.course.half_width, 0.0, view.course.half_width):
             line = np.rint((known + side * normal) * 8).astype(np.int32).reshape(-1, 1, 2)
             cv2.polylines(shape, [line], False, _YELLOW if side else _CYAN, 2, cv2.LINE_AA, 3)
-    pictures = {
+    pictures: dict[str, Image] = {
         "figure-2.png": image,
-        "figure-3.png": cv2.resize(regions.COLOURS[view.labels], size, interpolation=cv2.INTER_NEAREST),
+        "figure-3.png": _in_colours(view.labels, size),
         "figure-4.png": shape,
-        "figure-5.png": cv2.resize(regions.COLOURS[view.corrected], size, interpolation=cv2.INTER_NEAREST),
+        "figure-5.png": _in_colours(view.corrected, size),
     }
     return pictures, [
         f"figure 3, frame {frame}: {road_share(world, frame, view.labels):.0%} of the car's route in the picture is "
         f"road; of all pixels {_shares(view.labels)}",
-        f"figure 4: the road's middle keeps its distance from the car's route to {lane_scatter(world, frame, tracker):.1f}"
-        " px (std within the picture)",
+        "figure 4: the road's middle keeps its distance from the car's route to "
+        f"{lane_scatter(world, frame, tracker):.1f} px (std within the picture)",
         f"figure 5: {road_share(world, frame, view.corrected):.0%} of the car's route is road; of all pixels "
         f"{_shares(view.corrected)}",
     ]
@@ -263,6 +263,11 @@ def _seen_route(world: World, frame: int) -> Floats:
     places = route(world, frame)
     inside = ((places > 0.0) & (places < np.array(world.size) - 1.0)).all(axis=1)
     return places[inside]
+
+
+def _in_colours(labels: regions.Labels, size: tuple[int, int]) -> Image:
+    coloured = cv2.resize(regions.COLOURS[labels], size, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(coloured, dtype=np.uint8)
 
 
 def _share(mask: np.ndarray) -> float:

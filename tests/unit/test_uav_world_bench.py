@@ -20,6 +20,7 @@ from edge.uav.world.world import Truth, World
 from protocols.errors import EXIT_DONE
 from protocols.geometry.types import Floats
 from protocols.session.rig import read_rig
+from tests.bench import real_rigs, uav_aerial
 from tests.bench.uav_scoring import Score, score
 from tests.bench.uav_tracker import CASES, ROWS, fly, table
 
@@ -221,3 +222,28 @@ def test_simulate_writes_a_flight_that_can_be_read_back(tmp_path: Path, capsys: 
 def test_simulate_refuses_what_a_scene_has_no_use_for(options: list[str], tmp_path: Path) -> None:
     assert run(["simulate", *options, "--out", str(tmp_path / "x")]) == 2
     assert not (tmp_path / "x").exists()
+
+
+def test_windows_of_the_real_video_are_cropped_with_black_beyond_it() -> None:
+    image = np.arange(300 * 500 * 3, dtype=np.uint32).reshape(300, 500, 3).astype(np.uint8)
+    inner = uav_aerial.cropped(image, np.array([50.0, 60.0]))
+    assert np.array_equal(inner, image[60 : 60 + 225, 50 : 50 + 400])
+    beyond = uav_aerial.cropped(image, np.array([-10.0, 200.0]))
+    assert np.array_equal(beyond[:100, 10:], image[200:300, :390])
+    assert not beyond[:, :10].any()
+    assert not beyond[100:].any()
+
+
+def test_real_windows_make_the_car_leave_and_come_back() -> None:
+    folder = real_rigs.DEFAULT_DATA / uav_aerial.FOLDER
+    if not folder.exists():
+        pytest.skip(f"{folder} is absent")
+    windows = uav_aerial.read_windows(folder)
+    assert [window.car for window in windows] == ["car07", "car13", "car17", "car19"]
+    for window in windows:
+        low = np.maximum(window.box[:, :2], 0.0)
+        high = np.minimum(window.box[:, :2] + window.box[:, 2:], np.array(uav_aerial.SIZE))
+        share = np.maximum(high - low, 0.0).prod(axis=1) / window.box[:, 2:].prod(axis=1)
+        assert share == pytest.approx(window.visible, abs=2e-3)
+        assert (window.visible == 0.0).sum() > 20
+        assert window.visible[[0, -1]] == pytest.approx(1.0)

@@ -125,8 +125,8 @@ def cut_patch(
         valid = np.ones((height, width), np.float32)
     else:
         full = np.ones(image.shape[:2], np.float32)
-        valid = cv2.warpPerspective(full, image_from_cell, (width, height), flags=flags)
-        valid = (valid > 0.75).astype(np.float32)
+        seen = cv2.warpPerspective(full, image_from_cell, (width, height), flags=flags)
+        valid = (seen > 0.75).astype(np.float32)
     return Patch(np.asarray(cells, dtype=np.uint8), np.asarray(valid, np.float32), centre, angle, pitch, whole)
 
 
@@ -138,9 +138,9 @@ class Appearance:
         self.length, self.width = length, width
         self.pitch = float(np.clip(pitch, max(length, width) / _LONGEST, max(length, width) / _SHORTEST))
         self._make_masks()
-        self._target = np.zeros(_BINS**3, np.float64)
+        self._target: Floats = np.zeros(_BINS**3)
         self._first: Floats | None = None
-        self._around = np.zeros(_BINS**3, np.float64)
+        self._around: Floats = np.zeros(_BINS**3)
         self._table: Singles = np.zeros(_BINS**3, np.float32)
         self._template: Singles | None = None
         self._anchor: Singles | None = None
@@ -218,16 +218,16 @@ class Appearance:
         target_weight[y0:y1, x0:x1] = self._inside[y0 - iy : y1 - iy, x0 - ix : x1 - ix]
         outside = np.ones((height, width))
         outside[y0:y1, x0:x1] = self._ring[y0 - iy : y1 - iy, x0 - ix : x1 - ix]
-        inner = np.bincount(index, target_weight.ravel() * valid, _BINS**3)
-        outer = np.bincount(index, outside.ravel() * valid, _BINS**3)
-        if inner.sum() <= 0 or outer.sum() <= 0:
+        inside = np.bincount(index, target_weight.ravel() * valid, _BINS**3).astype(np.float64)
+        around = np.bincount(index, outside.ravel() * valid, _BINS**3).astype(np.float64)
+        if inside.sum() <= 0 or around.sum() <= 0:
             return
-        inner, outer = _smooth(inner / inner.sum()), _smooth(outer / outer.sum())
-        if self._first is None:
+        inner, outer = _smooth(inside / inside.sum()), _smooth(around / around.sum())
+        if self._first is None or rate > 0.5:
             self._first, self._target, self._around = inner, inner, outer
         else:
             self._target = (1 - rate) * self._target + rate * inner
-            self._around = (1 - 2 * rate) * self._around + 2 * rate * outer if rate < 0.5 else outer
+            self._around = (1 - 2 * rate) * self._around + 2 * rate * outer
         target = 0.35 * self._first + 0.65 * self._target
         floor = 2e-5
         ratio = np.log((target + floor) / (self._around + floor))

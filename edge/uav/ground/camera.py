@@ -78,6 +78,11 @@ class ImagePlane:
         return np.asarray(np.where(np.isfinite(shift), shift, 0.0))
 
 
+def inverse(matrix: Floats) -> Floats:
+    """The inverse (3, 3). Raises numpy.linalg.LinAlgError."""
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+
+
 def transfer(matrix: Floats, points: Floats) -> Floats:
     """Points (n, 2) through a homography (3, 3); NaN where they are not in front (third coordinate <= 0)."""
     p = points @ matrix[:, :2].T + matrix[:, 2]

@@ -15,9 +15,10 @@ from protocols.geometry.types import Floats, Ints
 FREE = -1
 """Of a particle that follows no way."""
 _SIDEWAYS = 6.5  # acceleration that a driver accepts in a bend [units/s²]
+_CORNER, _SIDEWAYS_CORNER = 0.07, 3.0  # the curvature of a turn at a junction, and what is accepted there
 _FASTEST = 60.0
 _UNKNOWN_BEND = 0.008  # std of the curvature of road that was never seen [1/unit]
-_GOES_ON = 0.5  # of the acceleration at the last sighting
+_GOES_ON = 0.35  # of the acceleration at the last sighting
 _MOOD_S = 1.5  # how long a change of speed lasts
 
 
@@ -116,7 +117,7 @@ def drawn(fit: MotionFit, place: Floats, std: float, count: int, rng: np.random.
     velocity = fit.velocity + rng.normal(0.0, fit.velocity_std, (count, 2))
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
     heading = np.arctan2(velocity[:, 1], velocity[:, 0])
-    shrink = 1.0 / (1.0 + np.square(fit.acceleration_std / 2.0))
+    shrink = 1.0 / (1.0 + np.square(fit.acceleration_std / max(2.0, 0.17 * fit.speed)))
     along = _GOES_ON * shrink * fit.along + rng.normal(0.0, min(fit.acceleration_std, 1.0), count)
     curvature = np.full(count, fit.turn_rate / max(fit.speed, 2.0)) + rng.normal(0.0, 0.01, count)
     return Cloud(
@@ -160,7 +161,7 @@ def driven(cloud: Cloud, dt: float, ways: list[Way], seen: bool, rng: np.random.
         if not on.any():
             continue
         bend = np.abs(way.curvature(cloud.along[on] + 4.0))
-        limit = np.sqrt(_SIDEWAYS / np.maximum(bend, 1e-3))
+        limit = np.sqrt(np.where(bend > _CORNER, _SIDEWAYS_CORNER, _SIDEWAYS) / np.maximum(bend, 1e-3))
         excess = np.maximum(speed[on] - limit, 0.0)
         speed[on] = speed[on] - np.minimum(excess, 3.5 * dt)
         along[on] = cloud.along[on] + speed[on] * dt
@@ -196,7 +197,7 @@ def rerouted(cloud: Cloud, old: list[Way], new: list[Way], rng: np.random.Genera
             gaps.append(float(np.linalg.norm(way.points[:m] - other.points[:m], axis=1).mean()))
         follows[k] = int(np.argmin(gaps))
         claimed[follows[k]] = True
-    way = np.where(cloud.way == FREE, FREE, follows[np.maximum(cloud.way, 0)])
+    taken = np.where(cloud.way == FREE, FREE, follows[np.maximum(cloud.way, 0)])
     for k, other in enumerate(new):
         if claimed[k] or k == 0:
             continue
@@ -204,10 +205,10 @@ def rerouted(cloud: Cloud, old: list[Way], new: list[Way], rng: np.random.Genera
         m = min(len(base.points), len(other.points))
         apart = np.linalg.norm(base.points[:m] - other.points[:m], axis=1) > 2.0
         leaves = float(np.argmax(apart)) * 1.5 if apart.any() else 0.0
-        can = (way == 0) & (cloud.along < leaves)
+        can = (taken == 0) & (cloud.along < leaves)
         takes = can & (rng.random(len(cloud)) < other.weight / (other.weight + base.weight))
-        way = np.where(takes, k, way)
-    return replace(cloud, way=way)
+        taken = np.where(takes, k, taken)
+    return replace(cloud, way=taken)
 
 
 def pulled(cloud: Cloud, fit: MotionFit, ahead: float, strength: float, rng: np.random.Generator) -> Cloud:
@@ -245,9 +246,7 @@ def _moods(count: int, rng: np.random.Generator) -> Floats:
     return np.where(kind < 0.68, going, np.where(kind < 0.92, changing, braking))
 
 
-def joined(
-    cloud: Cloud, place: Floats, motion: tuple[Floats, float], weight: float, rng: np.random.Generator
-) -> Cloud:
+def joined(cloud: Cloud, place: Floats, motion: tuple[Floats, float], weight: float, rng: np.random.Generator) -> Cloud:
     """The cloud with some particles instead of others: about a place (2,), with a velocity (2,) and its std."""
     n = max(len(cloud) // 20, 8)
     velocity = motion[0] + rng.normal(0.0, motion[1], (n, 2))

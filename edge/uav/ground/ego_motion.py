@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.ground.camera import ImagePlane, transfer
+from edge.uav.ground.camera import ImagePlane, inverse, transfer
 from edge.uav.ground.plane_motion import ChainPlane, PlaneMotion, PosePlane
 from protocols.geometry import so3
 from protocols.geometry.types import Bools, Floats
@@ -176,7 +176,7 @@ class EgoMotion:
         if not len(self._pixels):
             return self._pixels, np.zeros(0, bool)
         height, width = gray.shape[:2]
-        usable = np.isfinite(start).all(axis=1)
+        usable: Bools = np.asarray(np.isfinite(start).all(axis=1))
         begin = np.where(usable[:, None], start, self._pixels).astype(np.float32)
         begin = np.clip(begin, -50.0, [width + 50.0, height + 50.0]).astype(np.float32)
         found, status, _ = cv2.calcOpticalFlowPyrLK(
@@ -255,7 +255,7 @@ class EgoMotion:
         new = np.asarray(found, dtype=np.float32).reshape(-1, 2)
         seen = self._plane.normalise(self._full(new.astype(np.float64)))
         try:
-            back = np.linalg.inv(self.motion.matrix)
+            back = inverse(self.motion.matrix)
         except np.linalg.LinAlgError:
             return
         ground = transfer(back, seen)
@@ -283,7 +283,7 @@ class EgoMotion:
             moved = moved[np.isfinite(moved).all(axis=1)]
             if len(moved):
                 expected = np.median(moved, axis=0)
-        return np.array([dx, dy]) * scale - expected
+        return np.asarray(np.array([dx, dy]) * scale - expected, dtype=np.float64)
 
 
 def _place(

@@ -12,9 +12,10 @@ from protocols.geometry.types import Floats
 
 _SPAN_S = 0.9
 _MOST = 40
-_RECENT_S = 0.5
+_RECENT_S = 0.3
 _BETTER = 0.4  # of a sighting's std is what differs from frame to frame; the rest is common to all
 _ACCELERATION_STD = 3.5  # of a car, along each axis [units/s²]
+_AGILITY = 0.3  # the same over the speed, where that is more [1/s]
 _SPEED_STD = 15.0
 
 
@@ -110,7 +111,10 @@ class Sightings:
         stds = np.array(self._stds)[recent]
         mean, spread = self._prior or (np.zeros(2), _SPEED_STD)
         design = np.column_stack([np.ones_like(t), t, 0.5 * t * t])
-        information = np.diag([1e-8, 1.0 / spread**2, 1.0 / _ACCELERATION_STD**2])
+        # A film in quick motion, or units that are not metres: what is fast also changes its speed fast.
+        pace = float(np.hypot(*(places[-1] - places[0]))) / float(t[-1] - t[0])
+        agility = max(_ACCELERATION_STD, _AGILITY * pace)
+        information = np.diag([1e-8, 1.0 / spread**2, 1.0 / agility**2])
         right0 = np.zeros((3, 2))
         right0[1] = mean / spread**2
         # The newest count most: drivers brake and steer within a second.

@@ -15,6 +15,8 @@ from protocols.geometry.types import Floats
 _TRACE_EVERY = 8  # frames
 _NUMBER = 400
 _ON_WAYS = 0.92  # of the particles, where the target drove on the road
+_TURNING, _BRAKED = 0.36, 0.4  # chance of a turn where there is one, and how much more for one who brakes
+_TELLING = 1.5  # std of an acceleration that tells something
 _MADE_OF_ROAD = 0.5  # share of the trail that must be road for ways to count
 
 
@@ -31,6 +33,9 @@ class Outlook:
         self._speed = fit.speed if fit is not None else 0.0
         bend = fit.turn_rate / max(fit.speed, 2.0) if fit is not None else 0.0
         self._bend = float(np.clip(bend, -0.12, 0.12))
+        # Who brakes before a junction mostly turns there.
+        braking = -fit.along if fit is not None and fit.acceleration_std < _TELLING else 0.0
+        self._turning = _TURNING + _BRAKED * float(np.clip((braking - 0.5) / 1.5, 0.0, 1.0))
         self._keep = (float("nan"), float("nan"))
         self.on_road = 0.0
         if len(trail) > 3 and self._speed > 1.0 and road.ready:
@@ -61,7 +66,7 @@ class Outlook:
         if self.on_road < _MADE_OF_ROAD:
             return []
         reach = float(np.clip(self._speed * (3.0 + time - self._since) + 15.0, 30.0, 160.0))
-        return trace(road, self._place, self._heading, self._bend, reach, self._keep)
+        return trace(road, self._place, self._heading, self._bend, reach, self._keep, self._turning)
 
 
 def _middle(values: Floats) -> float:

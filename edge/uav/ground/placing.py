@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.ground.camera import ImagePlane, transfer
+from edge.uav.ground.camera import ImagePlane, inverse, transfer
 from edge.uav.ground.ego_motion import EgoMotion
 from edge.uav.ground.light import Light
 from edge.uav.ground.plane_motion import PosePlane
@@ -97,7 +97,7 @@ class Placing:
 
     def body_ground(self, pixels: Floats) -> Floats:
         """Ground points (n, 2) on which targets seen at image pixels (n, 2) stand; NaN above the horizon."""
-        return transfer(np.linalg.inv(self.body_matrix), self.plane.normalise(pixels))
+        return transfer(inverse(self.body_matrix), self.plane.normalise(pixels))
 
     def skip(self, dt: float) -> None:
         """A frame that could not be decoded."""
@@ -155,7 +155,7 @@ class Placing:
 
     def take(self, root: Root) -> Floats:
         """Go over to another ground frame; (3, 3) homography, new from old ground."""
-        change = np.linalg.inv(root.motion.matrix) @ self.matrix
+        change = inverse(root.motion.matrix) @ self.matrix
         self._ego.restart(root.motion, change)
         self._kind = root.kind
         if self.clock is not None:

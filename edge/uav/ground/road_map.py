@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.ground.camera import ImagePlane, transfer
+from edge.uav.ground.camera import ImagePlane, inverse, transfer
 from protocols.geometry.types import Floats
 
 Picture = npt.NDArray[np.uint8]
@@ -40,10 +40,13 @@ class RoadMap:
         """Colours (n, 3) of what is road, and of a whole picture; the newer count by ``rate``."""
         if len(road) < 8:
             return
+        # A verge or a marking among them is not what most of them are.
+        away = np.abs(road - np.median(road, axis=0)).max(axis=1)
+        road = road[away <= max(2.0 * float(np.median(away)), 12.0)]
         new_road = _blur(np.bincount(_index(road), minlength=_BINS**3).astype(np.float64))
         new_all = _blur(np.bincount(_index(everything), minlength=_BINS**3).astype(np.float64))
         new_road, new_all = new_road / max(new_road.sum(), 1e-9), new_all / max(new_all.sum(), 1e-9)
-        if self._table is None:
+        if self._table is None or rate >= 1.0:
             self._road, self._all = new_road, new_all
         else:
             self._road = (1 - rate) * self._road + rate * new_road
@@ -51,6 +54,11 @@ class RoadMap:
         other = np.maximum(self._all - _SHARE * self._road, 0.05 * self._all)
         ratio = np.log((self._road + 1e-4) / (other / max(other.sum(), 1e-9) + 1e-4))
         self._table = np.clip(ratio, -2.0, 2.0).astype(np.float32)
+
+    def forget(self) -> None:
+        """All cells unknown again; the colours stay."""
+        self._odds[:] = 0.0
+        self._smooth = None
 
     def take_colours(self, other: RoadMap) -> None:
         """What another map learnt of colours: the ground may be counted anew, asphalt stays asphalt."""
@@ -75,7 +83,7 @@ class RoadMap:
         )
         middle = np.array([[(plane.width - 1) / 2.0, (plane.height - 1) / 2.0]])
         try:
-            back = np.linalg.inv(matrix)
+            back = inverse(matrix)
         except np.linalg.LinAlgError:
             return
         seen = transfer(back, plane.normalise(np.concatenate([corners, middle])))
@@ -102,7 +110,9 @@ class RoadMap:
         pixels = plane.pixels(transfer(matrix, (mesh + first + 0.5) * CELL + self._origin))
         pixels = np.nan_to_num((pixels + 0.5) / factor - 0.5, nan=-1e4).clip(-1e4, 1e4).reshape(ny, nx, 2)
         maps = _stretch(pixels.astype(np.float32), (int(size[0]), int(size[1])))
-        cells = cv2.remap(small, maps, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+        across, down = cv2.split(maps)
+        warped = cv2.remap(small, across, down, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+        cells = np.asarray(warped, np.uint8)
         height, width = small.shape[:2]
         inside = (maps[..., 0] > 1) & (maps[..., 1] > 1) & (maps[..., 0] < width - 2) & (maps[..., 1] < height - 2)
         evidence = np.where(inside, np.clip(self._table[_index(cells)], -1.0, 1.0) * _EVIDENCE, 0.0).astype(np.float32)
@@ -139,7 +149,7 @@ class RoadMap:
         first = np.clip(np.floor((centre - reach - self._origin) / CELL).astype(int), 0, _SIZE - 1)
         last = np.clip(np.ceil((centre + reach - self._origin) / CELL).astype(int), 1, _SIZE)
         rows, columns = np.nonzero(self._odds[first[1] : last[1] : 2, first[0] : last[0] : 2] > 1.0)
-        return (np.column_stack([2 * columns, 2 * rows]) + first + 0.5) * CELL + self._origin
+        return np.asarray((np.column_stack([2 * columns, 2 * rows]) + first + 0.5) * CELL + self._origin)
 
     def _make_room(self, centre: Floats) -> None:
         """Shift the square so that ``centre`` is well inside."""
@@ -177,7 +187,8 @@ def _look(field: Singles, index: Floats) -> Floats:
 
 def _index(colours: Picture) -> npt.NDArray[np.int64]:
     q = colours >> (8 - _BITS)
-    return (q[..., 0].astype(np.int64) << 2 * _BITS) + (q[..., 1].astype(np.int64) << _BITS) + q[..., 2]
+    index = (q[..., 0].astype(np.int64) << 2 * _BITS) + (q[..., 1].astype(np.int64) << _BITS) + q[..., 2]
+    return np.asarray(index, dtype=np.int64)
 
 
 def _blur(histogram: Floats) -> Floats:

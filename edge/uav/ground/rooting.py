@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.uav.ground.camera import ImagePlane, transfer
+from edge.uav.ground.camera import ImagePlane, inverse, transfer
 from edge.uav.ground.plane_motion import ChainPlane, PosePlane
 from edge.uav.ground.telemetry import TelemetryClock
 from edge.uav.tracker import Box
@@ -46,7 +46,7 @@ def root_from_telemetry(plane: ImagePlane, clock: TelemetryClock | None, time: f
     unit = PosePlane(rotation, np.array([0.0, 0.0, -1.0]))
     if not _in_reach(unit, seen):
         return None
-    corners = transfer(np.linalg.inv(unit.matrix), seen)
+    corners = transfer(inverse(unit.matrix), seen)
     sides = (np.linalg.norm(corners[1] - corners[0]), np.linalg.norm(corners[3] - corners[0]))
     height = CAR_LENGTH / max(float(max(sides)), 1e-9)
     return Root(PosePlane(rotation, np.array([0.0, 0.0, -height])), "attitude")
@@ -67,7 +67,7 @@ def _corners(target: Box) -> Floats:
 def _in_reach(motion: PosePlane, seen: Floats) -> bool:
     """Whether all of these image points are on the ground and not near the horizon."""
     try:
-        ground = transfer(np.linalg.inv(motion.matrix), seen)
+        ground = transfer(inverse(motion.matrix), seen)
     except np.linalg.LinAlgError:
         return False
     if not np.isfinite(ground).all():

@@ -27,7 +27,9 @@ class Target:
         middle = np.array([[box.x + 0.5 * (box.width - 1.0), box.y + 0.5 * (box.height - 1.0)]])
         rough = placing.body_ground(middle)[0]
         unit = np.linalg.inv(footprint.local_axes(placing.plane, placing.matrix, rough))
-        placing.body_height = _BODY * max(box.width * float(np.hypot(*unit.T[0])), box.height * float(np.hypot(*unit.T[1])))
+        placing.body_height = _BODY * max(
+            box.width * float(np.hypot(*unit.T[0])), box.height * float(np.hypot(*unit.T[1]))
+        )
         self.place = placing.body_ground(middle)[0]
         axes = footprint.local_axes(placing.plane, placing.body_matrix, self.place)
         right, down = np.linalg.inv(axes).T  # the picture's axes on the ground

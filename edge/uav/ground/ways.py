@@ -75,11 +75,18 @@ def edges(road: RoadMap, points: Floats, headings: Floats) -> tuple[Floats, Floa
 
 
 def trace(
-    road: RoadMap, start: Floats, heading: float, curvature: float, length: float, keep: tuple[float, float]
+    road: RoadMap,
+    start: Floats,
+    heading: float,
+    curvature: float,
+    length: float,
+    keep: tuple[float, float],
+    turning: float = 0.36,
 ) -> list[Way]:
     """The ways from ``start`` (2,). keep: distances to the right and left edge there, NaN where not seen.
 
-    curvature: of the car's path now [1/unit]. length: how far to go. The first way is the road's own course.
+    curvature: of the car's path now [1/unit]. length: how far to go. turning: chance that it leaves the road where it
+    can. The first way is the road's own course.
     """
     road.prepare(start, length + 25.0)
     main = _follow(road, start, heading, curvature, length, keep)
@@ -95,8 +102,8 @@ def trace(
                 STEP * (index + len(points)) + tail[2],
             )
         )
-    share = 0.36 / max(len(found) - 1, 1)
-    weights = [1.0] if len(found) == 1 else [0.64] + [share] * (len(found) - 1)
+    share = turning / max(len(found) - 1, 1)
+    weights = [1.0] if len(found) == 1 else [1.0 - turning] + [share] * (len(found) - 1)
     return [Way(p, h, k, w) for (p, h, k), w in zip(found, weights, strict=True)]
 
 

@@ -7,6 +7,7 @@ it (``Target``), weigh the cloud by what was found and what was not (``evidence`
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from edge.uav.ground.camera import transfer
 from edge.uav.ground.cloud import Cloud
 from edge.uav.ground.evidence import Verdict, judge
 from edge.uav.ground.history import MotionFit, Sightings
+from edge.uav.ground.layers import Layers
 from edge.uav.ground.outlook import Outlook
 from edge.uav.ground.placing import Placing
 from edge.uav.ground.road_map import RoadMap
@@ -34,9 +36,12 @@ _FIRST_NUMBER = 400
 _PULL = 0.35  # of the motion towards the fit, a frame
 _ALIGN_AFTER = 0.6  # way travelled before the direction of motion counts, in target lengths
 _AGAIN = 3  # frames unseen after which finding the target is finding it again
+_KNOWN = 0.4  # std of a place that is as good as seen, in target lengths
 _ALIKE = 0.65  # mean score of a look-alike that is worth a thought
 _RECONSIDER = 0.02  # weight of the particles that it gets
 _ROAD_EVERY = 3  # frames between updates of the road map
+_ROAD_SHOWN = 45.0  # about the target [ground units]
+_ROAD_RATE = 0.15  # of what is learnt of road each time
 _TEACH_EVERY = 12
 _LOST_STD = 8.0  # in target lengths
 _LOST_AFTER_S = 15.0
@@ -81,6 +86,7 @@ class GroundTracker:
         self._state = State.VISIBLE
         self._trail: list[Floats] = [place]
         self._began = True
+        self._relearn = True  # what road looks like
         self._learn_road(small, teach=True)
         return self._estimate(time)
 
@@ -113,8 +119,9 @@ class GroundTracker:
             self._seen(image, best, verdict)
         else:
             self._not_seen()
-        if self._frame % _ROAD_EVERY == 0 and self._placing.blind == 0:
-            self._learn_road(small, teach=self._missed == 0 and self._frame % _TEACH_EVERY == 0)
+        if self._placing.blind == 0 and (self._relearn or self._frame % _ROAD_EVERY == 0):
+            teach = self._relearn or self._frame % _TEACH_EVERY == 0
+            self._learn_road(small, teach=teach and self._missed == 0)
         estimate = self._estimate(time)
         if self._missed == 0 and self._placing.clock is not None:
             self._reroot(estimate)
@@ -128,6 +135,7 @@ class GroundTracker:
         """Search where the cloud lies within the picture, and weigh the cloud by it."""
         cloud, target, placing = self._cloud, self._target, self._placing
         pixels = placing.body_pixels(cloud.place)
+        again = self._again()
         near = placing.plane.inside(pixels, -0.3 * target.length * target.scale)
         share = float(cloud.weights[near].sum())
         if share < 2e-3:
@@ -205,6 +213,13 @@ class GroundTracker:
                 self._target.angle = angle
         return self._target.search(image, middle, 1.1 + reach / self._target.length, angle)
 
+    def _again(self) -> bool:
+        """Whether finding the target now is finding it again: unseen for long, and no longer known to a length."""
+        if self._missed <= _AGAIN:
+            return False
+        spread = np.trace(pf.weighted_covariance(self._cloud.place, self._cloud.weights))
+        return bool(0.5 * spread > (_KNOWN * self._target.length) ** 2)
+
     def _chance(self, small: Image, pixels: Floats) -> Floats:
         """(n,) chance that the target would be found at image points (n, 2): 0 outside, little where it may hide."""
         inside = self._placing.plane.inside(pixels, 2.0)
@@ -229,7 +244,7 @@ class GroundTracker:
         self._seen_last = self._time
         self._outlook = None
         self._cloud = self._cloud.free()
-        if best.seen > 0.93:
+        if best.seen > 0.7:
             self._sightings.add(self._time, best.ground, target.noise(best.seen))
             self._fit = self._sightings.fit() or self._fit
         if self._fit is not None and not again:
@@ -244,9 +259,11 @@ class GroundTracker:
             far = self._sightings.travelled() > _ALIGN_AFTER * target.length
             if fit is not None and far and best.seen > 0.97 and fit.velocity_std < 0.15 * fit.speed:
                 target.align(image, fit)
-        elif verdict.sureness > 0.9 and not verdict.crowded and self._found > 3 and self._frame % 4 == 0:
-            if best.score > 0.75 and best.seen > 0.98:
-                target.study(image, best)
+                # What was beside an upright box may have been anything.
+                self._road.forget()
+                self._relearn = True
+        elif self._frame % 4 == 0 and self._found > 3 and _is_sure(verdict):
+            target.study(image, best)
 
     def _not_seen(self) -> None:
         """It is not there: the cloud drives on, along the ways that the road offers."""
@@ -272,7 +289,9 @@ class GroundTracker:
             pixels = placing.pixels(places)
             pixels = pixels[placing.plane.inside(pixels, 2.0)]
             at = np.clip((pixels / placing.factor).astype(int), 0, [small.shape[1] - 1, small.shape[0] - 1])
-            self._road.learn(lit[at[:, 1], at[:, 0]], lit[::4, ::4].reshape(-1, 3), 0.1)
+            rate = 1.0 if self._relearn else _ROAD_RATE
+            self._road.learn(lit[at[:, 1], at[:, 0]], lit[::4, ::4].reshape(-1, 3), rate)
+            self._relearn = False
         self._road.update(lit, placing.factor, placing.plane, placing.matrix, outline if self._missed == 0 else None)
 
     def _reroot(self, estimate: Estimate) -> None:
@@ -324,10 +343,6 @@ class GroundTracker:
         size = corners.max(axis=0) - corners.min(axis=0)
         ahead = axes @ np.array([np.cos(heading), np.sin(heading)])
         moving = target.aligned and np.isfinite(ahead).all()
-        layers = {"tracks": placing.tracks, "road": placing.pixels(self._road.outline(place, 45.0))}
-        if self._outlook is not None:
-            for k, way in enumerate(self._outlook.ways):
-                layers[f"way {k}"] = placing.pixels(way.points)
         common = Estimate(
             time=time,
             state=state,
@@ -339,7 +354,7 @@ class GroundTracker:
             std=std,
             hypotheses=self._hypotheses(groups),
             particles=placing.body_pixels(cloud.place),
-            layers=layers,
+            layers=self._layers(place),
         )
         if state is State.LOST:
             return replace(common, x=float("nan"), y=float("nan"), heading=float("nan"), hypotheses=())
@@ -347,6 +362,18 @@ class GroundTracker:
             return common
         course = float(np.arctan2(np.sin(heading), np.cos(heading))) if target.aligned else float("nan")
         return replace(common, north=float(place[0]), east=float(place[1]), speed=speed, course=course, std_m=std_m)
+
+    def _layers(self, place: Floats) -> Layers:
+        placing, road = self._placing, self._road
+        ways = self._outlook.ways if self._outlook is not None else []
+        named = {f"way {k}": partial(placing.pixels, way.points) for k, way in enumerate(ways)}
+        return Layers(
+            {
+                "tracks": lambda: placing.tracks,
+                "road": lambda: placing.pixels(road.outline(place, _ROAD_SHOWN)),
+                **named,
+            }
+        )
 
     def _hypotheses(self, groups: tuple[pf.Cluster, ...]) -> tuple[Hypothesis, ...]:
         if len(groups) < 2:
@@ -378,6 +405,14 @@ def check_target(image: Image, size: tuple[int, int], target: Box) -> None:
         )
     if target.width * target.height > 0.5 * width * height:
         raise InputError(f"target {text} fills the image", remedy="draw the box round one car")
+
+
+def _is_sure(verdict: Verdict) -> bool:
+    """Whether the target is wholly and surely seen, alone and as it always looks: then it may be learnt from."""
+    best = verdict.best
+    if best is None or verdict.crowded:
+        return False
+    return verdict.sureness > 0.9 and best.score > 0.75 and best.seen > 0.98
 
 
 def _between(corners: Floats) -> Floats:

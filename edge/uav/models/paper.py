@@ -35,7 +35,7 @@ _COURSE_STEP = 6.0  # px
 _SEEN = 0.5  # of the box that must lie in the image to be called visible
 _USELESS = 0.35  # image diagonals: a cloud with a larger std says nothing
 _DIRECTION_MEMORY = 0.15  # a frame
-_DOUBTFUL = 0.4  # of a road in the picture has white lines: the target may be on another one
+_DOUBTFUL = 0.6  # of a road in the picture has white lines: the target may be on another one
 _RETRACED_EVERY = 10  # frames, while the road is doubtful and the target in full sight
 _CLUSTER = 1.5  # radius of a hypothesis, in the box's longer side
 
@@ -149,12 +149,14 @@ class PaperTracker:
         share = 0.0
         if started.road is not None:
             started.road = started.road_filter.step(started.road.moved(motion, self._centre), edges)
-            share = 0.0 if started.road is None else support(started.road, edges)[1]
+            if started.road is not None and started.marked:
+                share = support(started.road, edges)[1]
         started.frames += 1
         seen = started.visible and seen_share(place[0], place[1], box, self.size) >= 1.0
         if share < _DOUBTFUL and seen and started.frames % _RETRACED_EVERY == 0:
             found, marked = _first_road(grey, box, started.road_filter)
-            if found is not None and support(found, Edges.of(grey, marked))[1] > share:
+            better = found is not None and support(found, Edges.of(grey, marked))[1] > share
+            if better and (marked or started.road is None):
                 started.road, started.marked = found, marked
                 started.forget_direction()
         drawn = self._drawn(started.road)

@@ -33,6 +33,8 @@ _CURVATURE_NOISE = 0.03  # a stride; the same
 _MARGIN = 6.0  # px that a new coordinate keeps from the border
 _MOST_STRIDES = 60  # a frame and an end
 _SHIFTS = np.arange(-4.0, 4.1)  # px
+_FIT_TURNS = np.radians([-3.0, -1.5, 0.0, 1.5, 3.0])
+_FIT_SHIFTS = np.arange(-12.0, 12.1)  # px
 _SMOOTHED = 7  # coordinates that are shifted alike
 _FEWEST = 6  # held coordinates: less is no road any more
 _KEPT = 1.6  # image diagonals from the centre: held coordinates farther away are dropped
@@ -114,7 +116,7 @@ class RoadFilter:
         """
         best: Road | None = None
         most, clouds = 0.0, self._clouds
-        for section in sections:
+        for section in (fitted(part, edges) for part in sections):
             stride = _stride(section.half_width)
             along = stride * (np.arange(2 * _BACK + 1) - _BACK)
             points = section.middle + along[:, None] * np.array([np.cos(section.heading), np.sin(section.heading)])
@@ -236,6 +238,26 @@ def _width_change(points: Floats, normal: Floats, half_width: float, edges: Edge
     costs = [line_distance(edges, points[None, good], normal[None, good], half_width * f)[0] for f in factors]
     best = int(np.argmin(np.array(costs) + [0.1, 0.0, 0.1]))
     return float(1.0 + 0.2 * (factors[best] - 1.0))
+
+
+def fitted(section: Section, edges: Edges) -> Section:
+    """The section turned and its lines shifted, each by itself, onto the nearest edges along both of them."""
+    along = _stride(section.half_width) * np.linspace(-_BACK, _BACK, 17)
+    angles = section.heading + _FIT_TURNS
+    tangent = np.stack([np.cos(angles), np.sin(angles)], axis=-1)[:, None, None]
+    normal = np.stack([-np.sin(angles), np.cos(angles)], axis=-1)[:, None, None]
+    at, costs = [], []
+    for side in (-1.0, 1.0):
+        offsets = side * section.half_width + _FIT_SHIFTS
+        distance, inside = edges.at(section.middle + along[:, None] * tangent + offsets[None, :, None, None] * normal)
+        mean = np.where(inside, distance, CAP).mean(axis=2) + 0.02 * np.abs(_FIT_SHIFTS)
+        at.append(offsets[mean.argmin(axis=1)])
+        costs.append(mean.min(axis=1))
+    best = int(np.argmin(costs[0] + costs[1]))
+    left, right = at[0][best], at[1][best]
+    middle = section.middle + 0.5 * (left + right) * normal[best, 0, 0]
+    half_width = max(0.5 * float(right - left), 0.5 * section.half_width)
+    return Section(middle, float(angles[best]), half_width)
 
 
 def support(road: Road, edges: Edges) -> tuple[int, float]:

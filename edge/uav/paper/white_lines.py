@@ -20,9 +20,10 @@ _SCALE = 2  # edges are looked for at half the resolution
 CAP = 8.0
 """px: an edge farther away than this is no edge of this line."""
 _ACROSS = 2.0  # how far from the target the lines are looked for, in its longer side
-_CLEAR = 0.35  # nearer than this is the target itself
+_CLEAR = 0.15  # nearer than this is the target itself, in the same
+_HALF_WIDTHS = (0.35, 1.4)  # of a lane or a road, in the same
 _ALONG = (1.5, 4.0)  # how far along the road the edges are averaged, to each side; the second sees across a crossing
-_CANDIDATES = 3
+_CANDIDATES = 5
 _SAMPLES = 41
 _ANGLES = 72
 _WEAKEST = 8.0  # grey levels, averaged along the road
@@ -50,7 +51,7 @@ class Edges:
         else:
             edges = cv2.Canny(half, 60, 140)
         gaps = np.asarray(255 - edges, dtype=np.uint8)
-        return cls(np.asarray(cv2.distanceTransform(gaps, cv2.DIST_L2, 3) * _SCALE, dtype=np.float32))
+        return cls(np.asarray(np.minimum(cv2.distanceTransform(gaps, cv2.DIST_L2, 3), CAP) * _SCALE, dtype=np.float32))
 
     def at(self, places: Floats) -> tuple[Floats, Bools]:
         """Distances (...) of places (..., 2) [px] to the nearest edge, capped, and which are in the image."""
@@ -97,7 +98,8 @@ def sections(grey: Grey, target: Box) -> list[Section]:
             best = int(score.argmax())
             a = float(offsets[left][strength[best, left].argmax()])
             b = float(offsets[right][strength[best, right].argmax()])
-            found.append(Section(centre + 0.5 * (a + b) * normal[best], float(angles[best]), 0.5 * (b - a)))
+            if _HALF_WIDTHS[0] * longer < 0.5 * (b - a) < _HALF_WIDTHS[1] * longer:
+                found.append(Section(centre + 0.5 * (a + b) * normal[best], float(angles[best]), 0.5 * (b - a)))
             apart = np.abs(np.arange(_ANGLES) - best)
             score[np.minimum(apart, _ANGLES - apart) < _ANGLES // 12] = 0.0
     return found

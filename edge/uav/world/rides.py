@@ -51,12 +51,12 @@ def lighting(stage: Stage) -> Script:
     gain = np.ones(RIDE_FRAMES)
     now = 1.0
     for start in (60, 105, 150, 195):
-        new = rng.uniform(0.45, 0.7) if now > 0.8 else rng.uniform(0.9, 1.3)
+        new = rng.uniform(0.5, 0.7) if now > 0.8 else rng.uniform(0.95, 1.25)
         gain = gain + (new - now) * ease((moments - start - rng.uniform(-12, 12)) / rng.uniform(4, 25))
         now = new
     tint = 1.0 + np.column_stack([wander(rng, RIDE_FRAMES, 1 / FPS, 0.06, 1.5) for _ in range(3)])
     flight = follow(rng, motion, stage.view, RIDE_FRAMES / FPS)
-    return Script(stage.view, roads, motion, flight, RIDE_FRAMES, gain=gain[:, None] * tint, clouds=0.5)
+    return Script(stage.view, roads, motion, flight, RIDE_FRAMES, gain=gain[:, None] * tint, clouds=0.4)
 
 
 def off_road(stage: Stage) -> Script:

@@ -1,0 +1,203 @@
+"""Timing of two cameras over random rigs: success, error over the floor, wrong answers, and time a pair.
+
+    python -m tests.bench.pair_timing [--trials 100] [--regimes clean,short] [--uncalibrated] [--jobs 2]
+
+Success: time map within 5 ms RMS over the overlap **and** F within 2 px, and accepted. Wrong: accepted and over
+20 ms or 10 px off, or accepted where the two cameras watched different things (a fifth as many trials again).
+The lag's error is that at mid-overlap, of all accepted answers that are not wrong, over the floor of `tests.bench.pair_trials.floor`; ms are CPU time of
+smoothing both tracks and solving the pair on one core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import cv2  # noqa: E402
+import numpy as np  # noqa: E402
+
+from hub.timing.pair import solve_pair  # noqa: E402
+from hub.timing.tracks import smooth_track  # noqa: E402
+from hub.timing.two_view import fundamental_from  # noqa: E402
+from tests.bench.pair_trials import (  # noqa: E402
+    FOCAL,
+    MATRIX,
+    Regime,
+    Trial,
+    floor,
+    geometry_error,
+    make,
+    map_error,
+    stranger,
+)
+
+GOOD_S, GOOD_PX = 5e-3, 2.0
+WRONG_S, WRONG_PX = 20e-3, 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A regime of the table. must, reach: shares of success; floor_must: lag error over the floor (or in ms)."""
+
+    regime: Regime
+    must: float | None = None
+    reach: float | None = None
+    floor_must: float | None = None
+    lag_must_ms: float | None = None
+    labelled_rates: bool = False
+
+
+ROWS: dict[str, Row] = {
+    "clean, ±5 s": Row(Regime(), 0.99, 1.0, 1.15),
+    "30 % dropped": Row(Regime(dropped=0.3), 0.99, 1.0, 1.15),
+    "10 % outliers": Row(Regime(outliers=0.1), 0.99, 1.0, 1.15),
+    "30/25 fps, ±200 ppm": Row(Regime(fps=(30.0, 25.0), ppm=200), 0.99, 1.0, 1.15),
+    "120 s, ±100 s": Row(Regime(span=120, late=100), 0.99, 1.0, 1.15),
+    "everything at once, 1 px": Row(
+        Regime(late=10, fps=(30.0, 25.0), ppm=200, noise=1.0, dropped=0.2, outliers=0.1, gaps=3),
+        0.98,
+        0.999,
+        lag_must_ms=0.8,
+    ),
+    "(a)": Row(Regime(paper_path=True, span=11, late=0.5), None, None, lag_must_ms=3.1),
+    "overlap 3 s of 10": Row(Regime(span=10, overlap=3), 0.95, 0.99),
+    "40 % outliers, 30 % dropped": Row(Regime(outliers=0.4, dropped=0.3), 0.60, 0.95),
+    "second thing 20 %": Row(Regime(second=0.2), 0.80, 0.95),
+    "second thing 40 %": Row(Regime(second=0.4), None, 0.80),
+    "10 fps, 3 Hz": Row(Regime(fps=(10.0, 10.0), slowest=0.5, fastest=3.0), None, 0.80),
+    "120 s, ±5000 ppm": Row(Regime(span=120, ppm=5000)),
+    "25 fps told as 30": Row(Regime(fps=(25.0, 30.0), told_fps=(30.0, 30.0)), labelled_rates=True),
+    "59.94 fps told as 25": Row(Regime(fps=(30.0, 59.94), told_fps=(30.0, 25.0)), labelled_rates=True),
+    "29.97 fps told as 30": Row(Regime(fps=(30.0, 29.97), told_fps=(30.0, 30.0))),
+    "rolling shutter 20 ms": Row(Regime(readout=0.02)),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One trial. lag_s, map_s: error at mid-overlap and RMS; f_px; floor_s; ms: CPU of smoothing and solving."""
+
+    status: str
+    lag_s: float
+    map_s: float
+    f_px: float
+    floor_s: float
+    smooth_ms: float
+    pair_ms: float
+
+    @property
+    def accepted(self) -> bool:
+        return self.status == "ok"
+
+    @property
+    def success(self) -> bool:
+        return self.accepted and self.map_s < GOOD_S and self.f_px < GOOD_PX
+
+    @property
+    def wrong(self) -> bool:
+        return self.accepted and (self.map_s > WRONG_S or self.f_px > WRONG_PX)
+
+
+def run(trial: Trial, calibrated: bool, labelled_rates: bool, related: bool = True) -> Outcome:
+    """Smooth, solve and score one trial. related: whether there is an answer at all."""
+    begin = time.process_time()
+    tracks = []
+    for view in trial.views:
+        normalised = (view.pixels - MATRIX[:2, 2]) / FOCAL
+        tracks.append(smooth_track(view.time, normalised, FOCAL))
+    smoothed = time.process_time()
+    a, b = tracks
+    if a is None or b is None:
+        return Outcome("no track", np.inf, np.inf, np.inf, np.nan, 1e3 * (smoothed - begin), 0.0)
+    answer = solve_pair({"": a}, {"": b}, ("a", "b"), calibrated=calibrated, labelled_rates=labelled_rates)
+    solved = time.process_time()
+    spent = 1e3 * (smoothed - begin), 1e3 * (solved - smoothed)
+    if answer.fit is None or not related:
+        return Outcome(answer.status, np.inf, np.inf, np.inf, np.nan, *spent)
+    rate = answer.fit.rate
+    lag, error = map_error(trial, rate, answer.fit.offset + a.epoch - rate * b.epoch)
+    found = fundamental_from(answer.fit.geometry, MATRIX, MATRIX)
+    return Outcome(answer.status, lag, error, geometry_error(trial, found), floor(trial, calibrated), *spent)
+
+
+def _one(name: str, calibrated: bool, job: tuple[int, bool]) -> Outcome:
+    cv2.setNumThreads(1)
+    seed, related = job
+    row = ROWS[name]
+    trial = make(row.regime, seed)
+    if not related:
+        trial = stranger(trial, row.regime, seed)
+    return run(trial, calibrated, row.labelled_rates, related)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--trials", type=int, default=100)
+    parser.add_argument(
+        "--start", type=int, default=10_000, help="first seed; seeds below 1000 were used while building"
+    )
+    parser.add_argument("--regimes", default="", help="parts of their names, separated by commas")
+    parser.add_argument("--uncalibrated", action="store_true", help="without intrinsics: F in place of E")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    wanted = [part for part in options.regimes.split(",") if part]
+    names = [name for name in ROWS if not wanted or any(part in name for part in wanted)]
+    print(f"{options.trials} random rigs a regime, {'unknown' if options.uncalibrated else 'known'} intrinsics, 0.5 px")
+    print(
+        f"{'':27s} {'success':>8s} {'must':>5s} {'reach':>6s} {'wrong':>6s} {'strangers':>10s} {'lag RMS':>9s} "
+        f"{'/ floor':>8s} {'must':>8s} {'F px':>6s} {'smooth':>7s} {'pair':>7s}"
+    )
+    kept: dict[str, object] = {}
+    with ProcessPoolExecutor(options.jobs) as pool:
+        for name in names:
+            trials = max(10, options.trials // 2) if ROWS[name].regime.span > 60 else options.trials
+            jobs = [(options.start + k, True) for k in range(trials)]
+            jobs += [(options.start + k, False) for k in range(max(5, trials // 5))]
+            done = list(pool.map(partial(_one, name, not options.uncalibrated), jobs, chunksize=4))
+            kept[name] = [asdict(one) for one in done]
+            _print(name, done[:trials], done[trials:])
+    if options.json:
+        options.json.write_text(json.dumps(kept, indent=1))
+
+
+def _print(name: str, done: list[Outcome], strangers: list[Outcome]) -> None:
+    row = ROWS[name]
+    good = [one for one in done if one.success]
+    share = len(good) / len(done)
+    counted = [one for one in done if one.accepted and not one.wrong]
+    lag = np.sqrt(np.mean([one.lag_s**2 for one in counted])) if counted else np.nan
+    over = lag / np.sqrt(np.mean([one.floor_s**2 for one in counted])) if counted else np.nan
+    pixels = np.median([one.f_px for one in good]) if good else np.nan
+    limit = f"{row.floor_must:.2f}" if row.floor_must else f"{row.lag_must_ms:.1f} ms" if row.lag_must_ms else ""
+    print(
+        f"{name:27s} {100 * share:6.1f} % {_percent(row.must):>5s} {_percent(row.reach):>6s} "
+        f"{sum(one.wrong for one in done):6d} {sum(one.accepted for one in strangers):3d} of {len(strangers):3d} "
+        f"{1e3 * lag:6.3f} ms {over:8.2f} {limit:>8s} {pixels:6.2f} "
+        f"{np.mean([one.smooth_ms for one in done]):4.0f} ms {np.mean([one.pair_ms for one in done]):4.0f} ms",
+        flush=True,
+    )
+    reasons: dict[str, int] = {}
+    for one in done:
+        if not one.success:
+            told = one.status if not one.accepted else f"accepted, {1e3 * one.map_s:.1f} ms, {one.f_px:.1f} px off"
+            reasons[told[:100]] = reasons.get(told[:100], 0) + 1
+    for reason, count in sorted(reasons.items(), key=lambda item: -item[1])[:4]:
+        print(f"{'':6s}{count} × {reason}")
+
+
+def _percent(share: float | None) -> str:
+    return "" if share is None else f"{100 * share:g}"
+
+
+if __name__ == "__main__":
+    main()
