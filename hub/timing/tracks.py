@@ -30,6 +30,8 @@ _STIFFNESS = 1e-3  # only closes empty intervals
 _SPACING_LIMITS = (0.06, 0.8)  # s
 _BRIDGED_SPACINGS = 1.5  # a pause in which so smooth a track can't have gone anywhere else
 _NEIGHBOURS = 4
+_NEIGHBOUR_QUANTILE = 0.2
+_JUMP_PASSES = 4
 _JUMP = 3.0  # times the accelerations that a track's faster tenth shows
 _CUT = 4.0  # residuals beyond this many sigma are false detections
 _LEAST_POINTS = 4  # in a stretch
@@ -159,28 +161,44 @@ def neighbour_test(time: Floats, points: Floats, floor: float) -> Bools:
 
     Each point is compared with linear interpolation between each of its 4 predecessors and successors;
     the 20 % quantile of the residuals survives 40 % false neighbours, where the median breaks at 30 %.
-    floor: residual below which a point is never suspected.
+    Then again with the neighbours that passed, of which few are false, and also with lines through two of one
+    side, on which the last points before a jump lie. floor: residual below which a point is
+    never suspected.
     """
-    n = len(time)
-    residuals = np.full((_NEIGHBOURS * _NEIGHBOURS, n), np.nan)
-    row = 0
-    for a in range(1, _NEIGHBOURS + 1):
-        for b in range(1, _NEIGHBOURS + 1):
-            middle = np.arange(a, n - b)
-            if len(middle):
-                before, after = middle - a, middle + b
-                share = (time[middle] - time[before]) / (time[after] - time[before])
-                line = points[before] + share[:, None] * (points[after] - points[before])
-                residuals[row, middle] = np.linalg.norm(points[middle] - line, axis=1)
-            row += 1
+    good = np.ones(len(time), dtype=np.bool_)
+    for one_sided in (False, True):
+        score = _neighbour_score(time, points, good, one_sided)
+        # The 40 % quantile lies among the true points even where 40 % are false.
+        limit = max(floor, 6.0 * float(np.quantile(score, 0.4)))
+        again = np.asarray(score <= limit)
+        if again.all() or again.sum() < 2 * _NEIGHBOURS:
+            return again
+        good = again
+    return good
+
+
+def _neighbour_score(time: Floats, points: Floats, good: Bools, one_sided: bool) -> Floats:
+    """20 % quantile (n,) of the distances of each point from lines through two good neighbours."""
+    rows = np.flatnonzero(good)
+    t, x = time[rows], points[rows]
+    before = np.searchsorted(rows, np.arange(len(time))) - 1
+    after = before + 1 + good
+    lines = [(before - i, after + j) for i in range(_NEIGHBOURS) for j in range(_NEIGHBOURS)]
+    if one_sided:
+        lines += [(before - j, before - i) for j in range(1, _NEIGHBOURS) for i in range(j)]
+        lines += [(after + i, after + j) for j in range(1, _NEIGHBOURS) for i in range(j)]
+    residuals = np.full((len(lines), len(time)), np.inf)
+    for k, (first, second) in enumerate(lines):
+        here = np.flatnonzero((first >= 0) & (second < len(rows)))
+        low, high = first[here], second[here]
+        share = (time[here] - t[low]) / (t[high] - t[low])
+        off = points[here] - x[low] - share[:, None] * (x[high] - x[low])
+        residuals[k, here] = np.hypot(off[:, 0], off[:, 1])
+    residuals.sort(axis=0)
     known = np.isfinite(residuals).sum(axis=0)
-    ordered = np.sort(residuals, axis=0)  # NaN last
-    pick = np.maximum(0, np.ceil(0.2 * known).astype(np.int64) - 1)
-    score = ordered[pick, np.arange(n)]
-    score = np.where(known > 0, score, 0.0)  # the very ends have no neighbours on one side
-    # The 40 % quantile lies among the true points even where 40 % are false.
-    limit = max(floor, 6.0 * float(np.quantile(score, 0.4)))
-    return np.asarray(score <= limit)
+    pick = np.maximum(0, np.ceil(_NEIGHBOUR_QUANTILE * known).astype(np.int64) - 1)
+    score = residuals[pick, np.arange(len(time))]
+    return np.where(known > 0, score, 0.0)  # the very ends have no neighbours on one side
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,17 +218,23 @@ def _jumps(t: Floats, x: Floats, good: Bools) -> Floats:
     Seen from both sides: what extrapolation misses, taken as an acceleration, is far beyond the track's own.
     """
     rows = np.flatnonzero(good)
-    if len(rows) < 2 * _LEAST_POINTS:
-        return np.zeros(0)
-    t, x = t[rows], x[rows]
-    dt, step = np.diff(t), np.diff(x, axis=0)
-    speed = step / dt[:, None]
-    # Between i and i + 1: from the speed before, and from the speed after.
-    bend = np.linalg.norm(np.diff(speed, axis=0), axis=1) / (0.5 * (dt[1:] + dt[:-1]))
-    before, after = bend[:-1], bend[1:]  # of the inner steps 1 … n - 3
-    limit = _JUMP * float(np.quantile(bend, 0.9))
-    where = np.flatnonzero(np.minimum(before, after) > limit) + 1
-    return np.asarray(0.5 * (t[where] + t[where + 1]))
+    for turn in range(_JUMP_PASSES):
+        if len(rows) < 2 * _LEAST_POINTS:
+            break
+        at, pos = t[rows], x[rows]
+        dt = np.diff(at)
+        speed = np.diff(pos, axis=0) / dt[:, None]
+        # Between i and i + 1: from the speed before, and from the speed after.
+        bend = np.linalg.norm(np.diff(speed, axis=0), axis=1) / (0.5 * (dt[1:] + dt[:-1]))
+        limit = _JUMP * float(np.quantile(bend, 0.9))
+        where = np.flatnonzero(np.minimum(bend[:-1], bend[1:]) > limit) + 1
+        # A piece of a few points is no other thing but false points, and the rest is looked at without them.
+        lengths = np.diff(np.r_[0, where + 1, len(rows)])
+        short = np.repeat(lengths < _LEAST_POINTS, lengths)
+        if not short.any() or turn == _JUMP_PASSES - 1:
+            return np.asarray(0.5 * (at[where] + at[where + 1]))
+        rows = rows[~short]
+    return np.zeros(0)
 
 
 def _robust_fit(

@@ -155,7 +155,8 @@ def floor(trial: Trial, calibrated: bool) -> float:
     """Least standard deviation [s] of the lag at mid-overlap (Cramér-Rao) for points that are not smoothed.
 
     Each good frame of the camera that has fewer gives one epipolar equation, with the noise of both
-    points, as if the other camera had fired at that very instant. Unknown beside the lag: the clock rate
+    points, as if the other camera had fired at that very instant, if that one saw the marker within 0.2 s
+    before and after. Unknown beside the lag: the clock rate
     and 5 (calibrated) or 7 parameters of the geometry.
     """
     begin, end = trial.overlap
@@ -163,7 +164,11 @@ def floor(trial: Trial, calibrated: bool) -> float:
     for k, view in enumerate(trial.views):
         true = trial.true(k, view.time)
         times.append(true[view.good & (true >= begin) & (true <= end)])
-    true = min(times, key=len)
+    true, other = sorted(times, key=len)
+    where = np.searchsorted(other, true)
+    inside = (where > 0) & (where < len(other))
+    true, where = true[inside], where[inside]
+    true = true[(other[where] - true < 0.2) & (true - other[where - 1] < 0.2)]
     a, b = (_project(pose, trial.path(true)) for pose in trial.poses)
     h = 1e-4
     speed = (_project(trial.poses[1], trial.path(true + h)) - _project(trial.poses[1], trial.path(true - h))) / (2 * h)

@@ -29,6 +29,7 @@ WINDING, TOWN = "paper-3.3", "paper-4.4"
 NEAR = 20.0
 """px: an estimate this near is right."""
 _CANVAS = 1.9  # the pictures show so many times what the camera sees
+_SAME_ROAD = 0.94  # cosine of the most that a road may have turned to be the same one
 _DIM = 0.55  # what the camera does not see is drawn darker
 _YELLOW, _CYAN, _RED, _GREEN, _WHITE = (0, 230, 255), (255, 200, 0), (40, 40, 255), (60, 230, 60), (255, 255, 255)
 
@@ -260,9 +261,11 @@ def main() -> None:
 
 
 def _seen_route(world: World, frame: int) -> Floats:
-    places = route(world, frame)
+    """The part of the route that is in the picture and on the road that the target drives on in this frame."""
+    turned = np.cos(world.target.course - world.target.course[frame])
+    places = route(world, frame)[turned > _SAME_ROAD]
     inside = ((places > 0.0) & (places < np.array(world.size) - 1.0)).all(axis=1)
-    return places[inside]
+    return np.asarray(places[inside], dtype=np.float64)
 
 
 def _in_colours(labels: regions.Labels, size: tuple[int, int]) -> Image:

@@ -312,19 +312,18 @@ def _place(
         depth = np.where(front, p[:, 2], 1.0)
         at = p[:, :2] / depth[:, None]
         residual = seen - at
-        squared = np.einsum("ni,ni->n", residual, residual)
+        squared = residual[:, 0] ** 2 + residual[:, 1] ** 2
         if step == 0:
             width = max(float(np.median(np.sqrt(squared))) * 1.5, 2.0 * unit)
         else:
             # What stands on the ground moves a little more than the ground: narrow, or roofs drag the pose along.
             width = max(width * 0.4, 2.5 * float(np.median(np.sqrt(squared))), 0.3 * unit)
         weight = np.where(front, 1.0 / np.square(1.0 + squared / (width * width)), 0.0) / (noise * noise)
-        j = motion.jacobian(ground, at, depth)
-        jw = j * weight[:, None, None]
-        normal = np.einsum("nij,nik->jk", jw, j)
-        normal[np.diag_indices_from(normal)] += information
-        right = np.einsum("nij,ni->j", jw, residual) + information * (pull - total)
-        delta = np.linalg.solve(normal, right)
+        j = motion.jacobian(ground, at, depth).reshape(2 * len(ground), -1)
+        jw = j * np.repeat(weight, 2)[:, None]
+        normal = jw.T @ j + np.diag(information)
+        right = residual.reshape(-1) @ jw + information * (pull - total)
+        delta: Floats = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
         total = total + delta
         motion = motion.moved(delta)
         if step >= 2 and float(np.abs(delta[:2]).max()) < 0.01 * unit:

@@ -21,6 +21,7 @@ _SCORE_AGAIN = 0.6
 _SHAPE_AGAIN = 0.45
 _PATIENT = 25.0  # most that one frame says for a place where it is found again: a look-alike soon drives elsewhere
 _UNKNOWN_MOTION = 3.0  # the same before its motion is known
+_BETTER = 4.0
 _MOTION_STD = 1.5  # of a particle's velocity, one coordinate [units/s]
 _CUT = 0.42  # least share of it in the picture
 
@@ -59,6 +60,7 @@ def judge(
     one frame then says less, its shape must fit too, and it must be seen to move as the particles do.
     """
     gain = np.zeros((len(candidates), len(cloud)))
+    most_alike = max((candidate.score for candidate in candidates), default=0.0)
     velocity = cloud.speed[:, None] * np.column_stack([np.cos(cloud.heading), np.sin(cloud.heading)])
     for j, candidate in enumerate(candidates):
         std = noise(candidate.seen) * (1.5 if again else 1.0) + (0.1 if again else 0.0)
@@ -70,7 +72,8 @@ def judge(
             if motion is None:
                 peak = min(peak, _UNKNOWN_MOTION)
             else:
-                peak = min(peak, _PATIENT)
+                # Of two that both may be it, the more alike wins in time.
+                peak = min(peak, _PATIENT) * float(np.exp(_BETTER * (candidate.score - most_alike)))
                 off = velocity - motion[0]
                 squared = squared + np.square(off).sum(axis=1) / (motion[1] ** 2 + _MOTION_STD**2)
         gain[j] = peak * np.exp(-0.5 * np.minimum(squared, 50.0))

@@ -21,7 +21,7 @@ Picture = npt.NDArray[np.uint8]
 
 _SETTLED_S = 0.04  # std of the clocks' offset that is good enough to go by
 _ATTITUDE_STD = np.deg2rad(1.0)  # how hard the absolute attitude and position pull, a frame
-_POSITION_STD = np.array([0.8, 0.8, 0.8])
+_POSITION_STD = np.array([4.0, 4.0, 2.0])  # [m]; harder, and the receiver's wandering becomes the target's speed
 _TURNED = np.deg2rad(1.5)  # error of the first attitude that is worth a new ground frame
 
 

@@ -55,7 +55,9 @@ class PosePlane:
     @property
     def matrix(self) -> Floats:
         """H = R [e1 e2 -C], with the camera matrix taken off."""
-        return np.column_stack([self.rotation[:, 0], self.rotation[:, 1], -self.rotation @ self.centre])
+        out = self.rotation.copy()
+        out[:, 2] = -(self.rotation @ self.centre)
+        return out
 
     def jacobian(self, ground: Floats, seen: Floats, depth: Floats) -> Floats:
         """Rotation acts as delta x p, a shift of the centre as -R delta."""

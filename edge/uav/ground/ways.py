@@ -137,7 +137,9 @@ def _follow(
         if not seen[:, :3].any():
             curvature, open_end = expected, True
         else:
-            curvature = 0.5 * curvature + 0.5 * float(_CURVATURES[best])
+            # Where the far part is unknown, what is known lies on one side: it says little of a bend.
+            trust = 0.5 * min(1.0, 1.4 * float(seen.mean())) ** 2
+            curvature = expected + trust * (float(_CURVATURES[best]) - expected)
         heading = heading + curvature * STEP
         at = at + STEP * np.array([np.cos(heading - 0.5 * curvature * STEP), np.sin(heading - 0.5 * curvature * STEP)])
         if not open_end:

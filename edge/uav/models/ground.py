@@ -236,8 +236,9 @@ class GroundTracker:
         """The target is there: motion, place and looks follow it."""
         target = self._target
         again = self._missed > _AGAIN
-        if again:
+        if again or self._fit is None:
             self._cloud = clouds.gathered(self._cloud, best.ground, target.noise(best.seen), self._rng)
+        if again:
             speed, heading = float(self._cloud.weights @ self._cloud.speed), self._heading
             self._sightings.begin_anew(speed * np.array([np.cos(heading), np.sin(heading)]), 3.0)
         self._missed, self._found = 0, self._found + 1
