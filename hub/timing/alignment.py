@@ -14,6 +14,9 @@ from hub.timing.two_view import Geometry, RelativePose
 from protocols.geometry.types import Bools, Floats, Ints
 
 
+_PAUSE_INTERVALS = 5.0
+
+
 @dataclass(frozen=True, slots=True)
 class PairSettings:
     """What the pair solver reckons with; the defaults hold on every rig."""
@@ -163,7 +166,7 @@ class Samples:
         self.label = np.concatenate([np.full(len(rows), k) for k, rows in enumerate(thinned)])
         self.time = np.concatenate([one.time[rows] for one, rows in zip(a, thinned, strict=True)])
         self.points = np.concatenate([one.points[rows] for one, rows in zip(a, thinned, strict=True)])
-        intervals = [float(np.median(np.diff(one.time))) for one in a]
+        intervals = [_interval(one.time) for one in a]
         seconds = sum(len(rows) * t for rows, t in zip(parts, intervals, strict=True))
         self.seconds_a_sample = len(a) ** -0.5 * seconds / max(len(self.time), 1)
         self._count()
@@ -254,6 +257,12 @@ class Samples:
             misfit=float((smoothed[close] ** 2).mean()) if close.any() else np.inf,
             flat_px=_flat_px(a[moving][close] * focal_a, b[moving][close] * focal_b),
         )
+
+
+def _interval(time: Floats) -> float:
+    """Mean interval [s] of a track's rows (n,), pauses left out: rows that were dropped leave longer ones."""
+    steps = np.diff(time)
+    return float(steps[steps <= _PAUSE_INTERVALS * np.median(steps)].mean())
 
 
 def evidence(fit: PairFit) -> float:

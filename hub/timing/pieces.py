@@ -17,8 +17,8 @@ from protocols.geometry.types import Bools, Floats, Ints
 _BIN = 0.4  # s
 _RUN = 3  # bins in a run
 _RUNS = 2  # runs in a first geometry
-_FIRST_STARTS, _MORE_STARTS = 8, 40
-_BEST_SHARE = 0.12  # of the lags, looked at again
+_FIRST_STARTS, _MORE_STARTS = 12, 120
+_BEST_SHARE = 0.2  # of the lags, looked at again
 _IMPROVEMENTS = 2
 _AGREES_PX = 6.0  # a bin's misfit: half a grid step of lag included
 _FULL = 0.5  # of a bin must be there and move

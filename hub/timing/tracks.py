@@ -36,6 +36,7 @@ _JUMP = 3.0  # times the accelerations that a track's faster tenth shows
 _CUT = 4.0  # residuals beyond this many sigma are false detections
 _LEAST_POINTS = 4  # in a stretch
 _NEVER_SUSPECT_PX = 1.5
+_SUSPECT_PX = 3.0  # noise that is rather motion too fast for the knots
 # Labels drawn between hand-set ones are exactly straight: without a floor the honest rest looks false.
 _LEAST_SIGMA_PX = 0.05
 
@@ -111,7 +112,9 @@ def smooth_track(time: Floats, normalised: Floats, focal: float, epoch: float | 
         fit = _robust_fit(t, x, good, jumps, spacing, _STIFFNESS, gap, focal)
         if fit is not None and (best is None or fit.score < best.score):
             best = fit
-    if best is not None and best.basis.spacing <= max(_SPACINGS[0] * interval, _SPACING_LIMITS[0]):
+    if best is not None and (
+        best.basis.spacing <= max(_SPACINGS[0] * interval, _SPACING_LIMITS[0]) or best.sigma * focal > _SUSPECT_PX
+    ):
         for stiffness in _FINE_STIFFNESS:
             fit = _robust_fit(t, x, good, jumps, _FINE_SPACING * interval, stiffness, gap, focal)
             if fit is not None and fit.score < best.score:

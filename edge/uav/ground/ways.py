@@ -137,8 +137,9 @@ def _follow(
         if not seen[:, :3].any():
             curvature, open_end = expected, True
         else:
-            # Where the far part is unknown, what is known lies on one side: it says little of a bend.
-            trust = 0.5 * min(1.0, 1.4 * float(seen.mean())) ** 2
+            # Near the end of what is known the known lies on one side, which says little of a bend.
+            on = int(np.argmin(np.abs(_CURVATURES - expected)))
+            trust = 0.5 * float(seen[on].mean()) ** 3
             curvature = expected + trust * (float(_CURVATURES[best]) - expected)
         heading = heading + curvature * STEP
         at = at + STEP * np.array([np.cos(heading - 0.5 * curvature * STEP), np.sin(heading - 0.5 * curvature * STEP)])

@@ -45,7 +45,8 @@ _ROAD_RATE = 0.15  # of what is learnt of road each time
 _TEACH_EVERY = 12
 _LOST_STD = 8.0  # in target lengths
 _LOST_AFTER_S = 15.0
-_CLUSTER = 0.7  # radius of what counts as one place, in target lengths
+_CLUSTER, _WIDEST = 0.7, 2.0  # radius of what counts as one place, in target lengths
+_SMOOTH = 0.7  # the same over the cloud's std
 
 
 class GroundTracker:
@@ -322,7 +323,10 @@ class GroundTracker:
     def _estimate(self, time: float) -> Estimate:
         """State, densest cluster, its spread, and the other clusters."""
         cloud, target, placing = self._cloud, self._target, self._placing
-        groups = pf.clusters(cloud.place, cloud.weights, _CLUSTER * target.length)
+        # What is spread wide has no fine structure but the sample's own.
+        wide = pf.weighted_covariance(cloud.place, cloud.weights)
+        radius = float(np.clip(_SMOOTH * np.sqrt(0.5 * np.trace(wide)) / target.length, _CLUSTER, _WIDEST))
+        groups = pf.clusters(cloud.place, cloud.weights, radius * target.length)
         main = groups[0]
         weights = np.where(main.members, cloud.weights, 0.0)
         weights = weights / weights.sum()
