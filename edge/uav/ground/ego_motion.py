@@ -205,6 +205,13 @@ class EgoMotion:
         if int(followed.sum()) < 6:
             return guess, (at, followed, followed), EgoReport(0.0, int(followed.sum()), float("inf"), False)
         seen = self._plane.normalise(self._full(at[followed].astype(np.float64)))
+        imaged = np.isfinite(seen).all(axis=1)  # a strongly bent lens has corners without an image
+        if not imaged.all():
+            followed = followed.copy()
+            followed[np.flatnonzero(followed)[~imaged]] = False
+            seen = seen[imaged]
+        if len(seen) < 6:
+            return guess, (at, followed, followed), EgoReport(0.0, len(seen), float("inf"), False)
         ground = self._ground[followed]
         unit = self.factor / self._plane.focal  # one pixel of the working picture in normalised units
         if isinstance(guess, PosePlane):

@@ -17,6 +17,7 @@ CELL = 0.5
 _SIZE = 1024  # cells a side
 _REACH = 70.0  # half side of what one frame updates [ground units]
 _MESH = 12  # cells between the points that are projected exactly
+_FARTHEST = 1e7  # a view beyond is no view [ground units]
 _BITS = 4
 _BINS = 1 << _BITS
 _CLIP = 4.0
@@ -87,8 +88,8 @@ class RoadMap:
         except np.linalg.LinAlgError:
             return
         seen = transfer(back, plane.normalise(np.concatenate([corners, middle])))
-        centre = seen[4] if np.isfinite(seen[4]).all() else np.nanmean(seen, axis=0)
-        if not np.isfinite(centre).all():
+        centre = seen[4]
+        if not np.isfinite(centre).all() or np.abs(centre).max() > _FARTHEST:
             return
         spread = np.where(np.isfinite(seen[:4]), seen[:4], centre + 2 * _REACH)
         low = np.maximum(

@@ -10,6 +10,7 @@ from edge.uav.ground.appearance import Appearance, Candidate, Patch, cut_patch
 from edge.uav.ground.history import MotionFit
 from edge.uav.ground.placing import Placing
 from edge.uav.tracker import Box
+from protocols.errors import InputError
 from protocols.geometry.types import Floats
 
 Picture = npt.NDArray[np.uint8]
@@ -26,6 +27,8 @@ class Target:
         self._placing = placing
         middle = np.array([[box.x + 0.5 * (box.width - 1.0), box.y + 0.5 * (box.height - 1.0)]])
         rough = placing.body_ground(middle)[0]
+        if not np.isfinite(rough).all():
+            raise InputError("the lens model has no image where the target is", remedy="correct distortions in --rig")
         unit = np.linalg.inv(footprint.local_axes(placing.plane, placing.matrix, rough))
         placing.body_height = _BODY * max(
             box.width * float(np.hypot(*unit.T[0])), box.height * float(np.hypot(*unit.T[1]))
@@ -64,7 +67,9 @@ class Target:
     def follow_scale(self, place: Floats) -> None:
         """Where the target is now decides how finely it is looked at."""
         axes = footprint.local_axes(self._placing.plane, self._placing.body_matrix, place)
-        scale = float(np.sqrt(abs(np.linalg.det(axes)))) if np.isfinite(axes).all() else 0.0
+        if not np.isfinite(axes).all():
+            return
+        scale = float(np.sqrt(abs(np.linalg.det(axes))))
         if scale > 1e-6:
             self.scale = scale
             self.looks.set_pitch(1.0 / scale)

@@ -21,6 +21,7 @@ _PRIOR_STD_S = 0.3
 _LONGEST_GAP_S = 2.5  # between two samples that are still interpolated
 _FORGET = 0.995  # of the evidence, a sample
 _NOISE_RAD = np.deg2rad(0.4)
+_APART_S = 0.06  # samples closer than this are of one piece
 _DRIFT_S = 1.5
 _MEMORY = 400
 
@@ -135,7 +136,8 @@ class TelemetryClock:
 
     def _compare(self, sampled: float, rotation: Floats) -> None:
         """Add one sample's evidence for every candidate offset."""
-        if len(self._seen_times) < 2:
+        soon = self._mean is not None and sampled - self._compared < _APART_S
+        if len(self._seen_times) < 2 or soon:
             return
         times = np.array(self._seen_times)
         moments = sampled - self._grid

@@ -17,7 +17,7 @@ STEP = 1.5
 """Distance between the points of a way [ground units]."""
 _LOOK = 12.0  # length of a feeler
 _STRIPS = (-1.1, 0.0, 1.1)  # across, within the car's lane
-_UNKNOWN = 0.9  # what never-seen ground is worth, asphalt being up to 1.5
+_UNKNOWN = 1.35  # what never-seen ground is worth, asphalt being up to 1.5: less would bend ways back to what is known
 _SHARPEST = 0.16  # curvature of a feeler [1/unit]
 _DECAY = 14.0  # length over which curvature decays where nothing is known
 _EDGE_REACH = 9.0
@@ -139,8 +139,8 @@ def _follow(
         else:
             # Near the end of what is known the known lies on one side, which says little of a bend.
             on = int(np.argmin(np.abs(_CURVATURES - expected)))
-            trust = 0.5 * float(seen[on].mean()) ** 3
-            curvature = expected + trust * (float(_CURVATURES[best]) - expected)
+            trust = 0.5 * max(0.0, 2.5 * float(seen[on].mean()) - 1.5) ** 2
+            curvature += trust * (float(_CURVATURES[best]) - curvature)
         heading = heading + curvature * STEP
         at = at + STEP * np.array([np.cos(heading - 0.5 * curvature * STEP), np.sin(heading - 0.5 * curvature * STEP)])
         if not open_end:

@@ -143,11 +143,13 @@ class GroundTracker:
             return Verdict.nothing()
         here = np.flatnonzero(near)
         weights = cloud.weights[here] / share
-        cluster = pf.densest_cluster(cloud.place[here], weights, 2.0 * target.length)
-        members = here[cluster.members]
+        members, together = here, 1.0
+        if self._missed:
+            cluster = pf.densest_cluster(cloud.place[here], weights, 2.0 * target.length)
+            members, together = here[cluster.members], cluster.weight
         candidates = self._search(image, members, wide=True)
         rest = np.setdiff1d(here, members)
-        if len(rest) and cluster.weight < 0.97:
+        if len(rest) and together < 0.97:
             # What lies scattered is searched piece by piece, another piece each frame.
             middle = self._rng.choice(rest)
             aside = np.square(cloud.place[rest] - cloud.place[middle]).sum(axis=1) < (1.5 * target.length) ** 2
@@ -323,10 +325,14 @@ class GroundTracker:
     def _estimate(self, time: float) -> Estimate:
         """State, densest cluster, its spread, and the other clusters."""
         cloud, target, placing = self._cloud, self._target, self._placing
-        # What is spread wide has no fine structure but the sample's own.
-        wide = pf.weighted_covariance(cloud.place, cloud.weights)
-        radius = float(np.clip(_SMOOTH * np.sqrt(0.5 * np.trace(wide)) / target.length, _CLUSTER, _WIDEST))
-        groups = pf.clusters(cloud.place, cloud.weights, radius * target.length)
+        groups: tuple[pf.Cluster, ...]
+        if self._missed:
+            # What is spread wide has no fine structure but the sample's own.
+            wide = pf.weighted_covariance(cloud.place, cloud.weights)
+            radius = float(np.clip(_SMOOTH * np.sqrt(0.5 * np.trace(wide)) / target.length, _CLUSTER, _WIDEST))
+            groups = pf.clusters(cloud.place, cloud.weights, radius * target.length)
+        else:
+            groups = (pf.Cluster(cloud.weights @ cloud.place, 1.0, np.ones(len(cloud), dtype=np.bool_)),)
         main = groups[0]
         weights = np.where(main.members, cloud.weights, 0.0)
         weights = weights / weights.sum()
