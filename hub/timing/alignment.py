@@ -13,7 +13,6 @@ from hub.timing.tracks import SmoothTrack
 from hub.timing.two_view import Geometry, RelativePose
 from protocols.geometry.types import Bools, Floats, Ints
 
-
 _PAUSE_INTERVALS = 5.0
 
 
@@ -62,6 +61,8 @@ class PairSettings:
     """Standard deviations by which a lag's agreeing seconds must stand out where the tracks jump, …"""
     accept_pieces_support: float = 4.0
     """… and how many of them there must be."""
+    accept_log10_gap: float = -2.0
+    """log10 of the chance that the next best lag is so much worse; either of the two will do."""
     distinct_alignments: float = 0.3
     """Seconds between lags whose misfits are independent."""
     flat_ratio: float = 3.0
@@ -93,8 +94,8 @@ class PairFit:
     parallax: median angle [rad] between the two rays of a point (0 without lenses).
     flat_px: what one plane would leave [px]. misfit: mean squared distance over the settings' noise of the
     smoothed samples that agree. own_px: noise of the noisier camera's tracks. log10_chance: of one unrelated
-    stretch of such length fitting as well, None where the recordings are too short to tell. lag_std [s],
-    turn_std [rad]: of the last refinement.
+    stretch of such length fitting as well, None where the recordings are too short to tell. log10_gap: of the
+    next best lag leaving so much more by chance. lag_std [s], turn_std [rad]: of the last refinement.
     """
 
     rate: float
@@ -112,6 +113,7 @@ class PairFit:
     misfit: float = float("inf")
     own_px: float = float("nan")
     log10_chance: float | None = None
+    log10_gap: float = 0.0
     lag_std: float = float("nan")
     turn_std: float = float("nan")
 

@@ -16,13 +16,15 @@ from hub.timing import two_view
 from hub.timing.alignment import PairFit, PairSettings, PairSolution, Samples, evidence
 from hub.timing.pieces import scan_pieces
 from hub.timing.refine import WIDE, Noise, Refined, refine
-from hub.timing.scan import PairMoments, Scan, candidates, grid_tracks, scan_lags
-from hub.timing.significance import Chance, bandwidth, chance
+from hub.timing.scan import PairMoments, Scan, busiest, candidates, grid_tracks, scan_lags
+from hub.timing.significance import OWN_LAGS, Chance, bandwidth, chance
 from hub.timing.tracks import SmoothTrack
 from hub.timing.two_view import Geometry, RelativePose, Uncalibrated
 from protocols.geometry.types import Floats
 
 _LEAST_SAMPLES = 12
+_MOST_DRIFTS = 8  # of either sign
+_MOST_PIECES = 45.0  # s of a that the scan in pieces looks at
 _PIECES_STEP = 0.033  # s: the scan in pieces is rough, and dear
 _NEAR_PX = 10.0  # what may belong to the geometry of the scan in pieces
 _MOSTLY_ONE = 0.85  # of a track's rows: with fewer on one path there may be another
@@ -54,7 +56,8 @@ def solve_pair(
     tracks_a, tracks_b: by label; all tracks of one camera share one epoch. known: the relative pose, where
     it is given: then only lag and rate are sought. calibrated: whether both lenses are known; if not, the
     tracks' normalised coordinates are those of any nominal lens and the answer is a fundamental matrix.
-    labelled_rates: whether to try, after rates near 1, those that a wrongly told frame rate would make.
+    labelled_rates: whether to go on where that finds nothing: clocks up to 5000 ppm off, those of wrongly told
+    frame rates, and tracks that follow something else now and then; tens of times as dear.
     """
     s = settings or PairSettings()
     labels = [label for label in tracks_a if label in tracks_b]
@@ -68,7 +71,7 @@ def solve_pair(
             return answer
         if first is None:
             first = answer
-    if search.jumps():
+    if labelled_rates and search.jumps():
         return search.in_pieces(names)
     assert first is not None
     return first
@@ -97,15 +100,16 @@ class _Search:
     def rates(self) -> Iterator[float]:
         """Clock rates worth a scan: 1, what a drift does to a long recording, and wrongly labelled frame rates."""
         yield 1.0
+        if not self.labelled_rates:
+            return
         # A scan at rate 1 sees a pair as long as the ends don't slip by more than a few steps.
         slip = 0.15 / max(self.span, 1e-9)
         if slip < 5e-3:
-            count = int(np.ceil(5e-3 / slip))
+            count = min(int(np.ceil(5e-3 / slip)), _MOST_DRIFTS)
             for k in range(1, count + 1):
                 yield 1.0 + k * slip
                 yield 1.0 - k * slip
-        if self.labelled_rates:
-            yield from _LABELLED_RATES
+        yield from _LABELLED_RATES
 
     def at_rate(self, names: tuple[str, str], rate: float) -> PairSolution:
         """Answer with b's clock taken to run ``rate`` times as fast: one scan, its candidates, the verdict."""
@@ -126,7 +130,7 @@ class _Search:
             fit = self._refine_candidate(b, offset, cost, start)
             if fit is None:
                 continue
-            fit = replace(fit, log10_chance=chances.of(fit, s))
+            fit = chances.of(fit)
             fits.append(fit)
             if _sound(fit, s) and (good is None or evidence(fit) > good[0]):
                 good = (evidence(fit), cost)
@@ -148,7 +152,8 @@ class _Search:
     def in_pieces(self, names: tuple[str, str]) -> PairSolution:
         """Answer for tracks that follow something else now and then: the lag with most time that agrees."""
         s, step = self.s, max(self.step, _PIECES_STEP)
-        moments = PairMoments(grid_tracks(self.a, step, s.sigma_px), grid_tracks(self.b, step, s.sigma_px))
+        grid_a = busiest(grid_tracks(self.a, step, s.sigma_px), _MOST_PIECES)
+        moments = PairMoments(grid_a, grid_tracks(self.b, step, s.sigma_px))
         scan = scan_pieces(moments, s.sigma_px, seed=0)
         tried = scan.agreeing > 0
         if not tried.any():
@@ -304,16 +309,28 @@ class _Chances:
         self.bandwidth = bandwidth
         self.found: list[tuple[float, float, Chance | None]] = []
 
-    def of(self, fit: PairFit, s: PairSettings) -> float | None:
-        """log10 of the chance that unrelated stretches as long as this fit's support leave no more than it does."""
-        seconds = fit.moving_overlap
+    def of(self, fit: PairFit) -> PairFit:
+        """The fit with the chance that unrelated stretches as long as its common motion leave no more than it does."""
+        seconds, cycles = fit.moving_overlap, self.bandwidth * fit.moving_overlap
         chosen = next(
             (c for long, lag, c in self.found if 0.8 * long < seconds < 1.25 * long and abs(lag - fit.lag) < 0.5), None
         )
-        if chosen is None:
+        if chosen is None and seconds > 0:
             chosen = chance(self.moments, self.scan, seconds, fit.lag, self.known)
             self.found.append((seconds, fit.lag, chosen))
-        return None if chosen is None else chosen.log10_probability(fit.misfit, fit.inliers, self.bandwidth * seconds)
+        if chosen is None:
+            return fit
+        # The next best: any lag that leaves at least half as much in common.
+        index = int(np.argmin(np.abs(self.scan.offset - fit.lag)))
+        others = (self.scan.support > 0.5 * self.scan.support[index]) & (np.abs(self.scan.offset - fit.lag) > OWN_LAGS)
+        following = float(self.scan.cost[others].min(initial=np.inf))
+        return replace(
+            fit,
+            log10_chance=chosen.log10_probability(fit.misfit, fit.inliers, cycles),
+            log10_gap=chosen.log10_gap(fit.misfit / max(fit.inliers, 1e-9), following, cycles)
+            if np.isfinite(following)
+            else 0.0,
+        )
 
 
 def _grid_step(a: Sequence[SmoothTrack], b: Sequence[SmoothTrack], s: PairSettings) -> float:
@@ -346,7 +363,11 @@ def _distinct(fits: list[PairFit], s: PairSettings) -> list[PairFit]:
     most evidence.
     """
 
+    told = all(fit.log10_chance is not None for fit in fits)
+
     def merit(fit: PairFit) -> tuple[float, float]:
+        if not told:
+            return (evidence(fit), 0.0)
         agreeing = fit.inliers * fit.front * (fit.support >= s.accept_support)
         return (-(fit.log10_chance or 0.0) * agreeing, evidence(fit))
 
@@ -374,6 +395,7 @@ def _judge(names: tuple[str, str], fits: list[PairFit], searched: float, s: Pair
     # it and nothing else comes near what the tracks' own noise leaves.
     settled = not rivals and best.support >= s.unchecked_support and best.sigma_px <= s.exact * best.own_px
     doubts = _doubts(best, s)
+    apart = not rivals and best.log10_gap < s.accept_log10_gap
     if doubts:
         reason = doubts
     elif best.inliers < needed_inliers(best, s):
@@ -382,7 +404,7 @@ def _judge(names: tuple[str, str], fits: list[PairFit], searched: float, s: Pair
         reason = (
             f"the recordings overlap too little ({best.moving_overlap:.1f} s of motion) to tell one lag from another"
         )
-    elif by_chance is not None and by_chance > s.accept_log10_chance and not settled:
+    elif by_chance is not None and by_chance > s.accept_log10_chance and not (settled or apart):
         reason = (
             f"other lags fit nearly as well (one of them would by chance in {100 * min(1.0, 10.0**by_chance):.0f} % "
             "of cases): too little or too regular common motion, or two different things"

@@ -8,7 +8,7 @@ squared epipolar distance, in units of the noise, that the best fundamental matr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
@@ -59,6 +59,22 @@ def grid_tracks(tracks: Sequence[SmoothTrack], step: float, sigma_px: float) -> 
     spread = np.sqrt(max(variance, 1e-12))
     transform = np.array([[1 / spread, 0, -centre[0] / spread], [0, 1 / spread, -centre[1] / spread], [0, 0, 1.0]])
     return GridTrack(begin, step, (points - centre) / spread, weight, sigma_px / focal / spread, transform)
+
+
+def busiest(track: GridTrack, seconds: float) -> GridTrack:
+    """The stretch of that many seconds in which a camera's tracks move most; all of it where it is no longer."""
+    length = max(1, round(seconds / track.step))
+    total = np.cumsum(np.r_[0.0, track.weight.sum(axis=0)])
+    if len(total) - 1 <= length:
+        return track
+    begin = int(np.argmax(total[length:] - total[:-length]))
+    part = slice(begin, begin + length)
+    return replace(
+        track,
+        begin=track.begin + begin * track.step,
+        points=track.points[:, part],
+        weight=track.weight[:, part],
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

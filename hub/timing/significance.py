@@ -30,7 +30,8 @@ from protocols.geometry.types import Floats, Ints
 
 COST_FLOOR = 0.04
 """Of squared noise: smoothing brings the misfit below the noise, but that tells nothing."""
-_OWN_LAGS = 1.0  # s about an alignment that are no other alignment
+OWN_LAGS = 1.0
+"""Seconds about an alignment that are no other alignment."""
 _STEPS_A_STRETCH = 4
 _MOST_STRETCHES = 24  # of one camera
 _LEAST_STRETCHES = 25  # pairs of them
@@ -57,14 +58,10 @@ class Chance:
         """log10 of the chance that one wrong alignment fits as well as ``cost``.
 
         share: of the common motion that agrees, to which ``cost`` belongs; the rest counts as unrelated.
-        cycles: bandwidth times seconds of the common motion. A product of two coordinates has twice the
-        bandwidth, so 4 cycles + 1 independent values, of which the geometry takes 7: no more freedom than
-        that, however alike the few stretches of a slow motion are.
+        cycles: bandwidth times seconds of the common motion.
         """
-        k = min(self.freedom, 4.0 * cycles - 6.0)
-        if k < _LEAST_FREEDOM:
-            return 0.0
-        if share <= 0.0:
+        k = self.freedom_of(cycles)
+        if share <= 0.0 or k <= 0.0 or not math.isfinite(cost):
             return 0.0
         ratio = share * math.exp(math.log(cost + COST_FLOOR) - self.log_median) + 1.0 - share
         x = ratio * float(chdtri(k, 0.5))
@@ -74,26 +71,46 @@ class Chance:
         # The first term of the series at 0, where the function itself underflows.
         return (0.5 * k * math.log(0.5 * x) - 0.5 * x - float(gammaln(0.5 * k + 1.0))) / math.log(10.0)
 
+    def log10_gap(self, cost: float, next_cost: float, cycles: float) -> float:
+        """log10 of the chance that the best of all wrong alignments leaves ``next_cost`` / ``cost`` times less
+        than the second best: at 0 a chi-square's distribution is a power, so the scale of the misfits drops out.
+        """
+        k = self.freedom_of(cycles)
+        if k <= 0.0 or not math.isfinite(cost) or not next_cost > cost:
+            return 0.0
+        return 0.5 * k * math.log10((cost + COST_FLOOR) / (next_cost + COST_FLOOR))
+
+    def freedom_of(self, cycles: float) -> float:
+        """Degrees of freedom of the misfit of ``cycles`` (bandwidth times seconds) of motion; 0 for none.
+
+        A product of two coordinates has twice the bandwidth, so 4 cycles + 1 independent values, of which
+        the geometry takes 7: no more than that, however alike the few stretches of a slow motion are.
+        """
+        k = min(self.freedom, 4.0 * cycles - 6.0)
+        return k if k >= _LEAST_FREEDOM else 0.0
+
 
 def chance(moments: PairMoments, scan: Scan, seconds: float, lag: float, known: Floats | None = None) -> Chance | None:
-    """Misfits where nothing corresponds, for ``seconds`` of common motion, away from the alignment ``t_a = t_b + lag``.
+    """Misfits where nothing corresponds, for as much common motion as the alignment ``t_a = t_b + lag`` has.
 
     Short stretches are tried everywhere; for ones nearly as long as the recordings, all lags that leave as
-    much in common are. known: (3, 3) ``m_aᵀ F m_b = 0`` of normalised points, where the geometry is given.
-    None where the recordings are too short for either.
+    much in common are. seconds: of the common motion. known: (3, 3) ``m_aᵀ F m_b = 0`` of normalised points,
+    where the geometry is given. None where the recordings are too short for either.
     """
     a, b = moments.a, moments.b
+    support = float(scan.support[int(np.argmin(np.abs(scan.offset - lag)))])
     moving = min(float((track.weight > 0).any(axis=0).sum()) * track.step for track in (a, b))
     plenty = moving / _SHORTENED
     if seconds <= plenty:
-        costs = _stretch_costs(a, b, seconds, lag, known)
+        costs = _stretch_costs(a, b, seconds, support, lag, known)
         if len(costs) >= _LEAST_STRETCHES:
             return _summary(costs)
-    alike = (scan.support > 0.7 * seconds) & (scan.support < 1.4 * seconds) & np.isfinite(scan.cost)
-    alike &= np.abs(scan.offset - lag) > _OWN_LAGS
+    alike = (scan.support > 0.7 * support) & (scan.support < 1.4 * support) & np.isfinite(scan.cost)
+    alike &= np.abs(scan.offset - lag) > OWN_LAGS
     if alike.sum() * a.step >= _LEAST_LAGS:
         return _summary(scan.cost[alike])
-    costs = _stretch_costs(a, b, min(seconds, plenty), lag, known)
+    share = min(1.0, plenty / seconds)
+    costs = _stretch_costs(a, b, share * seconds, share * support, lag, known)
     return None if len(costs) < _LEAST_STRETCHES else _summary(costs)
 
 
@@ -103,7 +120,10 @@ def _summary(costs: Floats) -> Chance:
     return Chance(median, _freedom(median - float(np.quantile(logs, _LOW))), len(costs))
 
 
-def _stretch_costs(a: GridTrack, b: GridTrack, seconds: float, lag: float, known: Floats | None) -> Floats:
+def _stretch_costs(
+    a: GridTrack, b: GridTrack, seconds: float, support: float, lag: float, known: Floats | None
+) -> Floats:
+    """Costs of stretches of ``seconds`` of motion with at least half of ``support``, the scan's weighted seconds."""
     # A track with holes needs longer stretches for as much in common.
     length = max(8, int(seconds / a.step / max(_density(a) * _density(b), 0.1)))
     starts = [_starts(track.weight.shape[1], length) for track in (a, b)]
@@ -114,7 +134,7 @@ def _stretch_costs(a: GridTrack, b: GridTrack, seconds: float, lag: float, known
     lags = (a.begin + a.step * starts[0])[:, None] - (b.begin + b.step * starts[1])[None, :]
     moments = np.einsum("ilpn,jlqn->ijpq", np.stack(parts_a), np.stack(parts_b), optimize=True)
     weight = moments[:, :, 5, 5]
-    use = (np.abs(lags - lag) > _OWN_LAGS) & (weight * a.step > _LEAST_MOVING * seconds * _usual(a, b))
+    use = (np.abs(lags - lag) > OWN_LAGS) & (weight * a.step > _LEAST_MOVING * support)
     if not use.any():
         return np.zeros(0)
     chosen = moments[use] / weight[use][:, None, None]
@@ -126,12 +146,6 @@ def _stretch_costs(a: GridTrack, b: GridTrack, seconds: float, lag: float, known
 def _density(track: GridTrack) -> float:
     """Share of the samples in which the track exists and moves."""
     return float((track.weight > 0).any(axis=0).mean())
-
-
-def _usual(a: GridTrack, b: GridTrack) -> float:
-    """Mean product of the weights of two moving samples: what a stretch that moves throughout would weigh."""
-    moving = [track.weight[track.weight > 0] for track in (a, b)]
-    return float(np.median(moving[0]) * np.median(moving[1])) if all(len(m) for m in moving) else 1.0
 
 
 def _starts(samples: int, length: int) -> Ints:

@@ -4,8 +4,8 @@
 
 Success: time map within 5 ms RMS over the overlap **and** F within 2 px, and accepted. Wrong: accepted and over
 20 ms or 10 px off, or accepted where the two cameras watched different things (a fifth as many trials again).
-The lag's error is that at mid-overlap, of all accepted answers that are not wrong, over the floor of `tests.bench.pair_trials.floor`; ms are CPU time of
-smoothing both tracks and solving the pair on one core.
+The lag's error is that at mid-overlap, of all accepted answers that are not wrong, over the floor of
+`tests.bench.pair_trials.floor`; ms are CPU time of smoothing both tracks and solving the pair on one core.
 """
 
 from __future__ import annotations
@@ -53,7 +53,6 @@ class Row:
     reach: float | None = None
     floor_must: float | None = None
     lag_must_ms: float | None = None
-    labelled_rates: bool = False
 
 
 ROWS: dict[str, Row] = {
@@ -75,8 +74,8 @@ ROWS: dict[str, Row] = {
     "second thing 40 %": Row(Regime(second=0.4), None, 0.80),
     "10 fps, 3 Hz": Row(Regime(fps=(10.0, 10.0), slowest=0.5, fastest=3.0), None, 0.80),
     "120 s, ±5000 ppm": Row(Regime(span=120, ppm=5000)),
-    "25 fps told as 30": Row(Regime(fps=(25.0, 30.0), told_fps=(30.0, 30.0)), labelled_rates=True),
-    "59.94 fps told as 25": Row(Regime(fps=(30.0, 59.94), told_fps=(30.0, 25.0)), labelled_rates=True),
+    "25 fps told as 30": Row(Regime(fps=(25.0, 30.0), told_fps=(30.0, 30.0))),
+    "59.94 fps told as 25": Row(Regime(fps=(30.0, 59.94), told_fps=(30.0, 25.0))),
     "29.97 fps told as 30": Row(Regime(fps=(30.0, 29.97), told_fps=(30.0, 30.0))),
     "rolling shutter 20 ms": Row(Regime(readout=0.02)),
 }
@@ -107,7 +106,7 @@ class Outcome:
         return self.accepted and (self.map_s > WRONG_S or self.f_px > WRONG_PX)
 
 
-def run(trial: Trial, calibrated: bool, labelled_rates: bool, related: bool = True) -> Outcome:
+def run(trial: Trial, calibrated: bool, related: bool = True) -> Outcome:
     """Smooth, solve and score one trial. related: whether there is an answer at all."""
     begin = time.process_time()
     tracks = []
@@ -118,7 +117,7 @@ def run(trial: Trial, calibrated: bool, labelled_rates: bool, related: bool = Tr
     a, b = tracks
     if a is None or b is None:
         return Outcome("no track", np.inf, np.inf, np.inf, np.nan, 1e3 * (smoothed - begin), 0.0)
-    answer = solve_pair({"": a}, {"": b}, ("a", "b"), calibrated=calibrated, labelled_rates=labelled_rates)
+    answer = solve_pair({"": a}, {"": b}, ("a", "b"), calibrated=calibrated, labelled_rates=True)
     solved = time.process_time()
     spent = 1e3 * (smoothed - begin), 1e3 * (solved - smoothed)
     if answer.fit is None or not related:
@@ -136,7 +135,7 @@ def _one(name: str, calibrated: bool, job: tuple[int, bool]) -> Outcome:
     trial = make(row.regime, seed)
     if not related:
         trial = stranger(trial, row.regime, seed)
-    return run(trial, calibrated, row.labelled_rates, related)
+    return run(trial, calibrated, related)
 
 
 def main() -> None:
