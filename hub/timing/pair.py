@@ -23,6 +23,7 @@ from hub.timing.two_view import Geometry, RelativePose, Uncalibrated
 from protocols.geometry.types import Floats
 
 _LEAST_SAMPLES = 12
+_AT_NOISE = 0.8  # mean robust cost of an alignment whose rows are as noisy as the settings say: about 0.75
 _MOST_DRIFTS = 8  # of either sign
 _MOST_PIECES = 45.0  # s of a that the scan in pieces looks at
 _PIECES_STEP = 0.033  # s: the scan in pieces is rough, and dear
@@ -213,11 +214,14 @@ class _Search:
         scale = float(np.sqrt(max(cost, 1.0)))
         noise = Noise(s.sigma_px / a[0].focal, s.sigma_px / b[0].focal, s.rate_std)
         fixed = self.known is not None
+        own = min(1.0, min(float(np.median([t.sigma_px for t in one])) for one in (a, b)) / s.sigma_px) ** 2
         best: Refined | None = None
         for geometry in self._starts(few, b, offset, scale, start):
             found = refine(few, geometry, few.centre - offset, scale, noise, fixed_geometry=fixed, iterations=14)
             if found is not None and (best is None or found.cost < best.cost):
                 best = found
+            if best is not None and best.cost < _AT_NOISE * own:
+                break  # nothing fits better than the noise allows
         if best is None:
             return None
         rate = 1.0 / best.slowness
@@ -240,21 +244,22 @@ class _Search:
 
     def _starts(
         self, few: Samples, b: Sequence[SmoothTrack], offset: float, scale: float, start: Floats | None
-    ) -> list[Geometry]:
+    ) -> Iterator[Geometry]:
         if self.known is not None:
-            return [self.known]
+            yield self.known
+            return
         here_a, here_b = few.at(1.0, offset)
         both = np.isfinite(here_b).all(axis=1)
         if both.sum() < _LEAST_SAMPLES or start is None:
-            return []
+            return
         if not self.calibrated:
-            return [Uncalibrated.of(start)]
+            yield Uncalibrated.of(start)
+            return
         here_a, here_b = here_a[both], here_b[both]
         threshold = 3.0 * self.s.sigma_px * scale / min(self.a[0].focal, b[0].focal)
-        starts: list[Geometry] = [two_view.decompose(start, here_a, here_b)]
+        yield two_view.decompose(start, here_a, here_b)
         for seed in range(2):
-            starts += two_view.five_point(here_a, here_b, threshold, seed)
-        return starts
+            yield from two_view.five_point(here_a, here_b, threshold, seed)
 
     def _finish(
         self, answer: PairSolution, fit: PairFit, b: Sequence[SmoothTrack], *, pieces: bool = False
