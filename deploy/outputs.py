@@ -68,7 +68,8 @@ def write_refusal(
         command=command,
         solver=solver,
         cpu_seconds=cpu_seconds,
-        warnings=warnings,
+        pairs=refusal.pairs,
+        warnings=(*warnings, *refusal.warnings),
     )
     write_together(
         {out / RESULT: result_text(document), out / REPORT: build_report(refusal, rig, observations, command)}

@@ -6,46 +6,30 @@ No sockets, files or clocks: `calibrate` offline and the live hub run the same c
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hub.points import sampled_track
-from hub.poses.adjust import adjust, noise, residual_norms
+from hub.pairs import Progress, rate_warnings, solve_pairs, timing_told
+from hub.poses import covariance as cov
+from hub.poses.adjust import adjust, motion_prior, noise, residual_norms
 from hub.poses.graph import ClockGraph, ClockGuess, average_clocks, components
-from hub.poses.initialise import Camera, Scaffold, agreement, grow, place_known
-from hub.poses.problem import Freedom, Problem, Rows, State
-from hub.publish import publish
-from hub.timing.pair import PairSolution, solve_pair
+from hub.poses.initialise import Scaffold, agreement, grow, place_known
+from hub.poses.problem import Freedom, Problem, State
+from hub.prepare import NO_INTRINSICS, Prepared, prepare
+from hub.publish import lone_pair_report, publish
+from hub.timing.pair import PairSolution
 from hub.timing.paper_pairs import paper_pair
-from hub.timing.shared import solve_shared_pair
-from hub.timing.tracks import Track, smooth_only, smooth_track, without_jumps
-from hub.timing.two_view import relative_pose
+from hub.timing.tracks import smooth_only
 from protocols.errors import Refused
 from protocols.session.calibration import Calibration, Known
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
-Progress = Callable[[str, float], None]
-"""Told what is being done and how much of the whole is done (0..1)."""
-
 _LEAST_AGREEMENT = 0.5  # share of a camera's rows that must fit the common path
 _LEAST_ROWS = 30
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Prepared:
-    """Cameras that can be tried: smoothed tracks, raw rows; and those that can't, with the reason."""
-
-    cameras: dict[str, Camera]
-    rows: dict[str, list[Rows]]
-    epochs: dict[str, float]
-    labels: list[str]
-    refused: dict[str, str]
-    order: tuple[str, ...]
-    shared_clock: bool = False
-    warnings: tuple[str, ...] = ()
+_LARGEST_TURN_STD = 0.035  # rad
+_LARGEST_CLOCK_STD = 5e-3  # s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,25 +53,42 @@ def calibrate(
     *,
     solver: str = "joint",
     known: Known | None = None,
+    thorough: bool = False,
 ) -> Calibration:
     """Timing and poses of all cameras from what they saw, with no guess.
 
     solver: "joint", or "paper" (the paper's alternating method: no adjustment, same frame rates, lags of
     a few frames). known: intrinsics and poses that are given; then only timing and paths are sought.
-    Raises Refused, with a reason for every camera, where fewer than two can be tied together.
+    thorough: whether cameras that nothing ties get a second, far dearer search: clock rates that a
+    wrongly told frame rate makes (times made of frame numbers: a live camera's are not), and torn tracks.
+    Raises Refused, with a reason for every camera and what is known of pairs, where fewer than two can be placed.
     """
     tell = progress or (lambda text, share: None)
     if known is not None:
         rig = with_known_lenses(rig, known)
     prepared = prepare(rig, observations)
-    if known is not None:
-        solution = solve_known(prepared, known, tell)
-    elif solver == "paper":
-        solution = solve_paper(prepared, paper_pairs(prepared, observations, tell), tell)
+    if solver == "paper" and known is None:
+        pairs = paper_pairs(prepared, observations, tell)
     else:
-        solution = solve_network(prepared, solve_pairs(prepared, tell), tell)
-    tell("covariances", 0.95)
-    return publish(rig, solution)
+        prepared, pairs = solve_pairs(prepared, tell, thorough=thorough, known=known)
+        prepared = replace(
+            prepared,
+            refused=_with_timing(prepared, pairs),
+            warnings=prepared.warnings + rate_warnings(prepared, pairs),
+        )
+    try:
+        if known is not None:
+            solution = solve_known(prepared, pairs, known, tell)
+        elif solver == "paper":
+            solution = solve_paper(prepared, pairs, tell)
+        else:
+            solution = solve_network(prepared, pairs, tell)
+        tell("covariances", 0.95)
+        return publish(rig, solution)
+    except Refused as refusal:
+        refusal.pairs = tuple(lone_pair_report(pair, prepared) for pair in pairs)
+        refusal.warnings = prepared.warnings
+        raise
 
 
 def with_known_lenses(rig: Rig, known: Known) -> Rig:
@@ -97,64 +98,6 @@ def with_known_lenses(rig: Rig, known: Known) -> Rig:
         for name, camera in rig.cameras.items()
     }
     return replace(rig, cameras=cameras)
-
-
-def prepare(rig: Rig, observations: Observations) -> Prepared:
-    """Undistort and smooth every track; name the cameras that cannot be used."""
-    refused: dict[str, str] = {}
-    cameras: dict[str, Camera] = {}
-    rows: dict[str, list[Rows]] = {}
-    epochs: dict[str, float] = {}
-    labels = observations.labels
-    start = min((float(track.time[0]) for track in observations.tracks.values()), default=0.0)
-    warnings: list[str] = []
-    for name, rig_camera in rig.cameras.items():
-        tracks, jump = without_jumps(observations.of_camera(name))
-        if jump:
-            warnings.append(f"{name}: {jump}")
-        if not tracks:
-            refused[name] = "no observations"
-            continue
-        lens = rig_camera.intrinsics
-        if lens is None:
-            refused[name] = "no intrinsics (matrix and distortions in rig.toml): run `syncline intrinsics`"
-            continue
-        epoch = start if rig.shared_clock else min(float(track.time[0]) for track in tracks)
-        smooth: dict[str, Track] = {}
-        mine = []
-        for track in tracks:
-            normalised = lens.unproject(track.pixels)
-            cleaned: Track | None
-            if rig.shared_clock:
-                cleaned = sampled_track(track.time, normalised, lens.focal, epoch)
-            else:
-                cleaned = smooth_track(track.time, normalised, lens.focal, epoch)
-            if cleaned is None:
-                continue
-            smooth[track.label] = cleaned
-            use = np.ones(len(track), dtype=np.bool_)
-            mine.append(Rows(-1, labels.index(track.label), track.time - epoch, track.pixels, use))
-        if not smooth:
-            refused[name] = f"too few connected observations ({sum(len(track) for track in tracks)} rows)"
-            continue
-        cameras[name], rows[name], epochs[name] = Camera(name, lens, smooth), mine, epoch
-    return Prepared(cameras, rows, epochs, labels, refused, tuple(rig.cameras), rig.shared_clock, tuple(warnings))
-
-
-def solve_pairs(prepared: Prepared, tell: Progress) -> list[PairSolution]:
-    """All pairs of cameras, each by itself."""
-    names = list(prepared.cameras)
-    todo = list(itertools.combinations(names, 2))
-    pairs = []
-    for done, (a, b) in enumerate(todo):
-        tell(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
-        tracks_a, tracks_b = prepared.cameras[a].tracks, prepared.cameras[b].tracks
-        pairs.append(
-            solve_shared_pair(tracks_a, tracks_b, (a, b))
-            if prepared.shared_clock
-            else solve_pair(smooth_only(tracks_a), smooth_only(tracks_b), (a, b))
-        )
-    return pairs
 
 
 def paper_pairs(prepared: Prepared, observations: Observations, tell: Progress) -> list[PairSolution]:
@@ -189,20 +132,47 @@ def solve_network(prepared: Prepared, pairs: list[PairSolution], tell: Progress)
         refused |= unplaced
         scaffold = _adjust_all(scaffold, tell)
         bad = [name for name in scaffold.names if not _fits(scaffold, name)]
-        if not bad:
-            break
-        # The worst one goes, and what it may have spoilt is made again without it.
-        worst = min(bad, key=lambda name: agreement(scaffold, name)[0])
-        share, count = agreement(scaffold, worst)
-        refused[worst] = f"only {100 * share:.0f} % of its {count} observations fit the path that the others see"
+        if bad:
+            # The worst one goes, and what it may have spoilt is made again without it.
+            worst = min(bad, key=lambda name: agreement(scaffold, name)[0])
+            share, count = agreement(scaffold, worst)
+            refused[worst] = f"only {100 * share:.0f} % of its {count} observations fit the path that the others see"
+        else:
+            worst, reason = _loosest(scaffold)
+            if not reason:
+                break
+            refused[worst] = reason
         remaining = [name for name in scaffold.names if name != worst]
         if len(remaining) < 2:
-            raise Refused("no two cameras agree on one path", refused)
+            raise Refused(f"no two cameras can be placed ({worst}: {refused[worst]})", refused)
         graph = _connect(prepared, remaining, list(graph.agreeing), refused)
     warnings = tuple(
         f"pair {pair.a}–{pair.b} contradicts the other pairs and was set aside" for pair in graph.contradicting
     )
     return Solution(scaffold, tuple(pairs), _ordered(refused, prepared), prepared, "joint", warnings)
+
+
+def _loosest(scaffold: Scaffold) -> tuple[str, str]:
+    """The camera that is least tied to any other, and what is too uncertain about it; "" for nothing."""
+    problem, state = scaffold.problem, scaffold.state
+    found = cov.covariance(problem, state, motion_prior(problem, state))
+    turns = cov.turn_stds(found, state)
+    clocks = np.zeros_like(turns)
+    if problem.freedom.clock:
+        clocks = np.array(
+            [[cov.time_map_std(found, state, i, j) for j in range(len(turns))] for i in range(len(turns))]
+        )
+    for between, limit, unit, text in (
+        (turns, _LARGEST_TURN_STD, np.rad2deg(1.0), "the common motion tells its orientation only to {:.1f}° (std)"),
+        (clocks, _LARGEST_CLOCK_STD, 1e3, "the common motion tells its clock only to {:.1f} ms (std, mid-recording)"),
+    ):
+        np.fill_diagonal(between, np.inf)
+        best = between.min(axis=1)
+        # Of two that are alike, the later one: the first camera is most often the reference.
+        loosest = int(len(best) - 1 - np.argmax(best[::-1]))
+        if best[loosest] > limit:
+            return scaffold.names[loosest], text.format(unit * best[loosest])
+    return "", ""
 
 
 def solve_paper(prepared: Prepared, pairs: list[PairSolution], tell: Progress) -> Solution:
@@ -216,28 +186,20 @@ def solve_paper(prepared: Prepared, pairs: list[PairSolution], tell: Progress) -
     return Solution(scaffold, tuple(pairs), _ordered(refused | unplaced, prepared), prepared, "paper", (warning,))
 
 
-def solve_known(prepared: Prepared, known: Known, tell: Progress) -> Solution:
+def solve_known(prepared: Prepared, pairs: list[PairSolution], known: Known, tell: Progress) -> Solution:
     """Only clocks and paths: intrinsics and poses are given and stay as they are."""
     refused = dict(prepared.refused)
     for name in [name for name in prepared.cameras if name not in known.cameras]:
         refused[name] = "not in the known calibration"
     cameras = {name: camera for name, camera in prepared.cameras.items() if name in known.cameras}
     inside = replace(prepared, cameras=cameras)
-    pairs = []
-    todo = list(itertools.combinations(cameras, 2))
-    for done, (a, b) in enumerate(todo):
-        tell(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
-        if prepared.shared_clock:
-            pairs.append(solve_shared_pair(cameras[a].tracks, cameras[b].tracks, (a, b)))
-            continue
-        relative = relative_pose(known.cameras[a].pose, known.cameras[b].pose)
-        pairs.append(solve_pair(smooth_only(cameras[a].tracks), smooth_only(cameras[b].tracks), (a, b), known=relative))
     graph = _connect(inside, list(cameras), pairs, refused)
     tell("adjusting", 0.75)
     poses = {name: known.cameras[name].pose for name in graph.clocks}
     scaffold = place_known(cameras, graph, prepared.rows, prepared.labels, poses, not prepared.shared_clock)
     problem, state, _ = adjust(scaffold.problem, scaffold.state)
-    return Solution(replace_solution(scaffold, problem, state), tuple(pairs), refused, inside, "joint", known=known)
+    solution = replace_solution(scaffold, problem, state)
+    return Solution(solution, tuple(pairs), _ordered(refused, prepared), inside, "joint", known=known)
 
 
 def _connect(prepared: Prepared, names: list[str], pairs: list[PairSolution], refused: dict[str, str]) -> ClockGraph:
@@ -245,9 +207,11 @@ def _connect(prepared: Prepared, names: list[str], pairs: list[PairSolution], re
 
     Raises Refused, with every camera's reason, where no pair is solved.
     """
-    solved = [pair for pair in pairs if pair.solved and pair.a in names and pair.b in names]
+    placeable = [pair for pair in pairs if pair.a in prepared.cameras and pair.b in prepared.cameras]
+    solved = [pair for pair in placeable if pair.solved and pair.a in names and pair.b in names]
     if not solved:
-        raise Refused(_why_nothing(pairs, refused), _ordered(refused | _pair_reasons(names, pairs), prepared))
+        reasons = refused | {name: _why_unplaced(name, prepared, pairs) for name in names}
+        raise Refused(_why_nothing(prepared, placeable, refused), _ordered(reasons, prepared))
     groups = components(names, solved)
     for name in [name for name in names if name not in groups[0]]:
         refused[name] = _why_alone(name, groups, pairs)
@@ -255,6 +219,19 @@ def _connect(prepared: Prepared, names: list[str], pairs: list[PairSolution], re
     if prepared.shared_clock:
         return ClockGraph({name: ClockGuess(1.0, 0.0, 0.0) for name in groups[0]}, tuple(inside), ())
     return average_clocks(groups[0], inside, {name: prepared.cameras[name].tracks for name in groups[0]})
+
+
+def _with_timing(prepared: Prepared, pairs: list[PairSolution]) -> dict[str, str]:
+    """Reasons of the refused, where cameras without intrinsics say what is known of their clocks."""
+    refused = dict(prepared.refused)
+    for name in prepared.lensless:
+        told = timing_told(name, prepared, pairs)
+        refused[name] = (
+            f"no intrinsics: only its timing is known (pairs in result.json: {told}); run `syncline intrinsics`"
+            if told
+            else f"{NO_INTRINSICS}; nor is its timing known ({_tried(name, pairs) or 'no other camera'})"
+        )
+    return refused
 
 
 def _ordered(refused: dict[str, str], prepared: Prepared) -> dict[str, str]:
@@ -304,29 +281,32 @@ def _deviance(problem: Problem, state: State) -> float:
     return total
 
 
-def _why_nothing(pairs: list[PairSolution], refused: dict[str, str]) -> str:
+def _why_nothing(prepared: Prepared, pairs: list[PairSolution], refused: dict[str, str]) -> str:
     if not pairs:
-        told = "; ".join(f"{name}: {reason}" for name, reason in refused.items())
-        return (
-            f"fewer than two cameras have usable observations ({told})" if told else "one camera only: a pair is needed"
-        )
+        short = refused | dict.fromkeys(prepared.lensless, "no intrinsics")
+        told = "; ".join(f"{name}: {reason}" for name, reason in short.items())
+        return f"fewer than two cameras can be placed ({told})" if told else "one camera only: a pair is needed"
     told = "; ".join(f"{pair.a}–{pair.b}: {pair.status}" for pair in pairs[:6])
     return f"no pair of cameras could be tied together ({told})"
 
 
-def _pair_reasons(names: list[str], pairs: list[PairSolution]) -> dict[str, str]:
-    return {
-        name: "; ".join(f"with {p.b if p.a == name else p.a}: {p.status}" for p in pairs if name in (p.a, p.b))
-        or "no other camera to compare with"
-        for name in names
-    }
+def _why_unplaced(name: str, prepared: Prepared, pairs: list[PairSolution]) -> str:
+    """Why a camera with intrinsics that is tied to none other with them has no place."""
+    told = timing_told(name, prepared, pairs)
+    if told:
+        return f"only its timing is known (pairs in result.json: {told}): tied to no other camera with intrinsics"
+    return _tried(name, pairs) or "no other camera to compare with"
+
+
+def _tried(name: str, pairs: list[PairSolution]) -> str:
+    return "; ".join(
+        f"with {p.b if p.a == name else p.a}: {p.status}" for p in pairs if name in (p.a, p.b) and not p.solved
+    )
 
 
 def _why_alone(name: str, groups: list[list[str]], pairs: list[PairSolution]) -> str:
     mine = next(group for group in groups if name in group)
-    tried = "; ".join(
-        f"with {p.b if p.a == name else p.a}: {p.status}" for p in pairs if name in (p.a, p.b) and not p.solved
-    )
+    tried = _tried(name, pairs)
     if len(mine) > 1:
         return f"tied only to {', '.join(other for other in mine if other != name)}, not to the rest ({tried})"
     return f"could not be tied to any camera ({tried})"
@@ -334,11 +314,8 @@ def _why_alone(name: str, groups: list[list[str]], pairs: list[PairSolution]) ->
 
 __all__ = [
     "Freedom",
-    "Prepared",
     "Progress",
     "Solution",
     "calibrate",
-    "prepare",
     "solve_network",
-    "solve_pairs",
 ]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hub.pairs import pair_lag
 from hub.points import SAME_TIME, PointBasis
 from hub.poses import covariance as cov
 from hub.poses.adjust import motion_prior, predict, residual_norms
@@ -22,6 +23,7 @@ from protocols.version import VERSION
 
 if TYPE_CHECKING:
     from hub.calibrate import Solution
+    from hub.prepare import Prepared
 
 SEEN_WITHIN = 0.2
 """A time counts as seen by a camera if it saw the point this near [s]."""
@@ -42,13 +44,15 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
     covariance = cov.covariance(problem, state, motion_prior(problem, state), gauge.information)
     reference = _reference(rig, names)
     epochs = [solution.prepared.epochs[name] for name in names]
+    paces = [solution.prepared.pace(name) for name in names]
     base = state.cameras[reference]
     maps = []
-    for camera, epoch in zip(state.cameras, epochs, strict=True):
-        rate = float(camera.rate / base.rate)
-        # reference clock = epoch + centre + (internal - offset) / rate of the reference camera
-        at_centre = float((camera.offset - base.offset) / base.rate + base.centre + epochs[reference])
-        maps.append(TimeMap(rate, at_centre - rate * (camera.centre + epoch)))
+    for camera, epoch, pace in zip(state.cameras, epochs, paces, strict=True):
+        rate = float(camera.rate / base.rate * (pace / paces[reference]))
+        # reference clock = epoch + (centre + (internal - offset) / rate) / pace of the reference camera
+        ahead = (camera.offset - base.offset) / base.rate + base.centre
+        at_centre = float(ahead / paces[reference] + epochs[reference])
+        maps.append(TimeMap(rate, at_centre - rate * (camera.centre / pace + epoch)))
     maps[reference] = TimeMap(1.0, 0.0)
     cameras = {
         name: CameraCalibration(
@@ -56,7 +60,7 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
             intrinsics=state.cameras[i].intrinsics,
             pose=state.cameras[i].pose,
             time_map=maps[i],
-            time_offset_std=_map_std(problem, state, covariance, i, reference),
+            time_offset_std=_map_std(problem, state, covariance, i, reference) / paces[reference],
             position_std=cov.position_std(covariance, i)
             if solution.known is None
             else solution.known.cameras[name].position_std,
@@ -81,13 +85,14 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
                 name,
                 reference,
                 epochs[reference],
-                _rate_hz(rig, problem, names),
+                paces[reference],
+                _rate_hz(rig, problem, names, paces, paces[reference]),
             )
             for label, name in enumerate(scaffold.labels)
         ),
-        pairs=tuple(_pair_report(pair, rig, cameras, problem, state, names, solution) for pair in solution.pairs),
+        pairs=tuple(_pair_report(pair, cameras, problem, state, names, solution) for pair in solution.pairs),
         warnings=solution.prepared.warnings + solution.warnings + gauge.warnings,
-        residuals={name: _residual_rows(problem, state, i, epochs[i]) for i, name in enumerate(names)},
+        residuals={name: _residual_rows(problem, state, i, epochs[i], paces[i]) for i, name in enumerate(names)},
     )
 
 
@@ -123,22 +128,23 @@ def _rms(problem: Problem, state: State, camera: int) -> float:
     return float(np.sqrt(np.mean(norms**2))) if len(norms) else 0.0
 
 
-def _residual_rows(problem: Problem, state: State, camera: int, epoch: float) -> Floats:
+def _residual_rows(problem: Problem, state: State, camera: int, epoch: float, pace: float) -> Floats:
     parts = []
     for rows in problem.rows:
         if rows.camera == camera:
             predicted = predict(rows, state.cameras[camera], state.trajectories[rows.label])
             good = rows.use & np.isfinite(predicted).all(axis=1)
-            parts.append(np.column_stack([rows.time[good] + epoch, rows.pixels[good], (rows.pixels - predicted)[good]]))
+            shown = rows.time[good] / pace + epoch
+            parts.append(np.column_stack([shown, rows.pixels[good], (rows.pixels - predicted)[good]]))
     return np.concatenate(parts) if parts else np.zeros((0, 5))
 
 
-def _rate_hz(rig: Rig, problem: Problem, names: list[str]) -> float:
-    """The fastest camera's frame rate: nominal, or as its rows come."""
-    rates = [rig.cameras[name].fps for name in names]
+def _rate_hz(rig: Rig, problem: Problem, names: list[str], paces: list[float], reference: float) -> float:
+    """The fastest camera's frames in a second of a clock of pace ``reference``: nominal, or as its rows come."""
+    rates = [rig.cameras[name].fps * reference / pace for name, pace in zip(names, paces, strict=True)]
     for rows in problem.rows:
         if rates[rows.camera] <= 0 and len(rows.time) > 2:
-            rates[rows.camera] = 1.0 / float(np.median(np.diff(rows.time)))
+            rates[rows.camera] = reference / float(np.median(np.diff(rows.time)))
     return max([rate for rate in rates if np.isfinite(rate)], default=30.0) or 30.0
 
 
@@ -166,18 +172,19 @@ def _table(
     name: str,
     reference: int,
     epoch: float,
+    pace: float,
     rate_hz: float,
 ) -> TrajectoryTable:
     """The path of one label at ``rate_hz`` on the reference camera's clock, where two cameras saw it."""
     base = state.cameras[reference]
     path = state.trajectories[label]
     if isinstance(path.basis, PointBasis):
-        ticks = base.camera_time(path.basis.instants) + epoch
+        ticks = base.camera_time(path.basis.instants) / pace + epoch
     else:
         # A grid on the reference camera's clock, so that two runs on one log sample the same instants.
-        first, last = base.camera_time(np.array([path.basis.begin, path.basis.end]))
+        first, last = base.camera_time(np.array([path.basis.begin, path.basis.end])) / pace
         ticks = np.arange(np.ceil((first + epoch) * rate_hz), np.floor((last + epoch) * rate_hz) + 1) / rate_hz
-    internal = base.reference_time(ticks - epoch)
+    internal = base.reference_time((ticks - epoch) * pace)
     position = path.at(internal)
     good = np.isfinite(position).all(axis=1) & (supported(problem, state, label, internal) >= 2)
     return TrajectoryTable(name, ticks[good], position[good], cov.path_std(covariance, state, label, internal[good]))
@@ -185,7 +192,6 @@ def _table(
 
 def _pair_report(
     pair: PairSolution,
-    rig: Rig,
     cameras: dict[str, CameraCalibration],
     problem: Problem,
     state: State,
@@ -197,9 +203,7 @@ def _pair_report(
     a, b = cameras.get(pair.a), cameras.get(pair.b)
     middle = _middle_of_overlap(problem, state, names, pair)
     if pair.fundamental is None and a is not None and b is not None and middle is not None:
-        epochs = solution.prepared.epochs
-        time_a = float(state.cameras[names.index(pair.a)].camera_time(np.array([middle]))[0]) + epochs[pair.a]
-        time_b = float(state.cameras[names.index(pair.b)].camera_time(np.array([middle]))[0]) + epochs[pair.b]
+        time_a, time_b = (_shown(state, names, name, middle, solution) for name in (pair.a, pair.b))
         relative = relative_pose(a.pose, b.pose)
         return PairReport(
             cameras=(pair.a, pair.b),
@@ -210,23 +214,34 @@ def _pair_report(
             inliers=None if fit is None else fit.inliers,
             rms_px=None if fit is None or not np.isfinite(fit.sigma_px) else fit.sigma_px,
         )
+    return lone_pair_report(pair, solution.prepared)
+
+
+def lone_pair_report(pair: PairSolution, prepared: Prepared) -> PairReport:
+    """What a pair says by itself, where no joint solution holds both its cameras."""
+    fit = pair.fit
     if fit is None or not pair.solved:
         return PairReport((pair.a, pair.b), pair.status, fundamental=pair.fundamental)
-    epochs = solution.prepared.epochs
-    time_b = (fit.middle - fit.offset) / fit.rate
-    lens_a, lens_b = rig.cameras[pair.a].intrinsics, rig.cameras[pair.b].intrinsics
     matrix = pair.fundamental
-    if matrix is None and lens_a is not None and lens_b is not None:
-        matrix = fundamental_from(fit.pose, lens_a.matrix, lens_b.matrix)
+    if matrix is None:
+        lenses = [prepared.camera(name).intrinsics.matrix for name in (pair.a, pair.b)]
+        matrix = fundamental_from(fit.geometry, *lenses)
     return PairReport(
         (pair.a, pair.b),
         pair.status,
-        fit.middle + epochs[pair.a] - time_b - epochs[pair.b],
-        fit.rate,
+        pair_lag(prepared, pair, fit),
+        fit.rate * prepared.pace(pair.b) / prepared.pace(pair.a),
         matrix,
         fit.inliers,
         fit.sigma_px,
     )
+
+
+def _shown(state: State, names: list[str], name: str, internal: float, solution: Solution) -> float:
+    """What a camera's clock shows at an internal time."""
+    prepared = solution.prepared
+    mine = float(state.cameras[names.index(name)].camera_time(np.array([internal]))[0])
+    return mine / prepared.pace(name) + prepared.epochs[name]
 
 
 def _middle_of_overlap(problem: Problem, state: State, names: list[str], pair: PairSolution) -> float | None:

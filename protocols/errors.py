@@ -10,6 +10,10 @@ Anything else that escapes is a bug: exit status 1.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from protocols.session.calibration import PairReport
 
 EXIT_DONE = 0
 EXIT_BUG = 1
@@ -44,12 +48,20 @@ class InputError(SynclineError):
 class Refused(SynclineError):
     """The input is well-formed, but there is no trustworthy answer in it; the reason says why.
 
-    cameras: reasons by camera, where single ones can be told.
+    cameras: reasons by camera, where single ones can be told. pairs: what is known of pairs of cameras all
+    the same. warnings: what a user should know beside the reason.
     """
 
     exit_status = EXIT_REFUSED
 
-    def __init__(self, reason: str, cameras: dict[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        reason: str,
+        cameras: dict[str, str] | None = None,
+        pairs: tuple[PairReport, ...] = (),
+        warnings: tuple[str, ...] = (),
+    ) -> None:
+        self.pairs, self.warnings = pairs, warnings
         self.reason = " ".join(reason.split())
         self.cameras = dict(cameras or {})
         super().__init__(self.reason)

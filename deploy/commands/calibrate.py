@@ -70,7 +70,7 @@ def calibrate(
     began = time.process_time()
     try:
         with progress_bar(f"calibrating {session.name}", quiet=json) as tell:
-            result = solve(rig, seen, tell, solver=solver, known=known)
+            result = solve(rig, seen, tell, solver=solver, known=known, thorough=True)
     except Refused as refusal:
         spent = time.process_time() - began
         write_refusal(

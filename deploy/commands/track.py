@@ -49,7 +49,8 @@ def track(
     rig
         A rig.toml with the camera: matrix, distortions, fps, body_from_camera. One camera, or the video's name.
     telemetry
-        The drone's telemetry.csv: time,qw,qx,qy,qz[,north,east,down]. Needs matrix and body_from_camera in --rig.
+        The drone's telemetry.csv: time,qw,qx,qy,qz[,north,east,down]. The ground model refuses it
+        without matrix and body_from_camera in --rig: it could not use it.
     model
         ground: on the ground plane, the best. paper, plain: the paper's, for comparison.
     fps

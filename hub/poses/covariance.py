@@ -57,6 +57,26 @@ def covariance(problem: Problem, state: State, prior: MotionPrior, references: F
     return Covariance(full, parts.carried, free, _inverse_blocks(system.band))
 
 
+def turn_stds(covariance: Covariance, state: State) -> Floats:
+    """(n, n) largest std [rad] of the rotation between two cameras in any direction; no gauge enters."""
+    count = len(state.cameras)
+    out = np.zeros((count, count))
+    for i in range(count):
+        for j in range(i):
+            at = np.r_[i * CAMERA_PARAMETERS : i * CAMERA_PARAMETERS + 3]
+            to = np.r_[j * CAMERA_PARAMETERS : j * CAMERA_PARAMETERS + 3]
+            relative = state.cameras[i].pose.rotation @ state.cameras[j].pose.rotation.T
+            cross = covariance.cameras[np.ix_(at, to)] @ relative.T
+            between = (
+                covariance.cameras[np.ix_(at, at)]
+                + relative @ covariance.cameras[np.ix_(to, to)] @ relative.T
+                - cross
+                - cross.T
+            )
+            out[i, j] = out[j, i] = float(np.sqrt(max(np.linalg.eigvalsh(between)[-1], 0.0)))
+    return out
+
+
 def gauge_generators(state: State) -> Floats:
     """(10 n, 7): how all cameras move under a small translation, rotation and scaling of the world."""
     rows = []

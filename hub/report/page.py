@@ -127,6 +127,11 @@ def _refusal_page(refused: Refused, rig: Rig, observations: Observations, comman
             tables.refused(reasons, {name: len(part) for name, part in rows.items()}),
         ),
         _section(
+            "Pairs",
+            "What could be told of two cameras by themselves: these lags hold, only places and paths are missing.",
+            tables.pairs(refused) if any(pair.status == "ok" for pair in refused.pairs) else "",
+        ),
+        _section(
             "When each camera saw the point",
             "The clocks are not known, so each row starts at the camera’s own first observation.",
             time_figures.own_time_lines(rows),

@@ -6,17 +6,18 @@ import numpy as np
 
 from hub.report.svg import THIN, at, drawing, esc, line, number, rect, text
 from hub.report.verdict import contradicts
+from protocols.errors import Refused
 from protocols.session.calibration import Calibration, PairReport
 
 _MOST_LABELS = 15  # more lags than this would cover each other
 _MOST_NODES = 8  # beyond, edges are a ball of wool and a matrix reads better
 
 
-def edge_kind(calibration: Calibration, pair: PairReport) -> str:
+def edge_kind(outcome: Calibration | Refused, pair: PairReport) -> str:
     """ "agrees", "contradicts" or "refused"."""
     if pair.status != "ok":
         return "refused"
-    return "contradicts" if contradicts(calibration, pair) else "agrees"
+    return "contradicts" if contradicts(outcome, pair) else "agrees"
 
 
 def pair_graph(calibration: Calibration) -> str:

@@ -12,6 +12,7 @@ from hub.report.pair_graph import edge_kind
 from hub.report.remedies import remedy_for
 from hub.report.svg import THIN, esc, number, short, whole
 from hub.report.verdict import half_interval_ms
+from protocols.errors import Refused
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration
 from protocols.session.rig import Rig
@@ -80,9 +81,9 @@ def _position(position: Floats, std: Floats) -> str:
     return f'{place} <span class="pm">{around}</span>'
 
 
-def pairs(calibration: Calibration) -> str:
+def pairs(outcome: Calibration | Refused) -> str:
     """One row a pair: lag at the middle of the overlap, rate, and how it was judged."""
-    if not calibration.pairs:
+    if not outcome.pairs:
         return ""
     head = [
         "Pair",
@@ -93,8 +94,8 @@ def pairs(calibration: Calibration) -> str:
         "Noise <small>px</small>",
     ]
     rows = []
-    for pair in calibration.pairs:
-        kind = edge_kind(calibration, pair)
+    for pair in outcome.pairs:
+        kind = edge_kind(outcome, pair)
         verdict = _SIGNS[kind] + (f" {esc(pair.status)}" if kind == "refused" else "")
         ppm = None if pair.clock_rate is None else 1e6 * (pair.clock_rate - 1.0)
         rows.append(

@@ -23,6 +23,7 @@ INTERVAL_95 = 1.96
 _EXACT_MS = 2.0  # half a 95 % interval that is good whatever the frame rate
 _GOOD_SHARE_OF_FRAME, _POOR_SHARE_OF_FRAME = 0.05, 0.25
 _SLOW_PPM, _WRONG_PPM = 300.0, 2000.0  # crystals drift by 50 ppm; nominal frame rates lie by 1000
+_WRONG_RATE_PPM = 10_000.0  # and these are no clocks but frame numbers
 _GOOD_PX_AT_1920 = 1.5
 _LENS_SHARE = 0.4  # of the squared residuals that the place in the image explains
 _FEW_ROWS, _VERY_FEW_ROWS = 0.7, 0.5
@@ -93,6 +94,7 @@ def judge_refusal(refused: Refused, rig: Rig) -> Verdict:
         if name in refused.cameras:
             reason = refused.cameras[name]
             findings.append(Finding("attention", f"{name}: {reason}.", remedy_for(reason)))
+    findings += [Finding("attention", _sentence(text), _warning_todo(text)) for text in refused.warnings]
     return Verdict(
         "refused",
         "Refused: there is no trustworthy answer in this session",
@@ -110,14 +112,14 @@ def _ppm(camera: CameraCalibration) -> float:
     return 1e6 * (camera.time_map.clock_rate - 1.0)
 
 
-def contradicts(calibration: Calibration, pair: PairReport) -> bool:
+def contradicts(outcome: Calibration | Refused, pair: PairReport) -> bool:
     """Whether the pair was set aside because the others contradict it."""
     names = {f"{pair.cameras[0]}–{pair.cameras[1]}", f"{pair.cameras[1]}–{pair.cameras[0]}"}
-    return any("contradicts" in text and any(name in text for name in names) for text in calibration.warnings)
+    return any("contradicts" in text and any(name in text for name in names) for text in outcome.warnings)
 
 
 def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:].rstrip(".") + "."
+    return text[:1].upper() + text[1:].rstrip(".") + ("" if text.endswith("?") else ".")
 
 
 def _listed(names: list[str]) -> str:
@@ -169,6 +171,8 @@ def _rates(calibration: Calibration, rig: Rig) -> list[Finding]:
     out = []
     for name, camera in calibration.cameras.items():
         ppm = _ppm(camera)
+        if abs(ppm) > _WRONG_RATE_PPM:
+            continue  # a warning of the solver tells it
         if abs(ppm) > _WRONG_PPM:
             out.append(
                 Finding(
@@ -317,6 +321,12 @@ def _scale(calibration: Calibration) -> list[Finding]:
 
 
 def _warning_todo(text: str) -> str:
+    if "were they made with" in text:
+        name = text.split(":")[0]
+        return (
+            f"{name}: make its times again with the true frame rate, or use them with the clock_rate of "
+            "calibration.toml: the answer allows for it."
+        )
     match = re.search(r"pair (\S+)–(\S+) contradicts", text)
     if match is None:
         return ""

@@ -80,8 +80,12 @@ class PairSettings:
     """What an alignment may leave over the tracks' own noise for the noise to explain it."""
     largest_lag_std: float = 4e-3
     """Least certainty [s] of the lag and …"""
-    largest_turn_std: float = 0.1
-    """… of the relative rotation [rad] that is worth an answer."""
+    largest_turn_std: float = 0.035
+    """… of the relative rotation [rad] that is worth an answer; …"""
+    sure_turn_std: float = 0.25
+    """… where the lag is beyond doubt, so much: epipolar lines can be right to a pixel with the pose open."""
+    sure_log10_chance: float = -4.5
+    """log10 of the chance of one unrelated stretch from which the lag is beyond doubt."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,6 +24,9 @@ from protocols.geometry.types import Floats
 
 _LEAST_SAMPLES = 12
 _AT_NOISE = 0.8  # mean robust cost of an alignment whose rows are as noisy as the settings say: about 0.75
+_STARTS = 4
+_SEEDS = 8  # of five-point hypotheses; the later ones only …
+_PROMISING = 12.0  # … for what comes this near the noise: a wrong minimum of E at the right lag
 _MOST_DRIFTS = 8  # of either sign
 _MOST_PIECES = 45.0  # s of a that the scan in pieces looks at
 _PIECES_STEP = 0.033  # s: the scan in pieces is rough, and dear
@@ -50,31 +53,32 @@ def solve_pair(
     known: RelativePose | None = None,
     *,
     calibrated: bool = True,
-    labelled_rates: bool = False,
+    thorough: bool = False,
 ) -> PairSolution:
     """Find lag, rate and geometry of two cameras from the labels that both saw.
 
     tracks_a, tracks_b: by label; all tracks of one camera share one epoch. known: the relative pose, where
     it is given: then only lag and rate are sought. calibrated: whether both lenses are known; if not, the
     tracks' normalised coordinates are those of any nominal lens and the answer is a fundamental matrix.
-    labelled_rates: whether to go on where that finds nothing: clocks up to 5000 ppm off, those of wrongly told
+    thorough: whether to go on where that finds nothing: clocks up to 5000 ppm off, those of wrongly told
     frame rates, and tracks that follow something else now and then; tens of times as dear.
     """
     s = settings or PairSettings()
     labels = [label for label in tracks_a if label in tracks_b]
     if not labels:
         return PairSolution(*names, "no label that both cameras saw")
-    search = _Search([tracks_a[k] for k in labels], [tracks_b[k] for k in labels], s, known, calibrated, labelled_rates)
-    first: PairSolution | None = None
+    search = _Search([tracks_a[k] for k in labels], [tracks_b[k] for k in labels], s, known, calibrated)
+    first = search.at_rate(names, 1.0)
+    if first.solved or not thorough:
+        return first
+    if search.jumps():
+        first = search.in_pieces(names)
+        if first.solved:
+            return first
     for rate in search.rates():
         answer = search.at_rate(names, rate)
         if answer.solved:
             return answer
-        if first is None:
-            first = answer
-    if labelled_rates and search.jumps():
-        return search.in_pieces(names)
-    assert first is not None
     return first
 
 
@@ -88,9 +92,7 @@ class _Search:
         s: PairSettings,
         known: RelativePose | None,
         calibrated: bool,
-        labelled_rates: bool,
     ) -> None:
-        self.labelled_rates = labelled_rates
         self.a, self.b, self.s, self.known, self.calibrated = a, b, s, known, calibrated
         self.step = _grid_step(a, b, s)
         self.grid_a = grid_tracks(a, self.step, s.sigma_px)
@@ -99,10 +101,7 @@ class _Search:
         self.span = min(max(t.basis.end for t in one) - min(t.basis.begin for t in one) for one in (a, b))
 
     def rates(self) -> Iterator[float]:
-        """Clock rates worth a scan: 1, what a drift does to a long recording, and wrongly labelled frame rates."""
-        yield 1.0
-        if not self.labelled_rates:
-            return
+        """Clock rates worth another scan: what a drift does to a long recording, and wrongly told frame rates."""
         # A scan at rate 1 sees a pair as long as the ends don't slip by more than a few steps.
         slip = 0.15 / max(self.span, 1e-9)
         if slip < 5e-3:
@@ -193,8 +192,12 @@ class _Search:
         return self._finish(PairSolution(*names, "ok", fit), fit, self.b, pieces=True)
 
     def _searched(self, scan: Scan, fit: PairFit) -> float:
-        """About how many independent alignments with as much common motion were looked at, rates included."""
-        alike = scan.support > 0.7 * fit.moving_overlap
+        """About how many independent alignments with as much common motion were looked at, rates included.
+
+        Those with much more of it could hardly fit as well by chance.
+        """
+        support = scan.support[int(np.argmin(np.abs(scan.offset - fit.lag)))]
+        alike = (scan.support > 0.7 * support) & (scan.support < 1.4 * support)
         return max(1.0, self.tried * float(alike.sum()) * self.step / self.s.distinct_alignments)
 
     def _refine_candidate(
@@ -216,7 +219,9 @@ class _Search:
         fixed = self.known is not None
         own = min(1.0, min(float(np.median([t.sigma_px for t in one])) for one in (a, b)) / s.sigma_px) ** 2
         best: Refined | None = None
-        for geometry in self._starts(few, b, offset, scale, start):
+        for count, geometry in enumerate(self._starts(few, b, offset, scale, start)):
+            if count >= _STARTS and (best is None or best.cost > _PROMISING * own):
+                break
             found = refine(few, geometry, few.centre - offset, scale, noise, fixed_geometry=fixed, iterations=14)
             if found is not None and (best is None or found.cost < best.cost):
                 best = found
@@ -258,7 +263,11 @@ class _Search:
         here_a, here_b = here_a[both], here_b[both]
         threshold = 3.0 * self.s.sigma_px * scale / min(self.a[0].focal, b[0].focal)
         yield two_view.decompose(start, here_a, here_b)
-        for seed in range(2):
+        noise = Noise(self.s.sigma_px / self.a[0].focal, self.s.sigma_px / b[0].focal, self.s.rate_std)
+        loose = refine(few, Uncalibrated.of(start), few.centre - offset, scale, noise, iterations=14)
+        if loose is not None:
+            yield two_view.decompose(loose.geometry.matrix, here_a, here_b)
+        for seed in range(_SEEDS):
             yield from two_view.five_point(here_a, here_b, threshold, seed)
 
     def _finish(
@@ -300,7 +309,8 @@ class _Search:
             return replace(
                 answer, status=f"the motion tells the lag only to {1e3 * last.lag_std:.0f} ms (std)", fit=last
             )
-        if last.turn_std > s.largest_turn_std:
+        sure = fit.log10_chance is not None and fit.log10_chance < s.sure_log10_chance
+        if last.turn_std > (s.sure_turn_std if sure else s.largest_turn_std):
             reason = f"the motion tells the relative rotation only to {np.rad2deg(last.turn_std):.1f}° (std)"
             return replace(answer, status=reason, fit=last)
         return replace(answer, fit=last)

@@ -64,7 +64,7 @@ class Chance:
         if share <= 0.0 or k <= 0.0 or not math.isfinite(cost):
             return 0.0
         ratio = share * math.exp(math.log(cost + COST_FLOOR) - self.log_median) + 1.0 - share
-        x = ratio * float(chdtri(k, 0.5))
+        x = max(ratio, 1e-300) * float(chdtri(k, 0.5))
         tail = float(gammainc(0.5 * k, 0.5 * x))
         if tail > 1e-200:
             return math.log10(tail)

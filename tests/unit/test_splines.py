@@ -149,3 +149,95 @@ def test_stretches_are_cut_at_long_gaps_only() -> None:
 def test_no_time_has_no_stretch() -> None:
     begins, ends = stretches(np.zeros(0), 1.0)
     assert len(begins) == len(ends) == 0
+
+
+@pytest.fixture
+def filled() -> SplineBasis:
+    """Stretches filled exactly, the second one beginning where the first one ends; none a multiple of the spacing."""
+    return SplineBasis.within(np.array([-3.0, 1.1, 9.0]), np.array([1.1, 7.33, 9.05]), 0.25)
+
+
+def inner_times(basis: SplineBasis, count: int = 300) -> Floats:
+    ends = basis.starts + basis.intervals * basis.widths
+    rng = np.random.default_rng(0)
+    which = rng.integers(0, len(ends), count)
+    share = rng.uniform(0.001, 0.999, count)
+    return np.sort(basis.starts[which] + share * (ends - basis.starts)[which])
+
+
+def test_stretches_within_end_exactly_where_they_should(filled: SplineBasis) -> None:
+    np.testing.assert_allclose(filled.starts, [-3.0, 1.1, 9.0])
+    np.testing.assert_allclose(filled.starts + filled.intervals * filled.widths, [1.1, 7.33, 9.05], atol=1e-12)
+    assert (filled.widths <= filled.spacing + 1e-12).all()
+    assert filled.begin == -3.0
+    assert filled.end == pytest.approx(9.05)
+
+
+def test_times_within_belong_to_their_stretch_and_gaps_to_none(filled: SplineBasis) -> None:
+    control = np.zeros((filled.size, 1))
+    control[filled.offsets[1] : filled.offsets[2]] = 1.0
+    values = filled.evaluate(control, np.array([1.1 - 1e-6, 1.1 + 1e-6, 7.33 - 1e-6, 7.33 + 1e-6, 9.0, 9.05, 9.06]))
+    np.testing.assert_allclose(values[:, 0], [0, 1, 1, np.nan, 0, 0, np.nan], atol=1e-12)
+
+
+@pytest.mark.parametrize("derivative", [1, 2])
+def test_derivatives_within_are_slopes(filled: SplineBasis, derivative: int) -> None:
+    """Each stretch has knots of its own width, not of the nominal one."""
+    control = np.random.default_rng(1).normal(size=(filled.size, 2))
+    time, h = inner_times(filled), 1e-6
+    clear = (filled.locate(time - h)[0] == filled.locate(time + h)[0]).nonzero()[0]
+    before, after = (filled.evaluate(control, time + step, derivative - 1) for step in (-h, h))
+    slope = (after - before) / (2 * h)
+    found = filled.evaluate(control, time, derivative)
+    scale = float(np.abs(found).max())
+    np.testing.assert_allclose(found[clear] / scale, slope[clear] / scale, atol=1e-6)
+
+
+def test_value_and_slope_at_once_are_those_one_by_one(filled: SplineBasis) -> None:
+    control = np.random.default_rng(2).normal(size=(filled.size, 2))
+    time = np.r_[inner_times(filled), 8.0, -4.0, np.nan]
+    values, slopes = filled.evaluate_both(control, time)
+    np.testing.assert_allclose(values, filled.evaluate(control, time), atol=1e-12)
+    np.testing.assert_allclose(slopes, filled.evaluate(control, time, 1), atol=1e-10)
+
+
+def test_a_spline_within_is_twice_smooth_inside_and_free_between_stretches(filled: SplineBasis) -> None:
+    control = np.random.default_rng(3).normal(size=(filled.size, 1))
+    knots = filled.starts[1] + filled.widths[1] * np.arange(1, filled.intervals[1])
+    for derivative in (0, 1, 2):
+        before = filled.evaluate(control, knots - 1e-9, derivative)
+        after = filled.evaluate(control, knots + 1e-9, derivative)
+        np.testing.assert_allclose(before, after, atol=1e-5)
+    seam = filled.evaluate(control, np.array([1.1 - 1e-9, 1.1 + 1e-9]))
+    assert abs(seam[1, 0] - seam[0, 0]) > 0.05
+
+
+def test_neighbouring_stretches_fit_a_step(filled: SplineBasis) -> None:
+    """What comes after a jump pulls nothing that came before."""
+    time = inner_times(filled, 500)
+    values = np.where(time < 1.1, np.sin(time), 5.0 + np.cos(time))[:, None]
+    control = fit_spline(filled, time, values, np.ones(500), stiffness=1e-9)
+    np.testing.assert_allclose(filled.evaluate(control, time), values, atol=2e-3)
+
+
+def test_a_stretched_basis_says_the_same_at_stretched_times(filled: SplineBasis) -> None:
+    control = np.random.default_rng(4).normal(size=(filled.size, 2))
+    time = inner_times(filled)
+    wide = filled.scaled(1.2)
+    np.testing.assert_allclose(wide.evaluate(control, 1.2 * time), filled.evaluate(control, time), atol=1e-9)
+    np.testing.assert_allclose(
+        1.2 * wide.evaluate(control, 1.2 * time, 1), filled.evaluate(control, time, 1), atol=1e-7
+    )
+
+
+def test_an_empty_stretch_is_no_trouble() -> None:
+    basis = SplineBasis.within(np.array([0.0, 5.0]), np.array([2.0, 5.0]), 0.25)
+    control = np.ones((basis.size, 1))
+    np.testing.assert_allclose(basis.evaluate(control, np.array([1.0, 5.0])), 1.0)
+
+
+def test_a_change_of_piece_ends_a_stretch() -> None:
+    time = np.array([0.0, 0.1, 0.2, 0.3, 2.0])
+    begins, ends = stretches(time, 0.5, np.array([0, 0, 1, 1, 1]))
+    np.testing.assert_array_equal(begins, [0.0, 0.2, 2.0])
+    np.testing.assert_array_equal(ends, [0.1, 0.3, 2.0])

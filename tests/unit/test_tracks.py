@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hub.timing.tracks import SmoothTrack, neighbour_test, smooth_track
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Bools, Floats
 from tests.rigs import random_path
 
 FOCAL = 1000.0
@@ -209,3 +209,95 @@ def test_the_neighbour_test_survives_forty_percent_of_lies() -> None:
 def test_the_neighbour_test_takes_any_number_of_rows(count: int) -> None:
     time, points, _ = track(14)
     assert neighbour_test(time[:count], points[:count], 1e-3).shape == (count,)
+
+
+def fast_track(seed: int, fps: float, slowest: float, fastest: float, noise_px: float) -> tuple[Floats, Floats, Floats]:
+    """Time (n,), noisy and true normalised points (n, 2) of motion between two frequencies [Hz]."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0, 30, 1 / fps)
+    frequency, phase = rng.uniform(slowest, fastest, (2, 6)), rng.uniform(0, 2 * np.pi, (2, 6))
+    truth = np.stack(
+        [0.04 * np.sin(2 * np.pi * np.outer(time, f) + p).sum(axis=1) for f, p in zip(frequency, phase, strict=True)], 1
+    )
+    return time, truth + rng.normal(0, noise_px / FOCAL, truth.shape), truth
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_slow_camera_s_fast_track_is_followed(seed: int) -> None:
+    """Three points a period: between them too the spline must be where the thing was."""
+    time, points, truth = fast_track(seed, 60.0, 0.5, 3.0, 0.5)
+    rows = np.arange(0, len(time), 6)  # 10 fps
+    found = smoothed(time[rows], points[rows])
+    assert found.inlier.mean() > 0.97
+    assert len(found.jumps) == 0
+    error = np.linalg.norm(found.at(time) - truth, axis=1)[30:-30] * FOCAL
+    at_rows = np.isin(np.arange(30, len(time) - 30), rows)
+    assert np.sqrt(np.mean(error[at_rows] ** 2)) < 0.95  # the points themselves: 0.71
+    assert np.median(error) < 1.2
+    assert np.quantile(error, 0.95) < 2.5  # of swings of some 100 px
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("fps", "fastest"), [(10.0, 3.0), (30.0, 1.2), (30.0, 3.0)])
+def test_a_smooth_fast_track_has_no_jumps(seed: int, fps: float, fastest: float) -> None:
+    time, points, _ = fast_track(seed, fps, 0.05, fastest, 0.5)
+    found = smoothed(time, points)
+    assert len(found.jumps) == 0
+    assert found.inlier.mean() > 0.97
+
+
+CUTS = np.array([5.0, 7.0, 15.0, 16.5])
+
+
+def taken_over(seed: int, away: float) -> tuple[Floats, Floats, Bools, Floats]:
+    """A track with two spells of another thing: time, points, the other's rows, and the jumps [px] at CUTS."""
+    time, points, _ = fast_track(seed, 30.0, 0.05, 1.2, 0.5)
+    _, other, _ = fast_track(seed + 50, 30.0, 0.05, 1.2, 0.5)
+    spells = np.searchsorted(CUTS, time + 1e-9)
+    second = spells % 2 == 1
+    points[second] = other[second] + away
+    before, after = (np.searchsorted(time, CUTS - 1e-9) + step for step in (-1, 0))
+    return time, points, second, np.linalg.norm(points[before] - points[after], axis=1) * FOCAL
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_jumps_are_found_where_another_thing_takes_over(seed: int) -> None:
+    time, points, second, _ = taken_over(seed, 0.5)
+    found = smoothed(time, points)
+    assert len(found.jumps) == len(CUTS)
+    np.testing.assert_allclose(found.jumps, CUTS, atol=0.05)
+    assert found.inlier[second].mean() > 0.8, "the second thing is a track of its own, no outlier"
+    again = found.at(found.time)
+    error = np.linalg.norm(again - points[found.inlier], axis=1) * FOCAL
+    assert error.max() < 5.0, "something is smeared over a jump"
+
+
+def test_most_jumps_to_something_near_are_found_too() -> None:
+    hits, extra = [], 0
+    for seed in range(8):
+        time, points, _, far = taken_over(seed, 0.0)
+        jumps = smoothed(time, points).jumps
+        hits += [bool(len(jumps)) and bool(np.abs(jumps - cut).min() < 0.06) for cut in CUTS[far > 60]]
+        extra += sum(bool(np.abs(CUTS - jump).min() > 0.06) for jump in jumps)
+    assert np.mean(hits) > 0.7
+    assert extra == 0
+
+
+def test_single_false_points_are_no_jumps() -> None:
+    time, points, _ = fast_track(1, 30.0, 0.05, 1.2, 0.5)
+    points[50::60] += 0.2
+    found = smoothed(time, points)
+    assert len(found.jumps) == 0
+    assert not found.inlier[50::60].any()
+
+
+def test_a_scaled_track_shows_the_same_points_later() -> None:
+    time, points, _ = fast_track(2, 30.0, 0.05, 1.2, 0.5)
+    found = smoothed(time, points)
+    slow = found.scaled(1.25)
+    when = np.linspace(1, 28, 200)
+    np.testing.assert_allclose(slow.at(1.25 * when), found.at(when), atol=1e-12)
+    point, speed = slow.point_and_speed(1.25 * when)
+    np.testing.assert_allclose(point, found.at(when), atol=1e-12)
+    np.testing.assert_allclose(1.25 * speed, found.at(when, 1), atol=1e-9)
+    assert slow.span == pytest.approx(1.25 * found.span)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hub.timing import two_view
-from hub.timing.two_view import RelativePose
+from hub.timing.two_view import Geometry, RelativePose, Uncalibrated
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 from tests.rigs import looking_at
@@ -136,3 +136,67 @@ def test_the_tangent_basis_is_orthonormal(seed: int) -> None:
     direction /= np.linalg.norm(direction)
     basis = np.column_stack([direction, two_view.tangent_basis(direction)])
     np.testing.assert_allclose(basis.T @ basis, np.eye(3), atol=1e-14)
+
+
+def uncalibrated(seed: int) -> Uncalibrated:
+    return Uncalibrated.of(np.random.default_rng(seed).normal(size=(3, 3)))
+
+
+@seeds
+def test_an_uncalibrated_matrix_has_rank_two_and_norm_one_wherever_it_moves(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    geometry = uncalibrated(seed)
+    for _ in range(5):
+        assert np.linalg.norm(geometry.matrix) == pytest.approx(1.0, abs=1e-12)
+        assert np.linalg.svd(geometry.matrix, compute_uv=False)[2] < 1e-12
+        geometry = geometry.moved(rng.normal(0, 1.0, 7))
+
+
+@seeds
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_tangents_are_what_small_steps_do(seed: int, calibrated: bool) -> None:
+    geometry: Geometry = scene(seed)[0] if calibrated else uncalibrated(seed)
+    tangents = geometry.tangents()
+    assert tangents.shape == (5 if calibrated else 7, 3, 3)
+    h = 1e-6
+    for axis, tangent in zip(np.eye(len(tangents)), tangents, strict=True):
+        slope = (geometry.moved(h * axis).matrix - geometry.moved(-h * axis).matrix) / (2 * h)
+        np.testing.assert_allclose(tangent, slope, atol=1e-8)
+
+
+@seeds
+def test_the_steps_of_an_uncalibrated_matrix_reach_every_neighbour(seed: int) -> None:
+    """Seven steps, none of them idle: matrices of rank 2 and norm 1 have seven degrees of freedom."""
+    assert np.linalg.matrix_rank(uncalibrated(seed).tangents().reshape(7, 9), tol=1e-3) == 7
+
+
+@seeds
+def test_the_nearest_rank_two_matrix_drops_the_smallest_singular_value(seed: int) -> None:
+    matrix = np.random.default_rng(seed).normal(size=(3, 3))
+    u, d, vt = np.linalg.svd(matrix)
+    nearest = (u * [d[0], d[1], 0.0]) @ vt
+    nearest /= np.linalg.norm(nearest)
+    found = Uncalibrated.of(matrix).matrix
+    np.testing.assert_allclose(found * np.sign((found * nearest).sum()), nearest, atol=1e-12)
+    for rotation in (Uncalibrated.of(matrix).left, Uncalibrated.of(matrix).right):
+        assert np.linalg.det(rotation) == pytest.approx(1.0)
+
+
+@seeds
+def test_a_fundamental_matrix_of_nominal_lenses_is_that_of_the_pixels(seed: int) -> None:
+    """Whatever lens is made up for the tracks, it drops out of the published matrix."""
+    pose, a, b, _, _ = scene(seed)
+    true = np.array([[900.0, 0, 640], [0, 905, 360], [0, 0, 1]])
+    nominal = np.array([[1280.0, 0, 639.5], [0, 1280.0, 359.5], [0, 0, 1]])
+    other = np.linalg.inv(nominal) @ true
+    seen = Uncalibrated.of(np.linalg.inv(other).T @ pose.essential @ np.linalg.inv(other))
+    f = two_view.fundamental_from(seen, nominal, nominal)
+    np.testing.assert_allclose(f, two_view.fundamental_from(pose, true, true), atol=1e-12)
+    m_a, m_b = two_view.homogeneous(a) @ true.T, two_view.homogeneous(b) @ true.T
+    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", m_a, f, m_b), 0, atol=1e-8)
+
+
+def test_without_lenses_nothing_is_behind_and_no_angle_known() -> None:
+    _, a, b, _, _ = scene(2)
+    assert two_view.in_front(uncalibrated(2), a, b).all()
+    assert two_view.parallax(uncalibrated(2), a, b) == 0.0

@@ -1,0 +1,184 @@
+"""All pairs of a session's cameras, each by itself; and clocks whose seconds are no seconds.
+
+Times made of frame numbers with a wrong frame rate run 0.4 to 2.5 times as fast as they should. To look for
+that in every pair is dear, so only cameras that nothing ties to the others are tried at such rates. What is
+found becomes the camera's pace: from then on its times are counted at it, and everything behind sees clocks
+that run about alike.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from hub.poses.graph import components
+from hub.prepare import Prepared
+from hub.timing.pair import PairFit, PairSolution, solve_pair
+from hub.timing.shared import solve_shared_pair
+from hub.timing.tracks import smooth_only
+from hub.timing.two_view import relative_pose
+from protocols.session.calibration import Known
+
+Progress = Callable[[str, float], None]
+"""Told what is being done and how much of the whole is done (0..1)."""
+
+FAR_FROM_ONE = 0.01
+"""No clock is off by that much: its times were made with a wrong frame rate."""
+_FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
+_SAME_RATIO = 0.01
+
+
+def solve_pairs(
+    prepared: Prepared, tell: Progress, *, thorough: bool = False, known: Known | None = None
+) -> tuple[Prepared, list[PairSolution]]:
+    """All pairs of cameras, lensless ones included, and the session at the paces that were found.
+
+    thorough: whether to try rates that a wrongly told frame rate makes, for cameras that nothing ties.
+    known: given poses; then only lags and rates are sought where both have one.
+    """
+    names = prepared.names
+    todo = list(itertools.combinations(names, 2))
+    pairs: dict[tuple[str, str], PairSolution] = {}
+    for done, (a, b) in enumerate(todo):
+        tell(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
+        pairs[a, b] = _solve(prepared, (a, b), known)
+    if thorough and not prepared.shared_clock:
+        prepared = _tie_at_other_rates(prepared, pairs, known, tell)
+    return prepared, list(pairs.values())
+
+
+def _solve(
+    prepared: Prepared, names: tuple[str, str], known: Known | None, thorough: bool = False
+) -> PairSolution:
+    a, b = (prepared.camera(name).tracks for name in names)
+    if prepared.shared_clock:
+        return solve_shared_pair(a, b, names)
+    given = None
+    if known is not None and all(name in known.cameras for name in names):
+        given = relative_pose(known.cameras[names[0]].pose, known.cameras[names[1]].pose)
+    calibrated = all(name in prepared.cameras for name in names)
+    return solve_pair(
+        smooth_only(a), smooth_only(b), names, known=given, calibrated=calibrated, thorough=thorough
+    )
+
+
+def _tie_at_other_rates(
+    prepared: Prepared, pairs: dict[tuple[str, str], PairSolution], known: Known | None, tell: Progress
+) -> Prepared:
+    """Tie what is not tied to the largest group at rates far from 1; ``pairs`` are replaced in place.
+
+    A group of several that is tied by one pair is paced as a whole, and its other pairs are solved again.
+    """
+    names, tried = prepared.names, set[tuple[str, str]]()
+    while True:
+        groups = components(names, [pair for pair in pairs.values() if pair.solved])
+        largest = groups[0] if groups else []
+        found = None
+        for a, b in pairs:
+            across = (a in largest) != (b in largest) if len(largest) > 1 else not pairs[a, b].solved
+            if not across or (a, b) in tried:
+                continue
+            tried.add((a, b))
+            tell(f"pair {a}–{b} at other frame rates", 0.57)
+            answer = _solve(prepared, (a, b), known, thorough=True)
+            if answer.solved and answer.fit is not None:
+                found = answer, answer.fit
+                break
+        if found is None:
+            return prepared
+        answer, fit = found
+        stays = answer.b if len(largest) > 1 and answer.b in largest else answer.a
+        moves = answer.a if stays == answer.b else answer.b
+        group = next(group for group in groups if moves in group)
+        factor = fit.rate if moves == answer.b else 1.0 / fit.rate
+        prepared = prepared.paced(group, factor)
+        pairs[answer.a, answer.b] = answer
+        for (a, b), pair in pairs.items():
+            if (a in group) == (b in group) or pair is answer:
+                pairs[a, b] = _paced(pair, *(factor if name in group else 1.0 for name in (a, b)))
+            else:
+                pairs[a, b] = _solve(prepared, (a, b), known)
+
+
+def _paced(pair: PairSolution, factor_a: float, factor_b: float) -> PairSolution:
+    """A pair after its clocks were made to run so many times as fast."""
+    if pair.fit is None:
+        return pair
+    fit = pair.fit
+    paced = replace(
+        fit, rate=fit.rate * factor_a / factor_b, offset=fit.offset * factor_a, middle=fit.middle * factor_a
+    )
+    return replace(pair, fit=paced, others=())
+
+
+def rate_warnings(prepared: Prepared, pairs: list[PairSolution]) -> tuple[str, ...]:
+    """One sentence for each camera whose times run far faster or slower than those of most others it is tied to."""
+    if not any(abs(pace - 1.0) > FAR_FROM_ONE for pace in prepared.paces.values()):
+        return ()
+    tied = components(prepared.names, [pair for pair in pairs if pair.solved])[0]
+    usual = max(tied, key=lambda name: sum(_alike(prepared, name, other) for other in tied))
+    alike = [name for name in tied if _alike(prepared, name, usual)]
+    out = []
+    for name in tied:
+        if name in alike:
+            continue
+        ratio = prepared.pace(usual) / prepared.pace(name)
+        told, actual = _frame_rates(ratio, _rows_a_second(prepared, name))
+        if 2 * len(alike) > len(tied):
+            doubt = f"the others': were they made with {told} fps for {actual}?"
+        else:
+            told_usual, actual_usual = _frame_rates(1.0 / ratio, _rows_a_second(prepared, usual))
+            doubt = (
+                f"{usual}'s: were they made with {told} fps for {actual}, "
+                f"or {usual}'s with {told_usual} for {actual_usual}?"
+            )
+        out.append(f"{name}: its times run {ratio:.4g} times as fast as {doubt}")
+    return tuple(out)
+
+
+def _alike(prepared: Prepared, a: str, b: str) -> bool:
+    return abs(prepared.pace(a) / prepared.pace(b) - 1.0) < FAR_FROM_ONE
+
+
+def _rows_a_second(prepared: Prepared, name: str) -> float:
+    """The camera's frame rate as its own times tell it."""
+    interval = min(float(np.median(np.diff(track.time))) for track in prepared.camera(name).tracks.values())
+    return prepared.pace(name) / interval
+
+
+def _frame_rates(ratio: float, told: float) -> tuple[str, str]:
+    """The frame rate that times were likely made with, and the true one, where they run ``ratio`` times as fast."""
+    usual = [(a, b) for a in _FRAME_RATES for b in _FRAME_RATES if abs(b / a / ratio - 1.0) < _SAME_RATIO]
+    likely = min(usual, key=lambda pair: abs(pair[0] - told), default=(told, told * ratio))
+    return f"{likely[0]:.3g}", f"{likely[1]:.3g}"
+
+
+def timing_told(name: str, prepared: Prepared, pairs: list[PairSolution]) -> str:
+    """What solved pairs say of a camera's clock: "12.3450 s against cam0, …"; "" where none is solved."""
+    parts = []
+    for pair in pairs:
+        if not pair.solved or pair.fit is None or name not in (pair.a, pair.b):
+            continue
+        lag = pair_lag(prepared, pair, pair.fit)
+        parts.append(f"{lag:.4f} s against {pair.b}" if name == pair.a else f"{-lag:.4f} s against {pair.a}")
+    return ", ".join(parts)
+
+
+def pair_lag(prepared: Prepared, pair: PairSolution, fit: PairFit) -> float:
+    """``t_a - t_b`` [s] as the cameras' clocks show it, in the middle of the time that both recorded."""
+    begin_a, end_a = _span(prepared, pair.a)
+    begin_b, end_b = (fit.rate * time + fit.offset for time in _span(prepared, pair.b))
+    middle = 0.5 * (max(begin_a, begin_b) + min(end_a, end_b))
+    shown_a = prepared.epochs[pair.a] + middle / prepared.pace(pair.a)
+    return shown_a - prepared.epochs[pair.b] - (middle - fit.offset) / fit.rate / prepared.pace(pair.b)
+
+
+def _span(prepared: Prepared, name: str) -> tuple[float, float]:
+    tracks = prepared.camera(name).tracks.values()
+    return min(float(track.time[0]) for track in tracks), max(float(track.time[-1]) for track in tracks)
+
+
+__all__ = ["Progress", "pair_lag", "rate_warnings", "solve_pairs", "timing_told"]

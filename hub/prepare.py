@@ -1,0 +1,130 @@
+"""From a session to what the solvers take: smoothed tracks, raw rows, and who can't be used and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hub.points import sampled_track
+from hub.poses.initialise import Camera
+from hub.poses.problem import Rows
+from hub.timing.tracks import SmoothTrack, Track, smooth_track, without_jumps
+from protocols.geometry.camera import Intrinsics
+from protocols.session.observations import Observations
+from protocols.session.rig import Rig, RigCamera
+
+NO_INTRINSICS = "no intrinsics (matrix and distortions in rig.toml): run `syncline intrinsics`"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """Cameras that can be tried: smoothed tracks, raw rows; and those that can't, with the reason.
+
+    lensless: cameras without intrinsics, of which only the timing can be found; their normalised coordinates
+    are those of a nominal lens, and they are among the refused. paces: of cameras whose seconds are no
+    seconds. All times in here are ``pace * (t_camera - epoch)``.
+    """
+
+    cameras: dict[str, Camera]
+    rows: dict[str, list[Rows]]
+    epochs: dict[str, float]
+    labels: list[str]
+    refused: dict[str, str]
+    order: tuple[str, ...]
+    shared_clock: bool = False
+    warnings: tuple[str, ...] = ()
+    lensless: dict[str, Camera] = field(default_factory=dict)
+    paces: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def names(self) -> list[str]:
+        """All cameras whose timing can be sought, in the rig's order."""
+        return [name for name in self.order if name in self.cameras or name in self.lensless]
+
+    def camera(self, name: str) -> Camera:
+        """A camera of `names`."""
+        return self.cameras[name] if name in self.cameras else self.lensless[name]
+
+    def pace(self, name: str) -> float:
+        """Seconds in here for one second that the camera's clock tells."""
+        return self.paces.get(name, 1.0)
+
+    def paced(self, names: list[str], factor: float) -> Prepared:
+        """The same with the clocks of ``names`` made to run ``factor`` times as fast."""
+        cameras, lensless, rows, paces = dict(self.cameras), dict(self.lensless), dict(self.rows), dict(self.paces)
+        for name in names:
+            camera = self.camera(name)
+            scaled = replace(camera, tracks=_scaled(camera.tracks, factor))
+            (cameras if name in cameras else lensless)[name] = scaled
+            if name in rows:
+                rows[name] = [replace(part, time=part.time * factor) for part in rows[name]]
+            paces[name] = self.pace(name) * factor
+        return replace(self, cameras=cameras, lensless=lensless, rows=rows, paces=paces)
+
+
+def prepare(rig: Rig, observations: Observations) -> Prepared:
+    """Undistort and smooth every track; name the cameras that cannot be used."""
+    refused: dict[str, str] = {}
+    cameras: dict[str, Camera] = {}
+    lensless: dict[str, Camera] = {}
+    rows: dict[str, list[Rows]] = {}
+    epochs: dict[str, float] = {}
+    labels = observations.labels
+    start = min((float(track.time[0]) for track in observations.tracks.values()), default=0.0)
+    warnings: list[str] = []
+    for name, rig_camera in rig.cameras.items():
+        tracks, jump = without_jumps(observations.of_camera(name))
+        if jump:
+            warnings.append(f"{name}: {jump}")
+        if not tracks:
+            refused[name] = "no observations"
+            continue
+        if rig_camera.intrinsics is None:
+            refused[name] = NO_INTRINSICS
+            if rig.shared_clock:
+                continue
+        lens = rig_camera.intrinsics or nominal_lens(rig_camera)
+        epoch = start if rig.shared_clock else min(float(track.time[0]) for track in tracks)
+        smooth: dict[str, Track] = {}
+        mine = []
+        for track in tracks:
+            normalised = lens.unproject(track.pixels)
+            cleaned: Track | None
+            if rig.shared_clock:
+                cleaned = sampled_track(track.time, normalised, lens.focal, epoch)
+            else:
+                cleaned = smooth_track(track.time, normalised, lens.focal, epoch)
+            if cleaned is None:
+                continue
+            smooth[track.label] = cleaned
+            use = np.ones(len(track), dtype=np.bool_)
+            mine.append(Rows(-1, labels.index(track.label), track.time - epoch, track.pixels, use))
+        if not smooth:
+            few = f"too few connected observations ({sum(len(track) for track in tracks)} rows)"
+            refused[name] = few if rig_camera.intrinsics is not None else f"{NO_INTRINSICS}; and {few}"
+            continue
+        epochs[name] = epoch
+        if rig_camera.intrinsics is None:
+            lensless[name] = Camera(name, lens, smooth)
+        else:
+            cameras[name], rows[name] = Camera(name, lens, smooth), mine
+    return Prepared(
+        cameras, rows, epochs, labels, refused, tuple(rig.cameras), rig.shared_clock, tuple(warnings), lensless
+    )
+
+
+def nominal_lens(camera: RigCamera) -> Intrinsics:
+    """A lens that any camera could have: good enough to speak of angles where only timing is sought."""
+    width, height = camera.size
+    focal = float(max(camera.size))
+    matrix = np.array([[focal, 0.0, 0.5 * (width - 1)], [0.0, focal, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
+    return Intrinsics(width, height, matrix)
+
+
+def _scaled(tracks: Mapping[str, Track], factor: float) -> dict[str, Track]:
+    return {label: track.scaled(factor) if isinstance(track, SmoothTrack) else track for label, track in tracks.items()}
+
+
+__all__ = ["NO_INTRINSICS", "Prepared", "nominal_lens", "prepare"]

@@ -1,0 +1,65 @@
+"""The paper on distributed poses: its equations by closed form, and section 4 within its own figures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hub.nodes import paper
+from protocols.geometry import so3
+from tests.papers.poses_paper import PRINTED, node_run, paper_run
+
+
+def _two_views(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    points = rng.uniform(-1, 1, (40, 3)) + [0.0, 0.0, 6.0]
+    turn, shift = so3.exp(rng.normal(0, 0.4, 3)), rng.normal(0, 1, 3)
+    return points, (points - shift) @ turn.T, turn, shift, np.eye(3)
+
+
+def test_the_correlation_holds_r_k_times_r_l_transposed() -> None:
+    points_k, points_l, l_from_k, shift, _ = _two_views(np.random.default_rng(0))
+    mean_k, mean_l = points_k.mean(0), points_l.mean(0)
+    found = paper.rotation_of(paper.correlation(paper.centred(points_k, mean_k), paper.centred(points_l, mean_l)))
+    np.testing.assert_allclose(found, l_from_k.T, atol=1e-9)
+    np.testing.assert_allclose(paper.direction(mean_k, mean_l, found), shift, atol=1e-9)
+
+
+def test_a_size_tells_the_depth() -> None:
+    point = np.array([0.4, -0.3, 5.0])
+    row = np.array([[*(point[:2] / point[2]), np.log(1.0 / point[2])]])
+    np.testing.assert_allclose(paper.point_in_camera(row)[0], point)
+
+
+def test_the_reference_keeps_its_attitude() -> None:
+    known = so3.exp(np.array([0.1, 0.2, 0.3]))
+    away = so3.exp(np.array([0.0, 0.5, 0.0]))
+    matrix = paper.own_matrix(1e6 * known, [(10.0 * away, np.eye(3))])
+    assert so3.angle_between(paper.rotation_of(matrix), known) < 1e-4
+
+
+def test_nothing_is_forgotten_with_u_1_and_a_part_with_more() -> None:
+    np.testing.assert_allclose(paper.forgotten(np.eye(3), np.eye(3), 1.0), 2 * np.eye(3))
+    np.testing.assert_allclose(paper.forgotten(np.eye(3), np.eye(3), 2.0), 1.5 * np.eye(3))
+
+
+def test_a_direction_moves_a_camera_across_and_never_along() -> None:
+    rotation = so3.exp(np.array([0.2, -0.1, 0.4]))
+    position, other = np.array([1.0, 2.0, 3.0]), np.array([4.0, 0.0, 9.0])
+    truth = position + np.array([0.3, -0.2, 0.1])
+    y = rotation @ (other - truth)
+    h = paper.direction_jacobian(y, rotation)
+    moved, covariance = paper.kalman_position(
+        position, np.eye(3), other, np.zeros((3, 3)), h, paper.PaperSettings(bearing_std=1e-6, drift=0.0)
+    )
+    along = (other - truth) / np.linalg.norm(other - truth)
+    np.testing.assert_allclose(np.cross(moved - truth, along), 0.0, atol=1e-6)
+    assert abs((moved - position) @ along) < 1e-9
+    np.testing.assert_allclose(along @ covariance @ along, 1.0, atol=1e-9)
+
+
+def test_section_4_comes_out_as_printed_and_the_nodes_beat_it() -> None:
+    cm, degrees = paper_run(7, 0.02, 1.0, 10, (10_000,))[0]
+    assert cm < PRINTED[0]
+    assert degrees < PRINTED[1]
+    ours = node_run(7, 0.02, 20, (2000,))[0]
+    assert ours[0] < 0.2 * PRINTED[0]
+    assert ours[1] < 0.2 * PRINTED[1]

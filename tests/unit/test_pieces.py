@@ -1,0 +1,151 @@
+"""The scan for torn tracks: its sums are plain sums, its best geometries the eigenvectors, the true lag stands out."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.linalg import eigh
+
+from hub.timing import pieces
+from hub.timing.pieces import PieceScan, scan_pieces
+from hub.timing.scan import GridTrack, PairMoments, grid_tracks, in_grid
+from hub.timing.tracks import smooth_track
+from protocols.geometry.types import Floats
+from tests.bench.pair_trials import FOCAL, MATRIX, Regime, Trial, make, stranger
+
+STEP, SIGMA_PX = 0.033, 0.5
+TORN = Regime(span=15, second=0.2, late=2)
+
+
+def random_grid(seed: int, count: int, labels: int = 2) -> GridTrack:
+    rng = np.random.default_rng(seed)
+    weight = rng.random((labels, count)) * (rng.random((labels, count)) > 0.2)
+    return GridTrack(rng.normal(), 0.05, rng.normal(size=(labels, count, 2)), weight, 1e-2 * (1 + seed), np.eye(3))
+
+
+def of(trial: Trial) -> tuple[PairMoments, float]:
+    """The moments of a trial and its true lag."""
+    a, b = (smooth_track(view.time, (view.pixels - MATRIX[:2, 2]) / FOCAL, FOCAL) for view in trial.views)
+    assert a is not None
+    assert b is not None
+    middle = np.array([np.mean(trial.overlap)])
+    offset = float((trial.shown(0, middle) - a.epoch - trial.shown(1, middle) + b.epoch)[0])
+    return PairMoments(*(grid_tracks([track], STEP, SIGMA_PX) for track in (a, b))), offset
+
+
+@cache
+def torn(seed: int) -> tuple[PairMoments, float, PieceScan]:
+    moments, offset = of(make(TORN, seed))
+    return moments, offset, scan_pieces(moments, SIGMA_PX, seed=0)
+
+
+def test_cells_are_the_sums_of_their_bins() -> None:
+    a, b = random_grid(1, 40), random_grid(2, 33)
+    width, bins = 8, 5
+    lags = np.arange(-39, 33)
+    cells = pieces._cells(a, b, lags, width, bins).reshape(len(lags), bins, 6, 6)
+    monomial = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+    for row in (0, 20, 39, 41, 60, 71):
+        for k in range(bins):
+            expected = np.zeros((6, 6))
+            for label, n in np.ndindex(2, width):
+                i, j = k * width + n, k * width + n + int(lags[row])
+                if not 0 <= j < 33:
+                    continue
+                here, there = np.r_[a.points[label, i], 1.0], np.r_[b.points[label, j], 1.0]
+                of_a = [here[p] * here[q] for p, q in monomial]
+                of_b = [there[p] * there[q] for p, q in monomial]
+                expected += a.weight[label, i] * b.weight[label, j] * np.outer(of_a, of_b)
+            np.testing.assert_allclose(cells[row, k], expected, atol=1e-12)
+
+
+def test_the_cells_of_a_lag_add_up_to_its_moments() -> None:
+    a, b = random_grid(3, 40), random_grid(4, 40)
+    moments = PairMoments(a, b)
+    cells = pieces._cells(a, b, moments.lags, 8, 5).sum(axis=1).reshape(-1, 6, 6)
+    np.testing.assert_allclose(cells, np.moveaxis(moments.moments, -1, 0), atol=1e-9)
+
+
+def cells_of(seed: int) -> tuple[Floats, GridTrack, GridTrack]:
+    """Sums (1, 1, 36) of points that nearly meet one geometry."""
+    moments, offset = of(make(Regime(late=2), seed))
+    a, b = moments.a, moments.b
+    index = int(np.argmin(np.abs(moments.offset - offset)))
+    width = a.weight.shape[1] // 2
+    return pieces._cells(a, b, moments.lags[index : index + 1], width, 1), a, b
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_best_geometry_is_the_smallest_eigenvector(seed: int) -> None:
+    cells, a, b = cells_of(seed)
+    cells = cells[0] / cells[0, :, 35:]
+    moment, norm = pieces._moments(cells, a, b)
+    values, vectors = eigh(norm[0], moment[0])  # the largest of the inverse problem: the norm is singular
+    found, expected = pieces._smallest(cells, a, b)[0], vectors[:, -1] / np.linalg.norm(vectors[:, -1])
+    assert abs(found @ expected) == pytest.approx(1.0, abs=1e-5)
+    cost = float(pieces._bin_costs(cells[None], found[None], a, b)[0, 0])
+    assert cost == pytest.approx(1.0 / values[-1], rel=1e-4)
+
+
+def test_the_misfit_of_a_bin_is_squared_distance_over_noise() -> None:
+    cells, a, b = cells_of(0)
+    theta = np.random.default_rng(0).normal(size=(1, 9))
+    moment, norm = pieces._moments(cells[0] / cells[0, :, 35:], a, b)
+    expected = (theta[0] @ moment[0] @ theta[0]) / (theta[0] @ norm[0] @ theta[0])
+    found = pieces._bin_costs(cells / cells[:, :, 35:], theta, a, b)
+    assert found[0, 0] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_the_true_lag_agrees_longest(seed: int) -> None:
+    moments, offset, scan = torn(seed)
+    best = int(np.argmax(scan.agreeing))
+    assert abs(moments.offset[best] - offset) < 2 * STEP
+    other = np.abs(moments.offset - offset) > 0.5
+    assert scan.agreeing[best] > 1.2 * scan.agreeing[other].max()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_geometry_found_is_the_marker_s(seed: int) -> None:
+    """In the grids' coordinates, whose noise is known: few units off on the marker's own rows."""
+    trial = make(TORN, seed)
+    moments, offset, scan = torn(seed)
+    best = int(np.argmax(scan.agreeing))
+    theta = in_grid(scan.matrix[best], moments.a, moments.b)
+    truth = in_grid(trial.pose.essential.T, moments.a, moments.b)
+    which = np.array([int(np.argmin(np.abs(moments.offset - offset)))])
+    assert abs(theta @ truth) / np.linalg.norm(theta) / np.linalg.norm(truth) > 0.9
+    assert np.isfinite(moments.costs_of(which, scan.matrix[best]))[0]
+
+
+def test_strangers_agree_nowhere_much_longer_than_elsewhere() -> None:
+    moments, _ = of(stranger(make(TORN, 1), TORN, 1))
+    scan = scan_pieces(moments, SIGMA_PX, seed=0)
+    tried = scan.agreeing[scan.agreeing > 0]
+    _, _, true = torn(1)
+    assert tried.max() < 0.75 * true.agreeing.max()
+
+
+def test_what_agrees_is_no_longer_than_what_is_common() -> None:
+    moments, _, scan = torn(0)
+    longest = np.minimum(moments.a.weight.shape[1], moments.b.weight.shape[1]) * STEP
+    assert (scan.agreeing <= longest).all()
+    reach = np.abs(moments.offset - np.median(moments.offset))
+    assert (scan.agreeing[reach > reach.max() - 1.0] == 0).all(), "a second in common is no basis for a geometry"
+    assert np.isinf(scan.misfit[scan.agreeing == 0]).all()
+
+
+def test_the_same_seed_says_the_same() -> None:
+    moments, _, scan = torn(0)
+    again = scan_pieces(moments, SIGMA_PX, seed=0)
+    np.testing.assert_array_equal(scan.agreeing, again.agreeing)
+    np.testing.assert_array_equal(scan.matrix, again.matrix)
+
+
+def test_short_tracks_have_no_pieces() -> None:
+    moments = PairMoments(random_grid(1, 50), random_grid(2, 50))
+    scan = scan_pieces(moments, SIGMA_PX, seed=0)
+    assert (scan.agreeing == 0).all()
+    assert np.isinf(scan.misfit).all()
