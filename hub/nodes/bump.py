@@ -1,0 +1,83 @@
+"""Whether a camera was bumped: a likelihood-ratio test over the latest observations of all its edges (step 8).
+
+Each edge keeps robust sums of its latest observations about where the network predicted them. "This camera moved by
+one step" must explain them far better than "nothing moved", and must do so without the edge that speaks loudest: what
+one edge says alone is that neighbour's affair.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hub.nodes.edge import Edge, Window
+from protocols.geometry.types import Floats
+
+RAISED = 55.0
+"""Chi2 (6 dof) of the motion that is an alarm; by chance less than once in 1e9 tests."""
+CONFIRMED = 22.0
+"""The same without the loudest edge."""
+_SHORT, _LONG = 48, 400
+"""Observations of all edges after which a window begins anew."""
+_ARMED = 4.0
+"""Times that an edge's past must outweigh its window."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """An edge and the derivative (6, 6) of its step by the camera's."""
+
+    edge: Edge
+    by_step: Floats
+
+
+def camera_moved(motions: list[Motion]) -> Floats | None:
+    """The camera's step (6,), or None while nothing says that it moved. Renews windows that are full."""
+    found = None
+    for short in (True, False):
+        windows = [(m, m.edge.short if short else m.edge.long) for m in motions]
+        count = sum(window.count for _, window in windows)
+        if count == 0:
+            continue
+        armed = [(m, w) for m, w in windows if m.edge.seen > _ARMED * w.count and w.count > 0]
+        step = _test(armed)
+        if step is not None:
+            found = step
+        if count > (_SHORT if short else _LONG):
+            for m, _ in windows:
+                if short:
+                    m.edge.short = Window.empty()
+                else:
+                    m.edge.long = Window.empty()
+    return found
+
+
+def _test(windows: list[tuple[Motion, Window]]) -> Floats | None:
+    if len(windows) < 2:
+        return None
+    hessians, gradients = [], []
+    for motion, window in windows:
+        # The past is uncertain too, by its share.
+        share = 1.0 / (1.0 + 2.0 * window.count / max(motion.edge.seen, 1))
+        hessians.append(share * motion.by_step.T @ window.hessian @ motion.by_step)
+        gradients.append(share * motion.by_step.T @ window.gradient)
+    whole, step = _evidence(np.sum(hessians, axis=0), np.sum(gradients, axis=0))
+    if whole < RAISED:
+        return None
+    for left_out in range(len(windows)):
+        rest = [i for i in range(len(windows)) if i != left_out]
+        rest_h = np.sum([hessians[i] for i in rest], axis=0)
+        rest_g = np.sum([gradients[i] for i in rest], axis=0)
+        if _evidence(rest_h, rest_g)[0] < CONFIRMED:
+            return None
+    return step
+
+
+def _evidence(hessian: Floats, gradient: Floats) -> tuple[float, Floats]:
+    """Chi2 of the best step, and the step (6,)."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    values, vectors = np.linalg.eigh(hessian * scale * scale[:, None])
+    inverse = np.where(values > 1e-6, 1.0 / np.maximum(values, 1e-6), 0.0)
+    step = -scale * (vectors @ (inverse * (vectors.T @ (scale * gradient))))
+    return float(-gradient @ step), step
