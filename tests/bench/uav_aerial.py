@@ -195,7 +195,7 @@ def main() -> None:
         print(json.dumps([asdict(result) for result in results], indent=1))
         return
     if absent:
-        print(f"{', '.join(absent)} left out: install opencv-contrib-python-headless in place of opencv's usual build")
+        print(f"{', '.join(absent)} left out: uav_rivals.py says how to get them")
     print(
         f"car    model   back  delay  lengths off at {AFTER_S} s  claims visible while out  in frame < 20 px  ms/frame"
     )

@@ -1,4 +1,11 @@
-"""OpenCV's CSRT and KCF behind the trackers' interface. They need opencv-contrib, which only this bench uses."""
+"""OpenCV's CSRT and KCF behind the trackers' interface. They need opencv-contrib, which only the benches use.
+
+opencv-contrib-python-headless and opencv-python-headless are both ``cv2`` and can't share an environment. Put the
+former, of the same version as the latter, into a folder of its own and that folder first on the path:
+
+    python -m pip install --no-deps --target contrib opencv-contrib-python-headless==5.0.0.93
+    PYTHONPATH=contrib python -m tests.bench.uav_tracker
+"""
 
 from __future__ import annotations
 

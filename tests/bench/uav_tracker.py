@@ -4,7 +4,8 @@
         [--no-telemetry] [--rate HZ] [--offset] [--jobs 2] [--json FILE]
 
 Simulated flights with known truth (edge/uav/world), the telemetry with 0.2° noise, 0.4° bias, one frame late. Scores as
-in ``uav_scoring``. CSRT and KCF need opencv-contrib; without it they are left out, and the bench says so.
+in ``uav_scoring``. CSRT and KCF need opencv-contrib: ``uav_rivals`` says how to get it; without it they are left out,
+and the bench says so.
 """
 
 from __future__ import annotations
@@ -239,7 +240,7 @@ def _models(names: str) -> tuple[str, ...]:
     out = []
     for name in names.split(","):
         if name in uav_rivals.NAMES and not uav_rivals.available(name):
-            print(f"{name} left out: this OpenCV has no {name.upper()}; install opencv-contrib-python-headless instead")
+            print(f"{name} left out: this OpenCV has no {name.upper()}; uav_rivals.py says how to get it")
             continue
         out.append(name)
     return tuple(out)

@@ -16,10 +16,11 @@ from edge.uav.ground.camera import ImagePlane
 from edge.uav.ground.cloud import FREE
 from edge.uav.ground.evidence import judge
 from edge.uav.ground.footprint import corners, oriented
-from edge.uav.ground.history import Sightings
-from edge.uav.ground.light import Light
+from edge.uav.ground.history import MotionFit, Sightings
+from edge.uav.ground.light import Light, Shade
 from edge.uav.ground.road_map import CELL, RoadMap
-from edge.uav.ground.tracklets import Tracklets
+from edge.uav.ground.survey import plausible
+from edge.uav.ground.tracklets import Tracklet, Tracklets
 from edge.uav.ground.ways import Way, edges, trace
 from protocols.geometry.types import Floats
 
@@ -118,6 +119,26 @@ def test_the_light_s_change_is_measured_and_undone() -> None:
     light.update(dark, points, points)
     np.testing.assert_allclose(light.gain, 0.7, atol=0.03)
     assert np.abs(light.undone(dark).astype(float) - bright).mean() < 5.0
+
+
+def test_a_car_that_drives_out_of_a_cloud_s_shadow_keeps_its_looks() -> None:
+    image = street()
+    put_car(image, 160, 120, (90, 92, 94))
+    looks, shade, light = looks_of(image, 160, 120), Shade(), Light()
+    shade.teach(looks.brightness(patch_of(image, 160, 120), ground_of(160, 120)))
+    scores = {}
+    for k in range(14):
+        sunny = np.clip(image * (1.0 + 0.06 * k), 0, 255).astype(np.uint8)
+        for name, value in (("shade", shade.value), ("without", 0.0)):
+            patch = patch_of(light.undone(sunny, value), 160, 120)
+            scores[name] = max(c.score for c in looks.candidates(patch, least=-1.0))
+        shade.update(looks.brightness(patch_of(light.undone(sunny, shade.value), 160, 120), ground_of(160, 120)))
+    assert shade.value == pytest.approx(np.log(1.78), abs=0.06)
+    assert scores["without"] < scores["shade"] - 0.1
+    assert scores["shade"] > 0.85
+    for _ in range(90):
+        shade.fade(1 / 30)
+    assert abs(shade.value) < 0.1
 
 
 def paint(road: RoadMap, near: object) -> None:
@@ -247,14 +268,84 @@ def test_a_look_alike_that_drives_the_other_way_is_not_taken_for_the_target() ->
             seen = [candidate(1.0 + sign * 10.0 * (k - 5) / 30, 0.5)]
             tracks = tracklets.update(k / 30, seen)
         assert tracks[0].age == 6
-        verdict = judge(cloud, seen, tracks, np.full(400, 0.3), lambda _: 0.25, 4.5, again=True)
+        verdict = judge(cloud, seen, tracks, np.full(400, 0.3), lambda _: 0.25, 4.5, True, lambda _: False)
         assert (verdict.best is not None) == taken
+
+
+@pytest.mark.parametrize(("at", "taken"), [((38.0, 0.0), False), ((3.0, 0.5), True)])
+def test_a_look_alike_where_hardly_anything_expects_the_target_never_becomes_it(
+    at: tuple[float, float], taken: bool
+) -> None:
+    """A car of the same make that follows the target is as alike in the hundredth frame as in the first."""
+    rng = np.random.default_rng(3)
+    cloud = clouds.scattered(np.zeros(2), 3.0, 400, rng)
+    place = cloud.place.copy()
+    place[0] = (38.0, 0.0)  # one who thinks that it goes that fast
+    weights = np.full(400, 1.0 / 399.2)
+    weights[0] = 0.0005
+    cloud = replace(
+        cloud, place=place, heading=rng.normal(0.0, 0.05, 400), speed=rng.normal(10.0, 0.7, 400), weights=weights
+    )
+    tracklets, found = Tracklets(), False
+    for k in range(40):  # all in a frame that moves with the cars
+        seen = [candidate(at[0] + 10.0 * k / 30, at[1])]
+        moved = replace(cloud, place=place + np.array([10.0 * k / 30, 0.0]))
+        tracks = tracklets.update(k / 30, seen)
+        verdict = judge(moved, seen, tracks, np.full(400, 0.03), lambda _: 0.25, 4.5, True, lambda _: False)
+        assert verdict.likelihood is not None
+        cloud = replace(cloud, weights=cloud.weighted(verdict.likelihood).weights)
+        found |= verdict.best is not None
+    assert found == taken
+
+
+def test_the_heading_that_a_template_tells_counts_once_its_shape_fits() -> None:
+    rng = np.random.default_rng(0)
+    cloud = clouds.scattered(np.zeros(2), 0.3, 400, rng)
+    heading = np.where(np.arange(400) < 200, 0.0, 0.6)
+    cloud = replace(cloud, heading=heading, speed=np.full(400, 0.5))
+    tracklets = Tracklets()
+    for k in range(6):
+        seen = [replace(candidate(0.0, 0.0), angle=0.6)]
+        tracks = tracklets.update(k / 30, seen)
+    for shaped, share in ((False, 0.5), (True, 0.9)):
+        verdict = judge(cloud, seen, tracks, np.full(400, 0.3), lambda _: 0.25, 4.5, True, lambda _, s=shaped: s)
+        assert verdict.likelihood is not None
+        got = cloud.weighted(verdict.likelihood).weights[200:].sum()
+        assert got == pytest.approx(share, abs=0.1)
+
+
+def spot(place: tuple[float, float], velocity: tuple[float, float], time: float) -> Tracklet:
+    out = Tracklet()
+    for k in range(8):
+        ago = (7 - k) / 30
+        out.add(time - ago, candidate(place[0] - ago * velocity[0], place[1] - ago * velocity[1]))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("place", "velocity", "low", "high"),
+    [
+        ((30.0, 0.0), (10.0, 0.0), 0.9, 1.0),  # straight on, 3 s later
+        ((12.0, 18.0), (0.0, 10.0), 0.9, 1.0),  # turned off after 12 m
+        ((12.0, -18.0), (1.0, -9.0), 0.8, 1.0),
+        ((30.0, 3.0), (-10.0, 0.0), 0.0, 0.0),  # comes back on the other lane
+        ((12.0, 18.0), (0.0, -10.0), 0.0, 0.0),  # drives towards where the target was last seen
+        ((-20.0, 0.0), (10.0, 0.0), 0.0, 0.3),  # was behind it
+        ((70.0, 0.0), (10.0, 0.0), 0.0, 0.0),  # too far
+        ((30.0, 0.0), (1.0, 0.0), 0.0, 0.0),  # nearly parked
+    ],
+)
+def test_what_may_be_the_target_by_the_way_it_must_have_driven(
+    place: tuple[float, float], velocity: tuple[float, float], low: float, high: float
+) -> None:
+    fit = MotionFit(0.0, np.zeros(2), np.array([10.0, 0.0]), np.zeros(2), 0.2, 0.5, 0.05, 20)
+    assert low <= plausible(spot(place, velocity, 3.0), fit, 4.5, 3.0) <= high
 
 
 def test_where_nothing_is_seen_in_plain_view_particles_lose_weight() -> None:
     cloud = clouds.scattered(np.zeros(2), 3.0, 200, np.random.default_rng(0))
     chance = np.where(cloud.place[:, 0] > 0, 0.3, 0.0)
-    verdict = judge(cloud, [], [], chance, lambda _: 0.25, 4.5, again=True)
+    verdict = judge(cloud, [], [], chance, lambda _: 0.25, 4.5, True, lambda _: False)
     assert verdict.best is None
     assert verdict.likelihood is not None
     after = cloud.weighted(verdict.likelihood).weights

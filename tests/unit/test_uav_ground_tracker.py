@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ import pytest
 
 from edge.uav.models import get
 from edge.uav.tracker import Box, Estimate, State, Telemetry
+from edge.uav.world import scenarios
 from protocols.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
@@ -197,3 +198,34 @@ def test_telemetry_that_comes_later_turns_the_answer_metric_without_losing_the_c
 def test_unknown_models_are_named() -> None:
     with pytest.raises(InputError, match="ground, paper, plain"):
         get("best", SIZE)
+
+
+def test_a_car_that_went_where_nobody_thought_is_found_by_a_look_over_the_whole_picture(scenery: Picture) -> None:
+    """Behind trees it left the street; it comes out 90 px beside it, beyond what is searched about the particles."""
+    shown = film(scenery, 100, 3.0, 3.0, hidden=range(30, 60))
+    away = shown.car.copy()
+    away[45:, 1] -= 90.0
+    estimates = follow(replace(shown, car=away))
+    assert estimates[55].state is State.COASTING
+    last = estimates[-1]
+    assert last.state is State.VISIBLE
+    assert np.hypot(*(np.array([last.x, last.y]) - (away[-1] - shown.window[-1]))) < 5.0
+
+
+def test_a_car_that_comes_back_turned_is_known_at_once() -> None:
+    """It took a bend out of view, and the cloud heads 15° beside it: its shape does not fit unless it is turned."""
+    world = scenarios.get("exit-bend", 0, frames=45)
+    tracker = get("ground", world.size, lens=world.lens, body_from_camera=world.body_from_camera, fps=world.fps)
+    samples = world.telemetry(30.0)
+    states = []
+    for i in range(175):
+        for sample in samples:
+            if world.time(i) - 1.0 / world.fps < sample.time <= world.time(i):
+                tracker.handle_telemetry(sample)
+        if i == 0:
+            tracker.begin(world.frame(0), 0.0, world.truth(0).box)
+            continue
+        states.append((world.truth(i).visible, tracker.handle_frame(world.frame(i), world.time(i)).state))
+    back = [state for visible, state in states[85:] if visible > 0.9]
+    assert len(back) > 30
+    assert sum(state is State.VISIBLE for state in back) > 0.85 * len(back)

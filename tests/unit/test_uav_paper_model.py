@@ -13,7 +13,7 @@ from edge.uav.models.plain import AppearanceJudge, PlainTracker
 from edge.uav.paper import histograms, regions, road
 from edge.uav.paper.background import BackgroundFilter, Motion, flow_of
 from edge.uav.paper.car import moved_car
-from edge.uav.paper.road_filter import RoadFilter, support
+from edge.uav.paper.road_filter import RoadFilter, aligned, support
 from edge.uav.paper.white_lines import Edges, sections
 from edge.uav.tracker import Box, Image, State, Tracker
 from protocols.errors import InputError
@@ -163,6 +163,17 @@ def test_3_3_to_3_8_trace_the_white_lines_through_the_whole_picture() -> None:
     assert np.abs(found.points[:, 1] - 256.5).max() < 4.0  # the lines are at rows 225.5 and 287.5
     assert found.half_width == pytest.approx(31.0, abs=2.0)
     assert support(found, edges)[1] > 0.9
+
+
+@pytest.mark.parametrize("count", [2, 5, 6, 7, 8, 40])
+def test_a_road_of_any_length_is_set_right_by_the_edges(count: int) -> None:
+    """A road of six places, one fewer than are smoothed over, once raised IndexError on a real video."""
+    grey = cv2.cvtColor(picture(300.0, 320.0), cv2.COLOR_BGR2GRAY)
+    held = road.Road(np.column_stack([100.0 + 12.0 * np.arange(count), np.full(count, 251.0)]), 31.0)
+    moved = aligned(held, Edges.of(grey))
+    assert moved.points.shape == (count, 2)
+    if count >= 6:  # half of the way towards the middle between the lines, at most 4 px of it
+        assert 252.0 < moved.points[:, 1].mean() < 254.0
 
 
 def test_without_a_road_none_is_found() -> None:

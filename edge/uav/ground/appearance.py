@@ -24,6 +24,7 @@ _CLIP = 2.5  # of a pixel's log-likelihood ratio
 _LONGEST = 30.0  # target's length in patch cells
 _SHORTEST = 12.0
 _LARGEST_PATCH = 200  # cells a side
+_SHAPED = 0.75  # of the usual shape response: the same car in another light
 _LEAST_SEEN = 0.3  # share of the footprint in the picture
 
 
@@ -64,7 +65,8 @@ class Patch:
 class Candidate:
     """A place that looks like the target. ground: (2,); score: 1 = as the target always looks, 0 = as background.
 
-    colour, shape: its parts; seen: share of the footprint inside the picture.
+    colour, shape: its parts; seen: share of the footprint inside the picture; angle: of the patch that it was found
+    in [rad].
     """
 
     ground: Floats
@@ -72,6 +74,7 @@ class Candidate:
     colour: float
     shape: float
     seen: float
+    angle: float = 0.0
 
 
 def cut_patch(
@@ -245,6 +248,23 @@ class Appearance:
         self._colour_scale = (1 - rate) * self._colour_scale + rate * max(colour, 0.15)
         self._shape_scale = (1 - rate) * self._shape_scale + rate * max(shape, 0.3)
 
+    def brightness(self, patch: Patch, centre: Floats) -> float:
+        """Mean logarithm of how bright the footprint is, of a target at ``centre`` (2,) ground, over all channels."""
+        ky, kx = self._inside.shape
+        at = patch.at(centre[None])[0]
+        cells = cv2.getRectSubPix(patch.cells, (kx, ky), (float(at[0]), float(at[1])))
+        levels = np.log(np.maximum(cells.astype(np.float64), 8.0)).mean(axis=2)
+        return float((levels * self._inside).sum() / float(self._inside.sum()))
+
+    @property
+    def colour_scale(self) -> float:
+        """The target's usual colour response."""
+        return self._colour_scale
+
+    def is_shaped(self, candidate: Candidate) -> bool:
+        """Whether its shape is nearly the one that the target always has, whatever the colour."""
+        return candidate.shape > _SHAPED * self._shape_scale
+
     def ratios(self, cells: Picture) -> Singles:
         """Log-likelihood ratio (h, w) of each cell's colour."""
         return self._table[self._index(cells)]
@@ -281,8 +301,8 @@ class Appearance:
             taken.append((row, column))
             dx, dy = _subcell(score, row, column)
             ground = patch.ground(np.array([[column + dx, row + dy]]))[0]
-            values = (float(field[row, column]) for field in (score, colour, shape, seen))
-            found.append(Candidate(ground, *values))
+            like_it, by_colour, by_shape, share = (float(field[row, column]) for field in (score, colour, shape, seen))
+            found.append(Candidate(ground, like_it, by_colour, by_shape, share, patch.angle))
             if len(found) == most:
                 break
         return found

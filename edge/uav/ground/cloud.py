@@ -258,6 +258,11 @@ def joined(cloud: Cloud, place: Floats, motion: tuple[Floats, float], weight: fl
     return replace(whole, weights=whole.weights / whole.weights.sum())
 
 
+def turned(cloud: Cloud, heading: float, std: float, rng: np.random.Generator) -> Cloud:
+    """The cloud heading one way, but for ``std`` [rad]."""
+    return replace(cloud, heading=heading + rng.normal(0.0, std, len(cloud)))
+
+
 def gathered(cloud: Cloud, place: Floats, std: float, rng: np.random.Generator) -> Cloud:
     """The cloud of a target that was found again: about its place (2,), with the motion that led there."""
     chosen = cloud.take(systematic(cloud.weights, len(cloud), rng))

@@ -8,6 +8,7 @@ import numpy.typing as npt
 from edge.uav.ground import footprint
 from edge.uav.ground.appearance import Appearance, Candidate, Patch, cut_patch
 from edge.uav.ground.history import MotionFit
+from edge.uav.ground.light import Shade
 from edge.uav.ground.placing import Placing
 from edge.uav.tracker import Box
 from protocols.errors import InputError
@@ -17,6 +18,7 @@ Picture = npt.NDArray[np.uint8]
 
 _LEARN = 0.04
 _BODY = 0.155  # height of a car's middle over its length
+_WHOLE = 0.97  # share of the footprint in the picture that is all of it
 _MOST_CELLS = 100  # half size of a patch
 
 
@@ -44,6 +46,7 @@ class Target:
         self.scale = float(np.sqrt(abs(np.linalg.det(axes))))
         """Pixels a ground unit at the target."""
         self.looks = Appearance(*self._box, 1.0 / self.scale)
+        self.shade = Shade()
         self._teach(image, 1.0)
 
     @property
@@ -62,7 +65,7 @@ class Target:
         turned = self.angle if angle is None else angle
         placing = self._placing
         patch = cut_patch(image, placing.plane, placing.body_matrix, middle, turned, (reach, reach), self.looks.pitch)
-        return None if patch is None else patch.relit(placing.light.undone(patch.cells))
+        return None if patch is None else patch.relit(placing.light.undone(patch.cells, self.shade.value))
 
     def follow_scale(self, place: Floats) -> None:
         """Where the target is now decides how finely it is looked at."""
@@ -85,6 +88,14 @@ class Target:
         self._placing.body_height = _BODY * self.length
         self.angle, self.aligned = fit.heading, True
         self._teach(image, 1.0)
+
+    def feel_light(self, image: Picture, best: Candidate) -> None:
+        """How light it is where the target is, if that is surely the target by its shape."""
+        if best.seen < _WHOLE or not self.looks.is_shaped(best):
+            return
+        patch = self.cut(image, best.ground, 0.7)
+        if patch is not None:
+            self.shade.update(self.looks.brightness(patch, best.ground))
 
     def study(self, image: Picture, best: Candidate) -> None:
         """Learn a little from a target that is surely and wholly seen."""
@@ -116,6 +127,7 @@ class Target:
         if rate >= 1.0:
             self.looks.forget()
         self.looks.learn(patch, self.place, rate)
+        self.shade.teach(self.looks.brightness(patch, self.place))
         found = self.looks.candidates(patch, least=-1.0)
         near = [c for c in found if np.linalg.norm(c.ground - self.place) < 0.3 * self.length]
         if near:

@@ -15,17 +15,21 @@ _FASTEST = 45.0  # of anything followed [units/s]
 _SLACK = 0.6  # between where one is expected and found [units]
 _PATIENCE = 2  # frames that one may be missing
 _MEMORY = 10
+_SURE = 5.0  # speed over its std from which the direction is known
 _NOISE = 0.2  # of a place [units]
 
 
 @dataclass(slots=True, eq=False)
 class Tracklet:
-    """One look-alike, or the target. times, places: its last sightings; score: their mean."""
+    """One look-alike, or the target. times, places: its last sightings; score: their mean; angle: of the last."""
 
     times: deque[float] = field(default_factory=lambda: deque(maxlen=_MEMORY))
     places: deque[Floats] = field(default_factory=lambda: deque(maxlen=_MEMORY))
     score: float = 0.0
+    angle: float = 0.0
     missing: int = 0
+    odds_limit: float | None = None
+    """That it is the target, by all that is known when it is first seen: a look-alike is as alike in each frame."""
 
     @property
     def age(self) -> int:
@@ -58,7 +62,15 @@ class Tracklet:
         self.places.append(candidate.ground)
         weight = 1.0 / min(len(self.times), 5)
         self.score += weight * (candidate.score - self.score)
+        self.angle = candidate.angle
         self.missing = 0
+
+    def course(self) -> float | None:
+        """Which way it moves [rad]; None while that is not known well."""
+        motion = self.velocity()
+        if motion is None or float(np.hypot(*motion[0])) < _SURE * motion[1]:
+            return None
+        return float(np.arctan2(motion[0][1], motion[0][0]))
 
 
 class Tracklets:
@@ -70,6 +82,12 @@ class Tracklets:
     def clear(self) -> None:
         """Forget all: the ground frame is another one, or nothing was looked at for long."""
         self._live = []
+
+    def near(self, time: float, place: Floats, within: float) -> Tracklet | None:
+        """The one that should be at a place (2,) now, or no farther from it than ``within``."""
+        away = [float(np.hypot(*(tracklet.expected(time)[0] - place))) for tracklet in self._live]
+        k = int(np.argmin(away)) if away else -1
+        return self._live[k] if away and away[k] < within else None
 
     def update(self, time: float, candidates: Sequence[Candidate]) -> list[Tracklet]:
         """The tracklet of each candidate, in their order; nearest pairs first."""

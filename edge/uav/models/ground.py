@@ -17,12 +17,13 @@ from edge.uav.ground import footprint
 from edge.uav.ground.appearance import Candidate
 from edge.uav.ground.camera import transfer
 from edge.uav.ground.cloud import Cloud
-from edge.uav.ground.evidence import Verdict, judge
+from edge.uav.ground.evidence import Verdict, allow, judge
 from edge.uav.ground.history import MotionFit, Sightings
 from edge.uav.ground.layers import Layers
 from edge.uav.ground.outlook import Outlook
 from edge.uav.ground.placing import Placing
 from edge.uav.ground.road_map import RoadMap
+from edge.uav.ground.survey import Survey
 from edge.uav.ground.target import Target
 from edge.uav.ground.tracklets import Tracklet, Tracklets
 from edge.uav.tracker import Box, Estimate, Hypothesis, Image, State, Telemetry
@@ -36,8 +37,15 @@ _FIRST_NUMBER = 400
 _PULL = 0.35  # of the motion towards the fit, a frame
 _ALIGN_AFTER = 0.6  # way travelled before the direction of motion counts, in target lengths
 _AGAIN = 3  # frames unseen after which finding the target is finding it again
-_KNOWN = 0.4  # std of a place that is as good as seen, in target lengths
 _ALIKE = 0.65  # mean score of a look-alike that is worth a thought
+_TURNS = (0.15, 0.3, 0.5, 0.8)  # by how much what is found is tried turned [rad]
+_MOST_TURNS = 3  # of them in a frame
+_TURNED_OF = 2  # of the best candidates in turn
+_SAME_TURN = 0.997  # cosine
+_TURNED_STD = 0.06  # of the heading that a template tells [rad]
+_SURVEY_AFTER = 12  # frames unseen after which all of the picture is looked over
+_WRONG_A_SECOND, _WRONG_AT_MOST = 0.002, 0.02  # chance that it took a way that nobody thought of
+_LOST_WEIGHT = 0.1  # the same once it counts as lost
 _RECONSIDER = 0.02  # weight of the particles that it gets
 _ROAD_EVERY = 3  # frames between updates of the road map
 _ROAD_SHOWN = 45.0  # about the target [ground units]
@@ -83,6 +91,7 @@ class GroundTracker:
         self._cloud = clouds.scattered(place, 0.03 * self._target.length, _FIRST_NUMBER, self._rng)
         self._missed, self._found = 0, 1  # frames in a row without and with the target
         self._tracklets = Tracklets()
+        self._survey = Survey()
         self._seen_last = time
         self._state = State.VISIBLE
         self._trail: list[Floats] = [place]
@@ -107,7 +116,7 @@ class GroundTracker:
         self._cloud = clouds.driven(self._cloud, dt, ways, self._missed == 0, self._rng)
         if image is None or image.shape[:2] != (self._size[1], self._size[0]):
             self._placing.skip(dt)
-            self._not_seen()
+            self._not_seen(dt)
             return self._estimate(time)
         small = self._placing.shrink(image)
         keep_out = None
@@ -119,7 +128,7 @@ class GroundTracker:
         if best is not None:
             self._seen(image, best, verdict)
         else:
-            self._not_seen()
+            self._not_seen(dt)
         if self._placing.blind == 0 and (self._relearn or self._frame % _ROAD_EVERY == 0):
             teach = self._relearn or self._frame % _TEACH_EVERY == 0
             self._learn_road(small, teach=teach and self._missed == 0)
@@ -134,9 +143,10 @@ class GroundTracker:
 
     def _look(self, image: Image, small: Image) -> Verdict:
         """Search where the cloud lies within the picture, and weigh the cloud by it."""
-        cloud, target, placing = self._cloud, self._target, self._placing
+        target, placing = self._target, self._placing
+        surveyed = self._survey_all(image, small) if self._missed > _SURVEY_AFTER else []
+        cloud = self._cloud
         pixels = placing.body_pixels(cloud.place)
-        again = self._again()
         near = placing.plane.inside(pixels, -0.3 * target.length * target.scale)
         share = float(cloud.weights[near].sum())
         if share < 2e-3:
@@ -156,6 +166,12 @@ class GroundTracker:
             for found in self._search(image, rest[aside], wide=False):
                 if all(np.linalg.norm(found.ground - c.ground) > 0.4 * target.length for c in candidates):
                     candidates.append(found)
+        if target.aligned and candidates and not any(target.looks.is_shaped(found) for found in candidates):
+            candidates = self._look_turned(image, candidates)
+        apart = 0.4 * target.length
+        for found in surveyed:
+            if all(np.linalg.norm(found.ground - c.ground) > apart for c in candidates):
+                candidates.append(found)
         # Until its motion is known, anywhere it can have gone in a frame will do.
         slack = 0.2 * target.length if self._fit is None else 0.0
         again = self._missed > _AGAIN
@@ -171,6 +187,7 @@ class GroundTracker:
             lambda seen: target.noise(seen) + slack,
             target.length,
             again,
+            lambda found: target.aligned and target.looks.is_shaped(found),
         )
         if verdict.likelihood is not None:
             self._cloud = cloud.weighted(verdict.likelihood)
@@ -199,6 +216,7 @@ class GroundTracker:
             if np.cos(headings - course).max() < 0.7:
                 continue
             cloud = clouds.joined(cloud, tracklet.places[-1], motion, _RECONSIDER, self._rng)
+            allow(tracklet, _RECONSIDER)
         return cloud
 
     def _search(self, image: Image, members: Ints, wide: bool) -> list[Candidate]:
@@ -216,12 +234,51 @@ class GroundTracker:
                 self._target.angle = angle
         return self._target.search(image, middle, 1.1 + reach / self._target.length, angle)
 
-    def _again(self) -> bool:
-        """Whether finding the target now is finding it again: unseen for long, and no longer known to a length."""
-        if self._missed <= _AGAIN:
-            return False
-        spread = np.trace(pf.weighted_covariance(self._cloud.place, self._cloud.weights))
-        return bool(0.5 * spread > (_KNOWN * self._target.length) ** 2)
+    def _look_turned(self, image: Image, candidates: list[Candidate]) -> list[Candidate]:
+        """The candidates, with one looked at again as if it headed another way: nobody saw the bend that it took."""
+        first = candidates[self._frame % min(len(candidates), _TURNED_OF)]
+        near = self._tracklets.near(self._time, first.ground, 0.5 * self._target.length)
+        angles = []
+        if near is not None and near.age > 1:
+            course = near.course()
+            angles = [near.angle] if course is None else [near.angle, course]
+        about = np.flatnonzero(np.square(self._cloud.place - first.ground).sum(axis=1) < self._target.length**2)
+        if len(about):
+            angles.append(float(self._cloud.heading[self._rng.choice(about)]))
+        step = _TURNS[self._frame // _TURNED_OF % len(_TURNS)]
+        angles += [first.angle + step, first.angle - step]
+        tried = [angle for angle in angles if np.cos(angle - first.angle) < _SAME_TURN][:_MOST_TURNS]
+        best = first
+        for angle in tried:
+            found = self._target.search(image, first.ground, 1.1, angle)
+            best = max([best, *found[:1]], key=lambda candidate: candidate.score)
+        if best.score < first.score + 0.05:
+            return candidates
+        reach = 0.5 * self._target.length
+        rest = [c for c in candidates if c is not first and np.linalg.norm(c.ground - best.ground) > reach]
+        return sorted([best, *rest], key=lambda candidate: -candidate.score)
+
+    def _survey_all(self, image: Image, small: Image) -> list[Candidate]:
+        """What drives anywhere in the picture as the target may: a few particles go there, more the longer it is gone.
+
+        The ways that are thought of may all be wrong. What is found is weighed together with what is expected.
+        """
+        fit, target = self._fit, self._target
+        if fit is None or not target.aligned or self._placing.blind:
+            return []
+        gone = self._time - self._seen_last
+        weight = _LOST_WEIGHT if self._state is State.LOST else min(_WRONG_A_SECOND * gone, _WRONG_AT_MOST)
+        out = []
+        for spot, found, fits in self._survey.look(image, small, self._placing, target, fit, self._time):
+            if found.score < _ALIKE or not target.looks.is_shaped(found):
+                continue
+            out.append(found)
+            motion = spot.velocity()
+            away = np.square(self._cloud.place - found.ground).sum(axis=1)
+            here = float(self._cloud.weights[away < (0.5 * target.length) ** 2].sum())
+            if motion is not None and here < weight * fits:
+                self._cloud = clouds.joined(self._cloud, found.ground, motion, weight * fits, self._rng)
+        return out
 
     def _chance(self, small: Image, pixels: Floats) -> Floats:
         """(n,) chance that the target would be found at image points (n, 2): 0 outside, little where it may hide."""
@@ -241,12 +298,15 @@ class GroundTracker:
         again = self._missed > _AGAIN
         if again or self._fit is None:
             self._cloud = clouds.gathered(self._cloud, best.ground, target.noise(best.seen), self._rng)
+            if target.aligned and target.looks.is_shaped(best):
+                self._cloud = clouds.turned(self._cloud, best.angle, _TURNED_STD, self._rng)
         if again:
             speed, heading = float(self._cloud.weights @ self._cloud.speed), self._heading
             self._sightings.begin_anew(speed * np.array([np.cos(heading), np.sin(heading)]), 3.0)
         self._missed, self._found = 0, self._found + 1
         self._seen_last = self._time
         self._outlook = None
+        self._survey.clear()
         self._cloud = self._cloud.free()
         if best.seen > 0.7:
             self._sightings.add(self._time, best.ground, target.noise(best.seen))
@@ -266,12 +326,16 @@ class GroundTracker:
                 # What was beside an upright box may have been anything.
                 self._road.forget()
                 self._relearn = True
-        elif self._frame % 4 == 0 and self._found > 3 and _is_sure(verdict):
-            target.study(image, best)
+        elif self._found > 3:
+            if verdict.sureness > 0.9 and not verdict.crowded:
+                target.feel_light(image, best)
+            if self._frame % 4 == 0 and _is_sure(verdict):
+                target.study(image, best)
 
-    def _not_seen(self) -> None:
+    def _not_seen(self, dt: float) -> None:
         """It is not there: the cloud drives on, along the ways that the road offers."""
         self._missed, self._found = self._missed + 1, 0
+        self._target.shade.fade(dt)
         if self._outlook is None:
             trail = np.array(self._trail[-25:])
             self._outlook = Outlook(self._cloud, self._fit, self._time, self._road, trail)
@@ -318,6 +382,7 @@ class GroundTracker:
         self._fit = self._sightings.fit()
         self._cloud = self._cloud.moved(change)
         self._tracklets.clear()
+        self._survey.clear()
         self._trail = [p for p in transfer(change, np.array(self._trail)) if np.isfinite(p).all()]
         old, self._road = self._road, RoadMap(near[0])
         self._road.take_colours(old)
