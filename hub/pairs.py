@@ -50,9 +50,7 @@ def solve_pairs(
     return prepared, list(pairs.values())
 
 
-def _solve(
-    prepared: Prepared, names: tuple[str, str], known: Known | None, thorough: bool = False
-) -> PairSolution:
+def _solve(prepared: Prepared, names: tuple[str, str], known: Known | None, thorough: bool = False) -> PairSolution:
     a, b = (prepared.camera(name).tracks for name in names)
     if prepared.shared_clock:
         return solve_shared_pair(a, b, names)
@@ -60,9 +58,7 @@ def _solve(
     if known is not None and all(name in known.cameras for name in names):
         given = relative_pose(known.cameras[names[0]].pose, known.cameras[names[1]].pose)
     calibrated = all(name in prepared.cameras for name in names)
-    return solve_pair(
-        smooth_only(a), smooth_only(b), names, known=given, calibrated=calibrated, thorough=thorough
-    )
+    return solve_pair(smooth_only(a), smooth_only(b), names, known=given, calibrated=calibrated, thorough=thorough)
 
 
 def _tie_at_other_rates(

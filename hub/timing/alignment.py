@@ -29,8 +29,8 @@ class PairSettings:
     """Seconds in which both must move for a lag to be looked at."""
     sigma_px: float = 0.5
     """Noise that a good track has; scales the scan's costs."""
-    per_stratum: int = 3
-    at_most: int = 10
+    per_stratum: int = 6
+    at_most: int = 18
     few: int = 160
     """Point pairs in the choice among the starts of a candidate."""
     samples: int = 500
@@ -80,11 +80,11 @@ class PairSettings:
     """What an alignment may leave over the tracks' own noise for the noise to explain it."""
     largest_lag_std: float = 4e-3
     """Least certainty [s] of the lag and …"""
-    largest_turn_std: float = 0.035
+    largest_turn_std: float = 0.1
     """… of the relative rotation [rad] that is worth an answer; …"""
     sure_turn_std: float = 0.25
     """… where the lag is beyond doubt, so much: epipolar lines can be right to a pixel with the pose open."""
-    sure_log10_chance: float = -4.5
+    sure_log10_chance: float = -4.0
     """log10 of the chance of one unrelated stretch from which the lag is beyond doubt."""
 
 
