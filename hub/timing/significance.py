@@ -137,10 +137,12 @@ def _stretch_costs(
     use = (np.abs(lags - lag) > OWN_LAGS) & (weight * a.step > _LEAST_MOVING * support)
     if not use.any():
         return np.zeros(0)
-    chosen = moments[use] / weight[use][:, None, None]
-    full = chosen[:, PAIR_OF][:, :, :, PAIR_OF]
+    chosen = moments[use]
+    if known is None:
+        return eigen_costs(np.moveaxis(chosen, 0, 2), a.sigma, b.sigma)
+    full = (chosen / weight[use][:, None, None])[:, PAIR_OF][:, :, :, PAIR_OF]
     moment, norm = full.transpose(0, 1, 3, 2, 4).reshape(-1, 9, 9), normalisation(full, a.sigma, b.sigma)
-    return eigen_costs(moment, norm) if known is None else fixed_costs(moment, norm, in_grid(known, a, b))
+    return fixed_costs(moment, norm, in_grid(known, a, b))
 
 
 def _density(track: GridTrack) -> float:

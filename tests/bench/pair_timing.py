@@ -161,7 +161,7 @@ def main() -> None:
     kept: dict[str, object] = {}
     with ProcessPoolExecutor(options.jobs) as pool:
         for name in names:
-            trials = max(10, options.trials // 2) if ROWS[name].regime.span > 60 else options.trials
+            trials = options.trials
             jobs = [(options.start + k, True) for k in range(trials)]
             jobs += [(options.start + k, False) for k in range(options.strangers)]
             done = list(pool.map(partial(_one, name, not options.uncalibrated), jobs, chunksize=4))
