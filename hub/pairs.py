@@ -17,6 +17,7 @@ import numpy as np
 from hub.poses.graph import components
 from hub.prepare import Prepared
 from hub.timing.pair import PairFit, PairSolution, solve_pair
+from hub.timing.promise import promise
 from hub.timing.shared import solve_shared_pair
 from hub.timing.tracks import smooth_only
 from hub.timing.two_view import relative_pose
@@ -29,6 +30,8 @@ FAR_FROM_ONE = 0.01
 """No clock is off by that much: its times were made with a wrong frame rate."""
 _FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
 _SAME_RATIO = 0.01
+_FEW = 8  # cameras whose pairs are all looked at closely
+_MUCH = 8.0  # s of common motion
 
 
 def solve_pairs(
@@ -41,16 +44,78 @@ def solve_pairs(
     """
     names = prepared.names
     todo = list(itertools.combinations(names, 2))
-    pairs: dict[tuple[str, str], PairSolution] = {}
-    for done, (a, b) in enumerate(todo):
+    many = len(names) > _FEW and not prepared.shared_clock
+    pairs = dict.fromkeys(todo, PairSolution("", "", ""))  # answers in the rig's order
+    told = _ToldClocks()
+    for done, (a, b) in enumerate(_most_promising_first(prepared, todo, tell) if many else todo):
         tell(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
-        pairs[a, b] = _solve(prepared, (a, b), known)
+        near = None if prepared.shared_clock else told.lag(prepared, a, b)
+        answer = _solve(prepared, (a, b), known, near=near)
+        # Where the others' clocks are right, a pair that sees much must agree; if not, it is heard for itself.
+        if near is not None and not answer.solved and (not many or _sees_much(answer)):
+            answer = _solve(prepared, (a, b), known)
+        pairs[a, b] = answer
+        told.hear(answer)
     if thorough and not prepared.shared_clock:
         prepared = _tie_at_other_rates(prepared, pairs, known, tell)
     return prepared, list(pairs.values())
 
 
-def _solve(prepared: Prepared, names: tuple[str, str], known: Known | None, thorough: bool = False) -> PairSolution:
+def _sees_much(answer: PairSolution) -> bool:
+    return answer.fit is not None and answer.fit.moving_overlap > _MUCH
+
+
+def _most_promising_first(prepared: Prepared, todo: list[tuple[str, str]], tell: Progress) -> list[tuple[str, str]]:
+    """The pairs, those first that a coarse scan of all lags likes best: once cameras are tied, the rest is cheap."""
+    tell(f"coarse look at {len(todo)} pairs", 0.05)
+    likes = {
+        (a, b): promise(smooth_only(prepared.camera(a).tracks), smooth_only(prepared.camera(b).tracks)) for a, b in todo
+    }
+    return sorted(todo, key=lambda pair: -likes[pair])
+
+
+class _ToldClocks:
+    """Groups of cameras that solved pairs tie, each with one time: ``t_group = rate * t + offset``."""
+
+    def __init__(self) -> None:
+        self._maps: dict[str, tuple[str, float, float]] = {}
+
+    def hear(self, pair: PairSolution) -> None:
+        """Join the groups of a solved pair's cameras; what is tied already stays as it is."""
+        if not pair.solved or pair.fit is None:
+            return
+        for name in (pair.a, pair.b):
+            self._maps.setdefault(name, (name, 1.0, 0.0))
+        (group_a, rate_a, offset_a), (group_b, rate_b, offset_b) = self._maps[pair.a], self._maps[pair.b]
+        if group_a == group_b:
+            return
+        # t_a = rate t_b + offset, so group a's time from group b's
+        rate = rate_a * pair.fit.rate / rate_b
+        offset = rate_a * pair.fit.offset + offset_a - rate * offset_b
+        for name, (group, r, o) in list(self._maps.items()):
+            if group == group_b:
+                self._maps[name] = (group_a, rate * r, rate * o + offset)
+
+    def lag(self, prepared: Prepared, a: str, b: str) -> float | None:
+        """``t_a - t_b`` [s] in the middle of the time that both recorded; None where nothing ties them."""
+        if a not in self._maps or b not in self._maps or self._maps[a][0] != self._maps[b][0]:
+            return None
+        (_, rate_a, offset_a), (_, rate_b, offset_b) = self._maps[a], self._maps[b]
+        rate, offset = rate_b / rate_a, (offset_b - offset_a) / rate_a
+        begin_a, end_a = _span(prepared, a)
+        begin_b, end_b = (rate * time + offset for time in _span(prepared, b))
+        middle = 0.5 * (max(begin_a, begin_b) + min(end_a, end_b))
+        return middle - (middle - offset) / rate
+
+
+def _solve(
+    prepared: Prepared,
+    names: tuple[str, str],
+    known: Known | None,
+    *,
+    thorough: bool = False,
+    near: float | None = None,
+) -> PairSolution:
     a, b = (prepared.camera(name).tracks for name in names)
     if prepared.shared_clock:
         return solve_shared_pair(a, b, names)
@@ -58,7 +123,9 @@ def _solve(prepared: Prepared, names: tuple[str, str], known: Known | None, thor
     if known is not None and all(name in known.cameras for name in names):
         given = relative_pose(known.cameras[names[0]].pose, known.cameras[names[1]].pose)
     calibrated = all(name in prepared.cameras for name in names)
-    return solve_pair(smooth_only(a), smooth_only(b), names, known=given, calibrated=calibrated, thorough=thorough)
+    return solve_pair(
+        smooth_only(a), smooth_only(b), names, known=given, calibrated=calibrated, thorough=thorough, near=near
+    )
 
 
 def _tie_at_other_rates(

@@ -29,6 +29,7 @@ _LEAST_BEARING = 0.05  # rad between two directions that intersect
 _PNP_POINTS = 400
 _PNP_PX = 8.0
 _LEAST_PNP = 12
+_SMALL, _GROWN = 6, 1.33  # cameras; growth
 _GRID = 0.05  # s between triangulated points
 _STRETCH_GAP = 1.0  # s: the path is cut where nobody saw the point for longer
 
@@ -71,6 +72,7 @@ def grow(
     placed |= _seed(cameras, graph, seed)
     anchors = (seed.a, seed.b)
     scaffold = settle(cameras, placed, rows, labels, anchors, freedom)
+    adjusted = len(placed)
     waiting = [name for name in graph.clocks if name not in placed]
     while waiting:
         spreads = {name: _common_spread(cameras[name], graph, scaffold) for name in waiting}
@@ -84,7 +86,13 @@ def grow(
             continue
         current = dict(zip(scaffold.names, scaffold.state.cameras, strict=True))
         current[name] = state
-        scaffold = settle(cameras, current, rows, labels, anchors, freedom)
+        # Each adjustment costs as much as the network is large: a large one is adjusted when it has grown by a third.
+        due = len(current) <= _SMALL or len(current) >= _GROWN * adjusted or not waiting
+        scaffold = settle(cameras, current, rows, labels, anchors, freedom if due else None)
+        adjusted = len(current) if due else adjusted
+    if adjusted < len(scaffold.names):
+        placed = dict(zip(scaffold.names, scaffold.state.cameras, strict=True))
+        scaffold = settle(cameras, placed, rows, labels, anchors, freedom)
     return scaffold, refused
 
 

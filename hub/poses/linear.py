@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.sparse import csr_array
 
 from hub.points import PointBasis
 from hub.splines import SUPPORT, SplineBasis
@@ -62,18 +63,12 @@ def path_gradient(index: Ints, weights: Floats, values: Floats, size: int) -> Fl
 
 
 def border_block(index: Ints, weights: Floats, blocks: Floats, size: int) -> Floats:
-    """Sum over rows of w ⊗ block: (3 n, p) of blocks (m, 3, p); rows need not be sorted."""
-    width = blocks.shape[2]
-    order = np.argsort(index, kind="stable")
-    index, weights, blocks = index[order], weights[order], blocks[order]
-    starts = np.flatnonzero(np.r_[True, np.diff(index) > 0])
-    products = weights[:, :, None, None] * blocks[:, None]
-    sums = np.add.reduceat(products.reshape(len(index), -1), starts, axis=0).reshape(-1, 3 * SUPPORT, width)
-    out = np.zeros((size // 3 + SUPPORT, 3, width))
-    first = index[starts]
-    for a in range(SUPPORT):
-        out[first + a] += sums[:, 3 * a : 3 * a + 3]
-    return np.asarray(out.reshape(-1, width)[:size])
+    """Sum over rows of w ⊗ block: (3 n, p) of blocks (m, 3, p)."""
+    rows, _, width = blocks.shape
+    columns = (index[:, None] + np.arange(SUPPORT)).ravel()
+    shape = (rows, size // 3 + SUPPORT)
+    spread = csr_array((weights.ravel(), columns, SUPPORT * np.arange(rows + 1)), shape=shape)
+    return np.asarray((spread.T @ blocks.reshape(rows, -1)).reshape(-1, width)[:size])
 
 
 def third_difference_band(basis: SplineBasis | PointBasis, weight: Floats) -> Floats:

@@ -14,6 +14,7 @@ from hub.timing.two_view import Geometry, RelativePose
 from protocols.geometry.types import Bools, Floats, Ints
 
 _PAUSE_INTERVALS = 5.0
+_STEPS = (0.01, 0.0125, 0.016, 0.02, 0.025, 0.033, 0.05)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +77,8 @@ class PairSettings:
     """… this many times where the best one leaves no more than the noise, …"""
     clearly_likelier: float = 3.0
     """… or if chance makes it this many powers of ten more often."""
+    near_window: float = 0.3
+    """How far the lag may be from what other cameras tell, where they do [s]."""
     exact: float = 1.3
     """What an alignment may leave over the tracks' own noise for the noise to explain it."""
     largest_lag_std: float = 4e-3
@@ -84,7 +87,7 @@ class PairSettings:
     """… of the relative rotation [rad] that is worth an answer; …"""
     sure_turn_std: float = 0.25
     """… where the lag is beyond doubt, so much: epipolar lines can be right to a pixel with the pose open."""
-    sure_log10_chance: float = -4.0
+    sure_log10_chance: float = -3.0
     """log10 of the chance of one unrelated stretch from which the lag is beyond doubt."""
 
 
@@ -269,6 +272,16 @@ def _interval(time: Floats) -> float:
     """Mean interval [s] of a track's rows (n,), pauses left out: rows that were dropped leave longer ones."""
     steps = np.diff(time)
     return float(steps[steps <= _PAUSE_INTERVALS * np.median(steps)].mean())
+
+
+def grid_step(a: Sequence[SmoothTrack], b: Sequence[SmoothTrack], s: PairSettings) -> float:
+    """Step of the scan [s] in which the faster motion of the two goes a few pixels."""
+    fast = max(
+        float(np.quantile(np.linalg.norm(track.at(track.time, 1), axis=1), 0.9)) * track.focal for track in (*a, *b)
+    )
+    wanted = s.step_px / max(fast, 1e-9)
+    fitting = [step for step in _STEPS if s.finest_step <= step <= min(s.coarsest_step, wanted)]
+    return max(fitting, default=s.finest_step)
 
 
 def evidence(fit: PairFit) -> float:

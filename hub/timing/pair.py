@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from hub.timing import two_view
-from hub.timing.alignment import PairFit, PairSettings, PairSolution, Samples, evidence
+from hub.timing.alignment import PairFit, PairSettings, PairSolution, Samples, evidence, grid_step
 from hub.timing.pieces import scan_pieces
 from hub.timing.refine import WIDE, Noise, Refined, refine
 from hub.timing.scan import PairMoments, Scan, busiest, candidates, grid_tracks, scan_lags
@@ -24,6 +24,7 @@ from protocols.geometry.types import Floats
 
 _LEAST_SAMPLES = 12
 _AT_NOISE = 0.8  # mean robust cost of an alignment whose rows are as noisy as the settings say: about 0.75
+_NEAR_CANDIDATES = 3
 _STARTS = 4
 _SEEDS = 8  # of five-point hypotheses; the later ones only …
 _PROMISING = 12.0  # … for what comes this near the noise: a wrong minimum of E at the right lag
@@ -34,7 +35,6 @@ _NEAR_PX = 10.0  # what may belong to the geometry of the scan in pieces
 _MOSTLY_ONE = 0.85  # of a track's rows: with fewer on one path there may be another
 _OTHER_LAGS = 0.5  # s from the best: what is no part of it
 _LEAST_OTHER_LAGS = 3.0  # s
-_STEPS = (0.01, 0.0125, 0.016, 0.02, 0.025, 0.033, 0.05)
 _FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
 _LABELLED_RATES = tuple(
     sorted(
@@ -54,6 +54,7 @@ def solve_pair(
     *,
     calibrated: bool = True,
     thorough: bool = False,
+    near: float | None = None,
 ) -> PairSolution:
     """Find lag, rate and geometry of two cameras from the labels that both saw.
 
@@ -61,15 +62,16 @@ def solve_pair(
     it is given: then only lag and rate are sought. calibrated: whether both lenses are known; if not, the
     tracks' normalised coordinates are those of any nominal lens and the answer is a fundamental matrix.
     thorough: whether to go on where that finds nothing: clocks up to 5000 ppm off, those of wrongly told
-    frame rates, and tracks that follow something else now and then; tens of times as dear.
+    frame rates, and tracks that follow something else now and then; tens of times as dear. near: ``t_a - t_b``
+    in the middle of the common time, where other cameras tell it: then only lags about it are looked at.
     """
     s = settings or PairSettings()
     labels = [label for label in tracks_a if label in tracks_b]
     if not labels:
         return PairSolution(*names, "no label that both cameras saw")
     search = _Search([tracks_a[k] for k in labels], [tracks_b[k] for k in labels], s, known, calibrated)
-    first = search.at_rate(names, 1.0)
-    if first.solved or not thorough:
+    first = search.at_rate(names, 1.0, None if near is None else (near, s.near_window))
+    if first.solved or not thorough or near is not None:
         return first
     if search.jumps():
         first = search.in_pieces(names)
@@ -94,7 +96,7 @@ class _Search:
         calibrated: bool,
     ) -> None:
         self.a, self.b, self.s, self.known, self.calibrated = a, b, s, known, calibrated
-        self.step = _grid_step(a, b, s)
+        self.step = grid_step(a, b, s)
         self.grid_a = grid_tracks(a, self.step, s.sigma_px)
         self.tried = 0
         self.bandwidth = min(max(bandwidth(track) for track in one) for one in (a, b))
@@ -111,18 +113,21 @@ class _Search:
                 yield 1.0 - k * slip
         yield from _LABELLED_RATES
 
-    def at_rate(self, names: tuple[str, str], rate: float) -> PairSolution:
-        """Answer with b's clock taken to run ``rate`` times as fast: one scan, its candidates, the verdict."""
+    def at_rate(self, names: tuple[str, str], rate: float, near: tuple[float, float] | None = None) -> PairSolution:
+        """Answer with b's clock taken to run ``rate`` times as fast: one scan, its candidates, the verdict.
+
+        near: offset and window [s] where it is about known.
+        """
         s, self.tried = self.s, self.tried + 1
         b = list(self.b) if rate == 1.0 else [track.scaled(rate) for track in self.b]
         moments = PairMoments(self.grid_a, grid_tracks(b, self.step, s.sigma_px))
         if float(moments.support.max(initial=0.0)) < s.least_support:
             return PairSolution(*names, "the point hardly moves while both could have seen it")
-        scan = scan_lags(moments, s.least_support, None if self.known is None else self.known.essential.T)
+        scan = scan_lags(moments, s.least_support, None if self.known is None else self.known.essential.T, near)
         chances = _Chances(moments, scan, self.known, self.bandwidth)
         fits: list[PairFit] = []
         good: tuple[float, float] | None = None  # evidence and scan cost of the best trustworthy fit so far
-        for index in candidates(scan, s.per_stratum, s.at_most):
+        for index in candidates(scan, s.per_stratum, s.at_most if near is None else _NEAR_CANDIDATES, near):
             offset, cost = float(scan.offset[index]), float(scan.cost[index])
             if good is not None and _hopeless(float(scan.support[index]), cost, *good, s):
                 continue
@@ -137,7 +142,7 @@ class _Search:
         if not fits:
             return PairSolution(*names, "no alignment of the two tracks agrees with any geometry")
         ordered = _distinct(fits, s)
-        answer = _judge(names, ordered, self._searched(scan, ordered[0]), s)
+        answer = _judge(names, ordered, 1.0 if near is not None else self._searched(scan, ordered[0]), s)
         if answer.solved and answer.fit is not None:
             answer = self._finish(answer, answer.fit, b)
         if rate != 1.0 and answer.fit is not None:
@@ -346,16 +351,6 @@ class _Chances:
             if np.isfinite(following)
             else 0.0,
         )
-
-
-def _grid_step(a: Sequence[SmoothTrack], b: Sequence[SmoothTrack], s: PairSettings) -> float:
-    """Step of the scan [s] in which the faster motion of the two goes a few pixels."""
-    fast = max(
-        float(np.quantile(np.linalg.norm(track.at(track.time, 1), axis=1), 0.9)) * track.focal for track in (*a, *b)
-    )
-    wanted = s.step_px / max(fast, 1e-9)
-    fitting = [step for step in _STEPS if s.finest_step <= step <= min(s.coarsest_step, wanted)]
-    return max(fitting, default=s.finest_step)
 
 
 def _sound(fit: PairFit, s: PairSettings) -> bool:

@@ -25,6 +25,7 @@ _PLANE_A = np.kron(np.diag([1.0, 1.0, 0.0]), np.ones((3, 3)))[:8, :8, None]
 _PLANE_B = np.kron(np.ones((3, 3)), np.diag([1.0, 1.0, 0.0]))[:8, :8, None]
 """(8, 8, 1): where noise in a's coordinates, and in b's, enters the normalisation."""
 _ITERATIONS = 10
+_COMPARED = 400
 _SLOW_PX = 20.0  # px/s: image speed at which a moment counts half
 _CHUNK = 4096  # lags per batch of eigenvalue problems
 
@@ -225,39 +226,52 @@ def monomials(track: GridTrack) -> Floats:
     return np.stack([track.weight * s[i] * s[j] for i, j in _PAIRS], axis=1)
 
 
-def scan_lags(moments: PairMoments, least_support: float, known: Floats | None = None) -> Scan:
+def scan_lags(
+    moments: PairMoments, least_support: float, known: Floats | None = None, near: tuple[float, float] | None = None
+) -> Scan:
     """Cost at every lag with at least ``least_support`` seconds of common motion.
 
-    known: (3, 3) ``m_aᵀ F m_b = 0`` of normalised points, where the geometry is given.
+    known: (3, 3) ``m_aᵀ F m_b = 0`` of normalised points, where the geometry is given. near: offset and
+    window [s] where the offset is about known: of the other lags a few hundred, to compare with.
     """
     cost = np.full(len(moments.lags), np.inf)
-    which = np.flatnonzero(moments.support >= least_support)
+    looked_at = moments.support >= least_support
+    if near is not None:
+        thinned = np.zeros_like(looked_at)
+        thinned[:: max(1, len(thinned) // _COMPARED)] = True
+        looked_at &= thinned | (np.abs(moments.offset - near[0]) <= near[1])
+    which = np.flatnonzero(looked_at)
     if len(which):
         cost[which] = moments.costs(which) if known is None else moments.costs_of(which, known)
     return Scan(moments.offset, moments.support, cost)
 
 
-def candidates(scan: Scan, per_stratum: int, at_most: int) -> Ints:
+def candidates(scan: Scan, per_stratum: int, at_most: int, near: tuple[float, float] | None = None) -> Ints:
     """Lags worth a closer look: local minima of the cost, the best few in each octave of support.
 
     Where little overlaps, any lag fits: comparing only lags of like support keeps the truth on the list.
+    near: offset and window [s] outside which none is.
     """
+    return ranked(scan, per_stratum, near)[0][:at_most]
+
+
+def ranked(scan: Scan, per_stratum: int, near: tuple[float, float] | None = None) -> tuple[Ints, Floats]:
+    """Those lags, and what speaks for them: seconds of support times how much better than usual; best first."""
     cost = scan.cost
     with np.errstate(invalid="ignore"):
         minimum: Bools = np.isfinite(cost)
         minimum[1:] &= ~(cost[1:] > cost[:-1])
         minimum[:-1] &= cost[:-1] <= cost[1:]
+    if near is not None:
+        minimum &= np.abs(scan.offset - near[0]) <= near[1]
     where = np.flatnonzero(minimum)
-    if len(where) == 0:
-        return where
     octave = np.floor(np.log2(scan.support[where])).astype(np.int64)
     chosen: list[tuple[float, int]] = []
     for level in np.unique(octave):
         members = where[octave == level]
         usual = max(float(np.median(cost[np.isfinite(cost) & (scan.support >= 2.0**level)])), 1e-9)
         for index in members[np.argsort(cost[members], kind="stable")][:per_stratum]:
-            # Ranked by evidence: seconds of support times how much better than usual.
             rank = scan.support[index] * np.log(usual / max(float(cost[index]), 0.05) + 1.0)
             chosen.append((-float(rank), int(index)))
     chosen.sort()
-    return np.array([index for _, index in chosen[:at_most]], dtype=np.int64)
+    return np.array([index for _, index in chosen], dtype=np.int64), np.array([-rank for rank, _ in chosen])

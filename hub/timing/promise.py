@@ -1,0 +1,31 @@
+"""Which of many pairs of cameras to look at first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from hub.timing.alignment import PairSettings, grid_step
+from hub.timing.scan import PairMoments, grid_tracks, ranked, scan_lags
+from hub.timing.tracks import SmoothTrack
+
+_COARSER = 4.0  # than the step of the scan proper
+
+
+def promise(
+    tracks_a: Mapping[str, SmoothTrack], tracks_b: Mapping[str, SmoothTrack], settings: PairSettings | None = None
+) -> float:
+    """What a coarse scan says for any alignment of two cameras: seconds of support times how much better than usual.
+
+    Tells which of many pairs to try first, and nothing else.
+    """
+    s = settings or PairSettings()
+    labels = [label for label in tracks_a if label in tracks_b]
+    if not labels:
+        return 0.0
+    a, b = [tracks_a[k] for k in labels], [tracks_b[k] for k in labels]
+    step = _COARSER * grid_step(a, b, s)
+    # A step moves the point by that much more than in the scan proper.
+    sigma = s.sigma_px * _COARSER
+    scan = scan_lags(PairMoments(grid_tracks(a, step, sigma), grid_tracks(b, step, sigma)), s.least_support)
+    found = ranked(scan, 1)[1]
+    return float(found[0]) if len(found) else 0.0
