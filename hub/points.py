@@ -60,6 +60,11 @@ class PointBasis:
             weights[:, 0] = 1.0
         return index, weights, found
 
+    def weights_both(self, time: Floats) -> tuple[Ints, Floats, Floats, Bools]:
+        """As `weights` for the value and the first derivative, which is 0."""
+        index, weights, found = self.weights(time)
+        return index, weights, np.zeros_like(weights), found
+
     def evaluate(self, control: Floats, time: Floats, derivative: int = 0) -> Floats:
         """Values (n, d); NaN where there is no point."""
         index, weights, found = self.weights(time, derivative)

@@ -90,6 +90,11 @@ class SplineBasis:
             weights /= (width**derivative)[:, None]
         return index, weights, inside
 
+    def weights_both(self, time: Floats) -> tuple[Ints, Floats, Floats, Bools]:
+        """First control point (n,), the weights of value and of first derivative (n, 4) each, inside (n,)."""
+        index, u, inside, width = self.locate(time)
+        return index, basis_weights(u), basis_weights(u, 1) / width[:, None], inside
+
     def evaluate(self, control: Floats, time: Floats, derivative: int = 0) -> Floats:
         """Values (n, d) at ``time`` of the spline with ``control`` (size, d); NaN outside the stretches."""
         index, weights, inside = self.weights(time, derivative)

@@ -41,6 +41,7 @@ from protocols.geometry.types import Floats
 _WIDTH = 4.0  # Cauchy width in sigma of the 2-D residual: nearly efficient for Gaussian noise
 _CUT = 5.0  # rows beyond this many sigma are false detections
 _LEAST_SIGMA = 0.05  # px
+_ROUGH, _FINE = 1e-4, 1e-7  # gain, as a share of the cost, at which a round and the last one end
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +79,7 @@ def adjust(
     robust = True
     for turn in range(rounds):
         last = turn == rounds - 1
-        state = _minimise(problem, state, prior, robust, iterations if last else max(4, iterations // 3))
+        state = _minimise(problem, state, prior, robust, iterations if last else max(4, iterations // 3), _ROUGH)
         state = replace(state, sigma=noise(problem, state))
         prior = motion_prior(problem, state)
         if turn >= rounds - 2:
@@ -86,7 +87,7 @@ def adjust(
             robust = False
         if progress is not None:
             progress(f"adjustment {turn + 1}/{rounds}: {float(np.median(state.sigma)):.2f} px")
-    state = _minimise(problem, state, prior, robust, iterations)
+    state = _minimise(problem, state, prior, robust, iterations, _FINE)
     return problem, replace(state, sigma=noise(problem, state)), prior
 
 
@@ -190,39 +191,36 @@ def motion_prior(problem: Problem, state: State, first: bool = False) -> MotionP
     return MotionPrior(tuple(weights))
 
 
-def linearise(rows: Rows, camera: CameraState, path: Trajectory, nominal: Intrinsics) -> Linearised:
+def linearise(rows: Rows, camera: CameraState, path: Trajectory) -> Linearised:
     """Residuals of the used rows and their derivatives by the point (n, 2, 3) and the camera (n, 2, 10)."""
     time = rows.time[rows.use]
-    reference = camera.reference_time(time)
-    index, weights, inside = path.basis.weights(reference)
-    _, speeds, _ = path.basis.weights(reference, 1)
-    control = path.control
-    point = sum(weights[:, k, None] * control[index + k] for k in range(4))
-    velocity = sum(speeds[:, k, None] * control[index + k] for k in range(4))
+    index, weights, slopes, inside = path.basis.weights_both(camera.reference_time(time))
+    around = path.control[index[:, None] + np.arange(weights.shape[1])]
+    point = np.einsum("nk,nki->ni", weights, around)
+    velocity = np.einsum("nk,nki->ni", slopes, around)
     local = (point - camera.pose.position) @ camera.pose.rotation.T
     z = local[:, 2]
     valid = inside & (z > 1e-9)
-    safe = np.where(valid, z, 1.0)
-    flat = np.where(valid[:, None], local[:, :2] / safe[:, None], 0.0)
+    over = 1.0 / np.where(valid, z, 1.0)
+    flat = np.where(valid[:, None], local[:, :2] * over[:, None], 0.0)
     lens = camera.intrinsics
     projected = lens.project_normalised(flat)
     valid &= np.isfinite(projected).all(axis=1)
     flat = np.where(valid[:, None], flat, 0.0)
     projected = np.where(valid[:, None], projected, lens.matrix[:2, 2])
-    slope = lens.pixel_jacobian(flat)
-    squash = np.zeros((len(time), 2, 3))
-    squash[:, 0, 0] = squash[:, 1, 1] = 1.0 / safe
-    squash[:, :, 2] = -flat / safe[:, None]
-    by_local = slope @ squash
-    by_point = by_local @ camera.pose.rotation
-    by_camera = np.zeros((len(time), 2, CAMERA_PARAMETERS))
-    by_camera[:, :, :3] = -by_local @ so3.hat(local)
+    by_local = np.empty((len(time), 2, 3))
+    by_local[:, :, :2] = lens.pixel_jacobian(flat) * over[:, None, None]
+    by_local[:, :, 2] = -by_local[:, :, 0] * flat[:, :1] - by_local[:, :, 1] * flat[:, 1:]
+    by_point = (by_local.reshape(-1, 3) @ camera.pose.rotation).reshape(-1, 2, 3)
+    by_camera = np.empty((len(time), 2, CAMERA_PARAMETERS))
+    # A turn by w moves the point by w × local.
+    for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+        by_camera[:, :, k] = local[:, i, None] * by_local[:, :, j] - local[:, j, None] * by_local[:, :, i]
     by_camera[:, :, 3:6] = -by_point
-    along = np.einsum("nij,nj->ni", by_point, velocity)
+    along = (by_point * velocity[:, None, :]).sum(axis=2)
     by_camera[:, :, OFFSET] = along
     by_camera[:, :, RATE] = along * (time - camera.centre)[:, None]
-    centre = lens.matrix[:2, 2]
-    by_camera[:, :, FOCAL] = projected - centre
+    by_camera[:, :, FOCAL] = projected - lens.matrix[:2, 2]
     radius2 = (flat**2).sum(axis=1)
     if lens.fisheye:
         radius = np.sqrt(radius2)
@@ -257,7 +255,7 @@ def build_system(problem: Problem, state: State, prior: MotionPrior, robust: boo
         cost += value
     for rows in problem.rows:
         part = slice(bases[rows.label], bases[rows.label + 1])
-        line = linearise(rows, state.cameras[rows.camera], state.trajectories[rows.label], problem.nominal[rows.camera])
+        line = linearise(rows, state.cameras[rows.camera], state.trajectories[rows.label])
         variance = state.sigma[rows.camera] ** 2
         squared = (line.residual**2).sum(axis=1) / variance
         if robust:
@@ -271,7 +269,7 @@ def build_system(problem: Problem, state: State, prior: MotionPrior, robust: boo
         gross = _WIDTH**2 * np.log1p((100.0 / _WIDTH) ** 2) if robust else 100.0**2
         cost += float(np.where(line.valid, losses, gross).sum())
         weighted = line.by_point * weight[:, None, None]
-        blocks = line.by_point.transpose(0, 2, 1) @ weighted
+        blocks = _outer(weighted, line.by_point)
         add_path_blocks(system.band[:, part], line.index, line.weights, blocks)
         pull = (weighted * line.residual[:, :, None]).sum(axis=1)
         system.gradient_path[part] += path_gradient(line.index, line.weights, pull, sizes[rows.label])
@@ -283,12 +281,19 @@ def build_system(problem: Problem, state: State, prior: MotionPrior, robust: boo
         system.gradient_cameras[mine] += (flat * flat_weight[:, None]).T @ line.residual.reshape(-1)
         free = place[mine] >= 0
         if free.any() and len(line.index):
-            cross = weighted.transpose(0, 2, 1) @ line.by_camera[:, :, free]
+            cross = _outer(weighted, line.by_camera[:, :, free])
             system.border[part, place[mine][free]] += border_block(line.index, line.weights, cross, sizes[rows.label])
     cost += _add_camera_priors(problem, state, system)
     system.corner = system.corner[np.ix_(columns, columns)]
     system.gradient_cameras = system.gradient_cameras[columns]
     return system, cost
+
+
+def _outer(left: Floats, right: Floats) -> Floats:
+    """``leftᵀ right`` (n, p, q) of (n, 2, p) and (n, 2, q)."""
+    out = left[:, 0, :, None] * right[:, 0, None, :]
+    out += left[:, 1, :, None] * right[:, 1, None, :]
+    return out
 
 
 def _motion_terms(path: Trajectory, weight: Floats) -> tuple[Floats, Floats, float]:
@@ -370,7 +375,7 @@ def _moved_camera(camera: CameraState, step: Floats) -> CameraState:
     )
 
 
-def _minimise(problem: Problem, state: State, prior: MotionPrior, robust: bool, iterations: int) -> State:
+def _minimise(problem: Problem, state: State, prior: MotionPrior, robust: bool, iterations: int, least_gain: float) -> State:
     damping = 1e-4
     system, cost = build_system(problem, state, prior, robust)
     for _ in range(iterations):
@@ -385,7 +390,7 @@ def _minimise(problem: Problem, state: State, prior: MotionPrior, robust: bool, 
             gain = cost - trial_cost
             state, system, cost = trial, trial_system, trial_cost
             damping = max(damping / 10.0, 1e-12)
-            if gain < 1e-7 * cost:
+            if gain < least_gain * cost:
                 break
         else:
             damping = max(damping * 10.0, 1e-8)

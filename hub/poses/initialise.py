@@ -29,6 +29,7 @@ _LEAST_BEARING = 0.05  # rad between two directions that intersect
 _PNP_POINTS = 400
 _PNP_PX = 8.0
 _LEAST_PNP = 12
+_FRAMES_A_KNOT = 1.5
 _SMALL, _GROWN = 6, 1.33  # cameras; growth
 _GRID = 0.05  # s between triangulated points
 _STRETCH_GAP = 1.0  # s: the path is cut where nobody saw the point for longer
@@ -171,9 +172,13 @@ def settle(
 
 
 def path_spacing(cameras: list[Camera], label: str) -> float:
-    """Knot spacing [s] of a label's path: what the tracks' own cross-validation chose, the finest of them."""
-    spacings = [camera.tracks[label].basis.spacing for camera in cameras if label in camera.tracks]
-    return float(np.clip(min(spacings), 0.05, 0.3))
+    """Knot spacing [s] of a label's path: what the tracks' own cross-validation chose, the finest of them.
+
+    But no finer than the frames of the fastest camera: the path would go through their noise.
+    """
+    tracks = [camera.tracks[label] for camera in cameras if label in camera.tracks]
+    frames = min(float(np.median(np.diff(track.time))) for track in tracks)
+    return float(np.clip(min(track.basis.spacing for track in tracks), max(0.05, _FRAMES_A_KNOT * frames), 0.3))
 
 
 def triangulate(

@@ -81,11 +81,11 @@ def test_every_camera_derivative_is_a_difference(lens: str, column: int) -> None
     which = 2 if lens == "fisheye" else 1
     rows, camera = next(r for r in problem.rows if r.camera == which), state.cameras[which]
     path = state.trajectories[rows.label]
-    line = linearise(rows, camera, path, problem.nominal[which])
+    line = linearise(rows, camera, path)
     assert line.valid.all()
     step = 1e-6
     ahead, behind = (
-        linearise(rows, nudged(camera, column, sign * step), path, problem.nominal[which]).residual for sign in (1, -1)
+        linearise(rows, nudged(camera, column, sign * step), path).residual for sign in (1, -1)
     )
     expected = (ahead - behind) / (2 * step)
     assert np.abs(expected).max() > 1e-3
@@ -97,12 +97,12 @@ def test_the_derivative_by_the_point_is_a_difference(which: int) -> None:
     problem, state, _ = world(2)
     rows, camera = next(r for r in problem.rows if r.camera == which), state.cameras[which]
     path = state.trajectories[rows.label]
-    line = linearise(rows, camera, path, problem.nominal[which])
+    line = linearise(rows, camera, path)
     for axis in range(3):
         step = np.zeros(3)
         step[axis] = 1e-6
         ahead, behind = (
-            linearise(rows, camera, replace(path, control=path.control + s * step), problem.nominal[which])
+            linearise(rows, camera, replace(path, control=path.control + s * step))
             for s in (1, -1)
         )
         difference = (ahead.residual - behind.residual) / 2e-6
@@ -116,7 +116,7 @@ def test_a_fisheye_point_on_the_axis_has_derivatives() -> None:
     ahead = camera.pose.world_from_camera(np.array([[0.0, 0.0, 4.0]]))
     path = Trajectory(basis, np.repeat(ahead, basis.size, axis=0))
     rows = Rows(2, 0, np.array([2.5, 3.0]), np.zeros((2, 2)), np.ones(2, dtype=bool))
-    line = linearise(rows, camera, path, problem.nominal[2])
+    line = linearise(rows, camera, path)
     assert np.isfinite(line.by_camera).all()
     assert np.isfinite(line.residual).all()
 
@@ -126,7 +126,7 @@ def test_a_point_behind_the_camera_is_not_valid_and_not_nan() -> None:
     camera = state.cameras[1]
     behind = replace(camera, pose=replace(camera.pose, position=camera.pose.position * -1.0))
     cameras = (state.cameras[0], behind, state.cameras[2])
-    line = linearise(problem.rows[1], behind, state.trajectories[0], problem.nominal[1])
+    line = linearise(problem.rows[1], behind, state.trajectories[0])
     assert not line.valid.any()
     system, cost = build_system(problem, replace(state, cameras=cameras), prior, robust=True)
     assert np.isfinite(cost)
@@ -170,7 +170,7 @@ def test_the_banded_normal_matrix_is_that_of_the_rows() -> None:
     sizes = [3 * path.basis.size for path in state.trajectories]
     blocks = []
     for rows in problem.rows:
-        line = linearise(rows, state.cameras[rows.camera], state.trajectories[rows.label], problem.nominal[rows.camera])
+        line = linearise(rows, state.cameras[rows.camera], state.trajectories[rows.label])
         jacobian = np.zeros((len(line.index), 2, sum(sizes) + 3 * CAMERA_PARAMETERS))
         for n, first in enumerate(line.index):
             for k in range(4):
@@ -322,6 +322,6 @@ def test_the_time_offset_column_is_the_velocity() -> None:
     """A later clock moves the point along its path: the unit is pixels a second."""
     problem, state, _ = world(13)
     rows, camera = problem.rows[0], state.cameras[0]
-    line = linearise(rows, camera, state.trajectories[0], problem.nominal[0])
+    line = linearise(rows, camera, state.trajectories[0])
     lever = (rows.time[rows.use] - camera.centre)[:, None]
     np.testing.assert_allclose(line.by_camera[:, :, RATE], line.by_camera[:, :, OFFSET] * lever, atol=1e-9)
