@@ -4,8 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DATA ?= ../shared/data
+SECONDS_OF_SOAK ?= 3600
 
-.PHONY: demo test lint types contracts check proto lock bench clean
+.PHONY: demo test lint types contracts check proto lock bench faults fuzz soak clean
 
 demo: $(STAMP)
 	$(BIN)/syncline demo --out demo-out
@@ -28,6 +29,16 @@ check: test lint types contracts
 bench: $(STAMP)
 	$(BIN)/python -m tests.bench $(if $(QUICK),--quick) --data $(DATA)
 
+# What is tried beyond `make test`: faults of links and processes, more random examples, a long demo.
+faults: $(STAMP)
+	$(BIN)/python -m pytest tests/faults tests/integration
+
+fuzz: $(STAMP)
+	$(BIN)/python -m pytest tests/property tests/unit --hypothesis-profile=fuzz
+
+soak: $(STAMP)
+	$(BIN)/syncline demo --seconds $(SECONDS_OF_SOAK) --out soak-out
+
 # Regenerates the protobuf code; a test fails if it is not what the .proto says.
 proto: $(STAMP)
 	$(BIN)/python -m tests.generate_messages
@@ -45,4 +56,4 @@ $(STAMP): pyproject.toml requirements.lock
 	@touch $(STAMP)
 
 clean:
-	rm -rf $(VENV) demo-out out
+	rm -rf $(VENV) demo-out soak-out out
