@@ -48,9 +48,11 @@ def start_hub(config: HubConfig, bus: Bus, stop: threading.Event) -> int:
     """Run the hub until it is stopped; its answers are also files where `out` is given."""
     from hub.agent import run_hub
     from hub.live import LiveHub, LiveSettings
+    from hub.nodes.host import NodeHost
 
     rig = None if config.rig is None else read_rig(config.rig)
-    hub = LiveHub(LiveSettings(config.window_s, config.interval_s), rig)
+    nodes = NodeHost(config.id, config.nodes, leave_after_s=config.leave_after_s) if config.pose_nodes else None
+    hub = LiveHub(LiveSettings(config.window_s, config.interval_s, solve=config.solve), rig, nodes)
     run_hub(hub, bus, config.id, stop, rig=rig)
     if config.out is not None:
         write_last(hub, config.out)

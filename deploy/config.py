@@ -54,10 +54,19 @@ class _Agent(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class RecorderConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The recorder. out: the log to write; a folder gets a file named by the time of its start."""
+    """The recorder. out: the log to write; a folder gets a file named by the time of its start.
+
+    part_s, part_mb: begin a new file, name-000.mcap, name-001.mcap, …, when the present one is so old or so large
+    [MB]; None = one file. min_free_mb: recording ends, with a whole log, before less than this is free on the disk.
+    foxglove: also write calibration, transforms, scene and annotations as Foxglove and rerun know them.
+    """
 
     id: str = "recorder"
     out: Path = Path("recordings")
+    part_s: Seconds | None = None
+    part_mb: Annotated[float, Meta(ge=0.1, le=1e6)] | None = None
+    min_free_mb: Annotated[float, Meta(ge=0.0, le=1e9)] = 200.0
+    foxglove: bool = True
 
 
 class SimulatedConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -115,7 +124,9 @@ class CameraConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True
 class HubConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The hub. rig: what is known of the rig; out: where calibrations are written.
 
-    window_s: how much of the past is solved together; interval_s: how often it is solved again.
+    window_s: how much of the past is solved together; interval_s: how often it is solved again. solve: false = this
+    hub seeks no timing itself. nodes: cameras whose pose nodes run here whoever else is there; the others are shared
+    out among all hubs. pose_nodes: false = none run here. leave_after_s: when a camera that has gone is forgotten.
     """
 
     id: str = "hub"
@@ -123,6 +134,10 @@ class HubConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
     out: Path | None = None
     window_s: Seconds = 60.0
     interval_s: Seconds = 2.0
+    solve: bool = True
+    pose_nodes: bool = True
+    nodes: tuple[str, ...] = ()
+    leave_after_s: Seconds = 30.0
 
 
 def _check_id(text: str, what: str) -> None:

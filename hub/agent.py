@@ -6,12 +6,15 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 
 from google.protobuf.message import Message
 
 from hub.live import LiveHub
-from protocols.bus.base import Bus
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, RIG_INFO, STATUS, TRACK
+from hub.nodes.host import ROLE as NODES
+from hub.nodes.host import NodeHost
+from protocols.bus.base import Bus, Publisher
+from protocols.catalogue import CALIBRATION, CAMERA_INFO, NODE_STATE, OBSERVATION, RIG_INFO, STATUS, TRACK
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import Rig
 from protocols.version import VERSION
@@ -37,7 +40,9 @@ def run_hub(
     solved: called after every solve that gave an answer or a refusal (to write files).
     """
     boot = boot_id or uuid.uuid4().hex
-    subscriptions = [bus.subscribe(topic) for topic in (CAMERA_INFO, OBSERVATION)]
+    nodes = hub.nodes
+    topics = (CAMERA_INFO, OBSERVATION) if nodes is None else (CAMERA_INFO, OBSERVATION, NODE_STATE, CALIBRATION)
+    subscriptions = [bus.subscribe(topic) for topic in topics]
     publishers = {
         "Calibration": bus.publisher(CALIBRATION, agent),
         "Track": bus.publisher(TRACK, agent, rate_hz=200.0),
@@ -50,13 +55,28 @@ def run_hub(
         for message in messages:
             publishers[message.DESCRIPTOR.name].put(message)
 
+    node_publishers: dict[str, Publisher] = {}
+
+    def publish_nodes(host: NodeHost, now: float) -> None:
+        for state in host.tick(now):
+            if state.camera not in node_publishers:
+                node_publishers[state.camera] = bus.publisher(NODE_STATE, state.camera)
+            node_publishers[state.camera].put(state)
+
+    watch = None if nodes is None else bus.watch_agents()
     try:
-        with bus.announce(ROLE, agent, boot):
+        with bus.announce(ROLE, agent, boot), nullcontext() if nodes is None else bus.announce(NODES, agent, boot):
             while True:
                 last = stop.is_set()
+                if nodes is not None and watch is not None:
+                    for event in watch.drain():
+                        nodes.agents(event.role, event.agent, event.boot_id, alive=event.alive)
                 for subscription in subscriptions:
                     for received in subscription.drain():
-                        hub.handle(received.message)
+                        if received.agent != agent or not isinstance(received.message, pb.Calibration):
+                            hub.handle(received.message)
+                if nodes is not None:
+                    publish_nodes(nodes, time.monotonic())
                 now = time.monotonic()
                 before = hub.counters["solved"] + hub.counters["refused"]
                 publish(hub.tick(now, final=last))
@@ -73,8 +93,10 @@ def run_hub(
                     break
                 stop.wait(_TICK_S)
     finally:
-        for publisher in publishers.values():
+        for publisher in (*publishers.values(), *node_publishers.values()):
             publisher.close()
+        if watch is not None:
+            watch.close()
         for subscription in subscriptions:
             subscription.close()
 
@@ -111,6 +133,10 @@ def status_message(
     )
     for name, count in hub.counters.items():
         message.counters[name] = count
+    if hub.nodes is not None:
+        message.gauges["nodes"] = len(hub.nodes.cameras())
+        for name, count in hub.nodes.counters.items():
+            message.counters[f"nodes.{name}"] = count
     for counts in counters:
         for name, count in counts.items():
             message.counters[name] = message.counters[name] + count

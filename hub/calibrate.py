@@ -10,7 +10,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hub.distributed import PlacedByNodes
 from hub.pairs import Progress, rate_warnings, solve_pairs, timing_told
+from hub.paper_poses import all_sized, place_by_paper
 from hub.poses import covariance as cov
 from hub.poses.adjust import adjust, motion_prior, noise, residual_norms
 from hub.poses.graph import ClockGraph, ClockGuess, average_clocks, components
@@ -67,7 +69,10 @@ def calibrate(
     if known is not None:
         rig = with_known_lenses(rig, known)
     prepared = prepare(rig, observations)
-    if solver == "paper" and known is None:
+    by_sizes = solver == "paper" and known is None and all_sized(prepared, observations)
+    if by_sizes and prepared.shared_clock:
+        pairs = []  # nothing to find
+    elif solver == "paper" and known is None:
         pairs = paper_pairs(prepared, observations, tell)
     else:
         prepared, pairs = solve_pairs(prepared, tell, thorough=thorough, known=known)
@@ -80,7 +85,9 @@ def calibrate(
         if known is not None:
             solution = solve_known(prepared, pairs, known, tell)
         elif solver == "paper":
-            solution = solve_paper(prepared, pairs, tell)
+            solution = solve_paper(prepared, pairs, tell, observations if by_sizes else None)
+        elif solver == "distributed":
+            solution = solve_network(prepared, pairs, tell, PlacedByNodes(rig, prepared, observations, tell))
         else:
             solution = solve_network(prepared, pairs, tell)
         tell("covariances", 0.95)
@@ -120,17 +127,25 @@ def paper_pairs(prepared: Prepared, observations: Observations, tell: Progress) 
     return pairs
 
 
-def solve_network(prepared: Prepared, pairs: list[PairSolution], tell: Progress) -> Solution:
-    """From pairs to one adjusted network; cameras that don't fit are refused by name."""
+def solve_network(
+    prepared: Prepared, pairs: list[PairSolution], tell: Progress, nodes: PlacedByNodes | None = None
+) -> Solution:
+    """From pairs to one adjusted network; cameras that don't fit are refused by name.
+
+    nodes: places the cameras of a graph; None = one after the other, then all in one adjustment.
+    """
     refused = dict(prepared.refused)
     freedom = Freedom(clock=not prepared.shared_clock)
     graph = _connect(prepared, list(prepared.cameras), pairs, refused)
     while True:
-        scaffold, unplaced = grow(
-            prepared.cameras, graph, prepared.rows, prepared.labels, lambda text: tell(text, 0.6), freedom
-        )
+        if nodes is not None:
+            scaffold, unplaced = nodes(graph)
+        else:
+            scaffold, unplaced = grow(
+                prepared.cameras, graph, prepared.rows, prepared.labels, lambda text: tell(text, 0.6), freedom
+            )
+            scaffold = _adjust_all(scaffold, tell)
         refused |= unplaced
-        scaffold = _adjust_all(scaffold, tell)
         bad = [name for name in scaffold.names if not _fits(scaffold, name)]
         if bad:
             # The worst one goes, and what it may have spoilt is made again without it.
@@ -149,7 +164,10 @@ def solve_network(prepared: Prepared, pairs: list[PairSolution], tell: Progress)
     warnings = tuple(
         f"pair {pair.a}–{pair.b} contradicts the other pairs and was set aside" for pair in graph.contradicting
     )
-    return Solution(scaffold, tuple(pairs), _ordered(refused, prepared), prepared, "joint", warnings)
+    solver = "joint"
+    if nodes is not None:
+        solver, warnings = "distributed", warnings + nodes.warnings
+    return Solution(scaffold, tuple(pairs), _ordered(refused, prepared), prepared, solver, warnings)
 
 
 def _loosest(scaffold: Scaffold) -> tuple[str, str]:
@@ -175,12 +193,26 @@ def _loosest(scaffold: Scaffold) -> tuple[str, str]:
     return "", ""
 
 
-def solve_paper(prepared: Prepared, pairs: list[PairSolution], tell: Progress) -> Solution:
-    """Network from the paper's pairs: clocks averaged, poses by resection, nothing adjusted."""
+def solve_paper(
+    prepared: Prepared, pairs: list[PairSolution], tell: Progress, sized: Observations | None = None
+) -> Solution:
+    """Network from the paper's pairs: clocks averaged, nothing adjusted.
+
+    Poses by resection, or, where all rows tell sizes (``sized``), by the paper's distributed method.
+    """
     refused = dict(prepared.refused)
-    graph = _connect(prepared, list(prepared.cameras), pairs, refused)
+    if pairs or sized is None:
+        graph = _connect(prepared, list(prepared.cameras), pairs, refused)
+    else:
+        graph = ClockGraph({name: ClockGuess(1.0, 0.0, 0.0) for name in prepared.cameras}, (), ())
     tell("placing", 0.8)
-    scaffold, unplaced = grow(prepared.cameras, graph, prepared.rows, prepared.labels, freedom=None)
+    if sized is None:
+        scaffold, unplaced = grow(prepared.cameras, graph, prepared.rows, prepared.labels, freedom=None)
+    else:
+        scaffold, unplaced = place_by_paper(prepared, sized, graph)
+    if prepared.shared_clock:
+        freedom = replace(scaffold.problem.freedom, clock=False)
+        scaffold.problem = replace(scaffold.problem, freedom=freedom)
     scaffold.state = replace(scaffold.state, sigma=noise(scaffold.problem, scaffold.state))
     warning = "the paper's method adjusts nothing: its stds count independent noise only and are too small"
     return Solution(scaffold, tuple(pairs), _ordered(refused | unplaced, prepared), prepared, "paper", (warning,))

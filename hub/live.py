@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from google.protobuf.message import Message
 
 from hub.calibrate import calibrate
+from hub.distributed import node_calibration, with_node_poses
 from hub.messages import calibration_message, refusal_message, track_messages
+from hub.nodes.host import NodeHost
 from protocols.errors import InputError, Refused
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder
@@ -25,24 +27,32 @@ from protocols.session.rig import Rig
 class LiveSettings:
     """window_s: how much of the past is solved together. interval_s: how often.
 
-    least_rows: detections a camera must have before solving is worth a try.
+    least_rows: detections a camera must have before solving is worth a try. solve: whether timing is sought here, or
+    only pose nodes run, on a shared clock or on what another hub found.
     """
 
     window_s: float = 60.0
     interval_s: float = 2.0
     least_rows: int = 90
+    solve: bool = True
 
 
 class LiveHub:
     """Gathers what cameras see and calibrates them again and again.
 
     rig: what the hub knows of the rig from its own rig.toml: references, distances, up; the cameras'
-    intrinsics come from the cameras unless it has them.
+    intrinsics come from the cameras unless it has them. nodes: this hub's pose nodes; then the published poses are
+    the network's as soon as it has settled, and the solver's timing is theirs.
     """
 
-    def __init__(self, settings: LiveSettings | None = None, rig: Rig | None = None) -> None:
+    def __init__(
+        self, settings: LiveSettings | None = None, rig: Rig | None = None, nodes: NodeHost | None = None
+    ) -> None:
         self.settings = settings or LiveSettings()
         self._rig = rig
+        self.nodes = nodes
+        if nodes is not None and rig is not None and rig.shared_clock:
+            nodes.share_clock()
         self._builder = SessionBuilder(self.settings.window_s)
         self._next = 0.0
         self._revision = 0
@@ -58,6 +68,8 @@ class LiveHub:
     def handle(self, message: Message) -> None:
         """Take one message from the bus or a log."""
         self._builder.handle(message)
+        if self.nodes is not None:
+            self.nodes.handle(message)
         if isinstance(message, pb.Observation):
             self._heard += 1
             self.counters["observations"] += 1
@@ -82,6 +94,8 @@ class LiveHub:
         if not final and now < self._next:
             return []
         self._next = now + self.settings.interval_s
+        if not self.settings.solve:
+            return self._solve()
         if self._solved_at == self._heard and not final:
             return []
         self._solved_at = self._heard
@@ -97,7 +111,7 @@ class LiveHub:
             rig, observations = self._builder.build()
             rig = merged(rig, self._rig)
             self.session = (rig, observations)
-            self.calibration = calibrate(rig, observations)
+            self.calibration = self._answer(rig, observations)
             self.refusal = None
         except Refused as refusal:
             self.counters["refused"] += 1
@@ -118,6 +132,16 @@ class LiveHub:
                 self._published[table.label] = float(table.time[-1])
             out.extend(tracks)
         return out
+
+    def _answer(self, rig: Rig, observations: Observations) -> Calibration:
+        if not self.settings.solve:
+            return node_calibration(rig, self.nodes)
+        found = calibrate(rig, observations)
+        if self.nodes is None:
+            return found
+        boots = {name: self._builder.boot(name) for name in found.cameras}
+        self.nodes.handle(calibration_message(found, self._revision, boots))
+        return with_node_poses(found, rig, self.nodes)
 
 
 def merged(heard: Rig, own: Rig | None) -> Rig:

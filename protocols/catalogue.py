@@ -60,8 +60,9 @@ RIG_INFO = Topic("rig_info", "hub/{id}/rig", "RigInfo", 0.1, True, Delivery.LATE
 CALIBRATION = Topic("calibration", "hub/{id}/calibration", "Calibration", 0.5, True, Delivery.LATEST, 64, 0.0)
 TRACK = Topic("track", "hub/{id}/track", "Track", 30.0, True, Delivery.RELIABLE, 4096, 0.0)
 STATUS = Topic("status", "agent/{id}/status", "AgentStatus", 1.0, True, Delivery.LATEST, 1024, 5.0)
+NODE_STATE = Topic("node_state", "node/{id}/state", "NodeState", 10.0, True, Delivery.LATEST, 4096, 2.0)
 
-TOPICS: tuple[Topic, ...] = (OBSERVATION, CAMERA_INFO, RIG_INFO, CALIBRATION, TRACK, STATUS)
+TOPICS: tuple[Topic, ...] = (OBSERVATION, CAMERA_INFO, RIG_INFO, CALIBRATION, TRACK, STATUS, NODE_STATE)
 BY_NAME: dict[str, Topic] = {topic.name: topic for topic in TOPICS}
 
 

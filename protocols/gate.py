@@ -68,7 +68,7 @@ def message_class(topic: Topic) -> type[Message]:
 
 def sender(message: Message) -> str | None:
     """The id that a message claims to come from; None for kinds that name no sender."""
-    if isinstance(message, pb.Observation | pb.CameraInfo):
+    if isinstance(message, pb.Observation | pb.CameraInfo | pb.NodeState):
         return message.camera
     if isinstance(message, pb.AgentStatus):
         return message.agent

@@ -265,6 +265,31 @@ def _agent_status(message: pb.AgentStatus) -> None:
             _number(value, "a counter or gauge")
 
 
+def _node_edge(edge: pb.NodeEdge) -> None:
+    _id(edge.neighbour, "neighbour")
+    for values, name, length in (
+        (edge.rotation, "rotation", 3),
+        (edge.centre, "centre", 3),
+        (edge.hessian, "hessian", 21),
+        (edge.gradient, "gradient", 6),
+    ):
+        _vector(values, name, (length,))
+    _number(edge.count, "count", 0.0)
+
+
+def _node_state(message: pb.NodeState) -> None:
+    _id(message.camera, "camera")
+    _id(message.host, "host")
+    _id(message.frame, "frame")
+    _id(message.partner, "partner", optional=True)
+    _vector(message.rotation, "rotation", (0, 3))
+    _vector(message.position, "position", (len(message.rotation),))
+    _count(message.edges, "edges", MAX_CAMERAS)
+    for edge in message.edges:
+        _node_edge(edge)
+    _distinct((edge.neighbour for edge in message.edges), "neighbour")
+
+
 _RULES: dict[str, Callable[[Any], None]] = {
     "Observation": _observation,
     "CameraInfo": _camera_info,
@@ -272,4 +297,5 @@ _RULES: dict[str, Callable[[Any], None]] = {
     "Calibration": _calibration,
     "Track": _track,
     "AgentStatus": _agent_status,
+    "NodeState": _node_state,
 }

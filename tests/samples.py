@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from google.protobuf.message import Message
 
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, RIG_INFO, STATUS, TRACK, Topic
+from protocols.catalogue import CALIBRATION, CAMERA_INFO, NODE_STATE, OBSERVATION, RIG_INFO, STATUS, TRACK, Topic
 from protocols.messages import syncline_pb2 as pb
 
 MATRIX = [600.0, 0.0, 319.5, 0.0, 600.0, 239.5, 0.0, 0.0, 1.0]
@@ -131,6 +131,36 @@ def status(agent: str = "cam0", sequence: int = 0) -> pb.AgentStatus:
     )
 
 
+def node_state(camera: str = "cam0", sequence: int = 0) -> pb.NodeState:
+    """A settled pose node with one edge."""
+    edge = pb.NodeEdge(
+        neighbour="cam1",
+        rotation=[0.1, 0.2, 0.3],
+        centre=[1.0, 2.0, 3.0],
+        hessian=[float(i + 1) for i in range(21)],
+        gradient=[0.1] * 6,
+        count=96.0,
+        bearings=True,
+    )
+    return pb.NodeState(
+        schema_version=1,
+        camera=camera,
+        host="hub",
+        takeover=1,
+        sequence=sequence,
+        epoch=2,
+        frame="cam0",
+        hops=1,
+        depth=2,
+        rotation=[0.1, 0.2, 0.3],
+        position=[1.0, 2.0, 3.0],
+        settled=40,
+        partner="cam1",
+        leaving=True,
+        edges=[edge],
+    )
+
+
 SAMPLES: dict[Topic, Callable[[], Message]] = {
     OBSERVATION: observation,
     CAMERA_INFO: camera_info,
@@ -138,6 +168,7 @@ SAMPLES: dict[Topic, Callable[[], Message]] = {
     CALIBRATION: calibration,
     TRACK: track,
     STATUS: status,
+    NODE_STATE: node_state,
 }
 
 

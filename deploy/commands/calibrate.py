@@ -17,6 +17,7 @@ from deploy.sessions import load_session
 from protocols.errors import EXIT_DONE, InputError, Refused
 from protocols.files import check_folder
 from protocols.session.calibration import Known, read_calibration
+from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
 
@@ -28,6 +29,7 @@ def calibrate(
     observations: Path | None = None,
     solver: Literal["joint", "distributed", "paper"] = "joint",
     from_known: Path | None = None,
+    marker: Path | None = None,
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
@@ -36,31 +38,39 @@ def calibrate(
     Writes calibration.toml, trajectory.csv, result.json and report.html to --out. Exit status 0 if at least
     two cameras are solved, 3 if the data hold no trustworthy answer (then only result.json and report.html).
 
+    Of a folder of videos, one a camera and named after it, each is looked through for the marker first; the session
+    that comes of it is kept in --out as session/, and videos that have not changed are not looked through again.
+    A rig.toml among the videos tells their lenses (`syncline intrinsics`).
+
     Example: syncline calibrate my-session --out out
+
+    Example: syncline calibrate my-videos --out out
 
     Parameters
     ----------
     session
-        A folder with rig.toml and observations.csv, or a .mcap log that Syncline recorded.
+        A folder with rig.toml and observations.csv, a .mcap log that Syncline recorded, or a folder of videos.
     out
         Folder for the results.
     observations
         Another observations file to use instead of the session's own.
     solver
-        joint: everything in one adjustment. paper: the paper's alternating method.
+        joint: everything in one adjustment. distributed: poses by pose nodes that talk with their
+        neighbours, in one process. paper: the paper's alternating method.
     from_known
         A calibration.toml whose intrinsics and poses are kept; only timing and path are found.
+    marker
+        Of videos: what the marker looks like, as `syncline detect --teach` wrote it. Default: marker.toml among
+        the videos, or else the orange ball of the demo.
     json
         Print the result as JSON on standard output.
     seed
         Recorded with the result; the solvers draw nothing at random.
     """
     check_folder(out)
-    if solver == "distributed":
-        raise InputError("--solver distributed is not in this version", remedy="use --solver joint")
     if from_known is not None and solver != "joint":
         raise InputError("--from-known goes with --solver joint", remedy="leave one of the two out")
-    rig, seen, warnings = load_session(session, observations)
+    rig, seen, warnings = _load(session, observations, out, marker, json)
     known = None
     if from_known is not None:
         known, rig = _known(from_known, rig)
@@ -80,6 +90,24 @@ def calibrate(
     result = replace(result, cpu_seconds=time.process_time() - began, warnings=warnings + result.warnings)
     write_outputs(out, result, rig, seen, command, echo_json=json)
     return EXIT_DONE
+
+
+def _load(
+    session: Path, observations: Path | None, out: Path, marker: Path | None, quiet: bool
+) -> tuple[Rig, Observations, tuple[str, ...]]:
+    """A session as it is, or one made of a folder of videos. Raises InputError."""
+    if observations is None and session.is_dir() and not (session / "observations.csv").exists():
+        from deploy.video_folder import SESSION, gather_session, holds_videos
+
+        if holds_videos(session):
+            with progress_bar("looking for the marker", quiet=quiet) as tell:
+                gathered = gather_session(session, out / SESSION, tell, marker)
+            for line in () if quiet else gathered.told:
+                print(line)
+            return gathered.rig, gathered.observations, gathered.warnings
+    if marker is not None:
+        raise InputError("--marker goes with a folder of videos", remedy="leave it out for a session")
+    return load_session(session, observations)
 
 
 def _known(file: Path, rig: Rig) -> tuple[Known, Rig]:

@@ -17,14 +17,20 @@ from protocols.geometry.types import Floats
 
 RAW = 96
 """Raw observations kept: 24 + 8 bytes each."""
-_TRY_AT = (12, 18, 24, 36, 48, 72, RAW)
-_REFINE_AT = (24, 48, RAW)
+_TRY_AT = (12, 18, 24, 36, 48, 72, *(96 * 2**n for n in range(12)))
+_REFINE_AT = (24, 48, *(96 * 2**n for n in range(12)))
+_MOST_TRIED = 400
+"""Observations that a beginning looks at, spread over all."""
+_TURN_STD, _CENTRE_STD = 0.05, 0.15
+"""Most uncertain rotation [rad] and centre (share of its distance) with which an edge begins: a target that moves on
+in a line for a second fits a family of poses."""
 _AGREES = 20.0
 """Half chi2 (6 dof) up to which the network's prediction is taken for the place to linearise."""
 _STREAM_AGREES = 8.0
 """The same for streamed observations, which are linearised once: a poor place would refuse good ones."""
 _MOVED = 0.05
 """Chi2 by which the prediction may move before the raw observations are linearised anew."""
+_LONGEST_STRIDE = 16
 _SHARE_LOST = 0.45
 _SHARE_MEMORY = 1.0 / 24.0
 _MEMORY = 200_000.0
@@ -60,7 +66,12 @@ class Summary:
         return _solve(self.hessian, -self.gradient)
 
     def excess(self, pose: Relative) -> float:
-        """How much half chi2 at ``pose`` lies above the minimum."""
+        """How much half chi2 at ``pose`` lies above the minimum.
+
+        Infinite on the other side of the camera: along a baseline of free length the quadratic tells nothing.
+        """
+        if self.bearings and float(self.anchor.centre @ pose.centre) <= 0.0:
+            return float("inf")
         step, best = self.step_to(pose), self.best_step()
         apart = step - best
         return 0.5 * float(apart @ self.hessian @ apart)
@@ -86,28 +97,41 @@ class Summary:
 class Window:
     """Robust sums of the latest observations about the network's prediction, for the test on bumps."""
 
-    hessian: Floats
-    gradient: Floats
+    sums: Floats
+    """(42,): Hessian (36) and gradient (6)."""
     count: int = 0
 
     @classmethod
     def empty(cls) -> Window:
         """Nothing seen yet."""
-        return cls(np.zeros((6, 6)), np.zeros(6))
+        return cls(np.zeros(42))
 
-    def add(self, terms: Terms, gate: Floats) -> None:
-        """Takes in a batch; far residuals count with a bounded pull, so that outliers don't look like motion."""
-        weight = np.where(terms.ahead, np.minimum(1.0, gate / np.maximum(terms.chi2, 1e-12)), 0.0)
-        self.hessian = self.hessian + (weight @ terms.hessian.reshape(-1, 36)).reshape(6, 6)
-        self.gradient = self.gradient + weight @ terms.gradient
-        self.count += len(weight)
+    @property
+    def hessian(self) -> Floats:
+        """(6, 6)."""
+        return self.sums[:36].reshape(6, 6)
+
+    @property
+    def gradient(self) -> Floats:
+        """(6,)."""
+        return self.sums[36:]
+
+    def add(self, sums: Floats, count: int) -> None:
+        """Takes in the sums of a batch."""
+        self.sums = self.sums + sums
+        self.count += count
 
 
 class Edge:
-    """One neighbour's edge. ``add`` observations; then ``flush_raw``, or `stream` for those that keep none."""
+    """One neighbour's edge. ``add`` observations; then ``flush_raw``, or `stream` for those that keep none.
 
-    def __init__(self, neighbour: int, rng: np.random.Generator) -> None:
+    raw: how many observations are kept raw. An edge that could not begin by then keeps every second, fourth, … of
+    what comes, until they tell the pose.
+    """
+
+    def __init__(self, neighbour: int, rng: np.random.Generator, raw: int = RAW) -> None:
         self.neighbour = neighbour
+        self.raw = raw
         self.summary: Summary | None = None
         self.began = False
         self._own: Relative | None = None
@@ -121,6 +145,7 @@ class Edge:
         self._tried = 0
         self._linearised = 0
         self._refused = False
+        self._stride, self._skipped = 1, 0
         self.contradictions = 0
 
     @property
@@ -149,16 +174,26 @@ class Edge:
         """A row of 10: x, y, log size in this camera and in the neighbour; then the four weights."""
         self._pending.append(row)
 
-    def reset(self) -> None:
-        """Forget everything: one of the cameras moved, or the edge began badly."""
-        self.__init__(self.neighbour, self._rng)  # type: ignore[misc]
+    def reset(self, *, badly: bool = False) -> None:
+        """Forget everything: one of the cameras moved, or the edge began ``badly``: then look at a longer stretch."""
+        stride = min(2 * self._stride, _LONGEST_STRIDE) if badly else 1
+        self.__init__(self.neighbour, self._rng, self.raw)  # type: ignore[misc]
+        self._stride = stride
+
+    def resume(self, summary: Summary) -> None:
+        """Goes on with what was learnt elsewhere."""
+        self.summary, self.began, self._keeps_raw = summary, True, False
 
     def flush_raw(self, predicted: Relative | None) -> None:
         """Take the waiting observations in while they are kept raw. predicted: where the network sees the neighbour."""
         fresh = self.drain()
+        if self._stride > 1:
+            at = self._skipped + np.arange(len(fresh))
+            self._skipped += len(fresh)
+            fresh = fresh[at % self._stride == 0]
         if len(fresh):
             self._take_raw(fresh[:, :6], fresh[:, 6:])
-        full = len(self._raw_rows) >= RAW
+        full = len(self._raw_rows) >= self.raw
         if full or len(self._raw_rows) >= 1.2 * self._linearised or len(self._raw_rows) in _TRY_AT:
             self.linearise_again(predicted)
         if full:
@@ -199,26 +234,35 @@ class Edge:
         """
         summary = self.summary
         assert summary is not None
-        inside = (terms.ahead & (terms.chi2 < gate)).astype(np.float64)
-        fade = max(0.0, 1.0 - len(inside) / _MEMORY)
+        inside = terms.ahead & (terms.chi2 < gate)
+        # For the windows far residuals count with a bounded pull, so that outliers don't look like motion.
+        near = np.minimum(1.0, gate / np.maximum(terms.chi2, 1e-12)) * terms.ahead
+        count = len(inside)
+        rows = np.concatenate([terms.hessian.reshape(count, 36), terms.gradient], axis=1)
+        certain, bounded = np.array([inside, near]) @ rows
+        taken = int(np.count_nonzero(inside))
+        fade = max(0.0, 1.0 - count / _MEMORY)
         self.summary = Summary(
             summary.anchor,
-            summary.hessian * fade + (inside @ terms.hessian.reshape(-1, 36)).reshape(6, 6),
-            summary.gradient * fade + inside @ terms.gradient,
-            summary.count * fade + float(inside.sum()),
+            summary.hessian * fade + certain[:36].reshape(6, 6),
+            summary.gradient * fade + certain[36:],
+            summary.count * fade + taken,
             summary.bearings,
         )
-        self.short.add(terms, gate)
-        self.long.add(terms, gate)
-        for good in inside:
-            self.share += (float(good) - self.share) * _SHARE_MEMORY
+        self.short.add(bounded, count)
+        self.long.add(bounded, count)
+        # As if they had come one by one, in any order.
+        self.share = taken / count + (self.share - taken / count) * (1.0 - _SHARE_MEMORY) ** count
         return self.share < _SHARE_LOST
 
-    def linearise_again(self, predicted: Relative | None) -> None:
-        """Raw observations only: the summary about the best pose known now."""
+    def linearise_again(self, predicted: Relative | None, *, spare: float = 0.0) -> None:
+        """Raw observations only: the summary about the best pose known now.
+
+        spare: share of new observations that may wait for the next time.
+        """
         if not self._keeps_raw or not len(self._raw_rows):
             return
-        if self._still_good(predicted):
+        if len(self._raw_rows) <= (1.0 + spare) * self._linearised and self._still_good(predicted):
             return
         rows, weights = self._raw_observations()
         self._linearised = len(rows)
@@ -235,7 +279,7 @@ class Edge:
 
     def _still_good(self, predicted: Relative | None) -> bool:
         """Nothing new, and the network's prediction hardly moved against what the edge knows."""
-        if self.summary is None or self._linearised != len(self._raw_rows):
+        if self.summary is None:
             return False
         if predicted is None:
             return True
@@ -257,14 +301,22 @@ class Edge:
         if not due:
             return
         self._tried = due[-1]
-        if self.began and not any(at in due for at in _REFINE_AT):
+        doubled = any(at in due for at in _REFINE_AT)
+        if self.began and not doubled:
             return
+        gate = gate_of(weights)
+        candidates = []
         if self._own is not None and self.summary is not None:
-            self._own = refine(self._own, rows, weights, self.summary.bearings)
-            return
-        found = begin(rows, weights, self._rng)
-        if found is not None:
-            self._own, self.began = found[0], True
+            candidates.append(refine(self._own, rows, weights, self.summary.bearings))
+        if self._own is None or doubled:
+            # What fitted a short path may be wrong about a long one: each doubling is a chance to begin anew.
+            pick = np.linspace(0, n - 1, min(n, _MOST_TRIED)).astype(np.int64)
+            found = begin(rows[pick], weights[pick], self._rng)
+            if found is not None and _well_told(found[0], rows, weights):
+                candidates.append(found[0])
+        if candidates:
+            self._own = min(candidates, key=lambda pose: loss(linearise(pose, rows, weights), gate))
+            self.began = True
 
     def _where(self, rows: Floats, weights: Floats, predicted: Relative | None) -> Relative | None:
         """The pose to linearise about: the network's unless the edge's own observations contradict it."""
@@ -279,9 +331,10 @@ class Edge:
         return self._own if self._refused else predicted
 
     def _drop_raw(self) -> None:
-        if self.summary is None:  # they agree on nothing: keep the later half
-            self._raw_rows, self._raw_weights = self._raw_rows[RAW // 2 :], self._raw_weights[RAW // 2 :]
-            self._tried = 0
+        if self.summary is None:  # they tell no pose yet: spread what is kept over twice the time
+            self._raw_rows, self._raw_weights = self._raw_rows[::2], self._raw_weights[::2]
+            self._stride, self._skipped = 2 * self._stride, 0
+            self._tried = len(self._raw_rows)
             return
         self._keeps_raw = False
         self._raw_rows, self._raw_weights = self._raw_rows[:0], self._raw_weights[:0]
@@ -309,6 +362,22 @@ def stream(edges: list[tuple[Edge, Relative | None]]) -> list[Edge]:
             bad.append(edge)
         at += count
     return bad
+
+
+def _well_told(pose: Relative, rows: Floats, weights: Floats) -> bool:
+    """Whether the observations fix the pose: rotation, and centre (with bearings only its direction)."""
+    hessian, _ = total(linearise(pose, rows, weights), gate_of(weights))
+    length = max(float(np.linalg.norm(pose.centre)), 1e-12)
+    along = np.concatenate([np.zeros(3), pose.centre / length])
+    if not (weights[:, [1, 3]] > 0).any():
+        hessian = hessian + np.outer(along, along) / length**2  # the distance is free: as good as known to itself
+    scale = np.array([1.0, 1.0, 1.0, length, length, length])
+    values, vectors = np.linalg.eigh(hessian * scale * scale[:, None])
+    spread = vectors / np.sqrt(np.maximum(values, 1e-12))
+    if not (weights[:, [1, 3]] > 0).any():
+        spread[3:] -= np.outer(along[3:], along[3:] @ spread[3:])
+    turn, centre = np.linalg.norm(spread[:3], ord=2), np.linalg.norm(spread[3:], ord=2)
+    return bool(turn < _TURN_STD and centre < _CENTRE_STD)
 
 
 def _solve(hessian: Floats, right: Floats) -> Floats:

@@ -8,23 +8,23 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
-from hub.nodes.begin import resect
 from hub.nodes.bump import Motion, camera_moved
-from hub.nodes.edge import Edge, stream
+from hub.nodes.edge import RAW, Edge, Summary, Window, stream
 from hub.nodes.gauge import reference_edge, usable, world_from_network
+from hub.nodes.joining import placed, placed_by_many
 from hub.nodes.messages import Anchor, Message, Notice, Out, Reference, SharedObservation, StateMessage
-from hub.nodes.pairing import Pairing
+from hub.nodes.neighbour import Neighbour
+from hub.nodes.pairing import GAP, Pairing
 from hub.nodes.solve import (
     Term,
     moved,
     normal_equations,
     one_term,
-    placed_by,
-    ray_meeting,
     relative,
     step_between,
 )
@@ -32,7 +32,7 @@ from hub.nodes.two_cameras import Relative
 from protocols.geometry.pose import Pose, Similarity
 from protocols.geometry.types import Floats
 
-_BATCH = 16
+_BATCH = 24
 """Observations that are taken in together: the cost of a batch hardly depends on its size."""
 _PATIENCE = 4
 """Updates that an observation waits at the longest."""
@@ -40,8 +40,6 @@ _RESECT_EVERY = 20
 """Updates between two tries to join by several neighbours."""
 _YOUNG = 100
 """Updates after joining during which nothing waits."""
-_SEQUENCES = 256
-"""Messages of one camera that may overtake each other."""
 _MOST_ANCHORS = 8
 _LONGEST_TURN = 0.3
 """Longest turn [rad] of one update, and longest shift as a share of the distance to the neighbours."""
@@ -51,24 +49,31 @@ _ROUTED = 20
 """Updates after which the hops to the frame's owner are the shortest."""
 _DAMPING = 0.5
 """Share of the block's step: with it, neighbours that move at once cannot overshoot, with or without momentum."""
+_SILENT = 20
+"""Updates after which a neighbour that is not heard of holds nobody up."""
+_CALM, _CALM_UPDATES = 9.0, 5
+"""Chi2 that a step may gain, and for how many updates in a row, while bumps are looked for."""
 _CONTRADICTED = 60.0
 _CONTRADICTIONS = 30
 
 
-@dataclass(slots=True, eq=False)
-class _Neighbour:
-    edge: Edge
-    boot: int = -1
-    highest: int = -1
-    bits: int = 0
-    state: StateMessage | None = None
-
-
 class PoseNode:
-    """One camera. camera: its number; lower numbers own the network's frame. seed: of its random choices."""
+    """One camera. camera: its number; lower numbers own the network's frame. seed: of its random choices.
+
+    raw: observations that it keeps of each neighbour to linearise again; more is more exact, and dearer. gap: longest
+    time [s] across which a target is interpolated; 0 where one clock stamps all, and nothing need move smoothly.
+    """
 
     def __init__(
-        self, camera: int, *, boot: int = 0, reference: Reference | None = None, seed: int = 0, depth: int = 0
+        self,
+        camera: int,
+        *,
+        boot: int = 0,
+        reference: Reference | None = None,
+        seed: int = 0,
+        depth: int = 0,
+        raw: int = RAW,
+        gap: float = GAP,
     ) -> None:
         self.camera = camera
         self.boot = boot
@@ -81,16 +86,19 @@ class PoseNode:
         self.updates = 0
         self.settled = 0
         self._depth = depth
-        self._ahead = self.pose
+        self._raw = raw
+        self._ahead: Pose | None = self.pose
         self._momentum = 0
         self._sequence = 0
         self._partner = -1
         self._rng = np.random.default_rng([seed, camera])
-        self._pairing = Pairing()
-        self._neighbours: dict[int, _Neighbour] = {}
+        self._pairing = Pairing(gap)
+        self._neighbours: dict[int, Neighbour] = {}
         self._anchors: dict[int, Anchor] = {}
         self._recovering = 0
         self._waiting = 0
+        self._lost = 0
+        self._calm = 0
 
     # messages
 
@@ -142,6 +150,29 @@ class PoseNode:
             anchors=anchors,
         )
 
+    def revise(self) -> None:
+        """Takes in all that waits, and linearises what is kept raw about where the cameras stand now."""
+        self._take_in()
+        for neighbour in self._neighbours.values():
+            neighbour.edge.linearise_again(self._predicted(neighbour))
+
+    def summaries(self) -> dict[int, Summary]:
+        """What has been learnt of each neighbour, for another host to go on with."""
+        edges = self.neighbours().items()
+        return {camera: edge.summary for camera, edge in edges if edge.summary is not None and edge.began}
+
+    def resume(self, state: StateMessage, edges: Mapping[int, Summary]) -> None:
+        """Goes on where another host of this camera's node ended."""
+        self.epoch, self.frame, self.hops = state.epoch, state.frame, state.hops
+        self.pose = self._ahead = state.pose
+        self.settled, self._depth, self._partner = state.settled, state.depth, state.partner
+        for camera, summary in edges.items():
+            self._neighbour(camera).edge.resume(summary)
+
+    def forget_tracks(self) -> None:
+        """What waits to be paired is void: a clock's map has changed."""
+        self._pairing = Pairing(self._pairing.gap)
+
     # read-out
 
     def world(self) -> Similarity | None:
@@ -183,40 +214,20 @@ class PoseNode:
                 out += self._pair(self._neighbour(camera), row)
             return out
         neighbour = self._neighbour(seen.camera)
-        if not self._is_new(neighbour, seen):
+        reason = neighbour.refuses(seen)
+        if reason:
+            self.refused[reason] += 1
             return []
         met = self._pairing.other(seen)
         return [] if met is None else self._pair(neighbour, met[1])
 
-    def _is_new(self, neighbour: _Neighbour, seen: SharedObservation) -> bool:
-        """False for a duplicate, and for one so late that it may be one (METHODS C, step 1)."""
-        if seen.boot != neighbour.boot:
-            if seen.boot < neighbour.boot:
-                self.refused["earlier boot"] += 1
-                return False
-            neighbour.boot, neighbour.highest, neighbour.bits = seen.boot, -1, 0
-        ahead = seen.sequence - neighbour.highest
-        if ahead > 0:
-            neighbour.bits = ((neighbour.bits << ahead) | 1) & ((1 << _SEQUENCES) - 1) if ahead < _SEQUENCES else 1
-            neighbour.highest = seen.sequence
-            return True
-        if -ahead >= _SEQUENCES:
-            self.refused["too late"] += 1
-            return False
-        bit = 1 << -ahead
-        if neighbour.bits & bit:
-            self.refused["duplicate"] += 1
-            return False
-        neighbour.bits |= bit
-        return True
-
-    def _neighbour(self, camera: int) -> _Neighbour:
+    def _neighbour(self, camera: int) -> Neighbour:
         found = self._neighbours.get(camera)
         if found is None:
-            found = self._neighbours[camera] = _Neighbour(Edge(camera, self._rng))
+            found = self._neighbours[camera] = Neighbour(Edge(camera, self._rng, self._raw))
         return found
 
-    def _pair(self, neighbour: _Neighbour, row: tuple[float, ...]) -> list[Out]:
+    def _pair(self, neighbour: Neighbour, row: tuple[float, ...]) -> list[Out]:
         neighbour.edge.add(row)
         self._waiting += 1
         return self._take_in() if self._waiting >= _BATCH else []
@@ -232,18 +243,18 @@ class PoseNode:
                 neighbour.edge.flush_raw(self._predicted(neighbour))
         out: list[Out] = []
         for edge in stream(streaming):
-            edge.reset()
+            edge.reset(badly=True)
             told = f"most of what {edge.neighbour} shares contradicts the edge"
             out.append(Notice(self.camera, "edge begun again", told))
         return self._find_bump() + out
 
-    def _predicted(self, neighbour: _Neighbour) -> Relative | None:
+    def _predicted(self, neighbour: Neighbour) -> Relative | None:
         other = self._standing(neighbour)
         if other is None or self.pose is None or self.settled < _TRUST_AFTER or neighbour.state is None:
             return None
         return relative(self.pose, other) if neighbour.state.settled >= _TRUST_AFTER else None
 
-    def _standing(self, neighbour: _Neighbour) -> Pose | None:
+    def _standing(self, neighbour: Neighbour) -> Pose | None:
         """The neighbour's pose if it is in this camera's frame."""
         state = neighbour.state
         return state.pose if state is not None and state.frame == self.frame else None
@@ -265,7 +276,7 @@ class PoseNode:
             return []
         if last is not None and (state.boot, state.epoch) != (last.boot, last.epoch):
             neighbour.edge.reset()
-        neighbour.state = state
+        neighbour.state, neighbour.stale = state, 0
         if state.frame == self.frame:
             self.hops = min(self.hops, state.hops + 1)
         if state.frame == self.frame and self.settled > _ROUTED:
@@ -304,7 +315,7 @@ class PoseNode:
             return self._join_by_many()
         frame = min(state.frame for state, _ in offers)
         offers = [offer for offer in offers if offer[0].frame == frame]
-        pose = self._placed(offers, frame)
+        pose = placed(self.camera, offers, frame)
         if pose is None:
             return []
         self.pose = self._ahead = pose
@@ -320,56 +331,25 @@ class PoseNode:
         if self.updates % _RESECT_EVERY or not states:
             return []
         frame = min(state.frame for state in states)
-        mine, there, spread = [], [], []
-        for neighbour in self._neighbours.values():
-            state = neighbour.state
-            if state is None or state.frame != frame or state.pose is None or state.settled < _TRUST_AFTER:
-                continue
-            own, other, std = neighbour.edge.points()
-            mine.append(own)
-            there.append(state.pose.world_from_camera(other))
-            spread.append(std)
-        if not mine:
+        placed_ones = [
+            (n.state, n.edge)
+            for n in self._neighbours.values()
+            if n.state is not None and n.state.frame == frame and n.state.settled >= _TRUST_AFTER
+        ]
+        pose = placed_by_many(placed_ones, self._rng)
+        if pose is None:
             return []
-        found = resect(np.concatenate(mine), np.concatenate(there), np.concatenate(spread), self._rng)
-        if found is None:
-            return []
-        self.pose = self._ahead = Pose(found.rotation, found.centre)
+        self.pose = self._ahead = pose
         self.hops = 1 + min(state.hops for state in states if state.frame == frame)
         self.frame, self.settled, self._momentum, self._partner = frame, 0, 0, -1
         self._depth = max(state.depth for state in states if state.frame == frame)
         return [Notice(self.camera, "joined", f"the frame of {frame}, by several neighbours")]
 
-    def _placed(self, offers: list[tuple[StateMessage, Edge]], frame: int) -> Pose | None:
-        def strength(edge: Edge) -> float:
-            assert edge.summary is not None
-            return float(np.linalg.slogdet(edge.summary.hessian + 1e-9 * np.eye(6))[1])
-
-        state, edge = max(offers, key=lambda offer: strength(offer[1]))
-        assert edge.summary is not None
-        assert state.pose is not None
-        best = edge.summary.anchor.moved(edge.summary.best_step())
-        if not edge.summary.bearings:
-            return placed_by(state.pose, best)
-        partner = next(
-            (offer for offer in offers if offer[0].camera == frame and offer[0].partner == self.camera), None
-        )
-        if partner is not None:
-            assert partner[1].summary is not None
-            assert partner[0].pose is not None
-            seen = partner[1].summary.anchor
-            return placed_by(partner[0].pose, seen.scaled(1.0 / float(np.linalg.norm(seen.centre))))
-        if len(offers) < 2:
-            return None
-        rotation = best.rotation.T @ state.pose.rotation
-        rays = []
-        for other, its in offers:
-            assert its.summary is not None
-            assert other.pose is not None
-            centre = its.summary.anchor.centre
-            rays.append((other.pose, centre / np.linalg.norm(centre)))
-        met = ray_meeting(rays, rotation)
-        return None if met is None else Pose(rotation, met[0])
+    def _leave_frame(self) -> None:
+        """Not localised any more; the edges stay."""
+        self.frame, self.hops, self._depth, self._partner = self.camera, 0, 0, -1
+        self.pose = self._ahead = Pose.identity()
+        self.settled = self._momentum = self._lost = 0
 
     # the update
 
@@ -401,7 +381,7 @@ class PoseNode:
             return
         for neighbour in self._neighbours.values():
             if not neighbour.edge.streaming and neighbour.edge.seen and (self.updates + self.camera) % 8 == 0:
-                neighbour.edge.linearise_again(self._predicted(neighbour))
+                neighbour.edge.linearise_again(self._predicted(neighbour), spare=0.1)
         terms = self._terms()
         self.settled += 1
         if not terms:
@@ -411,7 +391,12 @@ class PoseNode:
             self._recovering -= 1
         scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
         normalised = hessian / scale / scale[:, None] + 1e-6 * np.eye(6)
-        step = -_DAMPING * np.linalg.solve(normalised, gradient / scale) / scale
+        full = -np.linalg.solve(normalised, gradient / scale) / scale
+        self._calm = self._calm + 1 if -float(gradient @ full) < _CALM else 0
+        # Going on towards neighbours that have not been heard of since would end in a full step: then two hosts that
+        # hear each other late would chase each other for ever. So the steps after the first one halve.
+        patience = 0.5 ** self._oldest()
+        step = _DAMPING * patience * full
         distance = float(np.median([np.linalg.norm(t.other.position - self._ahead.position) for t in terms])) + 1e-9
         length = max(
             float(np.linalg.norm(step[:3])) / _LONGEST_TURN, float(np.linalg.norm(step[3:])) / (0.3 * distance)
@@ -425,7 +410,14 @@ class PoseNode:
         # The farther the network reaches, the longer it takes to bend back: depth is its size in hops.
         most = 1.0 - 1.0 / (2.0 + 7.0 * self._depth)
         share = min(self._momentum / (self._momentum + 3.0), most)
-        self._ahead = moved(found, share * carried)
+        self._ahead = moved(found, share * patience * carried)
+
+    def _oldest(self) -> int:
+        """Own updates since the neighbour last heard of was heard; those who have fallen silent don't count."""
+        ages = [n.stale for n in self._neighbours.values() if self._standing(n) is not None and n.stale <= _SILENT]
+        for neighbour in self._neighbours.values():
+            neighbour.stale += 1
+        return max(ages, default=0)
 
     # health
 
@@ -439,12 +431,21 @@ class PoseNode:
             other, summary = self._standing(neighbour), neighbour.edge.summary
             if other is not None and summary is not None and neighbour.edge.began:
                 judged.append((summary.excess(relative(self.pose, other)), neighbour.edge))
+        against = sum(excess > _CONTRADICTED for excess, _ in judged)
+        if against > 0.5 * len(judged) and self.frame != self.camera:
+            # Most edges contradict the pose: it was joined by edges that were wrong then. Leave, and join again.
+            self._lost += 1
+            if self._lost > _CONTRADICTIONS:
+                self._leave_frame()
+                return [Notice(self.camera, "joins again", f"{against} of {len(judged)} edges contradict its pose")]
+        else:
+            self._lost = max(0, self._lost - 1)
         calm = sum(excess < 0.3 * _CONTRADICTED for excess, _ in judged)
         for excess, edge in judged:
             if excess > _CONTRADICTED and calm >= 2:
                 edge.contradictions += 1
                 if edge.contradictions > _CONTRADICTIONS:
-                    edge.reset()
+                    edge.reset(badly=True)
                     out.append(
                         Notice(self.camera, "edge begun again", f"the others contradict the edge to {edge.neighbour}")
                     )
@@ -455,6 +456,10 @@ class PoseNode:
     def _find_bump(self) -> list[Out]:
         """Whether this camera was bumped (step 8): its edges' latest observations agree on a new pose."""
         if self.pose is None or self.settled < 20:
+            return []
+        if self._calm < _CALM_UPDATES:  # the network is on its way: what looks like motion is its own
+            for neighbour in self._neighbours.values():
+                neighbour.edge.short, neighbour.edge.long = Window.empty(), Window.empty()
             return []
         motions = []
         for neighbour in self._neighbours.values():

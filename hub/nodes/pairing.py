@@ -14,7 +14,7 @@ from hub.nodes.messages import SharedObservation
 
 SAME_TIME = 1e-6
 """Times [s] that differ by less are one."""
-_GAP = 0.2
+GAP = 0.2
 """Longest time [s] between own observations across which a target is interpolated."""
 _OWN = 16
 _WAITING = 64
@@ -24,9 +24,13 @@ Row = tuple[float, float, float, float, float, float, float, float, float, float
 
 
 class Pairing:
-    """Own observations by label, and neighbours' that wait for them."""
+    """Own observations by label, and neighbours' that wait for them.
 
-    def __init__(self) -> None:
+    gap: longest time [s] between own observations across which a target is interpolated; 0 = only same times meet.
+    """
+
+    def __init__(self, gap: float = GAP) -> None:
+        self.gap = gap
         self._own: OrderedDict[int, deque[SharedObservation]] = OrderedDict()
         self._waiting: OrderedDict[int, deque[SharedObservation]] = OrderedDict()
 
@@ -45,7 +49,7 @@ class Pairing:
             return []
         out, left = [], deque[SharedObservation](maxlen=_WAITING)
         for other in waiting:
-            met, final = _meet(track, other)
+            met, final = _meet(track, other, self.gap)
             if met is not None:
                 out.append((other.camera, met))
             elif not final:
@@ -60,7 +64,7 @@ class Pairing:
         """Takes a neighbour's observation; returns the pair if this camera saw the target then."""
         track = self._own.get(seen.label)
         if track is not None:
-            met, final = _meet(track, seen)
+            met, final = _meet(track, seen, self.gap)
             if met is not None:
                 return seen.camera, met
             if final:
@@ -74,7 +78,7 @@ class Pairing:
         return None
 
 
-def _meet(track: deque[SharedObservation], other: SharedObservation) -> tuple[Row | None, bool]:
+def _meet(track: deque[SharedObservation], other: SharedObservation, gap: float) -> tuple[Row | None, bool]:
     """The pair with the own track at the other's time, and whether waiting longer is in vain."""
     last = track[-1]
     time = other.time
@@ -86,21 +90,21 @@ def _meet(track: deque[SharedObservation], other: SharedObservation) -> tuple[Ro
     hit = track[after]
     if abs(hit.time - time) < SAME_TIME and hit.time_std == 0.0 and other.time_std == 0.0:
         return _row(hit.x, hit.y, hit.std, hit.size, hit.size_std, other), True
-    if after == 0 or track[after].time - track[after - 1].time > _GAP:
+    if gap <= 0.0 or after == 0 or track[after].time - track[after - 1].time > gap:
         return None, True
     if after + 1 >= len(track) and time > track[after - 1].time + SAME_TIME:
         # The next observation would make it cubic; wait for it.
         return None, False
-    return _interpolated(track, after, other), True
+    return _interpolated(track, after, other, gap), True
 
 
-def _interpolated(track: deque[SharedObservation], after: int, other: SharedObservation) -> Row:
+def _interpolated(track: deque[SharedObservation], after: int, other: SharedObservation, gap: float) -> Row:
     a, b = track[after - 1], track[after]
     time = other.time
     near = [a, b]
-    if after >= 2 and a.time - track[after - 2].time <= _GAP:
+    if after >= 2 and a.time - track[after - 2].time <= gap:
         near.insert(0, track[after - 2])
-    if after + 1 < len(track) and track[after + 1].time - b.time <= _GAP:
+    if after + 1 < len(track) and track[after + 1].time - b.time <= gap:
         near.append(track[after + 1])
     weights = []
     for p in near:

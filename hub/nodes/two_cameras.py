@@ -21,7 +21,7 @@ from protocols.geometry.types import Bools, Floats
 
 _NEAREST = 1e-3
 """Least depth of a triangulated point, as a share of its distance."""
-_POINT_STEPS = 2
+_POINT_STEPS = 1
 
 
 def small_log(rotation: Floats) -> Floats:
@@ -74,24 +74,23 @@ class Terms:
 
 def triangulate(pose: Relative, rows: Floats, weights: Floats) -> Floats:
     """Points (n, 3) in k's axes nearest to both rays, and to the depths that the sizes tell."""
-    n = len(rows)
-    ray_k = np.ones((n, 3))
+    ray_k = np.ones((len(rows), 3))
     ray_k[:, :2] = rows[:, 0:2]
-    ray_l = np.ones((n, 3))
+    ray_l = np.ones((len(rows), 3))
     ray_l[:, :2] = rows[:, 3:5]
     ray_l = _turned(ray_l, pose.rotation)
     # depth_k ray_k - depth_l ray_l = centre, least squares in angle; a depth of 0 is told by the size with weight.
     long_k, long_l = (ray_k * ray_k).sum(axis=1), (ray_l * ray_l).sum(axis=1)
     across = (ray_k * ray_l).sum(axis=1)
-    size_k, size_l = np.exp(-rows[:, 2]), np.exp(-rows[:, 5])
     # A size with relative std s leaves depth * s along the ray; the rays leave depth / weight across it.
-    pull_k = (weights[:, 1] / np.maximum(weights[:, 0], 1e-12)) ** 2 * long_k
-    pull_l = (weights[:, 3] / np.maximum(weights[:, 2], 1e-12)) ** 2 * long_l
+    pull = (weights[:, 1::2] / weights[:, 0::2]) ** 2
+    pull_k, pull_l = pull[:, 0] * long_k, pull[:, 1] * long_l
+    size = np.exp(-rows[:, 2::3])
     a, b = long_k + pull_k, long_l + pull_l
-    u = (ray_k * pose.centre).sum(axis=1) + pull_k * size_k
-    v = -(ray_l * pose.centre).sum(axis=1) + pull_l * size_l
-    determinant = np.maximum(a * b - across * across, 1e-12 * a * b)
-    depth = (b * u + across * v) / determinant
+    u = (ray_k * pose.centre).sum(axis=1) + pull_k * size[:, 0]
+    v = pull_l * size[:, 1] - (ray_l * pose.centre).sum(axis=1)
+    ab = a * b
+    depth = (b * u + across * v) / np.maximum(ab - across * across, 1e-12 * ab)
     return np.asarray(ray_k * depth[:, None])
 
 
@@ -111,59 +110,68 @@ def stacked(poses: list[Relative], counts: list[int]) -> Relative:
 def linearise(pose: Relative, rows: Floats, weights: Floats) -> Terms:
     """Residuals of both cameras, the point eliminated by its Schur complement (METHODS C, step 3).
 
-    A point that would lie behind a camera has ``ahead`` False and no meaning.
+    A point that would lie behind a camera has ``ahead`` False and no meaning. All in k's axes: with N = K + L the
+    point's information as the two cameras tell it, the relative pose feels M = L - L N⁻¹ L.
     """
+    turn = pose.rotation
+    back = np.swapaxes(turn, -1, -2)
     point = triangulate(pose, rows, weights)
+    seen = rows.reshape(-1, 2, 3)
+    pixel, size = np.ascontiguousarray(weights[:, 0::2]), np.ascontiguousarray(weights[:, 1::2])
     for _ in range(_POINT_STEPS):
-        by_k, by_l, residual_k, residual_l, ahead, _ = _residuals(pose, point, rows, weights)
-        normal = by_k.transpose(0, 2, 1) @ by_k + by_l.transpose(0, 2, 1) @ by_l
-        pull = (by_k * residual_k[:, :, None]).sum(axis=1) + (by_l * residual_l[:, :, None]).sum(axis=1)
-        inverse = _inverse(normal)
-        step = -(inverse * pull[:, None, :]).sum(axis=2)
+        by_l, normal, pull, _, _, _ = _both_cameras(pose, back, point, seen, pixel, size)
+        step = -(_inverse(normal) @ pull[:, :, None])[:, :, 0]
         # A far point may leap behind the camera; half its depth a step is enough.
         limit = 0.5 * np.abs(point[:, 2]) / np.maximum(np.abs(step[:, 2]), 1e-300)
         point = point + step * np.minimum(1.0, limit)[:, None]
-    by_k, by_l, residual_k, residual_l, ahead, local = _residuals(pose, point, rows, weights)
-    inverse = _inverse(by_k.transpose(0, 2, 1) @ by_k + by_l.transpose(0, 2, 1) @ by_l)
-    in_l = by_l @ np.swapaxes(pose.rotation, -1, -2)  # derivative by the point in l's axes
-    by_pose = np.concatenate([-in_l @ so3.hat(local), -by_l], axis=2)
+    by_l, normal, pull, pull_l, chi2, ahead = _both_cameras(pose, back, point, seen, pixel, size)
+    gain = by_l @ _inverse(normal)
+    information = by_l - gain @ by_l
+    gradient = pull_l - (gain @ pull[:, :, None])[:, :, 0]
+    # A step moves the point against l, in k's axes, by -hat(point - centre) rotationᵀ turn - shift.
+    by_pose = np.empty((len(rows), 3, 6))
+    by_pose[:, :, :3] = so3.hat(pose.centre - point) @ back
+    by_pose[:, :, 3:] = -_EYE
     turned = by_pose.transpose(0, 2, 1)
-    cross = turned @ by_l
-    hessian = turned @ by_pose - cross @ inverse @ cross.transpose(0, 2, 1)
-    pull = (by_k * residual_k[:, :, None]).sum(axis=1) + (by_l * residual_l[:, :, None]).sum(axis=1)
-    gradient = (turned * residual_l[:, None, :]).sum(axis=2)
-    gradient = gradient - ((cross @ inverse) * pull[:, None, :]).sum(axis=2)
-    chi2 = (residual_k * residual_k).sum(axis=1) + (residual_l * residual_l).sum(axis=1)
-    return Terms(hessian, gradient, chi2, ahead)
+    return Terms(turned @ information @ by_pose, (turned @ gradient[:, :, None])[:, :, 0], chi2, ahead)
 
 
-def _residuals(
-    pose: Relative, point: Floats, rows: Floats, weights: Floats
-) -> tuple[Floats, Floats, Floats, Floats, Bools, Floats]:
-    """Derivatives by the point in k's axes (n, 3, 3) and residuals (n, 3) in sigma, of k and of l."""
-    local = _turned(point - pose.centre, np.swapaxes(pose.rotation, -1, -2))
-    by_k, residual_k, ahead_k = _one_camera(point, rows[:, 0:3], weights[:, 0:2])
-    in_l, residual_l, ahead_l = _one_camera(local, rows[:, 3:6], weights[:, 2:4])
-    return by_k, in_l @ pose.rotation, residual_k, residual_l, ahead_k & ahead_l, local
+_EYE = np.eye(3)
 
 
-def _one_camera(local: Floats, seen: Floats, weights: Floats) -> tuple[Floats, Floats, Bools]:
-    depth = local[:, 2]
-    floor = _NEAREST * np.abs(local).max(axis=1) + 1e-12
-    ahead = np.asarray(depth > floor)
+def _both_cameras(
+    pose: Relative, back: Floats, point: Floats, seen: Floats, pixel: Floats, size: Floats
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Bools]:
+    """l's information (n, 3, 3) about the points, both cameras' together; the pull (n, 3) of both and of l alone; chi2.
+
+    All in k's axes. seen: (n, 2, 3); pixel, size: weights (n, 2).
+    """
+    n = len(point)
+    local = np.empty((n, 2, 3))
+    local[:, 0] = point
+    local[:, 1] = _turned(point - pose.centre, back)
+    depth = local[:, :, 2]
+    floor = _NEAREST * np.abs(local).max(axis=2) + 1e-12
+    ahead = (depth > floor).all(axis=1)
     safe = np.maximum(depth, floor)
     over = 1.0 / safe
-    flat = local[:, :2] * over[:, None]
-    scaled = over * weights[:, 0]
-    by = np.zeros((len(local), 3, 3))
-    by[:, 0, 0] = by[:, 1, 1] = scaled
-    by[:, 0, 2] = -flat[:, 0] * scaled
-    by[:, 1, 2] = -flat[:, 1] * scaled
-    by[:, 2, 2] = -over * weights[:, 1]
-    residual = np.empty((len(local), 3))
-    residual[:, :2] = (flat - seen[:, :2]) * weights[:, :1]
-    residual[:, 2] = (-np.log(safe) - seen[:, 2]) * weights[:, 1]
-    return by, residual, ahead
+    flat = local[:, :, :2] * over[:, :, None]
+    a, b = over * pixel, over * size
+    off = (flat - seen[:, :, :2]) * pixel[:, :, None]
+    far = (np.log(safe) + seen[:, :, 2]) * -size
+    pull = np.empty((n, 2, 3))
+    pull[:, :, :2] = off * a[:, :, None]
+    pull[:, :, 2] = -(pull[:, :, :2] * flat).sum(axis=2) - b * far
+    information = np.zeros((n, 2, 3, 3))
+    square = a * a
+    information[:, :, 0, 0] = information[:, :, 1, 1] = square
+    aslant = flat * -square[:, :, None]
+    information[:, :, :2, 2] = information[:, :, 2, :2] = aslant
+    information[:, :, 2, 2] = b * b - (aslant * flat).sum(axis=2)
+    by_l = back @ information[:, 1] @ pose.rotation
+    pull_l = _turned(pull[:, 1], pose.rotation)
+    chi2 = (off * off).sum(axis=(1, 2)) + (far * far).sum(axis=1)
+    return by_l, information[:, 0] + by_l, pull[:, 0] + pull_l, pull_l, chi2, np.asarray(ahead)
 
 
 def _inverse(m: Floats) -> Floats:

@@ -234,3 +234,55 @@ class AgentStatus(_message.Message):
     gauges: _containers.ScalarMap[str, float]
     version: str
     def __init__(self, schema_version: _Optional[int] = ..., agent: _Optional[str] = ..., role: _Optional[str] = ..., boot_id: _Optional[str] = ..., sequence: _Optional[int] = ..., state: _Optional[str] = ..., message: _Optional[str] = ..., counters: _Optional[_Mapping[str, float]] = ..., gauges: _Optional[_Mapping[str, float]] = ..., version: _Optional[str] = ...) -> None: ...
+
+class NodeEdge(_message.Message):
+    __slots__ = ("neighbour", "rotation", "centre", "hessian", "gradient", "count", "bearings")
+    NEIGHBOUR_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_FIELD_NUMBER: _ClassVar[int]
+    CENTRE_FIELD_NUMBER: _ClassVar[int]
+    HESSIAN_FIELD_NUMBER: _ClassVar[int]
+    GRADIENT_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    BEARINGS_FIELD_NUMBER: _ClassVar[int]
+    neighbour: str
+    rotation: _containers.RepeatedScalarFieldContainer[float]
+    centre: _containers.RepeatedScalarFieldContainer[float]
+    hessian: _containers.RepeatedScalarFieldContainer[float]
+    gradient: _containers.RepeatedScalarFieldContainer[float]
+    count: float
+    bearings: bool
+    def __init__(self, neighbour: _Optional[str] = ..., rotation: _Optional[_Iterable[float]] = ..., centre: _Optional[_Iterable[float]] = ..., hessian: _Optional[_Iterable[float]] = ..., gradient: _Optional[_Iterable[float]] = ..., count: _Optional[float] = ..., bearings: _Optional[bool] = ...) -> None: ...
+
+class NodeState(_message.Message):
+    __slots__ = ("schema_version", "camera", "host", "takeover", "sequence", "epoch", "frame", "hops", "depth", "rotation", "position", "settled", "partner", "leaving", "edges")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    HOST_FIELD_NUMBER: _ClassVar[int]
+    TAKEOVER_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    EPOCH_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    HOPS_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    SETTLED_FIELD_NUMBER: _ClassVar[int]
+    PARTNER_FIELD_NUMBER: _ClassVar[int]
+    LEAVING_FIELD_NUMBER: _ClassVar[int]
+    EDGES_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    camera: str
+    host: str
+    takeover: int
+    sequence: int
+    epoch: int
+    frame: str
+    hops: int
+    depth: int
+    rotation: _containers.RepeatedScalarFieldContainer[float]
+    position: _containers.RepeatedScalarFieldContainer[float]
+    settled: int
+    partner: str
+    leaving: bool
+    edges: _containers.RepeatedCompositeFieldContainer[NodeEdge]
+    def __init__(self, schema_version: _Optional[int] = ..., camera: _Optional[str] = ..., host: _Optional[str] = ..., takeover: _Optional[int] = ..., sequence: _Optional[int] = ..., epoch: _Optional[int] = ..., frame: _Optional[str] = ..., hops: _Optional[int] = ..., depth: _Optional[int] = ..., rotation: _Optional[_Iterable[float]] = ..., position: _Optional[_Iterable[float]] = ..., settled: _Optional[int] = ..., partner: _Optional[str] = ..., leaving: _Optional[bool] = ..., edges: _Optional[_Iterable[_Union[NodeEdge, _Mapping]]] = ...) -> None: ...

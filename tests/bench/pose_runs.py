@@ -29,7 +29,10 @@ class Traffic:
 
 @dataclass(slots=True, eq=False)
 class Network:
-    """Nodes, and what is under way between them. record: if a list, every observation delivered is added."""
+    """Nodes, and what is under way between them.
+
+    record: if a list, every observation delivered is added. arrived: points that one camera heard of from another.
+    """
 
     nodes: dict[int, PoseNode]
     traffic: Traffic = field(default_factory=Traffic)
@@ -38,6 +41,7 @@ class Network:
     now: int = 0
     points: int = 0
     record: list[tuple[int, SharedObservation]] | None = None
+    arrived: set[int] = field(default_factory=set)
     _queue: list[tuple[int, int, int, object]] = field(default_factory=list)
     _count: int = 0
     _sequences: dict[int, int] = field(default_factory=dict)
@@ -61,6 +65,8 @@ class Network:
             for item in message:
                 self._deliver(to, item)
         elif node is not None:
+            if isinstance(message, SharedObservation) and message.camera != to:
+                self.arrived.add(int(message.time))
             if self.record is not None and isinstance(message, SharedObservation):
                 self.record.append((to, message))
             self._note(node.handle(message))  # type: ignore[arg-type]

@@ -39,9 +39,15 @@ class Row:
 
 
 def ratio(
-    seed: int, *, points: int = POINTS, size: float = 0.02, outliers: float = 0.0, traffic: Traffic | None = None
+    seed: int,
+    *,
+    points: int = POINTS,
+    size: float = 0.02,
+    outliers: float = 0.0,
+    traffic: Traffic | None = None,
+    arrived: bool = False,
 ) -> float:
-    """Section 4's world once."""
+    """Section 4's world once. arrived: the joint optimum of what reached the other camera, either way."""
     rng = np.random.default_rng(seed)
     world = section_4(rng)
     sightings = observe(world, rng, cube(rng, points), size=size, outliers=outliers)
@@ -49,7 +55,10 @@ def ratio(
     feed(net, sightings, EVERY)
     for _ in range(SETTLE):
         net.tick()
-    best = joint_optimum(world, sightings.without(sightings.wrong))
+    left_out = sightings.wrong.astype(bool)
+    if arrived:
+        left_out = left_out | ~np.isin(np.arange(1, points + 1)[: len(left_out)], list(net.arrived))
+    best = joint_optimum(world, sightings.without(left_out))
     return errors(world, net.published())[0] / errors(world, best.poses)[0]
 
 
@@ -176,22 +185,28 @@ def _row_growing(seeds: range, quick: bool) -> list[Row]:
 
 def _row_bearings(seeds: range, quick: bool) -> list[Row]:
     del quick
-    return [Row("bearings only", "≤ 1.15", "≤ 1.02", _told([ratio(s, size=np.inf) for s in seeds]))]
+    return [Row("bearings only", "≤ 1.15", "≤ 1.02", _told([ratio(s, size=np.inf) for s in seeds[:20]]))]
 
 
 def _row_losses(seeds: range, quick: bool) -> list[Row]:
     del quick
-    bare = _told([ratio(s, traffic=Traffic(0.2, 0.2, 50)) for s in seeds])
+    seeds = seeds[:20]
     again = _told([ratio(s, traffic=Traffic(0.2, 0.2, 50, 3)) for s in seeds])
+    bare = _told([ratio(s, traffic=Traffic(0.2, 0.2, 50)) for s in seeds])
+    same = _told([ratio(s, traffic=Traffic(0.2, 0.2, 50), arrived=True) for s in seeds])
     name = "20 % lost + 20 % duplicated + ≤ 50 events late"
-    return [Row(name + ", last 4 a message", "≤ 1.15", "≤ 1.03", again), Row(name + ", one a message", "", "", bare)]
+    return [
+        Row(name + ", last 4 a message", "≤ 1.15", "≤ 1.03", again),
+        Row(name + ", one a message", "", "", bare),
+        Row(name + ", one a message, optimum of the points that anybody paired", "", "", same),
+    ]
 
 
 def _row_outliers(seeds: range, quick: bool) -> list[Row]:
     del quick
     return [
         Row("5 % outliers", "no failure, ≤ 1.5", "", _told([ratio(s, outliers=0.05) for s in seeds])),
-        Row("20 % outliers", "", "≤ 1.1", _told([ratio(s, outliers=0.2) for s in seeds])),
+        Row("20 % outliers", "", "≤ 1.1", _told([ratio(s, outliers=0.2) for s in seeds[:20]])),
     ]
 
 
