@@ -16,12 +16,18 @@ from edge.uav.ground.camera import ImagePlane
 from edge.uav.ground.cloud import FREE
 from edge.uav.ground.evidence import judge
 from edge.uav.ground.footprint import corners, oriented
+from edge.uav.ground.habits import Driving
 from edge.uav.ground.history import MotionFit, Sightings
 from edge.uav.ground.light import Light, Shade
 from edge.uav.ground.road_map import CELL, RoadMap
+from edge.uav.ground.rooting import root_from_telemetry
 from edge.uav.ground.survey import plausible
+from edge.uav.ground.telemetry import TelemetryClock
 from edge.uav.ground.tracklets import Tracklet, Tracklets
 from edge.uav.ground.ways import Way, edges, trace
+from edge.uav.tracker import Box, Telemetry
+from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA
+from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
 Picture = npt.NDArray[np.uint8]
@@ -230,6 +236,78 @@ def test_the_fit_gives_velocity_and_turn_of_a_noisy_arc() -> None:
     assert abs(fit.speed - 10.0) < 4 * fit.velocity_std + 0.3
 
 
+def test_what_a_hidden_part_holds_back_is_no_change_of_speed() -> None:
+    """A bridge's edge stood still over the car's front: in four frames the fit braked from 10 to 6.7 units/s."""
+    seen = Sightings()
+    for k in range(25):
+        seen.add(k / 30, np.array([10.0 * k / 30, 0.0]), 0.22)
+        before = seen.fit()
+    for k in range(25, 29):
+        seen.add(k / 30, np.array([10.0 * 24.5 / 30, 0.0]), 0.22)
+        fit = seen.fit()
+    assert before is not None
+    assert fit is not None
+    assert before.speed == pytest.approx(10.0, abs=0.1)
+    assert fit.speed > 7.2
+
+
+def test_a_car_that_really_brakes_hard_is_believed() -> None:
+    seen = Sightings()
+    for k in range(45):
+        t, braked = k / 30, max(k - 24, 0) / 30
+        seen.add(t, np.array([10.0 * t - 0.5 * 7.0 * braked**2, 0.0]), 0.22)
+        fit = seen.fit()
+    assert fit is not None
+    assert fit.speed == pytest.approx(10.0 - 7.0 * 20 / 30, abs=1.0)
+
+
+def bending_way(radius: float) -> Way:
+    """30 units straight on, then a bend to the right that goes on."""
+    along = np.arange(0, 120, 1.5)
+    headings = np.maximum(along - 30.0, 0.0) / radius
+    steps = 1.5 * np.column_stack([np.cos(headings), np.sin(headings)])
+    return Way(np.vstack([np.zeros(2), np.cumsum(steps, axis=0)[:-1]]), headings, 120.0, 1.0)
+
+
+def straight_fit(speed: float, time: float = 0.0, across: float = 0.0) -> MotionFit:
+    return MotionFit(time, np.zeros(2), np.array([speed, 0.0]), np.array([0.0, across]), 0.2, 0.3, 0.05, 20)
+
+
+def test_who_is_out_of_sight_slows_down_for_a_bend_and_not_on_the_straight() -> None:
+    rng = np.random.default_rng(0)
+    for way, low, high in ((bending_way(15.0), 0.0, 8.6), (straight_way(), 9.3, 10.7)):
+        cloud = clouds.launched(clouds.scattered(np.zeros(2), 0.1, 400, rng), straight_fit(10.0), 0.0, 400, rng)
+        cloud = clouds.on_ways(cloud, [way], 1.0, rng)
+        for _ in range(120):
+            cloud = clouds.driven(cloud, 1 / 30, [way], False, rng)
+        assert low < np.median(cloud.speed) < high
+
+
+def test_out_of_a_bend_a_driver_goes_back_to_the_speed_of_the_straight() -> None:
+    driving = Driving()
+    for k in range(20):
+        driving.saw(straight_fit(12.0, 0.1 * k))
+    for k in range(20, 30):
+        driving.saw(straight_fit(8.0, 0.1 * k, across=3.0))
+    habits = driving.habits(straight_fit(8.0, 3.0, across=3.0), np.full(400, 8.0), np.random.default_rng(0))
+    assert np.median(habits.cruise) == pytest.approx(12.0, abs=0.3)
+    assert np.quantile(habits.sideways, 0.1) > 2.0  # it was seen to take that bend
+    unknown = Driving().habits(straight_fit(8.0), np.full(400, 8.0), np.random.default_rng(0))
+    assert np.median(unknown.cruise) == pytest.approx(8.0, abs=0.2)
+
+
+@pytest.mark.parametrize(("height", "kind"), [(60.0, "metric"), (6e5, "attitude"), (3.0, "attitude")])
+def test_a_height_from_which_the_target_is_a_toy_or_a_ship_is_not_believed(height: float, kind: str) -> None:
+    clock = TelemetryClock(BODY_FROM_DOWN_CAMERA)
+    for k in range(3):
+        clock.add(Telemetry(k / 30, np.eye(3), np.array([0.0, 0.0, -height])))
+    matrix = np.array([[600.0, 0.0, 159.5], [0.0, 600.0, 119.5], [0.0, 0.0, 1.0]])
+    plane = ImagePlane((320, 240), Intrinsics(320, 240, matrix))
+    root = root_from_telemetry(plane, clock, 1 / 30, Box(150.0, 110.0, 25.0, 12.0))
+    assert root is not None
+    assert root.kind == kind
+
+
 def straight_way(known: float = 100.0) -> Way:
     points = np.column_stack([np.arange(0, 120, 1.5), np.zeros(80)])
     return Way(points, np.zeros(80), known, 1.0)
@@ -268,7 +346,7 @@ def test_a_look_alike_that_drives_the_other_way_is_not_taken_for_the_target() ->
             seen = [candidate(1.0 + sign * 10.0 * (k - 5) / 30, 0.5)]
             tracks = tracklets.update(k / 30, seen)
         assert tracks[0].age == 6
-        verdict = judge(cloud, seen, tracks, np.full(400, 0.3), lambda _: 0.25, 4.5, True, lambda _: False)
+        verdict = judge(cloud, seen, tracks, np.full(400, 0.3), lambda _: (0.25, 0.25), 4.5, True, lambda _: False)
         assert (verdict.best is not None) == taken
 
 
@@ -291,7 +369,7 @@ def test_a_look_alike_where_hardly_anything_expects_the_target_never_becomes_it(
         seen = [candidate(at[0] + 10.0 * k / 30, at[1])]
         moved = replace(cloud, place=place + np.array([10.0 * k / 30, 0.0]))
         tracks = tracklets.update(k / 30, seen)
-        verdict = judge(moved, seen, tracks, np.full(400, 0.03), lambda _: 0.25, 4.5, True, lambda _: False)
+        verdict = judge(moved, seen, tracks, np.full(400, 0.03), lambda _: (0.25, 0.25), 4.5, True, lambda _: False)
         assert verdict.likelihood is not None
         cloud = replace(cloud, weights=cloud.weighted(verdict.likelihood).weights)
         found |= verdict.best is not None
@@ -308,7 +386,9 @@ def test_the_heading_that_a_template_tells_counts_once_its_shape_fits() -> None:
         seen = [replace(candidate(0.0, 0.0), angle=0.6)]
         tracks = tracklets.update(k / 30, seen)
     for shaped, share in ((False, 0.5), (True, 0.9)):
-        verdict = judge(cloud, seen, tracks, np.full(400, 0.3), lambda _: 0.25, 4.5, True, lambda _, s=shaped: s)
+        verdict = judge(
+            cloud, seen, tracks, np.full(400, 0.3), lambda _: (0.25, 0.25), 4.5, True, lambda _, s=shaped: s
+        )
         assert verdict.likelihood is not None
         got = cloud.weighted(verdict.likelihood).weights[200:].sum()
         assert got == pytest.approx(share, abs=0.1)
@@ -345,7 +425,7 @@ def test_what_may_be_the_target_by_the_way_it_must_have_driven(
 def test_where_nothing_is_seen_in_plain_view_particles_lose_weight() -> None:
     cloud = clouds.scattered(np.zeros(2), 3.0, 200, np.random.default_rng(0))
     chance = np.where(cloud.place[:, 0] > 0, 0.3, 0.0)
-    verdict = judge(cloud, [], [], chance, lambda _: 0.25, 4.5, True, lambda _: False)
+    verdict = judge(cloud, [], [], chance, lambda _: (0.25, 0.25), 4.5, True, lambda _: False)
     assert verdict.best is None
     assert verdict.likelihood is not None
     after = cloud.weighted(verdict.likelihood).weights

@@ -126,6 +126,16 @@ def test_an_oncoming_twin_is_not_taken_for_the_car_that_left(scenery: Picture) -
     assert not any(found[i].state is State.VISIBLE for i in gone)
 
 
+def test_a_car_cut_in_half_by_the_border_at_first_is_known_when_it_is_whole(scenery: Picture) -> None:
+    shown = film(scenery, 45, 4.0, 0.0)
+    slide = np.maximum(120 - 40 - 12 * np.maximum(np.arange(45) - 5, 0), -60)
+    shown = Film(scenery, np.column_stack([40 + slide + 4 * np.arange(45), shown.window[:, 1]]), shown.car)
+    assert abs(shown.truth(0)[0]) < 0.1 * CAR[0]
+    found = follow(shown)
+    assert all(e.state is State.VISIBLE for e in found)
+    assert errors(shown, found)[25:].max() < 5.0
+
+
 def test_frames_that_cannot_be_decoded_are_coasting_and_cost_nothing(scenery: Picture) -> None:
     shown = film(scenery, 50, 4.0, 3.0)
     found = follow(shown, without=range(25, 31))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from edge.uav.ground.camera import transfer
+from edge.uav.ground.habits import Driving
 from edge.uav.ground.history import MotionFit
 from edge.uav.ground.ways import Way
 from edge.uav.particles import AdaptiveNumber, effective_sample_size, systematic
@@ -14,11 +15,16 @@ from protocols.geometry.types import Floats, Ints
 
 FREE = -1
 """Of a particle that follows no way."""
-_SIDEWAYS = 6.5  # acceleration that a driver accepts in a bend [units/s²]
-_CORNER, _SIDEWAYS_CORNER = 0.07, 3.0  # the curvature of a turn at a junction, and what is accepted there
+_SIDEWAYS = 3.4  # acceleration that a driver accepts in a bend, where nothing else is known [units/s²]
+_AHEAD = (1.0, 5.0, 10.0, 18.0)  # where on its way a driver looks for bends [units]
+_BRAKING = 2.5  # for one [units/s²]
+_SETTLE_S = 2.5  # within which the speed goes back to what the driver likes
+_HURRY = 2.0  # most acceleration for that [units/s²]
 _FASTEST = 60.0
 _UNKNOWN_BEND = 0.008  # std of the curvature of road that was never seen [1/unit]
+_VELOCITY_STD = (0.7, 3.0)  # least and most of what a cloud is taken to know of its velocity [units/s]
 _GOES_ON = 0.35  # of the acceleration at the last sighting
+_MEANT = 1.0  # a change of speed that is meant to last [units/s²]
 _MOOD_S = 1.5  # how long a change of speed lasts
 
 
@@ -27,6 +33,7 @@ class Cloud:
     """n cars. place: (n, 2) ground; heading, speed, acceleration, curvature: (n,); weights: (n,), sum 1.
 
     way: (n,) index of the way that each follows, or FREE; along, across: (n,) its place on it.
+    cruise, sideways: (n,) speed that the driver likes [units/s], acceleration across that is accepted [units/s²].
     """
 
     place: Floats
@@ -37,6 +44,8 @@ class Cloud:
     way: Ints
     along: Floats
     across: Floats
+    cruise: Floats
+    sideways: Floats
     weights: Floats
 
     def __len__(self) -> int:
@@ -53,6 +62,8 @@ class Cloud:
             self.way[index],
             self.along[index],
             self.across[index],
+            self.cruise[index],
+            self.sideways[index],
             np.full(len(index), 1.0 / len(index)),
         )
 
@@ -75,6 +86,13 @@ class Cloud:
             chosen = systematic(self.weights, wanted, rng)
         return self.take(chosen)
 
+    def velocity(self) -> tuple[Floats, float]:
+        """Mean (2,) and std of one coordinate, within _VELOCITY_STD [units/s]."""
+        every = self.speed[:, None] * np.column_stack([np.cos(self.heading), np.sin(self.heading)])
+        mean = self.weights @ every
+        variance = float(self.weights @ np.square(every - mean).sum(axis=1)) / 2.0
+        return np.asarray(mean), float(np.clip(np.sqrt(variance), *_VELOCITY_STD))
+
     def free(self) -> Cloud:
         """All off their ways."""
         return replace(self, way=np.full(len(self), FREE))
@@ -90,6 +108,7 @@ class Cloud:
             place=place,
             heading=np.arctan2(step[:, 1], step[:, 0]),
             speed=self.speed * scale,
+            cruise=self.cruise * scale,
             acceleration=self.acceleration * scale,
             curvature=self.curvature / np.maximum(scale, 1e-6),
             way=np.full(len(self), FREE),
@@ -99,15 +118,19 @@ class Cloud:
 def scattered(place: Floats, std: float, count: int, rng: np.random.Generator) -> Cloud:
     """A cloud about a place (2,) that knows nothing of the motion yet."""
     zeros = np.zeros(count)
+    places, headings = place + rng.normal(0.0, std, (count, 2)), rng.uniform(-np.pi, np.pi, count)
+    speed = np.abs(rng.normal(0.0, 14.0, count))
     return Cloud(
-        place + rng.normal(0.0, std, (count, 2)),
-        rng.uniform(-np.pi, np.pi, count),
-        np.abs(rng.normal(0.0, 14.0, count)),
+        places,
+        headings,
+        speed,
         zeros,
         zeros,
         np.full(count, FREE),
         zeros,
         zeros,
+        speed,
+        np.full(count, _SIDEWAYS),
         np.full(count, 1.0 / count),
     )
 
@@ -129,6 +152,8 @@ def drawn(fit: MotionFit, place: Floats, std: float, count: int, rng: np.random.
         np.full(count, FREE),
         np.zeros(count),
         np.zeros(count),
+        speed,
+        np.full(count, _SIDEWAYS),
         np.full(count, 1.0 / count),
     )
 
@@ -143,7 +168,8 @@ def driven(cloud: Cloud, dt: float, ways: list[Way], seen: bool, rng: np.random.
     fade = np.exp(-dt / (0.7 if seen else _MOOD_S))
     acceleration = cloud.acceleration * fade
     wander = 2.5 if seen else 0.8
-    speed = cloud.speed + acceleration * dt + wander * root * rng.normal(size=n)
+    liked = np.zeros(n) if seen else np.clip((cloud.cruise - cloud.speed) / _SETTLE_S, -_HURRY, _HURRY)
+    speed = cloud.speed + (acceleration + liked) * dt + wander * root * rng.normal(size=n)
     speed = np.clip(speed, 0.0, _FASTEST)
     free = cloud.way == FREE
     swerve = cloud.curvature * np.exp(-dt / 1.2) + (0.0 if seen else 0.02 * root) * rng.normal(size=n)
@@ -160,8 +186,10 @@ def driven(cloud: Cloud, dt: float, ways: list[Way], seen: bool, rng: np.random.
         on = cloud.way == k
         if not on.any():
             continue
-        bend = np.abs(way.curvature(cloud.along[on] + 4.0))
-        limit = np.sqrt(np.where(bend > _CORNER, _SIDEWAYS_CORNER, _SIDEWAYS) / np.maximum(bend, 1e-3))
+        limit = np.full(int(on.sum()), _FASTEST)
+        for ahead in _AHEAD:
+            bend = np.maximum(np.abs(way.bend(cloud.along[on] + ahead)), 1e-3)
+            limit = np.minimum(limit, np.sqrt(cloud.sideways[on] / bend + 2.0 * _BRAKING * max(ahead - _AHEAD[0], 0.0)))
         excess = np.maximum(speed[on] - limit, 0.0)
         speed[on] = speed[on] - np.minimum(excess, 3.5 * dt)
         along[on] = cloud.along[on] + speed[on] * dt
@@ -169,7 +197,16 @@ def driven(cloud: Cloud, dt: float, ways: list[Way], seen: bool, rng: np.random.
         past = np.maximum(along[on] - way.known, 0.0)
         place[on], heading[on] = way.at(along[on], across[on] + 0.5 * curvature[on] * np.square(past))
         heading[on] += curvature[on] * past
-    return Cloud(place, heading, speed, acceleration, curvature, cloud.way, along, across, cloud.weights)
+    return replace(
+        cloud,
+        place=place,
+        heading=heading,
+        speed=speed,
+        acceleration=acceleration,
+        curvature=curvature,
+        along=along,
+        across=across,
+    )
 
 
 def on_ways(cloud: Cloud, ways: list[Way], share: float, rng: np.random.Generator) -> Cloud:
@@ -211,27 +248,45 @@ def rerouted(cloud: Cloud, old: list[Way], new: list[Way], rng: np.random.Genera
     return replace(cloud, way=taken)
 
 
-def pulled(cloud: Cloud, fit: MotionFit, ahead: float, strength: float, rng: np.random.Generator) -> Cloud:
-    """Motion drawn towards a fit, ``ahead`` seconds after it: an error at the exit grows linearly with time."""
+def pulled(
+    cloud: Cloud, fit: MotionFit, ahead: float, strength: float, to_place: float, rng: np.random.Generator
+) -> Cloud:
+    """Motion drawn towards a fit, ``ahead`` seconds after it: an error at the exit grows linearly with time.
+
+    strength: how much, 0 to 1; to_place: how much the cloud's place is.
+    """
     velocity = fit.velocity + fit.acceleration * ahead + rng.normal(0.0, fit.velocity_std, (len(cloud), 2))
     own = cloud.speed[:, None] * np.column_stack([np.cos(cloud.heading), np.sin(cloud.heading)])
     mixed = own + strength * (velocity - own)
     slow = float(np.hypot(*fit.velocity)) < 0.7
     heading = cloud.heading if slow else np.arctan2(mixed[:, 1], mixed[:, 0])
-    return replace(cloud, speed=np.hypot(mixed[:, 0], mixed[:, 1]), heading=heading)
+    expected = fit.position + ahead * (fit.velocity + 0.5 * ahead * fit.acceleration)
+    place = cloud.place + to_place * (expected - cloud.weights @ cloud.place)
+    return replace(cloud, place=place, speed=np.hypot(mixed[:, 0], mixed[:, 1]), heading=heading)
 
 
-def launched(cloud: Cloud, fit: MotionFit, ahead: float, count: int, rng: np.random.Generator) -> Cloud:
-    """The cloud that loses sight of its target: places as they are, motion of the fit, as uncertain as it is."""
+def launched(
+    cloud: Cloud, fit: MotionFit, ahead: float, count: int, rng: np.random.Generator, driving: Driving | None = None
+) -> Cloud:
+    """The cloud that loses sight of its target: places as they are, motion of the fit, as uncertain as it is.
+
+    driving: what is known of how it drives.
+    """
     chosen = cloud.take(systematic(cloud.weights, count, rng))
     sent = drawn(fit, np.zeros(2), 0.0, count, rng)
     if fit.speed < 0.7:
         return replace(chosen, speed=sent.speed, acceleration=0.0 * sent.acceleration, way=sent.way)
-    acceleration = sent.acceleration + _moods(count, rng)
+    mood = _moods(count, rng)
+    acceleration = sent.acceleration + mood
+    speed = np.maximum(sent.speed + sent.acceleration * ahead, 0.0)
+    habits = (driving or Driving()).habits(fit, speed, rng)
     return replace(
         chosen,
         heading=sent.heading,
-        speed=np.maximum(sent.speed + sent.acceleration * ahead, 0.0),
+        speed=speed,
+        # Who changes the speed now means it.
+        cruise=np.maximum(habits.cruise + np.where(np.abs(mood) > _MEANT, _MOOD_S * mood, 0.0), 0.0),
+        sideways=habits.sideways,
         acceleration=acceleration,
         curvature=sent.curvature,
         way=sent.way,
@@ -252,7 +307,7 @@ def joined(cloud: Cloud, place: Floats, motion: tuple[Floats, float], weight: fl
     velocity = motion[0] + rng.normal(0.0, motion[1], (n, 2))
     new = scattered(place, 0.3, n, rng)
     speed, heading = np.hypot(velocity[:, 0], velocity[:, 1]), np.arctan2(velocity[:, 1], velocity[:, 0])
-    new = replace(new, speed=speed, heading=heading, weights=np.full(n, weight / n))
+    new = replace(new, speed=speed, cruise=speed, heading=heading, weights=np.full(n, weight / n))
     parts = ((getattr(cloud, f.name), getattr(new, f.name)) for f in fields(Cloud))
     whole = Cloud(*(np.concatenate(pair) for pair in parts))
     return replace(whole, weights=whole.weights / whole.weights.sum())

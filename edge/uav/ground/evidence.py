@@ -13,6 +13,7 @@ from edge.uav.ground.tracklets import Tracklet
 from protocols.geometry.types import Floats
 
 _SLOPE, _MIDDLE = 14.0, 0.62  # of the log-likelihood ratio of target against clutter over the score
+_MIDDLE_AGAIN = 0.72  # the same after a while unseen: crowns of trees have many spots that are a little alike
 _LEAST, _MOST = -6.0, 5.0
 _CLUTTER = 0.01  # candidates that are not the target [1/unit²]
 _BELIEVE = 0.7  # posterior of a candidate from which it is taken for the target
@@ -58,7 +59,7 @@ def judge(
     candidates: Sequence[Candidate],
     tracklets: Sequence[Tracklet],
     chance: Floats,
-    noise: Callable[[float], float],
+    noise: Callable[[Candidate], tuple[float, float]],
     length: float,
     again: bool,
     is_shaped: Callable[[Candidate], bool],
@@ -66,19 +67,22 @@ def judge(
     """Weigh particles by candidates: p = 1 - c + c sum_j r_j N(z_j; x, R) / clutter.
 
     chance: (n,) c, the chance that the target would have been found if it were at the particle. noise: std of a
-    sighting by the share that is seen. length: the target's. again: the target has been out of sight for a while:
-    one frame then says less, its shape must fit too, and it must be seen to move as the particles do. is_shaped:
-    whether a candidate's shape fits so well that its angle is the target's heading.
+    candidate's place, one coordinate [ground units], if it is seen as usual, and if something hides what it lacks.
+    length: the target's. again: the target has been out of sight for a while: one frame then says less, its shape must
+    fit too, and it must be seen to move as the particles do. is_shaped: whether a candidate's shape fits so well that
+    its angle is the target's heading.
     """
     gain = np.zeros((len(candidates), len(cloud)))
     there = np.zeros((len(candidates), len(cloud)), np.bool_)
     most_alike = max((candidate.score for candidate in candidates), default=0.0)
     velocity = cloud.speed[:, None] * np.column_stack([np.cos(cloud.heading), np.sin(cloud.heading)])
     for j, candidate in enumerate(candidates):
-        std = noise(candidate.seen) * (1.5 if again else 1.0) + (0.1 if again else 0.0)
-        squared = np.square(cloud.place - candidate.ground).sum(axis=1) / std**2
-        there[j] = squared < _THERE**2
-        ratio = np.exp(np.clip(_SLOPE * (candidate.score - _MIDDLE), _LEAST, _MOST))
+        usual, std = ((1.5 * value + 0.1 if again else value) for value in noise(candidate))
+        squared = np.square(cloud.place - candidate.ground).sum(axis=1)
+        there[j] = squared < (_THERE * usual) ** 2
+        squared = squared / std**2
+        middle = _MIDDLE_AGAIN if again else _MIDDLE
+        ratio = np.exp(np.clip(_SLOPE * (candidate.score - middle), _LEAST, _MOST))
         peak = 0.9 * ratio / (2 * np.pi * std**2) / _CLUTTER
         if again:
             motion = tracklets[j].velocity()

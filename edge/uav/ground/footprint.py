@@ -44,3 +44,9 @@ def corners(place: Floats, heading: float, length: float, width: float) -> Float
     return np.array(
         [place + forward + right, place + forward - right, place - forward - right, place - forward + right]
     )
+
+
+def between(corners: Floats) -> Floats:
+    """(16, 2) points along the sides of a quadrilateral (4, 2)."""
+    share = np.linspace(0.0, 1.0, 4, endpoint=False)[:, None]
+    return np.concatenate([a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])

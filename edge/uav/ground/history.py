@@ -17,6 +17,8 @@ _BETTER = 0.4  # of a sighting's std is what differs from frame to frame; the re
 _ACCELERATION_STD = 3.5  # of a car, along each axis [units/s²]
 _AGILITY = 0.3  # the same over the speed, where that is more [1/s]
 _SPEED_STD = 15.0
+_FRESH_S = 0.2  # age of the fit that judges
+_FIRM = 8  # sightings from which a fit is good enough to judge the next one by
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +68,7 @@ class Sightings:
         self._places: deque[Floats] = deque(maxlen=_MOST)
         self._stds: deque[float] = deque(maxlen=_MOST)
         self._prior: tuple[Floats, float] | None = None
+        self._fits: deque[MotionFit] = deque()
 
     def __len__(self) -> int:
         return len(self._times)
@@ -81,6 +84,7 @@ class Sightings:
         self._times.clear()
         self._places.clear()
         self._stds.clear()
+        self._fits.clear()
         self._prior = (np.asarray(velocity, dtype=np.float64), std)
 
     def moved(self, new_from_old: Floats) -> None:
@@ -89,6 +93,7 @@ class Sightings:
             places = transfer(new_from_old, np.array(self._places))
             self._places = deque(list(places), maxlen=_MOST)
         self._prior = None
+        self._fits.clear()
 
     def travelled(self) -> float:
         """Distance between the first and the last sighting held."""
@@ -99,7 +104,11 @@ class Sightings:
         return np.array(self._places).reshape(-1, 2)
 
     def fit(self) -> MotionFit | None:
-        """Least squares of place, velocity and a modest acceleration over the last second; None with < 3."""
+        """Least squares of place, velocity and a modest acceleration over the last second; None with < 3.
+
+        What jumps off the fit of a moment ago, faster than a car can brake or steer, counts little: that is the part of
+        the target which something leaves in sight.
+        """
         if len(self._times) < 3:
             return None
         times = np.array(self._times)
@@ -120,15 +129,23 @@ class Sightings:
         # The newest count most: drivers brake and steer within a second.
         stds = np.maximum(stds * _BETTER, 1e-3) * np.exp(-0.5 * t / _RECENT_S)
         weight = 1.0 / np.square(stds)
+        while self._fits and self._fits[0].time < times[-1] - _FRESH_S:
+            self._fits.popleft()
+        if self._fits and self._fits[0].samples >= _FIRM:
+            before = self._fits[0]
+            ahead = (times[recent] - before.time)[:, None]
+            expected = before.position + ahead * (before.velocity + 0.5 * ahead * before.acceleration)
+            error = np.linalg.norm(expected - places, axis=1)
+            weight = _robust(stds, error)
         for _ in range(3):
             normal = (design * weight[:, None]).T @ design + information
             solution = np.linalg.solve(normal, (design * weight[:, None]).T @ places + right0)
             error = np.linalg.norm(design @ solution - places, axis=1)
-            weight = 1.0 / np.square(stds) / (1.0 + np.square(error / (3.0 * stds)))
+            weight = _robust(stds, error)
         residual = float(np.sqrt(0.5 * np.mean(np.square(error))))
         inflate = max(1.0, float(np.sqrt(0.5 * np.mean(np.square(error / stds)))))
         covariance = np.linalg.inv(normal) * inflate**2
-        return MotionFit(
+        found = MotionFit(
             float(times[-1]),
             solution[0],
             solution[1],
@@ -138,3 +155,10 @@ class Sightings:
             residual,
             len(t),
         )
+        self._fits.append(found)
+        return found
+
+
+def _robust(stds: Floats, error: Floats) -> Floats:
+    """Weights (n,) of sightings by their stds and their distance from a motion (n,), both ground units."""
+    return np.asarray(1.0 / np.square(stds) / (1.0 + np.square(error / (3.0 * stds))))

@@ -7,6 +7,7 @@ import numpy as np
 from edge.uav import particles as pf
 from edge.uav.ground import cloud as clouds
 from edge.uav.ground.cloud import Cloud
+from edge.uav.ground.habits import Driving
 from edge.uav.ground.history import MotionFit
 from edge.uav.ground.road_map import RoadMap
 from edge.uav.ground.ways import Way, edges, trace
@@ -45,10 +46,18 @@ class Outlook:
             right, left = edges(road, trail, np.arctan2(steps[:, 1], steps[:, 0]))
             self._keep = _middle(right), _middle(left)
 
-    def begin(self, cloud: Cloud, fit: MotionFit | None, time: float, road: RoadMap, rng: np.random.Generator) -> Cloud:
+    def begin(
+        self,
+        cloud: Cloud,
+        fit: MotionFit | None,
+        time: float,
+        road: RoadMap,
+        driving: Driving,
+        rng: np.random.Generator,
+    ) -> Cloud:
         """The cloud that sets out."""
         if fit is not None:
-            cloud = clouds.launched(cloud, fit, time - fit.time, _NUMBER, rng)
+            cloud = clouds.launched(cloud, fit, time - fit.time, _NUMBER, rng, driving)
         self.ways = self._trace(road, time)
         return clouds.on_ways(cloud, self.ways, _ON_WAYS, rng) if self.ways else cloud
 

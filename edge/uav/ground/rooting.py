@@ -14,6 +14,7 @@ from protocols.geometry.types import Floats
 
 CAR_LENGTH = 4.5
 """What the target's longer side is taken for where nothing gives the scale [ground units]."""
+_SHORTEST_CAR, _LONGEST_CAR = 1.2, 30.0  # of what a target can be [m]
 _LOWEST = 2.0  # height that can be meant [m]
 _STEEPEST = 12.0  # distance on the ground over the height: beyond, the target is near the horizon
 
@@ -42,14 +43,23 @@ def root_from_telemetry(plane: ImagePlane, clock: TelemetryClock | None, time: f
     seen = plane.normalise(_corners(target))
     if position is not None and -position[2] > _LOWEST:
         motion = PosePlane(rotation, np.asarray(position, dtype=np.float64))
-        return Root(motion, "metric") if _in_reach(motion, seen) else None
+        if not _in_reach(motion, seen):
+            return None
+        longer = _longer_side(motion, seen)
+        # A height from which the target is a toy or a ship is wrong; the attitude may still be right.
+        if _SHORTEST_CAR < longer < _LONGEST_CAR:
+            return Root(motion, "metric")
     unit = PosePlane(rotation, np.array([0.0, 0.0, -1.0]))
     if not _in_reach(unit, seen):
         return None
-    corners = transfer(inverse(unit.matrix), seen)
-    sides = (np.linalg.norm(corners[1] - corners[0]), np.linalg.norm(corners[3] - corners[0]))
-    height = CAR_LENGTH / max(float(max(sides)), 1e-9)
+    height = CAR_LENGTH / max(_longer_side(unit, seen), 1e-9)
     return Root(PosePlane(rotation, np.array([0.0, 0.0, -height])), "attitude")
+
+
+def _longer_side(motion: PosePlane, seen: Floats) -> float:
+    """Of the box with normalised corners (4, 2), on the ground."""
+    corners = transfer(inverse(motion.matrix), seen)
+    return float(max(np.linalg.norm(corners[1] - corners[0]), np.linalg.norm(corners[3] - corners[0])))
 
 
 def root_from_picture(plane: ImagePlane, target: Box) -> Root:

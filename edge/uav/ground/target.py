@@ -18,8 +18,12 @@ Picture = npt.NDArray[np.uint8]
 
 _LEARN = 0.04
 _BODY = 0.155  # height of a car's middle over its length
+_MORE = 0.12  # of its share in the picture, by which it is worth learning again
 _WHOLE = 0.97  # share of the footprint in the picture that is all of it
 _MOST_CELLS = 100  # half size of a patch
+_CLEAR = 0.1  # by how much the score may fall short of the usual one while nothing hides a part of the target
+_HIDES = 0.6  # std of the place in target lengths, for each unit that the score is short beyond that
+_USUAL_RATE, _USUAL_RATE_UNCLEAR = 0.1, 0.02  # of the usual score, a frame
 
 
 class Target:
@@ -47,6 +51,8 @@ class Target:
         """Pixels a ground unit at the target."""
         self.looks = Appearance(*self._box, 1.0 / self.scale)
         self.shade = Shade()
+        self._usual = 1.0
+        self._known = 0.0  # share of it that was in the picture when it was learnt
         self._teach(image, 1.0)
 
     @property
@@ -54,10 +60,23 @@ class Target:
         """The longer side [ground units]."""
         return max(self.looks.length, self.looks.width)
 
-    def noise(self, seen: float) -> float:
-        """Std of a sighting, one coordinate [ground units]. seen: share of the footprint in the picture."""
+    def noise(self, seen: float, score: float = 1.0) -> float:
+        """Std of a sighting, one coordinate [ground units]. seen: share of the footprint in the picture.
+
+        score: where it is less than usual, something hides a part of the target, and the rest lies to one side.
+        """
         whole = max(0.05 * self.length, 0.6 / self.scale)
-        return whole * (1.0 + 5.0 * max(0.0, 0.97 - seen))
+        hidden = _HIDES * self.length * float(np.clip(self._usual - _CLEAR - score, 0.0, 0.5))
+        return whole * (1.0 + 5.0 * max(0.0, 0.97 - seen)) + hidden
+
+    def is_clear(self, score: float) -> bool:
+        """Whether a sighting's score is about the usual one; before the target's direction is known, any is."""
+        return not self.aligned or score > self._usual - _CLEAR
+
+    def grow_used(self, score: float) -> None:
+        """Take the score of a sure sighting of the whole target: what is usual follows it, slowly where it is less."""
+        rate = _USUAL_RATE if self.is_clear(score) else _USUAL_RATE_UNCLEAR
+        self._usual += rate * (min(score, 1.0) - self._usual)
 
     def cut(self, image: Picture, middle: Floats, half: float, angle: float | None = None) -> Patch | None:
         """A patch about a ground point (2,), ``half`` target lengths to each side; None if not in view."""
@@ -88,6 +107,14 @@ class Target:
         self._placing.body_height = _BODY * self.length
         self.angle, self.aligned = fit.heading, True
         self._teach(image, 1.0)
+
+    def complete(self, image: Picture, best: Candidate) -> None:
+        """Learn anew a target that was cut by the picture's border when it was learnt, as more of it comes in."""
+        if self.aligned or best.seen < min(self._known + _MORE, _WHOLE):
+            return
+        if self._known < _WHOLE:
+            self.place = best.ground
+            self._teach(image, 1.0)
 
     def feel_light(self, image: Picture, best: Candidate) -> None:
         """How light it is where the target is, if that is surely the target by its shape."""
@@ -131,4 +158,5 @@ class Target:
         found = self.looks.candidates(patch, least=-1.0)
         near = [c for c in found if np.linalg.norm(c.ground - self.place) < 0.3 * self.length]
         if near:
+            self._known = near[0].seen
             self.looks.calibrate(near[0].colour, near[0].shape, rate)

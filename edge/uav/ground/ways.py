@@ -21,6 +21,7 @@ _UNKNOWN = 1.35  # what never-seen ground is worth, asphalt being up to 1.5: les
 _SHARPEST = 0.16  # curvature of a feeler [1/unit]
 _DECAY = 14.0  # length over which curvature decays where nothing is known
 _EDGE_REACH = 9.0
+_SMOOTH = 2  # steps to each side over which a bend is measured
 _SIDE_RADII = (7.0, 11.0)
 _SIDE_LOOK = 16.0  # of a side road that must be seen to count
 
@@ -52,10 +53,12 @@ class Way:
         right = np.column_stack([-forward[:, 1], forward[:, 0]])
         return at + beyond[:, None] * forward + across[:, None] * right, heading
 
-    def curvature(self, along: Floats) -> Floats:
-        """(n,) [1/unit] at lengths (n,)."""
-        low = np.clip((along / STEP).astype(np.int64), 0, len(self.points) - 2)
-        return np.asarray(_wrap(self.headings[low + 1] - self.headings[low]) / STEP)
+    def bend(self, along: Floats) -> Floats:
+        """(n,) curvature [1/unit] at lengths (n,), over _SMOOTH points to each side: a single step is noise."""
+        middle = (along / STEP).astype(np.int64)
+        last = len(self.points) - 1
+        low, high = np.clip(middle - _SMOOTH, 0, last - 1), np.clip(middle + _SMOOTH, 1, last)
+        return np.asarray(_wrap(self.headings[high] - self.headings[low]) / ((high - low) * STEP))
 
 
 def edges(road: RoadMap, points: Floats, headings: Floats) -> tuple[Floats, Floats]:

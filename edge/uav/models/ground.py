@@ -14,10 +14,13 @@ import numpy as np
 from edge.uav import particles as pf
 from edge.uav.ground import cloud as clouds
 from edge.uav.ground import footprint
+from edge.uav.ground.answer import answer
 from edge.uav.ground.appearance import Candidate
+from edge.uav.ground.box import check_target
 from edge.uav.ground.camera import transfer
 from edge.uav.ground.cloud import Cloud
 from edge.uav.ground.evidence import Verdict, allow, judge
+from edge.uav.ground.habits import Driving
 from edge.uav.ground.history import MotionFit, Sightings
 from edge.uav.ground.layers import Layers
 from edge.uav.ground.outlook import Outlook
@@ -26,16 +29,18 @@ from edge.uav.ground.road_map import RoadMap
 from edge.uav.ground.survey import Survey
 from edge.uav.ground.target import Target
 from edge.uav.ground.tracklets import Tracklet, Tracklets
-from edge.uav.tracker import Box, Estimate, Hypothesis, Image, State, Telemetry
-from protocols.errors import InputError
+from edge.uav.tracker import Box, Estimate, Image, State, Telemetry
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Ints
 
-_SMALLEST_BOX = 4.0  # px
 _NUMBER = pf.AdaptiveNumber(cell=(0.6, 0.6), error=0.05, confidence=0.99, fewest=150, most=500)
 _FIRST_NUMBER = 400
 _PULL = 0.35  # of the motion towards the fit, a frame
+_PULL_PLACE = 0.2  # of the place, the same
 _ALIGN_AFTER = 0.6  # way travelled before the direction of motion counts, in target lengths
+_UNCLEAR = 4.0  # times the noise of a place that counts towards the motion, where a part of the target is hidden
+_FREE_FOR = 12  # frames for which a car whose motion was never seen may have gone anywhere
+_STEADY = 8  # frames seen in a row after which the ground frame may begin anew
 _AGAIN = 3  # frames unseen after which finding the target is finding it again
 _ALIKE = 0.65  # mean score of a look-alike that is worth a thought
 _TURNS = (0.15, 0.3, 0.5, 0.8)  # by how much what is found is tried turned [rad]
@@ -45,16 +50,14 @@ _SAME_TURN = 0.997  # cosine
 _TURNED_STD = 0.06  # of the heading that a template tells [rad]
 _SURVEY_AFTER = 12  # frames unseen after which all of the picture is looked over
 _WRONG_A_SECOND, _WRONG_AT_MOST = 0.002, 0.02  # chance that it took a way that nobody thought of
+_HIDING_CHANCE = (0.03, 0.03, 0.1, 0.3)  # to be found in a frame where none, one, two or three of its points are open
+_ENDS = 0.35  # of the length: where those points are, from the middle
 _LOST_WEIGHT = 0.1  # the same once it counts as lost
 _RECONSIDER = 0.02  # weight of the particles that it gets
 _ROAD_EVERY = 3  # frames between updates of the road map
 _ROAD_SHOWN = 45.0  # about the target [ground units]
 _ROAD_RATE = 0.15  # of what is learnt of road each time
 _TEACH_EVERY = 12
-_LOST_STD = 8.0  # in target lengths
-_LOST_AFTER_S = 15.0
-_CLUSTER, _WIDEST = 0.7, 2.0  # radius of what counts as one place, in target lengths
-_SMOOTH = 0.7  # the same over the cloud's std
 
 
 class GroundTracker:
@@ -87,6 +90,7 @@ class GroundTracker:
         self._sightings = Sightings()
         self._sightings.add(time, place, self._target.noise(1.0))
         self._fit: MotionFit | None = None
+        self._driving = Driving()
         self._outlook: Outlook | None = None
         self._cloud = clouds.scattered(place, 0.03 * self._target.length, _FIRST_NUMBER, self._rng)
         self._missed, self._found = 0, 1  # frames in a row without and with the target
@@ -133,7 +137,7 @@ class GroundTracker:
             teach = self._relearn or self._frame % _TEACH_EVERY == 0
             self._learn_road(small, teach=teach and self._missed == 0)
         estimate = self._estimate(time)
-        if self._missed == 0 and self._placing.clock is not None:
+        if self._found > _STEADY and self._placing.clock is not None:
             self._reroot(estimate)
         return estimate
 
@@ -172,8 +176,12 @@ class GroundTracker:
         for found in surveyed:
             if all(np.linalg.norm(found.ground - c.ground) > apart for c in candidates):
                 candidates.append(found)
-        # Until its motion is known, anywhere it can have gone in a frame will do.
-        slack = 0.2 * target.length if self._fit is None else 0.0
+        # Until its motion is known, anywhere it can have gone since it was seen will do.
+        slack = (
+            0.0
+            if target.aligned
+            else (0.2 if self._fit is None else 0.1) * target.length * (1 + min(self._missed, _FREE_FOR))
+        )
         again = self._missed > _AGAIN
         tracklets = self._tracklets.update(self._time, candidates)
         if again and share > 0.5:
@@ -183,8 +191,8 @@ class GroundTracker:
             cloud,
             candidates,
             tracklets,
-            self._chance(small, pixels),
-            lambda seen: target.noise(seen) + slack,
+            self._chance(small, cloud, pixels),
+            lambda found: (target.noise(found.seen) + slack, target.noise(found.seen, found.score) + slack),
             target.length,
             again,
             lambda found: target.aligned and target.looks.is_shaped(found),
@@ -280,16 +288,24 @@ class GroundTracker:
                 self._cloud = clouds.joined(self._cloud, found.ground, motion, weight * fits, self._rng)
         return out
 
-    def _chance(self, small: Image, pixels: Floats) -> Floats:
-        """(n,) chance that the target would be found at image points (n, 2): 0 outside, little where it may hide."""
+    def _chance(self, small: Image, cloud: Cloud, pixels: Floats) -> Floats:
+        """(n,) chance that the target would be found where the particles are: 0 outside, little where it may hide.
+
+        pixels: (n, 2) image points of the particles. A car shows where all of it lies on open road.
+        """
         inside = self._placing.plane.inside(pixels, 2.0)
         out = np.zeros(len(pixels))
-        if inside.any() and self._placing.blind == 0:
-            top = np.array([small.shape[1] - 1, small.shape[0] - 1])
-            at = np.clip((pixels[inside] / self._placing.factor).astype(int), 0, top)
-            colours = self._placing.light.undone(small[at[:, 1], at[:, 0]][None])[0]
-            open_road = self._road.ratios(colours) > -0.3 if self._road.ready else np.zeros(len(colours), bool)
-            out[inside] = np.where(open_road, 0.3, 0.03)
+        if not inside.any() or self._placing.blind or not self._road.ready:
+            return np.where(inside & (self._placing.blind == 0), _HIDING_CHANCE[0], 0.0)
+        half = _ENDS * self._target.length * np.column_stack([np.cos(cloud.heading), np.sin(cloud.heading)])[inside]
+        places = cloud.place[inside]
+        points = np.concatenate([places, places - half, places + half])
+        top = np.array([small.shape[1] - 1, small.shape[0] - 1])
+        ground = np.nan_to_num(self._placing.pixels(points), nan=-1.0)
+        at = np.clip((ground / self._placing.factor).astype(int), 0, top)
+        colours = self._placing.light.undone(small[at[:, 1], at[:, 0]][None])[0]
+        open_road = (self._road.ratios(colours) > -0.3).reshape(3, -1)
+        out[inside] = np.array(_HIDING_CHANCE)[open_road.sum(axis=0)]
         return out
 
     def _seen(self, image: Image, best: Candidate, verdict: Verdict) -> None:
@@ -301,24 +317,29 @@ class GroundTracker:
             if target.aligned and target.looks.is_shaped(best):
                 self._cloud = clouds.turned(self._cloud, best.angle, _TURNED_STD, self._rng)
         if again:
-            speed, heading = float(self._cloud.weights @ self._cloud.speed), self._heading
-            self._sightings.begin_anew(speed * np.array([np.cos(heading), np.sin(heading)]), 3.0)
+            self._sightings.begin_anew(*self._cloud.velocity())
         self._missed, self._found = 0, self._found + 1
         self._seen_last = self._time
         self._outlook = None
         self._survey.clear()
         self._cloud = self._cloud.free()
         if best.seen > 0.7:
-            self._sightings.add(self._time, best.ground, target.noise(best.seen))
+            # What hides a part of it holds it back, in every frame to the same side: that is no change of speed.
+            unclear = 1.0 if target.is_clear(best.score) else _UNCLEAR
+            self._sightings.add(self._time, best.ground, unclear * target.noise(best.seen, best.score))
             self._fit = self._sightings.fit() or self._fit
+            if self._fit is not None and self._found > _STEADY:
+                self._driving.saw(self._fit)
         if self._fit is not None and not again:
-            ahead = min(self._time - self._fit.time, 0.5)
-            self._cloud = clouds.pulled(self._cloud, self._fit, ahead, _PULL, self._rng)
+            old = self._time - self._fit.time
+            to_place = _PULL_PLACE if old < 1e-6 and self._found > _AGAIN else 0.0
+            self._cloud = clouds.pulled(self._cloud, self._fit, min(old, 0.5), _PULL, to_place, self._rng)
         self._cloud = self._cloud.resampled(self._rng, _NUMBER)
         target.place = self._cloud.weights @ self._cloud.place
         if best.seen > 0.9 and np.linalg.norm(target.place - self._trail[-1]) > 0.5:
             self._trail = [*self._trail[-60:], target.place]
         if not target.aligned:
+            target.complete(image, best)
             fit = self._fit
             far = self._sightings.travelled() > _ALIGN_AFTER * target.length
             if fit is not None and far and best.seen > 0.97 and fit.velocity_std < 0.15 * fit.speed:
@@ -327,6 +348,8 @@ class GroundTracker:
                 self._road.forget()
                 self._relearn = True
         elif self._found > 3:
+            if verdict.sureness > 0.9 and best.seen > 0.98:
+                target.grow_used(best.score)
             if verdict.sureness > 0.9 and not verdict.crowded:
                 target.feel_light(image, best)
             if self._frame % 4 == 0 and _is_sure(verdict):
@@ -339,7 +362,7 @@ class GroundTracker:
         if self._outlook is None:
             trail = np.array(self._trail[-25:])
             self._outlook = Outlook(self._cloud, self._fit, self._time, self._road, trail)
-            self._cloud = self._outlook.begin(self._cloud, self._fit, self._time, self._road, self._rng)
+            self._cloud = self._outlook.begin(self._cloud, self._fit, self._time, self._road, self._driving, self._rng)
         else:
             self._cloud = self._outlook.again(self._cloud, self._time, self._road, self._rng)
         self._cloud = self._cloud.resampled(self._rng, _NUMBER)
@@ -351,7 +374,7 @@ class GroundTracker:
         outline = target.outline(target.place, self._heading, 1.35)
         if teach:
             ring = [target.outline(target.place, self._heading, grown) for grown in (1.5, 1.8)]
-            edge = np.concatenate([_between(corners) for corners in ring])
+            edge = np.concatenate([footprint.between(corners) for corners in ring])
             behind = [p for p in self._trail[:-1] if np.linalg.norm(p - target.place) > 1.2 * target.length]
             places = np.concatenate([edge, np.array(behind).reshape(-1, 2)])
             pixels = placing.pixels(places)
@@ -381,6 +404,7 @@ class GroundTracker:
         self._sightings.moved(change)
         self._fit = self._sightings.fit()
         self._cloud = self._cloud.moved(change)
+        self._driving.rescaled(float(np.sqrt(abs(np.linalg.det(jacobian)))))
         self._tracklets.clear()
         self._survey.clear()
         self._trail = [p for p in transfer(change, np.array(self._trail)) if np.isfinite(p).all()]
@@ -388,59 +412,13 @@ class GroundTracker:
         self._road.take_colours(old)
 
     def _estimate(self, time: float) -> Estimate:
-        """State, densest cluster, its spread, and the other clusters."""
-        cloud, target, placing = self._cloud, self._target, self._placing
-        groups: tuple[pf.Cluster, ...]
-        if self._missed:
-            # What is spread wide has no fine structure but the sample's own.
-            wide = pf.weighted_covariance(cloud.place, cloud.weights)
-            radius = float(np.clip(_SMOOTH * np.sqrt(0.5 * np.trace(wide)) / target.length, _CLUSTER, _WIDEST))
-            groups = pf.clusters(cloud.place, cloud.weights, radius * target.length)
-        else:
-            groups = (pf.Cluster(cloud.weights @ cloud.place, 1.0, np.ones(len(cloud), dtype=np.bool_)),)
-        main = groups[0]
-        weights = np.where(main.members, cloud.weights, 0.0)
-        weights = weights / weights.sum()
-        place = weights @ cloud.place
-        heading = pf.circular_mean(cloud.heading, weights)
-        speed = float(weights @ cloud.speed)
-        spread = pf.weighted_covariance(cloud.place, cloud.weights if self._missed else weights)
-        std_m = float(np.sqrt(0.5 * np.trace(spread)))
-        axes = footprint.local_axes(placing.plane, placing.body_matrix, place)
-        std = float(np.sqrt(0.5 * np.trace(axes @ spread @ axes.T)))
-        centre = placing.body_pixels(place[None])[0]
-        state = State.VISIBLE if self._missed == 0 else State.COASTING
-        unseen = self._time - self._seen_last
-        useless = std_m > _LOST_STD * target.length or unseen > _LOST_AFTER_S
-        if state is State.COASTING and (useless or not np.isfinite([*centre, std]).all()):
-            state = State.LOST
-        self._state = state
-        corners = placing.body_pixels(target.outline(place, heading))
-        size = corners.max(axis=0) - corners.min(axis=0)
-        ahead = axes @ np.array([np.cos(heading), np.sin(heading)])
-        moving = target.aligned and np.isfinite(ahead).all()
-        common = Estimate(
-            time=time,
-            state=state,
-            x=float(centre[0]),
-            y=float(centre[1]),
-            width=float(size[0]),
-            height=float(size[1]),
-            heading=float(np.arctan2(ahead[1], ahead[0])) if moving else float("nan"),
-            std=std,
-            hypotheses=self._hypotheses(groups),
-            particles=placing.body_pixels(cloud.place),
-            layers=self._layers(place),
-        )
-        if state is State.LOST:
-            return replace(common, x=float("nan"), y=float("nan"), heading=float("nan"), hypotheses=())
-        if not placing.metric:
-            return common
-        course = float(np.arctan2(np.sin(heading), np.cos(heading))) if target.aligned else float("nan")
-        return replace(common, north=float(place[0]), east=float(place[1]), speed=speed, course=course, std_m=std_m)
+        """What is known now."""
+        found = answer(self._cloud, self._target, self._placing, self._missed, time, self._time - self._seen_last)
+        self._state = found.state
+        return replace(found, layers=self._layers())
 
-    def _layers(self, place: Floats) -> Layers:
-        placing, road = self._placing, self._road
+    def _layers(self) -> Layers:
+        placing, road, place = self._placing, self._road, self._cloud.weights @ self._cloud.place
         ways = self._outlook.ways if self._outlook is not None else []
         named = {f"way {k}": partial(placing.pixels, way.points) for k, way in enumerate(ways)}
         return Layers(
@@ -451,37 +429,6 @@ class GroundTracker:
             }
         )
 
-    def _hypotheses(self, groups: tuple[pf.Cluster, ...]) -> tuple[Hypothesis, ...]:
-        if len(groups) < 2:
-            return ()
-        total = sum(group.weight for group in groups)
-        places = self._placing.body_pixels(np.array([group.centre for group in groups]))
-        return tuple(
-            Hypothesis(group.weight / total, float(x), float(y)) for group, (x, y) in zip(groups, places, strict=True)
-        )
-
-
-def check_target(image: Image, size: tuple[int, int], target: Box) -> None:
-    """Raises InputError for a box that can't be a target, or a picture that isn't of this size."""
-    width, height = size
-    if image.ndim != 3 or image.shape[:2] != (height, width):
-        raise InputError(f"a picture of {image.shape[1]}x{image.shape[0]}, not {width}x{height}", remedy="check --rig")
-    values = (target.x, target.y, target.width, target.height)
-    text = ",".join(f"{value:g}" for value in values)
-    if not np.isfinite(values).all():
-        raise InputError(f"target {text} is not finite", remedy="give x,y,w,h in pixels")
-    if min(target.width, target.height) < _SMALLEST_BOX:
-        remedy = f"draw a box of at least {_SMALLEST_BOX:g} pixels a side round the car"
-        raise InputError(f"target {text} is too small to be recognised", remedy=remedy)
-    overlap_x = min(target.x + target.width, width) - max(target.x, 0.0)
-    overlap_y = min(target.y + target.height, height) - max(target.y, 0.0)
-    if min(overlap_x, overlap_y) <= 0 or overlap_x * overlap_y < 0.5 * target.width * target.height:
-        raise InputError(
-            f"target {text} is outside the image of {width}x{height}", remedy="give x,y,w,h of a car in the picture"
-        )
-    if target.width * target.height > 0.5 * width * height:
-        raise InputError(f"target {text} fills the image", remedy="draw the box round one car")
-
 
 def _is_sure(verdict: Verdict) -> bool:
     """Whether the target is wholly and surely seen, alone and as it always looks: then it may be learnt from."""
@@ -489,9 +436,3 @@ def _is_sure(verdict: Verdict) -> bool:
     if best is None or verdict.crowded:
         return False
     return verdict.sureness > 0.9 and best.score > 0.75 and best.seen > 0.98
-
-
-def _between(corners: Floats) -> Floats:
-    """(16, 2) points along the sides of a quadrilateral (4, 2)."""
-    share = np.linspace(0.0, 1.0, 4, endpoint=False)[:, None]
-    return np.concatenate([a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])

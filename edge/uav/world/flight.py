@@ -90,17 +90,21 @@ def unrest(rng: np.random.Generator, times: Floats, shake: Shake, mean_tilt_deg:
     return Unrest(angles, shift)
 
 
-def fly(times: Floats, aim: Floats, yaw: Floats, altitude: float, shaking: Unrest, body_from_camera: Floats) -> Flight:
+def fly(
+    times: Floats, aim: Floats, yaw: Floats, altitude: float | Floats, shaking: Unrest, body_from_camera: Floats
+) -> Flight:
     """A flight that looks at ``aim`` on the whole, shaking about it.
 
     times: (n,) the grid. aim: (n, 2) ground point that the middle of the picture shows but for the shaking [m].
-    yaw: (n,) wanted [rad]. altitude: [m]. The constant tilt and the mounting are flown out, their wander is not.
+    yaw: (n,) wanted [rad]. altitude: [m], one or (n,). The constant tilt and the mounting are flown out, their wander
+    is not.
     """
     angles = shaking.angles.copy()
     angles[:, 2] += yaw
     mean = shaking.angles[:, :2].mean(axis=0)
     level = rotation(np.full(len(times), mean[0]), np.full(len(times), mean[1]), yaw)
     axis = level @ body_from_camera[:, 2]
-    ahead = altitude * axis[:, :2] / axis[:, 2:]
-    position = np.column_stack([aim - ahead, np.full(len(times), -altitude)]) + shaking.shift
+    heights = np.broadcast_to(altitude, len(times))
+    ahead = heights[:, None] * axis[:, :2] / axis[:, 2:]
+    position = np.column_stack([aim - ahead, -heights]) + shaking.shift
     return Flight(times, position, angles)

@@ -7,13 +7,15 @@ import dataclasses
 import numpy as np
 
 from edge.uav.world import solids
-from edge.uav.world.flight import Shake, grid_times, unrest
+from edge.uav.world.flight import Shake, fly, grid_times, unrest
 from edge.uav.world.journey import FPS, Motion, chase, ease, follow, hold_at, out_of_picture
 from edge.uav.world.noise import wander
 from edge.uav.world.roads import Bend, Curve, Road, curve
 from edge.uav.world.solids import Solid
 from edge.uav.world.stage import AHEAD, BEHIND, RIDE_FRAMES, Script, Stage, along, right_lane
 from protocols.geometry.types import Floats
+
+_TENFOLD = (0.04, 0.4)  # metres on the ground a pixel
 
 
 def trees(stage: Stage) -> Script:
@@ -94,6 +96,49 @@ def partial(stage: Stage) -> Script:
     pixels[:, 1 - axis] += there * rng.uniform(-0.3, 0.3) * size[1 - axis]
     flight = hold_at(motion, stage.view, times, pixels, unrest(rng, times, Shake()))
     return Script(stage.view, roads, motion, flight, length)
+
+
+def cut(stage: Stage) -> Script:
+    """The target is cut about in half by the picture's border in the first frame, then comes in and stays."""
+    rng = stage.rng
+    roads, motion = _road(stage)
+    times = grid_times(RIDE_FRAMES / FPS)
+    size = np.array([stage.view.lens.width, stage.view.lens.height])
+    axis, sign = int(rng.integers(2)), rng.choice([-1.0, 1.0])
+    there = 1.0 - ease((times - 0.3) / rng.uniform(0.8, 2.0))
+    pixels = np.tile(0.5 * (size - 1.0), (len(times), 1))
+    pixels[:, axis] += sign * there * (0.5 * size[axis] - rng.uniform(0.0, 4.0))
+    pixels[:, 1 - axis] += there * rng.uniform(-0.3, 0.3) * size[1 - axis]
+    flight = hold_at(motion, stage.view, times, pixels, unrest(rng, times, Shake()))
+    return Script(stage.view, roads, motion, flight, RIDE_FRAMES)
+
+
+def climb(stage: Stage) -> Script:
+    """The drone climbs (or sinks) tenfold: the target is some 110 px long and 11 px, or the other way round."""
+    rng = stage.rng
+    roads, motion = _road(stage)
+    times = grid_times(RIDE_FRAMES / FPS)
+    low, high = (metres * stage.view.lens.focal for metres in _TENFOLD)
+    share = ease((times - 1.0) / (RIDE_FRAMES / FPS - 2.0))
+    if rng.random() < 0.5:
+        share = 1.0 - share
+    # By equal factors in equal times: what is seen grows or shrinks evenly.
+    altitude = low * (high / low) ** share
+    view = dataclasses.replace(stage.view, altitude=high)
+    ground, _ = motion.at(times)
+    yaw = np.full(len(times), view.yaw)
+    calm = Shake(position_m=0.3, altitude_m=0.3)
+    flight = fly(times, ground, yaw, altitude, unrest(rng, times, calm), view.body_from_camera)
+    return Script(view, roads, motion, flight, RIDE_FRAMES)
+
+
+def far(stage: Stage) -> Script:
+    """From high above: the target is about 10 px long, and stays in the picture."""
+    rng = stage.rng
+    roads, motion = _road(stage)
+    view = dataclasses.replace(stage.view, altitude=rng.uniform(0.42, 0.47) * stage.view.lens.focal)
+    flight = follow(rng, motion, view, RIDE_FRAMES / FPS)
+    return Script(view, roads, motion, flight, RIDE_FRAMES)
 
 
 def winding(stage: Stage) -> Script:

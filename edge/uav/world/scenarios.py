@@ -44,6 +44,9 @@ SCENARIOS = {
     "lighting": Scenario(rides.lighting, None, "the light changes"),
     "off-road": Scenario(rides.off_road, None, "drives over grass"),
     "partial": Scenario(rides.partial, 90, "cut in half by the picture's border"),
+    "cut": Scenario(rides.cut, None, "cut in half by the picture's border in the first frame"),
+    "climb": Scenario(rides.climb, None, "the drone climbs or sinks tenfold"),
+    "far": Scenario(rides.far, None, "10 px long, from high above"),
     "paper-3.3": Scenario(rides.winding, None, "a winding road, a drone with a simple controller"),
     "paper-4.4": Scenario(exits.town, 60, "crossings, buildings, many cars; the car turns, the drone does not"),
 }
