@@ -69,10 +69,12 @@ def adjust(
     *,
     iterations: int = 40,
     rounds: int = 4,
+    roughly: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[Problem, State, MotionPrior]:
     """Solve: robust rounds first, then the rows that fit with full weight.
 
+    roughly: for a start, which is adjusted again.
     Returns the problem with the rows that count marked, the state, and the motion prior used.
     """
     prior = motion_prior(problem, state, first=True)
@@ -87,7 +89,7 @@ def adjust(
             robust = False
         if progress is not None:
             progress(f"adjustment {turn + 1}/{rounds}: {float(np.median(state.sigma)):.2f} px")
-    state = _minimise(problem, state, prior, robust, iterations, _FINE)
+    state = _minimise(problem, state, prior, robust, iterations, _ROUGH if roughly else _FINE)
     return problem, replace(state, sigma=noise(problem, state)), prior
 
 

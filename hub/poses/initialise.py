@@ -167,7 +167,7 @@ def settle(
     if not used:
         raise Refused("no part of the path is seen by two cameras from directions that differ enough")
     if freedom is not None:
-        problem, state, _ = adjust(problem, state, iterations=12, rounds=2)
+        problem, state, _ = adjust(problem, state, iterations=12, rounds=2, roughly=True)
     return Scaffold(names, [labels[label] for label in used], problem, state)
 
 
