@@ -11,8 +11,9 @@ from hub.pairs import pair_lag
 from hub.points import SAME_TIME, PointBasis
 from hub.poses import covariance as cov
 from hub.poses.adjust import motion_prior, predict, residual_norms
-from hub.poses.gauge import fix_gauge, given_world, transform_state
+from hub.poses.gauge import fix_gauge, given_world, transform_state, weighed
 from hub.poses.problem import Problem, State
+from hub.poses.references import adjust_to_references
 from hub.timing.pair import PairSolution
 from hub.timing.two_view import fundamental_from, relative_pose
 from protocols.clocks import TimeMap
@@ -23,6 +24,7 @@ from protocols.version import VERSION
 
 if TYPE_CHECKING:
     from hub.calibrate import Solution
+    from hub.poses.initialise import Scaffold
     from hub.prepare import Prepared
 
 SEEN_WITHIN = 0.2
@@ -39,6 +41,8 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
     if solution.known is None:
         gauge = fix_gauge(rig, names, [camera.pose for camera in state.cameras])
         state = transform_state(state, gauge.similarity)
+        if gauge.scale == "metric" and problem.freedom.pose and weighed(rig, names):
+            state = adjust_to_references(rig, names, problem, state, motion_prior(problem, state))
     else:
         gauge = given_world(len(names), solution.known.scale)
     covariance = cov.covariance(problem, state, motion_prior(problem, state), gauge.information)
@@ -93,6 +97,20 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
         pairs=tuple(_pair_report(pair, cameras, problem, state, names, solution) for pair in solution.pairs),
         warnings=solution.prepared.warnings + solution.warnings + gauge.warnings,
         residuals={name: _residual_rows(problem, state, i, epochs[i], paces[i]) for i, name in enumerate(names)},
+    )
+
+
+def path_tables(rig: Rig, prepared: Prepared, scaffold: Scaffold, base: str) -> tuple[TrajectoryTable, ...]:
+    """The paths of a solution whose cameras were given and stay, in their world, on the clock of camera ``base``."""
+    problem, state, names = scaffold.problem, scaffold.state, scaffold.names
+    covariance = cov.covariance(problem, state, motion_prior(problem, state))
+    reference = names.index(base)
+    paces = [prepared.pace(name) for name in names]
+    rate_hz = _rate_hz(rig, problem, names, paces, paces[reference])
+    epoch, pace = prepared.epochs[base], paces[reference]
+    return tuple(
+        _table(problem, state, covariance, label, name, reference, epoch, pace, rate_hz)
+        for label, name in enumerate(scaffold.labels)
     )
 
 

@@ -377,7 +377,9 @@ def _moved_camera(camera: CameraState, step: Floats) -> CameraState:
     )
 
 
-def _minimise(problem: Problem, state: State, prior: MotionPrior, robust: bool, iterations: int, least_gain: float) -> State:
+def _minimise(
+    problem: Problem, state: State, prior: MotionPrior, robust: bool, iterations: int, least_gain: float
+) -> State:
     damping = 1e-4
     system, cost = build_system(problem, state, prior, robust)
     for _ in range(iterations):

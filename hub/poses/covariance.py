@@ -42,7 +42,7 @@ def covariance(problem: Problem, state: State, prior: MotionPrior, references: F
     if problem.freedom.pose:
         known = np.zeros((len(state.cameras) * CAMERA_PARAMETERS,) * 2) if references is None else references
         information = information + known[np.ix_(columns, columns)]
-        held = _held_rows(state, known)[:, columns]
+        held = held_rows(state, known)[:, columns]
     if held is not None and len(held):
         _, _, vt = np.linalg.svd(held)
         tangent = vt[len(held) :].T
@@ -90,7 +90,7 @@ def gauge_generators(state: State) -> Floats:
     return np.concatenate(rows)
 
 
-def _held_rows(state: State, references: Floats) -> Floats:
+def held_rows(state: State, references: Floats) -> Floats:
     """Constraint rows (q, 10 n) on the gauge directions that the references leave open."""
     generators = gauge_generators(state)
     default = np.zeros((7, len(generators)))

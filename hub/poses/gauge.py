@@ -21,6 +21,7 @@ from protocols.session.rig import Rig
 
 _EXACT = 1e-4  # std of a reference without one, relative to the size of the rig
 _UP_STD = 0.01  # rad
+_GAUGE_FREEDOM = 7
 _FAR = 8.0  # sigma: references that contradict each other by more are told
 _CONTRADICTION = 0.1  # … and refused if they are off by more than this share of the rig, or rad
 
@@ -72,7 +73,8 @@ def fix_gauge(rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
         if share > _CONTRADICTION:
             raise Refused(f"the rig's references contradict each other or what was seen: worst is {worst}")
         warnings.append(f"the rig's references disagree by more than their stds: worst is {worst}")
-    return Gauge(best, "metric", _information(rig, names, poses, best), tuple(warnings))
+    terms = reference_terms(rig, names, [best.pose(pose) for pose in poses])
+    return Gauge(best, "metric", terms.information, tuple(warnings))
 
 
 def _worst_reference(
@@ -233,28 +235,63 @@ def _extent(poses: list[Pose]) -> float:
     return max(float(np.linalg.norm(np.ptp(centres, axis=0))), 1e-9)
 
 
-def _information(rig: Rig, names: list[str], poses: list[Pose], s: Similarity) -> Floats:
-    """Information (10 n, 10 n) of the references about the cameras' parameters in the published world."""
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferenceTerms:
+    """What the references say of the cameras' parameters in the published world.
+
+    information: (10 n, 10 n). gradient: (10 n,) of half their cost, cost: their squared residuals in sigma.
+    """
+
+    information: Floats
+    gradient: Floats
+    cost: float
+
+
+def reference_terms(rig: Rig, names: list[str], poses: list[Pose]) -> ReferenceTerms:
+    """Terms of the rig's positions, attitudes and distances for cameras ``names`` at ``poses`` in its world."""
     width = CAMERA_PARAMETERS * len(names)
-    out = np.zeros((width, width))
-    size = s.scale * _extent(poses)
+    information, gradient, cost = np.zeros((width, width)), np.zeros(width), 0.0
+    size = _extent(poses)
     for i, name in enumerate(names):
         camera, base = rig.cameras[name], i * CAMERA_PARAMETERS
+        terms = []
         if camera.position is not None:
-            std = _sigma(camera.position_std, _EXACT * size)
-            out[base + 3 + np.arange(3), base + 3 + np.arange(3)] += 1.0 / std**2
+            off = poses[i].position - camera.position
+            terms.append((base + 3, off, _sigma(camera.position_std, _EXACT * size)))
         if camera.rotation is not None:
-            std = _sigma(camera.rotation_std, _EXACT)
-            out[base + np.arange(3), base + np.arange(3)] += 1.0 / std**2
+            terms.append((base, so3.log(poses[i].rotation @ camera.rotation.T), _sigma(camera.rotation_std, _EXACT)))
+        for begin, off, std in terms:
+            at = begin + np.arange(3)
+            information[at, at] += 1.0 / std**2
+            gradient[at] += off / std**2
+            cost += float(((off / std) ** 2).sum())
     for a, b, length in rig.distances:
         if a in names and b in names:
             i, j = names.index(a), names.index(b)
-            apart = s.points(poses[j].position[None])[0] - s.points(poses[i].position[None])[0]
+            apart = poses[j].position - poses[i].position
+            far = float(np.linalg.norm(apart))
             row = np.zeros(width)
-            row[i * CAMERA_PARAMETERS + 3 : i * CAMERA_PARAMETERS + 6] = -apart / np.linalg.norm(apart)
-            row[j * CAMERA_PARAMETERS + 3 : j * CAMERA_PARAMETERS + 6] = apart / np.linalg.norm(apart)
-            out += np.outer(row, row) / (_EXACT * length) ** 2
-    return out
+            row[i * CAMERA_PARAMETERS + 3 : i * CAMERA_PARAMETERS + 6] = -apart / far
+            row[j * CAMERA_PARAMETERS + 3 : j * CAMERA_PARAMETERS + 6] = apart / far
+            information += np.outer(row, row) / (_EXACT * length) ** 2
+            gradient += row * (far - length) / (_EXACT * length) ** 2
+            cost += ((far - length) / (_EXACT * length)) ** 2
+    return ReferenceTerms(information, gradient, cost)
+
+
+def weighed(rig: Rig, names: list[str]) -> bool:
+    """Whether the references say more than where the world is, and how sure they are of it.
+
+    Without a std nobody knows how much a reference beyond the gauge should bend what was seen.
+    """
+    cameras = [rig.cameras[name] for name in names]
+    rows = sum(3 * (one.position is not None) + 3 * (one.rotation is not None) for one in cameras)
+    told = any(
+        (one.position is not None and one.position_std is not None)
+        or (one.rotation is not None and one.rotation_std is not None)
+        for one in cameras
+    )
+    return told and rows + sum(a in names and b in names for a, b, _ in rig.distances) > _GAUGE_FREEDOM
 
 
 def transform_state(state: State, s: Similarity) -> State:

@@ -71,6 +71,11 @@ def solve_pair(
         return PairSolution(*names, "no label that both cameras saw")
     search = _Search([tracks_a[k] for k in labels], [tracks_b[k] for k in labels], s, known, calibrated)
     first = search.at_rate(names, 1.0, None if near is None else (near, s.near_window))
+    if first.solved and near is None and first.fit is not None and first.fit.support < s.hardly and search.jumps():
+        # A few seconds of a torn track agree with much; the lag at which its pieces agree for longer is likelier.
+        pieces = search.in_pieces(names)
+        if pieces.solved and pieces.fit is not None and pieces.fit.support > 2.0 * first.fit.support:
+            return pieces
     if first.solved or not thorough or near is not None:
         return first
     if search.jumps():

@@ -1,0 +1,75 @@
+"""References beyond the gauge: positions with stds are measurements that improve what was seen, as far as they can."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hub.calibrate import calibrate
+from protocols.geometry.types import Floats
+from protocols.session.calibration import Calibration
+from tests import rigs
+
+_STD = 0.004  # m
+
+
+def surveyed(session: rigs.Session, seed: int, std: float | None, told: float = _STD) -> rigs.Session:
+    """The session with every camera's position measured, ``std`` off, and told to be ``told`` off (None: not told)."""
+    rng = np.random.default_rng(seed)
+    cameras = {}
+    for name, camera in session.rig.cameras.items():
+        position = session.poses[name].position + rng.normal(0.0, 1.0, 3) * (0.0 if std is None else std)
+        cameras[name] = replace(camera, position=position, position_std=None if std is None else np.full(3, told))
+    return replace(session, rig=replace(session.rig, cameras=cameras))
+
+
+def errors(session: rigs.Session, found: Calibration) -> Floats:
+    return np.array(
+        [np.linalg.norm(one.pose.position - session.poses[name].position) for name, one in found.cameras.items()]
+    )
+
+
+def weak(seed: int) -> rigs.Session:
+    """Little motion, much noise: the poses are known to a centimetre or so."""
+    return rigs.simulate(seed, 4, 14.0, noise=4.0, late=1.0)
+
+
+@pytest.fixture(scope="module")
+def both() -> tuple[Floats, Floats, Floats]:
+    """Position errors (sessions, 4): with all references weighed, with them as the gauge only, and the stated stds."""
+    weighed, gauge_only, stated = [], [], []
+    for seed in range(4):
+        session = weak(seed)
+        sure = surveyed(session, seed, _STD)
+        found = calibrate(sure.rig, session.observations())
+        weighed.append(errors(session, found))
+        stated.append([np.linalg.norm(one.position_std) for one in found.cameras.values()])
+        untold = {name: replace(camera, position_std=None) for name, camera in sure.rig.cameras.items()}
+        gauge_only.append(errors(session, calibrate(replace(sure.rig, cameras=untold), session.observations())))
+    return np.array(weighed), np.array(gauge_only), np.array(stated)
+
+
+def test_weighed_references_beat_the_gauge_alone(both: tuple[Floats, Floats, Floats]) -> None:
+    weighed, gauge_only, _ = both
+    assert np.sqrt((weighed**2).mean()) < 0.8 * np.sqrt((gauge_only**2).mean())
+    # No worse than the survey itself.
+    assert np.sqrt((weighed**2).mean()) < 1.1 * np.sqrt(3.0) * _STD
+
+
+def test_the_stated_stds_are_those_of_the_combination(both: tuple[Floats, Floats, Floats]) -> None:
+    weighed, _, stated = both
+    assert 0.6 < np.sqrt((weighed**2).mean() / (stated**2).mean()) < 1.6
+
+
+def test_hardly_known_references_change_nothing_that_was_seen() -> None:
+    session = weak(11)
+    loose = calibrate(surveyed(session, 1, _STD, told=1e3).rig, session.observations())
+    plain = calibrate(session.rig, session.observations())
+    # The strength of the motion prior is told once more by the path, which moves a little less than its std.
+    apart = [
+        [np.linalg.norm(one[a].pose.position - one[b].pose.position) for a, b in (("cam0", "cam1"), ("cam0", "cam2"))]
+        for one in (loose.cameras, plain.cameras)
+    ]
+    assert apart[0][1] / apart[0][0] == pytest.approx(apart[1][1] / apart[1][0], rel=5e-4)
