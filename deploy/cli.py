@@ -31,11 +31,17 @@ COMMANDS: tuple[tuple[str, str, str], ...] = (
         "deploy.commands.calibrate:calibrate",
         "Timing and poses of all cameras of a session or log.",
     ),
+    ("triangulate", "deploy.commands.triangulate:triangulate", "3-D of labelled points with a given calibration."),
+    ("detect", "deploy.commands.detect:detect", "One detector over one video."),
+    ("intrinsics", "deploy.commands.intrinsics:intrinsics", "A camera's lens from a video of a board."),
+    ("sync", "deploy.commands.sync:sync", "Reference times of all frames; videos that line up."),
+    ("export", "deploy.commands.export:export", "Calibrations and paths in other tools' formats."),
     ("track", "deploy.commands.track:track", "Follow one car from the air, also out of the picture."),
     ("camera", "deploy.commands.agents:camera", "Camera agent: detect and publish."),
     ("hub", "deploy.commands.agents:hub", "Hub agent: gather, calibrate, track."),
     ("record", "deploy.commands.agents:record", "Recorder: everything on the bus into a log."),
-    ("replay", "deploy.commands.logs:replay", "Play a log back onto the bus."),
+    ("replay", "deploy.commands.logs:replay", "Play a log back onto the bus, or compare two."),
+    ("recover", "deploy.commands.logs:recover", "Make a whole log of a damaged one."),
     ("info", "deploy.commands.logs:info", "What is in a log or a session."),
 )
 
