@@ -97,7 +97,7 @@ def describe_log(path: Path | str) -> LogDescription:
     rejected = dict(reader.counters)
     return LogDescription(
         path=str(path),
-        bytes=Path(path).stat().st_size,
+        bytes=reader.size,
         begin_ns=summary.first_ns,
         duration_s=(summary.last_ns - summary.first_ns) / NANOSECONDS,
         messages=summary.messages,

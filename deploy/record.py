@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 import time
 import uuid
@@ -11,25 +12,41 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from deploy.config import RecorderConfig
+from deploy.config import RecorderConfig, effective_toml
 from protocols.bus.base import Bus, Received, Subscription
 from protocols.catalogue import STATUS, TOPICS
+from protocols.errors import InputError
 from protocols.gate import SCHEMA_VERSION
+from protocols.log.rotation import RotatingWriter
 from protocols.log.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
+from protocols.version import VERSION
 
 ROLE = "record"
 _TICK_S = 0.02
-_SYNC_S = 1.0
+_SYNC_S = 0.5
+"""Half of the second that may be lost: the writing and the disk need time too."""
+_STATUS_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class RecorderResult:
-    """What was recorded. counters: recorded, dropped, lost, rejected.<reason>, summed over all topics."""
+    """What was recorded. counters: recorded, dropped, lost, rejected.<reason>, summed over all topics.
+
+    path: the log, or the first of its parts. stopped: why it ended before it was told to; "" if it did not.
+    """
 
     path: Path
     messages: int
     counters: Mapping[str, int]
+    parts: int = 1
+    stopped: str = ""
+
+
+def free_bytes(folder: Path) -> int:
+    """Bytes that may still be written below ``folder``, which need not be there yet."""
+    place = next(parent for parent in (folder, *folder.absolute().parents) if parent.is_dir())
+    return shutil.disk_usage(place).free
 
 
 def log_path(out: Path, now: datetime) -> Path:
@@ -46,50 +63,86 @@ def run_recorder(
     *,
     stop_when: Callable[[int], bool] | None = None,
     boot_id: str | None = None,
+    free: Callable[[Path], int] = free_bytes,
 ) -> RecorderResult:
-    """Record until ``stop`` is set, or until ``stop_when(messages so far)`` is true.
+    """Record until ``stop`` is set, until ``stop_when(messages so far)`` is true, or until the disk is nearly full.
 
-    Log times are the arrival times. Each second the log is brought to the disk and the recorder's status
-    is published. Raises InputError if the log exists already or cannot be written.
+    Log times are the arrival times. Twice a second the log is brought to the disk; each second the recorder's
+    status is published. free: bytes left where the log is. Raises InputError if the log exists already or cannot be
+    written, or if the disk is too full to begin.
     """
     boot = boot_id or uuid.uuid4().hex
     path = log_path(config.out, datetime.now(UTC))
-    metadata = {
-        "syncline": {
-            "site": bus.site,
-            "recorder": config.id,
-            "boot_id": boot,
-            "schema_version": str(SCHEMA_VERSION),
-        }
-    }
-    with LogWriter(path, metadata) as writer, bus.announce(ROLE, config.id, boot):
+    full = _too_full(config, path, free)
+    if full:
+        raise InputError(f"not recorded: {full}", file=path, remedy="make room, or lower min_free_mb")
+    with _writer(config, path, bus.site, boot) as writer, bus.announce(ROLE, config.id, boot):
         subscriptions = [bus.subscribe(topic) for topic in TOPICS if topic.recorded]
         publisher = bus.publisher(STATUS, config.id)
         status = pb.AgentStatus(
-            schema_version=SCHEMA_VERSION, agent=config.id, role=ROLE, boot_id=boot, state="running"
+            schema_version=SCHEMA_VERSION, agent=config.id, role=ROLE, boot_id=boot, state="running", version=VERSION
         )
         messages = 0
-        next_sync = time.monotonic()
+        next_sync = next_status = time.monotonic()
         try:
-            while not stop.is_set() and not (stop_when is not None and stop_when(messages)):
+            while not stop.is_set() and not (stop_when is not None and stop_when(messages)) and not full:
                 messages += _record(writer, bus.site, subscriptions)
-                if time.monotonic() >= next_sync:
-                    next_sync = time.monotonic() + _SYNC_S
+                now = time.monotonic()
+                if now >= next_sync:
+                    next_sync = now + _SYNC_S
                     writer.sync()
-                    _report(status, subscriptions, messages, writer.size)
-                    publisher.put(status)
-                    status.sequence += 1
-                stop.wait(_TICK_S)
+                    full = _too_full(config, path, free)
+                    # Only right after a sync: what it reports as recorded is on the disk.
+                    if now >= next_status or full:
+                        next_status = now + _STATUS_S - _SYNC_S / 2
+                        _report(status, subscriptions, messages, writer.size, full)
+                        publisher.put(status)
+                        status.sequence += 1
+                if not full:
+                    stop.wait(_TICK_S)
             messages += _record(writer, bus.site, subscriptions)
             counters = _counters(subscriptions, messages)
         finally:
             publisher.close()
             for subscription in subscriptions:
                 subscription.close()
-    return RecorderResult(path, messages, counters)
+    return RecorderResult(
+        writer.first if isinstance(writer, RotatingWriter) else path,
+        messages,
+        counters,
+        writer.parts if isinstance(writer, RotatingWriter) else 1,
+        full,
+    )
 
 
-def _record(writer: LogWriter, site: str, subscriptions: list[Subscription]) -> int:
+def _writer(config: RecorderConfig, path: Path, site: str, boot: str) -> LogWriter | RotatingWriter:
+    metadata = {
+        "syncline": {
+            "site": site,
+            "recorder": config.id,
+            "boot_id": boot,
+            "schema_version": str(SCHEMA_VERSION),
+            "version": VERSION,
+        },
+        "configuration": {"recorder.toml": effective_toml(config)},
+    }
+    if config.part_s is None and config.part_mb is None:
+        return LogWriter(path, metadata, views=config.foxglove)
+    max_bytes = None if config.part_mb is None else round(config.part_mb * 1e6)
+    return RotatingWriter(path, metadata, boot, max_bytes=max_bytes, max_s=config.part_s, views=config.foxglove)
+
+
+def _too_full(config: RecorderConfig, path: Path, free: Callable[[Path], int]) -> str:
+    """Why the disk has no room for more; "" while it has."""
+    left = free(path.parent) / 1e6
+    return (
+        f"{left:.0f} MB are free on the disk, min_free_mb is {config.min_free_mb:g}"
+        if left < config.min_free_mb
+        else ""
+    )
+
+
+def _record(writer: LogWriter | RotatingWriter, site: str, subscriptions: list[Subscription]) -> int:
     """Write what has arrived, in the order of arrival over all topics."""
     batch: list[Received] = [received for subscription in subscriptions for received in subscription.drain()]
     batch.sort(key=lambda received: received.arrival_ns)
@@ -106,11 +159,13 @@ def _counters(subscriptions: list[Subscription], messages: int) -> dict[str, int
     return {"recorded": messages, **counts}
 
 
-def _report(status: pb.AgentStatus, subscriptions: list[Subscription], messages: int, size: int) -> None:
+def _report(status: pb.AgentStatus, subscriptions: list[Subscription], messages: int, size: int, full: str) -> None:
     counters = _counters(subscriptions, messages)
     missing = counters.get("dropped", 0) + counters.get("lost", 0)
     status.state = "degraded" if missing else "running"
     status.message = f"{missing} messages are missing from the log" if missing else f"{messages} messages"
+    if full:
+        status.state, status.message = "stopping", f"recording ended: {full}"
     status.counters.clear()
     for name, count in counters.items():
         status.counters[name] = count

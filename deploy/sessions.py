@@ -11,7 +11,7 @@ from protocols.session.rig import Rig
 
 def load_session(path: Path, observations: Path | None = None) -> tuple[Rig, Observations, tuple[str, ...]]:
     """The rig, the observations and warnings. Raises InputError."""
-    if path.suffix == ".mcap":
+    if is_log(path):
         if observations is not None:
             raise InputError("--observations goes with a session folder", file=path, remedy="leave it out for a log")
         from protocols.log.as_session import session_from_log
@@ -21,3 +21,10 @@ def load_session(path: Path, observations: Path | None = None) -> tuple[Rig, Obs
 
     rig, found = read_folder(path, observations)
     return rig, found, found.warnings
+
+
+def is_log(path: Path) -> bool:
+    """Whether a path means a log: a .mcap file, or a folder that holds the parts of one and is no session folder."""
+    if path.suffix == ".mcap" and not path.is_dir():
+        return True
+    return path.is_dir() and not (path / "rig.toml").exists() and any(path.glob("*.mcap"))

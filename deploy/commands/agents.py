@@ -14,7 +14,7 @@ from cyclopts import Parameter
 from deploy.config import CameraConfig, HubConfig, RecorderConfig, effective_toml, load
 from deploy.signals import stop_on_signals
 from protocols.bus.settings import BusConfig
-from protocols.errors import EXIT_DONE
+from protocols.errors import EXIT_DONE, EXIT_INPUT
 
 PrintConfig = Annotated[bool, Parameter(negative="")]
 
@@ -69,7 +69,8 @@ def record(config: Path, /, *, print_config: PrintConfig = False) -> int:
     Parameters
     ----------
     config
-        TOML file: id, site, [bus], out (a .mcap file, or a folder for files named by time).
+        TOML file: id, site, [bus], out (a .mcap file, or a folder for files named by time), part_s, part_mb,
+        min_free_mb, foxglove.
     print_config
         Show the configuration with all defaults filled in, and stop.
     """
@@ -81,10 +82,17 @@ def record(config: Path, /, *, print_config: PrintConfig = False) -> int:
 
     def start(bus: Any, stop: Any) -> int:
         result = run_recorder(settings, bus, stop)
-        print(f"recorded {result.messages} messages to {result.path}")
+        print(f"recorded {result.messages} messages to {result.path}" + _more_parts(result.parts))
+        if result.stopped:
+            print(f"syncline: recording ended: {result.stopped}; the log is whole; make room", file=sys.stderr)
+            return EXIT_INPUT
         return EXIT_DONE
 
     return _with_bus(settings, start)
+
+
+def _more_parts(parts: int) -> str:
+    return f" and {parts - 1} more parts" if parts > 1 else ""
 
 
 def _with_bus(settings: Any, start: Any) -> int:

@@ -44,6 +44,7 @@ BENCHES = {
         data=True,
     ),
     "poses": Bench("distributed poses against the joint optimum", ("--quick", "--rows", "section4,bearings")),
+    "logs": Bench("logs: rates, kill -9, damage", ("--quick",)),
     "uav_tracker": Bench(
         "one car from a drone, simulated",
         ("--seeds", "1", "--models", "ground", "--scenarios", "exit-bend,exit-straight"),

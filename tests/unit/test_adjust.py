@@ -84,9 +84,7 @@ def test_every_camera_derivative_is_a_difference(lens: str, column: int) -> None
     line = linearise(rows, camera, path)
     assert line.valid.all()
     step = 1e-6
-    ahead, behind = (
-        linearise(rows, nudged(camera, column, sign * step), path).residual for sign in (1, -1)
-    )
+    ahead, behind = (linearise(rows, nudged(camera, column, sign * step), path).residual for sign in (1, -1))
     expected = (ahead - behind) / (2 * step)
     assert np.abs(expected).max() > 1e-3
     np.testing.assert_allclose(line.by_camera[:, :, column], expected, rtol=2e-5, atol=2e-3)
@@ -101,16 +99,13 @@ def test_the_derivative_by_the_point_is_a_difference(which: int) -> None:
     for axis in range(3):
         step = np.zeros(3)
         step[axis] = 1e-6
-        ahead, behind = (
-            linearise(rows, camera, replace(path, control=path.control + s * step))
-            for s in (1, -1)
-        )
+        ahead, behind = (linearise(rows, camera, replace(path, control=path.control + s * step)) for s in (1, -1))
         difference = (ahead.residual - behind.residual) / 2e-6
         np.testing.assert_allclose(line.by_point[:, :, axis], difference, rtol=1e-5, atol=1e-3)
 
 
 def test_a_fisheye_point_on_the_axis_has_derivatives() -> None:
-    problem, state, _ = world(3)
+    _, state, _ = world(3)
     camera = state.cameras[2]
     basis = SplineBasis.over(np.array([0.0]), np.array([6.0]), 1.0)
     ahead = camera.pose.world_from_camera(np.array([[0.0, 0.0, 4.0]]))
