@@ -45,7 +45,7 @@ def solve_pairs(
     names = prepared.names
     todo = list(itertools.combinations(names, 2))
     many = len(names) > _FEW and not prepared.shared_clock
-    pairs = dict.fromkeys(todo, PairSolution("", "", ""))  # answers in the rig's order
+    pairs: dict[tuple[str, str], PairSolution] = {}
     told = _ToldClocks()
     for done, (a, b) in enumerate(_most_promising_first(prepared, todo, tell) if many else todo):
         tell(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
@@ -56,6 +56,7 @@ def solve_pairs(
             answer = _solve(prepared, (a, b), known)
         pairs[a, b] = answer
         told.hear(answer)
+    pairs = {both: pairs[both] for both in todo}  # in the rig's order
     if thorough and not prepared.shared_clock:
         prepared = _tie_at_other_rates(prepared, pairs, known, tell)
     return prepared, list(pairs.values())

@@ -25,6 +25,8 @@ from protocols.geometry.types import Floats
 _LEAST_SAMPLES = 12
 _AT_NOISE = 0.8  # mean robust cost of an alignment whose rows are as noisy as the settings say: about 0.75
 _NEAR_CANDIDATES = 3
+_NO_FIT = "no alignment of the two tracks agrees with any geometry"
+_NO_FIT_NEAR = "at the lag that the other cameras tell no geometry agrees; other lags were not looked at"
 _STARTS = 4
 _SEEDS = 8  # of five-point hypotheses; the later ones only …
 _PROMISING = 12.0  # … for what comes this near the noise: a wrong minimum of E at the right lag
@@ -145,7 +147,7 @@ class _Search:
             if _sound(fit, s) and (good is None or evidence(fit) > good[0]):
                 good = (evidence(fit), cost)
         if not fits:
-            return PairSolution(*names, "no alignment of the two tracks agrees with any geometry")
+            return PairSolution(*names, _NO_FIT if near is None else _NO_FIT_NEAR)
         ordered = _distinct(fits, s)
         answer = _judge(names, ordered, 1.0 if near is not None else self._searched(scan, ordered[0]), s)
         if answer.solved and answer.fit is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import eigh
 
 from hub.timing.scan import GridTrack, PairMoments, Scan, candidates, grid_tracks, scan_lags
 from hub.timing.tracks import SmoothTrack, smooth_track
@@ -88,6 +89,24 @@ def test_the_normalisation_is_the_variance_of_the_epipolar_product() -> None:
         total += w * (a.sigma**2 * gradient_a @ gradient_a + b.sigma**2 * gradient_b @ gradient_b)
         weights += w
     assert f @ norm[0] @ f == pytest.approx(total / weights, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_costs_are_the_smallest_generalised_eigenvalues(seed: int) -> None:
+    """Oracle: scipy's eigenvalues of the readable 9x9 matrices, the free constant term eliminated."""
+    a, b = smooth(simulate(seed, 2, 20))
+    moments = PairMoments(grid_tracks([a], STEP, SIGMA_PX), grid_tracks([b], STEP, SIGMA_PX))
+    which = np.flatnonzero(moments.support > 1.0)[::5]
+    expected = []
+    for moment, norm in zip(*moments.matrices(which), strict=True):
+        reduced = moment[:8, :8] - np.outer(moment[:8, 8], moment[8, :8]) / moment[8, 8]
+        expected.append(eigh(reduced, norm[:8, :8], eigvals_only=True)[0])
+    ratio = moments.costs(which) / np.array(expected)
+    # Inverse iteration comes from above, and is exact where one geometry stands out.
+    assert ratio.min() > 1.0 - 1e-6
+    assert np.median(ratio) < 1.01
+    assert ratio.max() < 2.0
+    assert ratio[np.argmin(expected)] == pytest.approx(1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -1,0 +1,66 @@
+"""What solved pairs tell of the others: lags through a chain of cameras, and searches about them."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from hub.pairs import _ToldClocks, solve_pairs
+from hub.prepare import Prepared, prepare
+from hub.timing.pair import solve_pair
+from hub.timing.promise import promise
+from hub.timing.tracks import smooth_only
+from tests.rigs import Session, simulate
+
+
+def prepared_of(session: Session) -> Prepared:
+    return prepare(session.rig, session.observations())
+
+
+def true_lag(session: Session, prepared: Prepared, a: str, b: str) -> float:
+    """t_a - t_b [s], times less the epochs, at the middle of the whole recording."""
+    middle = 15.0
+    return (session.shown(a, middle) - prepared.epochs[a]) - (session.shown(b, middle) - prepared.epochs[b])
+
+
+def test_a_chain_of_pairs_tells_the_lag_of_its_ends() -> None:
+    session = simulate(3, 4, 30.0)
+    prepared = prepared_of(session)
+    told = _ToldClocks()
+    assert told.lag(prepared, "cam0", "cam3") is None
+    for a, b in (("cam2", "cam3"), ("cam0", "cam1"), ("cam1", "cam2")):
+        tracks = [smooth_only(prepared.camera(name).tracks) for name in (a, b)]
+        told.hear(solve_pair(tracks[0], tracks[1], (a, b)))
+    for a, b in itertools.combinations(prepared.names, 2):
+        lag = told.lag(prepared, a, b)
+        assert lag is not None
+        assert lag == pytest.approx(true_lag(session, prepared, a, b), abs=0.01)
+        back = told.lag(prepared, b, a)
+        assert back is not None
+        assert back == pytest.approx(-lag, abs=1e-9)
+
+
+def test_a_search_about_the_right_lag_finds_it_and_about_a_wrong_one_does_not() -> None:
+    session = simulate(5, 2, 30.0)
+    prepared = prepared_of(session)
+    a, b = (smooth_only(prepared.camera(name).tracks) for name in ("cam0", "cam1"))
+    lag = true_lag(session, prepared, "cam0", "cam1")
+    there = solve_pair(a, b, ("cam0", "cam1"), near=lag + 0.1)
+    assert there.solved
+    assert there.fit is not None
+    assert there.fit.lag == pytest.approx(lag, abs=0.005)
+    assert not solve_pair(a, b, ("cam0", "cam1"), near=lag + 3.0).solved
+
+
+def test_a_pair_that_saw_the_same_thing_promises_more() -> None:
+    prepared = prepared_of(simulate(6, 3, 30.0, strangers=[2]))
+    tracks = {name: smooth_only(prepared.camera(name).tracks) for name in prepared.names}
+    assert promise(tracks["cam0"], tracks["cam1"]) > 1.5 * promise(tracks["cam0"], tracks["cam2"])
+
+
+def test_many_cameras_are_answered_in_the_rigs_order() -> None:
+    prepared = prepared_of(simulate(8, 10, 20.0))
+    _, pairs = solve_pairs(prepared, lambda text, share: None)
+    assert [(pair.a, pair.b) for pair in pairs] == list(itertools.combinations(prepared.names, 2))
+    assert sum(pair.solved for pair in pairs) >= 9
