@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DATA ?= ../shared/data
-SECONDS_OF_SOAK ?= 3600
+SECONDS_OF_SOAK ?= 900
 
 .PHONY: demo test lint types contracts check proto lock bench faults fuzz soak clean
 
@@ -46,7 +46,7 @@ proto: $(STAMP)
 # Renews the pinned versions in requirements.lock from pyproject.toml.
 lock: $(STAMP)
 	$(BIN)/uv pip compile --quiet --universal --no-header --no-annotate --no-emit-index-url --no-emit-find-links \
-	  --python-version 3.11 --extra dev --extra view --extra video pyproject.toml -o requirements.lock
+	  --python-version 3.11 --extra dev --extra keys --extra uav --extra view --extra video pyproject.toml -o requirements.lock
 
 $(STAMP): pyproject.toml requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Syncline needs Python 3.11 or newer: make PYTHON=python3.12")'
