@@ -20,6 +20,7 @@ from hub.poses.adjust import adjust
 from hub.poses.gauge import fix_gauge
 from hub.poses.graph import ClockGraph
 from hub.poses.initialise import Scaffold, place_known
+from hub.poses.trust import trusted
 from hub.prepare import Prepared
 from hub.timing.tracks import SmoothTrack, Track
 from protocols.clocks import TimeMap
@@ -189,9 +190,11 @@ def with_node_poses(found: Calibration, rig: Rig, nodes: NodeHost) -> Calibratio
     names = [name for name in found.cameras if name in poses]
     if len(names) < len(found.cameras):
         return found
+    rig, aside = trusted(rig, names, [poses[name] for name in names])
     world = fix_gauge(rig, names, [poses[name] for name in names]).similarity
     cameras = {name: replace(camera, pose=world.pose(poses[name])) for name, camera in found.cameras.items()}
-    return replace(found, cameras=cameras, solver="distributed")
+    warnings = found.warnings + tuple(told for told in aside if told not in found.warnings)
+    return replace(found, cameras=cameras, solver="distributed", warnings=warnings)
 
 
 def node_calibration(rig: Rig, nodes: NodeHost | None) -> Calibration:
@@ -207,6 +210,7 @@ def node_calibration(rig: Rig, nodes: NodeHost | None) -> Calibration:
     refused |= {} if nodes is None else nodes.refused
     if len(names) < 2:
         raise Refused("fewer than two pose nodes have settled", refused)
+    rig, aside = trusted(rig, names, [poses[name] for name in names])
     gauge = fix_gauge(rig, names, [poses[name] for name in names])
     cameras = {}
     for name in names:
@@ -224,5 +228,5 @@ def node_calibration(rig: Rig, nodes: NodeHost | None) -> Calibration:
         solver="distributed",
         version=VERSION,
         refused=refused,
-        warnings=gauge.warnings,
+        warnings=aside + gauge.warnings,
     )

@@ -14,6 +14,7 @@ from hub.poses.adjust import motion_prior, predict, residual_norms
 from hub.poses.gauge import fix_gauge, given_world, transform_state, weighed
 from hub.poses.problem import Problem, State
 from hub.poses.references import adjust_to_references
+from hub.poses.trust import trusted
 from hub.timing.pair import PairSolution
 from hub.timing.two_view import fundamental_from, relative_pose
 from protocols.clocks import TimeMap
@@ -38,7 +39,9 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
     order = [scaffold.names.index(name) for name in rig.cameras if name in scaffold.names]
     names = [scaffold.names[i] for i in order]
     problem, state = _reordered(scaffold.problem, scaffold.state, order)
+    aside: tuple[str, ...] = ()
     if solution.known is None:
+        rig, aside = trusted(rig, names, [camera.pose for camera in state.cameras])
         gauge = fix_gauge(rig, names, [camera.pose for camera in state.cameras])
         state = transform_state(state, gauge.similarity)
         if gauge.scale == "metric" and problem.freedom.pose and weighed(rig, names):
@@ -95,7 +98,7 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
             for label, name in enumerate(scaffold.labels)
         ),
         pairs=tuple(_pair_report(pair, cameras, problem, state, names, solution) for pair in solution.pairs),
-        warnings=solution.prepared.warnings + solution.warnings + gauge.warnings,
+        warnings=solution.prepared.warnings + solution.warnings + aside + gauge.warnings,
         residuals={name: _residual_rows(problem, state, i, epochs[i], paces[i]) for i, name in enumerate(names)},
     )
 

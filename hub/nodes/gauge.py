@@ -12,13 +12,14 @@ import numpy as np
 from hub.nodes.edge import Summary
 from hub.nodes.messages import Anchor
 from hub.nodes.two_cameras import Relative
+from hub.poses import trust
 from protocols.geometry import so3
 from protocols.geometry.pose import Similarity
 from protocols.geometry.types import Floats
+from protocols.session.rig import Rig, RigCamera
 
 LEAST_STD = 5e-5
 """Least std of a reference [rad, or share of the distance]: a stiffer one would only slow the network down."""
-_ASIDE = 40.0
 _STEPS = 12
 
 
@@ -57,6 +58,24 @@ def world_from_network(anchors: list[Anchor]) -> Similarity | None:
     if minimal:  # camera 1's pose and |t2 - t1|, exactly
         return now
     return _refined(now, positions, turns)
+
+
+def contradicted(anchors: list[Anchor]) -> dict[int, str]:
+    """Cameras whose reference all the others agree against, and how, in words."""
+    names = [str(anchor.camera) for anchor in anchors]
+    cameras = {
+        str(a.camera): RigCamera(
+            str(a.camera),
+            (1, 1),
+            position=a.reference.position,
+            rotation=a.reference.rotation,
+            position_std=np.full(3, a.reference.position_std),
+            rotation_std=np.full(3, a.reference.rotation_std),
+        )
+        for a in anchors
+    }
+    found = trust.contradicted(Rig(cameras), names, [anchor.pose for anchor in anchors])
+    return {int(name): told for name, told in found.items() if isinstance(name, str)}
 
 
 def _turn(source: Floats, target: Floats) -> Floats:

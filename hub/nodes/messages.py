@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeAlias
 
+import numpy as np
+
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 
@@ -84,6 +86,16 @@ class StateMessage:
     leaving: bool = False
     partner: int = -1
     anchors: tuple[Anchor, ...] = ()
+
+    @property
+    def sound(self) -> bool:
+        """Whether the pose is finite, with a rotation in it."""
+        if self.pose is None:
+            return True
+        rotation = self.pose.rotation
+        if not (np.isfinite(rotation).all() and np.isfinite(self.pose.position).all()):
+            return False
+        return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-6)
 
 
 @dataclass(frozen=True, slots=True)

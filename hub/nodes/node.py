@@ -15,7 +15,7 @@ import numpy as np
 
 from hub.nodes.bump import Motion, camera_moved
 from hub.nodes.edge import RAW, Edge, Summary, Window, stream
-from hub.nodes.gauge import reference_edge, usable, world_from_network
+from hub.nodes.gauge import contradicted, reference_edge, usable, world_from_network
 from hub.nodes.joining import placed, placed_by_many
 from hub.nodes.messages import Anchor, Message, Notice, Out, Reference, SharedObservation, StateMessage
 from hub.nodes.neighbour import Neighbour
@@ -41,6 +41,8 @@ _RESECT_EVERY = 20
 _YOUNG = 100
 """Updates after joining during which nothing waits."""
 _MOST_ANCHORS = 8
+_JUDGED_AT = 80
+"""Updates after joining, then again at each doubling, at which the references are judged; only then they pull."""
 _LONGEST_TURN = 0.3
 """Longest turn [rad] of one update, and longest shift as a share of the distance to the neighbours."""
 _TRUST_AFTER = 3
@@ -120,6 +122,7 @@ class PoseNode:
         out += self._join()
         self._update()
         out += self._watch_edges()
+        out += self._judge_reference()
         out.append(self.state())
         return out
 
@@ -262,7 +265,7 @@ class PoseNode:
     # neighbours' states
 
     def _state(self, state: StateMessage) -> list[Out]:
-        if state.camera == self.camera or not _sound(state):
+        if state.camera == self.camera or not state.sound:
             self.refused["senseless"] += 1
             return []
         if state.leaving:
@@ -361,7 +364,7 @@ class PoseNode:
             if other is not None and summary is not None:
                 terms.append(Term(summary, other))
         mine = self._anchors.get(self.camera)
-        if mine is not None and not self.reference_aside:
+        if mine is not None and not self.reference_aside and self.settled >= _JUDGED_AT:
             for anchor in usable(self._anchors):
                 # References talk to each other directly: a stiff tie to a pose that comes late would swing.
                 other = self._standing(self._neighbour(anchor.camera)) if anchor.camera != self.camera else None
@@ -453,6 +456,18 @@ class PoseNode:
                 edge.contradictions = max(0, edge.contradictions - 1)
         return out
 
+    def _judge_reference(self) -> list[Out]:
+        """A reference that the others contradict is set aside: the camera was bumped since it was surveyed."""
+        mine = self._anchors.get(self.camera)
+        doublings = math.log2(self.settled / _JUDGED_AT) if self.settled >= _JUDGED_AT else 0.5
+        if mine is None or self.reference_aside or doublings != int(doublings):
+            return []
+        told = contradicted([a for a in usable(self._anchors) if a.frame == self.frame]).get(self.camera)
+        if told is None:
+            return []
+        self.reference_aside = True
+        return [Notice(self.camera, "reference set aside", told)]
+
     def _find_bump(self) -> list[Out]:
         """Whether this camera was bumped (step 8): its edges' latest observations agree on a new pose."""
         if self.pose is None or self.settled < 20:
@@ -481,13 +496,3 @@ class PoseNode:
             self.reference_aside = True
             out.append(Notice(self.camera, "reference set aside", "the camera no longer stands where it was surveyed"))
         return out
-
-
-def _sound(state: StateMessage) -> bool:
-    """Finite, and a rotation."""
-    if state.pose is None:
-        return True
-    rotation = state.pose.rotation
-    if not (np.isfinite(rotation).all() and np.isfinite(state.pose.position).all()):
-        return False
-    return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-6)

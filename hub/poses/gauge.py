@@ -22,7 +22,7 @@ from protocols.session.rig import Rig
 _EXACT = 1e-4  # std of a reference without one, relative to the size of the rig
 _UP_STD = 0.01  # rad
 _GAUGE_FREEDOM = 7
-_FAR = 8.0  # sigma: references that contradict each other by more are told
+FAR = 8.0  # sigma: references that contradict each other by more are told
 _CONTRADICTION = 0.1  # … and refused if they are off by more than this share of the rig, or rad
 
 
@@ -42,59 +42,90 @@ class Gauge:
 
 def fix_gauge(rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
     """Find the published world for solved cameras ``names`` with ``poses`` in the internal one."""
-    known = [(i, rig.cameras[name]) for i, name in enumerate(names)]
-    positions = [(i, camera.position) for i, camera in known if camera.position is not None]
-    rotations = [(i, camera.rotation) for i, camera in known if camera.rotation is not None]
-    distances = [(names.index(a), names.index(b), d) for a, b, d in rig.distances if a in names and b in names]
-    base = _default(rig, names, poses)
-    apart = [poses[a].position - poses[b].position for a, b, _ in distances]
-    apart_known = float(np.linalg.norm(np.ptp([p for _, p in positions], axis=0))) if len(positions) >= 2 else 0.0
-    metric = apart_known > 0.0 or bool(distances)
-    if not metric:
+    told = told_of(rig, names)
+    if not told.metric:
         width = CAMERA_PARAMETERS * len(names)
-        told: tuple[str, ...] = ()
-        if positions or rotations:
-            told = (
+        warnings: tuple[str, ...] = ()
+        if told.positions or told.rotations:
+            warnings = (
                 "the rig's references fix no scale, so the first camera is the world: give two positions or a distance",
             )
-        return Gauge(base, "arbitrary", np.zeros((width, width)), told)
-    scale = base.scale
-    if apart_known > 0.0:
-        scale = _ratio([p for _, p in positions], [poses[i].position for i, _ in positions])
-    elif distances:
-        scale = float(np.median([d / np.linalg.norm(v) for (_, _, d), v in zip(distances, apart, strict=True)]))
-    starts = _starts(rotations, positions, poses, scale, base)
-    residual = _residuals(rig, names, poses, positions, rotations, distances)
-    best = min((_descend(start, residual) for start in starts), key=lambda item: item[1])[0]
-    final = residual(best)
-    warnings = []
-    if len(final) and float(np.sqrt(np.mean(final**2))) > _FAR:
-        worst, share = _worst_reference(names, poses, positions, rotations, distances, best)
+        return Gauge(_default(rig, names, poses), "arbitrary", np.zeros((width, width)), warnings)
+    best, final = fit_world(rig, names, poses)
+    found = []
+    if len(final) and float(np.sqrt(np.mean(final**2))) > FAR:
+        worst, share = _worst_reference(names, poses, told, best)
         if share > _CONTRADICTION:
             raise Refused(f"the rig's references contradict each other or what was seen: worst is {worst}")
-        warnings.append(f"the rig's references disagree by more than their stds: worst is {worst}")
+        found.append(f"the rig's references disagree by more than their stds: worst is {worst}")
     terms = reference_terms(rig, names, [best.pose(pose) for pose in poses])
-    return Gauge(best, "metric", terms.information, tuple(warnings))
+    return Gauge(best, "metric", terms.information, tuple(found))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """The references of solved cameras, by their place among these: positions (3,), attitudes (3, 3), distances."""
+
+    positions: list[tuple[int, Floats]]
+    rotations: list[tuple[int, Floats]]
+    distances: list[tuple[int, int, float]]
+
+    @property
+    def apart(self) -> float:
+        """How far the known positions lie apart."""
+        known = [position for _, position in self.positions]
+        return float(np.linalg.norm(np.ptp(known, axis=0))) if len(known) >= 2 else 0.0
+
+    @property
+    def metric(self) -> bool:
+        """Whether they tell the scale."""
+        return self.apart > 0.0 or bool(self.distances)
+
+
+def told_of(rig: Rig, names: list[str]) -> Told:
+    """What the rig knows of the cameras ``names``."""
+    known = [(i, rig.cameras[name]) for i, name in enumerate(names)]
+    return Told(
+        [(i, camera.position) for i, camera in known if camera.position is not None],
+        [(i, camera.rotation) for i, camera in known if camera.rotation is not None],
+        [(names.index(a), names.index(b), d) for a, b, d in rig.distances if a in names and b in names],
+    )
+
+
+def fit_world(rig: Rig, names: list[str], poses: list[Pose]) -> tuple[Similarity, Floats]:
+    """The similarity that fits the references best, by their stds, and their residuals in sigma.
+
+    Needs references that tell the scale.
+    """
+    told, base = told_of(rig, names), _default(rig, names, poses)
+    scale = base.scale
+    if told.apart > 0.0:
+        scale = _ratio([p for _, p in told.positions], [poses[i].position for i, _ in told.positions])
+    elif told.distances:
+        lengths = [float(np.linalg.norm(poses[a].position - poses[b].position)) for a, b, _ in told.distances]
+        scale = float(np.median([d / length for (_, _, d), length in zip(told.distances, lengths, strict=True)]))
+    starts = _starts(told.rotations, told.positions, poses, scale, base)
+    residual = reference_residuals(rig, names, poses)
+    best = min((_descend(start, residual) for start in starts), key=lambda item: item[1])[0]
+    return best, residual(best)
 
 
 def _worst_reference(
     names: list[str],
     poses: list[Pose],
-    positions: list[tuple[int, Floats]],
-    rotations: list[tuple[int, Floats]],
-    distances: list[tuple[int, int, float]],
+    told: Told,
     s: Similarity,
 ) -> tuple[str, float]:
     """The reference that fits worst, in words, and how far off it is as a share of the rig's size (or rad)."""
     size = s.scale * _extent(poses)
     found: list[tuple[float, str]] = []
-    for i, known in positions:
+    for i, known in told.positions:
         off = float(np.linalg.norm(s.points(poses[i].position[None])[0] - known))
         found.append((off / size, f"the position of {names[i]}, {off:.3g} off"))
-    for i, known in rotations:
+    for i, known in told.rotations:
         turn = so3.angle_between(poses[i].rotation @ s.rotation.T, known)
         found.append((turn, f"the rotation of {names[i]}, {np.degrees(turn):.3g} degrees off"))
-    for a, b, length in distances:
+    for a, b, length in told.distances:
         off = abs(s.scale * float(np.linalg.norm(poses[a].position - poses[b].position)) - length)
         found.append((off / length, f"the distance {names[a]}–{names[b]}, {off:.3g} off"))
     share, text = max(found, default=(0.0, "up"))
@@ -147,7 +178,7 @@ def _starts(
     target = np.array([p for _, p in positions]).reshape(-1, 3)
     if len(positions) >= 3:
         guesses.append(fit_similarity(source, target).rotation)
-    if len(positions) >= 2 and np.linalg.norm(target[1] - target[0]) > 0.0:
+    if len(positions) >= 2 and np.linalg.norm(target[1] - target[0]) > 0.0 and _in_line(target):
         line = so3.taking(source[1] - source[0], target[1] - target[0])
         axis = (target[1] - target[0]) / max(float(np.linalg.norm(target[1] - target[0])), 1e-12)
         guesses += [so3.exp(angle * axis) @ line for angle in np.linspace(0, 2 * np.pi, 6, endpoint=False)]
@@ -161,27 +192,27 @@ def _starts(
     return out
 
 
-def _residuals(
-    rig: Rig,
-    names: list[str],
-    poses: list[Pose],
-    positions: list[tuple[int, Floats]],
-    rotations: list[tuple[int, Floats]],
-    distances: list[tuple[int, int, float]],
-) -> Callable[[Similarity], Floats]:
-    """Residuals of all references in sigma; with the flag, the real ones only (no regulariser)."""
+def _in_line(points: Floats) -> bool:
+    """Whether nothing tells the turn about the line through the points (n, 3)."""
+    spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    return len(points) < 3 or bool(spread[1] < 0.02 * spread[0])
+
+
+def reference_residuals(rig: Rig, names: list[str], poses: list[Pose]) -> Callable[[Similarity], Floats]:
+    """Residuals of all references in sigma, as a function of the similarity."""
+    told = told_of(rig, names)
 
     def residual(s: Similarity) -> Floats:
         size = s.scale * _extent(poses)
         out: list[Floats] = []
-        for i, known in positions:
+        for i, known in told.positions:
             std = rig.cameras[names[i]].position_std
             out.append((s.points(poses[i].position[None])[0] - known) / _sigma(std, _EXACT * size))
-        for i, known in rotations:
+        for i, known in told.rotations:
             std = rig.cameras[names[i]].rotation_std
             turned = poses[i].rotation @ s.rotation.T
             out.append(so3.log(turned @ known.T) / _sigma(std, _EXACT))
-        for a, b, length in distances:
+        for a, b, length in told.distances:
             apart = s.scale * float(np.linalg.norm(poses[a].position - poses[b].position))
             out.append(np.array([(apart - length) / (_EXACT * length)]))
         if isinstance(rig.up, str) and rig.up in names:

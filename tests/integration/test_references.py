@@ -73,3 +73,13 @@ def test_hardly_known_references_change_nothing_that_was_seen() -> None:
         for one in (loose.cameras, plain.cameras)
     ]
     assert apart[0][1] / apart[0][0] == pytest.approx(apart[1][1] / apart[1][0], rel=5e-4)
+
+
+def test_a_camera_bumped_since_the_survey_is_told_and_does_not_bend_the_others() -> None:
+    session = surveyed(rigs.simulate(21, 4, 10.0), 2, _STD)
+    bumped = replace(session.rig.cameras["cam2"], position=session.poses["cam2"].position + [0.0, 0.3, 0.0])
+    rig = replace(session.rig, cameras=session.rig.cameras | {"cam2": bumped})
+    found = calibrate(rig, session.observations())
+    assert [told for told in found.warnings if "cam2 was set aside" in told]
+    assert not found.refused
+    assert errors(session, found).max() < 4.0 * _STD

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hub.nodes.messages import Notice, SharedObservation, StateMessage
+from hub.nodes.messages import Notice, Reference, SharedObservation, StateMessage
 from hub.nodes.node import PoseNode
 from hub.nodes.pairing import Pairing
 from protocols.geometry import so3
@@ -140,3 +140,21 @@ def test_a_moving_target_is_interpolated_between_own_observations() -> None:
 def test_notices_are_what_a_person_needs_to_know() -> None:
     _, net, _ = _settled(9, 300)
     assert all(isinstance(notice, Notice) and notice.detail for _, notice in net.notices)
+
+
+def test_a_reference_that_was_wrong_from_the_start_is_found_by_the_others() -> None:
+    rng = np.random.default_rng(11)
+    world = section_4(rng)
+    references = {k: Reference(pose.position, pose.rotation, 0.3, 0.003) for k, pose in enumerate(world.poses)}
+    references[3] = Reference(world.poses[3].position + [0.0, 12.0, 0.0], world.poses[3].rotation, 0.3, 0.003)
+    nodes = {k: PoseNode(k, reference=references[k], seed=11) for k in range(5)}
+    net = Network(nodes, Traffic(), np.random.default_rng(0))
+    feed(net, observe(world, rng, cube(rng, 1500)), 15)
+    for _ in range(40):
+        net.tick()
+    told = [(notice.camera, notice.detail) for _, notice in net.notices if notice.kind == "reference set aside"]
+    assert [camera for camera, _ in told] == [3]
+    assert "11." in told[0][1] or "12" in told[0][1]
+    for pose, there in zip(net.published(), world.poses, strict=True):
+        assert pose is not None
+        assert np.linalg.norm(pose.position - there.position) < 1.0
