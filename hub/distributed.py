@@ -99,7 +99,8 @@ def _run(
         watching.setdefault(row.label, set()).add(row.camera)
     gap = 0.0 if prepared.shared_clock else GAP
     nodes = {
-        i: PoseNode(i, reference=_reference(rig, name), seed=seed, raw=_RAW, gap=gap) for name, i in number.items()
+        i: PoseNode(i, reference=Reference.of(rig.cameras[name]), seed=seed, raw=_RAW, gap=gap)
+        for name, i in number.items()
     }
     network = LocalNetwork(nodes, {label: sorted(cameras) for label, cameras in watching.items()})
     due = rows[0].time + _EVERY_S if rows else 0.0
@@ -170,18 +171,6 @@ def _time_std(name: str, graph: ClockGraph) -> float:
     """How well the camera's clock is known [s]: the best of its pairs."""
     stds = [p.fit.lag_std for p in graph.agreeing if p.fit is not None and name in (p.a, p.b)]
     return min([s for s in stds if np.isfinite(s)], default=0.0)
-
-
-def _reference(rig: Rig, name: str) -> Reference | None:
-    """What the rig knows of a camera's pose."""
-    camera = rig.cameras[name]
-    if camera.position is None and camera.rotation is None:
-        return None
-
-    def largest(std: Floats | None) -> float:
-        return 0.0 if std is None else float(np.max(std))
-
-    return Reference(camera.position, camera.rotation, largest(camera.position_std), largest(camera.rotation_std))
 
 
 def with_node_poses(found: Calibration, rig: Rig, nodes: NodeHost) -> Calibration:

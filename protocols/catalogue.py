@@ -61,8 +61,22 @@ CALIBRATION = Topic("calibration", "hub/{id}/calibration", "Calibration", 0.5, T
 TRACK = Topic("track", "hub/{id}/track", "Track", 30.0, True, Delivery.RELIABLE, 4096, 0.0)
 STATUS = Topic("status", "agent/{id}/status", "AgentStatus", 1.0, True, Delivery.LATEST, 1024, 5.0)
 NODE_STATE = Topic("node_state", "node/{id}/state", "NodeState", 10.0, True, Delivery.LATEST, 4096, 2.0)
+COMMAND = Topic("command", "view/{id}/command", "Command", 0.1, False, Delivery.RELIABLE, 64, 0.0)
+PREDICTION = Topic("prediction", "hub/{id}/prediction", "Prediction", 20.0, True, Delivery.LATEST, 16, 0.0)
+PICTURE = Topic("picture", "camera/{id}/picture", "Picture", 4.0, False, Delivery.LATEST, 128, 5.0)
 
-TOPICS: tuple[Topic, ...] = (OBSERVATION, CAMERA_INFO, RIG_INFO, CALIBRATION, TRACK, STATUS, NODE_STATE)
+TOPICS: tuple[Topic, ...] = (
+    OBSERVATION,
+    CAMERA_INFO,
+    RIG_INFO,
+    CALIBRATION,
+    TRACK,
+    STATUS,
+    NODE_STATE,
+    COMMAND,
+    PICTURE,
+    PREDICTION,
+)
 BY_NAME: dict[str, Topic] = {topic.name: topic for topic in TOPICS}
 
 

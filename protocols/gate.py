@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 MAX_PAYLOAD = 1024 * 1024
-"""Bytes. An observation with the most detections that are allowed is about half of it."""
+"""Bytes. An observation with the most detections that are allowed is about two thirds of it."""
 
 _ID = r"[a-z0-9][a-z0-9_-]{0,62}"
 _KEYS: tuple[tuple[Topic, re.Pattern[str]], ...] = tuple(
@@ -68,8 +68,10 @@ def message_class(topic: Topic) -> type[Message]:
 
 def sender(message: Message) -> str | None:
     """The id that a message claims to come from; None for kinds that name no sender."""
-    if isinstance(message, pb.Observation | pb.CameraInfo | pb.NodeState):
+    if isinstance(message, pb.Observation | pb.CameraInfo | pb.NodeState | pb.Picture):
         return message.camera
+    if isinstance(message, pb.Command):
+        return message.sender
     if isinstance(message, pb.AgentStatus):
         return message.agent
     return None

@@ -42,6 +42,12 @@ class Reason(Enum):
     BAD_TEXT = "bad_text"
     WRONG_SENDER = "wrong_sender"
     UNKNOWN_KEY = "unknown_key"
+    PLAIN_PUBLISHER = "plain_publisher"
+    """It came from no publisher of ours: nothing would tell of its losses."""
+    WRONG_SOURCE = "wrong_source"
+    """It claims to be of a run of an agent that speaks from elsewhere."""
+    SECOND_AGENT = "second_agent"
+    """Two agents have one id; the first of them is heard."""
 
 
 class Rejected(Exception):
@@ -76,11 +82,11 @@ def _positive(value: float, name: str, high: float = inf) -> None:
         raise Rejected(Reason.OUT_OF_RANGE, f"{name} is 0")
 
 
-def _vector(values: Sequence[float], name: str, lengths: tuple[int, ...], low: float = -inf) -> None:
+def _vector(values: Sequence[float], name: str, lengths: tuple[int, ...], low: float = -inf, high: float = inf) -> None:
     if len(values) not in lengths:
         raise Rejected(Reason.BAD_LENGTH, f"{name} has {len(values)} numbers")
     for value in values:
-        _number(value, name, low)
+        _number(value, name, low, high)
 
 
 def _count(things: Sequence[object], name: str, most: int) -> None:
@@ -136,6 +142,14 @@ def _intrinsics(message: Any) -> None:
     _vector(message.distortions, "distortions", (0, 4) if message.fisheye else (0, 4, 5))
 
 
+_KINDS = frozenset({"marker", "person", "vehicle"})
+
+
+def _colour(colour: pb.Colour) -> None:
+    if max(colour.red, colour.green, colour.blue) > 255:
+        raise Rejected(Reason.OUT_OF_RANGE, "a colour is above 255")
+
+
 def _detection(detection: pb.Detection) -> None:
     _number(detection.u, "u", -MAX_PIXEL, MAX_PIXEL)
     _number(detection.v, "v", -MAX_PIXEL, MAX_PIXEL)
@@ -144,11 +158,21 @@ def _detection(detection: pb.Detection) -> None:
     if detection.label:
         _text(detection.label, "label", MAX_LABEL)
     if detection.HasField("colour"):
-        colour = detection.colour
-        if max(colour.red, colour.green, colour.blue) > 255:
-            raise Rejected(Reason.OUT_OF_RANGE, "a colour is above 255")
+        _colour(detection.colour)
     if detection.covariance:
         _covariance_2d(detection.covariance, "covariance")
+    if detection.kind:
+        _one_of(detection.kind, "kind", _KINDS)
+    if detection.head:
+        _vector(detection.head, "head", (2,), -MAX_PIXEL, MAX_PIXEL)
+    if detection.foot:
+        _vector(detection.foot, "foot", (2,), -MAX_PIXEL, MAX_PIXEL)
+    if detection.box:
+        _vector(detection.box, "box", (4,), -MAX_PIXEL, MAX_PIXEL)
+        if min(detection.box[2:]) < 0.0:
+            raise Rejected(Reason.OUT_OF_RANGE, "a box has a negative side")
+    if detection.target:
+        _text(detection.target, "target", MAX_LABEL)
 
 
 def _observation(message: pb.Observation) -> None:
@@ -242,9 +266,54 @@ def _track(message: pb.Track) -> None:
     _one_of(message.state, "state", _TRACK_STATES)
     _vector(message.position, "position", (3,))
     _vector(message.velocity, "velocity", (0, 3))
-    _vector(message.position_covariance, "position_covariance", (0, 9))
-    if message.position_covariance and min(message.position_covariance[::4]) < 0.0:
-        raise Rejected(Reason.OUT_OF_RANGE, "a variance is negative")
+    for covariance, name in ((message.position_covariance, "position"), (message.velocity_covariance, "velocity")):
+        _vector(covariance, f"{name}_covariance", (0, 9))
+        if covariance and min(covariance[::4]) < 0.0:
+            raise Rejected(Reason.OUT_OF_RANGE, f"a variance of the {name} is negative")
+    if message.kind:
+        _one_of(message.kind, "kind", _KINDS)
+    if message.HasField("heading"):
+        _number(message.heading, "heading", -7.0, 7.0)
+    _number(message.height, "height", 0.0)
+    _number(message.height_std, "height_std", 0.0)
+    _number(message.unseen_s, "unseen_s", 0.0)
+    _count(range(message.cameras), "cameras", MAX_CAMERAS)
+    if message.HasField("colour"):
+        _colour(message.colour)
+
+
+_VIEWS = frozenset({"", "front", "back", "left", "right"})
+
+
+def _predicted_target(target: pb.PredictedTarget) -> None:
+    _text(target.target, "target", MAX_LABEL)
+    if target.kind:
+        _one_of(target.kind, "kind", _KINDS)
+    for value, name in ((target.u, "u"), (target.v, "v")):
+        _number(value, name, -MAX_PIXEL, MAX_PIXEL)
+    for value, name in ((target.u_velocity, "u_velocity"), (target.v_velocity, "v_velocity")):
+        _number(value, name)
+    _covariance_2d(target.covariance, "covariance")
+    _number(target.size, "size", 0.0, MAX_PIXEL)
+    _vector(target.head, "head", (0, 2), -MAX_PIXEL, MAX_PIXEL)
+    _vector(target.foot, "foot", (0, 2), -MAX_PIXEL, MAX_PIXEL)
+    _vector(target.face, "face", (0, 4), -MAX_PIXEL, MAX_PIXEL)
+    if target.face and min(target.face[2:]) < 0.0:
+        raise Rejected(Reason.OUT_OF_RANGE, "a face has a negative side")
+    _one_of(target.view, "view", _VIEWS)
+    if target.HasField("colour"):
+        _colour(target.colour)
+
+
+def _prediction(message: pb.Prediction) -> None:
+    _count(message.cameras, "cameras", MAX_CAMERAS)
+    for camera in message.cameras:
+        _id(camera.camera, "camera")
+        _id(camera.boot_id, "boot id", optional=True)
+        _count(camera.targets, "targets", MAX_DETECTIONS)
+        for target in camera.targets:
+            _predicted_target(target)
+    _distinct((camera.camera for camera in message.cameras), "camera")
 
 
 _AGENT_STATES = frozenset({"starting", "running", "degraded", "stopping"})
@@ -277,6 +346,19 @@ def _node_edge(edge: pb.NodeEdge) -> None:
     _number(edge.count, "count", 0.0)
 
 
+def _node_anchor(anchor: pb.NodeAnchor) -> None:
+    _id(anchor.camera, "anchor")
+    for values, name, lengths in (
+        (anchor.rotation, "rotation", (3,)),
+        (anchor.position, "position", (3,)),
+        (anchor.world_rotation, "world_rotation", (0, 3)),
+        (anchor.world_position, "world_position", (0, 3)),
+    ):
+        _vector(values, name, lengths)
+    _number(anchor.rotation_std, "rotation_std", 0.0)
+    _number(anchor.position_std, "position_std", 0.0)
+
+
 def _node_state(message: pb.NodeState) -> None:
     _id(message.camera, "camera")
     _id(message.host, "host")
@@ -288,6 +370,30 @@ def _node_state(message: pb.NodeState) -> None:
     for edge in message.edges:
         _node_edge(edge)
     _distinct((edge.neighbour for edge in message.edges), "neighbour")
+    _count(message.anchors, "anchors", MAX_CAMERAS)
+    for anchor in message.anchors:
+        _node_anchor(anchor)
+    _distinct((anchor.camera for anchor in message.anchors), "anchor")
+
+
+ACTIONS = frozenset({"start_recording", "stop_recording", "recalibrate", "export"})
+MAX_PICTURE = 512 * 1024
+
+
+def _command(message: pb.Command) -> None:
+    _id(message.sender, "sender")
+    _id(message.boot_id, "boot id")
+    _one_of(message.action, "action", ACTIONS)
+    _id(message.agent, "agent")
+    _id(message.agent_boot, "agent boot")
+
+
+def _picture(message: pb.Picture) -> None:
+    _id(message.camera, "camera")
+    _id(message.boot_id, "boot id")
+    _number(message.width, "width", 1, MAX_IMAGE_SIDE)
+    _number(message.height, "height", 1, MAX_IMAGE_SIDE)
+    _count(message.jpeg, "bytes of picture", MAX_PICTURE)
 
 
 _RULES: dict[str, Callable[[Any], None]] = {
@@ -298,4 +404,7 @@ _RULES: dict[str, Callable[[Any], None]] = {
     "Track": _track,
     "AgentStatus": _agent_status,
     "NodeState": _node_state,
+    "Command": _command,
+    "Picture": _picture,
+    "Prediction": _prediction,
 }

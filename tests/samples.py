@@ -7,7 +7,19 @@ from collections.abc import Callable
 
 from google.protobuf.message import Message
 
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, NODE_STATE, OBSERVATION, RIG_INFO, STATUS, TRACK, Topic
+from protocols.catalogue import (
+    CALIBRATION,
+    CAMERA_INFO,
+    COMMAND,
+    NODE_STATE,
+    OBSERVATION,
+    PICTURE,
+    PREDICTION,
+    RIG_INFO,
+    STATUS,
+    TRACK,
+    Topic,
+)
 from protocols.messages import syncline_pb2 as pb
 
 MATRIX = [600.0, 0.0, 319.5, 0.0, 600.0, 239.5, 0.0, 0.0, 1.0]
@@ -23,6 +35,11 @@ def observation(camera: str = "cam0", sequence: int = 0, boot_id: str = "boot-1"
         label="marker",
         colour=pb.Colour(red=255, green=64),
         covariance=[0.25, 0.01, 0.5],
+        kind="person",
+        head=[321.0, 210.5],
+        foot=[320.0, 290.25],
+        box=[300.5, 210.5, 40.0, 80.0],
+        target="p7",
     )
     return pb.Observation(
         schema_version=1,
@@ -112,6 +129,14 @@ def track(sequence: int = 0) -> pb.Track:
         position=[1.0, 2.0, 3.0],
         velocity=[0.1, 0.2, 0.3],
         position_covariance=[0.1, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.1],
+        kind="person",
+        heading=-1.5,
+        height=1.75,
+        height_std=0.02,
+        colour=pb.Colour(red=200, green=30, blue=40),
+        cameras=3,
+        unseen_s=0.05,
+        velocity_covariance=[0.1, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.1],
     )
 
 
@@ -142,6 +167,18 @@ def node_state(camera: str = "cam0", sequence: int = 0) -> pb.NodeState:
         count=96.0,
         bearings=True,
     )
+    anchor = pb.NodeAnchor(
+        camera="cam2",
+        epoch=1,
+        sequence=7,
+        rotation=[0.1, 0.2, 0.3],
+        position=[1.0, 2.0, 3.0],
+        world_rotation=[0.3, 0.2, 0.1],
+        world_position=[3.0, 2.0, 1.0],
+        rotation_std=0.01,
+        position_std=0.02,
+        aside=True,
+    )
     return pb.NodeState(
         schema_version=1,
         camera=camera,
@@ -158,7 +195,50 @@ def node_state(camera: str = "cam0", sequence: int = 0) -> pb.NodeState:
         partner="cam1",
         leaving=True,
         edges=[edge],
+        anchors=[anchor],
     )
+
+
+def command(sender: str = "cam0", sequence: int = 0) -> pb.Command:
+    """What a button in a view sends."""
+    return pb.Command(
+        schema_version=1, sender=sender, boot_id="boot-1", sequence=sequence, action="recalibrate", agent="hub", agent_boot="b1"
+    )
+
+
+def picture(camera: str = "cam0") -> pb.Picture:
+    """A small picture for a view."""
+    return pb.Picture(
+        schema_version=1,
+        camera=camera,
+        boot_id="boot-1",
+        frame=7,
+        device_time_ns=1_000_000_000,
+        width=1280,
+        height=720,
+        jpeg=b"\xff\xd8\xff\xd9",
+    )
+
+
+def prediction(sequence: int = 0) -> pb.Prediction:
+    """One target in one camera."""
+    target = pb.PredictedTarget(
+        target="person-1",
+        kind="person",
+        u=320.5,
+        v=240.25,
+        u_velocity=-12.5,
+        v_velocity=3.5,
+        covariance=[4.0, 0.5, 9.0],
+        size=180.0,
+        head=[320.0, 150.0],
+        foot=[321.0, 330.0],
+        face=[310.0, 148.0, 21.0, 26.0],
+        view="left",
+        colour=pb.Colour(red=200),
+    )
+    camera = pb.CameraPrediction(camera="cam0", boot_id="boot-1", device_time_ns=-5, targets=[target])
+    return pb.Prediction(schema_version=1, sequence=sequence, reference_time_ns=1_000_000_000, cameras=[camera])
 
 
 SAMPLES: dict[Topic, Callable[[], Message]] = {
@@ -169,6 +249,9 @@ SAMPLES: dict[Topic, Callable[[], Message]] = {
     TRACK: track,
     STATUS: status,
     NODE_STATE: node_state,
+    COMMAND: command,
+    PICTURE: picture,
+    PREDICTION: prediction,
 }
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from google.protobuf.message import Message
 
-from hub.nodes.messages import Notice, SharedObservation, StateMessage
+from hub.nodes.messages import Notice, Reference, SharedObservation, StateMessage
 from hub.nodes.node import PoseNode
 from hub.nodes.pairing import GAP
 from hub.nodes.wire import edges_from_wire, edges_to_wire, number_of, state_from_wire, state_to_wire
@@ -82,6 +82,7 @@ class NodeHost:
         self._seed, self._leave_after = seed, leave_after_s
         self._hosted: dict[str, _Hosted] = {}
         self._lenses: dict[str, Intrinsics] = {}
+        self._references: dict[str, Reference] = {}
         self._clocks: dict[str, _Clock] = {}
         self._shared = False
         self._states: dict[str, pb.NodeState] = {}
@@ -246,9 +247,12 @@ class NodeHost:
     # other messages
 
     def _camera(self, message: pb.CameraInfo) -> None:
-        lens = rig_camera(message).intrinsics
+        camera = rig_camera(message)
+        lens, reference = camera.intrinsics, Reference.of(camera)
         if lens is None:
             return
+        if reference is not None:
+            self._references.setdefault(message.camera, reference)
         known = self._lenses.setdefault(message.camera, lens)
         if same_lens(known, lens):
             if self.refused.pop(message.camera, None) is not None:
@@ -337,7 +341,8 @@ class NodeHost:
             self._host(camera, last)
 
     def _host(self, camera: str, last: pb.NodeState | None) -> None:
-        node = PoseNode(number_of(camera), seed=self._seed, gap=0.0 if self._shared else GAP)
+        reference = self._references.get(camera)
+        node = PoseNode(number_of(camera), reference=reference, seed=self._seed, gap=0.0 if self._shared else GAP)
         takeover = 0
         if last is not None:
             takeover = last.takeover + 1

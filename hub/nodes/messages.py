@@ -9,6 +9,7 @@ import numpy as np
 
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
+from protocols.session.rig import RigCamera
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +46,14 @@ class Reference:
     rotation: Floats | None = None
     position_std: float = 0.0
     rotation_std: float = 0.0
+
+    @classmethod
+    def of(cls, camera: RigCamera) -> Reference | None:
+        """What the rig knows of a camera; None if nothing."""
+        if camera.position is None and camera.rotation is None:
+            return None
+        stds = [0.0 if std is None else float(np.max(std)) for std in (camera.position_std, camera.rotation_std)]
+        return cls(camera.position, camera.rotation, *stds)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

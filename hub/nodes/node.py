@@ -169,6 +169,8 @@ class PoseNode:
         self.epoch, self.frame, self.hops = state.epoch, state.frame, state.hops
         self.pose = self._ahead = state.pose
         self.settled, self._depth, self._partner = state.settled, state.depth, state.partner
+        self._anchors = {anchor.camera: anchor for anchor in state.anchors}
+        self.reference_aside = self.camera in self._anchors and self._anchors[self.camera].aside
         for camera, summary in edges.items():
             self._neighbour(camera).edge.resume(summary)
 

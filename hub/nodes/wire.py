@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from hub.nodes.edge import Summary
-from hub.nodes.messages import StateMessage
+from hub.nodes.messages import Anchor, Reference, StateMessage
 from hub.nodes.two_cameras import Relative
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
@@ -47,6 +47,7 @@ def state_to_wire(state: StateMessage, host: str, takeover: int) -> pb.NodeState
     if state.pose is not None:
         message.rotation.extend(so3.log(state.pose.rotation).tolist())
         message.position.extend(state.pose.position.tolist())
+    message.anchors.extend(_anchor_to_wire(anchor) for anchor in state.anchors)
     return message
 
 
@@ -67,7 +68,35 @@ def state_from_wire(message: pb.NodeState) -> StateMessage:
         depth=message.depth,
         leaving=message.leaving,
         partner=number_of(message.partner) if message.partner else -1,
+        anchors=tuple(_anchor_from_wire(anchor, number_of(message.frame)) for anchor in message.anchors),
     )
+
+
+def _anchor_to_wire(anchor: Anchor) -> pb.NodeAnchor:
+    known = anchor.reference
+    return pb.NodeAnchor(
+        camera=name_of(anchor.camera),
+        epoch=anchor.epoch,
+        sequence=anchor.sequence,
+        rotation=so3.log(anchor.pose.rotation).tolist(),
+        position=anchor.pose.position.tolist(),
+        world_rotation=[] if known.rotation is None else so3.log(known.rotation).tolist(),
+        world_position=[] if known.position is None else known.position.tolist(),
+        rotation_std=known.rotation_std,
+        position_std=known.position_std,
+        aside=anchor.aside,
+    )
+
+
+def _anchor_from_wire(message: pb.NodeAnchor, frame: int) -> Anchor:
+    known = Reference(
+        np.array(message.world_position) if message.world_position else None,
+        so3.exp(np.array(message.world_rotation)) if message.world_rotation else None,
+        message.position_std,
+        message.rotation_std,
+    )
+    pose = Pose(so3.exp(np.array(message.rotation)), np.array(message.position))
+    return Anchor(number_of(message.camera), message.epoch, message.sequence, frame, pose, known, message.aside)
 
 
 def edges_to_wire(summaries: Mapping[int, Summary]) -> list[pb.NodeEdge]:

@@ -314,7 +314,11 @@ def _add_camera_priors(problem: Problem, state: State, system: BorderedSystem) -
     for camera, (now, nominal) in enumerate(zip(state.cameras, problem.nominal, strict=True)):
         base = camera * CAMERA_PARAMETERS
         terms = [(RATE, now.rate - 1.0, freedom.rate_std)]
-        if freedom.lens:
+        guess = problem.lens_prior(camera)
+        if guess is not None:
+            terms.append((FOCAL, float(np.log(now.intrinsics.focal / guess.focal)), guess.focal_std))
+            terms.append((K1, float(now.intrinsics.distortions[0] - guess.k1), guess.k1_std))
+        elif freedom.lens:
             terms.append((FOCAL, float(np.log(now.intrinsics.focal / nominal.focal)), freedom.focal_std))
             terms.append((K1, float(now.intrinsics.distortions[0] - nominal.distortions[0]), freedom.k1_std))
         for column, value, std in terms:

@@ -14,7 +14,7 @@ import numpy as np
 from hub.points import PointBasis, SampledTrack, common_instants
 from hub.poses.adjust import adjust, residual_norms
 from hub.poses.graph import ClockGraph
-from hub.poses.problem import CameraState, Freedom, Problem, Rows, State, Trajectory
+from hub.poses.problem import CameraState, Freedom, LensPrior, Problem, Rows, State, Trajectory
 from hub.splines import SplineBasis, fit_spline, stretches
 from hub.timing.pair import PairSolution, evidence
 from hub.timing.tracks import Track
@@ -37,11 +37,12 @@ _STRETCH_GAP = 1.0  # s: the path is cut where nobody saw the point for longer
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """What initialisation knows of one camera. tracks: by label; epoch: its time zero."""
+    """What initialisation knows of one camera. tracks: by label. guess: prior of a lens that was not measured."""
 
     name: str
     intrinsics: Intrinsics
     tracks: Mapping[str, Track]
+    guess: LensPrior | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -162,6 +163,7 @@ def settle(
         clock_reference=names.index(anchors[0]),
         anchors=(names.index(anchors[0]), names.index(anchors[1])),
         freedom=freedom or Freedom(),
+        guessed=tuple(cameras[name].guess for name in names),
     )
     state = State(tuple(states), tuple(trajectories), np.full(len(names), 2.0))
     if not used:

@@ -82,6 +82,19 @@ class State:
 
 
 @dataclass(frozen=True, slots=True)
+class LensPrior:
+    """What is known beforehand of a lens that nobody measured: it is always estimated.
+
+    focal: [px], focal_std: of its logarithm. k1, k1_std: of the first distortion coefficient.
+    """
+
+    focal: float
+    focal_std: float
+    k1: float
+    k1_std: float
+
+
+@dataclass(frozen=True, slots=True)
 class Freedom:
     """What may move, and priors.
 
@@ -103,7 +116,7 @@ class Problem:
 
     rows: all observations. nominal: intrinsics as given (priors of the lens). clock_reference: index of the
     camera whose clock is the internal time. anchors: two cameras whose pose and distance fix the gauge.
-    freedom: what may move.
+    freedom: what may move. guessed: by camera, priors of lenses that were not measured, None = given; () = all are.
     """
 
     rows: tuple[Rows, ...]
@@ -111,6 +124,11 @@ class Problem:
     clock_reference: int
     anchors: tuple[int, int]
     freedom: Freedom = field(default_factory=Freedom)
+    guessed: tuple[LensPrior | None, ...] = ()
+
+    def lens_prior(self, camera: int) -> LensPrior | None:
+        """The prior of a lens that was not measured; None = the lens is given."""
+        return self.guessed[camera] if self.guessed else None
 
     def free_columns(self) -> Ints:
         """Indices of the free camera parameters in the stacked vector of CAMERA_PARAMETERS each."""
@@ -121,6 +139,6 @@ class Problem:
                 columns += range(base, base + 6)
             if self.freedom.clock and camera != self.clock_reference:
                 columns += [base + OFFSET, base + RATE]
-            if self.freedom.lens:
+            if self.freedom.lens or self.lens_prior(camera) is not None:
                 columns += [base + FOCAL, base + K1]
         return np.array(columns, dtype=np.int64)

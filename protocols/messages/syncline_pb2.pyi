@@ -17,7 +17,7 @@ class Colour(_message.Message):
     def __init__(self, red: _Optional[int] = ..., green: _Optional[int] = ..., blue: _Optional[int] = ...) -> None: ...
 
 class Detection(_message.Message):
-    __slots__ = ("u", "v", "size", "score", "label", "colour", "covariance")
+    __slots__ = ("u", "v", "size", "score", "label", "colour", "covariance", "kind", "head", "foot", "box", "target")
     U_FIELD_NUMBER: _ClassVar[int]
     V_FIELD_NUMBER: _ClassVar[int]
     SIZE_FIELD_NUMBER: _ClassVar[int]
@@ -25,6 +25,11 @@ class Detection(_message.Message):
     LABEL_FIELD_NUMBER: _ClassVar[int]
     COLOUR_FIELD_NUMBER: _ClassVar[int]
     COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    HEAD_FIELD_NUMBER: _ClassVar[int]
+    FOOT_FIELD_NUMBER: _ClassVar[int]
+    BOX_FIELD_NUMBER: _ClassVar[int]
+    TARGET_FIELD_NUMBER: _ClassVar[int]
     u: float
     v: float
     size: float
@@ -32,7 +37,12 @@ class Detection(_message.Message):
     label: str
     colour: Colour
     covariance: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, u: _Optional[float] = ..., v: _Optional[float] = ..., size: _Optional[float] = ..., score: _Optional[float] = ..., label: _Optional[str] = ..., colour: _Optional[_Union[Colour, _Mapping]] = ..., covariance: _Optional[_Iterable[float]] = ...) -> None: ...
+    kind: str
+    head: _containers.RepeatedScalarFieldContainer[float]
+    foot: _containers.RepeatedScalarFieldContainer[float]
+    box: _containers.RepeatedScalarFieldContainer[float]
+    target: str
+    def __init__(self, u: _Optional[float] = ..., v: _Optional[float] = ..., size: _Optional[float] = ..., score: _Optional[float] = ..., label: _Optional[str] = ..., colour: _Optional[_Union[Colour, _Mapping]] = ..., covariance: _Optional[_Iterable[float]] = ..., kind: _Optional[str] = ..., head: _Optional[_Iterable[float]] = ..., foot: _Optional[_Iterable[float]] = ..., box: _Optional[_Iterable[float]] = ..., target: _Optional[str] = ...) -> None: ...
 
 class Observation(_message.Message):
     __slots__ = ("schema_version", "camera", "boot_id", "sequence", "frame", "device_time_ns", "exposure_ns", "detections")
@@ -178,7 +188,7 @@ class Calibration(_message.Message):
     def __init__(self, schema_version: _Optional[int] = ..., revision: _Optional[int] = ..., status: _Optional[str] = ..., reason: _Optional[str] = ..., reference_camera: _Optional[str] = ..., scale: _Optional[str] = ..., units: _Optional[str] = ..., solver: _Optional[str] = ..., cameras: _Optional[_Iterable[_Union[CameraCalibration, _Mapping]]] = ..., refused: _Optional[_Iterable[_Union[Refusal, _Mapping]]] = ...) -> None: ...
 
 class Track(_message.Message):
-    __slots__ = ("schema_version", "sequence", "label", "state", "reference_time_ns", "position", "velocity", "position_covariance")
+    __slots__ = ("schema_version", "sequence", "label", "state", "reference_time_ns", "position", "velocity", "position_covariance", "kind", "heading", "height", "height_std", "colour", "cameras", "unseen_s", "velocity_covariance")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     LABEL_FIELD_NUMBER: _ClassVar[int]
@@ -187,6 +197,14 @@ class Track(_message.Message):
     POSITION_FIELD_NUMBER: _ClassVar[int]
     VELOCITY_FIELD_NUMBER: _ClassVar[int]
     POSITION_COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    HEADING_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_STD_FIELD_NUMBER: _ClassVar[int]
+    COLOUR_FIELD_NUMBER: _ClassVar[int]
+    CAMERAS_FIELD_NUMBER: _ClassVar[int]
+    UNSEEN_S_FIELD_NUMBER: _ClassVar[int]
+    VELOCITY_COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     sequence: int
     label: str
@@ -195,7 +213,15 @@ class Track(_message.Message):
     position: _containers.RepeatedScalarFieldContainer[float]
     velocity: _containers.RepeatedScalarFieldContainer[float]
     position_covariance: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, schema_version: _Optional[int] = ..., sequence: _Optional[int] = ..., label: _Optional[str] = ..., state: _Optional[str] = ..., reference_time_ns: _Optional[int] = ..., position: _Optional[_Iterable[float]] = ..., velocity: _Optional[_Iterable[float]] = ..., position_covariance: _Optional[_Iterable[float]] = ...) -> None: ...
+    kind: str
+    heading: float
+    height: float
+    height_std: float
+    colour: Colour
+    cameras: int
+    unseen_s: float
+    velocity_covariance: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, schema_version: _Optional[int] = ..., sequence: _Optional[int] = ..., label: _Optional[str] = ..., state: _Optional[str] = ..., reference_time_ns: _Optional[int] = ..., position: _Optional[_Iterable[float]] = ..., velocity: _Optional[_Iterable[float]] = ..., position_covariance: _Optional[_Iterable[float]] = ..., kind: _Optional[str] = ..., heading: _Optional[float] = ..., height: _Optional[float] = ..., height_std: _Optional[float] = ..., colour: _Optional[_Union[Colour, _Mapping]] = ..., cameras: _Optional[int] = ..., unseen_s: _Optional[float] = ..., velocity_covariance: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class AgentStatus(_message.Message):
     __slots__ = ("schema_version", "agent", "role", "boot_id", "sequence", "state", "message", "counters", "gauges", "version")
@@ -253,8 +279,32 @@ class NodeEdge(_message.Message):
     bearings: bool
     def __init__(self, neighbour: _Optional[str] = ..., rotation: _Optional[_Iterable[float]] = ..., centre: _Optional[_Iterable[float]] = ..., hessian: _Optional[_Iterable[float]] = ..., gradient: _Optional[_Iterable[float]] = ..., count: _Optional[float] = ..., bearings: _Optional[bool] = ...) -> None: ...
 
+class NodeAnchor(_message.Message):
+    __slots__ = ("camera", "epoch", "sequence", "rotation", "position", "world_rotation", "world_position", "rotation_std", "position_std", "aside")
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    EPOCH_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    WORLD_ROTATION_FIELD_NUMBER: _ClassVar[int]
+    WORLD_POSITION_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_STD_FIELD_NUMBER: _ClassVar[int]
+    POSITION_STD_FIELD_NUMBER: _ClassVar[int]
+    ASIDE_FIELD_NUMBER: _ClassVar[int]
+    camera: str
+    epoch: int
+    sequence: int
+    rotation: _containers.RepeatedScalarFieldContainer[float]
+    position: _containers.RepeatedScalarFieldContainer[float]
+    world_rotation: _containers.RepeatedScalarFieldContainer[float]
+    world_position: _containers.RepeatedScalarFieldContainer[float]
+    rotation_std: float
+    position_std: float
+    aside: bool
+    def __init__(self, camera: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., rotation: _Optional[_Iterable[float]] = ..., position: _Optional[_Iterable[float]] = ..., world_rotation: _Optional[_Iterable[float]] = ..., world_position: _Optional[_Iterable[float]] = ..., rotation_std: _Optional[float] = ..., position_std: _Optional[float] = ..., aside: _Optional[bool] = ...) -> None: ...
+
 class NodeState(_message.Message):
-    __slots__ = ("schema_version", "camera", "host", "takeover", "sequence", "epoch", "frame", "hops", "depth", "rotation", "position", "settled", "partner", "leaving", "edges")
+    __slots__ = ("schema_version", "camera", "host", "takeover", "sequence", "epoch", "frame", "hops", "depth", "rotation", "position", "settled", "partner", "leaving", "edges", "anchors")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     CAMERA_FIELD_NUMBER: _ClassVar[int]
     HOST_FIELD_NUMBER: _ClassVar[int]
@@ -270,6 +320,7 @@ class NodeState(_message.Message):
     PARTNER_FIELD_NUMBER: _ClassVar[int]
     LEAVING_FIELD_NUMBER: _ClassVar[int]
     EDGES_FIELD_NUMBER: _ClassVar[int]
+    ANCHORS_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     camera: str
     host: str
@@ -285,4 +336,97 @@ class NodeState(_message.Message):
     partner: str
     leaving: bool
     edges: _containers.RepeatedCompositeFieldContainer[NodeEdge]
-    def __init__(self, schema_version: _Optional[int] = ..., camera: _Optional[str] = ..., host: _Optional[str] = ..., takeover: _Optional[int] = ..., sequence: _Optional[int] = ..., epoch: _Optional[int] = ..., frame: _Optional[str] = ..., hops: _Optional[int] = ..., depth: _Optional[int] = ..., rotation: _Optional[_Iterable[float]] = ..., position: _Optional[_Iterable[float]] = ..., settled: _Optional[int] = ..., partner: _Optional[str] = ..., leaving: _Optional[bool] = ..., edges: _Optional[_Iterable[_Union[NodeEdge, _Mapping]]] = ...) -> None: ...
+    anchors: _containers.RepeatedCompositeFieldContainer[NodeAnchor]
+    def __init__(self, schema_version: _Optional[int] = ..., camera: _Optional[str] = ..., host: _Optional[str] = ..., takeover: _Optional[int] = ..., sequence: _Optional[int] = ..., epoch: _Optional[int] = ..., frame: _Optional[str] = ..., hops: _Optional[int] = ..., depth: _Optional[int] = ..., rotation: _Optional[_Iterable[float]] = ..., position: _Optional[_Iterable[float]] = ..., settled: _Optional[int] = ..., partner: _Optional[str] = ..., leaving: _Optional[bool] = ..., edges: _Optional[_Iterable[_Union[NodeEdge, _Mapping]]] = ..., anchors: _Optional[_Iterable[_Union[NodeAnchor, _Mapping]]] = ...) -> None: ...
+
+class Command(_message.Message):
+    __slots__ = ("schema_version", "sender", "boot_id", "sequence", "action", "agent", "agent_boot")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    SENDER_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    ACTION_FIELD_NUMBER: _ClassVar[int]
+    AGENT_FIELD_NUMBER: _ClassVar[int]
+    AGENT_BOOT_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    sender: str
+    boot_id: str
+    sequence: int
+    action: str
+    agent: str
+    agent_boot: str
+    def __init__(self, schema_version: _Optional[int] = ..., sender: _Optional[str] = ..., boot_id: _Optional[str] = ..., sequence: _Optional[int] = ..., action: _Optional[str] = ..., agent: _Optional[str] = ..., agent_boot: _Optional[str] = ...) -> None: ...
+
+class Picture(_message.Message):
+    __slots__ = ("schema_version", "camera", "boot_id", "frame", "device_time_ns", "width", "height", "jpeg")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    JPEG_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    camera: str
+    boot_id: str
+    frame: int
+    device_time_ns: int
+    width: int
+    height: int
+    jpeg: bytes
+    def __init__(self, schema_version: _Optional[int] = ..., camera: _Optional[str] = ..., boot_id: _Optional[str] = ..., frame: _Optional[int] = ..., device_time_ns: _Optional[int] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., jpeg: _Optional[bytes] = ...) -> None: ...
+
+class PredictedTarget(_message.Message):
+    __slots__ = ("target", "kind", "u", "v", "u_velocity", "v_velocity", "covariance", "size", "head", "foot", "face", "view", "colour")
+    TARGET_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    U_FIELD_NUMBER: _ClassVar[int]
+    V_FIELD_NUMBER: _ClassVar[int]
+    U_VELOCITY_FIELD_NUMBER: _ClassVar[int]
+    V_VELOCITY_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    SIZE_FIELD_NUMBER: _ClassVar[int]
+    HEAD_FIELD_NUMBER: _ClassVar[int]
+    FOOT_FIELD_NUMBER: _ClassVar[int]
+    FACE_FIELD_NUMBER: _ClassVar[int]
+    VIEW_FIELD_NUMBER: _ClassVar[int]
+    COLOUR_FIELD_NUMBER: _ClassVar[int]
+    target: str
+    kind: str
+    u: float
+    v: float
+    u_velocity: float
+    v_velocity: float
+    covariance: _containers.RepeatedScalarFieldContainer[float]
+    size: float
+    head: _containers.RepeatedScalarFieldContainer[float]
+    foot: _containers.RepeatedScalarFieldContainer[float]
+    face: _containers.RepeatedScalarFieldContainer[float]
+    view: str
+    colour: Colour
+    def __init__(self, target: _Optional[str] = ..., kind: _Optional[str] = ..., u: _Optional[float] = ..., v: _Optional[float] = ..., u_velocity: _Optional[float] = ..., v_velocity: _Optional[float] = ..., covariance: _Optional[_Iterable[float]] = ..., size: _Optional[float] = ..., head: _Optional[_Iterable[float]] = ..., foot: _Optional[_Iterable[float]] = ..., face: _Optional[_Iterable[float]] = ..., view: _Optional[str] = ..., colour: _Optional[_Union[Colour, _Mapping]] = ...) -> None: ...
+
+class CameraPrediction(_message.Message):
+    __slots__ = ("camera", "boot_id", "device_time_ns", "targets")
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    TARGETS_FIELD_NUMBER: _ClassVar[int]
+    camera: str
+    boot_id: str
+    device_time_ns: int
+    targets: _containers.RepeatedCompositeFieldContainer[PredictedTarget]
+    def __init__(self, camera: _Optional[str] = ..., boot_id: _Optional[str] = ..., device_time_ns: _Optional[int] = ..., targets: _Optional[_Iterable[_Union[PredictedTarget, _Mapping]]] = ...) -> None: ...
+
+class Prediction(_message.Message):
+    __slots__ = ("schema_version", "sequence", "reference_time_ns", "cameras")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    CAMERAS_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    sequence: int
+    reference_time_ns: int
+    cameras: _containers.RepeatedCompositeFieldContainer[CameraPrediction]
+    def __init__(self, schema_version: _Optional[int] = ..., sequence: _Optional[int] = ..., reference_time_ns: _Optional[int] = ..., cameras: _Optional[_Iterable[_Union[CameraPrediction, _Mapping]]] = ...) -> None: ...

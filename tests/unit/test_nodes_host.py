@@ -138,3 +138,31 @@ def test_an_edge_survives_the_wire() -> None:
     np.testing.assert_allclose(so3.log(summary.anchor.rotation), [0.1, 0.2, 0.3])
     assert summary.hessian[0, 1] == 2.0
     assert summary.hessian[5, 5] == 21.0
+
+
+def test_references_travel_between_hosts_and_a_wrong_one_is_found_by_the_others() -> None:
+    rng = np.random.default_rng(31)
+    world = section_4(rng)
+    site = _Site(world)
+    hosts = [NodeHost("a", ["cam0", "cam1"]), NodeHost("b", ["cam2", "cam3", "cam4"])]
+    wrong = world.poses[3].position + [0.0, 12.0, 0.0]
+    for host in hosts:
+        host.share_clock()
+        for other in hosts:
+            host.agents(ROLE, other.hub, "b", alive=True)
+        for k, pose in enumerate(world.poses):
+            message = info(k)
+            message.position.extend((wrong if k == 3 else pose.position).tolist())
+            message.position_std.extend([0.3] * 3)
+            message.rotation.extend(so3.log(pose.rotation).tolist())
+            message.rotation_std.extend([0.003] * 3)
+            host.handle(message)
+    site.hosts = {host.hub: host for host in hosts}
+    site.tick(12)
+    site.run(rng, 1500)
+    site.tick(100)
+    told = {host.hub: [n.camera for n in host.notices if n.kind == "reference set aside"] for host in hosts}
+    assert told == {"a": [], "b": [number_of("cam3")]}
+    states = {state.camera: state for state in site.states}
+    assert {anchor.camera for anchor in states["cam0"].anchors} == {name(k) for k in range(5)}
+    assert [anchor.camera for anchor in states["cam0"].anchors if anchor.aside] == ["cam3"]
