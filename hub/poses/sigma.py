@@ -1,0 +1,109 @@
+"""The noise that the covariances go by: the median residual, corrected for what it hides.
+
+A path with many knots follows part of the noise, so that residuals are smaller than the noise was. And errors of
+lenses and clocks last from frame to frame, so that n residuals tell less than n separate ones would.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hub.points import PointBasis
+from hub.poses.adjust import MotionPrior, linearise, predict
+from hub.poses.covariance import Covariance, covariance
+from hub.poses.linear import BAND
+from hub.poses.problem import CAMERA_PARAMETERS, Problem, Rows, State
+from hub.splines import SUPPORT
+from protocols.geometry.types import Floats
+
+_MOST_ROWS = 2000
+"""Rows of a camera of which the absorbed share is taken; evenly spread."""
+_LEAST_LEFT = 0.2
+"""Least share of the numbers that a camera must have left after what the path absorbed."""
+_LONGEST_S = 2.0
+"""Time [s] over which residuals are looked at for erring together."""
+_MOST_TOGETHER = 1000.0
+_LEAST_PAIRS = 200
+"""Pairs of residuals at one lag from which their correlation is told."""
+_TOLD = 3.0
+"""Sigma by which a correlation must stand out before it is believed."""
+
+
+def honest(problem: Problem, state: State, prior: MotionPrior) -> State:
+    """The state with ``sigma`` (cameras,) as a covariance must have it; nothing else changes.
+
+    Separate points (a shared clock) come with their own correction (`adjust.noise`) and stay.
+    """
+    if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
+        return state
+    found = covariance(problem, state, prior)
+    absorbed, together = np.zeros(len(state.cameras)), np.ones(len(state.cameras))
+    numbers = np.zeros(len(state.cameras))
+    for rows in problem.rows:
+        numbers[rows.camera] += 2.0 * float(np.count_nonzero(rows.use))
+        absorbed[rows.camera] += _absorbed(problem, state, found, rows)
+    for camera in range(len(state.cameras)):
+        together[camera] = _together(problem, state, camera)
+    left = np.maximum(1.0 - absorbed / np.maximum(numbers, 1.0), _LEAST_LEFT)
+    return replace(state, sigma=state.sigma * np.sqrt(together / left))
+
+
+def _absorbed(problem: Problem, state: State, found: Covariance, rows: Rows) -> float:
+    """How many of the rows' numbers the fit follows: the trace of the hat matrix over them."""
+    used = np.flatnonzero(rows.use)
+    if not len(used):
+        return 0.0
+    pick = used[np.unique(np.linspace(0, len(used) - 1, min(len(used), _MOST_ROWS)).astype(np.int64))]
+    use = np.zeros_like(rows.use)
+    use[pick] = True
+    line = linearise(rows.using(use), state.cameras[rows.camera], state.trajectories[rows.label], CAMERA_PARAMETERS)
+    base = 3 * sum(path.basis.size for path in state.trajectories[: rows.label])
+    first = base + 3 * line.index
+    inside = (first % BAND)[:, None] + np.arange(BAND)
+    blocks = found.blocks[(first // BAND)[:, None, None], inside[:, :, None], inside[:, None, :]]
+    w, n = line.weights, len(line.index)
+    point = np.einsum("na,naibj,nb->nij", w, blocks.reshape(n, SUPPORT, 3, SUPPORT, 3), w, optimize=True)
+    trace = float(np.einsum("npi,nij,npj->", line.by_point, point, line.by_point, optimize=True))
+    if found.free.size:
+        around = found.carried[first[:, None] + np.arange(BAND)].reshape(n, SUPPORT, 3, -1)
+        shift = -line.by_point @ np.einsum("na,naip->nip", w, around)
+        columns = problem.free_columns()
+        mine = np.flatnonzero(columns // CAMERA_PARAMETERS == rows.camera)
+        shift[:, :, mine] += line.by_camera[:, :, columns[mine] % CAMERA_PARAMETERS]
+        trace += float(np.einsum("npi,ij,npj->", shift, found.free, shift, optimize=True))
+    return trace / float(state.sigma[rows.camera]) ** 2 * len(used) / len(pick)
+
+
+def _together(problem: Problem, state: State, camera: int) -> float:
+    """How many residuals in a row count as one: 1 + 2 sum of their correlations, as far as these stand out."""
+    found = 1.0
+    for rows in problem.rows:
+        if rows.camera != camera or np.count_nonzero(rows.use) < 8:
+            continue
+        off = (predict(rows, state.cameras[camera], state.trajectories[rows.label]) - rows.pixels)[rows.use]
+        time = rows.time[rows.use]
+        good = np.isfinite(off).all(axis=1)
+        found = max(found, _in_a_row(time[good], off[good]))
+    return found
+
+
+def _in_a_row(time: Floats, off: Floats) -> float:
+    order = np.argsort(time, kind="stable")
+    time, off = time[order], off[order]
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    variance = float(np.mean(off**2))
+    if step <= 0.0 or variance <= 0.0:
+        return 1.0
+    total = 1.0
+    for lag in range(1, round(_LONGEST_S / step) + 1):
+        near = np.abs(time[lag:] - time[:-lag] - lag * step) < 0.5 * step if lag < len(time) else np.zeros(0, np.bool_)
+        pairs = int(np.count_nonzero(near))
+        if pairs < _LEAST_PAIRS:
+            break
+        correlation = float(np.mean(off[lag:][near] * off[:-lag][near])) / variance
+        if correlation < _TOLD / np.sqrt(2.0 * pairs):
+            break
+        total += 2.0 * correlation
+    return min(total, _MOST_TOGETHER)

@@ -1,0 +1,62 @@
+"""The noise behind the stds: what the path absorbed comes back, and errors that last are not counted as many."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hub.poses.adjust import adjust, build_system
+from hub.poses.covariance import covariance
+from hub.poses.sigma import _absorbed, _in_a_row, honest
+from protocols.geometry.types import Floats
+from tests.unit.test_adjust import dense, world
+
+
+def test_what_the_fit_absorbs_is_the_trace_of_the_dense_hat_matrix() -> None:
+    problem, state, prior = world(3)
+    found = covariance(problem, state, prior)
+    mine = sum(_absorbed(problem, state, found, rows) for rows in problem.rows)
+    whole = dense(build_system(problem, state, prior, robust=False)[0])
+    priors = dense(build_system(replace(problem, rows=()), state, prior, robust=False)[0])
+    scale = 1.0 / np.sqrt(np.diag(whole))  # one tolerance for metres, radians and seconds
+    whole, priors = whole * scale * scale[:, None], priors * scale * scale[:, None]
+    # Seven directions, the gauge, are told by nothing.
+    hat = np.linalg.pinv(whole, rcond=1e-11, hermitian=True) @ (whole - priors)
+    assert mine == pytest.approx(float(np.trace(hat)), rel=5e-3)
+
+
+def test_the_noise_of_simulated_cameras_is_found() -> None:
+    raw, corrected = [], []
+    for seed in range(8):
+        problem, state, _ = world(seed)
+        problem, state, prior = adjust(problem, state)
+        raw.append(state.sigma)
+        corrected.append(honest(problem, state, prior).sigma)
+    assert np.mean(corrected) == pytest.approx(0.5, rel=0.03)
+    assert np.mean(raw) < 0.97 * np.mean(corrected)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.5, 0.9])
+def test_residuals_in_a_row_count_as_the_closed_form_says(correlation: float) -> None:
+    rng = np.random.default_rng(int(10 * correlation))
+    count = 20_000
+    fresh = rng.normal(0.0, np.sqrt(1.0 - correlation**2), (count, 2))
+    off: Floats = np.zeros((count, 2))
+    for i in range(1, count):
+        off[i] = correlation * off[i - 1] + fresh[i]
+    found = _in_a_row(np.arange(count) / 30.0, off)
+    assert found == pytest.approx((1.0 + correlation) / (1.0 - correlation), rel=0.15)
+
+
+def test_lost_frames_and_the_order_of_rows_change_nothing() -> None:
+    rng = np.random.default_rng(1)
+    off = np.cumsum(rng.normal(size=(6000, 2)), axis=0)
+    off -= np.stack([np.convolve(column, np.ones(31) / 31, "same") for column in off.T], axis=1)
+    time, keep = np.arange(6000) / 30.0, np.sort(rng.permutation(6000)[:4500])
+    whole = _in_a_row(time, off)
+    assert whole > 3.0
+    assert _in_a_row(time[keep], off[keep]) == pytest.approx(whole, rel=0.15)
+    mixed = rng.permutation(6000)
+    assert _in_a_row(time[mixed], off[mixed]) == whole
