@@ -9,6 +9,7 @@ import difflib
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NoReturn
 
 # One thread a process: the solvers' matrices are small, agents share a board's cores, and sums that
@@ -36,14 +37,28 @@ COMMANDS: tuple[tuple[str, str, str], ...] = (
     ("intrinsics", "deploy.commands.intrinsics:intrinsics", "A camera's lens from a video of a board."),
     ("sync", "deploy.commands.sync:sync", "Reference times of all frames; videos that line up."),
     ("export", "deploy.commands.export:export", "Calibrations and paths in other tools' formats."),
+    ("import", "deploy.commands.import_:import_", "Other tools' calibrations and tracks; a session as a log."),
     ("track", "deploy.commands.track:track", "Follow one car from the air, also out of the picture."),
+    ("report", "deploy.commands.report:report", "One offline page on what an answer is worth."),
+    ("quick", "deploy.commands.quick:quick", "Calibrate two webcams without a configuration."),
+    ("view", "deploy.commands.view:view", "A rig in a browser: live, or a log with a timeline."),
     ("camera", "deploy.commands.agents:camera", "Camera agent: detect and publish."),
+    ("uav", "deploy.commands.agents:uav", "UAV agent: follow a car, tell it by MAVLink."),
     ("hub", "deploy.commands.agents:hub", "Hub agent: gather, calibrate, track."),
     ("record", "deploy.commands.agents:record", "Recorder: everything on the bus into a log."),
+    ("router", "deploy.commands.router:router", "Router: relays between agents, and watches itself."),
     ("replay", "deploy.commands.logs:replay", "Play a log back onto the bus, or compare two."),
     ("recover", "deploy.commands.logs:recover", "Make a whole log of a damaged one."),
     ("info", "deploy.commands.logs:info", "What is in a log or a session."),
+    ("keys", "deploy.commands.keys:KEYS", "Certificates: who may say and hear what."),
+    ("install", "deploy.commands.install:install", "An agent as a systemd service."),
+    ("uninstall", "deploy.commands.install:uninstall", "Take agents' services away."),
+    ("fleet", "deploy.commands.fleet:fleet", "All agents of a rig on this machine."),
+    ("bundle", "deploy.commands.bundle:bundle", "Wheels and a script for a board without a network."),
+    ("doctor", "deploy.commands.doctor:doctor", "What is wrong with this machine, and what to do."),
 )
+
+_AGENTS = ("camera", "uav", "hub", "record", "router")
 
 
 def build_app(called: str = "") -> App:
@@ -113,7 +128,15 @@ def _command_of(words: Sequence[str]) -> str:
 
 def main() -> NoReturn:
     """Entry point of the console script."""
-    sys.exit(run())
+    status = run()
+    if len(sys.argv) > 1 and sys.argv[1] in _AGENTS:
+        # A thread that is stuck in the transport when the interpreter is taken down aborts the process: an agent
+        # that ended in order would look as if it had crashed.
+        with suppress(OSError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(status)
+    sys.exit(status)
 
 
 __all__ = ["EXIT_BUG", "build_app", "main", "run"]

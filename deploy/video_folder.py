@@ -10,7 +10,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import tomli_w
@@ -26,10 +26,11 @@ from protocols.session.rig import Rig, read_rig, read_toml
 from protocols.version import VERSION
 
 Progress = Callable[[str, float], None]
+DetectorName = Literal["marker", "person", "vehicle"]
 
 SESSION = "session"
 _DETECTIONS, _STATE = "detections", "videos.json"
-_LENS = ("matrix", "distortions", "fisheye")
+_LENS = ("matrix", "distortions", "fisheye", "focal_std")
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,12 +88,15 @@ def list_videos(folder: Path) -> tuple[list[VideoFile], list[str]]:
     return videos, warnings
 
 
-def gather_session(folder: Path, session: Path, tell: Progress, marker: Path | None = None) -> Gathered:
-    """Detect the marker in every video and merge what was seen to a session folder.
+def gather_session(
+    folder: Path, session: Path, tell: Progress, marker: Path | None = None, detector: DetectorName = "marker"
+) -> Gathered:
+    """Detect the marker, or what else moves, in every video and merge what was seen to a session folder.
 
     session: is made or brought up to date: rig.toml, observations.csv, and what each video gave, so that a video that
     has not changed is not looked through again. marker: a marker.toml; default the folder's, or the
-    demo's orange ball. Raises InputError where fewer than two videos can be read.
+    demo's orange ball. detector: person and vehicle take videos in which one of them is at a time: who is who in
+    two videos nobody knows yet. Raises InputError where fewer than two videos can be read.
     """
     videos, warnings = list_videos(folder)
     if len(videos) < 2:
@@ -101,7 +105,7 @@ def gather_session(folder: Path, session: Path, tell: Progress, marker: Path | N
     given, tables = _given_rig(folder)
     own_marker = marker or (folder / MARKER_FILE if (folder / MARKER_FILE).exists() else None)
     model = MarkerModel.default() if own_marker is None else read_marker(own_marker)
-    found, failed = _detect_all(videos, session, model, given, tell)
+    found, failed = _detect_all(videos, session, model, given, tell, detector)
     warnings += failed
     if len(found) < 2:
         told = "; ".join(warnings)
@@ -112,12 +116,18 @@ def gather_session(folder: Path, session: Path, tell: Progress, marker: Path | N
         if video.camera not in found:
             continue
         one, kept = found[video.camera]
+        several = _several(one)
+        if several:
+            warnings.append(
+                f"{video.path.name}: {several} {detector}s in it, and who is who in two videos is not known; left out"
+            )
+            one = replace(one, rows=())
         rows += one.rows
         again = " (kept from before)" if kept else ""
-        lines.append(f"{video.path.name}: marker in {one.seen} of {one.frames} frames{again}")
+        lines.append(f"{video.path.name}: {detector} in {one.seen} of {one.frames} frames{again}")
         warnings += [f"{video.path.name}: {warning}" for warning in one.warnings]
-        if not one.rows:
-            warnings.append(f"{video.path.name}: no marker in any of its frames")
+        if not one.rows and not several:
+            warnings.append(f"{video.path.name}: no {detector} in any of its frames")
         tables[video.camera] = _table(video, one, tables.get(video.camera, {}), warnings)
     metadata = tables.pop("metadata", {})
     # Keys of [metadata] must not land in the last camera's table: it goes first.
@@ -174,7 +184,12 @@ def _table(video: VideoFile, found: Found, given: dict[str, Any], warnings: list
 
 
 def _detect_all(
-    videos: list[VideoFile], session: Path, model: MarkerModel, given: Rig | None, tell: Progress
+    videos: list[VideoFile],
+    session: Path,
+    model: MarkerModel,
+    given: Rig | None,
+    tell: Progress,
+    kind: DetectorName,
 ) -> tuple[dict[str, tuple[Found, bool]], list[str]]:
     """What each video gave, and whether it was kept from before; and why some could not be read."""
     state = _read_state(session)
@@ -190,7 +205,8 @@ def _detect_all(
 
     def look(video: VideoFile) -> None:
         lens = given.cameras[video.camera].intrinsics if given and video.camera in given.cameras else None
-        key = _key(video, model, None if lens is None else [lens.matrix.tolist(), lens.distortions.tolist()])
+        told_lens = None if lens is None else [lens.matrix.tolist(), lens.distortions.tolist()]
+        key = _key(video, model if kind == "marker" else None, told_lens, kind)
         before = _kept(session, video.camera, state.get(video.camera), key)
         if before is not None:
             found[video.camera] = before, True
@@ -199,14 +215,17 @@ def _detect_all(
         try:
             film = Film(video.path)
             total = max(film.info.frames, 1)
-            detector = marker_detector(model, lens, film.info.size)
-            one = detect_in(
-                film,
-                video.camera,
-                detector,
-                lambda frame: told(video, f"{frame} of {total}", min(frame / total, 1.0)),
-                stop.is_set,
-            )
+            if kind == "marker":
+                detector = marker_detector(model, lens, film.info.size)
+                one = detect_in(
+                    film,
+                    video.camera,
+                    detector,
+                    lambda frame: told(video, f"{frame} of {total}", min(frame / total, 1.0)),
+                    stop.is_set,
+                )
+            else:
+                one = _moving(film, video.camera, kind, lambda text, share: told(video, text, min(share, 1.0)))
         except InputError as error:
             with lock:
                 failed[video.camera] = f"{video.path.name}: {error.what}; left out"
@@ -235,9 +254,25 @@ def _detect_all(
     return found, [failed[video.camera] for video in videos if video.camera in failed]
 
 
-def _key(video: VideoFile, model: MarkerModel, lens: Any) -> str:
+def _moving(film: Film, camera: str, kind: str, tell: Progress) -> Found:
+    """People or vehicles of a video, without the columns that a session does not know."""
+    from deploy.detecting_moving import HEADER_EXTRA, find_moving, make_detector
+
+    found = find_moving(film, camera, make_detector(kind, "mog2", film.info.fps), tell)
+    extra = HEADER_EXTRA.count(",") + 1
+    return replace(found, rows=tuple(row.rsplit(",", extra)[0] for row in found.rows))
+
+
+def _several(found: Found) -> int:
+    """How many different points are in a video, if more than one: the label is the last cell but one."""
+    labels = {row.rsplit(",", 2)[1] for row in found.rows}
+    return len(labels) if len(labels) > 1 else 0
+
+
+def _key(video: VideoFile, model: MarkerModel | None, lens: Any, kind: str) -> str:
     """Changes with whatever changes a video's detections."""
-    about = [VERSION, has_pyav(), video.path.name, video.size, video.mtime_ns, model.to_table(), lens]
+    table = None if model is None else model.to_table()
+    about = [VERSION, has_pyav(), video.path.name, video.size, video.mtime_ns, table, lens, kind]
     return hashlib.sha256(json.dumps(about).encode()).hexdigest()
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hub.distributed import PlacedByNodes
+from hub.lens import LARGEST_STD, refocused, self_calibrated
 from hub.pairs import Progress, rate_warnings, solve_pairs, timing_told
 from hub.paper_poses import all_sized, place_by_paper
 from hub.poses import covariance as cov
@@ -19,10 +20,11 @@ from hub.poses.graph import ClockGraph, ClockGuess, average_clocks, components
 from hub.poses.initialise import Scaffold, agreement, grow, place_known
 from hub.poses.problem import Freedom, Problem, State
 from hub.prepare import NO_INTRINSICS, Prepared, prepare
-from hub.publish import lone_pair_report, publish
+from hub.publish import focal_stds, lone_pair_report, publish
 from hub.timing.pair import PairSolution
 from hub.timing.paper_pairs import paper_pair
 from hub.timing.tracks import smooth_only
+from hub.timing.two_view import fundamental_from
 from protocols.errors import Refused
 from protocols.session.calibration import Calibration, Known
 from protocols.session.observations import Observations
@@ -32,6 +34,7 @@ _LEAST_AGREEMENT = 0.5  # share of a camera's rows that must fit the common path
 _LEAST_ROWS = 30
 _LARGEST_TURN_STD = 0.035  # rad
 _LARGEST_CLOCK_STD = 5e-3  # s
+_LENS_ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +59,7 @@ def calibrate(
     solver: str = "joint",
     known: Known | None = None,
     thorough: bool = False,
+    seed: int = 0,
 ) -> Calibration:
     """Timing and poses of all cameras from what they saw, with no guess.
 
@@ -63,6 +67,7 @@ def calibrate(
     a few frames). known: intrinsics and poses that are given; then only timing and paths are sought.
     thorough: whether cameras that nothing ties get a second, far dearer search: clock rates that a
     wrongly told frame rate makes (times made of frame numbers: a live camera's are not), and torn tracks.
+    seed: of the samples by which pose nodes begin ("distributed"); the other solvers draw nothing at random.
     Raises Refused, with a reason for every camera and what is known of pairs, where fewer than two can be placed.
     """
     tell = progress or (lambda text, share: None)
@@ -87,9 +92,9 @@ def calibrate(
         elif solver == "paper":
             solution = solve_paper(prepared, pairs, tell, observations if by_sizes else None)
         elif solver == "distributed":
-            solution = solve_network(prepared, pairs, tell, PlacedByNodes(rig, prepared, observations, tell))
+            solution = solve_network(prepared, pairs, tell, PlacedByNodes(rig, prepared, observations, tell, seed))
         else:
-            solution = solve_network(prepared, pairs, tell)
+            solution = solve_with_guesses(rig, prepared, pairs, tell)
         tell("covariances", 0.95)
         return publish(rig, solution)
     except Refused as refusal:
@@ -101,7 +106,9 @@ def calibrate(
 def with_known_lenses(rig: Rig, known: Known) -> Rig:
     """The rig with the intrinsics of a known calibration, which may have been refined since."""
     cameras = {
-        name: replace(camera, intrinsics=known.cameras[name].intrinsics) if name in known.cameras else camera
+        name: replace(camera, intrinsics=known.cameras[name].intrinsics, focal_std=0.0)
+        if name in known.cameras
+        else camera
         for name, camera in rig.cameras.items()
     }
     return replace(rig, cameras=cameras)
@@ -127,6 +134,49 @@ def paper_pairs(prepared: Prepared, observations: Observations, tell: Progress) 
     return pairs
 
 
+def solve_with_guesses(rig: Rig, prepared: Prepared, pairs: list[PairSolution], tell: Progress) -> Solution:
+    """The network with the cameras whose lens nobody measured, as far as the common path tells their focal lengths.
+
+    Where it does not, those cameras are refused with what is known of their timing, as if they had not been tried.
+    """
+    trial, seen = self_calibrated(rig, prepared, pairs)
+    if trial is prepared:
+        return solve_network(prepared, pairs, tell)
+    tell("focal lengths", 0.58)
+    try:
+        for _ in range(_LENS_ROUNDS):
+            solution = solve_network(trial, seen, tell)
+            found = dict(zip(solution.scaffold.names, solution.scaffold.state.cameras, strict=True))
+            trial, seen, changed = refocused(trial, seen, {name: one.intrinsics for name, one in found.items()})
+            if not changed:
+                break
+    except Refused as refusal:
+        told = {name: refusal.cameras.get(name, "") for name in trial.cameras if trial.cameras[name].guess is not None}
+        return solve_network(replace(prepared, refused=_with_attempt(prepared, told)), pairs, tell)
+    guessed = [name for name in trial.cameras if trial.cameras[name].guess is not None]
+    left = {name: solution.refused[name] for name in guessed if name in solution.refused}
+    refused = solution.refused | {
+        name: reason for name, reason in _with_attempt(prepared, left).items() if name in left
+    }
+    # What is told of a refused camera's pairs is what they said before a lens was tried.
+    lenses = {name: prepared.camera(name).intrinsics.matrix for name in prepared.names}
+    before = {
+        (pair.a, pair.b): replace(pair, fundamental=fundamental_from(pair.fit.geometry, lenses[pair.a], lenses[pair.b]))
+        for pair in pairs
+        if {pair.a, pair.b} & set(left) and pair.fit is not None and pair.solved
+    }
+    told_pairs = tuple(before.get((pair.a, pair.b), pair) for pair in solution.pairs)
+    return replace(solution, refused=_ordered(refused, prepared), pairs=told_pairs)
+
+
+def _with_attempt(prepared: Prepared, told: dict[str, str]) -> dict[str, str]:
+    """Reasons of refused cameras, and why the path does not tell the lens of those that were tried."""
+    return {
+        name: f"{reason}; its lens could not be found from the path: {told[name]}" if told.get(name) else reason
+        for name, reason in prepared.refused.items()
+    }
+
+
 def solve_network(
     prepared: Prepared, pairs: list[PairSolution], tell: Progress, nodes: PlacedByNodes | None = None
 ) -> Solution:
@@ -147,13 +197,17 @@ def solve_network(
             scaffold = _adjust_all(scaffold, tell)
         refused |= unplaced
         bad = [name for name in scaffold.names if not _fits(scaffold, name)]
+        # A lens that was guessed may be what is wrong with all the others.
+        bad = [name for name in bad if prepared.cameras[name].guess is not None] or bad
         if bad:
             # The worst one goes, and what it may have spoilt is made again without it.
             worst = min(bad, key=lambda name: agreement(scaffold, name)[0])
             share, count = agreement(scaffold, worst)
             refused[worst] = f"only {100 * share:.0f} % of its {count} observations fit the path that the others see"
         else:
-            worst, reason = _loosest(scaffold)
+            worst, reason = _vaguest_lens(scaffold)
+            if not reason:
+                worst, reason = _loosest(scaffold)
             if not reason:
                 break
             refused[worst] = reason
@@ -168,6 +222,15 @@ def solve_network(
     if nodes is not None:
         solver, warnings = "distributed", warnings + nodes.warnings
     return Solution(scaffold, tuple(pairs), _ordered(refused, prepared), prepared, solver, warnings)
+
+
+def _vaguest_lens(scaffold: Scaffold) -> tuple[str, str]:
+    """The unmeasured camera whose focal length the path tells worst, and how badly; "" where all are told well."""
+    stds = focal_stds(scaffold.problem, scaffold.state)
+    worst = int(np.argmax(stds))
+    if stds[worst] <= LARGEST_STD:
+        return "", ""
+    return scaffold.names[worst], f"the common motion tells its focal length only to {100 * stds[worst]:.1f} % (std)"
 
 
 def _loosest(scaffold: Scaffold) -> tuple[str, str]:
@@ -317,7 +380,12 @@ def _why_nothing(prepared: Prepared, pairs: list[PairSolution], refused: dict[st
     if not pairs:
         short = refused | dict.fromkeys(prepared.lensless, "no intrinsics")
         told = "; ".join(f"{name}: {reason}" for name, reason in short.items())
-        return f"fewer than two cameras can be placed ({told})" if told else "one camera only: a pair is needed"
+        remedy = (
+            "; tell their lenses: `syncline intrinsics` with a board, --model or --field-of-view"
+            if prepared.lensless
+            else "; film the marker with two cameras or more at the same time"
+        )
+        return f"fewer than two cameras can be placed ({told}){remedy}" if told else "one camera only: a pair is needed"
     told = "; ".join(f"{pair.a}–{pair.b}: {pair.status}" for pair in pairs[:6])
     return f"no pair of cameras could be tied together ({told})"
 

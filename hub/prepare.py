@@ -22,9 +22,9 @@ NO_INTRINSICS = "no intrinsics (matrix and distortions in rig.toml): run `syncli
 class Prepared:
     """Cameras that can be tried: smoothed tracks, raw rows; and those that can't, with the reason.
 
-    lensless: cameras without intrinsics, of which only the timing can be found; their normalised coordinates
-    are those of a nominal lens, and they are among the refused. paces: of cameras whose seconds are no
-    seconds. All times in here are ``pace * (t_camera - epoch)``.
+    lensless: cameras without measured intrinsics, of which by themselves only the timing can be found; their
+    normalised coordinates are those of a nominal lens, and they are among the refused. paces: of cameras whose
+    seconds are no seconds. All times in here are ``pace * (t_camera - epoch)``.
     """
 
     cameras: dict[str, Camera]
@@ -81,7 +81,8 @@ def prepare(rig: Rig, observations: Observations) -> Prepared:
         if not tracks:
             refused[name] = "no observations"
             continue
-        if rig_camera.intrinsics is None:
+        unknown = rig_camera.intrinsics is None or rig_camera.focal_std > 0.0
+        if unknown:
             refused[name] = NO_INTRINSICS
             if rig.shared_clock:
                 continue
@@ -103,13 +104,11 @@ def prepare(rig: Rig, observations: Observations) -> Prepared:
             mine.append(Rows(-1, labels.index(track.label), track.time - epoch, track.pixels, use))
         if not smooth:
             few = f"too few connected observations ({sum(len(track) for track in tracks)} rows)"
-            refused[name] = few if rig_camera.intrinsics is not None else f"{NO_INTRINSICS}; and {few}"
+            refused[name] = f"{NO_INTRINSICS}; and {few}" if unknown else few
             continue
         epochs[name] = epoch
-        if rig_camera.intrinsics is None:
-            lensless[name] = Camera(name, lens, smooth)
-        else:
-            cameras[name], rows[name] = Camera(name, lens, smooth), mine
+        rows[name] = mine
+        (lensless if unknown else cameras)[name] = Camera(name, lens, smooth)
     return Prepared(
         cameras, rows, epochs, labels, refused, tuple(rig.cameras), rig.shared_clock, tuple(warnings), lensless
     )

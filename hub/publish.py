@@ -12,11 +12,13 @@ from hub.points import SAME_TIME, PointBasis
 from hub.poses import covariance as cov
 from hub.poses.adjust import motion_prior, predict, residual_norms
 from hub.poses.gauge import fix_gauge, given_world, transform_state, weighed
-from hub.poses.problem import Problem, State
+from hub.poses.problem import CAMERA_PARAMETERS, FOCAL, Problem, State
 from hub.poses.references import adjust_to_references
+from hub.poses.sigma import honest
 from hub.poses.trust import trusted
 from hub.timing.pair import PairSolution
 from hub.timing.two_view import fundamental_from, relative_pose
+from hub.wand import measured_wands, scaled_by_wands
 from protocols.clocks import TimeMap
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, CameraCalibration, PairReport, TrajectoryTable
@@ -43,12 +45,17 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
     if solution.known is None:
         rig, aside = trusted(rig, names, [camera.pose for camera in state.cameras])
         gauge = fix_gauge(rig, names, [camera.pose for camera in state.cameras])
+        gauge = scaled_by_wands(gauge, measured_wands(rig, scaffold.labels, problem, state))
         state = transform_state(state, gauge.similarity)
         if gauge.scale == "metric" and problem.freedom.pose and weighed(rig, names):
-            state = adjust_to_references(rig, names, problem, state, motion_prior(problem, state))
+            prior = motion_prior(problem, state)
+            fitted = adjust_to_references(rig, names, problem, honest(problem, state, prior), prior)
+            state = replace(fitted, sigma=state.sigma)
     else:
         gauge = given_world(len(names), solution.known.scale)
-    covariance = cov.covariance(problem, state, motion_prior(problem, state), gauge.information)
+    prior = motion_prior(problem, state)
+    covariance = cov.covariance(problem, honest(problem, state, prior), prior, gauge.information)
+    lens_stds = focal_stds(problem, state, covariance)
     reference = _reference(rig, names)
     epochs = [solution.prepared.epochs[name] for name in names]
     paces = [solution.prepared.pace(name) for name in names]
@@ -72,6 +79,7 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
             if solution.known is None
             else solution.known.cameras[name].position_std,
             rms_px=_rms(problem, state, i),
+            focal_std=float(lens_stds[i]),
         )
         for i, name in enumerate(names)
     }
@@ -98,7 +106,7 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
             for label, name in enumerate(scaffold.labels)
         ),
         pairs=tuple(_pair_report(pair, cameras, problem, state, names, solution) for pair in solution.pairs),
-        warnings=solution.prepared.warnings + solution.warnings + aside + gauge.warnings,
+        warnings=solution.prepared.warnings + solution.warnings + aside + gauge.warnings + _lenses_told(cameras),
         residuals={name: _residual_rows(problem, state, i, epochs[i], paces[i]) for i, name in enumerate(names)},
     )
 
@@ -106,7 +114,8 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
 def path_tables(rig: Rig, prepared: Prepared, scaffold: Scaffold, base: str) -> tuple[TrajectoryTable, ...]:
     """The paths of a solution whose cameras were given and stay, in their world, on the clock of camera ``base``."""
     problem, state, names = scaffold.problem, scaffold.state, scaffold.names
-    covariance = cov.covariance(problem, state, motion_prior(problem, state))
+    prior = motion_prior(problem, state)
+    covariance = cov.covariance(problem, honest(problem, state, prior), prior)
     reference = names.index(base)
     paces = [prepared.pace(name) for name in names]
     rate_hz = _rate_hz(rig, problem, names, paces, paces[reference])
@@ -130,8 +139,29 @@ def _reordered(problem: Problem, state: State, order: list[int]) -> tuple[Proble
         nominal=tuple(problem.nominal[i] for i in order),
         clock_reference=place[problem.clock_reference],
         anchors=(place[problem.anchors[0]], place[problem.anchors[1]]),
+        guessed=tuple(problem.lens_prior(i) for i in order),
     )
     return moved, replace(state, cameras=tuple(state.cameras[i] for i in order), sigma=state.sigma[order])
+
+
+def focal_stds(problem: Problem, state: State, covariance: cov.Covariance | None = None) -> Floats:
+    """(cameras,) relative stds of the focal lengths that the path told; 0 where the lens was given."""
+    guessed = [problem.lens_prior(i) is not None for i in range(len(state.cameras))]
+    if not any(guessed):
+        return np.zeros(len(guessed))
+    found = covariance or cov.covariance(problem, state, motion_prior(problem, state))
+    variance = np.diag(found.cameras)[FOCAL::CAMERA_PARAMETERS]
+    return np.where(guessed, np.sqrt(np.maximum(variance, 0.0)), 0.0)
+
+
+def _lenses_told(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
+    """One sentence for each lens that the path told."""
+    return tuple(
+        f"{name}: its lens was found from the path: focal length {camera.intrinsics.focal:.1f} px ± "
+        f"{100 * camera.focal_std:.2g} % (std)"
+        for name, camera in cameras.items()
+        if camera.focal_std > 0.0
+    )
 
 
 def _map_std(problem: Problem, state: State, covariance: cov.Covariance, camera: int, reference: int) -> float:

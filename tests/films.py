@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -25,14 +25,26 @@ def write_film(
 ) -> None:
     """A video with these frames at these times [s]."""
     height, width = pictures[0].shape[:2]
+    frames = zip((float(time) for time in times), pictures, strict=True)
+    write_film_of(file, (width, height), frames, codec, crf)
+
+
+def write_film_of(
+    file: Path,
+    size: tuple[int, int],
+    frames: Iterable[tuple[float, Image]],
+    codec: str = "libx264",
+    crf: str = "12",
+) -> None:
+    """A video of frames (time [s], picture) as they come: a long one need not be in memory. size: (width, height)."""
     with av.open(str(file), "w") as container:
         stream = container.add_stream(codec, rate=30)
-        stream.width, stream.height = width, height
+        stream.width, stream.height = size
         stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
         stream.time_base = stream.codec_context.time_base = Fraction(1, TICKS)
         if codec == "libx264":
             stream.options = {"preset": "ultrafast", "crf": crf, "threads": "1"}
-        for picture, time in zip(pictures, times, strict=True):
+        for time, picture in frames:
             frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
             frame.pts, frame.time_base = round(time * TICKS), Fraction(1, TICKS)
             container.mux(stream.encode(frame))

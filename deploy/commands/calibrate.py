@@ -30,6 +30,7 @@ def calibrate(
     solver: Literal["joint", "distributed", "paper"] = "joint",
     from_known: Path | None = None,
     marker: Path | None = None,
+    detector: Literal["marker", "person", "vehicle"] = "marker",
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
@@ -62,15 +63,17 @@ def calibrate(
     marker
         Of videos: what the marker looks like, as `syncline detect --teach` wrote it. Default: marker.toml among
         the videos, or else the orange ball of the demo.
+    detector
+        Of videos: what moves in them. person, vehicle: one at a time, before fixed cameras.
     json
         Print the result as JSON on standard output.
     seed
-        Recorded with the result; the solvers draw nothing at random.
+        Of the pose nodes' random samples (--solver distributed); the other solvers draw nothing at random.
     """
     check_folder(out)
     if from_known is not None and solver != "joint":
         raise InputError("--from-known goes with --solver joint", remedy="leave one of the two out")
-    rig, seen, warnings = _load(session, observations, out, marker, json)
+    rig, seen, warnings = _load(session, observations, out, marker, detector, json)
     known = None
     if from_known is not None:
         known, rig = _known(from_known, rig)
@@ -80,7 +83,7 @@ def calibrate(
     began = time.process_time()
     try:
         with progress_bar(f"calibrating {session.name}", quiet=json) as tell:
-            result = solve(rig, seen, tell, solver=solver, known=known, thorough=True)
+            result = solve(rig, seen, tell, solver=solver, known=known, thorough=True, seed=seed)
     except Refused as refusal:
         spent = time.process_time() - began
         write_refusal(
@@ -93,20 +96,29 @@ def calibrate(
 
 
 def _load(
-    session: Path, observations: Path | None, out: Path, marker: Path | None, quiet: bool
+    session: Path,
+    observations: Path | None,
+    out: Path,
+    marker: Path | None,
+    detector: Literal["marker", "person", "vehicle"],
+    quiet: bool,
 ) -> tuple[Rig, Observations, tuple[str, ...]]:
     """A session as it is, or one made of a folder of videos. Raises InputError."""
     if observations is None and session.is_dir() and not (session / "observations.csv").exists():
         from deploy.video_folder import SESSION, gather_session, holds_videos
 
         if holds_videos(session):
-            with progress_bar("looking for the marker", quiet=quiet) as tell:
-                gathered = gather_session(session, out / SESSION, tell, marker)
+            if marker is not None and detector != "marker":
+                raise InputError(f"--marker means nothing with --detector {detector}", remedy="leave one of them out")
+            with progress_bar(f"looking for the {detector}", quiet=quiet) as tell:
+                gathered = gather_session(session, out / SESSION, tell, marker, detector)
             for line in () if quiet else gathered.told:
                 print(line)
             return gathered.rig, gathered.observations, gathered.warnings
     if marker is not None:
         raise InputError("--marker goes with a folder of videos", remedy="leave it out for a session")
+    if detector != "marker":
+        raise InputError("--detector goes with a folder of videos", remedy="leave it out for a session")
     return load_session(session, observations)
 
 

@@ -27,6 +27,7 @@ def intrinsics(
     ratio: float = 0.75,
     fisheye: Annotated[bool, Parameter(negative="")] = False,
     field_of_view: float | None = None,
+    model: str | None = None,
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
@@ -37,6 +38,11 @@ def intrinsics(
     An existing rig.toml keeps everything else that stands in it, except its comments.
 
     Example: syncline intrinsics board.mp4 --camera cam0 --board charuco --squares 8x5 --out rig.toml
+
+    Without a board, --model or --field-of-view tell what the maker says. Such a lens is a guess and its table says so
+    (focal_std): `calibrate` then finds the focal length from the marker's path, or refuses the camera.
+
+    Example: syncline intrinsics cam0.mp4 --model gopro-wide --out rig.toml
 
     Example: syncline intrinsics cam0.mp4 --field-of-view 69 --out rig.toml
 
@@ -60,6 +66,8 @@ def intrinsics(
         OpenCV's fisheye model, for lenses of more than about 110 degrees.
     field_of_view
         Without a board: the picture's width in degrees, from the data sheet; distortion is taken as none.
+    model
+        Without a board: the camera, as gopro-wide, oak-d, pixel-main, logitech-c920, raspberry-pi-camera-3.
     json
         Print a summary as JSON.
     seed
@@ -76,18 +84,26 @@ def intrinsics(
     if field_of_view is not None and not 5.0 <= field_of_view <= widest:
         what = f"--field-of-view {field_of_view:g} is out of range"
         raise InputError(what, remedy=f"give 5 to {widest:g} degrees")
+    if model is not None and field_of_view is not None:
+        raise InputError("--model and --field-of-view each tell the field of view", remedy="keep one")
     from edge.devices.film import Film
     from edge.lens.board import Charuco, Chessboard, View, views_of
+    from edge.lens.models import UNKNOWN_STD, angle_across, find_model
     from edge.lens.solve import LensFit, coverage_map, lens_from_angle, solve_lens
     from protocols.files import write_atomically
 
     name = video.stem if camera is None else camera
     if not name or name != name.strip() or '"' in name or name == "metadata":
         raise InputError(f"{name!r} is no name for a camera", remedy="give --camera letters, digits, - and _")
+    known = None if model is None else find_model(model)
     film = Film(video)
     fit: LensFit | None = None
-    if field_of_view is not None:
-        lens = lens_from_angle(film.info.size, field_of_view, fisheye)
+    guess_std = 0.0
+    if known is not None:
+        lens = lens_from_angle(film.info.size, angle_across(known, film.info.size), known.fisheye)
+        guess_std = known.std
+    elif field_of_view is not None:
+        lens, guess_std = lens_from_angle(film.info.size, field_of_view, fisheye), UNKNOWN_STD
     else:
         grid = int(numbers[1]), int(numbers[2])
         finder = Chessboard(grid) if board == "chessboard" else Charuco(grid, dictionary, ratio)
@@ -109,6 +125,8 @@ def intrinsics(
     }
     if lens.fisheye:
         table["fisheye"] = True
+    if guess_std:
+        table["focal_std"] = guess_std
     write_atomically(out, _completed(out, name, table))
     if json:
         import json as json_module
@@ -126,7 +144,8 @@ def intrinsics(
         return EXIT_DONE
     model = "fisheye" if lens.fisheye else "pinhole"
     if fit is None:
-        print(f"{name}: {model}, focal length {lens.focal:.1f} px from the field of view; a board would tell it better")
+        print(f"{name}: {model}, focal length {lens.focal:.1f} px ± {100 * guess_std:.0f} % from the field of view")
+        print("a guess: `syncline calibrate` finds it from the marker's path, a board tells it better")
     else:
         print(f"{name}: {model}, focal length {lens.focal:.2f} px ± {100 * fit.focal_std:.2g} %, {fit.views} views")
         print(f"corners fit to {fit.rms_px:.3f} px; corners in each part of the picture ({100 * fit.coverage:.0f} %):")
@@ -147,6 +166,6 @@ def _completed(file: Path, name: str, table: dict[str, Any]) -> str:
         read_rig(file)  # what is wrong in it is told before anything is written
         values, _ = read_toml(file, "rig file")
     key = next((k for k, old in values.items() if k != "metadata" and old.get("name", k) == name), name)
-    kept = {k: v for k, v in values.get(key, {}).items() if k not in ("matrix", "distortions", "fisheye")}
+    kept = {k: v for k, v in values.get(key, {}).items() if k not in ("matrix", "distortions", "fisheye", "focal_std")}
     values[key] = {**kept, **table}
     return tomli_w.dumps(values)

@@ -22,12 +22,19 @@ from hub.poses.linear import (
     third_differences,
 )
 from hub.poses.problem import (
+    ASPECT,
     CAMERA_PARAMETERS,
+    CENTRE,
     FOCAL,
+    GIVEN_PARAMETERS,
     K1,
+    K2,
+    K3,
     OFFSET,
+    P1,
     RATE,
     CameraState,
+    LensPrior,
     Problem,
     Rows,
     State,
@@ -193,8 +200,8 @@ def motion_prior(problem: Problem, state: State, first: bool = False) -> MotionP
     return MotionPrior(tuple(weights))
 
 
-def linearise(rows: Rows, camera: CameraState, path: Trajectory) -> Linearised:
-    """Residuals of the used rows and their derivatives by the point (n, 2, 3) and the camera (n, 2, 10)."""
+def linearise(rows: Rows, camera: CameraState, path: Trajectory, columns: int = CAMERA_PARAMETERS) -> Linearised:
+    """Residuals of the used rows and their derivatives by the point (n, 2, 3) and the camera (n, 2, columns)."""
     time = rows.time[rows.use]
     index, weights, slopes, inside = path.basis.weights_both(camera.reference_time(time))
     around = path.control[index[:, None] + np.arange(weights.shape[1])]
@@ -214,7 +221,7 @@ def linearise(rows: Rows, camera: CameraState, path: Trajectory) -> Linearised:
     by_local[:, :, :2] = lens.pixel_jacobian(flat) * over[:, None, None]
     by_local[:, :, 2] = -by_local[:, :, 0] * flat[:, :1] - by_local[:, :, 1] * flat[:, 1:]
     by_point = (by_local.reshape(-1, 3) @ camera.pose.rotation).reshape(-1, 2, 3)
-    by_camera = np.empty((len(time), 2, CAMERA_PARAMETERS))
+    by_camera = np.empty((len(time), 2, columns))
     # A turn by w moves the point by w × local.
     for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
         by_camera[:, :, k] = local[:, i, None] * by_local[:, :, j] - local[:, j, None] * by_local[:, :, i]
@@ -230,6 +237,15 @@ def linearise(rows: Rows, camera: CameraState, path: Trajectory) -> Linearised:
         by_camera[:, :, K1] = flat * (angle**3 / np.maximum(radius, 1e-12))[:, None] * np.diag(lens.matrix)[:2]
     else:
         by_camera[:, :, K1] = (flat * radius2[:, None]) @ lens.matrix[:2, :2].T
+    if columns > GIVEN_PARAMETERS:
+        by_camera[:, :, CENTRE : CENTRE + 2] = np.eye(2)
+        factor = angle**2 if lens.fisheye else radius2
+        by_camera[:, :, K2] = by_camera[:, :, K1] * factor[:, None]
+        by_camera[:, :, K3] = by_camera[:, :, K2] * factor[:, None]
+        by_camera[:, :, ASPECT] = by_camera[:, :, FOCAL] * [-0.5, 0.5]
+        x, y = flat.T
+        tangents = np.stack([2 * x * y, radius2 + 2 * y * y, radius2 + 2 * x * x, 2 * x * y], axis=-1).reshape(-1, 2, 2)
+        by_camera[:, :, P1:] = 0.0 if lens.fisheye else (tangents @ lens.matrix[:2, :2].T).transpose(0, 2, 1)
     return Linearised(projected - rows.pixels[rows.use], by_point, by_camera, index, weights, valid)
 
 
@@ -257,7 +273,8 @@ def build_system(problem: Problem, state: State, prior: MotionPrior, robust: boo
         cost += value
     for rows in problem.rows:
         part = slice(bases[rows.label], bases[rows.label + 1])
-        line = linearise(rows, state.cameras[rows.camera], state.trajectories[rows.label])
+        count = GIVEN_PARAMETERS if problem.lens_prior(rows.camera) is None else CAMERA_PARAMETERS
+        line = linearise(rows, state.cameras[rows.camera], state.trajectories[rows.label], count)
         variance = state.sigma[rows.camera] ** 2
         squared = (line.residual**2).sum(axis=1) / variance
         if robust:
@@ -276,8 +293,8 @@ def build_system(problem: Problem, state: State, prior: MotionPrior, robust: boo
         pull = (weighted * line.residual[:, :, None]).sum(axis=1)
         system.gradient_path[part] += path_gradient(line.index, line.weights, pull, sizes[rows.label])
         base = rows.camera * CAMERA_PARAMETERS
-        mine = slice(base, base + CAMERA_PARAMETERS)
-        flat = line.by_camera.reshape(-1, CAMERA_PARAMETERS)
+        mine = slice(base, base + count)
+        flat = line.by_camera.reshape(-1, count)
         flat_weight = np.repeat(weight, 2)
         system.corner[mine, mine] += (flat * flat_weight[:, None]).T @ flat
         system.gradient_cameras[mine] += (flat * flat_weight[:, None]).T @ line.residual.reshape(-1)
@@ -317,7 +334,11 @@ def _add_camera_priors(problem: Problem, state: State, system: BorderedSystem) -
         guess = problem.lens_prior(camera)
         if guess is not None:
             terms.append((FOCAL, float(np.log(now.intrinsics.focal / guess.focal)), guess.focal_std))
+            off = now.intrinsics.matrix[:2, 2] - guess.centre
+            terms += [(CENTRE, float(off[0]), guess.centre_std), (CENTRE + 1, float(off[1]), guess.centre_std)]
             terms.append((K1, float(now.intrinsics.distortions[0] - guess.k1), guess.k1_std))
+            terms.append((K2, float(now.intrinsics.distortions[1] - guess.k2), guess.k2_std))
+            terms += _finer_priors(now.intrinsics, nominal, guess)
         elif freedom.lens:
             terms.append((FOCAL, float(np.log(now.intrinsics.focal / nominal.focal)), freedom.focal_std))
             terms.append((K1, float(now.intrinsics.distortions[0] - nominal.distortions[0]), freedom.k1_std))
@@ -326,6 +347,20 @@ def _add_camera_priors(problem: Problem, state: State, system: BorderedSystem) -
             system.gradient_cameras[base + column] += value / std**2
             cost += (value / std) ** 2
     return cost
+
+
+def _finer_priors(now: Intrinsics, nominal: Intrinsics, guess: LensPrior) -> list[tuple[int, float, float]]:
+    """Column, difference and std of what a lens has beside focal length, centre, k1 and k2."""
+    third = 2 if now.fisheye else 4
+    aspect = np.log(now.matrix[1, 1] / now.matrix[0, 0] / nominal.matrix[1, 1] * nominal.matrix[0, 0])
+    terms = [
+        (K3, float(now.distortions[third] - nominal.distortions[third]), guess.k3_std),
+        (ASPECT, float(aspect), guess.aspect_std),
+    ]
+    if not now.fisheye:
+        off = now.distortions[2:4] - nominal.distortions[2:4]
+        terms += [(P1, float(off[0]), guess.tangential_std), (P1 + 1, float(off[1]), guess.tangential_std)]
+    return terms
 
 
 def gauge_tangent(problem: Problem, state: State) -> Floats | None:
@@ -366,11 +401,18 @@ def moved(problem: Problem, state: State, path_step: Floats, camera_step: Floats
 def _moved_camera(camera: CameraState, step: Floats) -> CameraState:
     pose = Pose(so3.exp(step[:3]) @ camera.pose.rotation, camera.pose.position + step[3:6])
     lens = camera.intrinsics
-    if step[FOCAL] != 0.0 or step[K1] != 0.0:
+    if np.any(step[FOCAL:]):
         matrix = lens.matrix.copy()
         matrix[:2, :2] *= np.exp(step[FOCAL])
+        matrix[:2, 2] += step[CENTRE : CENTRE + 2]
         distortions = lens.distortions.copy()
         distortions[0] += step[K1]
+        distortions[1] += step[K2]
+        distortions[2 if lens.fisheye else 4] += step[K3]
+        matrix[0, 0] *= np.exp(-0.5 * step[ASPECT])
+        matrix[1, 1] *= np.exp(0.5 * step[ASPECT])
+        if not lens.fisheye:
+            distortions[2:4] += step[P1:]
         lens = Intrinsics(lens.width, lens.height, matrix, distortions, lens.fisheye)
     return replace(
         camera,

@@ -18,7 +18,7 @@ from protocols.geometry.types import Floats
 class Covariance:
     """Joint covariance of all camera parameters, and what is needed for the path's.
 
-    cameras: (10 n, 10 n), zero where a parameter was held. carried: (3 m, p) A⁻¹ B over the free columns.
+    cameras: (17 n, 17 n), zero where a parameter was held. carried: (3 m, p) A⁻¹ B over the free columns.
     free: (p, p) covariance of the free columns. blocks: (k, 24, 24) blocks of A⁻¹ about the diagonal.
     """
 
@@ -31,7 +31,7 @@ class Covariance:
 def covariance(problem: Problem, state: State, prior: MotionPrior, references: Floats | None = None) -> Covariance:
     """Covariance at the solution.
 
-    references: (10 n, 10 n) information of surveyed positions, attitudes and distances. Gauge directions
+    references: (17 n, 17 n) information of surveyed positions, attitudes and distances. Gauge directions
     that they leave open are held by convention: the first camera's pose and the first baseline.
     """
     system, _ = build_system(problem, state, prior, robust=False)
@@ -78,7 +78,7 @@ def turn_stds(covariance: Covariance, state: State) -> Floats:
 
 
 def gauge_generators(state: State) -> Floats:
-    """(10 n, 7): how all cameras move under a small translation, rotation and scaling of the world."""
+    """(17 n, 7): how all cameras move under a small translation, rotation and scaling of the world."""
     rows = []
     for camera in state.cameras:
         block = np.zeros((CAMERA_PARAMETERS, 7))
@@ -91,7 +91,7 @@ def gauge_generators(state: State) -> Floats:
 
 
 def held_rows(state: State, references: Floats) -> Floats:
-    """Constraint rows (q, 10 n) on the gauge directions that the references leave open."""
+    """Constraint rows (q, 17 n) on the gauge directions that the references leave open."""
     generators = gauge_generators(state)
     default = np.zeros((7, len(generators)))
     default[np.arange(6), np.arange(6)] = 1.0

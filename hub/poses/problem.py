@@ -12,9 +12,12 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats, Ints
 
-CAMERA_PARAMETERS = 10
-"""Columns of one camera: rotation 0..2, position 3..5, offset 6, rate 7, log focal length 8, k1 9."""
-OFFSET, RATE, FOCAL, K1 = 6, 7, 8, 9
+CAMERA_PARAMETERS = 17
+"""Columns of one camera: rotation 0..2, position 3..5, offset 6, rate 7, log focal length 8, k1 9; of a lens that was
+not measured also the principal point 10, 11, k2 12, k3 13, log fy/fx 14 and, of a pinhole lens, p1, p2 15, 16."""
+OFFSET, RATE, FOCAL, K1, CENTRE, K2, K3, ASPECT, P1 = 6, 7, 8, 9, 10, 12, 13, 14, 15
+GIVEN_PARAMETERS = 10
+"""Columns of a camera whose lens is given; the others are never free."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,13 +88,22 @@ class State:
 class LensPrior:
     """What is known beforehand of a lens that nobody measured: it is always estimated.
 
-    focal: [px], focal_std: of its logarithm. k1, k1_std: of the first distortion coefficient.
+    focal: [px], focal_std: of its logarithm. centre: (u, v) of the principal point, centre_std: [px]. k1, k2: the
+    first distortion coefficients, k1_std, k2_std: theirs; k3_std, tangential_std, aspect_std: of what is 0 beforehand
+    (k3 less its own, p1 and p2, log fy/fx less its own).
     """
 
     focal: float
     focal_std: float
+    centre: tuple[float, float]
+    centre_std: float
     k1: float
     k1_std: float
+    k2: float
+    k2_std: float
+    k3_std: float = 0.01
+    tangential_std: float = 2e-3
+    aspect_std: float = 2e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,4 +153,6 @@ class Problem:
                 columns += [base + OFFSET, base + RATE]
             if self.freedom.lens or self.lens_prior(camera) is not None:
                 columns += [base + FOCAL, base + K1]
+            if self.lens_prior(camera) is not None:
+                columns += range(base + CENTRE, base + (P1 if self.nominal[camera].fisheye else CAMERA_PARAMETERS))
         return np.array(columns, dtype=np.int64)

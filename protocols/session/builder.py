@@ -18,6 +18,9 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks
 from protocols.session.rig import Rig, RigCamera
 
+SETTLED_ROWS = 90
+"""Detections from which on a restarted camera's new clock is worth solving."""
+
 
 @dataclass(slots=True, eq=False)
 class _Boot:
@@ -42,6 +45,7 @@ class SessionBuilder:
         self._cameras: dict[str, pb.CameraInfo] = {}
         self._rig: pb.RigInfo | None = None
         self._boots: dict[str, dict[str, _Boot]] = {}
+        self._settled: dict[str, int] = {}
         self.counters: Counter[str] = Counter()
 
     def handle(self, message: Message) -> None:
@@ -67,9 +71,20 @@ class SessionBuilder:
         return sorted({*self._cameras, *self._boots})
 
     def boot(self, camera: str) -> str:
-        """The boot whose clock the session speaks of."""
+        """The boot whose clock the session speaks of.
+
+        While a window moves on, the newest that has seen enough: an older one would else stay for as long as it saw.
+        """
         boots = self._boots.get(camera, {})
+        if self._window_ns is not None:
+            for boot in reversed(boots):
+                if len(boots[boot].rows) >= self._settled.get(boot, SETTLED_ROWS):
+                    return boot
         return max(sorted(boots), key=lambda boot: len(boots[boot].rows), default="")
+
+    def settle_after(self, boot: str, rows: int) -> None:
+        """A boot is used only from so many detections on, because until then the one before it serves better."""
+        self._settled[boot] = rows
 
     @property
     def warnings(self) -> tuple[str, ...]:

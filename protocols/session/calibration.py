@@ -18,7 +18,7 @@ from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.rig import Rig, read_rig, read_toml
 
-_ANSWERED = ("distances", "refused", "scale", "solver", "version", "reference")
+_ANSWERED = ("distances", "wand", "refused", "scale", "solver", "version", "reference")
 """Metadata of rig.toml that the answer replaces."""
 
 
@@ -28,6 +28,7 @@ class CameraCalibration:
 
     time_map: reference clock from camera clock. time_offset_std: std [s] of that map in the middle of the
     camera's observed span. position_std: (3,) [rig units]. rms_px: root mean square reprojection error.
+    focal_std: relative std of a focal length that the path told; 0 = the lens was given.
     """
 
     name: str
@@ -37,6 +38,7 @@ class CameraCalibration:
     time_offset_std: float
     position_std: Floats
     rms_px: float
+    focal_std: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +117,7 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
         table = dict(rig.cameras[name].table) if name in rig.cameras else {}
         # A surveyed position stays an input: the answer is the translation, and two that differ by the
         # survey's error would contradict each other.
-        for key in ("position", "position_std", "rotation_std"):
+        for key in ("position", "position_std", "rotation_std", "focal_std"):
             table.pop(key, None)
         table |= {
             "name": name,
@@ -132,6 +134,8 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
         }
         if lens.fisheye:
             table["fisheye"] = True
+        if camera.focal_std > 0.0:
+            table["focal_std"] = camera.focal_std
         tables[name] = table
     if calibration.refused:
         metadata["refused"] = dict(calibration.refused)

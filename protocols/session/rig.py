@@ -17,6 +17,8 @@ from protocols.geometry.types import Floats
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 CLOCKS = ("independent", "shared")
+MEASURED = 0.02
+"""A focal length of no larger relative std counts as measured."""
 _LARGEST = 1e12  # no length, angle or pixel of a rig comes near
 _AGREE = 1e-3  # relative: position and translation may differ by rounding, not by more
 
@@ -28,6 +30,7 @@ class RigCamera:
     size: (width, height) [px]. fps: nominal, 0 = not told. intrinsics: None = uncalibrated.
     position: centre in the world [rig units]. rotation: (3, 3) camera from world.
     position_std: (3,) [rig units]. rotation_std: (3,) [rad]. body_from_camera: (3, 3).
+    focal_std: relative std of the focal length where the lens is a guess (a data sheet's); 0 = it was measured.
     table: the camera's table as it stands in the file, with keys this version does not know.
     """
 
@@ -40,6 +43,7 @@ class RigCamera:
     position_std: Floats | None = None
     rotation_std: Floats | None = None
     body_from_camera: Floats | None = None
+    focal_std: float = 0.0
     table: dict[str, Any] = field(default_factory=dict)
 
 
@@ -47,8 +51,8 @@ class RigCamera:
 class Rig:
     """All cameras in the file's order, and the metadata that fixes gauge and scale.
 
-    units: of every length. clock: "independent" or "shared". distances: (camera, camera, length).
-    up: a world vector (3,), or the name of a levelled camera, or None.
+    units: of every length. clock: "independent" or "shared". distances: (camera, camera, length). wands: (label, label,
+    length), two points that keep their distance. up: a world vector (3,), or the name of a levelled camera, or None.
     """
 
     cameras: dict[str, RigCamera]
@@ -58,6 +62,7 @@ class Rig:
     up: Floats | str | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
     file: Path | None = None
+    wands: tuple[tuple[str, str, float], ...] = ()
 
     @property
     def shared_clock(self) -> bool:
@@ -172,7 +177,22 @@ def read_rig(file: Path) -> Rig:
     reference = metadata.get("reference")
     if reference is not None and (not isinstance(reference, str) or reference not in cameras):
         raise meta.fail("reference", f"reference = {reference!r} is no camera", "use a camera of this file")
-    return Rig(cameras, units, clock, _read_distances(meta, cameras), _read_up(meta, cameras), dict(metadata), file)
+    distances, up = _read_distances(meta, cameras), _read_up(meta, cameras)
+    return Rig(cameras, units, clock, distances, up, dict(metadata), file, _read_wands(meta))
+
+
+def _read_wands(meta: _Table) -> tuple[tuple[str, str, float], ...]:
+    remedy = 'give wand = [["tip", "grip", 0.5]]: two labels and the length between them'
+    rows = meta.values.get("wand", [])
+    wands = []
+    for row in rows if isinstance(rows, list) else [rows]:
+        shape = isinstance(row, list) and len(row) == 3 and all(isinstance(name, str) for name in row[:2])
+        if not (shape and isinstance(row[2], int | float) and not isinstance(row[2], bool)):
+            raise meta.fail("wand", f"wand {row!r} is not [label, label, length]", remedy)
+        if not 0 < row[2] <= _LARGEST or row[0] == row[1]:
+            raise meta.fail("wand", f"wand {row!r} is not a length between two labels", remedy)
+        wands.append((row[0], row[1], float(row[2])))
+    return tuple(wands)
 
 
 def _read_distances(meta: _Table, cameras: dict[str, RigCamera]) -> tuple[tuple[str, str, float], ...]:
@@ -232,8 +252,18 @@ def _read_camera(table: _Table) -> RigCamera:
         position_std=table.std("position_std", "a length, or three"),
         rotation_std=table.std("rotation_std", "radians, or three"),
         body_from_camera=_read_body(table),
+        focal_std=_read_focal_std(table),
         table=dict(table.values),
     )
+
+
+def _read_focal_std(table: _Table) -> float:
+    """The guess's std; a lens that is known to a percent counts as measured."""
+    value = table.values.get("focal_std", 0.0)
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value <= 2.0:
+        remedy = "give the focal length's relative std, as 0.1 for 10 %"
+        raise table.fail("focal_std", f"focal_std = {value!r}", remedy)
+    return float(value) if value > MEASURED else 0.0
 
 
 def _read_body(table: _Table) -> Floats | None:
@@ -289,3 +319,8 @@ def _read_pose(table: _Table) -> tuple[Floats | None, Floats | None]:
             "remove one of the two, or correct it",
         )
     return position, rotation
+
+
+def camera_of_table(values: dict[str, Any], where: str, file: Path, text: str) -> RigCamera:
+    """One camera's table of a file that calls it ``where``, checked as rig.toml's are. Raises InputError."""
+    return _read_camera(_Table(values, where, file, text))

@@ -43,8 +43,15 @@ BENCHES = {
         ("--sessions", "4", "--seconds", "120", "--only", "five,twenty"),
         data=True,
     ),
+    "video_folder": Bench(
+        "a folder of videos, with and without measured lenses",
+        ("--seconds", "15", "--cameras", "4", "--size", "640x360"),
+    ),
+    "waving": Bench("how long and how fast a marker is waved", ("--seeds", "1")),
+    "lenses": Bench("focal lengths that nobody measured", ("--sessions", "3")),
     "poses": Bench("distributed poses against the joint optimum", ("--quick", "--rows", "section4,bearings")),
     "logs": Bench("logs: rates, kill -9, damage", ("--quick",)),
+    "view": Bench("help, first calibration, first paint, what watching costs", ("--quick",)),
     "uav_tracker": Bench(
         "one car from a drone, simulated",
         ("--seeds", "1", "--models", "ground", "--scenarios", "exit-bend,exit-straight"),

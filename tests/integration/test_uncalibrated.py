@@ -106,8 +106,11 @@ def check_pairs(full: Session, session: Session, result: dict[str, Any], within:
         assert 0.2 < pair["rms_px"] < 1.0
 
 
-def test_a_camera_without_a_lens_is_timed_while_the_others_are_placed(tmp_path: Path) -> None:
-    full = simulate(0, 3, 20)
+def test_a_camera_whose_lens_the_path_does_not_tell_is_timed_while_the_others_are_placed(tmp_path: Path) -> None:
+    # The third camera sees too little, in the middle of its picture, to tell its own focal length.
+    free = simulate(0, 3, 5).paths["marker"]
+    small = replace(free, amplitude=0.35 * free.amplitude)
+    full = simulate(0, 3, 20, path=small, windows=[(0.0, 20.0), (0.0, 20.0), (4.0, 11.0)])
     session = without_lenses(full, "cam2")
     status, result = solve(session, tmp_path)
     assert status == 0
@@ -116,7 +119,9 @@ def test_a_camera_without_a_lens_is_timed_while_the_others_are_placed(tmp_path: 
     assert "no intrinsics" in told
     assert "syncline intrinsics" in told
     assert f"{-result['pairs'][1]['lag_s']:.4f} s against cam0" in told
-    check_pairs(full, session, result)
+    for pair in result["pairs"]:  # seven seconds of a small path: less sure than elsewhere
+        assert pair["lag_s"] == pytest.approx(true_lag(session, *pair["cameras"]), abs=4e-3)
+        assert epipolar_px(full, session, pair) < 1.5
     assert "cam2" not in tomllib.loads((tmp_path / "out" / "calibration.toml").read_text())
 
 

@@ -197,8 +197,6 @@ def test_a_taught_marker_is_found_where_the_default_one_is_not(tmp_path: Path, c
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["detect", "person", "VIDEO"], "not in this version"),
-        (["detect", "vehicle", "VIDEO"], "not in this version"),
         (["detect", "marker", "VIDEO", "--teach"], "--target"),
         (["detect", "marker", "VIDEO", "--colour", "1,2"], "--colour"),
         (["detect", "marker", "nowhere.mp4"], "nowhere.mp4"),
@@ -283,14 +281,15 @@ def test_videos_without_a_common_time_are_refused_and_nothing_is_written(tmp_pat
     assert not out.exists()
 
 
-def test_the_road_from_videos_to_synchronised_videos_and_3d(filmed: Filmed, tmp_path: Path) -> None:
+def test_the_road_from_videos_to_synchronised_videos_3d_and_every_export(filmed: Filmed, tmp_path: Path) -> None:
     """The marker stands at one place of the world at one time: shown so by both retimed videos."""
     known = str(filmed.out / "calibration.toml")
     out = tmp_path / "sync"
-    assert run(["sync", str(filmed.folder), "--calibration", known, "--out", str(out), "--videos", "none"]) == 0
+    assert run(["sync", str(filmed.folder), "--calibration", known, "--out", str(out), "--fps", "12.5"]) == 0
     table = rows(out / "synchronised.csv")
     apart = [filmed.times["cam0"][int(row["cam0"])] - filmed.times["cam1"][int(row["cam1"])] for row in table]
     assert np.median(np.abs(apart)) < 0.5 / 25
+    assert [Film(out / f"cam{i}.mp4").info.frames for i in (0, 1)] == [len(table)] * 2
     track = tmp_path / "track.csv"
     assert run(["triangulate", str(filmed.out / "session"), "--calibration", known, "--out", str(track)]) == 0
     again, before = (
@@ -300,3 +299,14 @@ def test_the_road_from_videos_to_synchronised_videos_and_3d(filmed: Filmed, tmp_
     shared, here, there = np.intersect1d(again[:, 0].round(6), before[:, 0].round(6), return_indices=True)
     assert len(shared) > 0.9 * len(before)
     assert np.median(np.abs(again[here, 1:4] - before[there, 1:4])) < 1e-3
+    names = {"aniposelib": "a.toml", "caliscope": "c.toml", "pose2sim": "p.toml", "freemocap": "f.toml"}
+    names |= {"kalibr": "k.yaml", "opencv": "yml", "colmap": "model"}
+    for to, name in names.items():
+        assert run(["export", known, "--to", to, "--out", str(tmp_path / name)]) == 0
+        assert run(["import", str(tmp_path / name), "--out", str(tmp_path / f"{to}.toml")]) == 0
+        back = toml(tmp_path / f"{to}.toml")
+        for camera in ("cam0", "cam1"):
+            matrix = toml(Path(known))[camera]["matrix"]
+            np.testing.assert_allclose(back[camera]["matrix"], matrix, rtol=1e-12, atol=1e-9)
+    assert run(["export", str(track), "--to", "trc", "--out", str(tmp_path / "track.trc")]) == 0
+    assert len((tmp_path / "track.trc").read_text().splitlines()) > len(again)

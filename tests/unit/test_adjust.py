@@ -20,13 +20,19 @@ from hub.poses.adjust import (
 from hub.poses.covariance import _inverse_blocks
 from hub.poses.linear import BAND, BorderedSystem, eliminate, solve
 from hub.poses.problem import (
+    ASPECT,
     CAMERA_PARAMETERS,
+    CENTRE,
     FOCAL,
     K1,
+    K2,
+    K3,
     OFFSET,
+    P1,
     RATE,
     CameraState,
     Freedom,
+    LensPrior,
     Problem,
     Rows,
     State,
@@ -66,7 +72,8 @@ def world(seed: int = 0, labels: int = 2, lens: bool = True, shake: float = 0.0)
 
 def nudged(camera: CameraState, column: int, by: float) -> CameraState:
     """One camera parameter moved, through the function that the solver itself uses."""
-    problem = Problem((), (camera.intrinsics,) * 2, 1, (0, 1), Freedom(lens=True))
+    guess = LensPrior(500.0, 0.1, (0.0, 0.0), 9.0, 0.0, 0.1, 0.0, 0.1)
+    problem = Problem((), (camera.intrinsics,) * 2, 1, (0, 1), Freedom(lens=True), (guess, guess))
     both = State((camera, camera), (), np.ones(2))
     columns = problem.free_columns().tolist()
     step = np.zeros(len(columns))
@@ -83,11 +90,15 @@ def test_every_camera_derivative_is_a_difference(lens: str, column: int) -> None
     path = state.trajectories[rows.label]
     line = linearise(rows, camera, path)
     assert line.valid.all()
+    if lens == "fisheye" and column >= P1:
+        assert not line.by_camera[:, :, column].any()  # never free
+        return
     step = 1e-6
     ahead, behind = (linearise(rows, nudged(camera, column, sign * step), path).residual for sign in (1, -1))
     expected = (ahead - behind) / (2 * step)
-    assert np.abs(expected).max() > 1e-3
-    np.testing.assert_allclose(line.by_camera[:, :, column], expected, rtol=2e-5, atol=2e-3)
+    largest = float(np.abs(expected).max())
+    assert largest > 1e-4
+    np.testing.assert_allclose(line.by_camera[:, :, column], expected, rtol=2e-5, atol=min(2e-3, 0.01 * largest))
 
 
 @pytest.mark.parametrize("which", [0, 2])
@@ -191,8 +202,40 @@ def test_the_priors_add_their_information() -> None:
     gained = np.diag(with_priors.corner - without.corner)
     freedom = problem.freedom
     for value, column in zip(gained, problem.free_columns(), strict=True):
-        std = {RATE: freedom.rate_std, FOCAL: freedom.focal_std, K1: freedom.k1_std}.get(column % 10)
+        std = {RATE: freedom.rate_std, FOCAL: freedom.focal_std, K1: freedom.k1_std}.get(column % CAMERA_PARAMETERS)
         assert value == pytest.approx(0.0 if std is None else std**-2, rel=1e-3, abs=1e-3)
+
+
+def test_a_guessed_lens_is_free_under_its_own_prior_and_the_others_are_not() -> None:
+    problem, state, prior = world(5, lens=False)
+    lens = state.cameras[1].intrinsics
+    guess = LensPrior(1.1 * lens.focal, 0.2, (300.0, 250.0), 5.0, 0.05, 0.1, -0.02, 0.04)
+    one = replace(problem, guessed=(None, guess, None))
+    added = set(one.free_columns().tolist()) - set(problem.free_columns().tolist())
+    assert added == {CAMERA_PARAMETERS + column for column in (FOCAL, *range(K1, CAMERA_PARAMETERS))}
+    loose = replace(
+        one, guessed=(None, LensPrior(lens.focal, 1e9, (0.0, 0.0), 1e9, 0.0, 1e9, 0.0, 1e9, 1e9, 1e9, 1e9), None)
+    )
+    (with_prior, cost), (without, bare) = (build_system(p, state, prior, robust=False) for p in (one, loose))
+    gained = dict(zip(one.free_columns().tolist(), np.diag(with_prior.corner - without.corner), strict=True))
+    stds = {FOCAL: 0.2, CENTRE: 5.0, CENTRE + 1: 5.0, K1: 0.1, K2: 0.04, K3: 0.01, ASPECT: 2e-3, P1: 2e-3, P1 + 1: 2e-3}
+    for column, value in gained.items():
+        std = stds.get(column - CAMERA_PARAMETERS)
+        assert value == pytest.approx(0.0 if std is None else std**-2, rel=1e-3, abs=1e-3)
+    off = (lens.matrix[0, 2] - 300.0, lens.matrix[1, 2] - 250.0)
+    expected = (np.log(1.1) / 0.2) ** 2 + (off[0] ** 2 + off[1] ** 2) / 25.0
+    expected += ((lens.distortions[0] - 0.05) / 0.1) ** 2 + ((lens.distortions[1] + 0.02) / 0.04) ** 2
+    assert cost - bare == pytest.approx(expected, rel=1e-6)
+
+
+def test_where_all_lenses_are_given_nothing_depends_on_there_being_guesses() -> None:
+    problem, state, _ = world(6, lens=False, shake=1e-3)
+    (_, plain, _), (_, told, _) = (adjust(p, state) for p in (problem, replace(problem, guessed=(None, None, None))))
+    for one, other in zip(plain.cameras, told.cameras, strict=True):
+        np.testing.assert_array_equal(one.pose.rotation, other.pose.rotation)
+        np.testing.assert_array_equal(one.pose.position, other.pose.position)
+        assert (one.offset, one.rate) == (other.offset, other.rate)
+        np.testing.assert_array_equal(one.intrinsics.matrix, other.intrinsics.matrix)
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-3])

@@ -1,0 +1,265 @@
+"""Other tools' files into a session: what a file is, told by its content, and what comes of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from protocols.errors import InputError
+from protocols.formats import colmap, points, toml_rigs, yaml_rigs
+from protocols.formats.cameras import ForeignRig, rig_tables
+from protocols.geometry.types import Floats, Ints
+from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
+from protocols.session.observations import Observations
+from protocols.session.rig import Rig, camera_of_table, read_toml
+
+CALIBRATIONS = ("aniposelib", "caliscope", "pose2sim", "freemocap", "opencv", "kalibr", "colmap")
+POINTS = ("caliscope-points", "deeplabcut", "mvus")
+FORMATS = (*CALIBRATIONS, *POINTS, "session")
+_YAML = (".yml", ".yaml")
+_REMEDY = f"say what it is with --format: {', '.join(FORMATS)}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Source:
+    """What was given: its format and its files (of a session or a COLMAP model the folder)."""
+
+    kind: str
+    files: list[Path]
+
+
+def recognise(sources: list[Path], wanted: str | None) -> Source:
+    """The format of files or of one folder, by content, or as ``wanted`` says. Raises InputError."""
+    for path in sources:
+        if not path.exists():
+            raise InputError("this file does not exist", file=path, remedy="check the path")
+    files = sources
+    if len(sources) == 1 and sources[0].is_dir():
+        folder = sources[0]
+        if wanted == "session" or (wanted is None and (folder / RIG_FILE).exists()):
+            return Source("session", [folder])
+        if wanted == "colmap" or (wanted is None and (folder / colmap.IMAGES).exists()):
+            return Source("colmap", [folder])
+        kinds = (".csv", ".txt", *_YAML, ".toml")
+        files = sorted(path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in kinds)
+        if not files:
+            raise InputError("nothing in this folder can be imported", file=folder, remedy=_REMEDY)
+    if any(path.is_dir() for path in files):
+        raise InputError("a folder among files", file=next(p for p in files if p.is_dir()), remedy="give one folder")
+    if wanted in ("session", "colmap"):
+        raise InputError(f"a {wanted} is a folder", file=files[0], remedy="give the folder")
+    if wanted is not None:
+        return Source(wanted, files)
+    found = {path: _kind_of(path) for path in files}
+    unknown = next((path for path, kind in found.items() if kind is None), None)
+    if unknown is not None:
+        raise InputError("nothing that is known here", file=unknown, line=1, remedy=_REMEDY)
+    kinds_found = sorted({str(kind) for kind in found.values()})
+    if len(kinds_found) > 1:
+        raise InputError(f"files of different kinds ({', '.join(kinds_found)})", remedy="import each kind by itself")
+    return Source(kinds_found[0], files)
+
+
+def read_calibration_of(source: Source) -> ForeignRig:
+    """A calibration of another project. Raises InputError."""
+    if source.kind == "opencv":
+        return yaml_rigs.read_opencv(source.files)
+    if len(source.files) > 1:
+        raise InputError(f"{len(source.files)} files of one calibration", file=source.files[1], remedy="give one")
+    file = source.files[0]
+    if source.kind == "colmap":
+        return colmap.read(file)
+    if source.kind == "kalibr":
+        return yaml_rigs.read_kalibr(file)
+    return toml_rigs.read(file, source.kind)
+
+
+def calibration_text(rig: ForeignRig, units: str | None, file: Path) -> str:
+    """rig.toml's text, whose every table holds to rig.toml's own rules. Raises InputError."""
+    tables = rig_tables(rig, units or rig.units or "m")
+    for name, table in tables.items():
+        if name != "metadata":
+            camera_of_table(table, name, file, "")
+    return tomli_w.dumps(tables)
+
+
+def frame_clock(fps: float | None, videos: Path | None) -> points.Times:
+    """Seconds of frames: of the videos' own time stamps where they are given, else at a constant rate."""
+    stamps: dict[str, Floats] = {}
+
+    def times(camera: str, frames: Ints, file: Path) -> Floats:
+        if videos is not None:
+            if camera not in stamps:
+                stamps[camera] = _stamps_of(camera, videos)
+            known = stamps[camera]
+            beyond = frames[(frames < 0) | (frames >= len(known))]
+            if len(beyond):
+                what = f"frame {beyond[0]}, and the video of {camera} has {len(known)}"
+                raise InputError(what, file=file, remedy="give the very videos that were tracked")
+            return known[frames]
+        if fps is None:
+            what = "its frames tell no times"
+            raise InputError(what, file=file, remedy="give --videos FOLDER (best) or --fps RATE")
+        return np.asarray(frames / fps, dtype=np.float64)
+
+    return times
+
+
+def read_points(source: Source, times: points.Times, likelihood: float, camera: str | None) -> Observations:
+    """Observations of another tracker. Raises InputError."""
+    if camera is not None and (len(source.files) > 1 or source.kind == "caliscope-points"):
+        raise InputError("--camera names the camera of one file", remedy="leave it out: files are named after cameras")
+    return points.read(source.kind, source.files, times, likelihood, camera)
+
+
+def session_to_log(rig: Rig, observations: Observations, out: Path) -> int:
+    """A session as a log; returns the number of messages. The log is whole or not there. Raises InputError."""
+    from protocols.catalogue import CAMERA_INFO, OBSERVATION, RIG_INFO
+    from protocols.log.writer import LogWriter
+
+    if out.exists():
+        raise InputError("this file exists already", file=out, remedy="choose another --out: logs are not replaced")
+    part = out.with_name(f".{out.stem}.part.mcap")
+    part.unlink(missing_ok=True)
+    count = 0
+    try:
+        with LogWriter(part, views=True) as writer:
+            for name in rig.cameras:
+                writer.write(CAMERA_INFO, name, "import", _camera_info(rig, name), 0)
+            writer.write(RIG_INFO, "import", "import", _rig_info(rig), 0)
+            count = len(rig.cameras) + 1
+            for at, name, message in _observation_messages(rig, observations):
+                writer.write(OBSERVATION, name, "import", message, at)
+                count += 1
+        part.replace(out)
+    finally:
+        part.unlink(missing_ok=True)
+    return count
+
+
+def log_to_session(rig: Rig) -> dict[str, Any]:
+    """The tables of rig.toml of a log's rig."""
+    metadata: dict[str, Any] = {**rig.metadata, "units": rig.units, "clock": rig.clock}
+    if rig.distances:
+        metadata["distances"] = [list(row) for row in rig.distances]
+    if rig.up is not None:
+        metadata["up"] = rig.up if isinstance(rig.up, str) else rig.up.tolist()
+    tables: dict[str, Any] = {"metadata": metadata}
+    for name, camera in rig.cameras.items():
+        from protocols.geometry import so3
+
+        table: dict[str, Any] = {"name": name, "size": list(camera.size)}
+        if camera.fps:
+            table["fps"] = camera.fps
+        lens = camera.intrinsics
+        if lens is not None:
+            table |= {"matrix": lens.matrix.tolist(), "distortions": lens.distortions.tolist()}
+            table |= {"fisheye": True} if lens.fisheye else {}
+        if camera.rotation is not None:
+            table["rotation"] = so3.log(camera.rotation).tolist()
+        for key in ("position", "position_std", "rotation_std"):
+            value = getattr(camera, key)
+            if value is not None:
+                table[key] = value.tolist()
+        tables[name] = table
+    return tables
+
+
+def _kind_of(file: Path) -> str | None:
+    suffix = file.suffix.lower()
+    if suffix == ".toml":
+        return toml_rigs.kind_of(read_toml(file, "calibration")[0])
+    if suffix in _YAML:
+        return yaml_rigs.kind_of(yaml_rigs.load(file)[0])
+    try:
+        with file.open(encoding="utf-8-sig") as text:
+            begin = text.read(1 << 16)
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read: {error}", file=file, remedy="give a text file") from None
+    return points.kind_of(begin)
+
+
+def _stamps_of(camera: str, videos: Path) -> Floats:
+    """Times (n,) [s] of the frames of a camera's video, in the order in which they are shown."""
+    from edge.devices.film import VIDEO_SUFFIXES, Film
+
+    found = sorted(path for path in videos.glob(f"{camera}.*") if path.suffix.lower() in VIDEO_SUFFIXES)
+    if not found:
+        raise InputError(f"no video of camera {camera!r}", file=videos, remedy=f"name it {camera}.mp4, or give --fps")
+    return np.array([shot.time for shot in Film(found[0])])
+
+
+def _camera_info(rig: Rig, name: str) -> Any:
+    from protocols.geometry import so3
+    from protocols.messages import syncline_pb2 as pb
+
+    camera = rig.cameras[name]
+    info = pb.CameraInfo(schema_version=1, camera=name, boot_id="import", driver="import", clock="device")
+    info.width, info.height, info.fps = camera.size[0], camera.size[1], camera.fps
+    if camera.intrinsics is not None:
+        info.matrix.extend(camera.intrinsics.matrix.ravel().tolist())
+        info.distortions.extend(camera.intrinsics.distortions.tolist())
+        info.fisheye = camera.intrinsics.fisheye
+    for key in ("position", "position_std", "rotation_std"):
+        value = getattr(camera, key)
+        if value is not None:
+            getattr(info, key).extend(value.tolist())
+    if camera.rotation is not None:
+        info.rotation.extend(so3.log(camera.rotation).tolist())
+    return info
+
+
+def _rig_info(rig: Rig) -> Any:
+    from protocols.messages import syncline_pb2 as pb
+
+    info = pb.RigInfo(schema_version=1, units=rig.units, clock=rig.clock)
+    info.reference_camera = str(rig.metadata.get("reference", ""))
+    for a, b, length in rig.distances:
+        info.distances.add(camera_a=a, camera_b=b, distance=length)
+    if isinstance(rig.up, str):
+        info.up_camera = rig.up
+    elif rig.up is not None:
+        info.up.extend(rig.up.tolist())
+    return info
+
+
+def _observation_messages(rig: Rig, observations: Observations) -> list[tuple[int, str, Any]]:
+    """One message a frame of a camera, by the time since that camera's first frame."""
+    from protocols.messages import syncline_pb2 as pb
+
+    out: list[tuple[int, str, Any]] = []
+    for name in rig.cameras:
+        frames: dict[tuple[int, int], list[tuple[str, float, float, float]]] = {}
+        for track in observations.of_camera(name):
+            for frame, time, (u, v), size in zip(track.frame, track.time, track.pixels, track.size, strict=True):
+                seen = frames.setdefault((round(float(time) * 1e9), int(frame)), [])
+                seen.append((track.label, float(u), float(v), float(size) if np.isfinite(size) else 0.0))
+        first = min((key[0] for key in frames), default=0)
+        for sequence, ((time_ns, frame), seen) in enumerate(sorted(frames.items())):
+            message = pb.Observation(
+                schema_version=1, camera=name, boot_id="import", sequence=sequence, frame=frame, device_time_ns=time_ns
+            )
+            for label, u, v, size in seen:
+                message.detections.add(u=u, v=v, size=size, score=1.0, label=label)
+            out.append((time_ns - first, name, message))
+    return sorted(out, key=lambda item: item[:2])
+
+
+__all__ = [
+    "CALIBRATIONS",
+    "FORMATS",
+    "OBSERVATIONS_FILE",
+    "POINTS",
+    "Source",
+    "calibration_text",
+    "frame_clock",
+    "log_to_session",
+    "read_calibration_of",
+    "read_points",
+    "recognise",
+    "session_to_log",
+]

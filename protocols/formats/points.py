@@ -1,0 +1,232 @@
+"""Observations of other trackers: caliscope's point tables, DeepLabCut's CSV, mvus' text.
+
+DeepLabCut and mvus count frames and tell no times, caliscope may: ``times`` turns a camera's frames into its seconds.
+All count pixels from the centre of the top-left one, as OpenCV does.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from protocols.errors import InputError
+from protocols.formats.cameras import check_name
+from protocols.geometry.types import Floats, Ints
+from protocols.session.observations import Observations, gather_tracks
+
+Times = Callable[[str, Ints, Path], Floats]
+"""Camera, its frames (n,), the file → seconds (n,). May raise InputError."""
+_FARTHEST = 1e6  # px
+_CALISCOPE = ("sync_index", "point_id", "img_loc_x", "img_loc_y")
+
+
+@dataclass(slots=True)
+class _Rows:
+    """Rows of one file as they come."""
+
+    camera: list[str] = field(default_factory=list)
+    label: list[str] = field(default_factory=list)
+    frame: list[int] = field(default_factory=list)
+    time: list[float] = field(default_factory=list)
+    pixels: list[tuple[float, float]] = field(default_factory=list)
+    line: list[int] = field(default_factory=list)
+
+
+def kind_of(text: str) -> str | None:
+    """Which table of points a text begins like; None = none of them."""
+    lines = [line for line in text.splitlines()[:6] if line.strip()]
+    if not lines:
+        return None
+    header = [cell.strip() for cell in lines[0].split(",")]
+    if all(name in header for name in _CALISCOPE):
+        return "caliscope-points"
+    if header[0] == "scorer" and any(line.startswith("bodyparts,") for line in lines):
+        return "deeplabcut"
+    try:
+        first = [float(word) for word in lines[0].replace(",", " ").split()]
+    except ValueError:
+        return None
+    return "mvus" if len(first) >= 3 and first[2] == round(first[2]) and first[2] >= 0 else None
+
+
+def read(kind: str, files: list[Path], times: Times, likelihood: float, camera: str | None) -> Observations:
+    """The observations of some files of one kind.
+
+    likelihood: least one of DeepLabCut's points. camera: its name, for one file of one camera; default the file's.
+    Raises InputError: file, line, what, remedy.
+    """
+    rows = _Rows()
+    for file in files:
+        before = len(rows.camera)
+        if kind == "caliscope-points":
+            _caliscope(file, rows, times)
+        else:
+            name = check_name(camera or camera_of(file), file)
+            if name in rows.camera:
+                raise InputError(f"a second file of camera {name!r}", file=file, remedy="rename it after its camera")
+            _deeplabcut(file, name, rows, likelihood) if kind == "deeplabcut" else _mvus(file, name, rows)
+            mine = np.array(rows.frame[before:], dtype=np.int64)
+            rows.time += times(name, mine, file).tolist()
+        if len(rows.camera) == before:
+            raise InputError("no point in it", file=file, remedy="give a file in which something was seen")
+    return gather_tracks(
+        rows.camera,
+        rows.label,
+        np.array(rows.frame, dtype=np.int64),
+        np.array(rows.time),
+        np.array(rows.pixels),
+        np.full(len(rows.camera), np.nan),
+        file=files[0] if len(files) == 1 else None,
+        lines=rows.line if len(files) == 1 else None,
+    )
+
+
+def camera_of(file: Path) -> str:
+    """The camera that a file is named after: without what trackers append."""
+    return re.split(r"DLC_|_detections?$|_filtered$", file.stem)[0].rstrip("_-. ") or file.stem
+
+
+def _caliscope(file: Path, rows: _Rows, times: Times) -> None:
+    table = _table(file)
+    header = [cell.strip() for cell in table[0][1]] if table else []
+    place = {name: number for number, name in reversed(list(enumerate(header)))}
+    ids = next((name for name in ("cam_id", "port") if name in place), None)
+    missing = [name for name in _CALISCOPE if name not in place] + ([] if ids else ["port"])
+    if missing or ids is None:
+        remedy = "give caliscope's xy_….csv or image_points.csv"
+        raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)
+    timed = "frame_time" in place
+    begin = len(rows.camera)
+    counted = "frame_index" if "frame_index" in place else "sync_index"
+    for line, cells in table[1:]:
+        if len(cells) < len(header):
+            raise InputError(f"{len(cells)} columns of {len(header)}", file=file, line=line, remedy="complete the row")
+        if not cells[place["img_loc_x"]].strip() or not cells[place["img_loc_y"]].strip():
+            continue
+        port = _whole(cells[place[ids]], ids, file, line)
+        u, v = (_pixel(cells[place[name]], name, file, line) for name in ("img_loc_x", "img_loc_y"))
+        rows.camera.append(f"cam_{port}")
+        rows.label.append(str(_whole(cells[place["point_id"]], "point_id", file, line)))
+        rows.frame.append(_whole(cells[place[counted]], counted, file, line))
+        rows.pixels.append((u, v))
+        rows.line.append(line)
+        if timed:
+            rows.time.append(_number(cells[place["frame_time"]], "frame_time", file, line))
+    if not timed:
+        names = np.array(rows.camera[begin:])
+        frames = np.array(rows.frame[begin:], dtype=np.int64)
+        made = np.zeros(len(frames))
+        for name in dict.fromkeys(rows.camera[begin:]):
+            made[names == name] = times(name, frames[names == name], file)
+        rows.time += made.tolist()
+
+
+def _deeplabcut(file: Path, camera: str, rows: _Rows, least: float) -> None:
+    table = _table(file)
+    levels = {cells[0].strip(): cells for _, cells in table[:4]}
+    if not all(name in levels for name in ("bodyparts", "coords")):
+        remedy = "give the CSV that DeepLabCut's analyze_videos writes"
+        raise InputError("the rows scorer, bodyparts, coords are not there", file=file, line=1, remedy=remedy)
+    head = next(number for number, (_, cells) in enumerate(table) if cells[0].strip() == "coords") + 1
+    parts, coords = levels["bodyparts"], [cell.strip() for cell in levels["coords"]]
+    people = levels.get("individuals")
+    width = len(coords)
+    starts = [column for column in range(1, width) if coords[column] == "x"]
+    if not starts or any(coords[column : column + 2] != ["x", "y"] for column in starts):
+        raise InputError("coords are not x, y, likelihood", file=file, line=head, remedy="export it again")
+    if len(parts) != width or (people is not None and len(people) != width):
+        raise InputError("header rows of different lengths", file=file, line=head, remedy="export it again")
+    for line, cells in table[head:]:
+        if len(cells) != width:
+            raise InputError(f"{len(cells)} columns of {width}", file=file, line=line, remedy="complete the row")
+        frame = _frame(cells[0], file, line)
+        for column in starts:
+            if not cells[column].strip() or not cells[column + 1].strip():
+                continue
+            told = column + 2 < width and coords[column + 2] == "likelihood"
+            sure = _number(cells[column + 2], "likelihood", file, line) if told and cells[column + 2].strip() else 1.0
+            if not sure >= least:
+                continue
+            part = parts[column].strip()
+            rows.camera.append(camera)
+            rows.label.append(part if people is None else f"{people[column].strip()}.{part}")
+            rows.frame.append(frame)
+            rows.pixels.append((_pixel(cells[column], "x", file, line), _pixel(cells[column + 1], "y", file, line)))
+            rows.line.append(line)
+
+
+def _mvus(file: Path, camera: str, rows: _Rows) -> None:
+    """mvus reads columns 3, 1, 2: the file holds x, y, frame."""
+    for line, row in enumerate(_text(file).splitlines(), 1):
+        words = row.split("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        if len(words) < 3:
+            raise InputError(f"{len(words)} numbers", file=file, line=line, remedy="give x y frame")
+        u, v = _pixel(words[0], "x", file, line), _pixel(words[1], "y", file, line)
+        if u == 0.0 and v == 0.0:
+            continue  # its trackers write a frame without a detection so
+        rows.camera.append(camera)
+        rows.label.append("marker")
+        rows.frame.append(_whole(words[2], "frame", file, line))
+        rows.pixels.append((u, v))
+        rows.line.append(line)
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read: {error}", file=file, remedy="save it as UTF-8 text") from None
+
+
+def _table(file: Path) -> list[tuple[int, list[str]]]:
+    reader = csv.reader(io.StringIO(_text(file)), strict=True)
+    out: list[tuple[int, list[str]]] = []
+    try:
+        for cells in reader:
+            if any(cell.strip() for cell in cells):
+                out.append((reader.line_num, cells))
+    except csv.Error as error:
+        raise InputError(f"not CSV: {error}", file=file, line=reader.line_num, remedy="correct this row") from None
+    if len(out) < 2:
+        raise InputError("no rows", file=file, line=1, remedy="give a file in which something was seen")
+    return out
+
+
+def _number(cell: str, what: str, file: Path, line: int) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        raise InputError(f"{what} {cell.strip()!r} is not a number", file=file, line=line, remedy="correct the row")
+    return value
+
+
+def _pixel(cell: str, what: str, file: Path, line: int) -> float:
+    value = _number(cell, what, file, line)
+    if abs(value) > _FARTHEST:
+        raise InputError(f"{what} {value:g} is no pixel", file=file, line=line, remedy="correct or remove the row")
+    return value
+
+
+def _whole(cell: str, what: str, file: Path, line: int) -> int:
+    value = _number(cell, what, file, line)
+    if value != round(value) or abs(value) > 2**53:
+        raise InputError(f"{what} {cell.strip()} is not whole", file=file, line=line, remedy="correct the row")
+    return int(value)
+
+
+def _frame(cell: str, file: Path, line: int) -> int:
+    """A frame's index, or the last number in the name of a picture."""
+    numbers = re.findall(r"\d+", Path(cell.strip()).stem)
+    if not re.fullmatch(r"\s*\d+(\.0*)?\s*", cell) and numbers:
+        return int(numbers[-1])
+    return _whole(cell, "the frame", file, line)

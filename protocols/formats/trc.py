@@ -1,0 +1,87 @@
+"""Paths as TRC, the format of OpenSim and of Pose2Sim's results."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from protocols.errors import InputError
+from protocols.geometry.types import Floats, Ints
+from protocols.session.rig import UNITS
+
+
+def trc_text(file: Path, name: str, units: str) -> str:
+    """A trajectory.csv or track.csv as TRC (OpenSim): constant rate, empty where a label is not known, m or mm.
+
+    Time 0 is the first row. Raises InputError: file, line, what, remedy.
+    """
+    paths = _read_paths(file)
+    times, frames = _frames(paths)
+    count = int(frames[-1]) + 1
+    rate = (count - 1) / float(times[-1] - times[0]) if count > 1 else 1.0
+    scale, told = (UNITS[units], "m") if units == "cm" else (1.0, units)
+    cells = np.full((count, 3 * len(paths)), math.nan)
+    for column, path in enumerate(paths.values()):
+        at = frames[np.clip(np.searchsorted(times, path[:, 0] - 1e-6), 0, len(times) - 1)]
+        cells[at, 3 * column : 3 * column + 3] = scale * path[:, 1:4]
+    keys = "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames"
+    axes = "\t".join(f"{axis}{i}" for i in range(1, len(paths) + 1) for axis in "XYZ")
+    lines = [
+        f"PathFileType\t4\t(X/Y/Z)\t{name}",
+        keys,
+        f"{rate:.9g}\t{rate:.9g}\t{count}\t{len(paths)}\t{told}\t{rate:.9g}\t1\t{count}",
+        "Frame#\tTime\t" + "\t\t\t".join(label.replace("\t", " ") for label in paths) + "\t\t",
+        "\t\t" + axes,
+        "",
+    ]
+    for index, row in enumerate(cells):
+        shown = "\t".join("" if math.isnan(value) else f"{value:.9g}" for value in row)
+        lines.append(f"{index + 1}\t{index / rate:.9g}\t{shown}")
+    return "\n".join(lines) + "\n"
+
+
+def _frames(paths: Mapping[str, Floats]) -> tuple[Floats, Ints]:
+    """All instants (n,) [s] of some paths and the frame (n,) of each on one grid of a constant rate.
+
+    The grid's step is what most steps of single paths are; gaps are whole numbers of it.
+    """
+    joined = np.unique(np.concatenate([path[:, 0] for path in paths.values()]))
+    times = joined[np.r_[True, np.diff(joined) > 1e-6]]
+    steps = np.concatenate([np.diff(np.sort(path[:, 0])) for path in paths.values()])
+    steps = steps[steps > 1e-6]
+    if not len(steps):
+        return times, np.arange(len(times), dtype=np.int64)
+    step = float(np.quantile(steps, 0.1, method="lower"))
+    ahead = np.maximum(np.rint(np.diff(times) / step), 1).astype(np.int64)
+    return times, np.r_[np.zeros(1, dtype=np.int64), np.cumsum(ahead)]
+
+
+def _read_paths(file: Path) -> dict[str, Floats]:
+    """time, x, y, z (n, 4) by label."""
+    remedy = "give the trajectory.csv of `calibrate` or the track.csv of `triangulate`"
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError):
+        raise InputError("cannot be read", file=file, remedy=remedy) from None
+    reader = csv.DictReader(io.StringIO(text))
+    missing = [key for key in ("time", "x", "y", "z") if key not in (reader.fieldnames or [])]
+    if missing:
+        raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)
+    rows: dict[str, list[list[float]]] = {}
+    for row in reader:
+        try:
+            values = [float(row[key]) for key in ("time", "x", "y", "z")]
+        except (TypeError, ValueError):
+            what = "time, x, y, z are not four numbers"
+            raise InputError(what, file=file, line=reader.line_num, remedy="correct or remove the row") from None
+        if not np.isfinite(values).all():
+            raise InputError("a value is not finite", file=file, line=reader.line_num, remedy="remove the row")
+        rows.setdefault(row.get("label") or "marker", []).append(values)
+    if not rows:
+        raise InputError("no rows", file=file, line=1, remedy=remedy)
+    return {label: np.array(values) for label, values in rows.items()}
