@@ -64,6 +64,13 @@ NODE_STATE = Topic("node_state", "node/{id}/state", "NodeState", 10.0, True, Del
 COMMAND = Topic("command", "view/{id}/command", "Command", 0.1, False, Delivery.RELIABLE, 64, 0.0)
 PREDICTION = Topic("prediction", "hub/{id}/prediction", "Prediction", 20.0, True, Delivery.LATEST, 16, 0.0)
 PICTURE = Topic("picture", "camera/{id}/picture", "Picture", 4.0, False, Delivery.LATEST, 128, 5.0)
+FLIGHT_IMAGE = Topic("flight_image", "uav/{id}/image", "FlightImage", 30.0, True, Delivery.LATEST, 64, 2.0)
+TELEMETRY = Topic("telemetry", "uav/{id}/telemetry", "VehicleTelemetry", 50.0, True, Delivery.RELIABLE, 8192, 2.0)
+TARGET_COMMAND = Topic("target_command", "uav/{id}/command", "TargetCommand", 0.1, True, Delivery.RELIABLE, 64, 0.0)
+TARGET = Topic("target", "uav/{id}/target", "TargetState", 30.0, True, Delivery.RELIABLE, 4096, 0.0)
+TARGET_CLOUD = Topic("target_cloud", "uav/{id}/cloud", "TargetCloud", 5.0, True, Delivery.LATEST, 16, 0.0)
+UAV_INFO = Topic("uav_info", "uav/{id}/info", "UavInfo", 0.5, True, Delivery.LATEST, 16, 10.0)
+ROAD_MAP = Topic("road_map", "uav/{id}/road", "RoadMap", 2.0, True, Delivery.LATEST, 16, 0.0)
 
 TOPICS: tuple[Topic, ...] = (
     OBSERVATION,
@@ -76,6 +83,13 @@ TOPICS: tuple[Topic, ...] = (
     COMMAND,
     PICTURE,
     PREDICTION,
+    FLIGHT_IMAGE,
+    TELEMETRY,
+    TARGET_COMMAND,
+    TARGET,
+    TARGET_CLOUD,
+    ROAD_MAP,
+    UAV_INFO,
 )
 BY_NAME: dict[str, Topic] = {topic.name: topic for topic in TOPICS}
 

@@ -39,6 +39,10 @@ _KEYS: tuple[tuple[Topic, re.Pattern[str]], ...] = tuple(
     (topic, re.compile(rf"syncline/({_ID})/{re.escape(topic.key).replace(re.escape('{id}'), f'({_ID})')}\Z"))
     for topic in TOPICS
 )
+FLIGHT = (
+    pb.FlightImage | pb.VehicleTelemetry | pb.TargetCommand | pb.TargetState | pb.TargetCloud | pb.RoadMap | pb.UavInfo
+)
+"""What a UAV agent says; all name it as their sender."""
 _CLASSES: Mapping[str, type[Message]] = {topic.message: getattr(pb, topic.message) for topic in TOPICS}
 
 
@@ -72,7 +76,7 @@ def sender(message: Message) -> str | None:
         return message.camera
     if isinstance(message, pb.Command):
         return message.sender
-    if isinstance(message, pb.AgentStatus):
+    if isinstance(message, pb.AgentStatus | FLIGHT):
         return message.agent
     return None
 
@@ -94,7 +98,11 @@ def decode(topic: Topic, payload: bytes) -> Message:
         message.ParseFromString(payload)
     except DecodeError as error:
         raise Rejected(Reason.GARBLED, str(error)) from None
-    check(message)
+    try:
+        check(message)
+    except Rejected as error:
+        error.sequence = getattr(message, "sequence", None)
+        raise
     return message
 
 

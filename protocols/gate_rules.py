@@ -53,6 +53,9 @@ class Reason(Enum):
 class Rejected(Exception):
     """A message that must not be used. The caller counts ``reason``; ``detail`` is for a person."""
 
+    sequence: int | None = None
+    """The message's number, where it could be read that far."""
+
     def __init__(self, reason: Reason, detail: str) -> None:
         self.reason = reason
         self.detail = detail
@@ -396,6 +399,109 @@ def _picture(message: pb.Picture) -> None:
     _count(message.jpeg, "bytes of picture", MAX_PICTURE)
 
 
+MAX_IMAGE = 1_000_000
+"""Bytes of a compressed picture; with the rest of its message it stays below the largest payload."""
+MAX_POINTS = 4096
+MAX_FAR_PIXEL = 1e7
+MAX_METRES = 1e7
+_TARGET_STATES = frozenset({"visible", "coasting", "lost"})
+
+
+def _flight(message: Any) -> None:
+    """What all messages of a UAV agent have."""
+    _id(message.agent, "agent")
+    _id(message.boot_id, "boot id")
+
+
+def _points(values: Sequence[float], name: str, most: float) -> None:
+    """Pairs of coordinates."""
+    if len(values) % 2:
+        raise Rejected(Reason.BAD_LENGTH, f"{name} has {len(values)} numbers")
+    if len(values) > 2 * MAX_POINTS:
+        raise Rejected(Reason.TOO_MANY, f"{len(values) // 2} {name}, at most {MAX_POINTS}")
+    for value in values:
+        _number(value, name, -most, most)
+
+
+def _some(values: Sequence[float], name: str, lengths: tuple[int, ...], most: float) -> None:
+    _vector(values, name, lengths)
+    for value in values:
+        _number(value, name, -most, most)
+
+
+def _place(geo: Sequence[float], name: str) -> None:
+    """Latitude, longitude, altitude, or nothing."""
+    _vector(geo, name, (0, 3))
+    if geo and not (abs(geo[0]) <= 90.0 and abs(geo[1]) <= 180.0 and abs(geo[2]) <= 1e5):
+        raise Rejected(Reason.OUT_OF_RANGE, f"{name} is not on this earth")
+
+
+def _flight_image(message: pb.FlightImage) -> None:
+    _flight(message)
+    _number(message.width, "width", 1, MAX_IMAGE_SIDE)
+    _number(message.height, "height", 1, MAX_IMAGE_SIDE)
+    _count(message.jpeg, "bytes of picture", MAX_IMAGE)
+
+
+def _vehicle_telemetry(message: pb.VehicleTelemetry) -> None:
+    _flight(message)
+    _number(message.time_std_s, "time_std_s", 0.0)
+    _vector(message.ned_from_body, "ned_from_body", (4,))
+    if abs(sum(part * part for part in message.ned_from_body) - 1.0) > 1e-6:
+        raise Rejected(Reason.OUT_OF_RANGE, "ned_from_body is no rotation")
+    _some(message.position, "position", (0, 3), MAX_METRES)
+    _place(message.origin, "origin")
+
+
+def _target_command(message: pb.TargetCommand) -> None:
+    _flight(message)
+    _one_of(message.kind, "kind", frozenset({"select", "stop"}))
+    _some(message.box, "box", (4,) if message.kind == "select" else (0,), MAX_PIXEL)
+    if message.box and not (message.box[2] > 0.0 and message.box[3] > 0.0):
+        raise Rejected(Reason.OUT_OF_RANGE, "the box has no width or height")
+    _number(message.by, "by", 0, 255)
+
+
+def _target_state(message: pb.TargetState) -> None:
+    _flight(message)
+    _one_of(message.state, "state", _TARGET_STATES)
+    _some(message.centre, "centre", (0,) if message.state == "lost" else (2,), MAX_FAR_PIXEL)
+    _some(message.size, "size", (0, 2), MAX_FAR_PIXEL)
+    _some(message.heading, "heading", (0, 1), 7.0)
+    _number(message.std_px, "std_px", 0.0)
+    _some(message.ground, "ground", (0, 2), MAX_METRES)
+    _some(message.velocity, "velocity", (0, 2), 1e4)
+    _number(message.std_m, "std_m", 0.0)
+    _place(message.geo, "geo")
+    _count(message.hypotheses, "hypotheses", MAX_NUMBERS)
+    for hypothesis in message.hypotheses:
+        _number(hypothesis.weight, "weight", 0.0, 1.0)
+        _some((hypothesis.x, hypothesis.y), "hypothesis", (2,), MAX_FAR_PIXEL)
+
+
+def _target_cloud(message: pb.TargetCloud) -> None:
+    _flight(message)
+    _points(message.pixels, "pixels", MAX_FAR_PIXEL)
+
+
+def _road_map(message: pb.RoadMap) -> None:
+    _flight(message)
+    _points(message.pixels, "pixels", MAX_FAR_PIXEL)
+    _points(message.ground, "ground", MAX_METRES)
+    if message.ground and len(message.ground) != len(message.pixels):
+        raise Rejected(Reason.BAD_LENGTH, "ground and pixels are not the same points")
+
+
+def _uav_info(message: pb.UavInfo) -> None:
+    _flight(message)
+    _number(message.width, "width", 1, MAX_IMAGE_SIDE)
+    _number(message.height, "height", 1, MAX_IMAGE_SIDE)
+    _number(message.fps, "fps", 0.0, MAX_FPS)
+    _intrinsics(message)
+    _some(message.body_from_camera, "body_from_camera", (0, 9), 1.001)
+    _text(message.model, "model", MAX_LABEL)
+
+
 _RULES: dict[str, Callable[[Any], None]] = {
     "Observation": _observation,
     "CameraInfo": _camera_info,
@@ -407,4 +513,11 @@ _RULES: dict[str, Callable[[Any], None]] = {
     "Command": _command,
     "Picture": _picture,
     "Prediction": _prediction,
+    "FlightImage": _flight_image,
+    "VehicleTelemetry": _vehicle_telemetry,
+    "TargetCommand": _target_command,
+    "TargetState": _target_state,
+    "TargetCloud": _target_cloud,
+    "RoadMap": _road_map,
+    "UavInfo": _uav_info,
 }

@@ -11,13 +11,20 @@ from protocols.catalogue import (
     CALIBRATION,
     CAMERA_INFO,
     COMMAND,
+    FLIGHT_IMAGE,
     NODE_STATE,
     OBSERVATION,
     PICTURE,
     PREDICTION,
     RIG_INFO,
+    ROAD_MAP,
     STATUS,
+    TARGET,
+    TARGET_CLOUD,
+    TARGET_COMMAND,
+    TELEMETRY,
     TRACK,
+    UAV_INFO,
     Topic,
 )
 from protocols.messages import syncline_pb2 as pb
@@ -202,7 +209,13 @@ def node_state(camera: str = "cam0", sequence: int = 0) -> pb.NodeState:
 def command(sender: str = "cam0", sequence: int = 0) -> pb.Command:
     """What a button in a view sends."""
     return pb.Command(
-        schema_version=1, sender=sender, boot_id="boot-1", sequence=sequence, action="recalibrate", agent="hub", agent_boot="b1"
+        schema_version=1,
+        sender=sender,
+        boot_id="boot-1",
+        sequence=sequence,
+        action="recalibrate",
+        agent="hub",
+        agent_boot="b1",
     )
 
 
@@ -241,6 +254,108 @@ def prediction(sequence: int = 0) -> pb.Prediction:
     return pb.Prediction(schema_version=1, sequence=sequence, reference_time_ns=1_000_000_000, cameras=[camera])
 
 
+def flight_image(agent: str = "cam0", order: int = 0) -> pb.FlightImage:
+    """A picture of four bytes."""
+    return pb.FlightImage(
+        schema_version=1,
+        agent=agent,
+        boot_id="boot-1",
+        order=order,
+        frame=7,
+        device_time_ns=-5,
+        width=640,
+        height=480,
+        jpeg=b"jpeg",
+    )
+
+
+def vehicle_telemetry(agent: str = "cam0", order: int = 0) -> pb.VehicleTelemetry:
+    """A level vehicle 60 m up."""
+    return pb.VehicleTelemetry(
+        schema_version=1,
+        agent=agent,
+        boot_id="boot-1",
+        order=order,
+        device_time_ns=33_000_000,
+        vehicle_time_ns=70_000_000_000,
+        time_std_s=0.002,
+        ned_from_body=[1.0, 0.0, 0.0, 0.0],
+        position=[10.0, -4.0, -60.0],
+        origin=[47.4, 8.5, 410.0],
+    )
+
+
+def target_command(agent: str = "cam0", order: int = 0) -> pb.TargetCommand:
+    """A box drawn by the ground station 255."""
+    return pb.TargetCommand(
+        schema_version=1,
+        agent=agent,
+        boot_id="boot-1",
+        order=order,
+        kind="select",
+        box=[10.0, 20.0, 40.0, 20.0],
+        by=255,
+    )
+
+
+def target_state(agent: str = "cam0", sequence: int = 0) -> pb.TargetState:
+    """A car outside the picture."""
+    return pb.TargetState(
+        schema_version=1,
+        agent=agent,
+        boot_id="boot-1",
+        sequence=sequence,
+        frame=7,
+        device_time_ns=33_000_000,
+        state="coasting",
+        centre=[-20.5, 700.0],
+        size=[40.0, 20.0],
+        heading=[0.5],
+        std_px=12.0,
+        ground=[10.0, 20.0],
+        velocity=[8.0, -2.0],
+        std_m=1.2,
+        geo=[47.4, 8.5, 410.0],
+        hypotheses=[pb.TargetHypothesis(weight=1.0, x=-20.0, y=700.0)],
+    )
+
+
+def target_cloud(agent: str = "cam0", sequence: int = 0) -> pb.TargetCloud:
+    """Two particles."""
+    return pb.TargetCloud(
+        schema_version=1, agent=agent, boot_id="boot-1", sequence=sequence, particles=400, pixels=[1.0, 2.0, 3.0, 4.0]
+    )
+
+
+def road_map(agent: str = "cam0", sequence: int = 0) -> pb.RoadMap:
+    """Two points of a road's outline."""
+    return pb.RoadMap(
+        schema_version=1,
+        agent=agent,
+        boot_id="boot-1",
+        sequence=sequence,
+        pixels=[1.0, 2.0, 3.0, 4.0],
+        ground=[10.0, 20.0, 30.0, 40.0],
+    )
+
+
+def uav_info(agent: str = "cam0") -> pb.UavInfo:
+    """A camera that looks straight down."""
+    return pb.UavInfo(
+        schema_version=1,
+        agent=agent,
+        boot_id="boot-1",
+        width=640,
+        height=480,
+        fps=30.0,
+        matrix=MATRIX,
+        distortions=[0.1, -0.05, 0.001, 0.002, 0.01],
+        body_from_camera=[0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0],
+        seed=3,
+        model="ground",
+    )
+
+
 SAMPLES: dict[Topic, Callable[[], Message]] = {
     OBSERVATION: observation,
     CAMERA_INFO: camera_info,
@@ -252,6 +367,13 @@ SAMPLES: dict[Topic, Callable[[], Message]] = {
     COMMAND: command,
     PICTURE: picture,
     PREDICTION: prediction,
+    FLIGHT_IMAGE: flight_image,
+    TELEMETRY: vehicle_telemetry,
+    TARGET_COMMAND: target_command,
+    TARGET: target_state,
+    TARGET_CLOUD: target_cloud,
+    ROAD_MAP: road_map,
+    UAV_INFO: uav_info,
 }
 
 

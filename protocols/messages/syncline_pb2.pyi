@@ -430,3 +430,181 @@ class Prediction(_message.Message):
     reference_time_ns: int
     cameras: _containers.RepeatedCompositeFieldContainer[CameraPrediction]
     def __init__(self, schema_version: _Optional[int] = ..., sequence: _Optional[int] = ..., reference_time_ns: _Optional[int] = ..., cameras: _Optional[_Iterable[_Union[CameraPrediction, _Mapping]]] = ...) -> None: ...
+
+class FlightImage(_message.Message):
+    __slots__ = ("schema_version", "agent", "boot_id", "order", "frame", "device_time_ns", "width", "height", "jpeg")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    AGENT_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    ORDER_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    JPEG_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    agent: str
+    boot_id: str
+    order: int
+    frame: int
+    device_time_ns: int
+    width: int
+    height: int
+    jpeg: bytes
+    def __init__(self, schema_version: _Optional[int] = ..., agent: _Optional[str] = ..., boot_id: _Optional[str] = ..., order: _Optional[int] = ..., frame: _Optional[int] = ..., device_time_ns: _Optional[int] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., jpeg: _Optional[bytes] = ...) -> None: ...
+
+class VehicleTelemetry(_message.Message):
+    __slots__ = ("schema_version", "agent", "boot_id", "order", "device_time_ns", "vehicle_time_ns", "time_std_s", "ned_from_body", "position", "origin")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    AGENT_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    ORDER_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    VEHICLE_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    TIME_STD_S_FIELD_NUMBER: _ClassVar[int]
+    NED_FROM_BODY_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    ORIGIN_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    agent: str
+    boot_id: str
+    order: int
+    device_time_ns: int
+    vehicle_time_ns: int
+    time_std_s: float
+    ned_from_body: _containers.RepeatedScalarFieldContainer[float]
+    position: _containers.RepeatedScalarFieldContainer[float]
+    origin: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, schema_version: _Optional[int] = ..., agent: _Optional[str] = ..., boot_id: _Optional[str] = ..., order: _Optional[int] = ..., device_time_ns: _Optional[int] = ..., vehicle_time_ns: _Optional[int] = ..., time_std_s: _Optional[float] = ..., ned_from_body: _Optional[_Iterable[float]] = ..., position: _Optional[_Iterable[float]] = ..., origin: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class TargetCommand(_message.Message):
+    __slots__ = ("schema_version", "agent", "boot_id", "order", "kind", "box", "by")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    AGENT_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    ORDER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    BOX_FIELD_NUMBER: _ClassVar[int]
+    BY_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    agent: str
+    boot_id: str
+    order: int
+    kind: str
+    box: _containers.RepeatedScalarFieldContainer[float]
+    by: int
+    def __init__(self, schema_version: _Optional[int] = ..., agent: _Optional[str] = ..., boot_id: _Optional[str] = ..., order: _Optional[int] = ..., kind: _Optional[str] = ..., box: _Optional[_Iterable[float]] = ..., by: _Optional[int] = ...) -> None: ...
+
+class TargetHypothesis(_message.Message):
+    __slots__ = ("weight", "x", "y")
+    WEIGHT_FIELD_NUMBER: _ClassVar[int]
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    weight: float
+    x: float
+    y: float
+    def __init__(self, weight: _Optional[float] = ..., x: _Optional[float] = ..., y: _Optional[float] = ...) -> None: ...
+
+class TargetState(_message.Message):
+    __slots__ = ("schema_version", "agent", "boot_id", "sequence", "frame", "device_time_ns", "state", "centre", "size", "heading", "std_px", "ground", "velocity", "std_m", "geo", "hypotheses")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    AGENT_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    CENTRE_FIELD_NUMBER: _ClassVar[int]
+    SIZE_FIELD_NUMBER: _ClassVar[int]
+    HEADING_FIELD_NUMBER: _ClassVar[int]
+    STD_PX_FIELD_NUMBER: _ClassVar[int]
+    GROUND_FIELD_NUMBER: _ClassVar[int]
+    VELOCITY_FIELD_NUMBER: _ClassVar[int]
+    STD_M_FIELD_NUMBER: _ClassVar[int]
+    GEO_FIELD_NUMBER: _ClassVar[int]
+    HYPOTHESES_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    agent: str
+    boot_id: str
+    sequence: int
+    frame: int
+    device_time_ns: int
+    state: str
+    centre: _containers.RepeatedScalarFieldContainer[float]
+    size: _containers.RepeatedScalarFieldContainer[float]
+    heading: _containers.RepeatedScalarFieldContainer[float]
+    std_px: float
+    ground: _containers.RepeatedScalarFieldContainer[float]
+    velocity: _containers.RepeatedScalarFieldContainer[float]
+    std_m: float
+    geo: _containers.RepeatedScalarFieldContainer[float]
+    hypotheses: _containers.RepeatedCompositeFieldContainer[TargetHypothesis]
+    def __init__(self, schema_version: _Optional[int] = ..., agent: _Optional[str] = ..., boot_id: _Optional[str] = ..., sequence: _Optional[int] = ..., frame: _Optional[int] = ..., device_time_ns: _Optional[int] = ..., state: _Optional[str] = ..., centre: _Optional[_Iterable[float]] = ..., size: _Optional[_Iterable[float]] = ..., heading: _Optional[_Iterable[float]] = ..., std_px: _Optional[float] = ..., ground: _Optional[_Iterable[float]] = ..., velocity: _Optional[_Iterable[float]] = ..., std_m: _Optional[float] = ..., geo: _Optional[_Iterable[float]] = ..., hypotheses: _Optional[_Iterable[_Union[TargetHypothesis, _Mapping]]] = ...) -> None: ...
+
+class TargetCloud(_message.Message):
+    __slots__ = ("schema_version", "agent", "boot_id", "sequence", "frame", "device_time_ns", "particles", "pixels")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    AGENT_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    PARTICLES_FIELD_NUMBER: _ClassVar[int]
+    PIXELS_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    agent: str
+    boot_id: str
+    sequence: int
+    frame: int
+    device_time_ns: int
+    particles: int
+    pixels: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, schema_version: _Optional[int] = ..., agent: _Optional[str] = ..., boot_id: _Optional[str] = ..., sequence: _Optional[int] = ..., frame: _Optional[int] = ..., device_time_ns: _Optional[int] = ..., particles: _Optional[int] = ..., pixels: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class RoadMap(_message.Message):
+    __slots__ = ("schema_version", "agent", "boot_id", "sequence", "frame", "device_time_ns", "pixels", "ground")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    AGENT_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    PIXELS_FIELD_NUMBER: _ClassVar[int]
+    GROUND_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    agent: str
+    boot_id: str
+    sequence: int
+    frame: int
+    device_time_ns: int
+    pixels: _containers.RepeatedScalarFieldContainer[float]
+    ground: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, schema_version: _Optional[int] = ..., agent: _Optional[str] = ..., boot_id: _Optional[str] = ..., sequence: _Optional[int] = ..., frame: _Optional[int] = ..., device_time_ns: _Optional[int] = ..., pixels: _Optional[_Iterable[float]] = ..., ground: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class UavInfo(_message.Message):
+    __slots__ = ("schema_version", "agent", "boot_id", "width", "height", "fps", "matrix", "distortions", "fisheye", "body_from_camera", "seed", "model")
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    AGENT_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    FPS_FIELD_NUMBER: _ClassVar[int]
+    MATRIX_FIELD_NUMBER: _ClassVar[int]
+    DISTORTIONS_FIELD_NUMBER: _ClassVar[int]
+    FISHEYE_FIELD_NUMBER: _ClassVar[int]
+    BODY_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    SEED_FIELD_NUMBER: _ClassVar[int]
+    MODEL_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    agent: str
+    boot_id: str
+    width: int
+    height: int
+    fps: float
+    matrix: _containers.RepeatedScalarFieldContainer[float]
+    distortions: _containers.RepeatedScalarFieldContainer[float]
+    fisheye: bool
+    body_from_camera: _containers.RepeatedScalarFieldContainer[float]
+    seed: int
+    model: str
+    def __init__(self, schema_version: _Optional[int] = ..., agent: _Optional[str] = ..., boot_id: _Optional[str] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., fps: _Optional[float] = ..., matrix: _Optional[_Iterable[float]] = ..., distortions: _Optional[_Iterable[float]] = ..., fisheye: _Optional[bool] = ..., body_from_camera: _Optional[_Iterable[float]] = ..., seed: _Optional[int] = ..., model: _Optional[str] = ...) -> None: ...

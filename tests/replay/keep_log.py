@@ -47,7 +47,7 @@ def keep() -> Path:
     with LogWriter(path, {"syncline": {"seed": "7"}}, views=True) as log:
         log.attach("rig.toml", "application/toml", b"[cam0]\nsize = [640, 480]\n")
         # Hubs' talk among themselves about poses is of the moment: nobody replays it from an old log.
-        for number, topic in enumerate(topic for topic in TOPICS if topic is not NODE_STATE):
+        for number, topic in enumerate(topic for topic in TOPICS if topic.recorded and topic is not NODE_STATE):
             agent = "hub" if topic.key.startswith("hub/") else "cam0"
             log.write(topic, agent, "yard", SAMPLES[topic](), 1_700_000_000_000_000_000 + number)
     path.with_suffix(".json").write_text(json.dumps(content(path), indent=1) + "\n", encoding="utf-8")

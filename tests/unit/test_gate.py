@@ -12,7 +12,22 @@ from google.protobuf.message import Message
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, RIG_INFO, STATUS, TOPICS, TRACK, Topic
+from protocols.catalogue import (
+    CALIBRATION,
+    CAMERA_INFO,
+    FLIGHT_IMAGE,
+    OBSERVATION,
+    RIG_INFO,
+    ROAD_MAP,
+    STATUS,
+    TARGET,
+    TARGET_CLOUD,
+    TARGET_COMMAND,
+    TELEMETRY,
+    TOPICS,
+    TRACK,
+    Topic,
+)
 from protocols.gate import MAX_PAYLOAD, Reason, Rejected, admit, decode, encode, parse_key
 from protocols.messages import syncline_pb2 as pb
 from tests.samples import SAMPLES, camera_info, observation, status
@@ -77,6 +92,13 @@ Change = Callable[[Any], object]
 BAD: list[tuple[str, Topic, Change, Reason]] = [
     ("size below 0", OBSERVATION, lambda m: setattr(m.detections[0], "size", -1.0), Reason.OUT_OF_RANGE),
     ("score above 1", OBSERVATION, lambda m: setattr(m.detections[0], "score", 1.01), Reason.OUT_OF_RANGE),
+    ("unheard-of kind", OBSERVATION, lambda m: setattr(m.detections[0], "kind", "ghost"), Reason.BAD_TEXT),
+    ("half a head", OBSERVATION, lambda m: m.detections[0].head.pop(), Reason.BAD_LENGTH),
+    ("foot in three dimensions", OBSERVATION, lambda m: m.detections[0].foot.append(1.0), Reason.BAD_LENGTH),
+    ("head far outside", OBSERVATION, lambda m: m.detections[0].head.__setitem__(0, 1e7), Reason.OUT_OF_RANGE),
+    ("box of three numbers", OBSERVATION, lambda m: m.detections[0].box.pop(), Reason.BAD_LENGTH),
+    ("box inside out", OBSERVATION, lambda m: m.detections[0].box.__setitem__(2, -1.0), Reason.OUT_OF_RANGE),
+    ("target breaks lines", OBSERVATION, lambda m: setattr(m.detections[0], "target", "a\nb"), Reason.BAD_TEXT),
     ("u far outside", OBSERVATION, lambda m: setattr(m.detections[0], "u", 1e7), Reason.OUT_OF_RANGE),
     ("exposure below 0", OBSERVATION, lambda m: setattr(m, "exposure_ns", -1), Reason.OUT_OF_RANGE),
     ("colour 256", OBSERVATION, lambda m: setattr(m.detections[0].colour, "red", 256), Reason.OUT_OF_RANGE),
@@ -133,6 +155,20 @@ BAD: list[tuple[str, Topic, Change, Reason]] = [
     ("variance below 0", TRACK, lambda m: m.position_covariance.__setitem__(4, -1.0), Reason.OUT_OF_RANGE),
     ("unknown agent state", STATUS, lambda m: setattr(m, "state", "asleep"), Reason.BAD_TEXT),
     ("escape in message", STATUS, lambda m: setattr(m, "message", "\x1b[2J"), Reason.BAD_TEXT),
+    ("no rotation", TELEMETRY, lambda m: m.ned_from_body.__setitem__(0, 2.0), Reason.OUT_OF_RANGE),
+    ("origin beyond the pole", TELEMETRY, lambda m: m.origin.__setitem__(0, 91.0), Reason.OUT_OF_RANGE),
+    ("position of 2", TELEMETRY, lambda m: m.position.pop(), Reason.BAD_LENGTH),
+    ("select without a box", TARGET_COMMAND, lambda m: m.ClearField("box"), Reason.BAD_LENGTH),
+    ("stop with a box", TARGET_COMMAND, lambda m: setattr(m, "kind", "stop"), Reason.BAD_LENGTH),
+    ("box without width", TARGET_COMMAND, lambda m: m.box.__setitem__(2, 0.0), Reason.OUT_OF_RANGE),
+    ("station 256", TARGET_COMMAND, lambda m: setattr(m, "by", 256), Reason.OUT_OF_RANGE),
+    ("lost and somewhere", TARGET, lambda m: setattr(m, "state", "lost"), Reason.BAD_LENGTH),
+    ("unknown target state", TARGET, lambda m: setattr(m, "state", "gone"), Reason.BAD_TEXT),
+    ("std below 0", TARGET, lambda m: setattr(m, "std_m", -1.0), Reason.OUT_OF_RANGE),
+    ("half a particle", TARGET_CLOUD, lambda m: m.pixels.pop(), Reason.BAD_LENGTH),
+    ("4097 particles", TARGET_CLOUD, lambda m: m.pixels.extend([1.0] * 8192), Reason.TOO_MANY),
+    ("road of two lengths", ROAD_MAP, lambda m: m.ground.extend([1.0, 2.0]), Reason.BAD_LENGTH),
+    ("picture 0 wide", FLIGHT_IMAGE, lambda m: setattr(m, "width", 0), Reason.OUT_OF_RANGE),
     (
         "300 counters",
         STATUS,
