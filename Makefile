@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 DATA ?= ../shared/data
 SECONDS_OF_SOAK ?= 900
 
-.PHONY: demo test lint types contracts check proto lock bench faults fuzz soak clean
+.PHONY: demo test lint types contracts check proto lock bench faults fuzz soak browser clean
 
 demo: $(STAMP)
 	$(BIN)/syncline demo --out demo-out
@@ -29,15 +29,18 @@ check: test lint types contracts
 bench: $(STAMP)
 	$(BIN)/python -m tests.bench $(if $(QUICK),--quick) --data $(DATA)
 
-# What is tried beyond `make test`: faults of links and processes, more random examples, a long demo.
+# Faults of links, processes, clocks, cameras, disks; enemies with and without certificates: the matrix with its figures.
 faults: $(STAMP)
-	$(BIN)/python -m pytest tests/faults tests/integration
+	$(BIN)/python -m tests.faults -n 2 --dist loadfile
 
+# A million and more damaged inputs for every decoder of what others send; seed by the time, told in the output.
 fuzz: $(STAMP)
-	$(BIN)/python -m pytest tests/property tests/unit --hypothesis-profile=fuzz
+	$(BIN)/python -m tests.faults.fuzz
+	$(BIN)/python -m pytest tests/property --hypothesis-profile=fuzz
 
+# The demo's processes for 15 minutes: memory of each, and its growth after warm-up.
 soak: $(STAMP)
-	$(BIN)/syncline demo --seconds $(SECONDS_OF_SOAK) --out soak-out
+	$(BIN)/python -m tests.faults.soak --seconds $(SECONDS_OF_SOAK)
 
 # Regenerates the protobuf code; a test fails if it is not what the .proto says.
 proto: $(STAMP)

@@ -49,6 +49,12 @@ def free_bytes(folder: Path) -> int:
     return shutil.disk_usage(place).free
 
 
+def disk_bytes(folder: Path) -> int:
+    """Size of the disk below ``folder``, which need not be there yet."""
+    place = next(parent for parent in (folder, *folder.absolute().parents) if parent.is_dir())
+    return shutil.disk_usage(place).total
+
+
 def log_path(out: Path, now: datetime) -> Path:
     """The file to write: ``out`` itself if it is named .mcap, else a new one in the folder ``out``."""
     if out.suffix == ".mcap":
@@ -64,12 +70,13 @@ def run_recorder(
     stop_when: Callable[[int], bool] | None = None,
     boot_id: str | None = None,
     free: Callable[[Path], int] = free_bytes,
+    beat: Callable[[], None] = lambda: None,
 ) -> RecorderResult:
     """Record until ``stop`` is set, until ``stop_when(messages so far)`` is true, or until the disk is nearly full.
 
     Log times are the arrival times. Twice a second the log is brought to the disk; each second the recorder's
-    status is published. free: bytes left where the log is. Raises InputError if the log exists already or cannot be
-    written, or if the disk is too full to begin.
+    status is published. free: bytes left where the log is. beat: called after every round. Raises InputError if the log
+    exists already or cannot be written, or if the disk is too full to begin.
     """
     boot = boot_id or uuid.uuid4().hex
     path = log_path(config.out, datetime.now(UTC))
@@ -98,6 +105,7 @@ def run_recorder(
                         _report(status, subscriptions, messages, writer.size, full)
                         publisher.put(status)
                         status.sequence += 1
+                beat()
                 if not full:
                     stop.wait(_TICK_S)
             messages += _record(writer, bus.site, subscriptions)
@@ -135,11 +143,12 @@ def _writer(config: RecorderConfig, path: Path, site: str, boot: str) -> LogWrit
 def _too_full(config: RecorderConfig, path: Path, free: Callable[[Path], int]) -> str:
     """Why the disk has no room for more; "" while it has."""
     left = free(path.parent) / 1e6
-    return (
-        f"{left:.0f} MB are free on the disk, min_free_mb is {config.min_free_mb:g}"
-        if left < config.min_free_mb
-        else ""
-    )
+    if left < config.min_free_mb:
+        return f"{left:.0f} MB are free on the disk, min_free_mb is {config.min_free_mb:g}"
+    share = 100.0 * left * 1e6 / disk_bytes(path.parent) if free is free_bytes else 100.0
+    if share < config.min_free_percent:
+        return f"{share:.1f} % of the disk are free, min_free_percent is {config.min_free_percent:g}"
+    return ""
 
 
 def _record(writer: LogWriter | RotatingWriter, site: str, subscriptions: list[Subscription]) -> int:

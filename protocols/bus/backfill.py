@@ -36,13 +36,13 @@ class _Held:
 class Backfill(Generic[_Source]):
     """Stands before an inbox; may be called from any thread.
 
-    push: takes (key, payload) of a message in its turn. fetch: called once for a publisher whose first
+    push: takes (source, key, payload) of a message in its turn. fetch: called once for a publisher whose first
     message has a number above 0, with that message's key; the answers go to ``answer``, then ``finish``.
     """
 
     def __init__(
         self,
-        push: Callable[[str, bytes], None],
+        push: Callable[[_Source, str, bytes], None],
         fetch: Callable[[str, _Source, int], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -62,7 +62,7 @@ class Backfill(Generic[_Source]):
                 return
             if source in self._known or number == 0:
                 self._known.add(source)
-                self._push(key, payload)
+                self._push(source, key, payload)
                 return
             self._known.add(source)
             self._held[source] = _Held(number, self._clock(), later=[(key, payload)])
@@ -81,9 +81,9 @@ class Backfill(Generic[_Source]):
             held = self._held.pop(source, None)
             if held is not None:
                 for _, message in sorted(held.early.items()):
-                    self._push(*message)
+                    self._push(source, *message)
                 for message in held.later:
-                    self._push(*message)
+                    self._push(source, *message)
 
     def release_overdue(self) -> None:
         """Let through what has waited longer than PATIENCE_S."""

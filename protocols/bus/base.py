@@ -26,12 +26,25 @@ class Received:
     """One message that passed the gate.
 
     arrival_ns: the receiver's clock (Unix, ns) when it came off the wire, not when it was drained.
+    source: the connection that it came from, as the transport names it; "" where it does not.
     """
 
     topic: Topic
     agent: str
     message: Message
     arrival_ns: int
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """One message that was not let in. agent: by its key, "" where that names none; detail: for a person."""
+
+    reason: str
+    agent: str
+    key: str
+    detail: str
+    sequence: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +89,9 @@ class Subscription(Protocol):
         received: passed the gate. dropped: this queue was full. lost: never came, by the publisher's
         count. rejected.<reason>: stopped at the gate.
         """
+
+    def refusals(self) -> list[Refusal]:
+        """What was refused since the last call, the first few of it: the counters have all."""
 
     def close(self) -> None:
         """Stop receiving; what is queued can still be drained."""

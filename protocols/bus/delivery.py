@@ -7,12 +7,12 @@ import math
 from protocols.catalogue import Delivery, Topic
 
 OUTAGE_S = 60.0
-"""The longest cut of a link that loses nothing."""
+"""The longest cut of a link that loses nothing, unless the configuration says another."""
 _MARGIN = 1.5
 
 
-def cache_size(topic: Topic, rate_hz: float | None = None) -> int:
+def cache_size(topic: Topic, rate_hz: float | None = None, outage_s: float = OUTAGE_S) -> int:
     """Messages that a publisher of ``topic`` caches: the last one, or an outage's worth and a margin."""
     if topic.delivery is Delivery.LATEST:
         return 1
-    return max(1, math.ceil(max(topic.rate_hz, rate_hz or 0.0) * OUTAGE_S * _MARGIN))
+    return max(1, math.ceil(max(topic.rate_hz, rate_hz or 0.0) * outage_s * _MARGIN))

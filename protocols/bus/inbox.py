@@ -7,9 +7,12 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 
-from protocols.bus.base import AgentEvent, Received
+from protocols.bus.base import AgentEvent, Received, Refusal
 from protocols.catalogue import Topic, valid_id
-from protocols.gate import MAX_PAYLOAD, Reason, Rejected, admit
+from protocols.gate import MAX_PAYLOAD, Reason, Rejected, admit, parse_key
+
+_TOLD = 256
+"""Refusals that are kept for telling; all of them are counted."""
 
 
 class Inbox:
@@ -22,22 +25,38 @@ class Inbox:
     def __init__(self, topic: Topic, clock_ns: Callable[[], int] = time.time_ns) -> None:
         self._clock_ns = clock_ns
         self._capacity = topic.queue
-        self._queue: deque[tuple[str, bytes, int]] = deque()
+        self._queue: deque[tuple[str, bytes, int, str]] = deque()
+        self._refusals: list[Refusal] = []
         self._ready = threading.Condition()
         self._counts: Counter[str] = Counter(received=0, dropped=0, lost=0)
 
-    def push(self, key: str, payload: bytes) -> None:
+    def push(self, key: str, payload: bytes, source: str = "") -> None:
         """Queue one sample; the oldest is dropped and counted when the queue is full."""
+        if len(payload) > MAX_PAYLOAD:
+            self.refuse(Rejected(Reason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD}"), key)
+            return
         now = self._clock_ns()
         with self._ready:
-            if len(payload) > MAX_PAYLOAD:
-                self._counts[f"rejected.{Reason.OVERSIZED.value}"] += 1
-                return
             if len(self._queue) >= self._capacity:
                 self._queue.popleft()
                 self._counts["dropped"] += 1
-            self._queue.append((key, payload, now))
+            self._queue.append((key, payload, now, source))
             self._ready.notify_all()
+
+    def refuse(self, error: Rejected, key: str, sequence: int | None = None) -> None:
+        """Count, and keep for telling, one message that is not let in."""
+        address = parse_key(key)
+        refusal = Refusal(error.reason.value, address.agent if address else "", key[:200], error.detail, sequence)
+        with self._ready:
+            self._counts[f"rejected.{refusal.reason}"] += 1
+            if len(self._refusals) < _TOLD:
+                self._refusals.append(refusal)
+
+    def refusals(self) -> list[Refusal]:
+        """What was refused since the last call."""
+        with self._ready:
+            told, self._refusals = self._refusals, []
+        return told
 
     def lose(self, count: int) -> None:
         """Count messages that the transport knows will never come."""
@@ -49,17 +68,15 @@ class Inbox:
         with self._ready:
             queue, self._queue = self._queue, deque()
         messages: list[Received] = []
-        rejected: Counter[str] = Counter()
-        for key, payload, arrival_ns in queue:
+        for key, payload, arrival_ns, source in queue:
             try:
                 address, message = admit(key, payload)
             except Rejected as error:
-                rejected[f"rejected.{error.reason.value}"] += 1
+                self.refuse(error, key, error.sequence)
                 continue
-            messages.append(Received(address.topic, address.agent, message, arrival_ns))
+            messages.append(Received(address.topic, address.agent, message, arrival_ns, source))
         with self._ready:
             self._counts["received"] += len(messages)
-            self._counts.update(rejected)
         return messages
 
     def wait(self, timeout_s: float) -> bool:

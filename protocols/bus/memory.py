@@ -16,7 +16,7 @@ from typing import Self
 
 from google.protobuf.message import Message
 
-from protocols.bus.base import AgentEvent, BusDead, Received
+from protocols.bus.base import AgentEvent, BusDead, Received, Refusal
 from protocols.bus.delivery import cache_size
 from protocols.bus.inbox import Inbox, Roll, subscription_key
 from protocols.catalogue import Topic, liveliness_key, valid_id
@@ -130,6 +130,10 @@ class MemorySubscription:
     def counters(self) -> Mapping[str, int]:
         """See the contract; ``lost`` stays 0, since memory loses nothing."""
         return self.inbox.counters
+
+    def refusals(self) -> list[Refusal]:
+        """What was refused since the last call."""
+        return self.inbox.refusals()
 
     def close(self) -> None:
         """Stop receiving."""

@@ -11,13 +11,15 @@ from typing import Any
 
 import zenoh
 
+from protocols.bus.access import read_access, tls_settings
 from protocols.bus.base import BusDead, BusStopped
 from protocols.bus.settings import BusConfig
+from protocols.bus.tls import check_files, why_refused
 from protocols.errors import InputError
 
 MAX_MESSAGE_SIZE = 4 * 1024 * 1024
-LEASE_MS = 2000
-"""A frozen process counts as gone after this; a killed one at once."""
+LEASE_MS = 1900
+"""A frozen process counts as gone after this, and is told of within 2 s; a killed one at once."""
 _ATTEMPT_MS = 500
 _PAUSE_S = 0.1
 
@@ -49,7 +51,8 @@ def release(*declared: Any) -> None:
     """Undeclare what was declared; None, or what is gone already, is no error."""
     for thing in declared:
         if thing is not None:
-            with suppress(BusDead), zenoh_call("undeclare"):
+            # RuntimeError: a thread that was given up on still sends on it ("Already borrowed").
+            with suppress(BusDead, RuntimeError), zenoh_call("undeclare"):
                 thing.undeclare()
 
 
@@ -66,9 +69,11 @@ def open_session(
 
     A peer opens at once and keeps looking for the others; a client needs its router, so this waits for
     it until ``stop()`` (raises BusStopped) or ``timeout_s`` (raises InputError). Raises InputError for
-    endpoints that cannot be used.
+    endpoints that cannot be used, and for a router that can be reached but refuses this process, with its reason.
     """
     connect, listen = config.endpoints()
+    if config.tls is not None:
+        check_files(config.tls)
     settings = _settings(config, connect, listen)
     began = time.monotonic()
     while True:
@@ -83,6 +88,10 @@ def open_session(
                 raise InputError(
                     f"bus: {reason}", remedy=f"check connect = {list(connect)} and listen = {list(listen)}"
                 ) from None
+        for endpoint in connect:
+            refusal = why_refused(endpoint, config.tls)
+            if refusal:
+                raise InputError(f"bus: the router at {endpoint} refuses: {refusal}", remedy="see `syncline keys`")
         if timeout_s is not None and time.monotonic() - began >= timeout_s:
             raise InputError(
                 f"bus: no router answers at {', '.join(connect)} ({reason})",
@@ -111,7 +120,12 @@ def _settings(config: BusConfig, connect: tuple[str, ...], listen: tuple[str, ..
         # Else idle sockets lock out others for ten seconds.
         "transport/unicast/accept_pending": 2000,
         "transport/unicast/accept_timeout": 2000,
+        "transport/unicast/max_sessions": config.max_sessions,
     }
+    if config.tls is not None:
+        values["transport/link/tls"] = tls_settings(config.tls)
+    if config.access is not None:
+        values["access_control"] = read_access(config.access)
     settings = zenoh.Config()
     for key, value in values.items():
         settings.insert_json5(key, json.dumps(value))

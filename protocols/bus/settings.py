@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Literal
 
 import msgspec
+from msgspec import Meta
 
 from protocols.errors import InputError
 
@@ -14,7 +16,15 @@ LOOPBACK_ROUTER = "tcp/127.0.0.1:7447"
 LOOPBACK_ANY_PORT = "tcp/127.0.0.1:0"
 EVERY_INTERFACE = "tcp/[::]:0"
 
-_ENDPOINT = re.compile(r"tcp/(?P<host>\[[0-9a-fA-F:.%]+\]|[A-Za-z0-9._-]+):(?P<port>[0-9]{1,5})\Z")
+_ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?P<host>\[[0-9a-fA-F:.%]+\]|[A-Za-z0-9._-]+):(?P<port>[0-9]{1,5})\Z")
+
+
+class TlsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``[bus.tls]``: files that `syncline keys` makes. ca: whom to trust; certificate, key: who this process is."""
+
+    ca: Path
+    certificate: Path
+    key: Path
 
 
 class BusConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -25,12 +35,20 @@ class BusConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         for a router at LOOPBACK_ROUTER, and a router listens there.
     multicast: find other peers on the local network by multicast; then a peer that names no listen
         endpoint listens on every interface.
+    outage_s: the longest cut of a link that loses nothing: publishers keep half as much again.
+    max_sessions: how many others may be connected to this process at once.
+    tls: certificates for "tls/" endpoints. access: a router's access rules and TLS settings, as `syncline keys`
+        writes them; who is not named there may do nothing.
     """
 
     mode: Literal["peer", "client", "router"] = "peer"
     connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
     multicast: bool = False
+    outage_s: Annotated[float, Meta(ge=1.0, le=3600.0)] = 60.0
+    max_sessions: Annotated[int, Meta(ge=1, le=100_000)] = 1000
+    tls: TlsConfig | None = None
+    access: Path | None = None
 
     def endpoints(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """(connect, listen) with the defaults filled in; raises InputError for a bad combination."""
@@ -38,6 +56,19 @@ class BusConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
             _check(endpoint, lowest_port=1)
         for endpoint in self.listen:
             _check(endpoint, lowest_port=0)
+        secure = [endpoint for endpoint in (*self.connect, *self.listen) if endpoint.startswith("tls/")]
+        if secure and self.tls is None:
+            raise InputError(
+                f"bus: {secure[0]} needs certificates",
+                remedy="add [bus.tls] with ca, certificate and key; `syncline keys` makes them",
+            )
+        if self.access is not None and self.mode != "router":
+            raise InputError("bus: access is for a router", remedy='remove it, or set mode = "router"')
+        if self.tls is not None and self.mode == "peer":
+            # Who may say what is checked by the router; between two peers nobody would check it.
+            raise InputError(
+                "bus: a peer with certificates would go past the router's access rules", remedy='set mode = "client"'
+            )
         if self.mode == "client":
             if self.listen:
                 raise InputError("bus: a client cannot listen", remedy='use mode = "peer", or remove listen')
@@ -59,6 +90,13 @@ class BusConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         return connect, (LOOPBACK_ANY_PORT,)
 
 
+def parts_of(endpoint: str) -> tuple[str, str, int]:
+    """(protocol, host, port) of a checked endpoint; an IPv6 host without its brackets."""
+    found = _ENDPOINT.match(endpoint)
+    assert found is not None
+    return found["protocol"], found["host"].strip("[]"), int(found["port"])
+
+
 def is_loopback(endpoint: str) -> bool:
     """Whether an endpoint stays on this machine."""
     found = _ENDPOINT.match(endpoint)
@@ -71,3 +109,9 @@ def _check(endpoint: str, *, lowest_port: int) -> None:
     found = _ENDPOINT.match(endpoint)
     if not found or not lowest_port <= int(found["port"]) <= 65_535:
         raise InputError(f"bus: {endpoint!r} is not an endpoint", remedy='write it like "tcp/127.0.0.1:7447"')
+
+
+def open_to_others(config: BusConfig) -> tuple[str, ...]:
+    """Endpoints beyond this machine that this process would listen on without certificates."""
+    _, listen = config.endpoints()
+    return tuple(one for one in listen if not is_loopback(one) and not one.startswith("tls/"))

@@ -14,13 +14,13 @@ import zenoh.handlers
 from google.protobuf.message import Message
 
 from protocols.bus.backfill import Backfill
-from protocols.bus.base import AgentEvent, BusDead, Received
+from protocols.bus.base import AgentEvent, BusDead, Received, Refusal
 from protocols.bus.delivery import cache_size
 from protocols.bus.inbox import Inbox, Roll, subscription_key
 from protocols.bus.session import close_session, open_session, release, zenoh_call
 from protocols.bus.settings import BusConfig
 from protocols.catalogue import Delivery, Topic, liveliness_key, valid_id
-from protocols.gate import encode
+from protocols.gate import Reason, Rejected, encode
 
 HEARTBEAT_S = 0.5
 """How soon a subscriber learns that the last message before a silence is missing."""
@@ -34,7 +34,7 @@ _Source: TypeAlias = tuple[str, int]
 class ZenohPublisher:
     """See ``protocols.bus.base.Publisher``."""
 
-    def __init__(self, session: zenoh.Session, topic: Topic, key: str, rate_hz: float | None, block: bool) -> None:
+    def __init__(self, session: zenoh.Session, topic: Topic, key: str, cache: int, block: bool) -> None:
         self._message = topic.message
         self._session = session
         self._key = key
@@ -47,10 +47,11 @@ class ZenohPublisher:
                 key,
                 encoding=zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(f"syncline.v1.{topic.message}"),
                 congestion_control=congestion,
-                cache=zenoh.ext.CacheConfig(max_samples=cache_size(topic, rate_hz)),
-                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None)
-                if reliable
-                else None,
+                cache=zenoh.ext.CacheConfig(max_samples=cache),
+                # Also where nothing is recovered: it numbers the messages, which a plain publisher does not.
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(
+                    heartbeat=HEARTBEAT_S if reliable else None, sporadic_heartbeat=None
+                ),
                 publisher_detection=True,
             )
 
@@ -87,7 +88,7 @@ class ZenohSubscription:
         self._session = session
         self._inbox = Inbox(topic, clock_ns)
         self._reliable = topic.delivery is Delivery.RELIABLE
-        self._backfill: Backfill[_Source] = Backfill(self._inbox.push, self._fetch)
+        self._backfill: Backfill[_Source] = Backfill(self._push, self._fetch)
         recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
         with zenoh_call(f"subscribe {key}"):
             self._subscriber: zenoh.ext.AdvancedSubscriber[None] = zenoh.ext.declare_advanced_subscriber(
@@ -107,12 +108,18 @@ class ZenohSubscription:
     def _take(self, sample: zenoh.Sample) -> None:
         if sample.kind != zenoh.SampleKind.PUT:
             return
-        source = sample.source_info
-        if source is None or not self._reliable:
-            self._inbox.push(str(sample.key_expr), sample.payload.to_bytes())
+        source, key = sample.source_info, str(sample.key_expr)
+        if source is None:
+            self._inbox.refuse(Rejected(Reason.PLAIN_PUBLISHER, "not from an advanced publisher"), key)
+            return
+        name = (str(source.source_id.zid), source.source_id.eid)
+        if self._reliable:
+            self._backfill.take(name, source.source_sn, key, sample.payload.to_bytes())
         else:
-            name = (str(source.source_id.zid), source.source_id.eid)
-            self._backfill.take(name, source.source_sn, str(sample.key_expr), sample.payload.to_bytes())
+            self._push(name, key, sample.payload.to_bytes())
+
+    def _push(self, source: _Source, key: str, payload: bytes) -> None:
+        self._inbox.push(key, payload, source[0])
 
     def _miss(self, miss: zenoh.ext.Miss) -> None:
         self._inbox.lose(miss.nb)
@@ -152,6 +159,10 @@ class ZenohSubscription:
         """See the contract."""
         return self._inbox.counters
 
+    def refusals(self) -> list[Refusal]:
+        """What was refused since the last call."""
+        return self._inbox.refusals()
+
     def close(self) -> None:
         """Undeclare: a process with an open callback never exits."""
         release(self._misses, self._subscriber)
@@ -183,10 +194,11 @@ class ZenohWatch:
 class ZenohBus:
     """See ``protocols.bus.base.Bus``. Made by ``open_bus``."""
 
-    def __init__(self, session: zenoh.Session, site: str, clock_ns: Callable[[], int]) -> None:
+    def __init__(self, session: zenoh.Session, site: str, clock_ns: Callable[[], int], outage_s: float) -> None:
         self._session = session
         self._site = valid_id(site, "site")
         self._clock_ns = clock_ns
+        self._outage_s = outage_s
         self._declared: list[ZenohPublisher | ZenohSubscription | ZenohWatch] = []
 
     @property
@@ -199,7 +211,7 @@ class ZenohBus:
     ) -> ZenohPublisher:
         """Declare a publisher; see the contract."""
         key = topic.key_for(self._site, agent)
-        publisher = ZenohPublisher(self._session, topic, key, rate_hz, block)
+        publisher = ZenohPublisher(self._session, topic, key, cache_size(topic, rate_hz, self._outage_s), block)
         self._declared.append(publisher)
         return publisher
 
@@ -258,4 +270,5 @@ def open_bus(
     Raises InputError, in one line, for a site or an endpoint that cannot be used.
     """
     valid_id(site, "site")
-    return ZenohBus(open_session(config or BusConfig(), stop=stop, timeout_s=timeout_s), site, clock_ns)
+    config = config or BusConfig()
+    return ZenohBus(open_session(config, stop=stop, timeout_s=timeout_s), site, clock_ns, config.outage_s)

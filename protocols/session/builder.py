@@ -18,6 +18,8 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks
 from protocols.session.rig import Rig, RigCamera
 
+_REMEMBERED = 16_384
+"""Sequences of one run that a live hub remembers to know duplicates by: nine minutes at 30 Hz."""
 SETTLED_ROWS = 90
 """Detections from which on a restarted camera's new clock is worth solving."""
 
@@ -31,6 +33,8 @@ class _Boot:
     last_ns: int = -(2**63)
     """Clocks may count from anywhere, also below zero."""
     frames: int = 0
+    forgotten: int = 0
+    """Sequences below this one are taken for known."""
 
 
 class SessionBuilder:
@@ -128,10 +132,14 @@ class SessionBuilder:
     def _observe(self, message: pb.Observation) -> None:
         boots = self._boots.setdefault(message.camera, {})
         boot = boots.setdefault(message.boot_id, _Boot())
-        if message.sequence in boot.seen:
+        if message.sequence in boot.seen or message.sequence < boot.forgotten:
             self.counters["duplicates"] += 1
             return
         boot.seen.add(message.sequence)
+        if self._window_ns is not None and len(boot.seen) > 2 * _REMEMBERED:
+            # A live hub runs for months: what is so old could come again only from nowhere.
+            boot.forgotten = max(boot.seen) - _REMEMBERED
+            boot.seen = {number for number in boot.seen if number >= boot.forgotten}
         boot.frames += 1
         labels: set[str] = set()
         # One row a label and frame: of several detections the surest is the point, the rest are doubtful.

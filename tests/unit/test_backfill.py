@@ -13,7 +13,7 @@ class Stage:
         self.out: list[bytes] = []
         self.asked: list[tuple[str, str, int]] = []
         self.backfill: Backfill[str] = Backfill(
-            lambda key, payload: self.out.append(payload),
+            lambda source, key, payload: self.out.append(payload),
             lambda key, source, first: self.asked.append((key, source, first)),
             lambda: self.now,
         )

@@ -1,0 +1,291 @@
+"""A site's certificates: an authority, one short-lived certificate an agent, and the router's rules in one file.
+
+::
+
+    DIR/site.json              the site's name, and which certificates there are
+    DIR/ca.pem, ca-key.pem     the authority; who has ca-key.pem can be anybody, so it stays on one machine
+    DIR/<role>-<id>/           what one agent needs, to be copied to its machine: certificate.pem, key.pem (0600),
+                               ca.pem and bus.toml, the beginning of its configuration (paths from that folder)
+    DIR/router-<id>/           moreover zenoh.json5, TLS and access rules for `syncline router` and for zenohd alike,
+                               and router.toml, ready to run
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import tomli_w
+
+from protocols.bus.access import access_rules, certificate_name, tls_settings
+from protocols.bus.settings import BusConfig, TlsConfig
+from protocols.catalogue import valid_id
+from protocols.errors import InputError
+from protocols.files import write_atomically
+
+if TYPE_CHECKING:
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+SITE_FILE = "site.json"
+CA_FILE, CA_KEY_FILE = "ca.pem", "ca-key.pem"
+CERTIFICATE_FILE, KEY_FILE, BUS_FILE = "certificate.pem", "key.pem", "bus.toml"
+ZENOH_FILE, ROUTER_FILE = "zenoh.json5", "router.toml"
+_CA_DAYS = 3650
+_EARLY = timedelta(minutes=5)
+"""How far a board's clock may be behind before a fresh certificate is not valid yet."""
+
+
+@dataclass(frozen=True, slots=True)
+class Issued:
+    """One agent's folder, and until when its certificate is valid (UTC)."""
+
+    role: str
+    agent: str
+    folder: Path
+    until: datetime
+
+
+def make_site(folder: Path, site: str) -> None:
+    """Make the authority of a new site. Raises InputError where there is one already."""
+    valid_id(site, "site")
+    _need_cryptography()
+    if (folder / SITE_FILE).exists() or (folder / CA_KEY_FILE).exists():
+        raise InputError(
+            "there is an authority here already", file=folder, remedy="take another folder; a new one voids the old"
+        )
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    folder.mkdir(parents=True, exist_ok=True)
+    folder.chmod(0o700)
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = _name(f"syncline {site}"[:64])
+    now = datetime.now(UTC)
+    usage = x509.KeyUsage(False, False, False, False, False, True, True, False, False)
+    certificate = (
+        _builder(name, name, key.public_key(), now - _EARLY, now + timedelta(days=_CA_DAYS))
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(usage, critical=True)
+    )
+    _write_key(folder / CA_KEY_FILE, key)
+    write_atomically(folder / CA_FILE, _pem(certificate, key))
+    _write_site(folder, site, {})
+
+
+def issue(
+    folder: Path,
+    role: str,
+    agent: str,
+    *,
+    days: float = 30.0,
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    hosts: Sequence[str] = (),
+) -> Issued:
+    """Make, or renew, one agent's certificate, and write the routers' rules anew.
+
+    connect: endpoints of the site's routers, kept for the next agents. listen, hosts: of a router: where it listens,
+    and the names and addresses by which others reach it. Raises InputError.
+    """
+    name = certificate_name(role, agent)
+    if not 0.0 < days <= 825.0:
+        raise InputError(f"{days:g} days is no lifetime for a certificate", remedy="use 1 to 825 days")
+    _need_cryptography()
+    site, agents = read_site(folder)
+    entry = dict(agents.get(name, {"role": role, "id": agent}))
+    if role == "router":
+        entry["listen"] = list(listen) or entry.get("listen") or ["tls/127.0.0.1:7447"]
+        entry["hosts"] = sorted({*hosts, *entry.get("hosts", []), *_hosts_of(entry["listen"])})
+    entry["connect"] = list(connect) or entry.get("connect", [])
+    # Refuses bad endpoints before anything is written.
+    tls = TlsConfig(ca=Path(CA_FILE), certificate=Path(CERTIFICATE_FILE), key=Path(KEY_FILE))
+    mode: Any = "router" if role == "router" else "client"
+    BusConfig(mode=mode, connect=tuple(entry["connect"]), listen=tuple(entry.get("listen", ())), tls=tls).endpoints()
+    now = datetime.now(UTC)
+    until = now + timedelta(days=days)
+    own = folder / f"{role}-{agent}"
+    own.mkdir(exist_ok=True)
+    own.chmod(0o700)
+    sign(folder, own, name, now - _EARLY, until, entry.get("hosts", []))
+    entry["until"] = until.isoformat(timespec="seconds")
+    agents[name] = entry
+    _write_site(folder, site, agents)
+    _write_configurations(folder, site, agents)
+    return Issued(role, agent, own, until)
+
+
+def read_site(folder: Path) -> tuple[str, dict[str, dict[str, Any]]]:
+    """(site, agents by certificate name). Raises InputError where ``folder`` holds no authority."""
+    file = folder / SITE_FILE
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+        agents = {certificate_name(a["role"], a["id"]): dict(a) for a in document["agents"]}
+        return valid_id(document["site"], "site"), agents
+    except OSError:
+        raise InputError("holds no authority", file=folder, remedy="make one with `syncline keys init`") from None
+    except (ValueError, KeyError, TypeError):
+        raise InputError("is not what `syncline keys` writes", file=file, remedy="restore it from a copy") from None
+
+
+def _write_site(folder: Path, site: str, agents: dict[str, dict[str, Any]]) -> None:
+    document = {"site": site, "agents": [agents[name] for name in sorted(agents)]}
+    write_atomically(folder / SITE_FILE, json.dumps(document, indent=1) + "\n")
+
+
+def _write_configurations(folder: Path, site: str, agents: dict[str, dict[str, Any]]) -> None:
+    """Every agent's [bus] table and every router's rules: each router must know of every agent."""
+    rules = access_rules(site, [(a["role"], a["id"]) for a in agents.values()])
+    listening = [end for a in agents.values() if a["role"] == "router" for end in _reached(a)]
+    for entry in agents.values():
+        own = folder / f"{entry['role']}-{entry['id']}"
+        if not own.is_dir():
+            continue  # moved to its machine and taken away here
+        files = {"ca": CA_FILE, "certificate": CERTIFICATE_FILE, "key": KEY_FILE}
+        if entry["role"] == "router":
+            bus = {"mode": "router", "listen": entry["listen"], "connect": entry["connect"], "access": ZENOH_FILE}
+            table = {"id": entry["id"], "site": site, "bus": {**bus, "tls": files}}
+            write_atomically(own / ROUTER_FILE, tomli_w.dumps(table))
+            write_atomically(own / ZENOH_FILE, _zenoh_file(entry, rules))
+        else:
+            table = {"id": entry["id"], "site": site}
+            connect = entry["connect"] or listening
+            bus = {"mode": "client", "connect": connect}
+            write_atomically(own / BUS_FILE, tomli_w.dumps({**table, "bus": {**bus, "tls": files}}))
+
+
+def _zenoh_file(entry: dict[str, Any], rules: dict[str, Any]) -> str:
+    """A whole configuration for zenohd, to be started in this folder.
+
+    `syncline router` takes the access rules of it and sets the rest itself.
+    """
+    tls = TlsConfig(ca=Path(CA_FILE), certificate=Path(CERTIFICATE_FILE), key=Path(KEY_FILE))
+    document = {
+        "mode": "router",
+        "listen": {"endpoints": entry["listen"]},
+        "connect": {"endpoints": entry["connect"]},
+        "scouting": {"multicast": {"enabled": False}},
+        "transport": {
+            "unicast": {"accept_pending": 2000, "accept_timeout": 2000},
+            "link": {"tls": tls_settings(tls), "rx": {"max_message_size": 4 * 1024 * 1024}, "tx": {"lease": 1900}},
+            "shared_memory": {"enabled": False},
+        },
+        "access_control": rules,
+    }
+    return json.dumps(document, indent=1) + "\n"
+
+
+def _reached(router: dict[str, Any]) -> list[str]:
+    """Endpoints by which agents reach a router that may listen on every interface."""
+    out = []
+    for endpoint in router["listen"]:
+        protocol, _, place = endpoint.partition("/")
+        host, _, port = place.rpartition(":")
+        named = [one for one in router["hosts"] if one not in ("localhost", "127.0.0.1", "::1")]
+        if host in ("0.0.0.0", "[::]"):
+            host = named[0] if named else "127.0.0.1"
+        out.append(f"{protocol}/{host}:{port}")
+    return out
+
+
+def _hosts_of(endpoints: Sequence[str]) -> set[str]:
+    hosts = {endpoint.partition("/")[2].rpartition(":")[0].strip("[]") for endpoint in endpoints}
+    return (hosts - {"0.0.0.0", "::"}) | {"localhost", "127.0.0.1"}
+
+
+def sign(folder: Path, own: Path, name: str, begin: datetime, end: datetime, hosts: Sequence[str]) -> None:
+    from cryptography import x509
+    from cryptography.hazmat.primitives import serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import ExtendedKeyUsageOID
+
+    try:
+        authority = x509.load_pem_x509_certificate((folder / CA_FILE).read_bytes())
+        signer = serialization.load_pem_private_key((folder / CA_KEY_FILE).read_bytes(), None)
+    except (OSError, ValueError) as error:
+        raise InputError(f"the authority cannot be read: {error}", file=folder, remedy="restore its files") from None
+    if not isinstance(signer, ec.EllipticCurvePrivateKey):
+        raise InputError("the authority's key is of another kind", file=folder / CA_KEY_FILE, remedy="restore it")
+    key = ec.generate_private_key(ec.SECP256R1())
+    names: list[x509.GeneralName] = [_general_name(host) for host in hosts]
+    usage = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
+    builder = (
+        _builder(_name(name), authority.subject, key.public_key(), begin, end)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(usage), critical=False)
+    )
+    # rustls wants a name in every certificate that it is shown.
+    builder = builder.add_extension(x509.SubjectAlternativeName(names or [x509.DNSName(name)]), critical=False)
+    _write_key(own / KEY_FILE, key)
+    write_atomically(own / CERTIFICATE_FILE, _pem(builder, signer))
+    write_atomically(own / CA_FILE, (folder / CA_FILE).read_text(encoding="ascii"))
+
+
+def _general_name(host: str) -> x509.GeneralName:
+    from cryptography import x509
+
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        try:
+            return x509.DNSName(host)
+        except ValueError:
+            raise InputError(f"{host!r} is no host", remedy="give a name or an address") from None
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, begin: datetime, end: datetime
+) -> x509.CertificateBuilder:
+    from cryptography import x509
+
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(begin)
+        .not_valid_after(end)
+    )
+
+
+def _name(text: str) -> x509.Name:
+    from cryptography import x509
+    from cryptography.x509.oid import NameOID
+
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
+
+
+def _pem(builder: x509.CertificateBuilder, signer: ec.EllipticCurvePrivateKey) -> str:
+    from cryptography.hazmat.primitives import hashes, serialization
+
+    return builder.sign(signer, hashes.SHA256()).public_bytes(serialization.Encoding.PEM).decode("ascii")
+
+
+def _write_key(file: Path, key: ec.EllipticCurvePrivateKey) -> None:
+    """Never readable by others, not even for a moment."""
+    from cryptography.hazmat.primitives import serialization
+
+    text = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    temporary = file.with_suffix(".tmp")
+    temporary.unlink(missing_ok=True)
+    with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as out:
+        out.write(text)
+        out.flush()
+        os.fsync(out.fileno())
+    temporary.replace(file)
+
+
+def _need_cryptography() -> None:
+    try:
+        import cryptography  # noqa: F401
+    except ImportError:
+        raise InputError("this needs the package cryptography", remedy='pip install "syncline[keys]"') from None

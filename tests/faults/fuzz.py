@@ -1,0 +1,230 @@
+"""Random damage for everything that decodes what others send; `make fuzz` does a million and more.
+
+    python -m tests.faults.fuzz [--count N] [--seed S]
+
+Inputs are valid messages with bytes changed, cut, doubled, joined, lengths and numbers made extreme. An input must be
+refused with a reason, or what comes out must be usable: every number finite. Anything else ends the run with the
+input in hexadecimal.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import random
+import struct
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from google.protobuf.message import Message
+
+from protocols.gate import Rejected, admit, sender
+from tests.samples import SAMPLES
+
+_EXTREME = (
+    struct.pack("<d", math.nan), struct.pack("<d", math.inf), struct.pack("<d", -1e308), b"\xff" * 10, b"\x0b" * 200,
+    b"\x0a\xff\xff\xff\xff\x0f", b"\x00" * 9, struct.pack("<f", math.nan), b"\x80" * 11, b"\xf8\x7f",
+)  # fmt: skip
+
+
+def damaged(rng: random.Random, payloads: list[bytes]) -> bytes:
+    """One input: a valid payload with one to eight kinds of damage."""
+    data = bytearray(rng.choice(payloads))
+    for _ in range(rng.choice((1, 1, 1, 2, 3, 8))):
+        at = rng.randrange(len(data) + 1)
+        kind = rng.randrange(7)
+        if kind == 0 and data:
+            data[at % len(data)] ^= 1 << rng.randrange(8)
+        elif kind == 1 and data:
+            data[at % len(data)] = rng.randrange(256)
+        elif kind == 2:
+            del data[at : at + rng.randint(1, 16)]
+        elif kind == 3:
+            data[at:at] = rng.randbytes(rng.randint(1, 16))
+        elif kind == 4:
+            data[at:at] = rng.choice(_EXTREME)
+        elif kind == 5 and len(data) >= 8:
+            where = rng.randrange(len(data) - 7)
+            data[where : where + 8] = rng.choice(_EXTREME)[:8].ljust(8, b"\x00")
+        else:
+            other = rng.choice(payloads)
+            data = data[:at] + bytearray(other[rng.randrange(len(other) + 1) :])
+    return bytes(data)
+
+
+_NUMBERS = (math.nan, math.inf, -math.inf, -1.0, 0.0, 1e308, -1e308, 5e-324, 1e6, -1e-9)
+_COUNTS = (0, 1, 2, 99, 2**31 - 1, 2**32 - 1)
+_TEXTS = ("", "cam0", "cam?", "**", "a" * 5000, "\x00", "\u202e", "-", "Cam0")
+
+
+def spoiled(rng: random.Random, message: Message) -> bytes:
+    """One input: a message that is well-formed to protobuf, with one to three fields that say something absurd."""
+    copy = type(message)()
+    copy.CopyFrom(message)
+    for _ in range(rng.randint(1, 3)):
+        one = copy
+        while True:
+            fields = [item for item in one.ListFields() if isinstance(item[0].name, str)]
+            if not fields:
+                break
+            field, value = rng.choice(fields)
+            inner = value if isinstance(value, Message) else None
+            listed = list(value) if hasattr(value, "append") else []
+            if listed and isinstance(listed[0], Message):
+                inner = rng.choice(listed)
+                if rng.random() < 0.2 and len(listed) < 10:
+                    value.extend(listed * rng.choice((1, 50, 500)))
+                    break
+            if inner is not None:
+                one = inner
+                continue
+            if listed or hasattr(value, "append"):
+                _spoil_list(rng, value)
+            elif not hasattr(value, "values"):
+                setattr(one, field.name, _absurd(rng, value))
+            break
+    return copy.SerializeToString()
+
+
+def _spoil_list(rng: random.Random, values: Any) -> None:
+    kind = rng.randrange(3)
+    if kind == 0 and len(values):
+        values[rng.randrange(len(values))] = _absurd(rng, values[0])
+    elif kind == 1 and len(values):
+        del values[rng.randrange(len(values)) :]
+    elif 0 < len(values) < 1000:
+        values.extend([values[0]] * rng.choice((1, 10, 3000)))
+
+
+def _absurd(rng: random.Random, value: Any) -> Any:
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, float):
+        return rng.choice(_NUMBERS)
+    if isinstance(value, int):
+        return rng.choice(_COUNTS)
+    return rng.randbytes(rng.randrange(64)) if isinstance(value, bytes) else rng.choice(_TEXTS)
+
+
+def all_finite(message: Message) -> bool:
+    """Whether every number in a message, however deep, is finite."""
+    for _, value in message.ListFields():
+        whole = isinstance(value, str | bytes | int | float | Message)
+        values = [value] if whole else value.values() if hasattr(value, "values") else value
+        for one in values:
+            if isinstance(one, Message):
+                if not all_finite(one):
+                    return False
+            elif isinstance(one, float) and not math.isfinite(one):
+                return False
+    return True
+
+
+def fuzz_gate(count: int, seed: int) -> dict[str, Counter[str]]:
+    """``count`` inputs for every topic's decoder; counts by topic and reason ("" = let in)."""
+    out: dict[str, Counter[str]] = {}
+    payloads = {topic.name: make().SerializeToString() for topic, make in SAMPLES.items()}
+    for topic, make in SAMPLES.items():
+        sample = make()
+        rng, counts = random.Random(f"{seed} {topic.name}"), Counter[str]()
+        name = sender(sample) or "cam0"
+        key = topic.key_for("local", name)
+        seeds = [payloads[topic.name]] * 7 + list(payloads.values())
+        for _ in range(count):
+            data = spoiled(rng, sample) if rng.random() < 0.5 else damaged(rng, seeds)
+            try:
+                _, message = admit(key, data)
+            except Rejected as error:
+                counts[error.reason.value] += 1
+            except Exception as error:
+                raise AssertionError(f"{topic.name}: {type(error).__name__} on {data.hex()}") from error
+            else:
+                assert all_finite(message), f"{topic.name}: not finite past the gate: {data.hex()}"
+                counts["let in"] += 1
+        out[topic.name] = counts
+    return out
+
+
+def fuzz_mavlink(count: int, seed: int) -> Counter[str]:
+    """``count`` inputs for the MAVLink link: random damage to real frames; only finite messages come through."""
+    from tests.faults.mavlink_frames import frames, heard_of
+
+    rng, counts = random.Random(f"{seed} mavlink"), Counter[str]()
+    valid = frames()
+    hear = heard_of()
+    for _ in range(count):
+        data = damaged(rng, valid)
+        try:
+            heard = hear(data)
+        except Exception as error:
+            raise AssertionError(f"mavlink: {type(error).__name__} on {data.hex()}") from error
+        for one in heard:
+            values = [v for v in one.message.to_dict().values() if isinstance(v, float)]
+            assert all(map(math.isfinite, values)), f"mavlink: not finite: {data.hex()}"
+        counts["let in" if heard else "refused"] += 1
+    return counts
+
+
+def fuzz_config(count: int, seed: int) -> Counter[str]:
+    """``count`` inputs for the configuration reader: InputError, or a configuration."""
+    import tempfile
+    from pathlib import Path
+
+    from deploy.config import CameraConfig, load
+    from protocols.errors import InputError
+
+    rng, counts = random.Random(f"{seed} config"), Counter[str]()
+    valid = [
+        b'id = "cam0"\nsite = "yard"\n[bus]\nmode = "client"\nconnect = ["tcp/127.0.0.1:7447"]\noutage_s = 60.0\n',
+        b'id = "cam1"\ndriver = "simulated"\n[simulated]\nscene = "marker"\nseed = 3\ncameras = 4\n',
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "camera.toml"
+        for _ in range(count):
+            file.write_bytes(damaged(rng, valid))
+            try:
+                load(file, CameraConfig)
+                counts["let in"] += 1
+            except InputError as error:
+                _one_line(str(error))
+                counts["refused"] += 1
+            except Exception as error:
+                raise AssertionError(f"config: {type(error).__name__} on {file.read_bytes().hex()}") from error
+    return counts
+
+
+def _one_line(text: str) -> None:
+    if "\n" in text:
+        raise AssertionError(f"more than one line: {text!r}")
+
+
+def main() -> None:
+    """Run all and print the counts."""
+    parser = argparse.ArgumentParser(description="Random damage for every decoder.")
+    parser.add_argument("--count", type=int, default=60_000, help="inputs for each topic's decoder")
+    parser.add_argument("--seed", type=int, default=int(time.time()))
+    words = parser.parse_args()
+    began, total = time.process_time(), 0
+    print(f"seed {words.seed}")
+
+    def tell(name: str, counts: Counter[str]) -> None:
+        nonlocal total
+        total += sum(counts.values())
+        reasons = ", ".join(f"{number} {reason}" for reason, number in counts.most_common())
+        print(f"{name}: {sum(counts.values())} inputs: {reasons}", flush=True)
+
+    for name, counts in fuzz_gate(words.count, words.seed).items():
+        tell(name, counts)
+    others: tuple[tuple[str, Callable[[int, int], Counter[str]], int], ...] = (
+        ("mavlink", fuzz_mavlink, words.count),
+        ("config", fuzz_config, max(1, words.count // 10)),
+    )
+    for name, run, count in others:
+        tell(name, run(count, words.seed))
+    print(f"{total} inputs, 0 crashes, 0 non-finite values past the gate, {time.process_time() - began:.0f} s of CPU")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,99 @@
+"""A camera's clock that steps or changes its rate while the hub listens: told, kept apart, the offset found again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge import scenes
+from edge.scenes.session import simulated_session
+from hub.live import LiveHub, LiveSettings
+from protocols.messages import syncline_pb2 as pb
+from tests.faults.matrix import measured
+
+STEP_AT_S = 20.0
+
+
+def stream(seconds: float, change: str, size: float) -> list[tuple[float, pb.Observation | pb.CameraInfo]]:
+    """(true time, message) of three cameras; the clock of cam1 changes after STEP_AT_S."""
+    scene = scenes.get("marker", 3, 3)
+    filmed = simulated_session(scene, seconds, 3, pixel_noise=0.3, outlier_fraction=0.0, drop_fraction=0.0)
+    out: list[tuple[float, pb.Observation | pb.CameraInfo]] = []
+    rng = np.random.default_rng(1)
+    for camera in filmed.cameras:
+        lens = camera.intrinsics
+        info = pb.CameraInfo(
+            schema_version=1, camera=camera.name, boot_id=f"boot-{camera.name}", width=lens.width, height=lens.height,
+            fps=camera.fps, matrix=lens.matrix.ravel(), distortions=lens.distortions,
+        )  # fmt: skip
+        out.append((0.0, info))
+        track = filmed.tracks[camera.name]
+        start = min(t.time[0] / 1.0 for t in [track])
+        for index in range(len(track)):
+            time = float(track.time[index])
+            true = (time - start) / camera.clock.rate
+            after = max(0.0, true - STEP_AT_S) if camera.name == "cam1" else 0.0
+            if after > 0.0:
+                time += size if change == "step" else size * after
+            message = pb.Observation(
+                schema_version=1, camera=camera.name, boot_id=f"boot-{camera.name}", sequence=index,
+                frame=int(track.frame[index]), device_time_ns=round(time * 1e9),
+                detections=[pb.Detection(u=track.pixels[index, 0], v=track.pixels[index, 1], size=track.size[index])],
+            )  # fmt: skip
+            out.append((true + 0.002 + rng.exponential(3e-4), message))
+    return sorted(out, key=lambda item: item[0])
+
+
+@pytest.mark.parametrize("size", [10.0, -10.0])
+def test_a_step_is_told_at_once_and_the_offset_follows(size: float) -> None:
+    hub = LiveHub(LiveSettings(interval_s=4.0, window_s=30.0))
+    flagged = right = None
+    before: float | None = None
+    for true, message in stream(STEP_AT_S + 6.0, "step", size):
+        hub.handle(message, 1000.0 + true)
+        if flagged is None and hub.counters["clock_steps"]:
+            flagged = true - STEP_AT_S
+        for told in hub.tick(true):
+            if isinstance(told, pb.Calibration) and told.status == "solved":
+                found = {camera.camera: camera for camera in told.cameras}.get("cam1")
+                if found is None:
+                    continue
+                if found.boot_id == "boot-cam1":
+                    before = found.time_offset
+                elif right is None and before is not None:
+                    right = true - STEP_AT_S
+                    error = found.time_offset - (before - found.clock_rate * size)
+    assert flagged is not None
+    assert right is not None
+    assert hub.counters["clock_steps"] == 1
+    measured(
+        f"clock step of {size:+.0f} s",
+        "told, both sides apart, offset again ≤ 5 s",
+        f"told after {flagged:.2f} s, offset after {right:.2f} s to {abs(error) * 1e3:.2f} ms",
+        right <= 5.0,
+    )
+    assert abs(error) < 0.01
+    assert right <= 5.0
+
+
+def test_a_change_of_rate_by_200_ppm_is_told() -> None:
+    """The hub's own clock is the only one that can tell; delays scatter by 0.3 ms here."""
+    hub = LiveHub(LiveSettings(interval_s=1e9))
+    flagged = None
+    for true, message in stream(STEP_AT_S + 20.0, "drift", 2e-4):
+        hub.handle(message, 1000.0 + true)
+        if flagged is None and hub.counters["clock_drifts"]:
+            flagged = true - STEP_AT_S
+    assert flagged is not None
+    assert hub.counters["clock_drifts"] == 1
+    assert hub.counters["clock_steps"] == 0
+    told = hub.clocks.alarms["cam1"]
+    measured("clock drift of 200 ppm", "told, both sides apart", f"told after {flagged:.1f} s: {told}")
+    assert 100 < float(told.split()[-2]) < 300
+
+
+def test_steady_clocks_are_left_alone() -> None:
+    hub = LiveHub(LiveSettings(interval_s=1e9))
+    for true, message in stream(40.0, "step", 0.0):
+        hub.handle(message, 1000.0 + true)
+    assert hub.counters["clock_steps"] == hub.counters["clock_drifts"] == 0

@@ -1,0 +1,115 @@
+"""Links that are cut, lossy, slow, reordering, duplicating: no observation is lost, or their number is told."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from tests.faults.matrix import measured
+from tests.faults.processes import Link, Process, bad_link, publisher, receiver, router, rows
+
+ENDPOINT = "tcp/10.99.0.2:7447"
+Ends = tuple[Process, Process, Link]
+
+
+@pytest.fixture
+def ends(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Ends]:
+    """A camera at 30 Hz on one side, router and receiver on the other."""
+    with ExitStack() as stack:
+        near, far, link = stack.enter_context(bad_link(tmp_path))
+        stack.enter_context(router(tmp_path, ENDPOINT, far))
+        receiving = stack.enter_context(receiver(ENDPOINT, namespace=far))
+        receiving.ready()
+        sending = stack.enter_context(publisher(ENDPOINT, outage_s=getattr(request, "param", 60.0), namespace=near))
+        assert sending.ready()["ready"]
+        yield sending, receiving, link
+
+
+def settled(receiving: Process, patience_s: float = 20.0) -> dict:
+    """What was received, once nothing more comes."""
+    last, since = -1, time.monotonic()
+    while True:
+        answer = receiving.ask()
+        count = sum(map(len, answer["sequences"].values()))
+        if count != last:
+            last, since = count, time.monotonic()
+        if time.monotonic() - since > 3.0 or time.monotonic() - since > patience_s:
+            return answer
+        time.sleep(0.2)
+
+
+def test_a_partition_of_a_minute_loses_nothing(ends: Ends) -> None:
+    sending, receiving, link = ends
+    time.sleep(2.0)
+    link.set(partition=1)
+    time.sleep(60.0)
+    link.set()
+    healed = time.monotonic()
+    time.sleep(6.0)
+    put = sending.ask("stop")["put"]
+    answer = settled(receiving)
+    (sequences,), (arrivals,) = answer["sequences"].values(), answer["arrivals"].values()
+    flowing = min(arrival for arrival in arrivals if arrival > healed) - healed
+    lost = put - len(set(sequences))
+    measured(
+        "partition of 60 s at 30 Hz",
+        "0 lost, in order, flowing ≤ 3 s after healing",
+        f"{lost} of {put} lost, {'in order' if sequences == sorted(sequences) else 'OUT OF ORDER'}, "
+        f"flowing {flowing:.2f} s after healing",
+        flowing <= 3.0,
+    )
+    assert sequences == list(range(put))
+    assert answer["counters"]["lost"] == 0
+
+
+@pytest.mark.parametrize("ends", [4.0], indirect=True)
+def test_beyond_the_cache_the_exact_number_is_told(ends: Ends) -> None:
+    """Cache for 4 s and half as much again, a cut of 15 s."""
+    sending, receiving, link = ends
+    time.sleep(2.0)
+    link.set(partition=1)
+    time.sleep(15.0)
+    link.set()
+    time.sleep(6.0)
+    put = sending.ask("stop")["put"]
+    answer = settled(receiving)
+    (sequences,) = answer["sequences"].values()
+    missing, told = put - len(sequences), answer["counters"]["lost"]
+    measured("cut of 15 s, cache for 4 s", "the exact number of lost ones", f"{missing} missing, {told} told")
+    assert missing > 0
+    assert told == missing
+    assert sequences == sorted(set(sequences))
+
+
+@pytest.mark.parametrize(
+    ("name", "rules"),
+    [
+        ("30 % loss + 300 ms", {"loss": 0.3, "delay_s": 0.15}),
+        ("reordering and duplicates", {"jitter_s": 0.05, "duplicate": 0.3}),
+    ],
+)
+def test_a_bad_link_loses_nothing(ends: Ends, name: str, rules: dict[str, float]) -> None:
+    """300 ms there and back."""
+    sending, receiving, link = ends
+    time.sleep(1.0)
+    link.set(**rules)
+    time.sleep(15.0)
+    link.set()
+    healed = time.monotonic()
+    time.sleep(4.0)
+    put = sending.ask("stop")["put"]
+    answer = settled(receiving)
+    (sequences,), (arrivals,) = answer["sequences"].values(), answer["arrivals"].values()
+    flowing = min(arrival for arrival in arrivals if arrival > healed) - healed
+    p99 = rows(answer["latencies"], 0.99)
+    measured(
+        f"{name}, 15 s",
+        "0 lost, in order",
+        f"{put - len(set(sequences))} of {put} lost, in order, p99 {p99:.2f} s, flowing {flowing:.2f} s after",
+        flowing <= 3.0,
+    )
+    assert sequences == list(range(put))

@@ -1,0 +1,85 @@
+"""A million bytes of noise, and silences, on the UAV agent's link."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+
+from edge.mavlink.dialect import mavlink
+from edge.uav.world.patrol import patrol
+from protocols.messages import syncline_pb2 as pb
+from tests.uav_flights import Flight
+
+SIZE = (320, 240)
+
+
+def flown(noise: bool) -> Flight:
+    """Three seconds with a target; with noise, 10^6 random bytes come over the same wire meanwhile."""
+    flight = Flight(patrol(3, 10.0, SIZE), jpeg_quality=90)
+    flight.run(1.5)
+    assert flight.select()
+    rng = random.Random(1)
+    wire = flight.agent_pipe.other
+    assert wire is not None
+    while flight.time < 3.0:
+        if noise:
+            wire.send(rng.randbytes(7000), None)
+        flight.run(flight.time + 0.01)
+    return flight
+
+
+def test_a_million_garbled_bytes_change_nothing() -> None:
+    quiet, noisy = flown(False), flown(True)
+    assert noisy.link.counters["garbled_bytes"] > 900_000
+    assert noisy.link.vehicle == quiet.link.vehicle
+    assert noisy.agent.counters == quiet.agent.counters
+    kinds = (pb.TargetState, pb.VehicleTelemetry, pb.TargetCommand)
+    said = [
+        [m.SerializeToString(deterministic=True) for m in flight.published if isinstance(m, kinds)]
+        for flight in (quiet, noisy)
+    ]
+    assert said[0] == said[1]
+
+
+def test_a_silent_vehicle_and_a_dark_camera_are_told_and_got_over() -> None:
+    flight = Flight(patrol(3, 20.0, SIZE))
+    flight.run(1.5)
+    assert flight.select()
+    flight.run(2.0)
+    step, flight.autopilot.step = flight.autopilot.step, lambda time: None  # type: ignore[method-assign]
+    flight.run(5.0)
+    status = flight.agent.status(0)
+    assert status.state == "degraded"
+    assert "silent" in status.message
+    flight.autopilot.step = step  # type: ignore[method-assign]
+    flight.frames_lost = lambda frame: 5.1 < frame / 30.0 < 5.4
+    flight.run(5.95)
+    assert flight.agent.status(1).state == "running"
+    last = flight.said(pb.TargetState)[-1]
+    truth = flight.world.truth(last.frame)
+    assert last.centre
+    assert np.hypot(last.centre[0] - truth.x, last.centre[1] - truth.y) < 20.0
+
+
+def test_an_attitude_of_nan_is_refused_and_the_flight_goes_on() -> None:
+    flight = Flight(patrol(3, 10.0, SIZE))
+    flight.run(1.5)
+    assert flight.select()
+    codec = mavlink.MAVLink(None, 1, 1)
+    wire = flight.agent_pipe.other
+    assert wire is not None
+    nan = float("nan")
+    for _ in range(50):
+        boot = (flight.autopilot.boot_ns(flight.time) // 1_000_000) & 0xFFFFFFFF
+        for bad in (
+            mavlink.MAVLink_attitude_quaternion_message(boot, nan, 0, 0, 0, 0, 0, 0),
+            mavlink.MAVLink_attitude_quaternion_message(boot, 0, 0, 0, 0, 0, 0, 0),
+            mavlink.MAVLink_local_position_ned_message(boot, nan, 0, 0, 0, 0, 0),
+        ):
+            wire.send(bytes(bad.pack(codec)), None)
+        flight.run(flight.time + 0.02)
+    assert flight.link.counters["refused.not_finite"] == 100
+    last = flight.said(pb.TargetState)[-1]
+    truth = flight.world.truth(last.frame)
+    assert np.hypot(last.centre[0] - truth.x, last.centre[1] - truth.y) < 10.0

@@ -1,0 +1,108 @@
+"""Steps and drifts of a camera's clock, told from dropped frames, stalls, restarts and duplicates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from hub.timing.clock_watch import ClockEvent, ClockWatch
+
+PERIOD_NS = 33_333_333
+
+
+class Camera:
+    """Feeds one camera's stamps; time goes on by itself."""
+
+    def __init__(self, epoch_ns: int = 1_700_000_000_000_000_000) -> None:
+        self.watch, self.now_ns, self.number = ClockWatch(), epoch_ns, 0
+        self.arrival, self.events = 100.0, list[ClockEvent]()
+
+    def frames(self, count: int, *, skip: int = 0, wait_ns: int = 0, step_ns: int = 0) -> None:
+        self.now_ns += wait_ns + step_ns
+        self.arrival += wait_ns * 1e-9
+        for _ in range(count):
+            self.now_ns += PERIOD_NS * (1 + skip)
+            self.arrival += PERIOD_NS * (1 + skip) * 1e-9
+            self.number += 1 + skip
+            self.feed()
+
+    def feed(self) -> None:
+        sequence = self.number
+        _, event = self.watch.handle("cam0", "boot-1", sequence, self.number, self.now_ns, self.arrival)
+        if event is not None:
+            self.events.append(event)
+
+
+@pytest.mark.parametrize("step_s", [10.0, -10.0, 0.5, -0.5])
+def test_a_step_is_measured_to_a_millisecond_also_on_clocks_of_unix_time(step_s: float) -> None:
+    camera = Camera()
+    camera.frames(100)
+    camera.frames(100, step_ns=round(step_s * 1e9))
+    (event,) = camera.events
+    assert event.kind == "step"
+    assert abs(event.step_s - step_s) < 1e-3
+    assert camera.watch.since("cam0", "boot-1") == [event]
+    assert (event.before, event.boot) == ("boot-1", "boot-1-e1")
+
+
+def test_dropped_frames_and_a_stall_are_no_steps() -> None:
+    camera = Camera()
+    camera.frames(100)
+    camera.frames(5, skip=60)
+    camera.frames(100, wait_ns=5_000_000_000)
+    assert camera.events == []
+
+
+def test_steps_follow_one_another() -> None:
+    camera = Camera()
+    camera.frames(60)
+    camera.frames(60, step_ns=10_000_000_000)
+    camera.frames(60, step_ns=-4_000_000_000)
+    steps = [event.step_s for event in camera.watch.since("cam0", "boot-1")]
+    assert steps == pytest.approx([10.0, -4.0], abs=1e-3)
+    assert [event.step_s for event in camera.watch.since("cam0", "boot-1-e1")] == pytest.approx([-4.0], abs=1e-3)
+
+
+def test_duplicates_belong_to_the_epoch_they_came_from() -> None:
+    camera = Camera()
+    camera.frames(60)
+    old = camera.now_ns
+    camera.frames(10, step_ns=10_000_000_000)
+    name, event = camera.watch.handle("cam0", "boot-1", 30, 30, old - 30 * PERIOD_NS, None)
+    assert (name, event) == ("boot-1", None)
+    name, _ = camera.watch.handle("cam0", "boot-1", 65, 65, camera.now_ns, None)
+    assert name == "boot-1-e1"
+
+
+def _drifting(seconds: float, late: Callable[[float], float], ppm: float = 0.0, at_s: float = 30.0) -> list[ClockEvent]:
+    """Events of a camera whose frames arrive ``late(true time)`` after they were taken."""
+    watch, events = ClockWatch(), list[ClockEvent]()
+    for number in range(round(seconds * 30)):
+        true = number / 30.0
+        shown = true + 1e-6 * ppm * max(0.0, true - at_s)
+        _, event = watch.handle("cam0", "boot-1", number, number, round(shown * 1e9), 100.0 + true + late(true))
+        events += [] if event is None else [event]
+    return events
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("ppm", [200.0, -200.0])
+def test_a_clock_that_begins_to_drift_is_told_within_seconds(ppm: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    events = _drifting(45.0, lambda true: 0.002 + float(rng.exponential(0.001)), ppm)
+    assert [event.kind for event in events] == ["drift"]
+    assert events[0].rate == pytest.approx(1e-6 * ppm, abs=1.2e-4)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_frames_that_are_held_up_more_and_more_are_no_drift(seed: int) -> None:
+    rng = np.random.default_rng([seed, 1])
+    wander = np.cumsum(rng.normal(0.0, 0.01, 200))  # a busy machine: 10 ms more or less each second
+    swamped = 0.06 * rng.random()
+
+    def late(true: float) -> float:
+        return 1.0 + float(np.interp(true, np.arange(200), wander)) + swamped * max(0.0, true - 60.0)
+
+    assert _drifting(120.0, late) == []

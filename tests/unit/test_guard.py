@@ -1,0 +1,60 @@
+"""Who is believed, without a bus: ids that are there twice, runs that speak from elsewhere."""
+
+from __future__ import annotations
+
+from protocols.bus.base import AgentEvent, Received
+from protocols.bus.guard import SILENT_S, Guard
+from protocols.catalogue import OBSERVATION
+from protocols.gate import Reason
+from tests.samples import observation
+
+
+def message(boot: str, source: str = "a") -> Received:
+    return Received(OBSERVATION, "cam0", observation("cam0", 0, boot), 0, source)
+
+
+def alive(boot: str, yes: bool = True) -> AgentEvent:
+    return AgentEvent("camera", "cam0", boot, yes)
+
+
+def reason(guard: Guard, received: Received, now: float = 0.0) -> Reason | None:
+    why = guard.refuse(received, now)
+    return None if why is None else why[0]
+
+
+def test_without_an_announcement_everyone_is_believed() -> None:
+    assert reason(Guard(), message("boot-1")) is None
+
+
+def test_the_first_of_two_is_heard_until_it_is_gone() -> None:
+    guard = Guard()
+    guard.handle(alive("boot-1"))
+    guard.handle(alive("boot-2"))
+    assert reason(guard, message("boot-1")) is None
+    assert reason(guard, message("boot-2", "b")) is Reason.SECOND_AGENT
+    assert len(guard.alarms()) == 1
+    guard.handle(alive("boot-1", False))
+    assert reason(guard, message("boot-2", "b")) is None
+    assert reason(guard, message("boot-1")) is None, "what it said before may still come, recovered"
+    assert guard.alarms() == []
+
+
+def test_a_run_that_nobody_announced_is_refused_while_its_agent_lives() -> None:
+    guard = Guard()
+    guard.handle(alive("boot-1"))
+    assert reason(guard, message("boot-9", "b")) is Reason.WRONG_SOURCE
+
+
+def test_a_run_speaks_through_one_connection_until_that_is_silent() -> None:
+    guard = Guard()
+    assert reason(guard, message("boot-1", "a"), 0.0) is None
+    assert reason(guard, message("boot-1", "b"), 1.0) is Reason.WRONG_SOURCE
+    assert reason(guard, message("boot-1", "a"), 2.0) is None
+    assert reason(guard, message("boot-1", "b"), 2.0 + SILENT_S) is None
+
+
+def test_a_flood_of_invented_runs_does_not_fill_the_memory() -> None:
+    guard = Guard()
+    for number in range(10_000):
+        reason(guard, message(f"boot-{number}"), 0.0)
+    assert len(guard._sources) <= 4096
