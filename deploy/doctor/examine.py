@@ -1,0 +1,89 @@
+"""Which checks make sense for a machine or an agent, in the order in which one thing needs the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from deploy.doctor import agent as agents
+from deploy.doctor import machine
+from deploy.doctor.finding import Finding, missing, wrong
+from deploy.install import units
+from deploy.rig_folder import role_of
+from protocols.errors import InputError
+
+
+def examine(file: Path | None, role: str | None = None) -> Iterator[Finding]:
+    """All findings, each as soon as it is known. file: an agent's configuration; None = the machine alone."""
+    yield machine.python()
+    yield machine.cpu()
+    if file is None:
+        yield machine.packages(())
+        yield machine.disk(Path.cwd())
+        yield machine.clock(certificates=False)
+        yield machine.crash("syncline-*")
+        return
+    kind = role or told_role(file)
+    found, config = agents.configuration(file, kind)
+    yield found
+    if config is None:
+        return
+    driver = getattr(config, "driver", "")
+    yield machine.packages((kind, "oak") if driver == "oak" else (kind,))
+    yield machine.disk(getattr(config, "out", None) or Path.cwd(), getattr(config, "min_free_mb", 0.0))
+    yield machine.clock(certificates=config.bus.tls is not None)
+    yield from _sight(config, driver)
+    yield agents.certificates(config.bus, kind, config.id)
+    yield agents.bus_path(config.bus, config.site, kind, config.id)
+    yield agents.rights(config.bus, config.site, kind, config.id)
+    if kind == "uav":
+        yield _vehicle(config)
+    yield machine.crash(f"syncline-{kind}-{config.id}.service")
+
+
+def told_role(file: Path) -> str:
+    """The role by the file's name, or by its folder's as `syncline install` makes it."""
+    folder = file.absolute().parent.name.partition("-")[0]
+    return folder if file.name == "config.toml" and folder in units.ROLES else role_of(file)
+
+
+def _sight(config: Any, driver: str) -> Iterator[Finding]:
+    if not driver:
+        return
+    if driver == "oak" and not (config.oak and config.oak.device):
+        yield machine.oak_usb()
+    source = str(config.video.source) if driver == "video" and config.video else ""
+    if source.startswith("/dev/") or source.isdecimal():
+        yield machine.usb(source)
+    from deploy.agents import make_device
+    from deploy.config import CameraConfig
+
+    if not isinstance(config, CameraConfig):
+        if driver == "simulated":
+            return  # a whole flight, not only its camera
+        config = CameraConfig(id=config.id, driver=config.driver, video=config.video, oak=config.oak)
+    try:
+        device = make_device(config, None)
+    except InputError as error:
+        yield missing("camera", error.what, error.remedy or "correct the configuration")
+        return
+    except ImportError as error:
+        yield wrong("camera", str(error), 'pip install "syncline[oak]"')
+        return
+    yield agents.camera(device)
+
+
+def _vehicle(config: Any) -> Finding:
+    try:
+        from edge.mavlink.dialect import CAMERA
+        from edge.mavlink.link import Link
+        from edge.mavlink.transport import parse
+    except ImportError:
+        return wrong("mavlink", "pymavlink is missing", 'pip install "syncline[uav]"')
+    # Unsigned: only whether somebody is there is asked, and nothing is told to it.
+    link = Link(parse(config.mavlink.url), system=255, component=CAMERA, allowed=("HEARTBEAT",))
+    try:
+        return agents.mavlink(link)
+    finally:
+        link.close()

@@ -1,0 +1,139 @@
+"""`syncline doctor` on the bus: real routers on loopback, plain and with certificates, right and wrong."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from pathlib import Path
+
+import pytest
+
+from deploy.doctor import agent
+from protocols.bus import probe
+from protocols.bus.router import Router, free_endpoint
+from protocols.bus.settings import BusConfig, TlsConfig
+from protocols.bus.zenoh_bus import open_bus
+from protocols.catalogue import OBSERVATION, STATUS
+from protocols.messages import syncline_pb2 as pb
+
+pytest.importorskip("cryptography", reason="the extra `keys` is not installed: access rules are not tested")
+from deploy.keys import issue, make_site
+
+SITE = "test"
+
+
+def test_the_path_through_a_router() -> None:
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint):
+        found = agent.bus_path(config, SITE, "camera", "cam0")
+        assert found.verdict == "ok", found
+        assert "1 MB in" in found.text
+
+
+def test_no_router() -> None:
+    found = agent.bus_path(BusConfig(mode="client", connect=(free_endpoint(),)), SITE, "camera", "cam0")
+    assert (found.verdict, found.exit_status) == ("fail", 3)
+    assert "start one there" in found.remedy
+
+
+@pytest.mark.parametrize(
+    ("passes", "verdict", "remedy"),
+    [
+        ({1024: None}, "fail", "restart the router"),
+        ({1024: 0.001, 1_000_000: None}, "fail", "MTU"),
+        ({1024: 0.4, 1_000_000: 1.0}, "warn", "a cable"),
+    ],
+)
+def test_a_path_that_does_not_carry(
+    passes: dict[int, float | None], verdict: str, remedy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def trip(config: BusConfig, prefix: str, size: int = 0, timeout_s: float = 3.0) -> float | None:
+        return passes[size]
+
+    monkeypatch.setattr(probe, "round_trip", trip)
+    found = agent.bus_path(BusConfig(mode="client"), SITE, "hub", "hub")
+    assert (found.verdict, remedy in found.remedy) == (verdict, True)
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> tuple[Path, str]:
+    """Certificates of a router, a camera and a hub; the router's endpoint."""
+    folder = tmp_path / "keys"
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    make_site(folder, SITE)
+    issue(folder, "router", "main", listen=[endpoint])
+    issue(folder, "camera", "cam0", connect=[endpoint])
+    issue(folder, "hub", "hub", connect=[endpoint])
+    return folder, endpoint
+
+
+def of(folder: Path, name: str) -> TlsConfig:
+    own = folder / name
+    return TlsConfig(ca=own / "ca.pem", certificate=own / "certificate.pem", key=own / "key.pem")
+
+
+def secured(folder: Path, endpoint: str, *, rules: bool) -> Router:
+    access = folder / "router-main" / "zenoh.json5" if rules else None
+    return Router(config=BusConfig(mode="router", listen=(endpoint,), tls=of(folder, "router-main"), access=access))
+
+
+def test_certificates_and_access_rules_that_hold(keys: tuple[Path, str]) -> None:
+    folder, endpoint = keys
+    camera = BusConfig(mode="client", connect=(endpoint,), tls=of(folder, "camera-cam0"))
+    hub = BusConfig(mode="client", connect=(endpoint,), tls=of(folder, "hub-hub"))
+    assert agent.certificates(camera, "camera", "cam0").verdict == "ok"
+    with secured(folder, endpoint, rules=True):
+        nobody = agent.bus_path(camera, SITE, "camera", "cam0")
+        assert (nobody.verdict, "start a hub or recorder" in nobody.remedy) == ("fail", True)
+        found = agent.bus_path(hub, SITE, "hub", "hub")
+        assert found.verdict == "ok", found
+        assert agent.rights(hub, SITE, "hub", "hub").verdict == "ok"
+        with open_bus(SITE, hub, timeout_s=5.0) as bus:
+            bus.subscribe(OBSERVATION)
+            publisher = bus.publisher(STATUS, "hub")
+            publisher.put(pb.AgentStatus(schema_version=1, agent="hub", role="hub", boot_id="b", state="running"))
+            assert agent.bus_path(camera, SITE, "camera", "cam0").verdict == "ok"
+            assert agent.rights(camera, SITE, "camera", "cam0", seconds=0.7).verdict == "ok"
+
+
+def test_a_router_without_rules_is_found_out(keys: tuple[Path, str]) -> None:
+    folder, endpoint = keys
+    camera = BusConfig(mode="client", connect=(endpoint,), tls=of(folder, "camera-cam0"))
+    hub = BusConfig(mode="client", connect=(endpoint,), tls=of(folder, "hub-hub"))
+    with secured(folder, endpoint, rules=False), open_bus(SITE, hub, timeout_s=5.0) as bus:
+        publisher = bus.publisher(STATUS, "hub")
+        publisher.put(pb.AgentStatus(schema_version=1, agent="hub", role="hub", boot_id="b", state="running"))
+        speaks = agent.rights(hub, SITE, "hub", "hub")
+        assert (speaks.verdict, "speak for others" in speaks.text) == ("fail", True)
+        assert "zenoh.json5" in speaks.remedy
+
+        enough = threading.Event()
+
+        def talk() -> None:
+            while not enough.wait(0.1):
+                publisher.put(pb.AgentStatus(schema_version=1, agent="hub", role="hub", boot_id="b", state="running"))
+
+        thread = threading.Thread(target=talk)
+        thread.start()
+        try:
+            hears = agent.rights(camera, SITE, "camera", "cam0", seconds=3.0)
+        finally:
+            enough.set()
+            thread.join()
+        assert (hears.verdict, "hears what it may not" in hears.text) == ("fail", True)
+
+
+def test_anothers_an_expiring_and_an_open_certificate(keys: tuple[Path, str]) -> None:
+    folder, endpoint = keys
+    config = BusConfig(mode="client", connect=(endpoint,), tls=of(folder, "camera-cam0"))
+    anothers = agent.certificates(config, "camera", "cam1")
+    assert (anothers.verdict, anothers.exit_status) == ("fail", 2)
+    assert "--id cam1" in anothers.remedy
+    issue(folder, "camera", "cam0", days=2.0)
+    assert "renew with `syncline keys issue`" in agent.certificates(config, "camera", "cam0").remedy
+    (folder / "camera-cam0/key.pem").chmod(0o644)
+    assert "chmod 600" in agent.certificates(config, "camera", "cam0").remedy
+    shutil.rmtree(folder / "camera-cam0")
+    gone = agent.certificates(config, "camera", "cam0")
+    assert (gone.verdict, "syncline keys issue" in gone.remedy) == ("fail", True)

@@ -1,0 +1,115 @@
+"""What systemd is told: over a real datagram socket, at the right moments, and nothing without its environment."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deploy.notify import ALIVE_FILE, Notifier, Watched
+from edge.devices.base import DeviceInfo, Frame
+
+
+class Manager:
+    """systemd's end of the line."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind("\0" + address[1:] if address.startswith("@") else address)
+        self._socket.setblocking(False)
+
+    def heard(self) -> list[str]:
+        out = []
+        while True:
+            try:
+                out.append(self._socket.recv(4096).decode())
+            except BlockingIOError:
+                return out
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.fixture(params=["file", "abstract"])
+def manager(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Manager]:
+    made = Manager(str(tmp_path / "notify") if request.param == "file" else f"@syncline-test-{os.getpid()}")
+    yield made
+    made.close()
+
+
+def test_ready_comes_with_the_first_data_and_watchdog_as_often_as_asked(manager: Manager) -> None:
+    now = 100.0
+    notifier = Notifier(manager.address, watchdog_s=2.0, now=lambda: now)
+    assert manager.heard() == [], "ready before any data flowed"
+    notifier.beat()
+    assert manager.heard() == ["READY=1\nSTATUS=running\nWATCHDOG=1"]
+    for _ in range(100):  # 2 s of frames at 50 Hz
+        now += 0.02
+        notifier.beat()
+    heard = manager.heard()
+    assert set(heard) == {"WATCHDOG=1"}
+    assert 3 <= len(heard) <= 5, "each quarter of the watchdog's time, not each frame"
+    now += 60.0
+    assert manager.heard() == [], "it speaks without data: the watchdog would never bite"
+
+
+def test_waiting_for_a_router_lengthens_the_start_and_stops_once_ready(manager: Manager) -> None:
+    now = 0.0
+    notifier = Notifier(manager.address, now=lambda: now)
+    for _ in range(20):
+        notifier.waiting("a router\nREADY=1")
+        now += 0.5
+    heard = manager.heard()
+    assert len(heard) == 2
+    assert all("EXTEND_TIMEOUT_USEC=" in text and "\nREADY=1" not in text for text in heard)
+    notifier.beat()
+    manager.heard()
+    now += 60.0
+    notifier.waiting("a router")
+    assert manager.heard() == []
+
+
+def test_the_environment_of_systemd_is_understood(manager: Manager) -> None:
+    mine = {"NOTIFY_SOCKET": manager.address, "WATCHDOG_USEC": "4000000", "WATCHDOG_PID": str(os.getpid())}
+    Notifier.from_environment(mine).beat()
+    assert len(manager.heard()) == 1
+    Notifier.from_environment({}).beat()
+    Notifier.from_environment({"NOTIFY_SOCKET": "/no/such/socket"}).beat()  # a manager that is gone ends nothing
+    assert manager.heard() == []
+
+
+def test_a_container_sees_the_time_of_a_file_instead(tmp_path: Path) -> None:
+    file = tmp_path / "alive"
+    notifier = Notifier.from_environment({ALIVE_FILE: str(file)})
+    assert not file.exists()
+    notifier.beat()
+    assert file.exists()
+
+
+def test_a_device_beats_with_its_frames_and_with_nothing_else() -> None:
+    class Device:
+        def __init__(self) -> None:
+            self.frames = [Frame(np.zeros((2, 2, 3), np.uint8), 0, 0), None, None]
+            self.info = DeviceInfo(2, 2, 1.0, "test", "monotonic")
+            self.ended = False
+
+        def open(self) -> None: ...
+
+        def read(self, timeout_s: float) -> Frame | None:
+            return self.frames.pop(0)
+
+        def close(self) -> None: ...
+
+    beats: list[int] = []
+    watched = Watched(Device(), lambda: beats.append(1))
+    watched.open()
+    assert watched.read(0.1) is not None
+    assert beats == [1]
+    assert watched.read(0.1) is None
+    assert watched.read(0.1) is None
+    assert beats == [1], "a silent camera looks alive"
