@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from protocols.session.result import refusal_document, result_document, result_t
 from protocols.session.rig import Rig
 
 CALIBRATION, TRAJECTORY, RESULT, REPORT = "calibration.toml", "trajectory.csv", "result.json", "report.html"
+_WEAK_S = 0.002  # a clock known no better than this deserves advice
 
 
 def remove_outputs(out: Path) -> None:
@@ -45,6 +47,23 @@ def write_outputs(
         print(json.dumps(document, allow_nan=False))
     else:
         print_summary(calibration, out)
+        weak = {
+            name: ""
+            for name, camera in calibration.cameras.items()
+            if camera.time_offset_std > _WEAK_S or name in calibration.refused
+        }
+        print_advice(rig, observations, {**weak, **calibration.refused})
+
+
+def print_advice(rig: Rig, observations: Observations, cameras: Mapping[str, str] | None = None) -> None:
+    """Where to wave the marker next time, in a line or two; nothing where nothing is lacking.
+
+    cameras: only these; None = all.
+    """
+    from hub.guidance import advice_for
+
+    for advice in advice_for(rig, observations, cameras):
+        print(f"hint: {advice.text}")
 
 
 def write_refusal(
@@ -76,6 +95,8 @@ def write_refusal(
     )
     if echo_json:
         print(json.dumps(document, allow_nan=False))
+    else:
+        print_advice(rig, observations)
 
 
 def wide_console(markup: bool = False) -> Any:

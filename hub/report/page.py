@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from hub.report import image_maps, measures, pair_graph, scene, tables, time_figures
+from hub.report import convergence, image_maps, measures, pair_graph, scene, tables, time_figures
+from hub.report.convergence import Step
 from hub.report.measures import Usage
 from hub.report.style import STYLE
 from hub.report.svg import THIN, esc, number, short, whole
@@ -44,17 +45,26 @@ _WORDS = (
 )
 
 
-def build_report(outcome: Calibration | Refused, rig: Rig, observations: Observations, command: str = "") -> str:
+def build_report(
+    outcome: Calibration | Refused,
+    rig: Rig,
+    observations: Observations,
+    command: str = "",
+    history: tuple[Step, ...] = (),
+) -> str:
     """report.html: one file, no more than 6 MB, that loads nothing; the same input gives the same bytes.
 
-    outcome: the calibration, or the refusal that was raised instead of one. command: as it was typed.
+    outcome: the calibration, or the refusal that was raised instead of one. command: as it was typed. history: what a
+    live hub answered on the way, of a log.
     """
     if isinstance(outcome, Refused):
         return _refusal_page(outcome, rig, observations, command)
-    return _calibration_page(outcome, rig, observations, command)
+    return _calibration_page(outcome, rig, observations, command, history)
 
 
-def _calibration_page(calibration: Calibration, rig: Rig, observations: Observations, command: str) -> str:
+def _calibration_page(
+    calibration: Calibration, rig: Rig, observations: Observations, command: str, history: tuple[Step, ...]
+) -> str:
     used = measures.usage(calibration, rig, observations)
     verdict = judge(calibration, rig, observations, used)
     drawn = scene.build_scene(calibration, rig)
@@ -72,6 +82,11 @@ def _calibration_page(calibration: Calibration, rig: Rig, observations: Observat
             "Clock offsets",
             "How sharply each camera’s clock is known: the dot is the estimate, the bar its 95 % interval.",
             "" if rig.shared_clock else time_figures.offset_intervals(calibration, used),
+        ),
+        _section(
+            "Convergence",
+            "How sharply each clock was known as the recording went on: the std after every answer of the hub.",
+            "" if rig.shared_clock else convergence.convergence(history, calibration.reference),
         ),
         _section(
             "Pairs",

@@ -95,6 +95,7 @@ figcaption b{color:var(--ink);margin-right:6px}
 .graph{display:grid;grid-template-columns:minmax(0,5fr) minmax(0,6fr);gap:26px;align-items:center}
 .views{display:grid;grid-template-columns:1fr 1fr;gap:18px;align-items:start;margin-top:12px}
 .frame{border:1px solid var(--line);border-radius:6px;padding:1px}
+ul.why{margin:10px 0 0;padding-left:18px;font-size:13px;color:var(--soft)}
 #scene-3d{height:540px}
 dl.facts{display:grid;grid-template-columns:max-content 1fr;gap:5px 22px;margin:8px 0 0;font-size:14px}
 dl.facts dt{color:var(--soft)}dl.facts dd{margin:0;overflow-wrap:anywhere}

@@ -93,10 +93,12 @@ def pairs(outcome: Calibration | Refused) -> str:
         "Agree <small>%</small>",
         "Noise <small>px</small>",
     ]
-    rows = []
+    rows, why = [], []
     for pair in outcome.pairs:
         kind = edge_kind(outcome, pair)
-        verdict = _SIGNS[kind] + (f" {esc(pair.status)}" if kind == "refused" else "")
+        verdict = _SIGNS[kind] + (" not tied" if kind == "refused" else "")
+        if kind == "refused":
+            why.append(f"<li><b>{esc(pair.cameras[0])}–{esc(pair.cameras[1])}</b>: {esc(pair.status)}</li>")
         ppm = None if pair.clock_rate is None else 1e6 * (pair.clock_rate - 1.0)
         rows.append(
             [
@@ -109,6 +111,8 @@ def pairs(outcome: Calibration | Refused) -> str:
             ]
         )
     inner = table(head, rows, numeric=2, kind="pairs")
+    # Reasons are sentences: in a cell they would make it a hand high.
+    inner += f'<ul class="why">{"".join(why)}</ul>' if why else ""
     if len(rows) <= _MOST_OPEN:
         return inner
     return f"<details><summary>All {len(rows)} pairs</summary>{inner}</details>"

@@ -1,0 +1,1 @@
+"""The live view: what the bus says of a rig, in a browser."""

@@ -1,0 +1,55 @@
+"""calibration.toml out of what the bus said, for a browser to keep."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hub.view.state import ViewState
+from protocols.clocks import TimeMap
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.pose import Pose
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.builder import rig_camera
+from protocols.session.calibration import Calibration, CameraCalibration, calibration_text
+from protocols.session.rig import Rig
+from protocols.version import VERSION
+
+
+def calibration_file(state: ViewState) -> str:
+    """The text of calibration.toml; "" where nothing is solved yet."""
+    solved = state.solved
+    if solved is None:
+        return ""
+    infos = {name: camera.info for name, camera in state.cameras.items() if camera.info is not None}
+    rig = Rig({name: rig_camera(info) for name, info in infos.items()}, solved.units)
+    cameras = {}
+    for found in solved.cameras:
+        info = infos.get(found.camera)
+        if info is not None and len(found.matrix) == 9:
+            cameras[found.camera] = _camera(found, info)
+    return calibration_text(
+        Calibration(
+            cameras,
+            solved.reference_camera,
+            solved.scale,
+            solved.units,
+            solved.solver,
+            VERSION,
+            {entry.camera: entry.reason for entry in solved.refused},
+        ),
+        rig,
+    )
+
+
+def _camera(found: pb.CameraCalibration, info: pb.CameraInfo) -> CameraCalibration:
+    distortions = np.array(found.distortions) if found.distortions else np.zeros(4 if found.fisheye else 5)
+    lens = Intrinsics(info.width, info.height, np.array(found.matrix).reshape(3, 3), distortions, found.fisheye)
+    return CameraCalibration(
+        name=found.camera,
+        intrinsics=lens,
+        pose=Pose.from_rodrigues(np.array(found.rotation), np.array(found.translation)),
+        time_map=TimeMap(found.clock_rate, found.time_offset),
+        time_offset_std=found.time_offset_std,
+        position_std=np.array(found.position_std) if found.position_std else np.zeros(3),
+        rms_px=found.rms_px,
+    )

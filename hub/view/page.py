@@ -1,0 +1,202 @@
+"""The view's panel: state, cameras, buttons, what is drawn, and the timeline of a replay."""
+
+from __future__ import annotations
+
+import secrets
+from collections import deque
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hub.view.export import calibration_file
+from hub.view.panels import camera_details, camera_table, overview
+from hub.view.scene import Options, decoded
+from hub.view.state import CameraView, ViewState
+
+if TYPE_CHECKING:
+    import viser
+
+    from hub.view.player import Player
+
+ACTIONS = {
+    "start_recording": "Start recording",
+    "stop_recording": "Stop recording",
+    "recalibrate": "Recalibrate",
+    "export": "Export",
+}
+_HINTS = {
+    "start_recording": "Every recorder of the site begins a new log.",
+    "stop_recording": "Every recorder of the site ends its log; it is whole then.",
+    "recalibrate": "The hub forgets what it has gathered and begins again: after a camera was moved.",
+    "export": "The hub writes its files now, and your browser gets calibration.toml.",
+}
+
+
+class Page:
+    """Panels of one server.
+
+    asked: actions that were clicked, for the loop to send. allowed: whether buttons act. actions: which there are.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        options: Options,
+        *,
+        allowed: bool,
+        player: Player | None = None,
+        actions: tuple[str, ...] = tuple(ACTIONS),
+    ) -> None:
+        self.asked: deque[str] = deque(maxlen=32)
+        self.options = options
+        self._server = server
+        self._player = player
+        self._state = ViewState()
+        self._now = 0.0
+        self._texts: dict[int, str] = {}
+        gui = server.gui
+        # Sharing would go through a server of viser's makers: a rig's pictures stay here.
+        gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()
+        gui.set_panel_label("Syncline")
+        self._overview = gui.add_html("")
+        if player is not None:
+            self._add_timeline(player)
+        self._table = gui.add_html("")
+        self._note: Any = None
+        if player is None:
+            self._add_actions(allowed, actions)
+        with gui.add_folder("Camera"):
+            self._choice: Any = gui.add_dropdown("camera", ("–",))
+            self._picture = gui.add_image(np.full((90, 160, 3), 235, dtype=np.uint8), format="jpeg", visible=False)
+            self._details = gui.add_html("")
+        self._shown: tuple[str, int] = ("", -1)
+        self._add_options()
+
+    def update(self, state: ViewState, now: float) -> None:
+        """Bring the panels up to date."""
+        self._state, self._now = state, now
+        names = tuple(state.cameras) or ("–",)
+        if tuple(self._choice.options) != names:
+            chosen = self._choice.value
+            self._choice.options = names
+            if chosen in names:
+                self._choice.value = chosen
+        self._set(self._overview, overview(state, now))
+        self._set(self._table, camera_table(state, now))
+        camera = state.cameras.get(self._choice.value)
+        if camera is not None:
+            self._set(self._details, camera_details(state, camera, now))
+            self._show_picture(camera)
+        if self._player is not None:
+            self._show_time(self._player)
+
+    def _set(self, handle: Any, text: str) -> None:
+        if self._texts.get(id(handle)) != text:
+            self._texts[id(handle)] = text
+            handle.content = text
+
+    def _show_picture(self, camera: CameraView) -> None:
+        key = (camera.name, camera.pictures)
+        if camera.picture is None or key == self._shown:
+            self._picture.visible = camera.picture is not None
+            return
+        image = decoded(camera.picture.jpeg)
+        if image is None:
+            return
+        self._shown = key
+        self._picture.image = marked(image, camera)
+        self._picture.visible = True
+
+    def _add_actions(self, allowed: bool, actions: tuple[str, ...]) -> None:
+        gui = self._server.gui
+        with gui.add_folder("Actions"):
+            for action in actions:
+                button = gui.add_button(ACTIONS[action], hint=_HINTS[action], disabled=not allowed)
+                button.on_click(partial(self._clicked, action))
+            text = "" if allowed else "Looking only: start the view without --look-only to act."
+            self._note = gui.add_markdown(text)
+
+    def _clicked(self, action: str, event: Any) -> None:
+        self.asked.append(action)
+        client = event.client
+        if action == "export" and client is not None:
+            text = calibration_file(self._state)
+            if text:
+                client.send_file_download("calibration.toml", text.encode(), save_immediately=True)
+
+    def told(self, text: str) -> None:
+        """Say what became of a click."""
+        if self._note is not None:
+            self._note.content = text
+
+    def _add_options(self) -> None:
+        gui, options = self._server.gui, self.options
+        with gui.add_folder("Show", expand_by_default=False):
+            for name, label in (
+                ("pictures", "pictures"),
+                ("rays", "rays to the marker"),
+                ("paths", "paths"),
+                ("uncertainty", "uncertainty (3 std)"),
+            ):
+                box = gui.add_checkbox(label, True)
+                box.on_update(partial(self._switched, name))
+            spread = gui.add_slider("uncertainty ×", 1, 100, 1, int(options.spread))
+            spread.on_update(partial(self._switched, "spread"))
+
+    def _switched(self, name: str, event: Any) -> None:
+        setattr(self.options, name, event.target.value)
+
+    def _add_timeline(self, player: Player) -> None:
+        gui = self._server.gui
+        with gui.add_folder("Replay"):
+            # A hair longer than the log: a slider of no length is none.
+            self._time: Any = gui.add_slider("time [s]", 0.0, max(round(player.duration, 1), 0.1), 0.1, 0.0)
+            self._play = gui.add_button("Pause" if player.playing else "Play")
+            self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "5", "10"), initial_value="1")
+
+        @self._time.on_update
+        def _(event: Any) -> None:
+            if event.client is not None:  # a person moved it, not the replay
+                player.wanted = float(self._time.value)
+
+        @self._play.on_click
+        def _(event: Any) -> None:
+            player.playing = not player.playing
+            if player.playing and player.position >= player.duration:
+                player.wanted = 0.0
+            self._play.label = "Pause" if player.playing else "Play"
+
+        @self._speed.on_update
+        def _(event: Any) -> None:
+            player.speed = float(self._speed.value)
+
+    def _show_time(self, player: Player) -> None:
+        label = "Pause" if player.playing else "Play"
+        if self._play.label != label:
+            self._play.label = label
+        value = min(round(player.position, 1), self._time.max)
+        if player.wanted is None and abs(self._time.value - value) >= 0.1:
+            self._time.value = value
+
+
+def marked(image: Any, camera: CameraView) -> Any:
+    """A picture (H, W, 3) RGB with rings around what was detected last."""
+    import cv2
+
+    picture = camera.picture
+    assert picture is not None
+    scale = image.shape[1] / picture.width
+    out = image.copy()
+    for u, v, size in camera.detections[:64]:
+        centre = (round((u + 0.5) * scale), round((v + 0.5) * scale))
+        radius = max(8, round(0.5 * size * scale) + 5)
+        for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+            cv2.circle(out, centre, radius, colour, width, cv2.LINE_AA)
+    return out
+
+
+def new_id() -> str:
+    """An id for this view: several may look at one site."""
+    return f"view-{secrets.token_hex(3)}"

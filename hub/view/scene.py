@@ -1,0 +1,357 @@
+"""Draws the state in 3-D: cameras as frusta, rays to what they see now, paths, uncertainty."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hub.view.panels import SIGNS
+from hub.view.state import CameraState, CameraView, ViewState
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.pose import Pose
+from protocols.geometry.types import Floats
+
+if TYPE_CHECKING:
+    import viser
+
+COLOURS: dict[CameraState, tuple[int, int, int]] = {
+    "solved": (30, 110, 190),
+    "refused": (200, 60, 30),
+    "collecting": (120, 120, 120),
+    "silent": (200, 140, 0),
+    "gone": (190, 190, 190),
+}
+_PATHS = ((214, 96, 20), (30, 130, 90), (120, 70, 170), (20, 120, 160), (170, 40, 90))
+_PICTURES_A_SECOND = 24.0  # over all cameras: decoding and encoding one costs 2 ms
+_PATH_S = 20.0  # so much of a path is drawn
+
+
+class Options:
+    """What a viewer may switch. spread: how many times too large uncertainties are drawn."""
+
+    def __init__(self) -> None:
+        self.pictures = True
+        self.rays = True
+        self.paths = True
+        self.uncertainty = True
+        self.spread = 10.0
+
+
+class SceneDrawing:
+    """Keeps viser's scene like the state; sends only what has changed."""
+
+    def __init__(self, server: viser.ViserServer, options: Options) -> None:
+        self._scene = server.scene
+        self._server = server
+        self.options = options
+        self._frusta: dict[str, Any] = {}
+        self._labels: dict[str, Any] = {}
+        self._balls: dict[str, Any] = {}
+        self._paths: dict[str, Any] = {}
+        self._numbers: dict[str, int] = {}
+        self._drawn: dict[str, Any] = {}
+        self._rays: Any = None
+        self._size = 1.0
+        self._picture_budget, self._budget_at = 1.0, 0.0
+        self._framed: tuple[Floats, float] | None = None
+        self.frusta_moved = 0
+
+    def clear(self) -> None:
+        """Take everything away, as before a jump in a replay."""
+        for handles in (self._frusta, self._labels, self._balls, self._paths):
+            for handle in handles.values():
+                handle.remove()
+            handles.clear()
+        if self._rays is not None:
+            self._rays.remove()
+            self._rays = None
+        self._drawn.clear()
+        self._numbers.clear()
+
+    def update(self, state: ViewState, now: float) -> None:
+        """Draw what is new."""
+        with self._server.atomic():
+            poses = {name: camera.pose for name, camera in state.cameras.items()}
+            placed = {name: pose for name, pose in poses.items() if pose is not None}
+            self._gone(set(placed))
+            if placed:
+                self._measure(placed, state)
+                for name, pose in placed.items():
+                    self._camera(state.cameras[name], pose, now)
+            self._draw_rays(state, placed, now)
+            self._draw_paths(state)
+        if placed and self.options.pictures:
+            self._draw_pictures(state, placed, now)
+
+    def _measure(self, placed: dict[str, Pose], state: ViewState) -> None:
+        """Size of the drawings, the ground and the first look, from where cameras stand and points moved."""
+        centres = np.array([pose.position for pose in placed.values()])
+        points = [path.array()[:, 1:4] for path in state.paths.values() if path.points]
+        told = (tuple(np.round(centres.ravel(), 2)), bool(points))
+        if self._drawn.get("measure") == told:
+            return
+        self._drawn["measure"] = told
+        everything = np.concatenate([centres, *points])
+        low, high = np.percentile(everything, [2, 98], axis=0)
+        extent = max(float(np.linalg.norm(high - low)), 1e-6)
+        up = _up(placed)
+        self._size = extent
+        self._scene.set_up_direction(tuple(up))
+        floor = (low + high) / 2 - up * float(np.max(np.abs((everything - (low + high) / 2) @ up)))
+        self._scene.add_grid(
+            "/ground",
+            width=3 * extent,
+            height=3 * extent,
+            cell_size=_round(extent / 10),
+            section_size=5 * _round(extent / 10),
+            position=tuple(floor),
+            wxyz=_turn_z_to(up),
+        )
+        middle = np.mean(np.concatenate(points), axis=0) if points else (low + high) / 2
+        if self._framed is None or np.linalg.norm(self._framed[0] - middle) > self._framed[1] / 3:
+            # Look again only where the scene is another than the one that was looked at.
+            self._framed = (middle, extent)
+            side = np.cross(up, [1.0, 0.0, 0.0])
+            side = np.cross(up, [0.0, 1.0, 0.0]) if np.linalg.norm(side) < 0.1 else side
+            side = side / np.linalg.norm(side)
+            away = middle + 0.95 * extent * side + 0.65 * extent * up + 0.25 * extent * np.cross(side, up)
+            self._server.initial_camera.position = tuple(away)
+            self._server.initial_camera.look_at = tuple(middle)
+            self._server.initial_camera.up = tuple(up)
+            for client in self._server.get_clients().values():
+                client.camera.up_direction = tuple(up)
+                client.camera.position = tuple(away)
+                client.camera.look_at = tuple(middle)
+
+    def _camera(self, camera: CameraView, pose: Pose, now: float) -> None:
+        how = camera.state(now)
+        found = camera.calibration
+        assert found is not None
+        name, scale = camera.name, 0.07 * self._size
+        place = (tuple(pose.position), tuple(_quaternion(pose.rotation.T)), how, round(scale, 3))
+        if self._drawn.get(f"camera {name}") != place:
+            self._drawn[f"camera {name}"] = place
+            frustum = self._frusta.get(name)
+            if frustum is None:
+                fov, aspect = _field(camera)
+                frustum = self._scene.add_camera_frustum(
+                    f"/cameras/{name}", fov=fov, aspect=aspect, scale=scale, thickness=2.0, thickness_units="screen"
+                )
+                self._frusta[name] = frustum
+                self._labels[name] = self._scene.add_label(f"/labels/{name}", "", anchor="bottom-center")
+            frustum.wxyz, frustum.position = _quaternion(pose.rotation.T), pose.position
+            frustum.scale, frustum.color = scale, COLOURS[how]
+            self._labels[name].position = pose.position + 0.25 * scale * _up({name: pose})
+            self.frusta_moved += 1
+        std_ms = 1e3 * found.time_offset_std
+        sharp = f"± {std_ms:.2g} ms" if std_ms > 0.0 else "reference clock"
+        text = f"{SIGNS[how]} {name}  {sharp if how == 'solved' else how}"
+        if self._drawn.get(f"text {name}") != text:
+            self._drawn[f"text {name}"] = text
+            self._labels[name].text = text
+        self._ball(f"/uncertainty/{name}", pose.position, np.array(found.position_std), COLOURS[how])
+
+    def _ball(self, name: str, centre: Floats, std: Floats, colour: tuple[int, int, int]) -> None:
+        """An ellipsoid of three stds, drawn ``spread`` times too large."""
+        wanted = self.options.uncertainty and len(std) == 3 and float(np.max(std)) > 0.0
+        radii = tuple(np.maximum(3.0 * self.options.spread * std, 1e-9)) if wanted else ()
+        told = (tuple(centre), radii)
+        if self._drawn.get(name) == told:
+            return
+        self._drawn[name] = told
+        ball = self._balls.get(name)
+        if not wanted:
+            if ball is not None:
+                ball.visible = False
+            return
+        if ball is None:
+            ball = self._scene.add_icosphere(name, 1.0, colour, subdivisions=2, opacity=0.35)
+            self._balls[name] = ball
+        ball.position, ball.scale, ball.visible = centre, radii, True
+
+    def _draw_rays(self, state: ViewState, placed: dict[str, Pose], now: float) -> None:
+        """A line from each camera towards what it sees now, as far as the path's last point is away."""
+        starts, ends, colours = [], [], []
+        last = [path.points[-1][1:4] for path in state.paths.values() if path.points]
+        for name, pose in placed.items() if self.options.rays else ():
+            camera = state.cameras[name]
+            lens = _lens(camera)
+            if lens is None or camera.last_seen is None or now - camera.last_seen > 0.3 or not camera.detections:
+                continue
+            pixels = np.array([[u, v] for u, v, _ in camera.detections[:16]])
+            rays = lens.unproject(pixels)
+            far = min((float(np.linalg.norm(np.array(p) - pose.position)) for p in last), default=self._size)
+            seen = np.column_stack([rays, np.ones(len(rays))])
+            seen = seen / np.linalg.norm(seen, axis=1, keepdims=True) * far
+            starts += [pose.position] * len(rays)
+            ends += list(pose.world_from_camera(seen))
+            colours += [[COLOURS[camera.state(now)]] * 2] * len(rays)
+        meeting = _meeting(np.array(starts), np.array(ends), 0.05 * self._size)
+        points = np.array(
+            [[start, end if meeting is None else meeting] for start, end in zip(starts, ends, strict=True)],
+            dtype=np.float32,
+        ).reshape(-1, 2, 3)
+        told = points.tobytes()
+        if self._drawn.get("rays") == told:
+            return
+        self._drawn["rays"] = told
+        if not len(points):
+            if self._rays is not None:
+                self._rays.visible = False
+            return
+        shades = np.array(colours, dtype=np.uint8)
+        if self._rays is None or len(self._rays.points) != len(points):
+            self._rays = self._scene.add_line_segments("/rays", points, shades, thickness=1.5, thickness_units="screen")
+        self._rays.points, self._rays.colors, self._rays.visible = points, shades, True
+
+    def _draw_paths(self, state: ViewState) -> None:
+        for label in [label for label in self._numbers if label not in state.paths]:
+            key = f"/paths/{self._numbers.pop(label)}"
+            for name in (key, f"{key}/head"):
+                if name in self._paths:
+                    self._paths.pop(name).remove()
+        for label, path in state.paths.items():
+            if label not in self._numbers:
+                free = set(range(len(self._numbers) + 1)) - set(self._numbers.values())
+                self._numbers[label] = min(free)
+            index = self._numbers[label]
+            told = (path.count, self.options.paths, self.options.spread, self.options.uncertainty)
+            if self._drawn.get(f"path {label}") == told or not path.points:
+                continue
+            self._drawn[f"path {label}"] = told
+            table = path.array()
+            table = table[table[:, 0] > table[-1, 0] - _PATH_S]
+            paint = _PATHS[index % len(_PATHS)]
+            colour = np.array(paint)
+            key = f"/paths/{index}"
+            gaps = np.diff(table[:, 0]) < 0.5
+            points = np.stack([table[:-1, 1:4], table[1:, 1:4]], axis=1)[gaps].astype(np.float32)
+            if self.options.paths and len(points):
+                age = (table[-1, 0] - table[1:, 0])[gaps] / _PATH_S
+                fade = np.clip(0.75 * age, 0.0, 0.75)[:, None]
+                shades = np.repeat(((1 - fade) * colour + fade * 235)[:, None], 2, axis=1).astype(np.uint8)
+                self._paths[key] = self._scene.add_line_segments(
+                    key, points, shades, thickness=3.0, thickness_units="screen"
+                )
+            elif key in self._paths:
+                self._paths.pop(key).remove()
+            head = table[-1]
+            self._paths[f"{key}/head"] = self._scene.add_icosphere(
+                f"{key}-head", 0.012 * self._size, paint, subdivisions=2, position=head[1:4]
+            )
+            self._ball(f"/uncertainty/path-{index}", head[1:4], np.full(3, head[4]), paint)
+
+    def _draw_pictures(self, state: ViewState, placed: dict[str, Pose], now: float) -> None:
+        """The newest pictures into the frusta, those first that wait longest."""
+        elapsed, self._budget_at = now - self._budget_at, now
+        self._picture_budget = min(self._picture_budget + elapsed * _PICTURES_A_SECOND, _PICTURES_A_SECOND)
+        waiting = [
+            (self._drawn.get(f"picture at {name}", -math.inf), name)
+            for name in placed
+            if state.cameras[name].picture is not None
+            and self._drawn.get(f"picture {name}") != state.cameras[name].pictures
+        ]
+        for _, name in sorted(waiting):
+            if self._picture_budget < 1.0:
+                return
+            self._picture_budget -= 1.0
+            camera = state.cameras[name]
+            assert camera.picture is not None
+            self._drawn[f"picture {name}"], self._drawn[f"picture at {name}"] = camera.pictures, now
+            image = decoded(camera.picture.jpeg)
+            if image is not None:
+                self._frusta[name].image = image
+
+    def _gone(self, placed: set[str]) -> None:
+        for name in set(self._frusta) - placed:
+            self._frusta.pop(name).remove()
+            self._labels.pop(name).remove()
+            ball = self._balls.pop(f"/uncertainty/{name}", None)
+            if ball is not None:
+                ball.remove()
+            for key in [key for key in self._drawn if key.endswith((f" {name}", f"/{name}"))]:
+                del self._drawn[key]
+
+
+def _meeting(starts: Floats, ends: Floats, tolerance: float) -> Floats | None:
+    """The point (3,) next to all rays (n, 3) to (n, 3), None where they do not meet within ``tolerance``.
+
+    Rays of one moment only by their arrival: good enough to draw, not to measure.
+    """
+    if len(starts) < 2:
+        return None
+    along = ends - starts
+    along = along / np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.eye(3) - along[:, :, None] * along[:, None, :]
+    try:
+        point = np.linalg.solve(across.sum(axis=0), (across @ starts[:, :, None]).sum(axis=0)[:, 0])
+    except np.linalg.LinAlgError:
+        return None
+    off = np.linalg.norm((across @ (point - starts)[:, :, None])[:, :, 0], axis=1)
+    return np.asarray(point) if float(off.max()) < tolerance else None
+
+
+def decoded(jpeg: bytes) -> Any:
+    """A JPEG as (H, W, 3) RGB; None where it is none."""
+    import cv2
+
+    image = cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), cv2.IMREAD_COLOR) if jpeg else None
+    return None if image is None else np.ascontiguousarray(image[..., ::-1])
+
+
+def _lens(camera: CameraView) -> Intrinsics | None:
+    found, info = camera.calibration, camera.info
+    if found is None or len(found.matrix) != 9:
+        return None
+    size = (info.width, info.height) if info is not None else _size_of(found.matrix)
+    distortions = np.array(found.distortions) if found.distortions else np.zeros(4 if found.fisheye else 5)
+    return Intrinsics(size[0], size[1], np.array(found.matrix).reshape(3, 3), distortions, found.fisheye)
+
+
+def _size_of(matrix: Any) -> tuple[int, int]:
+    """The image's size where nobody told it: the principal point is about its middle."""
+    return max(round(2 * matrix[2] + 1), 1), max(round(2 * matrix[5] + 1), 1)
+
+
+def _field(camera: CameraView) -> tuple[float, float]:
+    """(vertical field of view [rad], aspect) of a frustum."""
+    lens = _lens(camera)
+    if lens is None:
+        return 0.8, 1.5
+    return min(2 * math.atan(0.5 * lens.height / float(lens.matrix[1, 1])), 2.5), lens.width / lens.height
+
+
+def _up(placed: dict[str, Pose]) -> Floats:
+    """Up as most cameras are held; z where they don't agree."""
+    mean = np.mean([pose.rotation.T @ np.array([0.0, -1.0, 0.0]) for pose in placed.values()], axis=0)
+    norm = float(np.linalg.norm(mean))
+    if norm < 0.2:
+        return np.array([0.0, 0.0, 1.0])
+    mean = mean / norm
+    axis = np.zeros(3)
+    axis[int(np.argmax(np.abs(mean)))] = math.copysign(1.0, mean[int(np.argmax(np.abs(mean)))])
+    # A world whose axis is nearly up was meant so.
+    return axis if float(axis @ mean) > 0.8 else mean
+
+
+def _quaternion(rotation: Floats) -> Floats:
+    import viser.transforms
+
+    return np.asarray(viser.transforms.SO3.from_matrix(rotation).wxyz, dtype=np.float64)
+
+
+def _turn_z_to(up: Floats) -> Floats:
+    """Quaternion (w, x, y, z) that turns z to ``up``."""
+    w = 1.0 + float(up[2])
+    if w < 1e-9:
+        return np.array([0.0, 1.0, 0.0, 0.0])
+    turn = np.array([w, -up[1], up[0], 0.0])
+    return np.asarray(turn / np.linalg.norm(turn))
+
+
+def _round(length: float) -> float:
+    """The next 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** math.floor(math.log10(length))
+    return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= length)

@@ -1,0 +1,204 @@
+"""Runs the view: a thin loop between the bus, or a recording, and the browser."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import secrets
+import socket
+import threading
+import time
+import uuid
+from collections.abc import Callable
+
+import viser
+
+from hub.view.gate import Gate, is_local
+from hub.view.page import ACTIONS, Page, new_id
+from hub.view.player import Player, Recording
+from hub.view.scene import Options, SceneDrawing
+from hub.view.state import ViewState
+from protocols.bus.base import Bus, Subscription
+from protocols.catalogue import CALIBRATION, CAMERA_INFO, COMMAND, OBSERVATION, PICTURE, STATUS, TRACK
+from protocols.clocks import NANOSECONDS
+from protocols.errors import InputError
+from protocols.gate import SCHEMA_VERSION
+from protocols.messages import syncline_pb2 as pb
+
+ROLE = "view"
+_DRAW_S = 0.2
+_PANEL_S = 0.5
+_ALONE_S = 1.0  # how often it is drawn where nobody looks
+_WHO = {"start_recording": "record", "stop_recording": "record", "recalibrate": "hub", "export": "hub"}
+
+
+class ViewServer:
+    """The browser's side: a port, its gate, and what is drawn.
+
+    host: beyond loopback a token is asked for; token: "" = a new one there, none on loopback. port: 0 = any free one.
+    look_only: no button acts. Raises InputError where the port cannot be had.
+    """
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        *,
+        token: str = "",
+        look_only: bool = False,
+        player: Player | None = None,
+        actions: tuple[str, ...] = tuple(ACTIONS),
+    ) -> None:
+        _check_port(host, port)
+        self._closed = False
+        self.gate = Gate(token or ("" if is_local(host) else secrets.token_urlsafe(18)))
+        # It prints a banner whose address lacks the token.
+        with self.gate.before_every_server(), contextlib.redirect_stdout(io.StringIO()):
+            self.server = viser.ViserServer(host, port, label="Syncline", verbose=False)
+        self.host, self.port = host, self.server.get_port()
+        self.options = Options()
+        self.scene = SceneDrawing(self.server, self.options)
+        self.page = Page(self.server, self.options, allowed=not look_only, player=player, actions=actions)
+
+    @property
+    def address(self) -> str:
+        """What to open in a browser."""
+        host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{self.port}/" + (f"?token={self.gate.token}" if self.gate.token else "")
+
+    @property
+    def watched(self) -> bool:
+        """Whether any browser is open."""
+        return bool(self.server.get_clients())
+
+    def close(self) -> None:
+        """Stop serving; twice is no error."""
+        if not self._closed:
+            self._closed = True
+            with contextlib.redirect_stdout(io.StringIO()):
+                self.server.stop()
+
+
+def run_view(
+    bus: Bus,
+    view: ViewServer,
+    stop: threading.Event,
+    *,
+    each: Callable[[ViewState], None] = lambda state: None,
+) -> None:
+    """Show what the bus says until ``stop`` is set; send what is clicked. each: called ten times a second."""
+    state = ViewState()
+    name, boot = new_id(), uuid.uuid4().hex
+    topics = (CAMERA_INFO, OBSERVATION, CALIBRATION, TRACK, STATUS)
+    subscriptions = [bus.subscribe(topic) for topic in topics]
+    commands = bus.publisher(COMMAND, name)
+    watch = bus.watch_agents()
+    pictures: Subscription | None = None
+    sequence = 0
+    pace = _Pace()
+    try:
+        with bus.announce(ROLE, name, boot):
+            while not stop.wait(0.1):
+                now, wall = time.monotonic(), time.time_ns()
+                for event in watch.drain():
+                    state.presence(event.role, event.agent, event.alive, event.boot_id)
+                # Pictures are sent only while somebody looks.
+                if (view.watched and view.options.pictures) != (pictures is not None):
+                    if pictures is None:
+                        pictures = bus.subscribe(PICTURE)
+                    else:
+                        pictures.close()
+                        pictures = None
+                for subscription in (*subscriptions, *([pictures] if pictures else [])):
+                    for received in subscription.drain():
+                        state.handle(received.message, now - max(0, wall - received.arrival_ns) / NANOSECONDS)
+                while view.page.asked:
+                    action = view.page.asked.popleft()
+                    for command in commands_for(state, action, name, boot, sequence):
+                        commands.put(command)
+                        sequence += 1
+                    view.page.told(answer_to(state, action))
+                pace.draw(view, state, now)
+                each(state)
+    finally:
+        commands.close()
+        watch.close()
+        for subscription in (*subscriptions, *([pictures] if pictures else [])):
+            subscription.close()
+
+
+def run_replay(recording: Recording, serve: Callable[[Player], ViewServer], stop: threading.Event) -> None:
+    """Play a recording in the browser until ``stop`` is set; the time stands still while nobody looks."""
+    player = Player(recording)
+    view = serve(player)
+    pace = _Pace()
+    before = time.monotonic()
+    try:
+        while not stop.wait(0.1):
+            now = time.monotonic()
+            if player.advance(now - before if view.watched else 0.0):
+                view.scene.clear()
+            before = now
+            pace.draw(view, player.state, now, at=player.position)
+    finally:
+        view.close()
+
+
+def commands_for(state: ViewState, action: str, sender: str, boot: str, sequence: int) -> list[pb.Command]:
+    """The messages of one click: one for each agent that can do it, by its present run."""
+    return [
+        pb.Command(
+            schema_version=SCHEMA_VERSION,
+            sender=sender,
+            boot_id=boot,
+            sequence=sequence + number,
+            action=action,
+            agent=agent.status.agent,
+            agent_boot=agent.status.boot_id,
+        )
+        for number, agent in enumerate(state.of_role(_WHO[action]))
+    ]
+
+
+def answer_to(state: ViewState, action: str) -> str:
+    """What the page says after a click."""
+    names = [agent.status.agent for agent in state.of_role(_WHO[action])]
+    words = action.replace("_", " ")
+    who = {"record": "recorder", "hub": "hub"}[_WHO[action]]
+    return f"asked {', '.join(names)}: {words}" if names else f"no {who} is on this site: {words} went to nobody"
+
+
+class _Pace:
+    """Draws as often as it is worth."""
+
+    def __init__(self) -> None:
+        self._draw = self._panel = 0.0
+
+    def draw(self, view: ViewServer, state: ViewState, now: float, at: float | None = None) -> None:
+        """now: the machine's time; at: the state's own, where it is another."""
+        watched = view.watched
+        moment = now if at is None else at
+        if now >= self._draw:
+            self._draw = now + (_DRAW_S if watched else _ALONE_S)
+            view.scene.update(state, moment)
+        if now >= self._panel:
+            self._panel = now + (_PANEL_S if watched else _ALONE_S)
+            view.page.update(state, moment)
+
+
+def _check_port(host: str, port: int) -> None:
+    """Viser would take another port without a word."""
+    if not 0 <= port <= 65_535:
+        raise InputError(f"--port {port} is out of range", remedy="give 1 to 65535, or 0 for any free one")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as error:
+        taken = error.errno == errno.EADDRINUSE
+        what = f"port {port} is taken" if taken else f"cannot listen on {host}:{port}: {error.strerror or error}"
+        remedy = "give --port another number, or 0" if taken else "give --listen an address of this machine"
+        raise InputError(what, remedy=remedy) from None

@@ -1,0 +1,210 @@
+"""What a view knows of a site: messages in, the state of every camera, path and agent out.
+
+No sockets, no clock and nothing of the browser: the same state is drawn live and in replay.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from google.protobuf.message import Message
+
+from hub.guidance import Guidance
+from protocols.clocks import NANOSECONDS
+from protocols.geometry import so3
+from protocols.geometry.pose import Pose
+from protocols.geometry.types import Floats
+from protocols.messages import syncline_pb2 as pb
+
+SILENT_S = 2.0
+"""Without a frame for this long a camera counts as silent."""
+_RATE_S = 3.0  # frames of the last so many seconds make the frame rate
+_PATH_POINTS = 1200
+_MOST_PATHS = 48  # people come and go under new names: the one longest silent makes room
+
+CameraState = Literal["solved", "refused", "collecting", "silent", "gone"]
+
+
+@dataclass(slots=True, eq=False)
+class CameraView:
+    """One camera. Times are the view's own [s]; offset_std_ms and the rest are None until a hub told them.
+
+    lost: frames that never came, by the sequence numbers. detections: of the last frame: u, v, size [px]. still: it is
+    a calibration from a file that is looked at, so that no frame is missed.
+    """
+
+    name: str
+    info: pb.CameraInfo | None = None
+    boot: str = ""
+    frames: int = 0
+    seen: int = 0
+    lost: int = 0
+    restarts: int = 0
+    last_frame: float | None = None
+    last_seen: float | None = None
+    detections: list[tuple[float, float, float]] = field(default_factory=list)
+    arrivals: deque[float] = field(default_factory=lambda: deque(maxlen=256))
+    calibration: pb.CameraCalibration | None = None
+    refused: str = ""
+    refusals: int = 0
+    alive: bool = True
+    picture: pb.Picture | None = None
+    pictures: int = 0
+    sequence: int = -1
+    still: bool = False
+
+    @property
+    def pose(self) -> Pose | None:
+        """Where it stands, None until that is known."""
+        found = self.calibration
+        if found is None:
+            return None
+        rotation = so3.exp(np.array(found.rotation))
+        return Pose(rotation, -rotation.T @ np.array(found.translation))
+
+    def fps(self, now: float) -> float:
+        """Frames a second over the last seconds."""
+        recent = [moment for moment in self.arrivals if moment > now - _RATE_S]
+        return (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 2 and recent[-1] > recent[0] else 0.0
+
+    def state(self, now: float) -> CameraState:
+        """How it does."""
+        if not self.alive:
+            return "gone"
+        if not self.still and (self.last_frame is None or now - self.last_frame > SILENT_S):
+            return "silent"
+        if self.refused:
+            return "refused"
+        return "solved" if self.calibration is not None else "collecting"
+
+
+@dataclass(slots=True, eq=False)
+class PathView:
+    """The path of one point: time on the reference clock [s], x, y, z, std of one axis; newest last."""
+
+    label: str
+    points: deque[tuple[float, float, float, float, float]] = field(default_factory=lambda: deque(maxlen=_PATH_POINTS))
+    state: str = ""
+    count: int = 0
+
+    def array(self) -> Floats:
+        """(n, 5) in order of time."""
+        return np.array(sorted(self.points), dtype=np.float64).reshape(-1, 5)
+
+
+@dataclass(slots=True, eq=False)
+class AgentView:
+    """One hub or recorder: its last status and when it came."""
+
+    status: pb.AgentStatus
+    at: float
+
+
+class ViewState:
+    """Everything a view shows. ``handle`` takes messages with the view's time [s, any monotonic clock]."""
+
+    def __init__(self, still: bool = False) -> None:
+        self._still = still
+        self.cameras: dict[str, CameraView] = {}
+        self.paths: dict[str, PathView] = {}
+        self.agents: dict[str, AgentView] = {}
+        self.calibration: pb.Calibration | None = None
+        self.solved: pb.Calibration | None = None
+        self.guidance = Guidance()
+        self.revision = 0
+
+    def handle(self, message: Message, now: float) -> None:
+        """Take one message from the bus or a log."""
+        if isinstance(message, pb.Observation):
+            self._observe(message, now)
+        elif isinstance(message, pb.Track):
+            self._follow(message)
+        elif isinstance(message, pb.Picture):
+            camera = self._camera(message.camera)
+            camera.picture, camera.pictures = message, camera.pictures + 1
+        elif isinstance(message, pb.CameraInfo):
+            self._camera(message.camera).info = message
+            self.guidance.handle(message)
+        elif isinstance(message, pb.Calibration):
+            self._calibrate(message)
+        elif isinstance(message, pb.AgentStatus) and message.role != "camera":
+            self.agents[message.agent] = AgentView(message, now)
+
+    def presence(self, role: str, agent: str, alive: bool, boot: str) -> None:
+        """An agent appeared or is gone; of a camera that was restarted only the newest boot counts."""
+        if role == "camera":
+            camera = self._camera(agent)
+            if alive or camera.boot in ("", boot):
+                camera.alive = alive
+        elif not alive and agent in self.agents and self.agents[agent].status.boot_id == boot:
+            del self.agents[agent]
+
+    def of_role(self, role: str) -> list[AgentView]:
+        """The hubs, or the recorders, by name."""
+        return [self.agents[name] for name in sorted(self.agents) if self.agents[name].status.role == role]
+
+    def headline(self) -> str:
+        """One line on the whole site."""
+        found = self.calibration
+        if not self.cameras:
+            return "waiting for cameras"
+        if found is None:
+            return f"{len(self.cameras)} cameras, no hub has answered yet"
+        if found.status == "solved":
+            stds = [camera.time_offset_std for camera in found.cameras]
+            refused = f", {len(found.refused)} refused" if found.refused else ""
+            return f"{len(found.cameras)} cameras calibrated, offsets ± {1e3 * max(stds, default=0.0):.2f} ms{refused}"
+        return f"{found.status}: {found.reason}"
+
+    def _camera(self, name: str) -> CameraView:
+        if name not in self.cameras:
+            self.cameras[name] = CameraView(name, still=self._still)
+            self.cameras = {key: self.cameras[key] for key in sorted(self.cameras)}
+        return self.cameras[name]
+
+    def _observe(self, message: pb.Observation, now: float) -> None:
+        camera = self._camera(message.camera)
+        if message.boot_id != camera.boot:
+            camera.restarts += bool(camera.boot)
+            camera.boot, camera.sequence, camera.alive = message.boot_id, message.sequence - 1, True
+        if message.sequence <= camera.sequence:
+            return  # heard twice, or healed out of order
+        camera.lost += message.sequence - camera.sequence - 1
+        camera.sequence = message.sequence
+        camera.frames += 1
+        camera.last_frame = now
+        camera.arrivals.append(now)
+        camera.detections = [(one.u, one.v, one.size) for one in message.detections]
+        if message.detections:
+            camera.seen += 1
+            camera.last_seen = now
+        self.guidance.handle(message)
+
+    def _follow(self, message: pb.Track) -> None:
+        path = self.paths.pop(message.label, None) or PathView(message.label)
+        self.paths[message.label] = path  # the last heard stand last
+        while len(self.paths) > _MOST_PATHS:
+            del self.paths[next(iter(self.paths))]
+        variance = message.position_covariance[::4]
+        std = float(np.sqrt(np.mean(variance))) if variance else 0.0
+        x, y, z = message.position
+        path.points.append((message.reference_time_ns / NANOSECONDS, x, y, z, std))
+        path.state, path.count = message.state, path.count + 1
+
+    def _calibrate(self, message: pb.Calibration) -> None:
+        self.calibration = message
+        self.revision += 1
+        refused = {entry.camera: entry.reason for entry in message.refused}
+        if message.status == "solved":
+            self.solved = message
+            solved = {entry.camera: entry for entry in message.cameras}
+            for name in solved:
+                self._camera(name)
+            for name, camera in self.cameras.items():
+                camera.calibration = solved.get(name)
+        for name, camera in self.cameras.items():
+            camera.refusals += name in refused and not camera.refused
+            camera.refused = refused.get(name, "")

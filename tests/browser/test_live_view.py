@@ -1,0 +1,115 @@
+"""The live view of a running demo, in a browser: figures of the hub, frusta, pictures, buttons."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from protocols.bus.settings import BusConfig
+from protocols.bus.zenoh_bus import open_bus
+from protocols.catalogue import CALIBRATION, STATUS
+from protocols.log.reader import LogReader
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.calibration import read_calibration
+from tests.browser.conftest import Tab
+from tests.samples import eventually
+
+NAMES = ("cam0", "cam1", "cam2")
+
+
+@dataclass
+class Demo:
+    """A demo that runs: where its view is, and its bus."""
+
+    out: Path
+    address: str
+    endpoint: str
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory, chromium: Any) -> Iterator[Demo]:
+    out = tmp_path_factory.mktemp("demo") / "out"
+    words = ["demo", "--view", "--view-port", "0", "--seconds", "600", "--out", str(out)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "deploy", *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line.startswith("live view: open http://127.0.0.1:"), line
+        config = tomllib.loads((out / "config" / "cam0.toml").read_text(encoding="utf-8"))
+        yield Demo(out, line.split()[-1], config["bus"]["connect"][0])
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)
+
+
+def test_the_view_of_a_running_demo(demo: Demo, tab: Tab) -> None:
+    page = tab.page
+    with open_bus("demo", BusConfig(mode="client", connect=(demo.endpoint,)), timeout_s=20.0) as bus:
+        answers, statuses = bus.subscribe(CALIBRATION), bus.subscribe(STATUS)
+        page.goto(demo.address)
+        for name in NAMES:
+            page.wait_for_selector(f"[data-camera={name}]")
+        page.wait_for_selector("[data-state=solved]")
+        page.wait_for_function("document.querySelectorAll('[data-state=solved]').length === 3")
+        page.wait_for_timeout(1500)
+        tab.shot("live")
+        assert "3 cameras calibrated" in page.inner_text("[data-syncline=headline]")
+
+        # What the panel says of cam1 is what the hub has published.
+        told: set[str] = set()
+
+        def same() -> bool:
+            for received in answers.drain():
+                assert isinstance(received.message, pb.Calibration)
+                told.update(
+                    f"{found.time_offset:+.6f} s ± {1e3 * found.time_offset_std:.3f} ms · "
+                    f"{1e6 * (found.clock_rate - 1.0):+.1f} ppm · {found.rms_px:.2f} px"
+                    for found in received.message.cameras
+                    if found.camera == "cam1"
+                )
+            return page.inner_text("[data-clock=cam1]") in told
+
+        assert eventually(same, 30.0), (page.inner_text("[data-clock=cam1]"), told)
+        rate = float(page.locator("[data-camera=cam1] td").nth(1).inner_text())
+        assert 0.0 < rate < 60.0, "frames arrive; how many a second is the machine's business"
+
+        # The camera's picture arrives while somebody looks.
+        page.wait_for_function("Array.from(document.images).some(image => image.naturalWidth >= 300)")
+
+        # Export: a file for the browser, and files of the hub's own.
+        with page.expect_download() as download:
+            page.get_by_role("button", name="Export").click()
+        file = Path(download.value.path())
+        assert sorted(read_calibration(file)[1]) == list(NAMES)
+        assert eventually((demo.out / "result.json").exists, 30.0)
+
+        # Stop: the log is whole. Start: another one begins.
+        page.get_by_role("button", name="Stop recording").click()
+        page.get_by_text("paused after demo.mcap").wait_for()
+        reader = LogReader(demo.out / "demo.mcap")
+        assert sum(1 for _ in reader.messages()) > 100
+        assert reader.damage == ""
+        page.get_by_role("button", name="Start recording").click()
+        assert eventually((demo.out / "demo-2.mcap").exists, 30.0)
+
+        page.get_by_role("button", name="Recalibrate").click()
+
+        def asked() -> bool:
+            return any(
+                received.agent == "hub" and received.message.counters["asked.recalibrate"] == 1  # type: ignore[attr-defined]
+                for received in statuses.drain()
+            )
+
+        assert eventually(asked, 30.0)
+    outside = [url for url in tab.requests if not url.startswith((demo.address, "data:", "blob:"))]
+    assert outside == [], "the page asks nobody else for anything"

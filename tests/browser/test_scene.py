@@ -1,0 +1,129 @@
+"""The 3-D scene itself: what is told on the bus moves in the picture; a log replays; the report opens offline."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("viser")
+
+from hub.view.player import LogRecording
+from hub.view.server import ViewServer, run_replay, run_view
+from protocols.bus.memory import MemoryBus, MemoryHub
+from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION
+from tests.browser.conftest import Tab
+from tests.integration.test_view_server import TOKEN, solved
+from tests.samples import camera_info, eventually, observation
+from tests.unit.test_view_state import log_of
+
+_BLUE = np.array([190, 110, 30])  # BGR of a camera that is solved
+
+
+def blue(tab: Tab, name: str) -> tuple[int, np.ndarray[Any, Any]]:
+    """How many pixels of the scene have the frusta's colour, and their mean place; waits for what fades in."""
+    for _ in range(40):
+        tab.page.wait_for_timeout(1200)
+        count, place = _blue(tab, name)
+        if count > 100:
+            break
+    return count, place
+
+
+def _blue(tab: Tab, name: str) -> tuple[int, np.ndarray[Any, Any]]:
+    image = cv2.imdecode(np.frombuffer(tab.shot(name), dtype=np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    scene = image[:, :700].astype(np.int64)  # beside the panel
+    near = (scene[..., 0] - scene[..., 2] > 60) & (np.abs(scene - _BLUE).max(axis=2) < 70)
+    places = np.argwhere(near)
+    return len(places), places.mean(axis=0) if len(places) else np.zeros(2)
+
+
+def test_a_frustum_moves_in_the_picture_when_its_camera_has_moved(tab: Tab) -> None:
+    network, stop, view = MemoryHub(), threading.Event(), ViewServer(port=0)
+    with MemoryBus(network) as agents, MemoryBus(network) as bus:
+        loop = threading.Thread(target=run_view, args=(bus, view, stop))
+        loop.start()
+        frames = threading.Thread(target=film, args=(agents, stop))
+        frames.start()
+        try:
+            hub = agents.publisher(CALIBRATION, "hub")
+            hub.put(solved((0, 0, 0), (2, 0, 0)))
+            tab.page.goto(view.address)
+            tab.page.wait_for_function("document.querySelectorAll('[data-state=solved]').length === 2")
+            count, place = blue(tab, "frusta-before")
+            assert count > 100, "the frusta are in the picture"
+            hub.put(solved((0, 0, 0), (2, 0.6, 0), revision=2))
+            assert eventually(lambda: np.allclose(view.scene._frusta["cam1"].position, [2, 0.6, 0]))
+            moved, elsewhere = blue(tab, "frusta-after")
+            assert moved > 100
+            assert float(np.linalg.norm(elsewhere - place)) > 3.0
+        finally:
+            stop.set()
+            loop.join(20.0)
+            frames.join(20.0)
+            view.close()
+
+
+def film(agents: MemoryBus, stop: threading.Event) -> None:
+    """Two cameras that see something, 20 times a second."""
+    publishers = {name: agents.publisher(OBSERVATION, name) for name in ("cam0", "cam1")}
+    infos = {name: agents.publisher(CAMERA_INFO, name) for name in publishers}
+    index = 0
+    while not stop.wait(0.05):
+        for name, publisher in publishers.items():
+            if index % 20 == 0:
+                infos[name].put(camera_info(name))
+            publisher.put(observation(name, index))
+        index += 1
+
+
+def test_without_the_token_the_browser_sees_nothing(chromium: Any) -> None:
+    view = ViewServer(port=0, token=TOKEN)
+    tab = Tab(chromium)
+    try:
+        answer = tab.page.goto(f"http://127.0.0.1:{view.port}/")
+        assert answer is not None
+        assert answer.status == 403
+        assert "token" in tab.page.inner_text("body")
+        tab.page.goto(view.address)
+        tab.page.get_by_role("button", name="Recalibrate").wait_for()
+        assert view.watched
+    finally:
+        tab.context.close()
+        view.close()
+
+
+def test_a_log_is_moved_along_its_timeline(tab: Tab, tmp_path: Path) -> None:
+    stop = threading.Event()
+    views: list[ViewServer] = []
+
+    def serve(player: Any) -> ViewServer:
+        views.append(ViewServer(port=0, player=player))
+        return views[0]
+
+    loop = threading.Thread(target=run_replay, args=(LogRecording(log_of(tmp_path / "a.mcap")), serve, stop))
+    loop.start()
+    try:
+        assert eventually(lambda: bool(views))
+        page = tab.page
+        page.goto(views[0].address)
+        page.get_by_role("button", name="Pause").click()
+        page.get_by_role("button", name="Play").wait_for()
+        page.wait_for_selector("[data-state=collecting]")
+        time = page.get_by_role("textbox").first
+        time.fill("30")
+        time.press("Enter")
+        page.wait_for_selector("[data-state=solved]")
+        tab.shot("replay")
+        time.fill("1")
+        time.press("Enter")
+        page.wait_for_selector("[data-state=collecting]")
+        assert page.get_by_role("button", name="Recalibrate").count() == 0, "nothing can be asked of a recording"
+    finally:
+        stop.set()
+        loop.join(20.0)

@@ -1,0 +1,288 @@
+"""What the view knows, and what its panels say of it; no browser here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hub.view.export import calibration_file
+from hub.view.gate import Gate, is_local
+from hub.view.page import marked
+from hub.view.panels import ago, camera_details, camera_table, overview
+from hub.view.planes import pixel_of
+from hub.view.player import CalibrationRecording, LogRecording, Player
+from hub.view.server import answer_to, commands_for
+from hub.view.state import SILENT_S, ViewState
+from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, TRACK
+from protocols.errors import InputError
+from protocols.gate import encode
+from protocols.log.writer import LogWriter
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.calibration import read_calibration
+from tests.samples import calibration, camera_info, observation, picture, status, track
+
+SECOND = 1_000_000_000
+
+
+def filming(state: ViewState, camera: str = "cam0", seconds: float = 2.0, fps: float = 25.0, begin: int = 0) -> float:
+    """Frames at ``fps`` up to ``seconds``; returns the time of the last one."""
+    moment = 0.0
+    for index in range(round(seconds * fps)):
+        moment = index / fps
+        state.handle(observation(camera, begin + index), moment)
+    return moment
+
+
+def test_the_rate_is_that_of_the_frames_and_a_gap_in_the_sequence_is_a_loss() -> None:
+    state = ViewState()
+    now = filming(state)
+    camera = state.cameras["cam0"]
+    assert camera.fps(now) == pytest.approx(25.0)
+    assert (camera.frames, camera.lost, camera.restarts) == (50, 0, 0)
+    state.handle(observation("cam0", 59), now + 0.4)
+    assert camera.lost == 9
+    state.handle(observation("cam0", 59), now + 0.5)
+    assert camera.frames == 51, "one frame that is heard twice counts once"
+    state.handle(observation("cam0", 3, boot_id="boot-2"), now + 0.6)
+    assert (camera.restarts, camera.lost) == (1, 9), "another boot counts from anywhere"
+
+
+def test_a_camera_is_solved_refused_silent_or_gone() -> None:
+    state = ViewState()
+    now = filming(state)
+    camera = state.cameras["cam0"]
+    assert camera.state(now) == "collecting"
+    solved = calibration()
+    state.handle(solved, now)
+    assert camera.state(now) == "solved"
+    assert camera.state(now + SILENT_S + 0.1) == "silent"
+    refused = pb.Calibration(schema_version=1, status="refused", reason="moved", revision=9)
+    refused.refused.append(pb.Refusal(camera="cam0", reason="it was moved"))
+    state.handle(refused, now)
+    assert (camera.state(now), camera.refused) == ("refused", "it was moved")
+    assert camera.calibration is not None, "where it stood is still shown"
+    state.presence("camera", "cam0", alive=False, boot="boot-1")
+    assert camera.state(now) == "gone"
+
+
+def test_the_panel_shows_the_figures_of_the_hub() -> None:
+    state = ViewState()
+    now = filming(state)
+    message = calibration()
+    state.handle(camera_info("cam0"), now)
+    state.handle(message, now)
+    found = message.cameras[0]
+    text = camera_table(state, now)
+    assert f"{1e3 * found.time_offset_std:.3f} ms" in text
+    assert f"{found.time_offset:+.6f} s" in text
+    assert f"{1e6 * (found.clock_rate - 1):+.1f} ppm" in text
+    assert f"{found.rms_px:.2f} px" in text
+    assert "25.0" in text
+    assert "✓ cam0" in text
+    assert "50 frames, marker in 50" in camera_details(state, state.cameras["cam0"], now)
+
+
+def test_names_and_reasons_cannot_put_markup_into_the_page() -> None:
+    state = ViewState()
+    filming(state)
+    bad = pb.Calibration(schema_version=1, status="refused", reason="<script>alert(1)</script>")
+    bad.refused.append(pb.Refusal(camera="cam0", reason="<img src=x onerror='alert(2)'>\"'"))
+    state.handle(bad, 2.0)
+    for text in (overview(state, 2.0), camera_table(state, 2.0), camera_details(state, state.cameras["cam0"], 2.0)):
+        assert "<script" not in text
+        assert "<img" not in text
+        assert "onerror='" not in text
+
+
+def test_guidance_is_shown_while_something_is_missing() -> None:
+    state = ViewState()
+    state.handle(camera_info("cam0"), 0.0)
+    filming(state)
+    assert "of its view: wave it" in overview(state, 2.0)
+
+
+def test_of_many_paths_the_one_longest_silent_makes_room() -> None:
+    state = ViewState()
+    for index in range(100):
+        for label in (f"p{index}", "p0"):
+            point = track(index)
+            point.label = label
+            state.handle(point, float(index))
+    assert 10 < len(state.paths) < 60
+    assert "p0" in state.paths
+    assert "p99" in state.paths
+    assert "p1" not in state.paths
+
+
+def test_times_are_short() -> None:
+    assert [ago(value, 100.0) for value in (None, 99.9, 70.0)] == ["never", "now", "30\u2009s"]
+    assert ago(0.0, 600.0) == "10\u2009min"
+
+
+def test_a_click_is_one_command_for_each_agent_that_can_and_its_present_run() -> None:
+    state = ViewState()
+    for agent, role, boot in (("rec-a", "record", "b1"), ("rec-b", "record", "b2"), ("hub", "hub", "b3")):
+        message = status(agent)
+        message.role, message.boot_id = role, boot
+        state.handle(message, 0.0)
+    commands = commands_for(state, "stop_recording", "view-1", "boot", 4)
+    assert [(c.agent, c.agent_boot, c.sequence) for c in commands] == [("rec-a", "b1", 4), ("rec-b", "b2", 5)]
+    assert all(encode(command) for command in commands)
+    assert commands_for(state, "recalibrate", "view-1", "boot", 0)[0].agent == "hub"
+    assert answer_to(state, "export") == "asked hub: export"
+    assert "nobody" in answer_to(ViewState(), "export")
+
+
+def test_calibration_toml_from_the_bus_says_what_the_hub_said(tmp_path: Path) -> None:
+    state = ViewState()
+    assert calibration_file(state) == ""
+    message = calibration()
+    for found in message.cameras:
+        state.handle(camera_info(found.camera), 0.0)
+    state.handle(message, 0.0)
+    file = tmp_path / "calibration.toml"
+    file.write_text(calibration_file(state), encoding="utf-8")
+    _, cameras = read_calibration(file)
+    assert list(cameras) == [found.camera for found in message.cameras]
+    first = message.cameras[0]
+    assert cameras[first.camera].time_map.time_offset == first.time_offset
+    assert cameras[first.camera].pose.translation == pytest.approx(np.array(first.translation))
+
+
+def log_of(path: Path, seconds: int = 40) -> Path:
+    with LogWriter(path) as log:
+        log.write(CAMERA_INFO, "cam0", "local", camera_info("cam0"), 100 * SECOND)
+        for index in range(seconds * 10):
+            at = 100 * SECOND + index * SECOND // 10
+            log.write(OBSERVATION, "cam0", "local", observation("cam0", index), at)
+            if index == 50:
+                log.write(CALIBRATION, "hub", "local", calibration(), at)
+            if index > 50:
+                point = track(index)
+                point.reference_time_ns = index * SECOND // 10
+                log.write(TRACK, "hub", "local", point, at)
+    return path
+
+
+def test_a_replay_can_be_moved_forward_and_back(tmp_path: Path) -> None:
+    player = Player(LogRecording(log_of(tmp_path / "a.mcap")))
+    assert player.duration == pytest.approx(39.9)
+    assert player.state.solved is None
+    player.wanted = 30.0
+    assert player.advance(0.1), "a jump makes a new state"
+    camera = player.state.cameras["cam0"]
+    assert camera.state(player.position) == "solved", "the calibration was told 25 s before"
+    assert camera.fps(player.position) == pytest.approx(10.0, rel=0.05)
+    path = player.state.paths["marker"].array()
+    assert path[-1, 0] == pytest.approx(30.0, abs=0.11)
+    assert not player.advance(1.0)
+    assert player.position == pytest.approx(31.0)
+    player.wanted = 2.0
+    player.advance(0.1)
+    assert player.state.solved is None, "nothing was calibrated yet"
+    assert player.state.cameras["cam0"].frames == 21
+    player.speed = 1000.0
+    player.advance(1.0)
+    assert (player.position, player.playing) == (player.duration, False)
+
+
+def test_a_refusal_in_a_log_does_not_take_the_cameras_away(tmp_path: Path) -> None:
+    refused = pb.Calibration(schema_version=1, status="refused", reason="nothing moved", revision=8)
+    with LogWriter(tmp_path / "a.mcap") as log:
+        log.write(CAMERA_INFO, "cam0", "local", camera_info("cam0"), 0)
+        log.write(CALIBRATION, "hub", "local", calibration(), SECOND)
+        log.write(CALIBRATION, "hub", "local", refused, 2 * SECOND)
+        log.write(OBSERVATION, "cam0", "local", observation("cam0"), 60 * SECOND)
+    player = Player(LogRecording(tmp_path / "a.mcap"))
+    player.seek(60.0)
+    assert player.state.headline() == "refused: nothing moved"
+    assert player.state.cameras["cam0"].pose is not None
+
+
+def test_a_log_with_nothing_to_see_is_refused(tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "a.mcap"):
+        pass
+    with pytest.raises(InputError, match="nothing in this log"):
+        LogRecording(tmp_path / "a.mcap")
+
+
+def test_a_calibration_that_is_looked_at_misses_no_frames(tmp_path: Path) -> None:
+    state = ViewState()
+    message = calibration()
+    for found in message.cameras:
+        state.handle(camera_info(found.camera), 0.0)
+    state.handle(message, 0.0)
+    (tmp_path / "calibration.toml").write_text(calibration_file(state), encoding="utf-8")
+    (tmp_path / "trajectory.csv").write_text("time,x,y,z,std\n5,1,2,3,0.1\n6,2,2,3,0.1\n", encoding="utf-8")
+    player = Player(CalibrationRecording(tmp_path))
+    player.advance(1.0)
+    assert player.duration == 1.0
+    assert {camera.state(player.position) for camera in player.state.cameras.values()} == {"solved"}
+    assert player.state.paths["marker"].array()[:, 1].tolist() == [1.0, 2.0]
+    (tmp_path / "trajectory.csv").write_text("time,x,y,z,std\n5,1,nan,3,0.1\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"trajectory.csv:2: a number is not finite"):
+        CalibrationRecording(tmp_path)
+
+
+def test_a_ray_meets_the_pixel_that_was_clicked() -> None:
+    origin = np.array([0.5, 0.1, -2.0])
+    for index, u, v in ((0, 10.0, 20.0), (1, 630.0, 470.0)):
+        aim = np.array([index * 1.06 + (u + 0.5) / 640 - 0.5, ((v + 0.5) / 480 - 0.5) * 0.75, 0.0])
+        assert pixel_of(origin, aim - origin, index, (640, 480)) == pytest.approx((u, v))
+    assert pixel_of(origin, np.array([1.0, 0.0, 0.0]), 0, (640, 480)) is None
+    assert pixel_of(origin, np.array([5.0, 0.0, 1.0]), 0, (640, 480)) is None
+
+
+def test_the_ring_is_where_the_detection_is() -> None:
+    state = ViewState()
+    state.handle(picture("cam0"), 0.0)
+    state.handle(observation("cam0"), 0.0)
+    camera = state.cameras["cam0"]
+    image = np.full((180, 320, 3), 128, dtype=np.uint8)
+    drawn = marked(image, camera)
+    changed = np.argwhere((drawn != image).any(axis=2))
+    # (320.5, 240.25) of 1280x720 is (80, 60) of 320x180.
+    assert changed.mean(axis=0) == pytest.approx([60.2, 80.2], abs=0.7)
+    assert (image == 128).all()
+
+
+class Headers(dict):  # type: ignore[type-arg]
+    """As websockets gives them: by name, None where absent."""
+
+
+@pytest.mark.parametrize(
+    ("headers", "open_"),
+    [
+        ({"Host": "127.0.0.1:8080"}, True),
+        ({"Host": "localhost:8080", "Origin": "http://localhost:8080"}, True),
+        ({"Host": "[::1]:8080"}, True),
+        ({"Host": "127.0.0.1:8080", "Origin": "https://evil.example"}, False),
+        ({"Host": "evil.example:8080"}, False),
+        ({}, False),
+    ],
+)
+def test_without_a_token_only_this_machine_and_only_this_page_may_look(headers: dict[str, str], open_: bool) -> None:
+    assert Gate().allows("/", Headers(headers)) is open_
+
+
+@pytest.mark.parametrize(
+    ("path", "cookie", "open_"),
+    [
+        ("/?token=secret-secret", "", True),
+        ("/?token=wrong-secret!", "", False),
+        ("/", "", False),
+        ("/", "syncline-view=secret-secret", True),
+        ("/", "other=1; syncline-view=secret-secret", True),
+        ("/", "syncline-view=", False),
+        ("/?token=", "syncline-view=wrong", False),
+    ],
+)
+def test_beyond_this_machine_the_token_is_asked_for(path: str, cookie: str, open_: bool) -> None:
+    assert Gate("secret-secret").allows(path, Headers({"Host": "rig.lan:8080", "Cookie": cookie})) is open_
+
+
+def test_which_hosts_are_this_machine() -> None:
+    assert all(is_local(host) for host in ("localhost", "127.0.0.1", "127.8.8.8", "::1"))
+    assert not any(is_local(host) for host in ("0.0.0.0", "192.168.1.4", "localhost.evil.example", "", "::"))
