@@ -5,27 +5,35 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from hub.live import LiveHub, LiveSettings
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, RIG_INFO, TRACK
+from hub.live import KnownCalibration, LiveHub, LiveSettings
+from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, PREDICTION, RIG_INFO, TRACK
 from protocols.clocks import NANOSECONDS
 from protocols.errors import InputError
 from protocols.log.reader import LogReader
 from protocols.log.writer import LogWriter
+from protocols.session.calibration import read_calibration
 
-_TOPICS = {topic.message: topic for topic in (CALIBRATION, TRACK)}
+_TOPICS = {topic.message: topic for topic in (CALIBRATION, TRACK, PREDICTION)}
 
 
-def replay_through_hub(log: Path, out: Path, settings: LiveSettings | None = None, agent: str = "hub") -> int:
+def replay_through_hub(
+    log: Path,
+    out: Path,
+    settings: LiveSettings | None = None,
+    agent: str = "hub",
+    calibration: Path | None = None,
+) -> int:
     """What a hub publishes when it hears a log, as a log; returns how many messages.
 
-    The hub's clock is the log's: it solves after the same messages on every machine. ``out`` is whole or not there.
-    Raises InputError.
+    calibration: a calibration.toml to track with instead of solving. The hub's clock is the log's: it solves after the
+    same messages on every machine. ``out`` is whole or not there. Raises InputError.
     """
     reader = LogReader(log)
     if out.exists():
         raise InputError("exists already", file=out, remedy="choose another --out, or move it away")
     temporary = out.with_name(f".{out.name}.{os.getpid()}")
-    hub = LiveHub(settings)
+    known = None if calibration is None else KnownCalibration(*read_calibration(calibration))
+    hub = LiveHub(settings, known=known)
     count, first_ns, now_ns, site = 0, None, 0, ""
     try:
         with LogWriter(temporary, {"replay": {"through": "hub"}}) as writer:

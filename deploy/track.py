@@ -75,8 +75,8 @@ def read_telemetry(file: Path) -> TelemetryFile:
     Rows with NaN, empty cells, no rotation or a time already seen are left out and counted.
     Raises InputError: file, line, what, remedy.
     """
-    if file.suffix.lower() in (".tlog", ".mcap", ".bin"):
-        remedy = "export it to a telemetry.csv with time,qw,qx,qy,qz[,north,east,down]"
+    if file.suffix.lower() in (".bin", ".ulg"):
+        remedy = "give the .tlog, or export a telemetry.csv with time,qw,qx,qy,qz[,north,east,down]"
         raise InputError(f"{file.suffix} telemetry can't be read by this version", file=file, remedy=remedy)
     try:
         text = file.read_text(encoding="utf-8-sig")

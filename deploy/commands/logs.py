@@ -101,8 +101,9 @@ def replay(
     topics: list[str] | None = None,
     compare: Path | None = None,
     tolerance: list[str] | None = None,
-    through: Literal["hub"] | None = None,
+    through: Literal["hub", "uav"] | None = None,
     out: Path | None = None,
+    calibration: Path | None = None,
     site: str = "local",
     connect: list[str] | None = None,
     json: Annotated[bool, Parameter(negative="")] = False,
@@ -132,9 +133,12 @@ def replay(
     tolerance
         topic.field=greatest difference in the field's own unit, for --compare; default: 0 for every field.
     through
-        Publish nothing; let this estimator hear the log, without clock or bus, and write what it says to --out.
+        Publish nothing; let this estimator hear the log, without clock or bus, and write what it says to --out. uav
+        needs a log with pictures.
     out
         The new log for --through; must not exist.
+    calibration
+        For --through hub: a calibration.toml to follow people with, instead of solving.
     site
         Site to publish on.
     connect
@@ -152,6 +156,8 @@ def replay(
         raise InputError("--tolerance goes with --compare", remedy="leave it out, or give --compare OTHER.mcap")
     if (through is None) != (out is None):
         raise InputError("--through and --out go together", remedy="e.g. --through hub --out again.mcap")
+    if calibration is not None and through != "hub":
+        raise InputError("--calibration goes with --through hub", remedy="leave it out, or give --through hub")
     if (through or compare) and (rate, start, loop, connect) != ("1", 0.0, False, None):
         raise InputError(
             f"--{'through' if through else 'compare'} publishes nothing",
@@ -160,9 +166,17 @@ def replay(
     if through is not None and out is not None:
         if compare is not None or topics:
             raise InputError("--through hears a whole log", remedy="leave out --compare and --topics")
-        from deploy.process_replay import replay_through_hub
+        if through == "uav":
+            from deploy.uav_replay import replay_through_uav
 
-        count = replay_through_hub(log, out)
+            count, missing = replay_through_uav(log, out)
+            if missing:
+                text = f"{missing} inputs were not recorded: not all that was said comes again"
+                print(f"syncline: {log}: {text}", file=sys.stderr)
+        else:
+            from deploy.process_replay import replay_through_hub
+
+            count = replay_through_hub(log, out, calibration=calibration)
         print(f'{{"written": {count}}}' if json else f"{count} messages written to {out}")
         return EXIT_DONE
     if compare is not None:

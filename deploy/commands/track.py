@@ -49,8 +49,9 @@ def track(
     rig
         A rig.toml with the camera: matrix, distortions, fps, body_from_camera. One camera, or the video's name.
     telemetry
-        The drone's telemetry.csv: time,qw,qx,qy,qz[,north,east,down]. The ground model refuses it
-        without matrix and body_from_camera in --rig: it could not use it.
+        The drone's telemetry.csv: time,qw,qx,qy,qz[,north,east,down], on the video's clock; or a .tlog or .mcap, whose
+        clock is found by the video's own turning. The ground model refuses it without matrix and body_from_camera
+        in --rig: it could not use it.
     model
         ground: on the ground plane, the best. paper, plain: the paper's, for comparison.
     fps
@@ -80,7 +81,14 @@ def track(
     mounting = camera.body_from_camera if camera is not None else None
     warnings: list[str] = []
     samples: tuple[Telemetry, ...] = ()
-    told = tracking.read_telemetry(telemetry) if telemetry is not None else None
+    own_clock = telemetry is not None and telemetry.suffix.lower() in (".tlog", ".mcap")
+    told: tracking.TelemetryFile | None = None
+    if telemetry is not None and own_clock:
+        from deploy.uav_telemetry import read_own_clock
+
+        told = read_own_clock(telemetry)
+    elif telemetry is not None:
+        told = tracking.read_telemetry(telemetry)
     if told is not None and telemetry is not None:
         if model == "ground" and (lens is None or mounting is None):
             what = "telemetry says nothing without the camera's matrix and body_from_camera"
@@ -95,7 +103,18 @@ def track(
     recording.open()
     size = (recording.info.width, recording.info.height)
     count = tracking.count_frames(video)
-    if told is not None and telemetry is not None:
+    if told is not None and own_clock:
+        samples = ()
+        if lens is not None and mounting is not None:
+            from deploy.uav_telemetry import onto_video
+
+            with progress_bar(f"looking for the telemetry's clock in {video.name}", quiet=json) as tell:
+                samples, line = onto_video(
+                    told, video, rate, lens, mounting, lambda i: tell(f"frame {i}", i / count if count else 0.0)
+                )
+            if not samples:
+                warnings.append(line)
+    elif told is not None and telemetry is not None:
         end = count / recording.info.fps if count else float("inf")
         tracking.check_clock(told, telemetry, start / recording.info.fps, end)
     tracker = models.get(model, size, lens, mounting, recording.info.fps, seed)

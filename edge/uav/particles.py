@@ -12,10 +12,10 @@ in particle filters through KLD-sampling" (2003). Equation numbers are those of 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import Protocol, TypeVar
 
 import numpy as np
-from scipy.special import ndtri
 
 from protocols.geometry.types import Bools, Floats, Ints
 
@@ -129,7 +129,7 @@ def kld_number(cells: int, error: float, confidence: float) -> int:
         return 1
     free = cells - 1.0
     spread = 2.0 / (9.0 * free)
-    root = 1.0 - spread + np.sqrt(spread) * float(ndtri(confidence))
+    root = 1.0 - spread + np.sqrt(spread) * NormalDist().inv_cdf(confidence)
     return int(np.ceil(free / (2.0 * error) * root**3))
 
 

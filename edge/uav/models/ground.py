@@ -141,6 +141,11 @@ class GroundTracker:
             self._reroot(estimate)
         return estimate
 
+    def road_outline(self) -> tuple[Floats, Floats | None]:
+        """The road near the target as it was seen: image pixels (n, 2), and north, east (n, 2) [m] where known."""
+        ground = self._road.outline(self._cloud.weights @ self._cloud.place, _ROAD_SHOWN)
+        return self._placing.pixels(ground), ground if self._placing.metric else None
+
     @property
     def _heading(self) -> float:
         return pf.circular_mean(self._cloud.heading, self._cloud.weights)

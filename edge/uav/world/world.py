@@ -112,11 +112,21 @@ class World:
         moving = (self.target, *self.traffic) if target else self.traffic
         return self._renderer.draw(i, matrix, position, moving, noise=noise)
 
+    def draw_from(self, i: int, rotation: Floats, position: Floats) -> npt.NDArray[np.uint8]:
+        """The picture of frame ``i`` from another place: rotation (3, 3) camera from NED, centre (3,) NED [m]."""
+        self._check(i)
+        matrix = self._projection(rotation, position)
+        return self._renderer.draw(i, matrix, position, (self.target, *self.traffic))
+
     def truth(self, i: int) -> Truth:
         """The truth about frame ``i``."""
         self._check(i)
         rotation, position = (part[i] for part in self._poses)
-        matrix = self._matrix(i)
+        return self.truth_from(i, rotation, position)
+
+    def truth_from(self, i: int, rotation: Floats, position: Floats) -> Truth:
+        """The truth about frame ``i`` as seen from another place; ned_from_body is that of a camera so mounted."""
+        matrix = self._projection(rotation, position)
         ground, course = self.target.ground[i], float(self.target.course[i])
         centre = np.array([ground[0], ground[1], -cars.MIDDLE_HEIGHT])
         ahead = centre + _AHEAD * np.array([np.cos(course), np.sin(course), 0.0])
@@ -144,7 +154,7 @@ class World:
             speed=float(np.linalg.norm(step)) * self.fps / (after - before),
             course=float(np.arctan2(np.sin(course), np.cos(course))),
             camera=Pose(rotation, position),
-            ned_from_body=self.flight.at(np.array([self.time(i)]))[0][0],
+            ned_from_body=rotation.T @ self.body_from_camera.T,
             others=self._others(i, matrix, position),
         )
 
@@ -202,7 +212,9 @@ class World:
 
     def _matrix(self, i: int) -> Floats:
         """Projection (3, 4), pixels from NED."""
-        rotation, position = (part[i] for part in self._poses)
+        return self._projection(*(part[i] for part in self._poses))
+
+    def _projection(self, rotation: Floats, position: Floats) -> Floats:
         return np.asarray(self.lens.matrix @ np.column_stack([rotation, -rotation @ position]))
 
     def _others(self, i: int, matrix: Floats, position: Floats) -> Floats:

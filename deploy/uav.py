@@ -1,0 +1,304 @@
+"""Puts the UAV agent together from its configuration: camera, link, controls, video, and the simulated aircraft."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from deploy.uav_config import FlightConfig, UavConfig
+from edge.devices.base import Device
+from protocols.bus.base import Bus
+from protocols.errors import EXIT_DONE, InputError
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Floats
+from protocols.session.rig import read_rig
+from protocols.version import VERSION
+
+if TYPE_CHECKING:
+    from edge.devices.aircraft import SimulatedAircraft
+    from edge.mavlink.autopilot import Autopilot
+    from edge.mavlink.camera import CameraComponent, Select, Stop, Stream
+    from edge.mavlink.link import Link
+    from edge.uav.tracker import Estimate, Image
+    from edge.uav.world.world import World
+    from edge.video_server import VideoServer
+
+_HOVER_M = 62.0
+_GIMBAL_PITCH = math.radians(-62.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulation:
+    """The world of a simulated agent, and what flies in it."""
+
+    world: World
+    aircraft: SimulatedAircraft
+    autopilot: Autopilot | None = None
+
+
+def start_uav(config: UavConfig, bus: Bus, stop: threading.Event, beat: Callable[[], None] | None = None) -> int:
+    """Run a UAV agent until it is stopped or its recording ends."""
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+    import cv2
+
+    from edge.uav_agent import Looking, UavAgent
+
+    cv2.setNumThreads(1)
+    with ExitStack() as stack:
+        device, lens, mounting = stack.enter_context(_camera(config))
+        device.open()  # also tells its size; opening it again does nothing
+        info = device.info
+        lens = lens or info.intrinsics
+        if config.model == "ground" and (lens is None or mounting is None):
+            # It works without, but blind to telemetry: say so once, where somebody looks.
+            print("syncline: without matrix and body_from_camera in rig the telemetry is not used", flush=True)
+        size, fps = (info.width, info.height), info.fps or 30.0
+        link = make_link(config)
+        watch = _Watched()
+        stream: Stream | None = None
+        server: VideoServer | None = None
+        if config.video_out is not None:
+            server, stream = _serve_video(config, watch, stack)
+        agent = make_agent(
+            config, device, link, Looking(size, fps, lens, mounting, config.seed, config.model, _quality(config)),
+            stream=stream, shown=watch.take if server is not None else None,
+        )  # fmt: skip
+        watch.tell = server.changed if server is not None else lambda: None
+        assert isinstance(agent, UavAgent)
+        agent.run(bus, stop, beat)
+    return EXIT_DONE
+
+
+def make_link(config: UavConfig) -> Link:
+    """The link that the configuration names, not yet open."""
+    from edge.mavlink import camera, telemetry
+    from edge.mavlink.dialect import CAMERA
+    from edge.mavlink.link import Link
+    from edge.mavlink.signing import Signing, read_key
+    from edge.mavlink.transport import parse
+
+    settings = config.mavlink
+    signing = None
+    if settings.key is not None:
+        state = settings.key_state or settings.key.with_name(f"{settings.key.name}.times.json")
+        signing = Signing(read_key(settings.key), state)
+    return Link(
+        parse(settings.url),
+        system=settings.system,
+        component=CAMERA,
+        allowed=(*telemetry.KINDS, *camera.KINDS),
+        signing=signing,
+        vehicle=settings.vehicle,
+    )
+
+
+def make_agent(
+    config: UavConfig,
+    device: Device,
+    link: Link,
+    looking: object,
+    *,
+    stream: Stream | None = None,
+    shown: Callable[[Image, Estimate | None, str], None] | None = None,
+    now_ns: Callable[[], int] = time.monotonic_ns,
+    boot_id: str | None = None,
+) -> object:
+    """The agent around a device and a link. looking: a ``Looking``; now_ns: the host's monotonic clock."""
+    from edge.mavlink.camera import CameraComponent
+    from edge.mavlink.control import Control, Limits
+    from edge.mavlink.vehicle import Vehicle
+    from edge.uav_agent import Looking, UavAgent
+
+    assert isinstance(looking, Looking)
+    numbers = tuple(int(part) for part in VERSION.split(".")[:3])
+    bounds = config.control
+    limits = Limits(
+        gimbal=bounds.gimbal,
+        follow=bounds.follow,
+        pitch=(math.radians(bounds.pitch_deg[0]), math.radians(bounds.pitch_deg[1])),
+        rate=math.radians(bounds.rate_deg_s),
+        coast_s=bounds.coast_s,
+        std_m=bounds.std_m,
+        range_m=bounds.range_m,
+        speed=bounds.speed,
+    )
+
+    def component(obey: Callable[[Select | Stop], bool]) -> CameraComponent:
+        return CameraComponent(
+            link,
+            looking.size,
+            looking.fps,
+            looking.lens,
+            stream,
+            obey,
+            stations=frozenset(config.mavlink.stations),
+            version=(numbers[0], numbers[1], numbers[2]),
+        )
+
+    return UavAgent(
+        device,
+        link,
+        Vehicle(link, gimbal=config.mount == "gimbal", rate_hz=config.mavlink.rate_hz),
+        component,
+        Control(link, limits),
+        config.id,
+        looking,
+        shown=shown,
+        now_ns=now_ns,
+        boot_id=boot_id,
+    )
+
+
+def simulation(flight: FlightConfig, size: tuple[int, int] = (640, 480)) -> Simulation:
+    """The world of a [simulated] table and its aircraft, at the world's time 0. Raises InputError."""
+    import numpy as np
+
+    from edge.devices.aircraft import SimulatedAircraft
+    from edge.uav.world.patrol import patrol
+
+    world = patrol(flight.seed, flight.seconds, size)
+    gimbal = None
+    start = None
+    yaw = 0.0
+    if flight.flies == "follow" or flight.gimbal:
+        ground = world.target.ground[0]
+        start = np.array([ground[0], ground[1], -_HOVER_M])
+        yaw = float(world.target.course[0])
+    if flight.gimbal:
+        # Beside the way, so that the car is looked at from aside.
+        assert start is not None
+        back = _HOVER_M / math.tan(-_GIMBAL_PITCH)
+        start[:2] -= back * np.array([math.cos(yaw), math.sin(yaw)])
+        gimbal = (_GIMBAL_PITCH, yaw)
+    path = world.flight if flight.flies == "path" and not flight.gimbal else None
+    return Simulation(world, SimulatedAircraft(path, start=start, yaw=yaw, gimbal=gimbal, seed=flight.seed))
+
+
+@contextmanager
+def flying(flight: FlightConfig, site: Simulation, epoch_unix_s: float) -> Iterator[None]:
+    """The autopilot of a simulation, on its UDP port, in a thread of its own."""
+    from edge.devices.pacing import RealTime
+    from edge.mavlink.autopilot import Autopilot, Faults
+    from edge.mavlink.transport import Udp, Url
+
+    host, _, port = flight.autopilot.rpartition(":")
+    try:
+        transport = Udp(Url("udpin", host, int(port)), bound=True)
+    except OSError as error:
+        raise InputError(
+            f"the autopilot cannot wait at {flight.autopilot}: {error.strerror}", remedy="choose another port"
+        ) from None
+    faults = Faults(
+        flight.drop, flight.duplicate, flight.garble, flight.delay_s, flight.jitter_s, tuple(flight.reboot_at)
+    )
+    autopilot = Autopilot(site.aircraft, transport, boot_s=flight.boot_s, faults=faults, seed=flight.seed)
+    pace, stop = RealTime(epoch_unix_s), threading.Event()
+
+    def run() -> None:
+        while not stop.is_set():
+            transport.wait(0.005)
+            autopilot.step(pace.now())
+
+    thread = threading.Thread(target=run, name="autopilot", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(2.0)
+        transport.close()
+
+
+@contextmanager
+def _camera(config: UavConfig) -> Iterator[tuple[Device, Intrinsics | None, Floats | None]]:
+    """The camera, its lens, and body_from_camera."""
+    if config.driver == "simulated":
+        import numpy as np
+
+        from edge.devices.flight_camera import FlightCamera
+        from edge.devices.pacing import RealTime
+
+        flight = config.simulated or FlightConfig()
+        site = simulation(flight)
+        epoch = time.time() if flight.start_unix_s is None else flight.start_unix_s
+        fixed = np.asarray(site.world.body_from_camera)
+        with flying(flight, site, epoch):
+            camera = FlightCamera(site.world, site.aircraft, RealTime(epoch), ahead_s=flight.camera_ahead_s)
+            yield camera, site.world.lens, gimbal_mounting() if config.mount == "gimbal" else fixed
+        return
+    from deploy.agents import make_device
+    from deploy.config import CameraConfig
+
+    lens, mounting = _rig_camera(config)
+    settings = CameraConfig(id=config.id, driver=config.driver, video=config.video, oak=config.oak)
+    yield make_device(settings, lens), lens, mounting
+
+
+def gimbal_mounting() -> Floats:
+    """body_from_camera of a camera that looks along its gimbal's x axis."""
+    from edge.devices.aircraft import GIMBAL_FROM_CAMERA
+
+    return GIMBAL_FROM_CAMERA
+
+
+def _rig_camera(config: UavConfig) -> tuple[Intrinsics | None, Floats | None]:
+    if config.rig is None:
+        return None, gimbal_mounting() if config.mount == "gimbal" else None
+    rig = read_rig(config.rig)
+    camera = rig.cameras.get(config.id)
+    if camera is None:
+        raise InputError(
+            f"no camera {config.id!r} ({', '.join(rig.cameras)})", file=config.rig, remedy=f"add [{config.id}] to it"
+        )
+    mounting = camera.body_from_camera
+    if mounting is None and config.mount == "gimbal":
+        mounting = gimbal_mounting()
+    return camera.intrinsics, mounting
+
+
+def _quality(config: UavConfig) -> int | None:
+    return None if config.images is None else config.images.quality
+
+
+class _Watched:
+    """The newest picture and estimate, for the operator's video; drawn and compressed only if somebody watches."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._newest: tuple[Image, Estimate | None, str] | None = None
+        self.tell: Callable[[], None] = lambda: None
+
+    def take(self, image: Image, estimate: Estimate | None, line: str) -> None:
+        with self._lock:
+            # Layers speak of the tracker's present frame only.
+            self._newest = (image, None if estimate is None else replace(estimate, layers={}), line)
+        self.tell()
+
+    def jpeg(self, quality: int) -> bytes | None:
+        import cv2
+
+        from edge.uav.operator_view import draw
+
+        with self._lock:
+            newest = self._newest
+        if newest is None:
+            return None
+        good, data = cv2.imencode(".jpg", draw(*newest), [cv2.IMWRITE_JPEG_QUALITY, quality])
+        return data.tobytes() if good else None
+
+
+def _serve_video(config: UavConfig, watch: _Watched, stack: ExitStack) -> tuple[VideoServer, Stream]:
+    from edge.mavlink.camera import Stream
+    from edge.video_server import PATH, VideoServer
+
+    out = config.video_out
+    assert out is not None
+    host, _, port = out.listen.rpartition(":")
+    server = stack.enter_context(VideoServer(host, int(port), lambda: watch.jpeg(out.quality)))
+    return server, Stream("mjpeg", out.uri or f"http://{host}:{server.port}{PATH}")

@@ -1,0 +1,30 @@
+"""The dialect, chosen before pymavlink is loaded: without these it would speak MAVLink 1."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from protocols.errors import InputError
+
+os.environ["MAVLINK20"] = "1"
+os.environ.setdefault("MAVLINK_DIALECT", "common")
+
+try:
+    from pymavlink.dialects.v20 import common as _common
+except ImportError:
+    raise InputError(
+        "MAVLink needs the package pymavlink", remedy='install the extra: pip install "syncline[uav]"'
+    ) from None
+
+mavlink: Any = _common
+"""pymavlink's module of the common dialect: one class a message, one constant an enumeration's entry."""
+
+AUTOPILOT = 1
+"""Component id of an autopilot."""
+CAMERA = 100
+"""Component id of the first camera."""
+GIMBAL = 154
+"""Component id of the first gimbal."""
+STATION = 190
+"""Component id of a ground station's mission planner."""

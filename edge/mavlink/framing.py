@@ -1,0 +1,88 @@
+"""Finds whole messages in a stream of bytes in which anything may have happened.
+
+pymavlink's own parser throws away as many bytes as a chance marker in garbage claims, and good messages with them.
+This one goes on one byte after a marker that began no message.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from edge.mavlink.dialect import mavlink
+
+_V1, _V2 = 0xFE, 0xFD
+_SIGNED = 0x01
+_SIGNATURE = 13
+_LONGEST = 280 + _SIGNATURE
+
+
+class Framer:
+    """One stream. unreadable: bytes that belong to no message; unknown: messages of other dialects."""
+
+    def __init__(self) -> None:
+        self._codec: Any = mavlink.MAVLink(None)
+        self._buffer = bytearray()
+        self.unreadable = 0
+        self.unknown = 0
+
+    def feed(self, data: bytes, *, whole: bool = False) -> Iterator[tuple[Any, bytes]]:
+        """Messages whose checksum is right, each with its bytes.
+
+        whole: no message goes on in the next piece, as in datagrams: what looks like the beginning of one at the end
+        holds nothing up.
+        """
+        self._buffer += data
+        at = 0
+        while (found := self._marker(at)) is not None:
+            self.unreadable += found - at
+            at = found
+            length = self._length(at)
+            if length is None or at + length > len(self._buffer):
+                if not whole:
+                    break
+                self.unreadable += 1
+                at += 1
+                continue
+            frame = bytes(self._buffer[at : at + length])
+            message = self._decode(frame)
+            if message is None:
+                self.unreadable += 1
+                at += 1
+            elif message.get_msgId() < 0 or isinstance(message, mavlink.MAVLink_unknown):
+                # Its checksum can't be known. Believe its length only if something begins where it ends.
+                end = at + length
+                if end < len(self._buffer) and self._buffer[end] not in (_V1, _V2):
+                    self.unreadable += 1
+                    at += 1
+                else:
+                    self.unknown += 1
+                    at = end
+            else:
+                at += length
+                yield message, frame
+        else:
+            self.unreadable += len(self._buffer) - at
+            at = len(self._buffer)
+        del self._buffer[:at]
+
+    def _marker(self, at: int) -> int | None:
+        first = [place for mark in (_V1, _V2) if (place := self._buffer.find(mark, at)) >= 0]
+        return min(first, default=None)
+
+    def _length(self, at: int) -> int | None:
+        """Bytes of the message that may begin here; None where too few have come to tell."""
+        head = self._buffer[at : at + 3]
+        if len(head) < 3:
+            return None
+        if head[0] == _V1:
+            return 8 + head[1]
+        return 12 + head[1] + (_SIGNATURE if head[2] & _SIGNED else 0)
+
+    def _decode(self, frame: bytes) -> Any:
+        if frame[0] == _V2 and frame[2] & ~_SIGNED:
+            return None
+        try:
+            return self._codec.decode(bytearray(frame))
+        except mavlink.MAVError:
+            return None

@@ -1,0 +1,222 @@
+"""The UAV agent's estimator: pictures, telemetry and the operator's orders in, what is known of the target out.
+
+Messages in, messages out, no clock and no link: live, the agent feeds it; a replay feeds it from a log, in the same
+order, and gets the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+from google.protobuf.message import Message
+
+from edge.uav import models
+from edge.uav.navigation import Origin, from_quaternion
+from edge.uav.tracker import Box, Estimate, Image, State, Telemetry, Tracker
+from protocols.clocks import NANOSECONDS
+from protocols.errors import InputError
+from protocols.gate import SCHEMA_VERSION
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Floats
+from protocols.messages import syncline_pb2 as pb
+
+_REMEMBERED = 200  # samples of telemetry from before a target is chosen
+_CLOUD_EVERY, _ROAD_EVERY = 6, 15  # frames
+_CLOUD_POINTS, _ROAD_POINTS = 100, 600
+_FARTHEST_PX = 1e6
+_CAR_M = 5.5  # side of the box that a point stands for, where the ground's scale is known
+_POINT_PX = 40.0
+
+
+class Follower:
+    """One agent's. size: (width, height) [px]. seed: of every tracker's random numbers; the n-th target's is seed + n.
+
+    model: one of ``models.NAMES``. lens, body_from_camera: as far as known; where the camera hangs on a gimbal, body
+    is the gimbal. estimate: the newest; None while nothing is followed. counters: what was refused.
+    """
+
+    def __init__(
+        self,
+        agent: str,
+        boot_id: str,
+        size: tuple[int, int],
+        lens: Intrinsics | None = None,
+        body_from_camera: Floats | None = None,
+        *,
+        fps: float = 30.0,
+        seed: int = 0,
+        model: str = "ground",
+    ) -> None:
+        self._agent, self._boot = agent, boot_id
+        self._size, self._fps, self._seed, self._model = size, fps, seed, model
+        self._lens, self._mounting = lens, body_from_camera
+        self._samples: deque[Telemetry] = deque(maxlen=_REMEMBERED)
+        self._tracker: Tracker | None = None
+        self._image: Image | None = None
+        self._frame, self._time_ns = 0, 0
+        self._sequence = 0
+        self._targets = 0
+        self.origin: Origin | None = None
+        self.estimate: Estimate | None = None
+        self.refused = 0
+        self.undecodable = 0
+
+    @property
+    def following(self) -> bool:
+        """Whether there is a target."""
+        return self._tracker is not None
+
+    def handle(self, message: Message) -> list[Message]:
+        """Take one input message; what is to be published because of it."""
+        if isinstance(message, pb.FlightImage):
+            return self.handle_frame(decoded(message), message.frame, message.device_time_ns)
+        if isinstance(message, pb.VehicleTelemetry):
+            self._take_sample(message)
+        elif isinstance(message, pb.TargetCommand):
+            return self._obey(message)
+        return []
+
+    def handle_frame(self, image: Image | None, frame: int, device_time_ns: int) -> list[Message]:
+        """Take a picture; None: one that could not be decoded."""
+        if image is None or image.shape[:2] != (self._size[1], self._size[0]):
+            image = None
+            self.undecodable += 1
+        self._image, self._frame, self._time_ns = image, frame, device_time_ns
+        if self._tracker is None:
+            return []
+        self.estimate = self._tracker.handle_frame(image, device_time_ns / NANOSECONDS)
+        return self._say()
+
+    def box_about(self, x: float, y: float) -> Box:
+        """The box that a point (x, y) [px] stands for: a car's size, where the height above the ground is known."""
+        side = _POINT_PX
+        sample = self._samples[-1] if self._samples else None
+        if sample is not None and sample.position is not None and self._lens is not None and self._mounting is not None:
+            ray = np.append(self._lens.unproject(np.array([[x, y]]))[0], 1.0)
+            down = float((sample.ned_from_body @ self._mounting @ ray)[2])
+            if np.isfinite(down) and down > 1e-3 and sample.position[2] < -2.0:
+                side = float(np.clip(_CAR_M * self._lens.focal * down / -sample.position[2], 8.0, 0.5 * self._size[1]))
+        return Box(x - 0.5 * side, y - 0.5 * side, side, side)
+
+    def _take_sample(self, message: pb.VehicleTelemetry) -> None:
+        turned = from_quaternion(list(message.ned_from_body))
+        if turned is None:
+            return
+        position = np.array(message.position) if message.position else None
+        if message.origin:
+            self.origin = Origin(*message.origin)
+        sample = Telemetry(message.device_time_ns / NANOSECONDS, turned, position)
+        self._samples.append(sample)
+        if self._tracker is not None:
+            self._tracker.handle_telemetry(sample)
+
+    def _obey(self, message: pb.TargetCommand) -> list[Message]:
+        if message.kind == "stop":
+            self._tracker = self.estimate = None
+            return []
+        if self._image is None:
+            self.refused += 1
+            return []
+        tracker = models.get(self._model, self._size, self._lens, self._mounting, self._fps, self._seed + self._targets)
+        for sample in self._samples:
+            tracker.handle_telemetry(sample)
+        try:
+            estimate = tracker.begin(self._image, self._time_ns / NANOSECONDS, Box(*message.box))
+        except InputError:
+            self.refused += 1  # what was followed goes on being followed
+            return []
+        self._targets += 1
+        self._tracker, self.estimate = tracker, estimate
+        return self._say()
+
+    def _say(self) -> list[Message]:
+        estimate = self.estimate
+        assert estimate is not None
+        out: list[Message] = [self._state(estimate)]
+        if self._sequence % _CLOUD_EVERY == 0 and estimate.particles is not None:
+            pixels = _near(estimate.particles)
+            out.append(
+                pb.TargetCloud(**self._head(), particles=len(pixels), pixels=_thinned(pixels, _CLOUD_POINTS).ravel())
+            )
+        if self._sequence % _ROAD_EVERY == 0:
+            out.append(self._road(estimate))
+        self._sequence += 1
+        return out
+
+    def _head(self) -> dict[str, Any]:
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "agent": self._agent,
+            "boot_id": self._boot,
+            "sequence": self._sequence,
+            "frame": self._frame,
+            "device_time_ns": self._time_ns,
+        }
+
+    def _state(self, e: Estimate) -> pb.TargetState:
+        message = pb.TargetState(**self._head(), state=e.state.value)
+        if e.state is not State.LOST:
+            message.centre.extend((_bounded(e.x), _bounded(e.y)))
+            message.std_px = min(e.std, _FARTHEST_PX) if math.isfinite(e.std) else 0.0
+        if math.isfinite(e.width) and math.isfinite(e.height):
+            message.size.extend((_bounded(e.width), _bounded(e.height)))
+        if math.isfinite(e.heading):
+            message.heading.append(e.heading)
+        if e.state is not State.LOST and math.isfinite(e.north) and math.isfinite(e.east):
+            message.ground.extend((e.north, e.east))
+            message.std_m = e.std_m if math.isfinite(e.std_m) else 0.0
+            if math.isfinite(e.speed) and math.isfinite(e.course):
+                message.velocity.extend((e.speed * math.cos(e.course), e.speed * math.sin(e.course)))
+            if self.origin is not None:
+                message.geo.extend(float(part) for part in self.origin.world(e.north, e.east, 0.0))
+        for hypothesis in e.hypotheses:
+            if math.isfinite(hypothesis.x) and math.isfinite(hypothesis.y):
+                message.hypotheses.add(weight=hypothesis.weight, x=_bounded(hypothesis.x), y=_bounded(hypothesis.y))
+        return message
+
+    def _road(self, estimate: Estimate) -> pb.RoadMap:
+        message = pb.RoadMap(**self._head())
+        outline: Callable[[], tuple[Floats, Floats | None]] | None = getattr(self._tracker, "road_outline", None)
+        if outline is None:
+            return message
+        pixels, ground = outline()
+        good = np.isfinite(pixels).all(axis=1) & (np.abs(pixels).max(axis=1, initial=0.0) < _FARTHEST_PX)
+        chosen = np.flatnonzero(good)
+        chosen = chosen[:: max(1, -(-len(chosen) // _ROAD_POINTS))]
+        message.pixels.extend(pixels[chosen].ravel())
+        if ground is not None:
+            message.ground.extend(ground[chosen].ravel())
+        return message
+
+
+def decoded(message: pb.FlightImage) -> Image | None:
+    """The picture (h, w, 3) BGR of a message; None where it is none."""
+    if not message.jpeg:
+        return None
+    try:
+        image = cv2.imdecode(np.frombuffer(message.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error:
+        return None
+    if image is None or image.shape[:2] != (message.height, message.width):
+        return None
+    return np.asarray(image, np.uint8)
+
+
+def _bounded(value: float) -> float:
+    return float(np.clip(value, -_FARTHEST_PX, _FARTHEST_PX))
+
+
+def _near(pixels: Floats) -> Floats:
+    """Those (n, 2) that are finite and can be told."""
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(pixels).all(axis=1) & np.asarray((np.abs(pixels) < _FARTHEST_PX).all(axis=1))
+    return pixels[good]
+
+
+def _thinned(points: Floats, most: int) -> Floats:
+    return points[:: max(1, -(-len(points) // most))]

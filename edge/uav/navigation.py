@@ -1,0 +1,82 @@
+"""Attitudes and places in the terms of a flight: angles, quaternions, latitude and longitude, north-east-down."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from protocols.geometry import so3
+from protocols.geometry.types import Floats
+
+_EARTH_RADIUS_M = 6_378_137.0
+_ECCENTRICITY2 = 6.694379990141317e-3  # of the WGS 84 ellipsoid
+
+
+def from_angles(roll: float, pitch: float, yaw: float) -> Floats:
+    """(3, 3) Rz(yaw) Ry(pitch) Rx(roll)."""
+    x, y, z = np.eye(3)
+    return np.asarray(so3.exp(yaw * z) @ so3.exp(pitch * y) @ so3.exp(roll * x))
+
+
+def from_quaternion(q: Any) -> Floats | None:
+    """(3, 3) of w, x, y, z; None where that is no rotation."""
+    parts = np.array(q, np.float64)
+    size = float(np.linalg.norm(parts))
+    if not (np.isfinite(parts).all() and 0.9 < size < 1.1):
+        return None
+    w, x, y, z = parts / size
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def to_quaternion(rotation: Floats) -> list[float]:
+    """w, x, y, z of a rotation (3, 3), w ≥ 0."""
+    vector = so3.log(rotation)
+    angle = float(np.linalg.norm(vector))
+    axis = vector / angle if angle > 1e-12 else np.zeros(3)
+    return [math.cos(0.5 * angle), *(math.sin(0.5 * angle) * axis).tolist()]
+
+
+def curvature_radii(latitude: float) -> tuple[float, float]:
+    """Metres a radian north and a radian east (that one still times cos latitude) on the WGS 84 ellipsoid."""
+    w = 1.0 - _ECCENTRICITY2 * math.sin(math.radians(latitude)) ** 2
+    return _EARTH_RADIUS_M * (1.0 - _ECCENTRICITY2) / w**1.5, _EARTH_RADIUS_M / math.sqrt(w)
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where a local NED frame stands [degrees, m above the sea]; flat-earth, good for some kilometres."""
+
+    latitude: float
+    longitude: float
+    altitude: float
+
+    def local(self, latitude: float, longitude: float, altitude: float) -> Floats:
+        """(3,) north, east, down [m]."""
+        north, east = curvature_radii(self.latitude)
+        across = (longitude - self.longitude + 180.0) % 360.0 - 180.0
+        return np.array(
+            [
+                math.radians(latitude - self.latitude) * north,
+                math.radians(across) * east * math.cos(math.radians(self.latitude)),
+                self.altitude - altitude,
+            ]
+        )
+
+    def world(self, north: float, east: float, down: float) -> tuple[float, float, float]:
+        """Latitude, longitude [degrees], altitude [m]."""
+        a, b = curvature_radii(self.latitude)
+        longitude = self.longitude + math.degrees(east / (b * math.cos(math.radians(self.latitude))))
+        return (
+            self.latitude + math.degrees(north / a),
+            (longitude + 180.0) % 360.0 - 180.0,
+            float(self.altitude - down),
+        )

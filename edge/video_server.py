@@ -1,0 +1,146 @@
+"""Pictures over HTTP to whoever asks, as motion JPEG: what every browser and GStreamer, VLC and FFmpeg can show.
+
+Only the newest picture counts, and it is compressed only while somebody watches.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from types import TracebackType
+from typing import Self
+
+from protocols.errors import InputError
+
+PATH = "/stream.mjpg"
+_BOUNDARY = "frame"
+_MOST_VIEWERS = 4
+_SEND_TIMEOUT_S = 5.0
+_PAGE = (
+    b"<!doctype html><title>Syncline</title><style>body{margin:0;background:#111}img{width:100%}</style>"
+    b"<img src=stream.mjpg>"
+)
+
+
+class VideoServer:
+    """Serves ``PATH``, a page with it at /, and /snapshot.jpg. host, port: where it listens; port 0: any free one.
+
+    compress: the newest picture as JPEG, called on a viewer's thread; None while there is none.
+    """
+
+    def __init__(self, host: str, port: int, compress: Callable[[], bytes | None]) -> None:
+        self._changed = threading.Condition()
+        self._number = 0
+        self._closed = False
+        self._viewers = 0
+        self._compress = compress
+        self._jpeg: tuple[int, bytes | None] = (-1, None)
+        try:
+            self._server = ThreadingHTTPServer((host, port), self._handler())
+        except OSError as error:
+            raise InputError(
+                f"the video cannot be served at {host}:{port}: {error.strerror}",
+                remedy="choose another [video_out] listen",
+            ) from None
+        self._server.daemon_threads = True
+        self._thread = threading.Thread(target=self._server.serve_forever, name="video", daemon=True)
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        return int(self._server.server_address[1])
+
+    @property
+    def viewers(self) -> int:
+        """How many watch now."""
+        return self._viewers
+
+    def changed(self) -> None:
+        """There is a new picture."""
+        with self._changed:
+            self._number += 1
+            self._changed.notify_all()
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._server.shutdown()
+        self._server.server_close()
+
+    def _next(self, seen: int) -> tuple[int, bytes | None]:
+        """The first picture after number ``seen``; waits for it, up to a second."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._number != seen or self._closed, 1.0)
+            number = self._number
+            if self._closed or number == seen:
+                return seen, None
+            if self._jpeg[0] != number:
+                self._jpeg = (number, self._compress())
+            return self._jpeg
+
+    def _handler(self) -> type[BaseHTTPRequestHandler]:
+        server = self
+
+        class Handler(BaseHTTPRequestHandler):
+            timeout = _SEND_TIMEOUT_S
+
+            def do_GET(self) -> None:
+                try:
+                    self._serve()
+                except OSError:
+                    self.close_connection = True  # the viewer has gone
+
+            def _serve(self) -> None:
+                path = self.path.partition("?")[0]
+                if path == "/":
+                    self._whole("text/html", _PAGE)
+                elif path == "/snapshot.jpg":
+                    _, data = server._next(-1)
+                    self._whole("image/jpeg", data) if data else self.send_error(503, "no picture yet")
+                elif path == PATH:
+                    self._stream()
+                else:
+                    self.send_error(404)
+
+            def _whole(self, kind: str, data: bytes) -> None:
+                self.send_response(200)
+                self.send_header("Content-Type", kind)
+                self.send_header("Content-Length", str(len(data)))
+                self.end_headers()
+                self.wfile.write(data)
+
+            def _stream(self) -> None:
+                with server._changed:
+                    full = server._viewers >= _MOST_VIEWERS
+                    server._viewers += not full
+                if full:
+                    self.send_error(503, f"{_MOST_VIEWERS} are watching already")
+                    return
+                try:
+                    self.send_response(200)
+                    self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
+                    self.send_header("Cache-Control", "no-store")
+                    self.end_headers()
+                    seen = -1
+                    while not server._closed:
+                        seen, data = server._next(seen)
+                        if data is None:
+                            continue
+                        head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
+                        self.wfile.write(head.encode() + data + b"\r\n")
+                finally:
+                    with server._changed:
+                        server._viewers -= 1
+
+            def log_message(self, format: str, *args: object) -> None:
+                pass
+
+        return Handler

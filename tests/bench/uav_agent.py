@@ -1,0 +1,204 @@
+"""The UAV agent: how quick it is, how well it finds the telemetry's clock, and whether its loops close.
+
+    python -m tests.bench.uav_agent [--only latency,offset,tlog,gimbal,follow] [--seeds 4] [--first-seed 700]
+
+latency: CPU from a frame's arrival to its status on the link, 640x480 with a target. offset: error of the map from the
+vehicle's clock to the camera's, 26 s after the start, on the simulated aircraft. tlog: the same on flight/plane.tlog,
+beside frames drawn from its attitude. gimbal, follow: pushes that take the car out of the picture, and how often the
+agent's own commands bring it back within 12 s. Leaves with status 1 if a figure is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from deploy.uav_config import ControlConfig
+from edge.devices.aircraft import Push
+from edge.devices.base import Frame
+from edge.mavlink.link import Heard
+from edge.mavlink.tlog import read_tlog
+from edge.uav.alignment import find_offset
+from edge.uav.seen_turning import SeenTurning, usual_tilt
+from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA
+from edge.uav.world.patrol import patrol
+from protocols.geometry.camera import Intrinsics
+from protocols.messages import syncline_pb2 as pb
+from tests.bench.real_rigs import DEFAULT_DATA
+from tests.uav_flights import Flight
+
+FPS = 30.0
+_BACK_S = 12.0
+_PITCH = np.deg2rad(-62.0)
+_HEIGHT = 62.0
+
+
+def latency(seeds: list[int]) -> bool:
+    """CPU a frame of the agent alone: link, estimator, alignment, statuses."""
+    spent = []
+    flight = Flight(patrol(seeds[0], 16.0), seed=seeds[0])
+    step = flight.agent.step
+
+    def timed(heard: list[Heard], frame: Frame | None) -> None:
+        began = time.process_time()
+        step(heard, frame)
+        if frame is not None and flight.agent.follower.following:
+            spent.append(time.process_time() - began)
+
+    flight.agent.step = timed  # type: ignore[method-assign]
+    flight.run(1.5)
+    flight.select()
+    flight.run(14.0)
+    median, tail = 1e3 * np.quantile(spent, [0.5, 0.99])
+    print(f"latency: {len(spent)} frames, CPU median {median:.1f} ms, p99 {tail:.1f} ms (asked for: p99 <= 50 ms)")
+    return bool(tail <= 1.5e3 / FPS)
+
+
+def offset(seeds: list[int]) -> bool:
+    """Simulated aircraft: vehicle clock to camera clock."""
+    good = True
+    for seed in seeds:
+        flight = Flight(patrol(seed, 30.0), seed=seed)
+        flight.run(26.0)
+        newest = flight.said(pb.VehicleTelemetry)[-5:]
+        true = flight.camera_ahead_s - flight.boot_s
+        error = float(np.median([(m.device_time_ns - m.vehicle_time_ns) / 1e9 - true for m in newest]))
+        found = None if flight.agent.aligner is None else flight.agent.aligner.found
+        std = float("nan") if found is None else found.std
+        print(f"offset: seed {seed}: {1e3 * error:+.1f} ms, says +-{1e3 * std:.1f} ms (asked for: 5 ms)", flush=True)
+        good &= abs(error) <= 0.005
+    return good
+
+
+def tlog(data: Path) -> bool:
+    """A real flight's attitude: frames drawn from it, and its clock found again over the whole log."""
+    file = data / "flight" / "plane.tlog"
+    if not file.exists():
+        print(f"tlog: left out, there is no {file}")
+        return True
+    samples = read_tlog(file).samples
+    times = np.array([sample.time for sample in samples])
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    # As an aircraft turns: smoothly through its samples, which are half a second and more apart.
+    turned = RotationSpline(times, Rotation.from_matrix(np.array([sample.ned_from_body for sample in samples])))
+    lens = Intrinsics(640, 480, np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 239.5], [0.0, 0.0, 1.0]]))
+    ground = _texture()
+    good = True
+    for begin in (150.0, 300.0, 450.0):
+        seen = SeenTurning((640, 480), lens)
+        tilt = usual_tilt(samples, BODY_FROM_DOWN_CAMERA)
+        for k in range(round(40.0 * FPS)):
+            moment = begin + 0.1234 + k / FPS
+            camera = BODY_FROM_DOWN_CAMERA.T @ turned(moment).as_matrix().T
+            place = np.array([3.0 * np.sin(0.2 * moment), 12.0 * k / FPS - 200.0, -80.0])
+            seen.update(_draw(ground, lens, camera, place), k / FPS, tilt)
+        answer = find_offset(seen.turning(), samples, BODY_FROM_DOWN_CAMERA)
+        if isinstance(answer, str):
+            print(f"tlog: from {begin:.0f} s: refused: {answer}", flush=True)
+            good = False
+            continue
+        error = answer.offset - begin - 0.1234
+        print(f"tlog: from {begin:.0f} s: {1e3 * error:+.1f} ms, says +-{1e3 * answer.std:.1f} ms (asked for: 5 ms)")
+        good &= abs(error) <= 0.005
+    return good
+
+
+def _texture() -> np.ndarray:
+    rng = np.random.default_rng(1)
+    out = np.zeros((2048, 2048), np.float32)
+    for size in (32, 128, 512, 2048):
+        out += cv2.resize(rng.standard_normal((size, size)).astype(np.float32), (2048, 2048))
+    return np.clip(128 + 30 * out, 0, 255).astype(np.uint8)
+
+
+def _draw(ground: np.ndarray, lens: Intrinsics, camera_from_ned: np.ndarray, place: np.ndarray) -> np.ndarray:
+    metres = np.array([[0.0, 0.25, -256.0], [0.25, 0.0, -256.0], [0.0, 0.0, 1.0]])  # NED of the texture's pixels
+    flat = camera_from_ned.copy()
+    flat[:, 2] = -camera_from_ned @ place
+    gray = cv2.warpPerspective(ground, lens.matrix @ flat @ metres, (640, 480), borderMode=cv2.BORDER_WRAP)
+    return np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR))
+
+
+def loops(seeds: list[int], kind: str) -> bool:
+    """Push the camera away from the car; count how often it comes back by the agent's own commands."""
+    back = exits = 0
+    for seed in seeds:
+        world = patrol(seed, 34.0)
+        rng = np.random.default_rng(seed)
+        yaw = float(world.target.course[0])
+        start = np.array([*world.target.ground[0], -_HEIGHT])
+        pushes = []
+        for begin in (8.0, 19.0):
+            angle = rng.uniform(-np.pi, np.pi)
+            if kind == "gimbal":
+                turn = (float(rng.choice([-1.0, 1.0]) * 0.1), float(rng.choice([-1.0, 1.0]) * rng.uniform(0.7, 1.0)))
+                pushes.append(Push(begin, 0.9, turn=turn))
+            else:
+                speed = 16.0
+                pushes.append(Push(begin, 3.0, velocity=(speed * float(np.cos(angle)), speed * float(np.sin(angle)))))
+        gimbal = None
+        if kind == "gimbal":
+            start[:2] -= _HEIGHT / np.tan(-_PITCH) * np.array([np.cos(yaw), np.sin(yaw)])
+            gimbal = (float(_PITCH), yaw)
+        control = ControlConfig(gimbal=kind == "gimbal", follow=kind != "gimbal", coast_s=15.0)
+        flight = Flight(
+            world, control=control, flies="follow", gimbal=gimbal, start=start, yaw=yaw, pushes=tuple(pushes), seed=seed
+        )
+        inside: list[tuple[float, float]] = []
+
+        def watch(frame: int, flight: Flight = flight, inside: list[tuple[float, float]] = inside) -> None:
+            inside.append((flight.world.time(frame), flight.truth(frame).inside))
+
+        flight.on_frame = watch
+        flight.run(1.5)
+        if not flight.select():
+            print(f"{kind}: seed {seed}: no target could be selected")
+            exits += len(pushes)
+            continue
+        flight.run(33.5)
+        table = np.array(inside)
+        for push in pushes:
+            after = (table[:, 0] > push.begin) & (table[:, 0] < push.begin + push.seconds + _BACK_S)
+            away = table[after & (table[:, 1] == 0.0), 0]
+            if not len(away):
+                continue
+            exits += 1
+            back += bool((table[after & (table[:, 0] > away[-1]), 1] > 0.9).any())
+        print(f"{kind}: seed {seed}: {back} of {exits} so far", flush=True)
+    share = back / exits if exits else 0.0
+    print(f"{kind}: the car is back in the picture after {back} of {exits} exits (asked for: 90 %)")
+    return exits > 0 and share >= 0.9
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="latency,offset,tlog,gimbal,follow")
+    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--first-seed", type=int, default=700)
+    parser.add_argument("--data", type=Path, default=DEFAULT_DATA)
+    options = parser.parse_args()
+    seeds = list(range(options.first_seed, options.first_seed + options.seeds))
+    parts = {
+        "latency": lambda: latency(seeds),
+        "offset": lambda: offset(seeds),
+        "tlog": lambda: tlog(options.data),
+        "gimbal": lambda: loops(seeds, "gimbal"),
+        "follow": lambda: loops(seeds, "follow"),
+    }
+    unknown = set(options.only.split(",")) - set(parts)
+    if unknown:
+        parser.error(f"no part {', '.join(sorted(unknown))}; there are {', '.join(parts)}")
+    cv2.setNumThreads(1)
+    missed = [name for name in options.only.split(",") if not parts[name]()]
+    if missed:
+        print(f"missed: {', '.join(missed)}")
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,181 @@
+"""The UAV agent, its simulated aircraft and pymavlink as a ground station of its own, over loopback UDP."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+os.environ["MAVLINK20"] = "1"
+from pymavlink import mavutil
+
+from deploy import uav
+from deploy.config import load
+from deploy.uav_config import FlightConfig, UavConfig
+from edge.uav.world.world import World
+from protocols.bus.memory import MemoryBus, MemoryHub
+from protocols.catalogue import TOPICS
+from tests.samples import eventually
+
+M = mavutil.mavlink
+ACTIVE, ERROR, COASTING = 1, 2, 8
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Gcs:
+    """pymavlink on UDP, as MAVProxy is."""
+
+    def __init__(self, port: int) -> None:
+        self.link = mavutil.mavlink_connection(f"udpout:127.0.0.1:{port}", source_system=255, source_component=190)
+        self.beat()
+
+    def beat(self) -> None:
+        self.link.mav.heartbeat_send(M.MAV_TYPE_GCS, M.MAV_AUTOPILOT_INVALID, 0, 0, 4)
+
+    def wait(self, kind: str, accept: Callable[[Any], bool] = lambda m: True, timeout_s: float = 20.0) -> Any:
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            message = self.link.recv_match(type=kind, blocking=True, timeout=0.5)
+            if message is not None and message.get_srcComponent() == 100 and accept(message):
+                return message
+            self.beat()
+        raise AssertionError(f"no {kind} came")
+
+    def command(self, command: int, *parameters: float) -> int:
+        filled = [*parameters, *([0.0] * (7 - len(parameters)))]
+        for tried in range(10):  # as stations do: an order may be lost, or come before the camera knows its vehicle
+            self.link.mav.command_long_send(1, 100, command, tried, *filled)
+            try:
+                return int(self.wait("COMMAND_ACK", lambda m: m.command == command, 2.0).result)
+            except AssertionError:
+                continue
+        raise AssertionError(f"command {command} was never answered")
+
+    def close(self) -> None:
+        self.link.close()
+
+
+@contextmanager
+def agent(tmp_path: Path, text: str = "") -> Iterator[tuple[Gcs, World, Any, UavConfig]]:
+    """A running agent on a memory bus, a station, the world, and all that was published as (topic, message)."""
+    port = free_port()
+    file = tmp_path / "drone.toml"
+    file.write_text(
+        f'id = "drone"\n[simulated]\nautopilot = "127.0.0.1:{port}"\nseconds = 60\nseed = 3\n'
+        f'[mavlink]\nurl = "udpout:127.0.0.1:{port}"\n[images]\n' + text
+    )
+    config = load(file, UavConfig)
+    world = small_world(config.simulated or FlightConfig())
+    hub = MemoryHub()
+    ear = MemoryBus(hub)
+    subscriptions = {topic.name: ear.subscribe(topic) for topic in TOPICS}
+    stop = threading.Event()
+    thread = threading.Thread(target=uav.start_uav, args=(config, MemoryBus(hub), stop))
+    thread.start()
+    gcs = Gcs(port)
+    try:
+        yield gcs, world, subscriptions, config
+    finally:
+        stop.set()
+        thread.join(20.0)
+        gcs.close()
+        assert not thread.is_alive()
+
+
+_WORLDS: dict[int, Any] = {}
+
+
+def small_world(flight: FlightConfig) -> World:
+    """The agent's world, built once: towns take seconds."""
+    if flight.seed not in _WORLDS:
+        _WORLDS[flight.seed] = BUILD(flight, (320, 240))
+    site = _WORLDS[flight.seed]
+    return site.world
+
+
+BUILD = uav.simulation
+
+
+@pytest.fixture(autouse=True)
+def built_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    from edge.devices.aircraft import SimulatedAircraft
+
+    def simulation(flight: FlightConfig, size: tuple[int, int] = (640, 480)) -> uav.Simulation:
+        world = small_world(flight)
+        return uav.Simulation(world, SimulatedAircraft(world.flight, seed=flight.seed))
+
+    monkeypatch.setattr(uav, "simulation", simulation)
+
+
+def newest_frame(subscriptions: Any) -> int:
+    images = [received.message for received in subscriptions["flight_image"].drain()]
+    return int(images[-1].frame)
+
+
+def select(gcs: Gcs, world: World, subscriptions: Any) -> None:
+    width, height = world.size
+    assert eventually(lambda: subscriptions["flight_image"].wait(0.1))
+    for _ in range(40):
+        box = world.truth(newest_frame(subscriptions)).box
+        corners = (box.x / width, box.y / height, (box.x + box.width) / width, (box.y + box.height) / height)
+        if min(corners) > 0.02 and max(corners) < 0.98:
+            assert gcs.command(M.MAV_CMD_CAMERA_TRACK_RECTANGLE, *corners) == M.MAV_RESULT_ACCEPTED
+            return
+        time.sleep(0.2)
+    raise AssertionError("the car is never in the picture")
+
+
+def test_a_ground_station_selects_a_car_and_hears_where_it_is_also_out_of_the_picture(tmp_path: Path) -> None:
+    with agent(tmp_path, '[video_out]\nlisten = "127.0.0.1:0"\n') as (gcs, world, subscriptions, _):
+        beat = gcs.wait("HEARTBEAT")
+        assert (beat.type, beat.autopilot) == (M.MAV_TYPE_CAMERA, M.MAV_AUTOPILOT_INVALID)
+        assert gcs.command(M.MAV_CMD_REQUEST_MESSAGE, M.MAVLINK_MSG_ID_CAMERA_INFORMATION) == 0
+        info = gcs.wait("CAMERA_INFORMATION")
+        assert (info.resolution_h, info.resolution_v) == world.size
+        assert info.flags & (512 | 1024 | 2048) == 512 | 1024 | 2048
+        assert gcs.command(M.MAV_CMD_REQUEST_MESSAGE, M.MAVLINK_MSG_ID_VIDEO_STREAM_INFORMATION) == 0
+        uri = gcs.wait("VIDEO_STREAM_INFORMATION").uri
+        with urllib.request.urlopen(uri, timeout=10) as stream:
+            assert b"image/jpeg" in stream.read(200)
+        assert gcs.command(M.MAV_CMD_CAMERA_TRACK_RECTANGLE, 0.1, 0.1, 1.2, 0.2) == M.MAV_RESULT_DENIED
+        assert gcs.command(M.MAV_CMD_IMAGE_START_CAPTURE) == M.MAV_RESULT_UNSUPPORTED
+
+        select(gcs, world, subscriptions)
+        seen = gcs.wait("CAMERA_TRACKING_IMAGE_STATUS", lambda m: m.tracking_status == ACTIVE)
+        assert 0.0 <= seen.rec_top_x < seen.rec_bottom_x <= 1.0
+        place = gcs.wait("CAMERA_TRACKING_GEO_STATUS", lambda m: m.tracking_status == ACTIVE and m.lat != 0x7FFFFFFF)
+        assert 0.0 < place.h_acc < 5.0
+        # The flight loses the car within 12 s.
+        away = gcs.wait("CAMERA_TRACKING_IMAGE_STATUS", lambda m: m.tracking_status == ACTIVE | COASTING, 30.0)
+        assert np.isnan(away.rec_top_x) or away.rec_bottom_x <= 1.0
+        gcs.wait("CAMERA_TRACKING_IMAGE_STATUS", lambda m: m.tracking_status == ACTIVE, 30.0)
+        assert gcs.command(M.MAV_CMD_CAMERA_STOP_TRACKING) == M.MAV_RESULT_ACCEPTED
+        gcs.wait("CAMERA_TRACKING_IMAGE_STATUS", lambda m: m.tracking_status == 0)
+
+    states = [received.message for received in subscriptions["target"].drain()]
+    errors = []
+    for state in states:
+        truth = world.truth(state.frame)
+        if state.centre and truth.inside > 0.5:
+            errors.append(np.hypot(state.centre[0] - truth.x, state.centre[1] - truth.y))
+    assert len(errors) > 30
+    assert np.median(errors) < 5.0
+    status = [r.message for r in subscriptions["status"].drain() if r.message.agent == "drone"][-1]
+    assert status.state == "stopping"
+    assert status.counters["camera.selections"] == 1
+    assert status.counters["camera.refused.box"] == 1
+    assert not any(name.startswith("sent.") and value for name, value in status.counters.items())

@@ -1,0 +1,142 @@
+"""The UAV agent in a time of its own: replay, faults of the link, and what it commands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deploy.uav_config import ControlConfig
+from deploy.uav_replay import replay_through_uav
+from edge.mavlink.autopilot import Faults
+from edge.uav.world.patrol import patrol
+from edge.uav.world.world import World
+from edge.uav_agent import TOPICS
+from protocols.errors import InputError
+from protocols.log.reader import LogReader
+from protocols.log.writer import LogWriter
+from protocols.messages import syncline_pb2 as pb
+from tests.uav_flights import Flight, mavlink
+
+SIZE = (320, 240)
+SHOWN = (pb.TargetState, pb.TargetCloud, pb.RoadMap)
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return patrol(3, 20.0, SIZE)
+
+
+def recorded(flight: Flight, log: Path, keep: Callable[[object], bool] = lambda message: True) -> Path:
+    with LogWriter(log) as writer:
+        for k, message in enumerate(flight.published):
+            if keep(message):
+                writer.write(TOPICS[message.DESCRIPTOR.name], "drone", "local", message, 10**18 + k)
+    return log
+
+
+def test_a_replay_says_what_the_agent_said_to_the_byte(world: World, tmp_path: Path) -> None:
+    flight = Flight(world, jpeg_quality=90)
+    flight.run(1.5)
+    assert flight.select()
+    flight.run(3.0)
+    log = recorded(flight, tmp_path / "flight.mcap")
+    count, missing = replay_through_uav(log, tmp_path / "again.mcap")
+    assert missing == 0
+    again = [
+        logged.message.SerializeToString(deterministic=True) for logged in LogReader(tmp_path / "again.mcap").messages()
+    ]
+    said = [m.SerializeToString(deterministic=True) for m in flight.published if isinstance(m, SHOWN)]
+    assert again == said
+    assert count == len(said) > 40
+    partial = recorded(
+        flight, tmp_path / "partial.mcap", lambda m: getattr(m, "frame", 0) != 50 or not isinstance(m, pb.FlightImage)
+    )
+    _, missing = replay_through_uav(partial, tmp_path / "partial-again.mcap")
+    assert missing == 1
+    with pytest.raises(InputError, match="exists already"):
+        replay_through_uav(log, tmp_path / "again.mcap")
+    with pytest.raises(InputError, match="record from the agent's start"):
+        replay_through_uav(
+            recorded(flight, tmp_path / "blind.mcap", lambda m: not isinstance(m, pb.UavInfo)), tmp_path / "none.mcap"
+        )
+
+
+def test_a_link_that_drops_delays_doubles_and_garbles_costs_little(world: World) -> None:
+    faults = Faults(drop=0.2, duplicate=0.2, garble=0.1, delay_s=0.05, jitter_s=0.05)
+    flight = Flight(world, faults=faults)
+    flight.run(1.5)
+    assert any(flight.select(0.4) for _ in range(5))  # an order may be lost on the way
+    flight.run(4.5)
+    states = flight.said(pb.TargetState)
+    errors = [np.hypot(s.centre[0] - world.truth(s.frame).x, s.centre[1] - world.truth(s.frame).y) for s in states]
+    assert np.median(errors) < 4.0
+    assert flight.link.counters["garbled_bytes"] > 0
+
+
+def test_an_autopilot_that_starts_anew_and_a_clock_that_jumps_are_noticed(world: World) -> None:
+    flight = Flight(world, faults=Faults(reboot_at=(2.0,), steps=((5.0, 30.0),)))
+    flight.run(8.0)
+    clock = flight.agent._vehicle.clock
+    assert (clock.reboots, clock.steps) == (1, 1)
+    newest = flight.said(pb.VehicleTelemetry)[-1]
+    # The vehicle has been up for 6 s, and its clock is 30 s ahead of that; the camera's clock is its own.
+    assert newest.vehicle_time_ns / 1e9 == pytest.approx(8.0 - 2.0 + 30.0, abs=0.3)
+    assert newest.device_time_ns / 1e9 == pytest.approx(8.0 + flight.camera_ahead_s, abs=0.3)
+    # The rates are asked for again.
+    assert (
+        len([m for m in flight.said(pb.VehicleTelemetry) if m.device_time_ns / 1e9 - flight.camera_ahead_s > 7.0]) > 20
+    )
+
+
+def test_nothing_is_commanded_unless_it_is_allowed(world: World) -> None:
+    flight = Flight(world)
+    flight.run(1.5)
+    assert flight.select()
+    flight.run(2.5)
+    assert flight.autopilot.counters["follow_targets"] == flight.autopilot.counters["pointed"] == 0
+
+
+def test_an_aircraft_that_may_be_told_to_follow_is_told_and_stops_when_the_operator_says_so(world: World) -> None:
+    start = np.array([*world.target.ground[0], -62.0])
+    flight = Flight(
+        world, control=ControlConfig(follow=True), flies="follow", start=start, yaw=float(world.target.course[0])
+    )
+    flight.run(1.5)
+    assert flight.select()
+    flight.run(3.0)
+    sent = flight.autopilot.counters["follow_targets"]
+    assert sent > 10
+    told = flight.station.last("CAMERA_TRACKING_GEO_STATUS")
+    north, east, _ = flight.autopilot.origin.local(1e-7 * told.lat, 1e-7 * told.lon, 0.0)
+    assert np.hypot(*(world.target.ground[flight.frame] - [north, east])) < 6.0
+    car = world.target.ground[flight.frame] - world.target.ground[flight.frame - 30]
+    moving = flight.aircraft.pose(flight.time).velocity[:2]
+    assert float(moving @ car) / float(np.linalg.norm(car)) > 2.0  # from a standstill, after the car
+    flight.station.command(mavlink.MAV_CMD_CAMERA_STOP_TRACKING)
+    flight.run(3.2)
+    sent = flight.autopilot.counters["follow_targets"]
+    flight.run(4.0)
+    assert flight.autopilot.counters["follow_targets"] == sent
+    assert flight.agent.status(0).message == "stopped by the operator"
+
+
+def test_with_a_key_an_unsigned_station_commands_nothing(world: World) -> None:
+    key = bytes(range(32))
+    flight = Flight(world, key=key)
+    flight.run(1.5)
+    flight.station.codec.signing.sign_outgoing = False
+    stranger = mavlink.MAVLink_command_long_message(
+        1, 100, mavlink.MAV_CMD_CAMERA_TRACK_POINT, 0, 0.5, 0.5, 0, 0, 0, 0, 0
+    )
+    # Past the autopilot, straight onto the agent's wire.
+    assert flight.agent_pipe.other is not None
+    flight.agent_pipe.other.send(bytes(stranger.pack(flight.station.codec)), None)
+    flight.run(1.7)
+    assert flight.link.counters["refused.unsigned"] == 1
+    assert not flight.agent.follower.following
+    flight.station.codec.signing.sign_outgoing = True
+    assert flight.select()
+    assert flight.agent.follower.following
