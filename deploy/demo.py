@@ -15,6 +15,7 @@ from types import FrameType
 
 import tomli_w
 
+from protocols.bus.base import Bus
 from protocols.bus.router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.zenoh_bus import open_bus
@@ -24,9 +25,9 @@ from protocols.files import check_folder
 from protocols.messages import syncline_pb2 as pb
 
 LOG = "demo.mcap"
-_STARTING_S = 20.0
+_STARTING_S = 60.0
 _STOPPING_S = 40.0
-_MINE = ("config", "logs", LOG, "calibration.toml", "trajectory.csv", "result.json", "report.html")
+_MINE = ("config", "logs", LOG, "calibration.toml", "trajectory.csv", "tracks.csv", "result.json", "report.html")
 
 
 @dataclass(slots=True)
@@ -39,17 +40,22 @@ class Live:
     status: str = "starting"
     first_calibration_s: float | None = None
     calibration: pb.Calibration | None = None
+    address: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class DemoSettings:
-    """What to run. scene, seed, cameras: the world; seconds: how long it is filmed."""
+    """What to run. scene, seed, cameras: the world; seconds: how long it is filmed.
+
+    view_port: of a live view beside it; None = none, 0 = any free one.
+    """
 
     scene: str
     seed: int
     cameras: int
     seconds: float
     out: Path
+    view_port: int | None = None
 
 
 class Fleet:
@@ -78,6 +84,10 @@ class Fleet:
                 # Recorder and hub first, so that they hear everything from the first frame.
                 for name in ("recorder", "hub", *self.names):
                     self._start(name, configs[name])
+                if self.settings.view_port is not None:
+                    live.address = self._open_view(self.settings.view_port)
+                    show(live)
+                look = self._watch(bus)
                 began = time.monotonic()
                 first: float | None = None
                 while first is None or time.monotonic() - first < self.settings.seconds:
@@ -97,6 +107,7 @@ class Fleet:
                         if solved and live.first_calibration_s is None:
                             live.first_calibration_s = time.monotonic() - (first or began)
                         live.status = _status(received.message)
+                    look(live)
                     live.elapsed = 0.0 if first is None else time.monotonic() - first
                     self._check_alive()
                     if first is None and time.monotonic() - began > _STARTING_S:
@@ -105,6 +116,8 @@ class Fleet:
                             f"no frame from {', '.join(missing)} within {_STARTING_S:.0f} s; see {self.out}/logs"
                         )
                     show(live)
+                if self.settings.view_port is not None:
+                    self._stop("view")
                 live.status = "stopping the cameras"
                 show(live)
                 for name in self.names:
@@ -119,6 +132,10 @@ class Fleet:
                         process.kill()
                         process.wait()
         return live
+
+    def _watch(self, bus: Bus) -> Callable[[Live], None]:
+        """What else a scene's demo wants to hear and show; called every round."""
+        return lambda live: None
 
     def _clean(self) -> None:
         """Make the folder, taking away only what an earlier demo wrote."""
@@ -167,9 +184,23 @@ class Fleet:
 
     def _start(self, name: str, config: Path) -> None:
         role = {"recorder": "record", "hub": "hub"}.get(name, "camera")
+        self._run(name, [role, str(config)])
+
+    def _open_view(self, port: int) -> str:
+        """Start the live view; the address to open."""
+        self._run("view", ["view", "--connect", self._endpoint, "--site", self._site, "--port", str(port)])
+        deadline = time.monotonic() + 3 * _STARTING_S
+        while time.monotonic() < deadline and self._processes["view"].poll() is None:
+            for line in (self.out / "logs" / "view.txt").read_text(encoding="utf-8").splitlines():
+                if line.startswith("open http") and len(line.split()) > 1:
+                    return line.split()[1]
+            time.sleep(0.05)
+        raise Refused(f"the view did not start: {self._last_line('view')}")
+
+    def _run(self, name: str, arguments: list[str]) -> None:
         with (self.out / "logs" / f"{name}.txt").open("wb") as log:
             self._processes[name] = subprocess.Popen(
-                [sys.executable, "-m", "deploy", role, str(config)],
+                [sys.executable, "-m", "deploy", *arguments],
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,

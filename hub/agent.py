@@ -14,8 +14,9 @@ from hub.live import LiveHub
 from hub.nodes.host import ROLE as NODES
 from hub.nodes.host import NodeHost
 from protocols.bus.base import Bus, Publisher
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, NODE_STATE, OBSERVATION, RIG_INFO, STATUS, TRACK
+from protocols.catalogue import CALIBRATION, CAMERA_INFO, NODE_STATE, OBSERVATION, PREDICTION, RIG_INFO, STATUS, TRACK
 from protocols.messages import syncline_pb2 as pb
+from protocols.orders import Orders
 from protocols.session.rig import Rig
 from protocols.version import VERSION
 
@@ -23,6 +24,7 @@ ROLE = "hub"
 _TICK_S = 0.05
 _STATUS_S = 1.0
 _RIG_S = 5.0
+_MOST_TEXT = 2000  # characters of a status message
 
 
 def run_hub(
@@ -34,10 +36,13 @@ def run_hub(
     rig: Rig | None = None,
     solved: Callable[[LiveHub], None] | None = None,
     boot_id: str | None = None,
+    beat: Callable[[], None] = lambda: None,
+    export: Callable[[LiveHub], str] | None = None,
 ) -> None:
     """Gather, solve and publish until ``stop`` is set; then solve once more with all that came.
 
-    solved: called after every solve that gave an answer or a refusal (to write files).
+    solved: called after every solve that gave an answer or a refusal (to write files). beat: called after every round,
+    so that a watchdog sees a loop that hangs. export: writes the answer because a view asked; returns what to say.
     """
     boot = boot_id or uuid.uuid4().hex
     nodes = hub.nodes
@@ -46,10 +51,13 @@ def run_hub(
     publishers = {
         "Calibration": bus.publisher(CALIBRATION, agent),
         "Track": bus.publisher(TRACK, agent, rate_hz=200.0),
+        "Prediction": bus.publisher(PREDICTION, agent),
         "RigInfo": bus.publisher(RIG_INFO, agent),
         "AgentStatus": bus.publisher(STATUS, agent),
     }
+    orders = Orders(bus, agent, boot, ("recalibrate", "export"))
     sequence, next_status, next_rig = 0, 0.0, 0.0
+    said = ""
 
     def publish(messages: list[Message]) -> None:
         for message in messages:
@@ -74,7 +82,14 @@ def run_hub(
                 for subscription in subscriptions:
                     for received in subscription.drain():
                         if received.agent != agent or not isinstance(received.message, pb.Calibration):
-                            hub.handle(received.message)
+                            hub.handle(received.message, received.arrival_ns * 1e-9)
+                for action in orders.take():
+                    hub.counters[f"asked.{action}"] += 1
+                    if action == "recalibrate":
+                        hub.start_anew()
+                        said = "recalibrating, as asked"
+                    elif action == "export":
+                        said = "no folder to export to: set out" if export is None else export(hub)
                 if nodes is not None:
                     publish_nodes(nodes, time.monotonic())
                 now = time.monotonic()
@@ -87,8 +102,13 @@ def run_hub(
                     publish([rig_message(rig)])
                 if now >= next_status or last:
                     next_status = now + _STATUS_S
-                    publish([status_message(hub, agent, boot, sequence, [s.counters for s in subscriptions])])
+                    status = status_message(hub, agent, boot, sequence, [s.counters for s in subscriptions])
+                    wanting = hub.calibration is None or hub.refusal is not None or hub.calibration.refused
+                    advice = [one.text for one in hub.guidance.advice()] if wanting else []
+                    status.message = "; ".join(text for text in (status.message, *advice, said) if text)[:_MOST_TEXT]
+                    publish([status])
                     sequence += 1
+                beat()
                 if last:
                     break
                 stop.wait(_TICK_S)
@@ -97,6 +117,7 @@ def run_hub(
             publisher.close()
         if watch is not None:
             watch.close()
+        orders.close()
         for subscription in subscriptions:
             subscription.close()
 
@@ -133,6 +154,15 @@ def status_message(
     )
     for name, count in hub.counters.items():
         message.counters[name] = count
+    for camera, ppm in hub.clocks.rates_ppm().items():
+        message.gauges[f"ppm.{camera}"[:64]] = ppm
+    if hub.clocks.alarms:
+        message.message = "; ".join([*hub.clocks.alarms.values(), message.message])[:1000]
+    if hub.tracking is not None and hub.tracking.heard_any:
+        for name, value in hub.tracking.gauges().items():
+            message.gauges[name] = value
+        for name, count in hub.tracking.counters.items():
+            message.counters[name] = count
     if hub.nodes is not None:
         message.gauges["nodes"] = len(hub.nodes.cameras())
         for name, count in hub.nodes.counters.items():

@@ -19,17 +19,22 @@ if TYPE_CHECKING:
 def demo(
     *,
     seconds: float = 30.0,
-    cameras: int = 3,
+    cameras: int | None = None,
     scene: Literal["marker", "people", "town"] = "marker",
     out: Path = Path("demo-out"),
     view: Annotated[bool, Parameter(negative="")] = False,
+    view_port: int = 8080,
     seed: int = 1,
     json: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
     """Film a simulated marker with cameras that share no clock, find clocks and places, compare with the truth.
 
+    --scene people: calibrated cameras find people who walk about a room, the hub follows them in 3-D.
+    --scene town: a drone over a town; a ground station selects a car by MAVLink and hears where it is, also when it is
+    out of the picture.
     Cameras, hub and recorder are processes that talk over Zenoh on this machine. Ends with a table of recovered against
-    true, the log demo.mcap and report.html in --out. Exit status 3 if the errors are larger than promised.
+    true, the log demo.mcap and report.html (people: tracks.csv) in --out. Exit status 3 if the errors are larger than
+    promised.
 
     Example: syncline demo --cameras 4 --seconds 40 --out demo-out
 
@@ -38,32 +43,48 @@ def demo(
     seconds
         How long to film.
     cameras
-        How many cameras, 2 to 20.
+        How many cameras, 2 to 20; without it 3, or 5 for people.
     scene
-        marker: a marker waved in a room. people and town come with later versions.
+        marker: a marker waved in a room. people: five walkers in a room. town: a car from a drone.
     out
         Folder for the results.
     view
-        Open the live view (comes with a later version).
+        Show it live in a browser too: prints the address to open.
+    view_port
+        Port of the live view; 0 = any free one.
     seed
         Of the simulated world: same seed, same cameras and motion.
     json
         Print the table as JSON.
     """
-    if scene != "marker":
-        raise InputError(f"--scene {scene} is not in this version", remedy="use --scene marker")
-    if view:
-        raise InputError("--view is not in this version", remedy="open report.html in --out when the demo has ended")
+    if cameras is None:
+        cameras = 5 if scene == "people" else 3
     if seed < 0:
         raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
     if not 2 <= cameras <= 20:
         raise InputError(f"--cameras {cameras} is out of range", remedy="give 2 to 20")
     if not 5.0 <= seconds <= 3600.0:
         raise InputError(f"--seconds {seconds:g} is out of range", remedy="give 5 to 3600")
-    from deploy.comparison import compare_with_truth
+    if scene == "town":
+        return _town(out, seconds, seed, view=view, as_json=json)
     from deploy.demo import DemoSettings, Fleet
 
-    fleet = Fleet(DemoSettings(scene, seed, cameras, seconds, out))
+    settings = DemoSettings(scene, seed, cameras, seconds, out, view_port if view else None)
+    if scene == "people":
+        from deploy.demo_people import PeopleFleet, compare_with_people
+
+        people = PeopleFleet(settings)
+        with _display(seconds, people.names, quiet=json, what="people") as show:
+            people.run(show)
+        followed = compare_with_people(out, seed, cameras)
+        if json:
+            print(followed.as_json())
+        else:
+            followed.print(out)
+        return EXIT_DONE if followed.good else EXIT_REFUSED
+    from deploy.comparison import compare_with_truth
+
+    fleet = Fleet(settings)
     with _display(seconds, fleet.names, quiet=json) as show:
         live = fleet.run(show)
     comparison = compare_with_truth(out, scene, seed, cameras)
@@ -74,12 +95,29 @@ def demo(
     return EXIT_DONE if comparison.good else EXIT_REFUSED
 
 
+def _town(out: Path, seconds: float, seed: int, *, view: bool, as_json: bool) -> int:
+    if view:
+        raise InputError("--view shows rigs, not a flight", remedy="leave it out")
+    from deploy.uav_demo import as_json as to_json
+    from deploy.uav_demo import print_outcome, run_town
+    from deploy.uav_demo_display import Display
+
+    with Display(seconds, quiet=as_json) as show:
+        outcome = run_town(out, seconds, seed, show)
+    if as_json:
+        print(to_json(outcome))
+    else:
+        print_outcome(outcome, out)
+    return EXIT_DONE if outcome.good else EXIT_REFUSED
+
+
 class _display:
     """Live progress: a bar, and what each camera has seen. On a terminal it redraws, elsewhere it prints lines."""
 
-    def __init__(self, seconds: float, names: list[str], quiet: bool) -> None:
-        self._seconds, self._names, self._quiet = seconds, names, quiet
+    def __init__(self, seconds: float, names: list[str], quiet: bool, what: str = "marker") -> None:
+        self._seconds, self._names, self._quiet, self._what = seconds, names, quiet, what
         self._printed = -10.0
+        self._told = False
         self._live: RichLive | None = None
 
     def __enter__(self):  # type: ignore[no-untyped-def]
@@ -97,6 +135,9 @@ class _display:
 
     def show(self, live: Live) -> None:
         """Draw the state."""
+        if live.address and not self._told:
+            self._told = True
+            print(f"live view: open {live.address}", file=sys.stderr if self._quiet else sys.stdout, flush=True)
         if self._quiet:
             return
         seen = "  ".join(
@@ -115,7 +156,7 @@ class _display:
             Group(
                 Text(f"filming {live.elapsed:4.0f} of {self._seconds:.0f} s"),
                 ProgressBar(total=self._seconds, completed=min(live.elapsed, self._seconds), width=60),
-                Text(f"marker seen / frames: {seen}"),
+                Text(f"{self._what} seen / frames: {seen}"),
                 Text(live.status),
             )
         )

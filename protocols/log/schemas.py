@@ -18,6 +18,7 @@ VIEW_KINDS = {
     "transforms": "FrameTransforms",
     "scene": "SceneUpdate",
     "annotations": "ImageAnnotations",
+    "expected": "ImageAnnotations",
 }
 
 

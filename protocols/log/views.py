@@ -14,6 +14,7 @@ from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.Pose_pb2 import Pose as ViewPose
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
@@ -74,6 +75,8 @@ class Views:
             return self._calibration(where, message, stamp)
         elif isinstance(message, pb.Track):
             return [View(f"{where}/scene", self._scene(message, stamp))]
+        elif isinstance(message, pb.Prediction):
+            return [View(f"{where}/{part.camera}/expected", _expected(part, stamp)) for part in message.cameras]
         return []
 
     def _lens(self, where: str, camera: str, lens: Any, stamp: Timestamp) -> View:
@@ -118,10 +121,12 @@ class Views:
             return SceneUpdate(deletions=[gone])
         x, y, z = (value * self._metres for value in track.position)
         solid = track.state == "confirmed"
+        paint = track.colour
+        rgb = (paint.red / 255, paint.green / 255, paint.blue / 255) if track.HasField("colour") else (1.0, 0.55, 0.0)
         sphere = SpherePrimitive(
             pose=ViewPose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(w=1.0)),
             size=Vector3(x=_MARK_M, y=_MARK_M, z=_MARK_M),
-            color=Color(r=1.0, g=0.55, b=0.0, a=1.0 if solid else 0.4),
+            color=Color(r=rgb[0], g=rgb[1], b=rgb[2], a=1.0 if solid else 0.4),
         )
         entity = SceneEntity(timestamp=stamp, frame_id=WORLD, id=track.label, spheres=[sphere])
         entity.lifetime.seconds = _FADE_S
@@ -146,6 +151,30 @@ def _annotations(observation: pb.Observation, stamp: Timestamp) -> ImageAnnotati
             text.text = detection.label
             text.font_size = 12.0
             text.text_color.CopyFrom(_ORANGE)
+    return annotations
+
+
+def _expected(part: pb.CameraPrediction, stamp: Timestamp) -> ImageAnnotations:
+    """Where targets are expected in one image: the region of head and face, and the name."""
+    annotations = ImageAnnotations()
+    for target in part.targets:
+        u, v = target.u, target.v
+        if len(target.face) == 4:
+            x, y, width, height = target.face
+            u, v = x, y
+            box = annotations.points.add()
+            box.timestamp.CopyFrom(stamp)
+            box.type = PointsAnnotation.LINE_LOOP
+            for corner in ((x, y), (x + width, y), (x + width, y + height), (x, y + height)):
+                box.points.add(x=corner[0], y=corner[1])
+            box.outline_color.CopyFrom(_ORANGE)
+            box.thickness = 1.0
+        text = annotations.texts.add()
+        text.timestamp.CopyFrom(stamp)
+        text.position.x, text.position.y = u, v
+        text.text = f"{target.target} {target.view}".strip()
+        text.font_size = 12.0
+        text.text_color.CopyFrom(_ORANGE)
     return annotations
 
 

@@ -1,0 +1,122 @@
+"""Which detection of a frame is which target: joint assignment by what the filter expects and by colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from hub.tracking.camera import Frame, TrackingCamera
+from hub.tracking.kalman import LOG_SIZE
+from hub.tracking.measure import FOOT, HEAD, POINT, SEEN_SIZE, Expected
+from hub.tracking.targets import Targets
+from protocols.geometry.types import Bools, Floats, Ints
+
+POINT_GATE = 18.4
+"""Of the representative point: chance beyond 1e-4 (chi2, 2 dof)."""
+PART_GATE = 13.8
+"""Of head and foot: chance beyond 1e-3; beyond, that part is something else and is not used."""
+_SIZE_GATE = 9.0
+_MOST = 45.0
+"""Cost of leaving a detection alone: that of a fit at the gate by a target known to some 10 px."""
+_PART_SHARE, _PART_MOST = 0.5, 12.0
+COLOUR_STD = 28.0
+"""Of one channel between cameras: light and white balance differ."""
+_COLOUR_MOST = 12.0
+_HINT = 2.0
+"""What the camera's own matching counts."""
+_WIDTH = 0.2
+_LENGTH = 0.6
+"""Where silhouettes touch: shares of the sum of two lengths, across and along the body."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Costs:
+    """Of n targets and m detections. total: (n, m), inf beyond the gate.
+
+    distance: (n, m, 3) squared Mahalanobis distances of point, head, foot, NaN where not told.
+    """
+
+    total: Floats
+    distance: Floats
+
+
+def costs(
+    frame: Frame, value: Floats, noise: Floats, targets: Targets, expected: Expected, names: tuple[str, ...]
+) -> Costs:
+    """How ill each detection fits each target. value, noise: (m, 7), (m, 7, 7) of the frame. names: of the targets."""
+    n, m = len(targets), len(frame)
+    distance = np.full((n, m, 3), np.nan)
+    spread = np.zeros((n, m))
+    for part, rows in enumerate((POINT, HEAD, FOOT)):
+        slope = expected.slope[:, rows]
+        own = slope @ targets.covariance @ slope.transpose(0, 2, 1) + expected.body_noise[:, rows, rows]
+        both = own[:, None] + noise[None, :, rows, rows]
+        a, b, c = both[..., 0, 0], both[..., 0, 1], both[..., 1, 1]
+        determinant = a * c - b * b
+        off = value[None, :, rows] - expected.value[:, None, rows]
+        x, y = off[..., 0], off[..., 1]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            distance[:, :, part] = (c * x * x - 2.0 * b * x * y + a * y * y) / determinant
+            if rows is POINT:
+                spread = np.log(determinant / frame.per[None, :] ** 4)
+    parts = np.minimum(np.nan_to_num(distance[:, :, 1:], nan=_PART_MOST / 3.0), _PART_MOST).sum(axis=2)
+    with np.errstate(invalid="ignore"):
+        shade = ((frame.colour[None] - targets.colour[:, None]) ** 2).sum(axis=2) / COLOUR_STD**2
+    shade = np.minimum(np.nan_to_num(shade, nan=_COLOUR_MOST / 4.0), _COLOUR_MOST)
+    total = distance[:, :, 0] + spread + _PART_SHARE * parts + shade
+    if any(frame.target):
+        total = total - _HINT * (np.array(names)[:, None] == np.array(frame.target)[None, :])
+    good = (distance[:, :, 0] < POINT_GATE) & (targets.kind[:, None] == frame.kind[None, :]) & (total < _MOST)
+    return Costs(np.where(good, total, np.inf), distance)
+
+
+def assign(total: Floats) -> tuple[Ints, Ints]:
+    """Rows and columns of the cheapest joint assignment; what is cheaper alone stays alone. total: (n, m)."""
+    if not np.isfinite(total).any():
+        none = np.zeros(0, dtype=np.int64)
+        return none, none
+    rows, columns = linear_sum_assignment(np.where(np.isfinite(total), total, _MOST))
+    good = np.isfinite(total[rows, columns])
+    return rows[good].astype(np.int64), columns[good].astype(np.int64)
+
+
+def rows_used(value: Floats, expected: Expected, distance: Floats, covariance: Floats) -> Bools:
+    """Which rows (k, 7) of matched measurements count: a head or foot out of its gate is another's, or hidden."""
+    used = np.isfinite(value) & np.isfinite(expected.value)
+    for part, rows in ((1, HEAD), (2, FOOT)):
+        used[:, rows] &= (distance[:, part] < PART_GATE)[:, None]
+    slope = expected.slope[:, SEEN_SIZE]
+    spread = np.einsum("ni,nij,nj->n", slope, covariance, slope) + expected.body_noise[:, SEEN_SIZE, SEEN_SIZE]
+    with np.errstate(invalid="ignore"):
+        used[:, SEEN_SIZE] &= (value[:, SEEN_SIZE] - expected.value[:, SEEN_SIZE]) ** 2 < _SIZE_GATE * spread
+    return used
+
+
+def overlaps(camera: TrackingCamera, expected: Expected, targets: Targets) -> tuple[Bools, Bools]:
+    """Of targets in one image: (crowded, hidden), (n,) each.
+
+    crowded: its silhouette touches that of another confirmed target, so that the two may be one. hidden: that other
+    one stands in front.
+    """
+    n = len(targets)
+    point = expected.value[:, POINT]
+    length = np.exp(targets.mean[:, LOG_SIZE]) / np.where(expected.depth > 0.0, expected.depth, np.inf)
+    along = expected.value[:, HEAD] - expected.value[:, FOOT]
+    norm = np.linalg.norm(along, axis=1)
+    upright = np.isfinite(norm) & (norm > 0.0)
+    along = np.where(upright[:, None], along / np.where(upright, norm, 1.0)[:, None], [0.0, 1.0])
+    length = np.where(upright, norm, length)
+    off = point[None] - point[:, None]
+    with np.errstate(invalid="ignore"):
+        lengthwise = np.abs((off * along[:, None]).sum(axis=2))
+        across = np.abs(off[..., 0] * along[:, None, 1] - off[..., 1] * along[:, None, 0])
+        total = length[:, None] + length[None, :]
+        width = np.where(upright, _WIDTH, _LENGTH)
+        touching = (across < width[:, None] * total) & (lengthwise < _LENGTH * total)
+    seen = camera.sees(point, expected.depth)
+    touching &= targets.confirmed[None, :] & seen[None, :] & seen[:, None]
+    touching[np.arange(n), np.arange(n)] = False
+    behind = expected.depth[:, None] > expected.depth[None, :]
+    return touching.any(axis=1), (touching & behind).any(axis=1)
