@@ -15,6 +15,7 @@ from protocols.catalogue import Topic
 from protocols.clocks import NANOSECONDS
 from protocols.errors import InputError
 from protocols.log.reader import Logged, LogReader
+from protocols.messages import syncline_pb2 as pb
 
 _LINGER_S = 0.5
 _BOOT_LENGTH = 50
@@ -91,7 +92,7 @@ def replay(
 
 def _as_restarted(message: Message, round_number: int) -> None:
     """Give a message, and the cameras in it, the boot ids of one round of a loop."""
-    for part in (message, *getattr(message, "cameras", ())):
+    for part in (message, *(message.cameras if isinstance(message, pb.Calibration) else ())):
         boot = getattr(part, "boot_id", "")
         if boot:
             part.boot_id = f"{boot[:_BOOT_LENGTH]}-{round_number}"

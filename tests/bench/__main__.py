@@ -52,10 +52,16 @@ BENCHES = {
     "poses": Bench("distributed poses against the joint optimum", ("--quick", "--rows", "section4,bearings")),
     "logs": Bench("logs: rates, kill -9, damage", ("--quick",)),
     "view": Bench("help, first calibration, first paint, what watching costs", ("--quick",)),
+    "people_tracking": Bench(
+        "people followed, what clocks are worth, walkers as markers", ("--quick", "--seconds", "30")
+    ),
     "uav_tracker": Bench(
         "one car from a drone, simulated",
         ("--seeds", "1", "--models", "ground", "--scenarios", "exit-bend,exit-straight"),
         ("--jobs", "2"),
+    ),
+    "uav_agent": Bench(
+        "UAV agent: latency, clocks, closed loops", ("--only", "latency,offset", "--seeds", "1"), data=True
     ),
     "uav_aerial": Bench("one car from a drone, real video", ("--models", "ground"), data=True),
 }

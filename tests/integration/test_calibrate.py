@@ -236,15 +236,17 @@ def test_two_cameras_that_see_different_things_are_refused(seed: int) -> None:
     assert caught.value.exit_status == EXIT_REFUSED
 
 
-def test_cameras_without_observations_or_lens_are_refused_by_name() -> None:
+def test_a_camera_without_observations_is_refused_by_name_and_one_without_lens_gets_one() -> None:
     session = simulate(45, 4, 15)
     session = without(session, np.array([name == "cam1" for name in session.camera]))
     rig = replace(session.rig, cameras=dict(session.rig.cameras))
     rig.cameras["cam3"] = replace(rig.cameras["cam3"], intrinsics=None)
     found = calibrate(rig, session.observations())
-    assert set(found.cameras) == {"cam0", "cam2"}
+    assert set(found.cameras) == {"cam0", "cam2", "cam3"}
     assert "no observations" in found.refused["cam1"]
-    assert "intrinsics" in found.refused["cam3"]
+    lens = session.rig.cameras["cam3"].intrinsics
+    assert lens is not None
+    assert found.cameras["cam3"].intrinsics.focal == pytest.approx(lens.focal, rel=0.03)
 
 
 def test_a_camera_of_three_rows_is_refused_by_name() -> None:

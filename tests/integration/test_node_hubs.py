@@ -63,7 +63,7 @@ class _Cameras:
         self.infos: list[Publisher] = []
 
     def join(self, camera: int) -> None:
-        self.tokens[camera] = self.bus.announce("camera", name(camera), f"boot{camera}")
+        self.tokens[camera] = self.bus.announce("camera", name(camera), "b0")
         self.tokens[camera].__enter__()
         self.publishers[name(camera)] = self.bus.publisher(OBSERVATION, name(camera))
         self.infos.append(self.bus.publisher(CAMERA_INFO, name(camera)))
