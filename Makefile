@@ -5,6 +5,10 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DATA ?= ../shared/data
 SECONDS_OF_SOAK ?= 900
+# One thread a process, as the command itself has it: more of them fight over the cores for matrices this small.
+export OPENBLAS_NUM_THREADS := 1
+export OMP_NUM_THREADS := 1
+export MKL_NUM_THREADS := 1
 
 .PHONY: demo test lint types contracts check proto lock bench faults fuzz soak browser clean
 
