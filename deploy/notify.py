@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from edge.devices.base import Device, DeviceInfo, Frame
+from edge.devices.base import Device, DeviceInfo, Frame, Returning
 
 ALIVE_FILE = "SYNCLINE_ALIVE_FILE"
 """Environment variable: a file whose time of change says when data flowed last."""
@@ -58,8 +58,11 @@ class Notifier:
             Path(file) if file else None,
         )
 
-    def beat(self) -> None:
-        """Data has flowed: READY=1 the first time, WATCHDOG=1 as often as is asked for."""
+    def beat(self, ending: bool = False) -> None:
+        """Data has flowed: READY=1 the first time, WATCHDOG=1 as often as is asked for.
+
+        ending: the end was ordered, and what is done now belongs to it: it may take a minute more.
+        """
         now = self._now()
         if not self._ready:
             self._ready = True
@@ -67,7 +70,7 @@ class Notifier:
             self._next = now + self._every_s
         elif now >= self._next:
             self._next = now + self._every_s
-            self._send("WATCHDOG=1")
+            self._send("WATCHDOG=1" + ("\nEXTEND_TIMEOUT_USEC=60000000" if ending else ""))
         if self._alive is not None and now >= self._next_file:
             self._next_file = now + _FILE_S
             with suppress(OSError):
@@ -94,7 +97,11 @@ class Notifier:
 
 
 class Watched:
-    """A device that beats with every frame it gives: see ``edge.devices.base.Device``."""
+    """A device that beats with every frame it gives: see ``edge.devices.base.Device``.
+
+    It beats also while it seeks a camera that was unplugged: that is told in the agent's status, and to start the
+    agent anew would not help, but forget what is known of its clock.
+    """
 
     def __init__(self, device: Device, beat: Callable[[], None]) -> None:
         self._device, self._beat = device, beat
@@ -109,6 +116,16 @@ class Watched:
         """The device's."""
         return self._device.ended
 
+    @property
+    def away(self) -> bool:
+        """The device's; False of one that does not come back by itself."""
+        return isinstance(self._device, Returning) and self._device.away
+
+    @property
+    def reconnections(self) -> int:
+        """The device's."""
+        return self._device.reconnections if isinstance(self._device, Returning) else 0
+
     def open(self) -> None:
         """Open the device."""
         self._device.open()
@@ -116,7 +133,7 @@ class Watched:
     def read(self, timeout_s: float) -> Frame | None:
         """The next frame. The one before has been looked at and handed to the bus when this is called again."""
         frame = self._device.read(timeout_s)
-        if frame is not None:
+        if frame is not None or self.away:
             self._beat()
         return frame
 

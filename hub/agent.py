@@ -42,7 +42,8 @@ def run_hub(
     """Gather, solve and publish until ``stop`` is set; then solve once more with all that came.
 
     solved: called after every solve that gave an answer or a refusal (to write files). beat: called after every round,
-    so that a watchdog sees a loop that hangs. export: writes the answer because a view asked; returns what to say.
+    and within one as the solver gets on, so that a watchdog sees a loop that hangs. export: writes the answer because
+    a view asked; returns what to say.
     """
     boot = boot_id or uuid.uuid4().hex
     nodes = hub.nodes
@@ -56,6 +57,7 @@ def run_hub(
         "AgentStatus": bus.publisher(STATUS, agent),
     }
     orders = Orders(bus, agent, boot, ("recalibrate", "export"))
+    hub.working = beat
     sequence, next_status, next_rig = 0, 0.0, 0.0
     said = ""
 

@@ -342,10 +342,10 @@ def _fits(scaffold: Scaffold, name: str) -> bool:
 def _adjust_all(scaffold: Scaffold, tell: Progress) -> Scaffold:
     """The final adjustment, with the lens freed where the data clearly ask for it."""
     tell("adjusting", 0.75)
-    problem, state, _ = adjust(scaffold.problem, scaffold.state)
+    problem, state, _ = adjust(scaffold.problem, scaffold.state, progress=lambda text: tell(text, 0.75))
     tell("adjusting the lenses", 0.85)
     freed = replace(problem, freedom=replace(problem.freedom, lens=True))
-    freed_problem, freed_state, _ = adjust(freed, state, rounds=3)
+    freed_problem, freed_state, _ = adjust(freed, state, rounds=3, progress=lambda text: tell(text, 0.85))
     if _prefers(freed_problem, freed_state, problem, state):
         problem, state = freed_problem, freed_state
     return replace_solution(scaffold, problem, state)

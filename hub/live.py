@@ -7,6 +7,7 @@ in the agent, in replay and in tests.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,7 +64,7 @@ class LiveHub:
     rig: what the hub knows of the rig from its own rig.toml: references, distances, up; the cameras'
     intrinsics come from the cameras unless it has them. nodes: this hub's pose nodes; then the published poses are
     the network's as soon as it has settled, and the solver's timing is theirs. known: a calibration that is given:
-    then nothing is solved.
+    then nothing is solved. working: called as a solve gets on, which takes minutes on a small machine.
     """
 
     def __init__(
@@ -97,6 +98,7 @@ class LiveHub:
         self._infos: dict[str, pb.CameraInfo] = {}
         self._walked = False
         self._known = known
+        self.working: Callable[[], None] = lambda: None
         if known is not None:
             self._take_over(known)
 
@@ -273,7 +275,7 @@ class LiveHub:
     def _answer(self, rig: Rig, observations: Observations) -> Calibration:
         if not self.settings.solve:
             return node_calibration(rig, self.nodes)
-        found = calibrate(rig, observations)
+        found = calibrate(rig, observations, lambda text, share: self.working())
         if self.nodes is None:
             return found
         boots = self._boots(found)

@@ -68,10 +68,10 @@ def _sees_much(answer: PairSolution) -> bool:
 
 def _most_promising_first(prepared: Prepared, todo: list[tuple[str, str]], tell: Progress) -> list[tuple[str, str]]:
     """The pairs, those first that a coarse scan of all lags likes best: once cameras are tied, the rest is cheap."""
-    tell(f"coarse look at {len(todo)} pairs", 0.05)
-    likes = {
-        (a, b): promise(smooth_only(prepared.camera(a).tracks), smooth_only(prepared.camera(b).tracks)) for a, b in todo
-    }
+    likes = {}
+    for a, b in todo:
+        tell(f"coarse look at {a}–{b}", 0.05)
+        likes[a, b] = promise(smooth_only(prepared.camera(a).tracks), smooth_only(prepared.camera(b).tracks))
     return sorted(todo, key=lambda pair: -likes[pair])
 
 

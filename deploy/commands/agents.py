@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
 from deploy.config import CameraConfig, HubConfig, RecorderConfig, effective_toml, load
 from deploy.signals import stop_on_signals
 from protocols.bus.settings import BusConfig
-from protocols.errors import EXIT_DONE, EXIT_INPUT
+from protocols.errors import EXIT_BUG, EXIT_DONE, EXIT_INPUT
+
+if TYPE_CHECKING:
+    from deploy.notify import Notifier
 
 PrintConfig = Annotated[bool, Parameter(negative="")]
 
@@ -37,7 +41,33 @@ def camera(config: Path, /, *, print_config: PrintConfig = False) -> int:
         return EXIT_DONE
     from deploy.agents import start_camera
 
-    return _with_bus(settings, lambda bus, stop: start_camera(settings, bus, stop))
+    return _with_bus(settings, lambda bus, stop, beat: start_camera(settings, bus, stop, beat))
+
+
+def uav(config: Path, /, *, print_config: PrintConfig = False) -> int:
+    """Run the UAV agent: follow the car that a ground station selects, also out of the picture, and tell it by MAVLink.
+
+    Example: syncline uav drone.toml
+
+    Nothing is commanded to the vehicle unless [control] switches it on.
+
+    Parameters
+    ----------
+    config
+        TOML file: id, site, [bus], rig, driver ("simulated", "video" or "oak") with its table, mount, [mavlink],
+        [control], [video_out], [images].
+    print_config
+        Show the configuration with all defaults filled in, and stop.
+    """
+    from deploy.uav_config import UavConfig
+
+    settings = load(config, UavConfig)
+    if print_config:
+        print(effective_toml(settings), end="")
+        return EXIT_DONE
+    from deploy.uav import start_uav
+
+    return _with_bus(settings, lambda bus, stop, beat: start_uav(settings, bus, stop, beat))
 
 
 def hub(config: Path, /, *, print_config: PrintConfig = False) -> int:
@@ -58,7 +88,7 @@ def hub(config: Path, /, *, print_config: PrintConfig = False) -> int:
         return EXIT_DONE
     from deploy.agents import start_hub
 
-    return _with_bus(settings, lambda bus, stop: start_hub(settings, bus, stop))
+    return _with_bus(settings, lambda bus, stop, beat: start_hub(settings, bus, stop, beat))
 
 
 def record(config: Path, /, *, print_config: PrintConfig = False) -> int:
@@ -78,10 +108,10 @@ def record(config: Path, /, *, print_config: PrintConfig = False) -> int:
     if print_config:
         print(effective_toml(settings), end="")
         return EXIT_DONE
-    from deploy.record import run_recorder
+    from deploy.recording_orders import record_as_asked
 
-    def start(bus: Any, stop: Any) -> int:
-        result = run_recorder(settings, bus, stop)
+    def start(bus: Any, stop: Any, beat: Any) -> int:
+        result = record_as_asked(settings, bus, stop, beat=beat, tell=lambda line: print(line, flush=True))
         print(f"recorded {result.messages} messages to {result.path}" + _more_parts(result.parts))
         if result.stopped:
             print(f"syncline: recording ended: {result.stopped}; the log is whole; make room", file=sys.stderr)
@@ -96,24 +126,45 @@ def _more_parts(parts: int) -> str:
 
 
 def _with_bus(settings: Any, start: Any) -> int:
-    """Open the bus, run until a signal, close it; a signal while opening is a clean end."""
-    from protocols.bus.base import BusStopped
+    """Open the bus, run until a signal, close it; a signal while opening is a clean end.
+
+    A bus that has died ends the process with one line and status 1, for its supervisor to start it again.
+    """
+    from deploy.health import Health
+    from deploy.notify import Notifier
+    from deploy.supervised import checked, serve_health
+    from protocols.bus.base import BusDead, BusStopped
+    from protocols.bus.guard import GuardedBus
     from protocols.bus.zenoh_bus import open_bus
 
+    checked(settings)
     stop = stop_on_signals()
+    notifier = Notifier.from_environment()
+    health = Health()
     try:
-        with open_bus(settings.site, settings.bus, stop=_told_waiting(stop, settings.bus)) as bus:
-            return int(start(bus, stop))
+        with (
+            serve_health(settings, health),
+            open_bus(settings.site, settings.bus, stop=_told_waiting(stop, settings.bus, notifier)) as bus,
+        ):
+            guarded = GuardedBus(bus, time.monotonic, seen=health.seen, refused=health.refused)
+            try:
+                return int(start(guarded, stop, lambda: notifier.beat(ending=stop.is_set())))
+            except BusDead as error:
+                print(f"syncline: the bus has died: {error}; start this agent again", file=sys.stderr, flush=True)
+                os._exit(EXIT_BUG)  # closing a session that has panicked may hang
     except BusStopped:
         return EXIT_DONE
+    finally:
+        notifier.stopping()
 
 
-def _told_waiting(stop: threading.Event, bus: BusConfig) -> Callable[[], bool]:
+def _told_waiting(stop: threading.Event, bus: BusConfig, notifier: Notifier) -> Callable[[], bool]:
     """The stop condition that is asked while a client waits for its router; after 2 s it says so, once."""
     began, told = time.monotonic(), False
 
     def stopped() -> bool:
         nonlocal told
+        notifier.waiting(f"a router at {', '.join(bus.endpoints()[0])}")
         if not told and time.monotonic() - began > 2.0:
             told = True
             print(f"syncline: waiting for a router at {', '.join(bus.endpoints()[0])}", file=sys.stderr, flush=True)

@@ -85,7 +85,7 @@ def certificates(bus: BusConfig, role: str, agent: str) -> Finding:
     return ok("certificates", f"valid for {left:.0f} days, names {role} {agent}")
 
 
-def bus_path(bus: BusConfig, site: str, role: str, agent: str) -> Finding:
+def bus_path(bus: BusConfig, site: str, role: str, agent: str, patience_s: float = 10.0) -> Finding:
     """A canary there and back through the router, small and large; for an agent that may not hear, a listener."""
     from protocols.bus.base import BusDead
 
@@ -108,7 +108,7 @@ def bus_path(bus: BusConfig, site: str, role: str, agent: str) -> Finding:
                 f"{where} lets us in, but nothing comes through",
                 "restart the router (`systemctl restart syncline-router-…`); with certificates, issue them again",
             )
-        large = round_trip(config, prefix, _LARGE, timeout_s=10.0)
+        large = round_trip(config, prefix, _LARGE, timeout_s=patience_s)
     except (InputError, BusDead) as error:
         remedy = getattr(error, "remedy", "") or "restart the router"
         return missing("bus", getattr(error, "what", str(error)), remedy)
@@ -166,19 +166,30 @@ def rights(bus: BusConfig, site: str, role: str, agent: str, seconds: float = 2.
     return ok("access rules", f"{agent} hears nothing of others")
 
 
-def mavlink(link: Any, patience_s: float = 3.0, now: Callable[[], float] = time.monotonic) -> Finding:
-    """A heartbeat of an autopilot. link: an ``edge.mavlink.link.Link`` that lets HEARTBEAT in."""
+def mavlink(
+    link: Any, hello: Any = None, patience_s: float = 3.0, now: Callable[[], float] = time.monotonic
+) -> Finding:
+    """A heartbeat of an autopilot.
+
+    link: an ``edge.mavlink.link.Link`` that lets HEARTBEAT in. hello: a message that is sent each second, for
+    autopilots that answer only who has called them; None = only listen.
+    """
     began = now()
+    called = 0.0
     while now() - began < patience_s:
+        heartbeats = [heard for heard in link.poll() if heard.kind == "HEARTBEAT"]
+        if heartbeats:
+            return ok("mavlink", f"heartbeat of system {heartbeats[0].system}")
+        if hello is not None and now() - began >= called and link.send(hello):
+            called += 1.0
         link.wait(0.1)
-        for heard in link.poll():
-            if heard.kind == "HEARTBEAT":
-                return ok("mavlink", f"heartbeat of system {heard.system}")
+    if "in use" in link.problem:
+        return missing("mavlink", str(link.problem), "stop the agent (or whoever holds that port) and ask again")
     if link.problem:
         return missing(
             "mavlink", str(link.problem), "check device, baud rate and rights (group dialout), or the address"
         )
-    refused = sum(count for name, count in link.counters.items() if name not in ("received", "bytes", "opened"))
+    refused = sum(count for name, count in link.counters.items() if name not in ("received", "bytes", "opened", "sent"))
     if refused:
         return missing(
             "mavlink",

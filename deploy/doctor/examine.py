@@ -8,7 +8,7 @@ from typing import Any
 
 from deploy.doctor import agent as agents
 from deploy.doctor import machine
-from deploy.doctor.finding import Finding, missing, wrong
+from deploy.doctor.finding import Finding, missing, skip, wrong
 from deploy.install import units
 from deploy.rig_folder import role_of
 from protocols.errors import InputError
@@ -69,21 +69,27 @@ def _sight(config: Any, driver: str) -> Iterator[Finding]:
         yield missing("camera", error.what, error.remedy or "correct the configuration")
         return
     except ImportError as error:
-        yield wrong("camera", str(error), 'pip install "syncline[oak]"')
+        yield skip("camera", f"not tried: {error.name or error} is missing")
         return
     yield agents.camera(device)
 
 
-def _vehicle(config: Any) -> Finding:
+def _vehicle(config: Any, patience_s: float = 3.0) -> Finding:
     try:
-        from edge.mavlink.dialect import CAMERA
+        from edge.mavlink.dialect import CAMERA, mavlink
         from edge.mavlink.link import Link
         from edge.mavlink.transport import parse
-    except ImportError:
-        return wrong("mavlink", "pymavlink is missing", 'pip install "syncline[uav]"')
-    # Unsigned: only whether somebody is there is asked, and nothing is told to it.
-    link = Link(parse(config.mavlink.url), system=255, component=CAMERA, allowed=("HEARTBEAT",))
+
+        url = parse(config.mavlink.url)
+    except InputError as error:
+        return wrong("mavlink", error.what, error.remedy)
+    # Unsigned: only whether somebody is there is asked. As the vehicle's camera and never as a ground station (255):
+    # an autopilot that hears one, and then no more, takes it for a lost link and flies home.
+    link = Link(url, system=None, component=CAMERA, allowed=("HEARTBEAT",))
+    hello = mavlink.MAVLink_heartbeat_message(
+        mavlink.MAV_TYPE_CAMERA, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
+    )
     try:
-        return agents.mavlink(link)
+        return agents.mavlink(link, hello if url.kind == "udpout" else None, patience_s)
     finally:
         link.close()

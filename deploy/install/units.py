@@ -13,7 +13,8 @@ class Role:
     """What a role needs of the machine.
 
     command: of `syncline`. watchdog_s: silence of the data path after which systemd restarts it; a hub solves in that
-    path. devices: classes of device nodes it may open. groups: that own those nodes. stop_s: for ending in order.
+    path, and speaks at every step of the solver. stop_s: for ending in order; a hub that still solves then asks for
+    more, a minute at a time. devices: classes of device nodes it may open. groups: that own those nodes.
     """
 
     command: str
@@ -30,7 +31,7 @@ ROLES: dict[str, Role] = {
         "uav", 10, 10, (*_CAMERA_NODES, "char-ttyACM", "char-ttyUSB", "char-ttyAMA", "char-ttyS"),
         ("video", "dialout", "syncline"),
     ),
-    "hub": Role("hub", 300, 300),
+    "hub": Role("hub", 60, 60),
     "recorder": Role("record", 15, 30),
     "router": Role("router", 10, 10),
 }  # fmt: skip
@@ -55,6 +56,7 @@ RestrictRealtime=yes
 RestrictSUIDSGID=yes
 RemoveIPC=yes
 LockPersonality=yes
+MemoryDenyWriteExecute=yes
 SystemCallArchitectures=native
 SystemCallFilter=@system-service
 SystemCallFilter=~@resources @privileged

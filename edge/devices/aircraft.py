@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,9 +23,14 @@ GIMBAL_FROM_CAMERA: Floats = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1
 _STEP_S = 0.01
 _KEPT_S = 3.0
 _GRAVITY = 9.81
-_ACCELERATION = 3.0
-_JERK = 6.0
-_SPEED = 16.0
+_ACCELERATION = 4.0  # a lean of 22 degrees
+_JERK = 8.0
+_SPEED = 18.0
+_CLOSING_GAIN, _CLOSING_BRAKE = 0.4, 1.2  # 1/s, m/s2: how quickly it nears the target, and slows down in time
+_HOLD_GAIN = 2.0  # 1/s, of the speed
+_EYE_RAD = np.array([0.31, 0.41])  # up and across a 4:3 picture: as far from its middle as the target may come
+_BLIND_RAD = np.array([0.42, 0.53])  # farther, it is out of the picture, and leaning more costs nothing
+_LEAST_PULL = 1.5
 _STALE_S = 3.0  # after which an aircraft that follows stays where it is
 _GIMBAL_RATE = np.deg2rad(70.0)
 _GIMBAL_GAIN = 5.0  # 1/s
@@ -58,7 +64,9 @@ class Pose:
 class SimulatedAircraft:
     """One aircraft. Time only goes forward, in steps of 10 ms; what it did lately can still be asked for.
 
-    path: flown exactly; None: hovers at ``start`` (3,) NED until it is told to follow, then keeps above the target.
+    path: flown exactly; None: hovers at ``start`` (3,) NED until it is told to follow, then keeps the target where a
+    level camera's axis meets the ground. pilot: place and velocity (2,) at a time [s] that is followed before that, as
+    by a pilot's eye. camera: body_from_camera of a fixed camera, whose tilt is flown out; None: straight down.
     gimbal: pitch, yaw [rad] of a stabilised gimbal at first; None: the camera is fixed. pushes: disturbances.
     noise_rad, noise_m: of what the sensors say, a sample. seed: of all noise.
     """
@@ -69,6 +77,8 @@ class SimulatedAircraft:
         *,
         start: Floats | None = None,
         yaw: float = 0.0,
+        pilot: Callable[[float], tuple[Floats, Floats]] | None = None,
+        camera: Floats | None = None,
         gimbal: tuple[float, float] | None = None,
         pushes: tuple[Push, ...] = (),
         noise_rad: float = 0.001,
@@ -81,8 +91,17 @@ class SimulatedAircraft:
         self._pushes = pushes
         self._time = -2.0
         self._position = np.array([0.0, 0.0, -60.0]) if start is None else np.asarray(start, np.float64).copy()
-        self._velocity, self._acceleration = np.zeros(3), np.zeros(3)
+        self._velocity, self._acceleration, self._carried = np.zeros(3), np.zeros(3), np.zeros(3)
         self._yaw = yaw
+        self._pilot = pilot
+        axis = np.array([0.0, 0.0, 1.0]) if camera is None else np.asarray(camera, np.float64)[:, 2]
+        ahead = axis[:2] / max(float(axis[2]), 0.3)
+        c, s = np.cos(yaw), np.sin(yaw)
+        self._looks_ahead = np.array([c * ahead[0] - s * ahead[1], s * ahead[0] + c * ahead[1]])  # per metre of height
+        if pilot is not None and start is not None:
+            place, along = pilot(0.0)
+            self._velocity[:2] = along
+            self._position[:2] = place + self._position[2] * self._looks_ahead + self._time * along
         self._altitude = float(self._position[2])
         self._has_gimbal = gimbal is not None
         self._gimbal = np.array((0.0, 0.0) if gimbal is None else gimbal, np.float64)
@@ -156,21 +175,40 @@ class SimulatedAircraft:
         self._past.append(self._pose())
 
     def _fly(self, push: Push | None) -> None:
+        gust = np.zeros(3) if push is None else np.array([*push.velocity, 0.0])
+        told = self._followed()
         wanted = np.zeros(3)
-        if self._target is not None and self._time - self._target[0] < _STALE_S:
-            told, place, velocity = self._target
-            gap = place + (self._time - told) * velocity - self._position
-            wanted[:2] = velocity[:2] + 0.8 * gap[:2]
+        aside: Floats | None = None
+        if told is not None:
+            place, velocity = told
+            height = max(-float(self._position[2]), 1.0)
+            gap = place - height * self._looks_ahead - self._position[:2]
+            far = float(np.hypot(*gap))
+            closing = min(_CLOSING_GAIN * far, float(np.sqrt(2.0 * _CLOSING_BRAKE * far)))
+            wanted[:2] = velocity + closing * gap / max(far, 1e-9)
+            aside = gap / height
         speed = float(np.linalg.norm(wanted[:2]))
         if speed > _SPEED:
             wanted *= _SPEED / speed
         wanted[2] = 0.5 * (self._altitude - self._position[2])
-        pull = _limited(1.5 * (wanted - self._velocity), _ACCELERATION)
-        self._acceleration = self._acceleration + _limited(pull - self._acceleration, 3.0 * _JERK * _STEP_S)
+        pull = _limited(_HOLD_GAIN * (wanted - self._velocity), _ACCELERATION)
+        if aside is not None and not self._has_gimbal:
+            c, s = np.cos(self._yaw), np.sin(self._yaw)
+            level = np.array([[c, -s], [s, c]])
+            pull[:2] = level @ _kept_in_sight(level.T @ pull[:2], level.T @ aside)
+        self._acceleration = self._acceleration + _limited(pull - self._acceleration, _JERK * _STEP_S)
         self._velocity = self._velocity + self._acceleration * _STEP_S
-        self._position = self._position + self._velocity * _STEP_S
-        if push is not None:  # the air moves, and the aircraft with it
-            self._position[:2] += np.array(push.velocity) * _STEP_S
+        self._carried = gust  # the air moves, and the aircraft with it; its speed is held through the air
+        self._position = self._position + (self._velocity + gust) * _STEP_S
+
+    def _followed(self) -> tuple[Floats, Floats] | None:
+        """Place and velocity (2,) of what is followed now."""
+        if self._target is None:
+            return None if self._pilot is None else self._pilot(self._time)
+        told, place, velocity = self._target
+        if self._time - told >= _STALE_S:
+            return None
+        return np.asarray(place[:2] + (self._time - told) * velocity[:2]), np.asarray(velocity[:2])
 
     def _turn_gimbal(self, push: Push | None) -> None:
         if push is not None and any(push.turn):
@@ -191,11 +229,23 @@ class SimulatedAircraft:
         pitch, roll = -np.arctan2(forward, _GRAVITY), np.arctan2(right, _GRAVITY)
         turned = so3.exp(self._yaw * z) @ so3.exp(pitch * y) @ so3.exp(roll * x) @ so3.exp(2.0 * self._tremble)
         gimbal = so3.exp(self._gimbal[1] * z) @ so3.exp(self._gimbal[0] * y) @ so3.exp(self._tremble)
-        return Pose(self._time, turned, gimbal, self._position.copy(), self._velocity.copy())
+        return Pose(self._time, turned, gimbal, self._position.copy(), self._velocity + self._carried)
 
 
 def _between(first: Floats, second: Floats, share: float) -> Floats:
     return np.asarray(so3.exp(share * so3.log(second @ first.T)) @ first)
+
+
+def _kept_in_sight(pull: Floats, aside: Floats) -> Floats:
+    """An acceleration (2,) forward, right by which a fixed camera does not lose a target ``aside`` (2,) [rad] of it.
+
+    The aircraft leans to where it accelerates, and the camera looks the other way.
+    """
+    if (np.abs(aside) > _BLIND_RAD).any():
+        return pull
+    most = np.maximum(_GRAVITY * (_EYE_RAD - aside), _LEAST_PULL)
+    least = np.minimum(_GRAVITY * (-_EYE_RAD - aside), -_LEAST_PULL)
+    return np.asarray(np.clip(pull, least, most))
 
 
 def _limited(vector: Floats, most: float) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeAlias
+from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -74,6 +74,19 @@ class Device(Protocol):
 
     def close(self) -> None:
         """Release the source; may be called twice."""
+
+
+@runtime_checkable
+class Returning(Protocol):
+    """What a device that comes back by itself after it was unplugged can say besides."""
+
+    @property
+    def away(self) -> bool:
+        """Whether it is gone, and is tried again with every ``read``."""
+
+    @property
+    def reconnections(self) -> int:
+        """How often it came back."""
 
 
 def check_size(intrinsics: Intrinsics | None, width: int, height: int, what: str) -> None:

@@ -74,6 +74,7 @@ class OakCamera:
         self._first: Frame | None = None
         self._info: DeviceInfo | None = None
         self._last = -1
+        self._last_s = 0.0
         self._offset = 0  # added to the board's frame numbers, which begin anew after a reconnection
         self._again = 0.0
         self._ended = False
@@ -90,6 +91,11 @@ class OakCamera:
     def ended(self) -> bool:
         """True once closed: an unplugged board is waited for."""
         return self._ended
+
+    @property
+    def away(self) -> bool:
+        """Whether the board is gone, and is tried again with every ``read``."""
+        return self._stream is None and self._info is not None and not self._ended
 
     def open(self) -> None:
         """Raises InputError where no board answers or no picture comes."""
@@ -146,12 +152,15 @@ class OakCamera:
     def _frame(self, picture: Any) -> Frame:
         import depthai as dai
 
+        middle = picture.getTimestamp(dai.CameraExposureOffset.MIDDLE)
+        seconds = middle / timedelta(seconds=1)
         number = int(picture.getSequenceNum()) + self._offset
         if number <= self._last:
-            self._offset += self._last + 1 - number
-            number = self._last + 1
-        self._last = number
-        middle = picture.getTimestamp(dai.CameraExposureOffset.MIDDLE)
+            # Plugged in again: the board counts anew, and what was missed meanwhile is a gap.
+            passed = max(round((seconds - self._last_s) * self._settings.fps), 1)
+            self._offset += self._last + passed - number
+            number = self._last + passed
+        self._last, self._last_s = number, seconds
         return Frame(
             image=np.ascontiguousarray(_bgr(picture.getCvFrame()), dtype=np.uint8),
             device_time_ns=(middle // timedelta(microseconds=1)) * 1000,

@@ -23,13 +23,14 @@ def open_video(
 ) -> Recording | LiveCamera:
     """The device for a source; it still has to be opened.
 
-    source: a file; a folder of pictures, sorted by name; an index or /dev/video… of a USB camera; or a URL.
+    source: a file; a folder of pictures, sorted by name; an index or /dev/… of a USB camera (a stable name as udev
+    gives it, too); or a URL.
     fps: of a recording, instead of its time stamps; of a live camera, asked for. loop: start a recording again at its
     end, its time running on. pace: a clock by which a recording is played in real time; None = as fast as it is read.
     intrinsics: of this camera. now_ns: the host's monotonic clock, which stamps live frames.
     """
     text = str(source)
-    if isinstance(source, int) or text.isdecimal() or text.startswith("/dev/video"):
+    if isinstance(source, int) or text.isdecimal() or text.startswith("/dev/"):
         return LiveCamera(int(text) if text.isdecimal() else text, fps=fps, intrinsics=intrinsics, now_ns=now_ns)
     if "://" in text:
         return LiveCamera(text, fps=fps, intrinsics=intrinsics, now_ns=now_ns)

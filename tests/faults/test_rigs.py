@@ -13,7 +13,7 @@ import pytest
 from deploy.info import describe_log
 from deploy.rig_folder import find_rig, read_rig_folder
 
-SECONDS = {"webcams-room": 15, "drone-cage": 30, "oak-array": 40, "companion": 15}
+SECONDS = {"webcams-room": 15, "drone-cage": 20, "oak-array": 25, "companion": 15}
 
 
 @pytest.mark.parametrize("name", sorted(SECONDS))

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import shutil
+import socket
 import threading
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -11,6 +14,7 @@ import pytest
 from deploy.doctor import agent
 from protocols.bus import probe
 from protocols.bus.router import Router, free_endpoint
+from protocols.bus.session import open_session
 from protocols.bus.settings import BusConfig, TlsConfig
 from protocols.bus.zenoh_bus import open_bus
 from protocols.catalogue import OBSERVATION, STATUS
@@ -37,10 +41,58 @@ def test_no_router() -> None:
     assert "start one there" in found.remedy
 
 
+def through_a_link(endpoint: str, change: Callable[[bytes], bytes]) -> str:
+    """A link to a router on which what clients say is changed; its own address."""
+    host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
+    listening = socket.create_server(("127.0.0.1", 0))
+
+    def pump(source: socket.socket, sink: socket.socket, changed: Callable[[bytes], bytes]) -> None:
+        with suppress(OSError):
+            while data := source.recv(65_536):
+                sink.sendall(changed(data))
+        for end in (source, sink):
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def serve() -> None:
+        with suppress(OSError):
+            while True:
+                client, _ = listening.accept()
+                there = socket.create_connection((host, int(port)))
+                threading.Thread(target=pump, args=(client, there, change), daemon=True).start()
+                threading.Thread(target=pump, args=(there, client, bytes), daemon=True).start()
+
+    threading.Thread(target=serve, daemon=True).start()
+    return f"tcp/127.0.0.1:{listening.getsockname()[1]}"
+
+
+def test_a_router_that_lives_but_does_not_route() -> None:
+    """A declaration with a `?` ends all routing in Zenoh 1.10.2; the router still lets everybody in."""
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint):
+        assert agent.bus_path(config, SITE, "camera", "cam0").verdict == "ok"
+        hostile = through_a_link(endpoint, lambda data: data.replace(b"camQ", b"cam?"))
+        poison = open_session(BusConfig(mode="client", connect=(hostile,)), timeout_s=5.0)
+        poison.declare_publisher("camQ/observation")
+        found = agent.bus_path(config, SITE, "camera", "cam0")
+        assert (found.verdict, found.exit_status) == ("fail", 3)
+        assert "nothing comes through" in found.text
+        assert "restart the router" in found.remedy
+
+
+def test_a_path_that_swallows_what_is_large() -> None:
+    """As a tunnel with a smaller MTU does, when nobody hears of it: small packets pass, full ones vanish."""
+    endpoint = free_endpoint()
+    with Router(endpoint):
+        narrow = through_a_link(endpoint, lambda data: data if len(data) < 20_000 else b"")
+        found = agent.bus_path(BusConfig(mode="client", connect=(narrow,)), SITE, "camera", "cam0", 2.0)
+    assert (found.verdict, "MTU" in found.remedy) == ("fail", True), found
+
+
 @pytest.mark.parametrize(
     ("passes", "verdict", "remedy"),
     [
-        ({1024: None}, "fail", "restart the router"),
         ({1024: 0.001, 1_000_000: None}, "fail", "MTU"),
         ({1024: 0.4, 1_000_000: 1.0}, "warn", "a cable"),
     ],

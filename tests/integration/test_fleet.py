@@ -1,9 +1,8 @@
-"""`syncline fleet` with real processes: started, killed and started again, asked, stopped in order."""
+"""`syncline fleet` with real processes: what a killed one leaves behind. More in tests/faults/test_fleet_kill.py."""
 
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 import sys
 import time
@@ -12,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from deploy.fleet import STATE, runs
-from deploy.info import describe_log
 
 HUB = 'id = "hub"\nsite = "mini"\nrig = "rig.toml"\ninterval_s = 1.0\n'
 RIG = '[{0}]\nname = "{0}"\nsize = [640, 480]\n'
@@ -62,31 +60,6 @@ def fleet(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "deploy", "fleet", *arguments], capture_output=True, text=True, timeout=120, check=False
     )
-
-
-def test_up_status_down(tmp_path: Path) -> None:
-    rig, out = mini(tmp_path / "rig"), tmp_path / "out"
-    up = start(["up", str(rig), "--simulated", "--out", str(out)], tmp_path / "log.txt")
-    try:
-        until(lambda: frames(out, "cam0") > 5 and frames(out, "cam1") > 5)
-        told = json.loads(fleet("status", "--out", str(out), "--json").stdout)
-        assert told["up"]
-        assert all(agent["runs"] for agent in told["agents"].values())
-        again = fleet("up", str(rig), "--simulated", "--out", str(out))
-        assert (again.returncode, "is up in" in again.stderr) == (3, True)
-        down = fleet("down", "--out", str(out))
-        assert (down.returncode, down.stdout) == (0, "stopped 4 agents\n")
-        assert up.wait(60) == 0
-        assert not any(runs(agent["pid"], agent["started"]) for agent in told["agents"].values())
-        # In order: the recorder, stopped after the cameras, has heard each of them.
-        (log,) = (out / "recordings").glob("*.mcap")
-        description = describe_log(log)
-        assert not description.damage
-        assert {camera.camera for camera in description.cameras} == {"cam0", "cam1"}
-    finally:
-        if up.poll() is None:
-            up.send_signal(signal.SIGTERM)
-            up.wait(60)
 
 
 def test_agents_of_a_killed_fleet_are_ended_by_the_next(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from google.protobuf.message import Message
@@ -96,6 +98,21 @@ def test_its_answer_is_the_truth_and_its_std_is_honest(session: Session) -> None
         error = session.clock_error(name, hub.calibration.reference, camera.time_map)
         assert abs(error) < 1e-3
         assert abs(error) <= 5.0 * camera.time_offset_std
+
+
+def test_a_watchdog_hears_of_every_step_of_a_solve(session: Session) -> None:
+    hub = LiveHub(LiveSettings(window_s=100.0))
+    for message in messages(session):
+        hub.handle(message)
+    beats: list[float] = []
+    hub.working = lambda: beats.append(time.process_time())
+    began = time.process_time()
+    hub.tick(1000.0)
+    ended = time.process_time()
+    assert hub.calibration is not None
+    silent = np.diff([began, *beats, ended])
+    assert silent.max() < 0.7 * (ended - began), "one silence is most of the solve"
+    assert len(beats) > 8
 
 
 def test_the_same_messages_give_the_same_bytes(session: Session) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import socket
@@ -17,6 +18,14 @@ CONFIGS = {
     # Nobody listens at that port: it must wait, and say so, and never be ready.
     "waiting": ("hub", 'id = "lonely"\n[bus]\nmode = "client"\nconnect = ["tcp/127.0.0.1:1"]\n'),
 }
+
+
+_PR_SET_MDWE, _REFUSE_EXEC_GAIN = 65, 1
+
+
+def _as_in_the_unit() -> None:
+    """MemoryDenyWriteExecute=yes, by the kernel's own word for it; kernels before 6.3 do not know it."""
+    ctypes.CDLL(None).prctl(_PR_SET_MDWE, _REFUSE_EXEC_GAIN, 0, 0, 0)
 
 
 def test_agents_tell_systemd_that_data_flows(tmp_path: Path) -> None:
@@ -36,6 +45,7 @@ def test_agents_tell_systemd_that_data_flows(tmp_path: Path) -> None:
                 env=environment,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
+                preexec_fn=_as_in_the_unit,
             )
 
         def listen() -> None:

@@ -275,14 +275,23 @@ def test_live_sources_are_told_from_recordings(source: int | str) -> None:
     assert isinstance(open_video(source), LiveCamera)
 
 
-class Unplugged:
-    """A camera that gives two frames and then is gone."""
+class Plug:
+    """A camera at 10 Hz, its plug, and the test's clock. Built by ``cv2.VideoCapture`` through this object."""
 
-    def __init__(self, *_: object) -> None:
-        self.left = 3  # one is read when it is opened
+    def __init__(self) -> None:
+        self.inside, self.size, self.now_ns = True, (4, 6, 3), 0
+        self.since: list[float] = []  # of tries, while it is out
+
+    def __call__(self, *_: object) -> Plug:
+        if not self.inside:
+            self.since.append(self.now_ns * 1e-9)
+        return self
+
+    def sleep(self, seconds: float) -> None:
+        self.now_ns += round(seconds * 1e9)
 
     def isOpened(self) -> bool:
-        return True
+        return self.inside
 
     def set(self, *_: object) -> bool:
         return False
@@ -291,11 +300,11 @@ class Unplugged:
         return 0.0
 
     def grab(self) -> bool:
-        self.left -= 1
-        return self.left >= 0
+        self.now_ns += 10**8 if self.inside else 10**3
+        return self.inside
 
     def retrieve(self) -> tuple[bool, np.ndarray]:
-        return True, np.zeros((4, 6, 3), np.uint8)
+        return True, np.zeros(self.size, np.uint8)
 
     def read(self) -> tuple[bool, np.ndarray]:
         return self.grab(), self.retrieve()[1]
@@ -304,22 +313,64 @@ class Unplugged:
         pass
 
 
-def test_a_live_camera_stamps_on_arrival_and_ends_when_it_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cv2, "VideoCapture", Unplugged)
-    now = iter(range(0, 10**12, 10**9))
-    device = LiveCamera("rtsp://user:secret@camera/stream", now_ns=lambda: next(now))
+def plugged(monkeypatch: pytest.MonkeyPatch) -> tuple[Plug, LiveCamera]:
+    plug = Plug()
+    monkeypatch.setattr(cv2, "VideoCapture", plug)
+    device = LiveCamera("/dev/video0", now_ns=lambda: plug.now_ns, sleep=plug.sleep)
     device.open()
+    return plug, device
+
+
+def test_a_live_camera_stamps_on_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, device = plugged(monkeypatch)
     assert device.info.fps == 0.0
     frames = [device.read(0.0) for _ in range(2)]
-    assert [frame.device_time_ns for frame in frames if frame] == [10**9, 2 * 10**9]
-    for _ in range(10):
-        assert device.read(0.0) is None
-    assert device.ended
+    assert [(frame.frame, frame.device_time_ns) for frame in frames if frame] == [(0, 2 * 10**8), (1, 3 * 10**8)]
+
+
+def test_an_unplugged_camera_is_sought_ever_more_slowly_and_counts_what_it_missed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plug, device = plugged(monkeypatch)
+    before = [frame for frame in (device.read(0.1) for _ in range(20)) if frame]
+    plug.inside, pulled = False, plug.now_ns * 1e-9
+    while plug.now_ns * 1e-9 < pulled + 30.0:
+        assert device.read(0.1) is None
+    assert device.away
+    assert not device.ended, "an agent would end"
+    assert plug.since[0] - pulled < 2.0
+    pauses = np.diff(plug.since)
+    assert pauses[0] < 1.0
+    assert pauses.max() <= 5.1, "back-off above 5 s"
+    assert 5 <= len(plug.since) <= 12, "it hammers at a plug that is empty, or has given up"
+    plug.inside, again = True, plug.now_ns * 1e-9
+    after: list[Frame] = []
+    while len(after) < 5:
+        frame = device.read(0.1)
+        after += [frame] if frame else []
+    assert after[0].device_time_ns * 1e-9 - again < 5.5
+    assert device.reconnections == 1
+    assert not device.away
+    passed = (after[0].device_time_ns - before[-1].device_time_ns) * 1e-9
+    assert after[0].frame - before[-1].frame == round(passed * 10.0), "10 Hz: the missed frames are a gap"
+    assert [frame.frame - after[0].frame for frame in after] == [0, 1, 2, 3, 4]
+
+
+def test_a_camera_that_comes_back_as_another_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    plug, device = plugged(monkeypatch)
+    plug.inside = False
+    while not device.away:
+        device.read(0.1)
+    plug.inside, plug.size = True, (8, 6, 3)
+    plug.sleep(5.0)
+    with pytest.raises(InputError, match="came back as 6x8, it was 6x4; plug the same camera in"):
+        device.read(0.1)
 
 
 def test_a_password_does_not_reach_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Unplugged, "isOpened", lambda _: False)
-    monkeypatch.setattr(cv2, "VideoCapture", Unplugged)
+    plug = Plug()
+    plug.inside = False
+    monkeypatch.setattr(cv2, "VideoCapture", plug)
     with pytest.raises(InputError, match=r"rtsp://…@camera/stream does not answer; check address") as told:
         LiveCamera("rtsp://user:secret@camera/stream").open()
     assert "secret" not in str(told.value)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -204,6 +206,9 @@ class Vehicle:
     def wait(self, timeout_s: float) -> None:
         self.time += timeout_s
 
+    def send(self, message: Any) -> bool:
+        raise AssertionError("it was told to listen only")
+
     def poll(self) -> list[Any]:
         return [SimpleNamespace(kind=self._kinds.pop(0), system=1)] if self._kinds else []
 
@@ -214,6 +219,7 @@ class Vehicle:
         (Vehicle(("ATTITUDE", "HEARTBEAT")), "ok", ""),
         (Vehicle(), "fail", "TX to RX"),
         (Vehicle(problem="/dev/ttyAMA0: Permission denied"), "fail", "group dialout"),
+        (Vehicle(problem="Address already in use"), "fail", "stop the agent"),
         (Vehicle(counters=Counter(garbage=40)), "fail", "baud rate, MAVLink 2"),
     ],
 )
@@ -238,6 +244,42 @@ def test_configuration(tmp_path: Path) -> None:
     found, config = agent.configuration(file, "camera")
     check(found, "ok")
     assert config.id == "cam0"
+
+
+WITHOUT = """\
+import sys
+for name in sys.argv[2:]:
+    sys.modules[name] = None
+from deploy.cli import run
+sys.exit(run(["doctor", sys.argv[1], "--json"]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("role", "text", "gone", "remedy"),
+    [
+        ("cam0", 'driver = "video"\n[video]\nsource = "/dev/video97"\n', ["cv2"], "syncline bundle"),
+        ("cam0", 'driver = "oak"\n[oak]\ndevice = "127.0.0.1"\n', ["depthai"], 'pip install "syncline[oak]"'),
+        ("uav", "", ["pymavlink"], 'pip install "syncline[uav]"'),
+    ],
+)
+def test_a_camera_whose_packages_are_missing_is_told_which(
+    tmp_path: Path, role: str, text: str, gone: list[str], remedy: str
+) -> None:
+    """In a process of its own, where these modules cannot be imported: doctor itself must not need them."""
+    file = tmp_path / f"{role}.toml"
+    file.write_text(f'id = "{role}"\n' + text + '[bus]\nmode = "peer"\nlisten = ["tcp/127.0.0.1:0"]\n')
+    ended = subprocess.run(
+        [sys.executable, "-c", WITHOUT, str(file), *gone], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert ended.returncode == 2, ended.stderr
+    found = {one["check"]: one for one in json.loads(ended.stdout)}
+    assert found["packages"]["verdict"] == "fail"
+    assert gone[0] in found["packages"]["text"]
+    assert remedy in found["packages"]["remedy"]
+    assert "Traceback" not in ended.stderr
+    for one in found.values():
+        assert one["verdict"] != "fail" or one["remedy"]
 
 
 def test_a_roles_name_is_told_by_file_or_folder() -> None:

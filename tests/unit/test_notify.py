@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from deploy.notify import ALIVE_FILE, Notifier, Watched
-from edge.devices.base import DeviceInfo, Frame
+from edge.devices.base import DeviceInfo, Frame, Returning
 
 
 class Manager:
@@ -56,6 +56,17 @@ def test_ready_comes_with_the_first_data_and_watchdog_as_often_as_asked(manager:
     assert 3 <= len(heard) <= 5, "each quarter of the watchdog's time, not each frame"
     now += 60.0
     assert manager.heard() == [], "it speaks without data: the watchdog would never bite"
+
+
+def test_an_end_that_takes_long_asks_for_more_time_while_it_gets_on(manager: Manager) -> None:
+    now = 0.0
+    notifier = Notifier(manager.address, watchdog_s=60.0, now=lambda: now)
+    notifier.beat()
+    manager.heard()
+    for _ in range(10):
+        now += 2.0
+        notifier.beat(ending=True)
+    assert manager.heard() == ["WATCHDOG=1\nEXTEND_TIMEOUT_USEC=60000000"] * 10
 
 
 def test_waiting_for_a_router_lengthens_the_start_and_stops_once_ready(manager: Manager) -> None:
@@ -113,3 +124,28 @@ def test_a_device_beats_with_its_frames_and_with_nothing_else() -> None:
     assert watched.read(0.1) is None
     assert watched.read(0.1) is None
     assert beats == [1], "a silent camera looks alive"
+
+
+def test_an_unplugged_camera_that_is_sought_is_no_reason_to_start_anew() -> None:
+    class Board:
+        def __init__(self) -> None:
+            self.info = DeviceInfo(2, 2, 1.0, "test", "monotonic")
+            self.ended, self.away, self.reconnections = False, False, 3
+
+        def open(self) -> None: ...
+
+        def read(self, timeout_s: float) -> Frame | None:
+            return None
+
+        def close(self) -> None: ...
+
+    beats: list[int] = []
+    board = Board()
+    watched = Watched(board, lambda: beats.append(1))
+    watched.read(0.1)
+    assert beats == [], "plugged in and silent: it hangs"
+    board.away = True
+    watched.read(0.1)
+    assert beats == [1]
+    assert isinstance(watched, Returning)
+    assert (watched.away, watched.reconnections) == (True, 3)

@@ -1,0 +1,107 @@
+"""`syncline doctor` and the vehicle: real MAVLink links, against nobody, the wrong one and a simulated autopilot."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("pymavlink", reason="the extra `uav` is not installed: DOCTOR IS NOT TESTED ON MAVLINK")
+from deploy.doctor import examine
+from deploy.doctor.finding import Finding
+from deploy.uav_config import MavlinkConfig, UavConfig
+from edge.devices.aircraft import SimulatedAircraft
+from edge.devices.pacing import RealTime
+from edge.mavlink.autopilot import Autopilot
+from edge.mavlink.transport import Udp, Url
+
+
+def asked(url: str, patience_s: float = 0.5) -> Finding:
+    return examine._vehicle(UavConfig(id="drone", mavlink=MavlinkConfig(url=url)), patience_s)
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def looping(step: object) -> Iterator[None]:
+    stop = threading.Event()
+
+    def run() -> None:
+        while not stop.wait(0.01):
+            step()  # type: ignore[operator]
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_an_autopilot_that_answers_who_calls_it_is_heard() -> None:
+    transport = Udp(Url("udpin", "127.0.0.1", 0), bound=True)
+    autopilot, pace = Autopilot(SimulatedAircraft(), transport, system=7), RealTime(time.time())
+    with looping(lambda: autopilot.step(pace.now())):
+        found = asked(f"udpout:127.0.0.1:{transport.port}", 20.0)
+    transport.close()
+    assert (found.verdict, found.text) == ("ok", "heartbeat of system 7")
+
+
+def test_a_wire_that_is_not_there() -> None:
+    found = asked("serial:/dev/ttyNOPE:921600")
+    assert (found.verdict, found.exit_status) == ("fail", 3)
+    assert "No such file" in found.text
+    assert "check device, baud rate and rights" in found.remedy
+
+
+def test_nobody_speaks() -> None:
+    found = asked(f"udpin:127.0.0.1:{free_port()}")
+    assert (found.verdict, found.exit_status) == ("fail", 3)
+    assert "TX to RX" in found.remedy
+
+
+def test_a_port_that_the_agent_itself_holds() -> None:
+    taken = Udp(Url("udpin", "127.0.0.1", 0), bound=True)
+    found = asked(f"udpin:127.0.0.1:{taken.port}")
+    taken.close()
+    assert found.verdict == "fail"
+    assert "stop the agent" in found.remedy
+
+
+def test_bytes_at_the_wrong_baud_rate() -> None:
+    port = free_port()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+
+        def shout() -> None:
+            with suppress(OSError):
+                line.sendto(b"\xfd\x09\x00\x00\x17\x01\x01\x00\x00\x00garbled bytes\xfe\x03", ("127.0.0.1", port))
+
+        with looping(shout):
+            found = asked(f"udpin:127.0.0.1:{port}")
+    assert found.verdict == "fail"
+    assert "baud rate, MAVLink 2" in found.remedy, found.text
+
+
+def test_the_command_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from deploy.cli import run
+
+    file = tmp_path / "uav.toml"
+    file.write_text(
+        'id = "drone"\n[mavlink]\nurl = "tcp:127.0.0.1:1"\n[bus]\nmode = "peer"\nlisten = ["tcp/127.0.0.1:0"]\n'
+    )
+    assert run(["doctor", str(file), "--json"]) in (2, 3)
+    found = {one["check"]: one for one in json.loads(capsys.readouterr().out)}
+    assert found["mavlink"]["verdict"] == "fail"
+    assert found["mavlink"]["exit_status"] == 3
+    assert "refused" in found["mavlink"]["text"]
