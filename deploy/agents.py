@@ -6,11 +6,14 @@ import math
 import os
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-from deploy.config import CameraConfig, HubConfig, SimulatedConfig
+from deploy.config import CameraConfig, HubConfig, OakConfig, SimulatedConfig
 from deploy.outputs import write_outputs, write_refusal
+from edge.detectors.base import Detector
 from edge.devices.base import Device
 from protocols.bus.base import Bus
 from protocols.errors import EXIT_DONE, InputError
@@ -20,43 +23,91 @@ from protocols.session.rig import Rig, RigCamera, read_rig
 _DAY_S = 86_400.0
 
 
-def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event) -> int:
-    """Run a camera agent until it is stopped or its recording ends."""
+def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event, beat: Callable[[], None] = lambda: None) -> int:
+    """Run a camera agent until it is stopped or its recording ends. beat: called with every frame."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # a source that doesn't open is told by us, in one line
     import cv2
 
+    from deploy.notify import Watched
     from edge.camera_agent import run_camera_agent
-    from edge.detectors.marker import MarkerDetector, MarkerModel
 
     cv2.setNumThreads(1)  # one core a camera: several agents share a board
     known = _known_camera(config)
     device = make_device(config, None if known is None else known.intrinsics)
     lens = device.info.intrinsics if config.driver == "simulated" else None if known is None else known.intrinsics
-    marker = config.marker
-    model = MarkerModel.default() if marker.colour is None else MarkerModel.of_colour(*marker.colour)
-    detector = MarkerDetector(
-        replace(model, label=marker.label),
-        intrinsics=lens,
-        min_size=marker.min_size or 0.0,
-        max_size=marker.max_size or math.inf,
+    detector = _detector(config, lens, device.info.fps if config.driver == "simulated" else _fps(config))
+    run_camera_agent(
+        Watched(device, beat),
+        detector,
+        bus,
+        config.id,
+        stop,
+        known=known,
+        pictures_hz=config.pictures_hz,
+        predictions=config.detector != "marker",
     )
-    run_camera_agent(device, detector, bus, config.id, stop, known=known)
     return EXIT_DONE
 
 
-def start_hub(config: HubConfig, bus: Bus, stop: threading.Event) -> int:
-    """Run the hub until it is stopped; its answers are also files where `out` is given."""
+def _detector(config: CameraConfig, lens: Intrinsics | None, fps: float) -> Detector:
+    if config.detector == "marker":
+        from edge.detectors.marker import MarkerDetector, MarkerModel
+
+        marker = config.marker
+        model = MarkerModel.default() if marker.colour is None else MarkerModel.of_colour(*marker.colour)
+        return MarkerDetector(
+            replace(model, label=marker.label),
+            intrinsics=lens,
+            min_size=marker.min_size or 0.0,
+            max_size=marker.max_size or math.inf,
+        )
+    moving = config.moving
+    if config.detector == "person":
+        from edge.detectors.person import PersonDetector
+
+        # Cameras do not know each other's people: their labels must not look like the same points.
+        return PersonDetector(moving.background, fps, prefix=f"{config.id[:48]}-p")
+    from edge.detectors.vehicle import VehicleDetector
+
+    camera = {"auto": None, "fixed": False, "moving": True}[moving.camera]
+    return VehicleDetector(moving.background, fps, prefix=f"{config.id[:48]}-t", moving=camera)
+
+
+def _fps(config: CameraConfig) -> float:
+    """What the configuration says of the frame rate; 25 where it says nothing."""
+    if config.driver == "video" and config.video is not None and config.video.fps is not None:
+        return config.video.fps
+    if config.driver == "oak" and config.oak is not None:
+        return config.oak.fps
+    return 25.0
+
+
+def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable[[], None] = lambda: None) -> int:
+    """Run the hub until it is stopped; its answers are also files where `out` is given. beat: called every round."""
     from hub.agent import run_hub
-    from hub.live import LiveHub, LiveSettings
+    from hub.live import KnownCalibration, LiveHub, LiveSettings
     from hub.nodes.host import NodeHost
+    from protocols.session.calibration import read_calibration
 
     rig = None if config.rig is None else read_rig(config.rig)
     nodes = NodeHost(config.id, config.nodes, leave_after_s=config.leave_after_s) if config.pose_nodes else None
-    hub = LiveHub(LiveSettings(config.window_s, config.interval_s, solve=config.solve), rig, nodes)
-    run_hub(hub, bus, config.id, stop, rig=rig)
+    known = None if config.known is None else KnownCalibration(*read_calibration(config.known))
+    settings = LiveSettings(config.window_s, config.interval_s, solve=config.solve, track=config.track)
+    hub = LiveHub(settings, rig, None if known is not None else nodes, known)
+    export = None if config.out is None else partial(_export, out=config.out)
+    run_hub(hub, bus, config.id, stop, rig=rig, beat=beat, export=export)
     if config.out is not None:
         write_last(hub, config.out)
     return EXIT_DONE
+
+
+def _export(hub: object, out: Path) -> str:
+    """Write the files because a view asked for them; one line on what came of it, and never an end of the hub."""
+    try:
+        write_last(hub, out)
+    except InputError as error:
+        return f"not exported: {error}"
+    return f"exported to {out}"
 
 
 def write_last(hub: object, out: Path) -> None:
@@ -77,6 +128,12 @@ def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:
     """The device that the configuration names, not yet open."""
     if config.driver == "simulated":
         return _simulated(config)
+    if config.driver == "oak":
+        from edge.devices.oak import OakCamera, OakSettings
+
+        oak = config.oak or OakConfig()
+        settings = OakSettings(oak.device, oak.socket, oak.size, oak.fps, oak.exposure_us, oak.iso, oak.focus)
+        return OakCamera(settings, intrinsics=intrinsics)
     from edge.devices.pacing import RealTime
     from edge.devices.video import open_video
 
@@ -94,13 +151,17 @@ def _simulated(config: CameraConfig) -> Device:
     from edge import scenes
     from edge.devices.pacing import RealTime
     from edge.devices.simulated import SimulatedDevice
+    from edge.scenes.scaled import scaled
 
     world = config.simulated or SimulatedConfig()
     epoch = world.start_unix_s
     if epoch is None:
         epoch = time.time() // _DAY_S * _DAY_S
-    scene = scenes.get(world.scene, world.seed, world.cameras)
-    return SimulatedDevice(scene, config.id, world.seed, RealTime(epoch), duration_s=world.duration_s)
+    scene = scenes.any_scene(world.scene, world.seed, world.cameras)
+    if world.width is not None or world.fps is not None:
+        scene = scaled(scene, world.width, world.fps)
+    camera = world.camera or config.id
+    return SimulatedDevice(scene, camera, world.seed, RealTime(epoch), duration_s=world.duration_s)
 
 
 def _known_camera(config: CameraConfig) -> RigCamera | None:

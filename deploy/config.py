@@ -16,12 +16,17 @@ from protocols.errors import InputError
 __all__ = [
     "BusConfig",
     "CameraConfig",
+    "HealthConfig",
     "HubConfig",
     "MarkerConfig",
+    "MovingConfig",
+    "OakConfig",
     "RecorderConfig",
+    "RouterConfig",
     "SimulatedConfig",
     "Source",
     "VideoConfig",
+    "ViewConfig",
     "effective_toml",
     "load",
 ]
@@ -38,11 +43,31 @@ class _Strict(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """An unknown key is an error: else a misspelt one would be a setting that silently does nothing."""
 
 
+class HealthConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[health]: /metrics, /livez and /readyz over HTTP at ``listen``, "address:port".
+
+    beyond_loopback: whether others than this machine may ask; nobody is asked for a password.
+    """
+
+    listen: str = "127.0.0.1:9100"
+    beyond_loopback: bool = False
+
+    def __post_init__(self) -> None:
+        host, _, port = self.listen.rpartition(":")
+        if not host or not port.isdigit() or int(port) > 65_535:
+            raise ValueError(f'listen {self.listen!r} is no address; write it like "127.0.0.1:9100"')
+        if not (self.beyond_loopback or host in ("localhost", "[::1]") or host.startswith("127.")):
+            raise ValueError(
+                f"listen {self.listen!r} is open to the network; take 127.0.0.1, or set beyond_loopback = true"
+            )
+
+
 class _Agent(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What every agent has. site: agents see only those of their own site."""
+    """What every agent has. site: agents see only those of their own site. health: None = no HTTP."""
 
     site: str = "local"
     bus: BusConfig = msgspec.field(default_factory=BusConfig)
+    health: HealthConfig | None = None
 
     def __post_init__(self) -> None:
         _check_id(self.site, "site")
@@ -53,11 +78,24 @@ class _Agent(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
             raise ValueError(f"{error.what}; {error.remedy}") from None
 
 
+class RouterConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A router. bus: its mode is "router" without saying so; with `syncline keys`, access and [bus.tls] too."""
+
+    id: str = "router"
+
+    def __post_init__(self) -> None:
+        if self.bus.mode == "client":
+            raise ValueError('bus.mode of a router is "router"; remove the line')
+        msgspec.structs.force_setattr(self, "bus", msgspec.structs.replace(self.bus, mode="router"))
+        super().__post_init__()
+
+
 class RecorderConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The recorder. out: the log to write; a folder gets a file named by the time of its start.
 
     part_s, part_mb: begin a new file, name-000.mcap, name-001.mcap, …, when the present one is so old or so large
-    [MB]; None = one file. min_free_mb: recording ends, with a whole log, before less than this is free on the disk.
+    [MB]; None = one file. min_free_mb, min_free_percent: recording ends, with a whole log, before less than this is
+    free on the disk.
     foxglove: also write calibration, transforms, scene and annotations as Foxglove and rerun know them.
     """
 
@@ -66,6 +104,7 @@ class RecorderConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     part_s: Seconds | None = None
     part_mb: Annotated[float, Meta(ge=0.1, le=1e6)] | None = None
     min_free_mb: Annotated[float, Meta(ge=0.0, le=1e9)] = 200.0
+    min_free_percent: Annotated[float, Meta(ge=0.0, le=100.0)] = 5.0
     foxglove: bool = True
 
 
@@ -74,7 +113,8 @@ class SimulatedConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=
 
     cameras: how many the world has, which also decides where they stand. duration_s: None = endless.
     start_unix_s: the Unix time of the world's true time 0; agents of one world must share it. None = the
-    machine's start of the day, which agents on one machine share without being told.
+    machine's start of the day, which agents on one machine share without being told. camera: which of the world's
+    cameras this is; None = the one of the agent's id. width, fps: of all its pictures [px, Hz], instead of the world's.
     """
 
     scene: str = "marker"
@@ -82,6 +122,25 @@ class SimulatedConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=
     cameras: Annotated[int, Meta(ge=2, le=64)] = 4
     duration_s: Seconds | None = None
     start_unix_s: Annotated[float, Meta(ge=0.0)] | None = None
+    camera: str | None = None
+    width: Annotated[int, Meta(ge=64, le=7680)] | None = None
+    fps: Hertz | None = None
+
+
+class OakConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[oak]: one sensor of an OAK board, through depthai.
+
+    device: IP address, device id or USB path; "" = the only one there is. size: [w, h]. exposure_us, iso: fixed, so
+    that mid-exposure and brightness keep still. focus: lens position 0..255, fixed; None = a lens that cannot move.
+    """
+
+    device: str = ""
+    socket: Literal["CAM_A", "CAM_B", "CAM_C"] = "CAM_A"
+    size: tuple[Annotated[int, Meta(ge=64, le=8192)], Annotated[int, Meta(ge=64, le=8192)]] = (1280, 800)
+    fps: Hertz = 30.0
+    exposure_us: Annotated[int, Meta(ge=1, le=500_000)] = 5000
+    iso: Annotated[int, Meta(ge=100, le=6400)] = 400
+    focus: Byte | None = None
 
 
 class VideoConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -104,16 +163,33 @@ class MarkerConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     max_size: Pixels | None = None
 
 
+class MovingConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[moving]: how people and vehicles are told from what stands still.
+
+    background: the model of the background. camera: of vehicles, whether it stands or moves; people need one that
+    stands.
+    """
+
+    background: Literal["mog2", "knn"] = "mog2"
+    camera: Literal["auto", "fixed", "moving"] = "auto"
+
+
 class CameraConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One camera agent. rig: a rig.toml to take this camera's intrinsics and known pose from."""
+    """One camera agent. rig: a rig.toml to take this camera's intrinsics and known pose from.
+
+    pictures_hz: small pictures a second on the bus while a view is open; 0 = none, ever.
+    """
 
     id: str
     rig: Path | None = None
-    driver: Literal["simulated", "video"] = "simulated"
-    detector: Literal["marker"] = "marker"
+    pictures_hz: Annotated[float, Meta(ge=0.0, le=30.0)] = 2.0
+    driver: Literal["simulated", "video", "oak"] = "simulated"
+    detector: Literal["marker", "person", "vehicle"] = "marker"
     simulated: SimulatedConfig | None = None
     video: VideoConfig | None = None
+    oak: OakConfig | None = None
     marker: MarkerConfig = msgspec.field(default_factory=MarkerConfig)
+    moving: MovingConfig = msgspec.field(default_factory=MovingConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -127,6 +203,8 @@ class HubConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
     window_s: how much of the past is solved together; interval_s: how often it is solved again. solve: false = this
     hub seeks no timing itself. nodes: cameras whose pose nodes run here whoever else is there; the others are shared
     out among all hubs. pose_nodes: false = none run here. leave_after_s: when a camera that has gone is forgotten.
+    known: a calibration.toml that is kept as it is: poses, lenses and clocks; nothing is solved then. track: whether
+    people, vehicles and markers without a name are followed.
     """
 
     id: str = "hub"
@@ -138,6 +216,12 @@ class HubConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
     pose_nodes: bool = True
     nodes: tuple[str, ...] = ()
     leave_after_s: Seconds = 30.0
+    known: Path | None = None
+    track: bool = True
+
+
+class ViewConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=False):
+    """What a view takes from any agent's file: its site and how to reach the bus; the rest is that agent's own."""
 
 
 def _check_id(text: str, what: str) -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import tomli_w
 
-from edge.detectors.base import Detector
+from edge.detectors.base import Detection, Detector
 from edge.detectors.marker import MarkerDetector, MarkerModel, teach
 from edge.devices.film import Film
 from protocols.errors import InputError
@@ -59,11 +59,15 @@ def detect_in(
     detector: Detector,
     tell: Callable[[int], None] = lambda frame: None,
     stop: Callable[[], bool] = lambda: False,
+    seen: dict[int, list[tuple[str, Detection]]] | None = None,
 ) -> Found:
-    """Run a detector over all frames. tell: called with the frame's index now and then. stop: ends it early."""
+    """Run a detector over all frames. tell: called with the frame's index now and then. stop: ends it early.
+
+    seen: is filled with each frame's rows and detections; the rows have ``{label}`` where the label belongs.
+    """
     rows: list[str] = []
     name = csv_cell(camera)
-    frames = seen = 0
+    frames = frames_with = 0
     first = last = math.nan
     for shot in film:
         if stop():
@@ -72,27 +76,41 @@ def detect_in(
         last = shot.time
         frames += 1
         labels: set[str] = set()
-        for one in detector.detect(shot.image()):
+        for one in detector.detect(shot.image(), shot.time):
             # One row a label and frame: detections come best first.
             if one.label in labels or not (math.isfinite(one.u) and math.isfinite(one.v)):
                 continue
             labels.add(one.label)
             size = f"{one.size:.17g}" if one.size > 0 else ""
             place = f"{shot.frame},{shot.time:.17g},{one.u:.17g},{one.v:.17g}"
-            rows.append(f"{name},{place},{size},{csv_cell(one.label)},{one.score:.6g}")
-        seen += bool(labels)
+            if seen is not None:
+                template = name.replace("{", "{{").replace("}", "}}")
+                row = f"{template},{place},{size},{{label}},{one.score:.6g}"
+                seen.setdefault(shot.frame, []).append((row, one))
+            else:
+                rows.append(f"{name},{place},{size},{csv_cell(one.label)},{one.score:.6g}")
+        frames_with += bool(labels)
         if frames % _TELL_EVERY == 0:
             tell(frames)
     if not frames:
         raise InputError("no frame can be read from this file", file=film.path, remedy="replace it")
     # A mean rate that the container only guesses is better measured.
     fps = (frames - 1) / (last - first) if frames > 1 and last > first else film.info.fps
-    return Found(tuple(rows), frames, seen, film.corrupt, film.repaired, film.info.size, fps, (first, last))
+    return Found(tuple(rows), frames, frames_with, film.corrupt, film.repaired, film.info.size, fps, (first, last))
 
 
-def observations_text(rows: tuple[str, ...] | list[str]) -> str:
-    """observations.csv."""
-    return "\n".join([HEADER, *rows]) + "\n"
+def with_overlay(film: Film, found: Found, seen: dict[int, list[tuple[str, Detection]]], overlay: Path) -> Found:
+    """Draw what was seen into a copy of the film; ``found`` with its rows. Raises InputError."""
+    from deploy.detecting_overlay import draw_overlay
+
+    draw_overlay(film, overlay, {frame: [(one.label, one) for _, one in shown] for frame, shown in seen.items()})
+    rows = [row.format(label=csv_cell(one.label)) for shown in seen.values() for row, one in shown]
+    return replace(found, rows=tuple(rows))
+
+
+def observations_text(rows: tuple[str, ...] | list[str], extra: str = "") -> str:
+    """observations.csv. extra: names of further columns."""
+    return "\n".join([HEADER + (f",{extra}" if extra else ""), *rows]) + "\n"
 
 
 def marker_detector(model: MarkerModel, lens: Intrinsics | None, size: tuple[int, int]) -> MarkerDetector:

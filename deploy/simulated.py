@@ -9,6 +9,7 @@ import numpy as np
 import tomli_w
 
 from edge import scenes
+from edge.scenes.base import Scene
 from edge.scenes.session import SimulatedTracks, simulated_session
 from protocols.errors import InputError
 from protocols.files import write_atomically
@@ -43,26 +44,38 @@ def write_simulated_session(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot be made: {error.strerror}", file=out, remedy="choose another --out") from None
-    tables = _rig_tables(filmed, scene_name)
-    write_rig(out / RIG_FILE, tables)
+    rig, truth = camera_tables(scene, scene_name)
+    write_rig(out / RIG_FILE, rig)
     write_observations(out / OBSERVATIONS_FILE, observations_of(filmed))
-    write_atomically(out / TRUTH_CALIBRATION, tomli_w.dumps(_truth_tables(filmed, tables)))
+    write_atomically(out / TRUTH_CALIBRATION, tomli_w.dumps(truth))
     _write_truth_trajectory(out / TRUTH_TRAJECTORY, filmed)
     return {"scene": scene_name, "seed": seed, "cameras": len(scene.cameras), "rows": rows, "seconds": seconds}
 
 
-def _rig_tables(filmed: SimulatedTracks, name: str) -> dict[str, Any]:
-    tables: dict[str, Any] = {"metadata": {"name": name, "units": "m"}}
-    for camera in filmed.cameras:
+def camera_tables(scene: Scene, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """rig.toml of a scene, and calibration.toml as it should come out, in the scene's own world and in metres."""
+    reference = scene.cameras[0].name
+    metadata = {"name": name, "units": "m"}
+    rig: dict[str, Any] = {"metadata": metadata}
+    truth: dict[str, Any] = {"metadata": {**metadata, "reference": reference, "scale": "metric"}}
+    for camera in scene.cameras:
         lens = camera.intrinsics
-        tables[camera.name] = {
+        rig[camera.name] = {
             "name": camera.name,
             "size": [lens.width, lens.height],
             "fps": camera.fps,
             "matrix": lens.matrix.tolist(),
             "distortions": lens.distortions.tolist(),
         }
-    return tables
+        time_map = scene.true_time_map(camera.name, reference)
+        truth[camera.name] = {
+            **rig[camera.name],
+            "rotation": camera.pose.rodrigues.tolist(),
+            "translation": camera.pose.translation.tolist(),
+            "time_offset": time_map.time_offset,
+            "clock_rate": time_map.clock_rate,
+        }
+    return rig, truth
 
 
 def rig_of(filmed: SimulatedTracks) -> Rig:
@@ -90,22 +103,6 @@ def observations_of(filmed: SimulatedTracks) -> Observations:
         np.concatenate([track.size for track in tracks]),
         order=[camera.name for camera in filmed.cameras],
     )
-
-
-def _truth_tables(filmed: SimulatedTracks, rig: dict[str, Any]) -> dict[str, Any]:
-    """calibration.toml as it should come out, in the scene's own world and in metres."""
-    reference = filmed.cameras[0].name
-    tables: dict[str, Any] = {"metadata": {**rig["metadata"], "reference": reference, "scale": "metric"}}
-    for camera in filmed.cameras:
-        time_map = filmed.true_time_map(camera.name, reference)
-        tables[camera.name] = {
-            **rig[camera.name],
-            "rotation": camera.pose.rodrigues.tolist(),
-            "translation": camera.pose.translation.tolist(),
-            "time_offset": time_map.time_offset,
-            "clock_rate": time_map.clock_rate,
-        }
-    return tables
 
 
 def _write_truth_trajectory(file: Path, filmed: SimulatedTracks) -> None:

@@ -17,10 +17,14 @@ from collections.abc import Callable
 from google.protobuf.message import Message
 
 from edge.detectors.base import Detection, Detector
-from edge.devices.base import Device, Frame
+from edge.devices.base import Device, Frame, Returning
+from edge.picture_watch import PictureWatch
+from edge.pictures import picture_message
+from edge.predictions import Predictions
 from protocols.bus.base import Bus, Publisher
-from protocols.catalogue import CAMERA_INFO, OBSERVATION, STATUS, Topic
+from protocols.catalogue import CAMERA_INFO, OBSERVATION, PICTURE, PREDICTION, STATUS, Topic
 from protocols.clocks import NANOSECONDS
+from protocols.errors import InputError
 from protocols.gate import SCHEMA_VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import RigCamera
@@ -30,7 +34,9 @@ ROLE = "camera"
 _READ_TIMEOUT_S = 0.1  # how long a stop may wait for a silent camera
 _INFO_PERIOD_S = 2.0
 _STATUS_PERIOD_S = 1.0
-_SILENT_S = 2.0  # without a frame for this long the agent calls itself degraded
+_UNPLUGGABLE = frozenset({"video", "oak"})  # drivers of real devices, which do not end of themselves
+_IDLE_S = 0.2  # how often it is asked whether there is something to complain of
+_LOOK_S = 1.0  # how often it is asked whether anybody watches
 _OUTBOX = 1024
 _FLUSH_S = 2.0
 
@@ -40,7 +46,8 @@ class CameraAgent:
 
     device: is opened by ``run`` and closed after it. camera: its id. now_ns: a monotonic clock for rates and latencies;
     it never stamps an observation. known: what the rig file knows of this camera beforehand. boot_id: a new one
-    each time the process starts, by default.
+    each time the process starts, by default. pictures_hz: small pictures a second while somebody watches; 0 = never.
+    predictions: whether the detector is told what the hub's tracking expects.
     """
 
     def __init__(
@@ -53,7 +60,11 @@ class CameraAgent:
         now_ns: Callable[[], int] = time.monotonic_ns,
         known: RigCamera | None = None,
         boot_id: str | None = None,
+        pictures_hz: float = 2.0,
+        predictions: bool = False,
     ) -> None:
+        self._follows = predictions
+        self._predictions: Predictions | None = None
         self._device = device
         self._detector = detector
         self._bus = bus
@@ -62,12 +73,19 @@ class CameraAgent:
         self._known = known
         self.boot_id = uuid.uuid4().hex if boot_id is None else boot_id
         self._sequence = 0
+        self._picture_ns = 0 if pictures_hz <= 0.0 else round(NANOSECONDS / pictures_hz)
         self._last_frame: int | None = None
         self._recent: deque[tuple[int, float]] = deque(maxlen=300)  # (arrival, latency) of the last frames
         self.frames = 0
         self.dropped = 0
         self.detections = 0
         self.empty = 0
+        self._watch = PictureWatch(live=False)
+        self._status_lock = threading.Lock()
+        self._status_sequence = 0
+        self._next_status = 0
+        self._told = ""
+        self._stopping = False
 
     def run(self, stop: threading.Event) -> None:
         """Publish until ``stop`` is set or the device has ended.
@@ -75,33 +93,59 @@ class CameraAgent:
         Raises InputError where the device cannot be opened, BusDead where the bus has died.
         """
         self._device.open()
+        info = self._device.info
+        self._watch = PictureWatch(live=info.clock != "stream", period_s=1.0 / info.fps if info.fps > 0.0 else 0.0)
+        outbox = _Outbox(self._bus, self._camera, self._due_status)
+        if self._follows:
+            self._predictions = Predictions(self._bus.subscribe(PREDICTION), self._camera, self.boot_id)
         try:
-            with self._bus.announce(ROLE, self._camera, self.boot_id), _Outbox(self._bus, self._camera) as outbox:
+            with self._bus.announce(ROLE, self._camera, self.boot_id), outbox:
                 self._loop(stop, outbox)
         finally:
+            if self._predictions is not None:
+                self._predictions.close()
             self._device.close()
 
     def _loop(self, stop: threading.Event, outbox: _Outbox) -> None:
-        status_sequence = 0
-        next_info = next_status = arrived = self._now_ns()
+        next_info = next_picture = self._now_ns()
+        self._watch.start(next_info / NANOSECONDS)
         while not (stop.is_set() or self._device.ended):
             frame = self._device.read(_READ_TIMEOUT_S)
             now = self._now_ns()
-            if frame is not None:
-                arrived = now
+            if frame is not None and self._watch.fresh(frame, now / NANOSECONDS):
                 outbox.put(OBSERVATION, self._observe(frame))
-                self._recent.append((arrived, (self._now_ns() - arrived) / NANOSECONDS))
+                self._recent.append((now, (self._now_ns() - now) / NANOSECONDS))
+                if self._picture_ns and now >= next_picture and outbox.watched:
+                    outbox.put(PICTURE, picture_message(frame, self._camera, self.boot_id))
+                    next_picture = now + self._picture_ns
             if now >= next_info:
                 outbox.put(CAMERA_INFO, self._info())
                 next_info = now + round(_INFO_PERIOD_S * NANOSECONDS)
-            if now >= next_status:
-                silent = (now - arrived) / NANOSECONDS
-                state, text = ("running", "") if silent < _SILENT_S else ("degraded", f"no frame for {silent:.0f} s")
-                outbox.put(STATUS, self._status(state, text, status_sequence, outbox))
-                status_sequence += 1
-                next_status = now + round(_STATUS_PERIOD_S * NANOSECONDS)
-        text = "the recording has ended" if self._device.ended and not stop.is_set() else "stopped"
-        outbox.put(STATUS, self._status("stopping", text, status_sequence, outbox))
+            outbox.check()
+        gone = self._device.ended and not stop.is_set()
+        unplugged = gone and self._watch.live and self._device.info.driver in _UNPLUGGABLE
+        text = "the camera is gone" if unplugged else "the recording has ended" if gone else "stopped"
+        with self._status_lock:
+            self._stopping = True
+            outbox.put(STATUS, self._status("stopping", text, self._status_sequence, outbox))
+        if unplugged:
+            raise InputError(f"camera {self._camera} is gone", remedy="plug it in, and start its agent again")
+
+    def _due_status(self, outbox: _Outbox) -> pb.AgentStatus | None:
+        """The status where one is due: each second, and at once when a complaint begins or ends.
+
+        Called by the outbox's thread, because a device that hangs holds up the agent's own.
+        """
+        now = self._now_ns()
+        complaint = self._watch.complaint(now / NANOSECONDS)
+        told = complaint.partition(" for ")[0]
+        if self._stopping or (now < self._next_status and told == self._told):
+            return None
+        with self._status_lock:
+            self._told, self._next_status = told, now + round(_STATUS_PERIOD_S * NANOSECONDS)
+            status = self._status("degraded" if complaint else "running", complaint, self._status_sequence, outbox)
+            self._status_sequence += 1
+        return status
 
     def _observe(self, frame: Frame) -> pb.Observation:
         """The message of one frame, also when nothing is seen in it."""
@@ -109,7 +153,9 @@ class CameraAgent:
             self.dropped += frame.frame - self._last_frame - 1
         self._last_frame = frame.frame
         self.frames += 1
-        found = [detection for detection in self._detector.detect(frame.image) if _usable(detection)]
+        expected = [] if self._predictions is None else self._predictions.at(frame.device_time_ns)
+        seen = self._detector.detect(frame.image, frame.device_time_ns / NANOSECONDS, expected)
+        found = [detection for detection in seen if _usable(detection)]
         self.detections += len(found)
         self.empty += not found
         message = pb.Observation(
@@ -156,12 +202,22 @@ class CameraAgent:
             "unpublished": outbox.lost,
             "detections": self.detections,
             "empty": self.empty,
+            "repeated": self._watch.repeated,
+            "stale": self._watch.late,
         }
+        if isinstance(self._device, Returning):
+            counters["reconnections"] = self._device.reconnections
         gauges = {"fps": 0.0, "latency_s": 0.0}
-        if len(self._recent) > 1:
-            span = (self._recent[-1][0] - self._recent[0][0]) / NANOSECONDS
-            gauges["fps"] = (len(self._recent) - 1) / span if span > 0 else 0.0
-            gauges["latency_s"] = sorted(latency for _, latency in self._recent)[len(self._recent) // 2]
+        if outbox.heard is not None:
+            gauges["heard"] = float(outbox.heard)
+        if outbox.heard is False and not text:
+            # A put that the router's rules deny returns as if all were well.
+            text = "nobody hears this camera: no hub is there, or the router's access rules do not let it speak"
+        recent = self._recent.copy()
+        if len(recent) > 1:
+            span = (recent[-1][0] - recent[0][0]) / NANOSECONDS
+            gauges["fps"] = (len(recent) - 1) / span if span > 0 else 0.0
+            gauges["latency_s"] = sorted(latency for _, latency in recent)[len(recent) // 2]
         return pb.AgentStatus(
             schema_version=SCHEMA_VERSION,
             agent=self._camera,
@@ -180,16 +236,20 @@ class _Outbox:
     """Hands messages to the bus in a thread of its own; when full it loses the newest, and counts it.
 
     sent, lost: observations that went out, and that did not. An observation that is lost leaves a gap in the
-    sequence, so that its receivers know too.
+    sequence, so that its receivers know too. watched: whether somebody wants pictures; heard: whether
+    somebody is subscribed to the observations, None until it has been asked. status: asked five times a
+    second for a status to send.
     """
 
-    def __init__(self, bus: Bus, camera: str) -> None:
-        self._bus, self._camera = bus, camera
+    def __init__(self, bus: Bus, camera: str, status: Callable[[_Outbox], Message | None]) -> None:
+        self._bus, self._camera, self._status = bus, camera, status
         self._queue: queue.Queue[tuple[Topic, Message] | None] = queue.Queue(_OUTBOX)
         self._thread = threading.Thread(target=self._run, name=f"outbox {camera}", daemon=True)
         self._error: Exception | None = None
         self.sent = 0
         self.lost = 0
+        self.watched = False
+        self.heard: bool | None = None
 
     def put(self, topic: Topic, message: Message) -> None:
         """Never waits. Raises what the bus has raised."""
@@ -199,6 +259,11 @@ class _Outbox:
             self._queue.put_nowait((topic, message))
         except queue.Full:
             self.lost += topic is OBSERVATION
+
+    def check(self) -> None:
+        """Raises what the bus has raised."""
+        if self._error is not None:
+            raise self._error
 
     def __enter__(self) -> _Outbox:
         self._thread.start()
@@ -217,11 +282,25 @@ class _Outbox:
     def _run(self) -> None:
         publishers: dict[str, Publisher] = {}
         try:
-            for topic in (OBSERVATION, CAMERA_INFO, STATUS):
+            for topic in (OBSERVATION, CAMERA_INFO, STATUS, PICTURE):
                 publishers[topic.name] = self._bus.publisher(topic, self._camera)
-            while (item := self._queue.get()) is not None:
+            look = 0.0
+            while True:
+                status = self._status(self)
+                if status is not None:
+                    publishers[STATUS.name].put(status)
+                try:
+                    item = self._queue.get(timeout=_IDLE_S)
+                except queue.Empty:
+                    continue
+                if item is None:
+                    break
                 topic, message = item
                 publishers[topic.name].put(message)
+                if time.monotonic() >= look:
+                    look = time.monotonic() + _LOOK_S
+                    self.watched = publishers[PICTURE.name].wait_matched(0.0)
+                    self.heard = publishers[OBSERVATION.name].wait_matched(0.0)
                 self.sent += topic is OBSERVATION
         except Exception as error:  # noqa: BLE001 - it belongs to the thread that runs the agent
             self._error = error
@@ -237,9 +316,21 @@ def run_camera_agent(
     *,
     known: RigCamera | None = None,
     boot_id: str | None = None,
+    pictures_hz: float = 2.0,
+    predictions: bool = False,
 ) -> CameraAgent:
     """Run an agent to its end and return it with its counts; see ``CameraAgent`` for the arguments."""
-    agent = CameraAgent(device, detector, bus, camera, now_ns=now_ns, known=known, boot_id=boot_id)
+    agent = CameraAgent(
+        device,
+        detector,
+        bus,
+        camera,
+        now_ns=now_ns,
+        known=known,
+        boot_id=boot_id,
+        pictures_hz=pictures_hz,
+        predictions=predictions,
+    )
     agent.run(stop)
     return agent
 
@@ -266,7 +357,16 @@ def _usable(detection: Detection) -> bool:
 
 def _detection(detection: Detection) -> pb.Detection:
     message = pb.Detection(
-        u=detection.u, v=detection.v, size=detection.size, score=detection.score, label=detection.label
+        u=detection.u,
+        v=detection.v,
+        size=detection.size,
+        score=detection.score,
+        label=detection.label,
+        kind=detection.kind,
+        head=detection.head or (),
+        foot=detection.foot or (),
+        box=detection.box or (),
+        target=detection.target,
     )
     if detection.colour is not None:
         message.colour.red, message.colour.green, message.colour.blue = detection.colour

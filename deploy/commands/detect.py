@@ -8,7 +8,14 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from deploy.progress import progress_bar
+from edge.detectors.base import Detection
 from protocols.errors import EXIT_DONE, InputError, Refused
+
+_REMEDIES = {
+    "marker": "use a brightly coloured ball that is whole in the picture, or show it with --teach --target x,y,w,h",
+    "person": "nobody was seen moving before a fixed camera",
+    "vehicle": "nothing was seen moving",
+}
 
 
 def detect(
@@ -25,22 +32,31 @@ def detect(
     colour: str | None = None,
     rig: Path | None = None,
     fps: float | None = None,
+    overlay: Path | None = None,
+    background: Literal["mog2", "knn"] = "mog2",
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
-    """Find one thing in every frame of a video, and write when and where it was seen.
+    """Find a marker, people or vehicles in every frame of a video, and write when and where they were seen.
 
     Writes camera,frame,time,u,v,size,label,score to --out: time as the file says (variable frame rates are kept),
-    u, v and size in pixels. Exit status 3 if it is in no frame.
+    u, v and size in pixels. Exit status 3 if nothing is in any frame.
+
+    People and vehicles are what moves before the background; person: u, v is the representative point, size the
+    distance from head to foot, label p0, p1, ... one a person as far as this video tells (person where there is never
+    more than one). vehicle: u, v is the box's centre, label t0, t1, ... one a vehicle; the camera may be moving. Both
+    have further columns: head_u,head_v,foot_u,foot_v,box_x,box_y,box_w,box_h (x, y of the top left).
 
     Example: syncline detect marker cam0.mp4 --out observations.csv
 
     Example: syncline detect marker cam0.mp4 --teach --target 612,300,40,40 --out observations.csv
 
+    Example: syncline detect person street.mp4 --out observations.csv --overlay seen.mp4
+
     Parameters
     ----------
     what
-        marker: one brightly coloured ball. person, vehicle: not in this version.
+        marker: one brightly coloured ball. person: before a fixed camera. vehicle: moving ones.
     video
         A video file, or a folder of pictures in the order of their names.
     out
@@ -61,17 +77,24 @@ def detect(
         A rig.toml with this camera's matrix: a large ball's centre is then corrected for perspective.
     fps
         Frame rate, instead of the file's time stamps; of pictures 30 by default.
+    overlay
+        A video to write, with what was found drawn into it.
+    background
+        Model of the background for people and vehicles: mog2 or knn.
     json
         Print a summary as JSON.
     seed
         Accepted as everywhere; nothing here is drawn at random.
     """
-    if what != "marker":
-        raise InputError(f"`detect {what}` is not in this version", remedy="use `detect marker`")
+    shown = {"--teach": teach or None, "--target": target, "--marker": marker, "--colour": colour, "--rig": rig}
+    if what != "marker" and (useless := [option for option, value in shown.items() if value is not None]):
+        raise InputError(f"{useless[0]} means nothing for `detect {what}`", remedy="leave it out")
     if fps is not None and not 0.1 <= fps <= 10_000:
         raise InputError(f"--fps {fps:g} is out of range", remedy="give frames a second")
     if out.is_dir():
         raise InputError("a folder of this name is in the way", file=out, remedy="give --out the name of a CSV file")
+    if overlay is not None and (overlay.is_dir() or not overlay.parent.is_dir()):
+        raise InputError("cannot be written", file=overlay, remedy="give --overlay a file in a folder that exists")
     if teach != (target is not None):
         remedy = "give --teach --target x,y,w,h: the box of the marker in frame --start"
         raise InputError("--teach and --target go together", remedy=remedy)
@@ -100,26 +123,36 @@ def detect(
         model = detecting.read_marker(marker)
     elif colour is not None:
         model = MarkerModel.of_colour(*_colour(colour))
+    extra = ""
     with progress_bar(f"looking through {video.name}", quiet=json) as tell:
         total = film.info.frames
 
         def told(frame: int) -> None:
             tell(f"frame {frame}" + (f" of {total}" if total else ""), frame / total if total else 0.0)
 
-        found = detecting.detect_in(film, name, detecting.marker_detector(model, lens, film.info.size), told)
+        if what == "marker":
+            detector = detecting.marker_detector(model, lens, film.info.size)
+            drawn: dict[int, list[tuple[str, Detection]]] = {}
+            found = detecting.detect_in(film, name, detector, told, seen=drawn if overlay else None)
+            if overlay is not None:
+                found = detecting.with_overlay(film, found, drawn, overlay)
+        else:
+            from deploy import detecting_moving
+
+            extra = detecting_moving.HEADER_EXTRA
+            moving = detecting_moving.make_detector(what, background, film.info.fps)
+            found = detecting_moving.find_moving(film, name, moving, tell, overlay)
     if not found.rows:
-        raise Refused(
-            f"{video}: no marker in any of {found.frames} frames; use a brightly coloured ball that is whole in the "
-            "picture, or show it with --teach --target x,y,w,h"
-        )
-    write_together({**files, out: detecting.observations_text(found.rows)})
+        raise Refused(f"{video}: no {what} in any of {found.frames} frames; {_REMEDIES[what]}")
+    write_together({**files, out: detecting.observations_text(found.rows, extra)})
     warnings = [f"{video}: {warning}" for warning in found.warnings]
     if json:
         import json as json_module
 
         document = {
             "out": str(out),
-            "files": [str(file) for file in (*files, out)],
+            "files": [str(file) for file in (*files, out, *([overlay] if overlay else []))],
+            "labels": sorted({row.split(",")[6] for row in found.rows}),
             "camera": name,
             "size": list(found.size),
             "fps": found.fps,
@@ -131,6 +164,8 @@ def detect(
         }
         print(json_module.dumps(document, allow_nan=False))
         return EXIT_DONE
+    if overlay is not None:
+        files[overlay] = ""
     print(f"{name}: seen in {found.seen} of {found.frames} frames, {found.fps:.3f} frames a second")
     for warning in warnings:
         print(f"warning: {warning}")

@@ -13,6 +13,8 @@ from protocols.errors import EXIT_DONE, InputError
 from protocols.files import check_folder
 
 _SECONDS, _NOISE_PX = 60.0, 0.5
+_BODY_NOISE_PX = 2.0  # a head's top and a foot point are not as sharp as a ball
+_PEOPLE = "people"
 
 
 def simulate(
@@ -29,11 +31,16 @@ def simulate(
     frames: int | None = None,
     size: str | None = None,
     telemetry_hz: float | None = None,
+    people: int | None = None,
+    render: Annotated[bool, Parameter(negative="")] = False,
     json: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
     """Write a session of a simulated scene: rig.toml, observations.csv and the truth.
 
     The truth is in truth_calibration.toml and truth_trajectory.csv (true time of the first camera's clock).
+
+    Scene people is walkers in a room: observations.csv has the head tops and foot points of everybody, as labels
+    person0-head, person0-foot, ...; truth_trajectory.csv their places, truth_boxes.csv the bodies in every picture.
 
     Scene town:SCENARIO is a drone that follows a car and loses it: video.mp4, rig.toml, telemetry.csv and truth.csv
     (the car in every frame, also out of the picture). Scenarios: exit-bend (the usual one), exit-straight,
@@ -41,12 +48,14 @@ def simulate(
 
     Example: syncline simulate marker --cameras 5 --seed 3 --out my-session
 
+    Example: syncline simulate people --cameras 5 --people 5 --seconds 60 --out my-room
+
     Example: syncline simulate town:exit-bend --frames 90 --seed 3 --out my-flight
 
     Parameters
     ----------
     scene
-        Name of the scene: marker (a room), marker-outdoor (a field), or town:SCENARIO (a flight).
+        Name of the scene: marker (a room), marker-outdoor (a field), people (a room), or town:SCENARIO (a flight).
     out
         Folder to write; made if need be.
     seconds
@@ -56,9 +65,9 @@ def simulate(
     seed
         Same seed, same session.
     noise_px
-        Detector noise, std of each coordinate (default 0.5); not for town.
+        Detector noise, std of each coordinate (default 0.5, of people 2); not for town.
     outliers
-        Share of false detections, 0 to 1 (default 0); not for town.
+        Share of false detections, 0 to 1 (default 0); only for marker scenes.
     drops
         Share of lost frames, 0 to 1; default: the scene's own; not for town.
     frames
@@ -67,20 +76,32 @@ def simulate(
         Of the picture, default 640x480; only for town.
     telemetry_hz
         Rate of the telemetry, 1 to 50 Hz (default 30); only for town.
+    people
+        How many walk about, 1 to 12 (default 5); only for people.
+    render
+        Also write every camera's pictures, cam0.mp4, ...; only for people.
     json
         Print what was written as JSON.
     """
     check_folder(out)
     if seed < 0:
         raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
-    marker = {"--seconds": seconds, "--cameras": cameras, "--noise-px": noise_px, "--outliers": outliers}
-    town = {"--frames": frames, "--size": size, "--telemetry-hz": telemetry_hz}
+    marker: dict[str, object] = {
+        "--seconds": seconds,
+        "--cameras": cameras,
+        "--noise-px": noise_px,
+        "--outliers": outliers,
+    }
+    town: dict[str, object] = {"--frames": frames, "--size": size, "--telemetry-hz": telemetry_hz}
+    crowd: dict[str, object] = {"--people": people, "--render": render or None}
     if scene.partition(":")[0] == "town":
-        _refuse(marker | {"--drops": drops}, scene)
+        _refuse(marker | crowd | {"--drops": drops}, scene)
         return _fly(scene, out, seed, frames, size, 30.0 if telemetry_hz is None else telemetry_hz, json)
-    _refuse(town, scene)
+    useless: dict[str, object] = {"--outliers": outliers} if scene == _PEOPLE else crowd
+    _refuse(town | useless, scene)
     seconds = _SECONDS if seconds is None else seconds
-    noise_px = _NOISE_PX if noise_px is None else noise_px
+    if noise_px is None:
+        noise_px = _BODY_NOISE_PX if scene == _PEOPLE else _NOISE_PX
     outliers = 0.0 if outliers is None else outliers
     if cameras is not None and not 2 <= cameras <= 64:
         raise InputError(f"--cameras {cameras} is out of range", remedy="give 2 to 64")
@@ -88,11 +109,25 @@ def simulate(
         raise InputError(f"--seconds {seconds:g} is out of range", remedy="give 1 to 7200")
     if not 0.0 <= outliers < 1.0 or (drops is not None and not 0.0 <= drops < 1.0) or not 0.0 <= noise_px <= 50.0:
         raise InputError("--outliers and --drops are shares below 1, --noise-px is 0 to 50", remedy="correct them")
-    from deploy.simulated import write_simulated_session
+    if scene == _PEOPLE:
+        from deploy.simulated_people import write_people_session
 
-    written = write_simulated_session(
-        scene, out, seconds=seconds, cameras=cameras, seed=seed, noise_px=noise_px, outliers=outliers, drops=drops
-    )
+        written = write_people_session(
+            out,
+            seconds=seconds,
+            cameras=cameras,
+            people=people,
+            seed=seed,
+            noise_px=noise_px,
+            drops=drops,
+            render=render,
+        )
+    else:
+        from deploy.simulated import write_simulated_session
+
+        written = write_simulated_session(
+            scene, out, seconds=seconds, cameras=cameras, seed=seed, noise_px=noise_px, outliers=outliers, drops=drops
+        )
     if json:
         import json as json_module
 

@@ -9,6 +9,7 @@ centroid is where the ball was on average) and does not follow the shading, as a
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.detectors.base import Detection
+from edge.detectors.base import Detection, Prediction
 from edge.detectors.colour import ColourModel, codes, taught
 from edge.detectors.outline import measure_outline
 from protocols.errors import InputError
@@ -106,7 +107,9 @@ class MarkerDetector:
         self._most = most
         self._sizes = min_size, max_size
 
-    def detect(self, image: npt.NDArray[np.uint8]) -> list[Detection]:
+    def detect(
+        self, image: npt.NDArray[np.uint8], time_s: float | None = None, predictions: Sequence[Prediction] = ()
+    ) -> list[Detection]:
         coarse = self._table[codes(image[::_STEP, ::_STEP])]
         if not coarse.any():
             return []
@@ -160,6 +163,7 @@ class MarkerDetector:
             label=self._model.label,
             colour=(round(float(red)), round(float(green)), round(float(blue))),
             covariance=(float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])),
+            kind="marker",
         )
 
 

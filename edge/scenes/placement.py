@@ -31,6 +31,8 @@ class Surroundings:
     size: tuple[int, int]
     exposure_s: float
     mixed_fps: bool = False
+    fps: tuple[float, ...] = (30.0,)
+    roll: float = 0.3
 
 
 def cameras_around(
@@ -58,8 +60,9 @@ def _camera(
     position = np.array(
         [centre[0] + distance * np.cos(azimuth), centre[1] + distance * np.sin(azimuth), rng.uniform(*where.height)]
     )
-    pose = looking_at(position, centre + rng.normal(0.0, where.aim, 3), rng.uniform(-0.3, 0.3))
-    fps = float(_MIXED_FPS[index % len(_MIXED_FPS)]) if where.mixed_fps else 30.0
+    pose = looking_at(position, centre + rng.normal(0.0, where.aim, 3), rng.uniform(-where.roll, where.roll))
+    rates = _MIXED_FPS if where.mixed_fps else where.fps
+    fps = float(rates[index % len(rates)])
     return SimulatedCamera(
         name=f"cam{index}",
         intrinsics=_lens(rng, where),

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from edge.scenes import background
 from edge.scenes.base import Renderer
-from protocols.geometry.camera import Intrinsics
+from edge.scenes.sensor import PEDESTAL, SensorNoise, dimmed, pixel_rays
 from protocols.geometry.types import Floats
 
 if TYPE_CHECKING:
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 BACKGROUND_STREAM = 2  # beside the streams of cameras (0) and path (1)
 _NOISE_STD = 3.0  # of a small sensor indoors, in 8-bit steps
-_PEDESTAL = 20  # the noise is stored with it, so that one saturating 8-bit addition applies it
-_BANK_MARGIN = 96  # px by which the noise picture exceeds the image: 9216 different crops
 _MAX_STEPS = 16  # instants that an exposure is sampled at
 _BACKGROUND_WIDTH = 960  # px; wider pictures get a background of this width, enlarged
 _AMBIENT, _DIFFUSE, _GLINT = 0.62, 0.42, 0.35
@@ -47,23 +45,16 @@ class MarkerRenderer(Renderer):
         self._scene = scene
         self._camera = scene.camera(camera)
         self._name = camera
-        self._rng = noise_rng
         lens = self._camera.intrinsics
         self._background = self._draw_background(np.random.default_rng([scene.seed, BACKGROUND_STREAM]))
-        # Room for the pedestal below 0; above 255 the addition saturates as a sensor does.
-        self._dimmed = np.maximum(self._background, _PEDESTAL) - np.uint8(_PEDESTAL)
-        shape = (lens.height + _BANK_MARGIN, lens.width + _BANK_MARGIN, 3)
-        noise = noise_rng.standard_normal(shape, dtype=np.float32) * noise_std + _PEDESTAL
-        self._noise = np.clip(np.rint(noise), 0, 255).astype(np.uint8)
+        self._dimmed = dimmed(self._background)
+        self._noise = SensorNoise(lens.width, lens.height, noise_std, noise_rng)
         self._light = self._camera.pose.rotation @ background.LIGHT_WORLD
 
     def render(self, true_time: float) -> npt.NDArray[np.uint8]:
         image = self._dimmed.copy()
         self._draw_marker(image, true_time)
-        dy, dx = self._rng.integers(0, _BANK_MARGIN, 2)
-        lens = self._camera.intrinsics
-        noise = self._noise[dy : dy + lens.height, dx : dx + lens.width]
-        return np.asarray(cv2.add(image, noise), dtype=np.uint8)
+        return self._noise.add(image)
 
     def _draw_background(self, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
         lens, pose = self._camera.intrinsics, self._camera.pose
@@ -71,7 +62,7 @@ class MarkerRenderer(Renderer):
         width, height = round(lens.width / shrink), round(lens.height / shrink)
         u = (np.arange(width) + 0.5) * lens.width / width - 0.5
         v = (np.arange(height) + 0.5) * lens.height / height - 0.5
-        rays = _rays(lens, *np.meshgrid(u, v)) @ pose.rotation
+        rays = pixel_rays(lens, *np.meshgrid(u, v)) @ pose.rotation
         if self._scene.room is None:
             picture = background.field(rays, pose.position, rng)
         else:
@@ -96,7 +87,7 @@ class MarkerRenderer(Renderer):
         right, bottom = min(int(high[0]), lens.width), min(int(high[1]), lens.height)
         if right <= left or bottom <= top:
             return
-        rays = _rays(lens, *np.meshgrid(np.arange(left, right, dtype=float), np.arange(top, bottom, dtype=float)))
+        rays = pixel_rays(lens, *np.meshgrid(np.arange(left, right, dtype=float), np.arange(top, bottom, dtype=float)))
         rays = np.where(np.isfinite(rays), rays, 0.0)
         steps = int(np.clip(np.ceil(2.0 * smear), 1, _MAX_STEPS))
         instants = true_time + camera.exposure_s * ((np.arange(steps) + 0.5) / steps - 0.5)
@@ -105,10 +96,10 @@ class MarkerRenderer(Renderer):
             instants = instants + camera.readout_s * (row / (lens.height - 1) - 0.5)
         centres = camera.pose.camera_from_world(self._scene.marker_position(instants))
         cover, light = self._ball(rays, centres)
-        patch = image[top:bottom, left:right].astype(np.float64) + _PEDESTAL
+        patch = image[top:bottom, left:right].astype(np.float64) + PEDESTAL
         bare = 1.0 - cover.mean(axis=0)[..., None]
         patch = bare * patch + (cover[..., None] * light).mean(axis=0)
-        image[top:bottom, left:right] = np.clip(np.rint(patch - _PEDESTAL), 0, 255)
+        image[top:bottom, left:right] = np.clip(np.rint(patch - PEDESTAL), 0, 255)
 
     def _ball(self, rays: Floats, centres: Floats) -> tuple[Floats, Floats]:
         """Coverage (s, h, w) in 0..1 and colour (s, h, w, 3) of the ball.
@@ -135,11 +126,3 @@ class MarkerRenderer(Renderer):
         half_way /= np.linalg.norm(half_way, axis=1, keepdims=True)
         glint = np.clip(np.einsum("shwk,sk->shw", normal, half_way), 0.0, 1.0) ** 40
         return cover, np.minimum(colour + 255.0 * _GLINT * glint[..., None], 255.0)
-
-
-def _rays(lens: Intrinsics, u: Floats, v: Floats) -> Floats:
-    """Unit vectors (h, w, 3) in camera axes of pixels (h, w), (h, w)."""
-    flat = lens.unproject(np.column_stack([u.ravel(), v.ravel()]))
-    rays = np.column_stack([flat, np.ones(len(flat))])
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    return np.asarray(rays.reshape(*u.shape, 3))

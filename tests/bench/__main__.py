@@ -52,6 +52,7 @@ BENCHES = {
     "poses": Bench("distributed poses against the joint optimum", ("--quick", "--rows", "section4,bearings")),
     "logs": Bench("logs: rates, kill -9, damage", ("--quick",)),
     "view": Bench("help, first calibration, first paint, what watching costs", ("--quick",)),
+    "people_detector": Bench("people before one camera, beside MOG2 alone", ("--seeds", "1", "--seconds", "20")),
     "people_tracking": Bench(
         "people followed, what clocks are worth, walkers as markers", ("--quick", "--seconds", "30")
     ),

@@ -1,0 +1,413 @@
+"""Explains silhouettes by people: one, or several who stand together or hide each other.
+
+A person is a template of three bars (head, trunk, legs) of the height that people have at that place. Those templates
+are sought whose union covers what is silhouette and little else, each one worth its place; a person who is followed is
+sought about where it is expected. After the occupancy by ground plane templates of Fleuret et al. (2008), with greedy
+placing and coordinate descent in place of its mean field.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from edge.detectors.stature import Stature
+from protocols.geometry.types import Bools, Floats, Ints
+
+Image = npt.NDArray[np.uint8]
+Box = tuple[float, float, float, float]
+_BARS = ((0.065, 0.0, 0.14), (0.125, 0.14, 0.52), (0.095, 0.52, 1.0))
+"""Half-breadth, upper and lower end of each bar, of the height."""
+_AREA = sum(2.0 * half * (low - high) for half, high, low in _BARS)
+_WORK_HEIGHT = 64.0  # px: larger people are looked for in a smaller picture
+# Log-likelihood ratios of body to background, against that of a silhouette's pixel.
+_EMPTY, _SHADOW = -0.45, -0.08
+_NEW, _KEPT = 0.55, 0.28  # gain of a template, of its area, that makes it worth its place
+_COUNTS = (2.5, 1.0, 1.0)  # a head is small, but says most about where somebody stands
+_BEYOND = 1.0  # by how much a silhouette that goes on above the head or below the feet speaks against a template
+_REACH = 0.14  # of the height: how far somebody may be from where it is expected
+_PULL = 3.0  # of its area, by the square of that distance over the height
+_SHORT, _LONG = 0.9, 1.12  # of the usual height at a place, that one who is followed may have
+_LOW, _HIGH, _BROAD, _BULK, _HEAD, _SLENDER = 0.85, 1.17, 0.62, 0.28, 0.22, 0.42
+"""Of one whole silhouette: height, of the usual; breadth, area over height, breadth of the head, and
+breadth up to which no more is asked, of the height."""
+_MOST = 12  # people in one silhouette
+_LIKE = 0.7  # share of template and silhouette that one who stands alone has in common
+_SLIM, _STOUT = 1.15, 7.0  # height to breadth of one who stands alone, where nothing is known of the place
+_LEAST_HEIGHT = 12.0  # px
+BREADTH = 0.36  # of a person's box, of the height
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """One person in the silhouettes. box: x, y, w, h [px]. fill: share of what is in view of it that is silhouette.
+
+    seen: share of it that nobody nearer hides. alone: the whole silhouette is this one's.
+    expected: index of the expectation that it was placed by; -1 = none. cut: the image's border cuts it.
+    """
+
+    box: Box
+    fill: float
+    seen: float
+    alone: bool
+    expected: int = -1
+    cut: bool = False
+
+
+@dataclass(slots=True)
+class _Placed:
+    """A template: its middle u, foot and height [px of the working picture].
+
+    stature: its height, of the usual one there. expected: which expectation it is; home: where that was.
+    """
+
+    u: float
+    foot: float
+    tall: float
+    stature: float = 1.0
+    expected: int = -1
+    home: tuple[float, float] | None = None
+    gain: float = 0.0
+
+    @property
+    def top(self) -> float:
+        return self.foot - self.tall
+
+
+def explain(figure: Image, shadow: Image, stature: Stature, expected: list[Box]) -> list[Body]:
+    """People in a clean silhouette picture (H, W) 0/255.
+
+    shadow: (H, W) what is only darker than the background: somebody may stand there in dark clothes, or a shadow lie.
+    expected: boxes [px] where some should be.
+    """
+    if not stature.known:
+        return _by_shape(figure, expected)
+    scale = min(1.0, _WORK_HEIGHT / stature.typical)
+    size = max(round(figure.shape[1] * scale), 1), max(round(figure.shape[0] * scale), 1)
+    scales = size[0] / figure.shape[1], size[1] / figure.shape[0]
+    small, dim = figure, shadow
+    if scale < 1.0:
+        small = np.asarray(cv2.resize(figure, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        dim = np.asarray(cv2.resize(shadow, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    filled = small.astype(np.float32) / 255.0
+    weight = filled + _SHADOW * dim.astype(np.float32) / 255.0
+    weight += _EMPTY * np.clip(1.0 - filled - dim.astype(np.float32) / 255.0, 0.0, 1.0)
+    bodies: list[Body] = []
+    for rows, columns, mine in _clusters(small, stature, scales, expected):
+        whole = _whole(figure, (rows, columns), scales, stature) if len(mine) < 2 else None
+        if whole is not None:
+            near = [index for index in mine if _overlap(expected[index], whole.box) > 0.25]
+            owner = max(near, key=lambda index: _overlap(expected[index], whole.box), default=-1)
+            bodies.append(replace(whole, expected=owner))
+            continue
+        scene = _Cluster(weight[rows, columns], filled[rows, columns], (columns.start, rows.start), scales, stature)
+        placed = scene.explain([(index, expected[index]) for index in mine])
+        bodies += scene.bodies(placed, figure)
+    return bodies
+
+
+def lone_people(figure: Image) -> list[tuple[float, float, float]]:
+    """Foot points u, v and heights [px] of silhouettes that have the shape of one whole person."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(figure, connectivity=8)
+    found = []
+    for one in range(1, count):
+        x, y, w, h = (int(value) for value in stats[one, :4])
+        if h < _LEAST_HEIGHT or _is_cut((x, y, w, h), figure.shape) or not 1.8 * w < h < 4.5 * w:
+            continue
+        if _shaped(np.asarray(labels[y : y + h, x : x + w] == one, dtype=np.bool_)):
+            found.append((x + 0.5 * w, float(y + h), float(h)))
+    return found
+
+
+def _shaped(mask: Bools) -> bool:
+    """Whether a silhouette (h, w), cropped to itself, is shaped as the template."""
+    h = mask.shape[0]
+    u = float(np.median(np.nonzero(mask[: max(h // 8, 2)])[1])) + 0.5  # the head's middle
+    inside = covered = 0
+    for half, high, low in _BARS:
+        left, right = max(round(u - half * h), 0), max(round(u + half * h), 0)
+        inside += int(mask[round(high * h) : round(low * h), left:right].sum())
+        covered += round(2.0 * half * h) * (round(low * h) - round(high * h))
+    return inside > _LIKE * covered and inside > _LIKE * int(mask.sum())
+
+
+def _by_shape(figure: Image, expected: list[Box]) -> list[Body]:
+    """Where nothing is known of the place: silhouettes that are as slim as one person."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(figure, connectivity=8)
+    owners = [_owner(np.asarray(labels, dtype=np.int32), box) for box in expected]
+    bodies = []
+    for one in range(1, count):
+        x, y, w, h, area = (int(value) for value in stats[one])
+        if h < _LEAST_HEIGHT or w < 3 or area < 0.16 * min(w, h) * h:
+            continue
+        cut = _is_cut((x, y, w, h), figure.shape)
+        if _SLIM <= h / w <= _STOUT or (cut and h >= 0.8 * w):
+            # Pieces that were once taken for somebody do not make several of one whole.
+            mine = [at for at, owner in enumerate(owners) if owner == one and expected[at][3] > 0.6 * h]
+            bodies.append(Body((x, y, w, h), area / (w * h), 1.0, True, mine[0] if mine else -1, cut))
+    return bodies
+
+
+def _owner(labels: Ints | npt.NDArray[np.int32], box: Box) -> int:
+    """The silhouette that fills most of a box's core; 0 = none."""
+    x, y, w, h = box
+    part = labels[max(int(y), 0) : max(int(y + h) + 1, 0), max(int(x + 0.15 * w), 0) : max(int(x + 0.85 * w) + 1, 0)]
+    counts = np.bincount(part.ravel())
+    if len(counts) < 2:
+        return 0
+    counts[0] = 0
+    best = int(counts.argmax())
+    return best if counts[best] > 0.08 * part.size else 0
+
+
+def _is_cut(box: Box, shape: tuple[int, ...]) -> bool:
+    x, y, w, h = box
+    return x <= 1 or y <= 1 or x + w >= shape[1] - 2 or y + h >= shape[0] - 2
+
+
+def _clusters(
+    small: Image, stature: Stature, scales: tuple[float, float], expected: list[Box]
+) -> list[tuple[slice, slice, list[int]]]:
+    """Parts of the working picture that hold near silhouettes together, and who is expected in each."""
+    reach = max(round(0.08 * min(stature.typical * scales[1], _WORK_HEIGHT)), 1)
+    near = cv2.dilate(small, np.ones((4 * reach + 1, 2 * reach + 1), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((near > 100).astype(np.uint8), connectivity=8)
+    fx, fy = scales
+    owners = [_owner(np.asarray(labels, dtype=np.int32), (x * fx, y * fy, w * fx, h * fy)) for x, y, w, h in expected]
+    parts = []
+    for one in range(1, count):
+        x, y, w, h = (int(value) for value in stats[one, :4])
+        mine = [index for index, owner in enumerate(owners) if owner == one]
+        foot = float(stature.at(np.array([(x + 0.5 * w) / fx]), np.array([(y + h) / fy]))[0])
+        if h / fy < 0.3 * foot and not mine:
+            continue
+        parts.append((slice(y, y + h), slice(x, x + w), mine))
+    return parts
+
+
+def _whole(figure: Image, part: tuple[slice, slice], scales: tuple[float, float], stature: Stature) -> Body | None:
+    """The silhouette in a part of the working picture as one person, if it is as tall and as slim as one there."""
+    (fx, fy), (rows, columns) = scales, part
+    left, top = int(columns.start / fx), int(rows.start / fy)
+    mask = figure[top : int(rows.stop / fy) + 1, left : int(columns.stop / fx) + 1]
+    x, y, w, h = cv2.boundingRect(mask)
+    box = float(left + x), float(top + y), float(w), float(h)
+    if h < _LEAST_HEIGHT or _is_cut(box, figure.shape):
+        return None
+    usual = float(stature.at(np.array([box[0] + 0.5 * w]), np.array([box[1] + h]))[0])
+    fill = cv2.countNonZero(mask) / (w * h)
+    if not (_LOW * usual < h < _HIGH * usual and w < _BROAD * h and fill * w < _BULK * h):
+        return None
+    # Two heads side by side are broader than one, whatever the legs do.
+    head = np.flatnonzero(mask[y : y + max(round(0.12 * h), 2), x : x + w].any(axis=0))
+    if head[-1] - head[0] > _HEAD * h or (w > _SLENDER * h and not _shaped(mask[y : y + h, x : x + w] > 0)):
+        return None
+    return Body(box, fill, 1.0, True)
+
+
+def _overlap(a: Box, b: Box) -> float:
+    """Intersection over union of two boxes."""
+    across = min(a[0] + a[2], b[0] + b[2]) - max(a[0], b[0])
+    down = min(a[1] + a[3], b[1] + b[3]) - max(a[1], b[1])
+    if across <= 0 or down <= 0:
+        return 0.0
+    return across * down / (a[2] * a[3] + b[2] * b[3] - across * down)
+
+
+class _Cluster:
+    """One part of the working picture. weight: (h, w) what it speaks for a body there; filled: (h, w) 0..1 silhouette.
+
+    origin: of the part in the working picture, x and y; scales: working px a px, x and y.
+    """
+
+    def __init__(
+        self,
+        weight: npt.NDArray[np.float32],
+        filled: npt.NDArray[np.float32],
+        origin: tuple[int, int],
+        scales: tuple[float, float],
+        stature: Stature,
+    ) -> None:
+        self._weight, self._filled = weight, filled
+        self._origin, self._scales, self._stature = origin, scales, stature
+        self._covered = np.zeros(weight.shape, np.int16)
+        self._sums = cv2.integral(weight)
+        wide, high = stature.size
+        self._limits = -origin[0], round(wide * scales[0]) - origin[0], -origin[1], round(high * scales[1]) - origin[1]
+        self._at_bottom = self._limits[3] <= weight.shape[0] + 1
+
+    def explain(self, expected: list[tuple[int, Box]]) -> list[_Placed]:
+        """The templates that explain the silhouettes, nearest last expectations first."""
+        placed: list[_Placed] = []
+        for index, (x, y, w, h) in sorted(expected, key=lambda one: -(one[1][1] + one[1][3])):
+            u, foot, tall = self._inward(x + 0.5 * w, y + h, h)
+            usual = float(self._heights(np.array([u]), np.array([foot]))[0])
+            stature = float(np.clip(tall / usual, _SHORT, _LONG))
+            one = _Placed(u, foot, stature * usual, stature, index, (u, foot))
+            self._settle(one)
+            self._cover(one, 1)
+            placed.append(one)
+        if len(placed) > 1:
+            self._descend(placed, 2)
+        grid = self._grid()
+        while len(placed) < _MOST:
+            new = self._best_new(*grid)
+            if new is None:
+                break
+            self._cover(new, 1)
+            placed.append(new)
+            self._descend(placed, 1)
+        for one in sorted(placed, key=lambda each: each.gain):
+            self._cover(one, -1)
+            worth = self._gain(one) / (_AREA * one.tall**2)
+            if worth < (_KEPT if one.expected >= 0 else 0.7 * _NEW):
+                placed = [each for each in placed if each is not one]
+                continue
+            one.gain = worth
+            self._cover(one, 1)
+        return placed
+
+    def _inward(self, u: float, foot: float, tall: float) -> tuple[float, float, float]:
+        fx, fy = self._scales
+        return u * fx - self._origin[0], foot * fy - self._origin[1], tall * fy
+
+    def _heights(self, u: Floats, foot: Floats) -> Floats:
+        """Heights [working px] of people whose feet are at places of this part."""
+        fx, fy = self._scales
+        return self._stature.at((u + self._origin[0]) / fx, (foot + self._origin[1]) / fy) * fy
+
+    def _grid(self) -> tuple[Floats, Floats, Floats]:
+        """Where somebody's foot may be, n places, and heights there: below what may be a head."""
+        h, w = self._weight.shape
+        step = 2 if h > 24 else 1
+        # Feet may be below the picture; elsewhere the part has all of them.
+        reach = int(0.7 * self._stature.typical * self._scales[1]) if self._at_bottom else 0
+        u, foot = (one.ravel() for one in np.meshgrid(np.arange(0.5, w, step), np.arange(4.0, h + reach, step)))
+        tall = self._heights(u, foot)
+        chest = np.rint(foot - 0.7 * tall).astype(np.intp)
+        inside = (chest >= 0) & (chest < h)
+        inside[inside] = self._filled[chest[inside], u[inside].astype(np.intp)] > 0.3
+        return u[inside], foot[inside], tall[inside]
+
+    def _gains(self, u: Floats, foot: Floats, tall: Floats) -> Floats:
+        """What templates (n,) would explain of what is not yet, less what they cover of nothing."""
+        top = foot - tall
+        total = np.zeros(len(u))
+        for (half, high, low), counts in zip(_BARS, _COUNTS, strict=True):
+            total += counts * self._sum(u - half * tall, top + high * tall, u + half * tall, top + low * tall)
+        crown = self._sum(u - 0.07 * tall, top - 0.1 * tall, u + 0.07 * tall, top - 0.02 * tall)
+        below = self._sum(u - 0.1 * tall, foot + 0.02 * tall, u + 0.1 * tall, foot + 0.12 * tall)
+        return total - _BEYOND * (np.maximum(crown, 0.0) + np.maximum(below, 0.0))
+
+    def _sum(self, x0: Floats, y0: Floats, x1: Floats, y1: Floats) -> Floats:
+        h, w = self._weight.shape
+        a, b = np.rint(x0).astype(np.intp), np.rint(x1).astype(np.intp)
+        c, d = np.rint(y0).astype(np.intp), np.rint(y1).astype(np.intp)
+        ai, bi, ci, di = a.clip(0, w), b.clip(0, w), c.clip(0, h), d.clip(0, h)
+        inner = self._sums[di, bi] - self._sums[ci, bi] - self._sums[di, ai] + self._sums[ci, ai]
+        # What is beyond the picture cannot be seen; what is only beyond this part is empty.
+        left, right, top, bottom = self._limits
+        al, bl, cl, dl = a.clip(left, right), b.clip(left, right), c.clip(top, bottom), d.clip(top, bottom)
+        beyond = (bl - al) * (dl - cl) - (bi - ai) * (di - ci)
+        return np.asarray(inner + _EMPTY * beyond, dtype=np.float64)
+
+    def _gain(self, one: _Placed) -> float:
+        return float(self._gains(np.array([one.u]), np.array([one.foot]), np.array([one.tall]))[0])
+
+    def _settle(self, one: _Placed) -> None:
+        """Move a template to the best place near, drawn to where it is expected."""
+        reach = max(_REACH * one.tall, 2.0)
+        steps = np.linspace(-reach, reach, 9)
+        u, foot = (values.ravel() for values in np.meshgrid(one.u + steps, one.foot + steps))
+        tall = one.stature * self._heights(u, foot)
+        gains = self._gains(u, foot, tall)
+        home = one.home or (one.u, one.foot)
+        pull = _PULL if one.home is not None else 0.3
+        away = ((u - home[0]) ** 2 + (foot - home[1]) ** 2) / one.tall**2
+        best = int(np.argmax(gains - pull * away * _AREA * one.tall**2))
+        one.u, one.foot, one.tall, one.gain = float(u[best]), float(foot[best]), float(tall[best]), float(gains[best])
+
+    def _descend(self, placed: list[_Placed], sweeps: int) -> None:
+        for _ in range(sweeps):
+            for one in placed:
+                self._cover(one, -1)
+                self._settle(one)
+                self._cover(one, 1)
+
+    def _best_new(self, u: Floats, foot: Floats, tall: Floats) -> _Placed | None:
+        if not len(u):
+            return None
+        gains = self._gains(u, foot, tall)
+        worth = gains / (_AREA * tall**2)
+        best = int(np.argmax(worth))
+        if worth[best] < _NEW:
+            return None
+        return _Placed(float(u[best]), float(foot[best]), float(tall[best]), gain=float(gains[best]))
+
+    def _cover(self, one: _Placed, by: int) -> None:
+        for half, high, low in _BARS:
+            a, b = round(one.u - half * one.tall), round(one.u + half * one.tall)
+            c, d = round(one.top + high * one.tall), round(one.top + low * one.tall)
+            self._covered[max(c, 0) : max(d, 0), max(a, 0) : max(b, 0)] += by
+        self._sums = cv2.integral(np.where(self._covered == 0, self._weight, np.float32(0.0)))
+
+    def bodies(self, placed: list[_Placed], figure: Image) -> list[Body]:
+        """The templates as bodies [px of the picture], with the breadth that their silhouettes have."""
+        if not placed:
+            return []
+        h, w = self._weight.shape
+        y, x = np.mgrid[:h, :w] + 0.5
+        # Whose each pixel is: the one in whose rows it lies and whose middle is nearest.
+        distance = np.full((len(placed), h, w), np.inf)
+        for index, one in enumerate(placed):
+            rows = (y > one.top - 0.1 * one.tall) & (y < one.top + 1.12 * one.tall)
+            distance[index] = np.where(rows, np.abs(x - one.u) / one.tall, np.inf)
+        owner = distance.argmin(axis=0)
+        mine_all = (distance.min(axis=0) < 0.33) & (self._filled > 0.5)
+        order = np.argsort([one.top + one.tall for one in placed])[::-1]
+        nearer = np.zeros((h, w), dtype=bool)
+        found: list[Body] = []
+        for index in order:
+            one = placed[index]
+            own = self._template(one)
+            seen = float((own & ~nearer).sum() / max(own.sum(), 1))
+            view = own & ~nearer
+            fill = float(self._filled[view].mean()) if view.any() else 0.0
+            nearer |= own
+            found.append(self._body(one, mine_all & (owner == index), seen, fill, len(placed) == 1, figure.shape))
+        return found
+
+    def _template(self, one: _Placed) -> Bools:
+        mask = np.zeros(self._weight.shape, dtype=np.bool_)
+        for half, high, low in _BARS:
+            a, b = round(one.u - half * one.tall), round(one.u + half * one.tall)
+            c, d = round(one.top + high * one.tall), round(one.top + low * one.tall)
+            mask[max(c, 0) : max(d, 0), max(a, 0) : max(b, 0)] = True
+        return mask
+
+    def _body(self, one: _Placed, own: Bools, seen: float, fill: float, alone: bool, shape: tuple[int, ...]) -> Body:
+        left, right = one.u - 0.5 * BREADTH * one.tall, one.u + 0.5 * BREADTH * one.tall
+        top, bottom = one.top, one.top + one.tall
+        columns = own.sum(axis=0)
+        full = np.flatnonzero(columns >= max(0.04 * one.tall, 1))
+        if len(full) and seen > 0.6:
+            left = float(np.clip(full[0], one.u - 0.33 * one.tall, one.u - 0.1 * one.tall))
+            right = float(np.clip(full[-1] + 1, one.u + 0.1 * one.tall, one.u + 0.33 * one.tall))
+        if alone:
+            rows = np.flatnonzero(own.sum(axis=1) >= max(0.03 * one.tall, 1))
+            if len(rows):
+                first, last = float(rows[0]), float(rows[-1] + 1)
+                if abs(first - top) < 0.12 * one.tall:
+                    top = first
+                if abs(last - bottom) < 0.2 * one.tall:
+                    bottom = last
+        fx, fy = self._scales
+        x, y = (left + self._origin[0]) / fx, (top + self._origin[1]) / fy
+        w, h = (right - left) / fx, (bottom - top) / fy
+        cut = _is_cut((x, y, w, h), shape)
+        x1, y1 = min(x + w, float(shape[1])), min(y + h, float(shape[0]))
+        x, y = max(x, 0.0), max(y, 0.0)
+        return Body((x, y, max(x1 - x, 1.0), max(y1 - y, 1.0)), fill, seen, alone, one.expected, cut)

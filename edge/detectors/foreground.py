@@ -1,0 +1,313 @@
+"""What is not background: a model of every pixel's values, light that changes, shadows, ghosts and jolts.
+
+The model is OpenCV's mixture of Gaussians (MOG2) or its k nearest neighbours (KNN). It is asked with every frame and
+taught with every few, from a picture in which what is being followed is replaced by what is behind it: so somebody who
+stands still does not sink into the background.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from protocols.geometry.types import Bools, Floats
+
+Image = npt.NDArray[np.uint8]
+Box = tuple[float, float, float, float]
+ModelName = Literal["mog2", "knn"]
+
+_TEACH_S = 0.4  # the model learns this often
+_MEMORY_S = 30.0  # and forgets over that time
+_BEGIN_S = 1.0  # in which a new model learns fast, and after which it begins again from what was there most of the time
+_REVIEWS_S = (_BEGIN_S, 4.0, 12.0)  # when that is done, each time better
+_REVIEWED = 24  # pictures that a review looks at
+_CLOSEST = 0.34  # of the pictures that show a place's background, at least
+_STRIP = 32  # rows at once
+_JOLT = 0.4  # of the picture being foreground at once: the camera was pushed, or the light went on
+_SUBSAMPLE = 8
+_GAIN = (0.3, 3.3)
+_EVEN_FIELD = 0.08  # a gain this far from 1 is not the same everywhere
+_DIM_STEP = 11  # 8-bit steps, times the gain: a dim picture's noise is raised with it
+_SHADOW = (0.42, 0.95)  # light that a shadow leaves
+_SHADOW_TEXTURE = 7.0  # 8-bit steps that are noise
+_SHADOW_CHROMA = 9.0  # 8-bit steps by which a shadow changes colours
+_GHOST_STEP = 22  # 8-bit steps
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layers:
+    """One frame's pixels. figure: 255 where something stands before the background, 0 elsewhere, (H, W).
+
+    shadow: the same where only light is missing. background: what stands behind, (H, W, 3), under today's light.
+    fresh: the model has begun anew with this frame, or is still learning: nothing can be told.
+    """
+
+    figure: Image
+    shadow: Image
+    background: Image
+    fresh: bool
+
+
+class Foreground:
+    """The background of one fixed camera.
+
+    model: mog2 or knn. fps: of the pictures that come, as far as known.
+    ``jolts`` counts how often everything had to be learnt anew.
+    """
+
+    def __init__(self, model: ModelName = "mog2", fps: float = 25.0) -> None:
+        self._name = model
+        self._period = 1.0 / fps if fps > 0 and math.isfinite(fps) else 0.04
+        self._made = False
+        self.jolts = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        if self._name == "mog2":
+            mixture = cv2.createBackgroundSubtractorMOG2(500, 16.0, False)
+            mixture.setBackgroundRatio(0.75)
+            mixture.setVarInit(60.0)
+            mixture.setVarMin(6.0)
+            self._model: cv2.BackgroundSubtractor = mixture
+        else:
+            self._model = cv2.createBackgroundSubtractorKNN(500, 300.0, False)
+        self._seen = 0
+        self._since = 0
+        self._high = 0
+        self._dimming = 1.0
+        self._ghosts: Image | None = None
+        self._ghostly: Bools | None = None
+        self._background: Image | None = None
+        self._slow: npt.NDArray[np.float32] | None = None  # the background, in parts of a step
+        self._album: list[Image] = []
+        self._reviews = list(_REVIEWS_S)
+
+    def prime(self, pictures: Sequence[Image]) -> None:
+        """Learn from pictures spread over a longer time, so that what was here and there for a moment is not in it."""
+        self._begin()
+        if not pictures:
+            return
+        middle = usual(pictures)
+        self._model.apply(middle, learningRate=1.0)
+        for picture in pictures:
+            # Whatever differs much from what is usual is passing.
+            odd = cv2.absdiff(picture, middle).max(axis=2) > 40
+            self._model.apply(np.where(odd[..., None], middle, picture), learningRate=0.03)
+        self._set_background(middle)
+        self._seen = 10**6
+        self._reviews = []
+
+    def _set_background(self, picture: Image) -> None:
+        self._background = picture
+        self._slow = picture.astype(np.float32)
+
+    def _review(self, even: Image) -> None:
+        """A young model's picture has everybody in it who was there at first: keep some pictures, and start over."""
+        age = self._seen * self._period
+        every = max(round(self._reviews[0] / self._period / _REVIEWED), 1)
+        if self._seen % every == 0:
+            self._album.append(even.copy())
+        if age < self._reviews[0]:
+            return
+        album, left, seen = self._album, self._reviews[1:], self._seen
+        self.prime(album)
+        self._seen, self._reviews = seen, left
+        # The later reviews span the first's time too.
+        self._album = album[::3] if left else []
+
+    def look(self, image: Image, protected: Sequence[Box] = ()) -> Layers:
+        """Split a picture (H, W, 3) BGR. protected: x, y, w, h [px] of what must not be learnt."""
+        if self._background is not None and self._background.shape != image.shape:
+            self._begin()
+        if self._background is None:
+            self._model.apply(image, learningRate=1.0)
+            self._set_background(image.copy())
+            assert self._background is not None
+            self._seen = 1
+            nothing = np.zeros(image.shape[:2], np.uint8)
+            return Layers(nothing, nothing, self._background, True)
+        even = self._even(image)
+        figure = np.asarray(self._model.apply(even, learningRate=0.0), dtype=np.uint8)
+        if self._dimming > 1.0 + _EVEN_FIELD:
+            step = _DIM_STEP * self._dimming
+            quiet = cv2.inRange(cv2.absdiff(even, self._background), (0, 0, 0), (step, step, step))
+            figure = np.asarray(cv2.subtract(figure, quiet), dtype=np.uint8)
+        self._seen += 1
+        learning = self._seen * self._period < _BEGIN_S
+        if self._jolted(figure):
+            self._begin()
+            self.jolts += 1
+            return self.look(image)
+        figure = self._without_ghosts(even, figure)
+        shadow = np.zeros_like(figure) if learning else self._shadow(even, figure)
+        self._teach(even, figure, protected, learning)
+        young = len(self._reviews) == len(_REVIEWS_S)
+        if self._reviews:
+            self._review(even)
+        return Layers(np.asarray(cv2.subtract(figure, shadow), dtype=np.uint8), shadow, self._background, young)
+
+    def haunt(self, image: Image, box: Box) -> None:
+        """Take what stands in a box for background from now on: it is a place from which something has gone."""
+        rows, columns = _slices(box, image.shape)
+        if self._ghosts is None or self._ghostly is None:
+            self._ghosts, self._ghostly = image.copy(), np.zeros(image.shape[:2], dtype=bool)
+        self._ghosts[rows, columns] = self._even(image)[rows, columns]
+        self._ghostly[rows, columns] = True
+
+    def _even(self, image: Image) -> Image:
+        """The picture in the background's light, from what most of the picture says.
+
+        One gain a channel; where it is far from 1, also its slow change over the picture: cameras that change their
+        exposure do not treat bright and dark parts, or middle and corners, alike.
+        """
+        assert self._background is not None
+        self._dimming = 1.0
+        now = image[::_SUBSAMPLE, ::_SUBSAMPLE].astype(np.float32)
+        then = self._background[::_SUBSAMPLE, ::_SUBSAMPLE].astype(np.float32)
+        usable = np.asarray(((now > 8) & (now < 245) & (then > 8) & (then < 245)).all(axis=2), dtype=np.bool_)
+        if usable.sum() < 50:
+            return image
+        ratio = then[usable] / now[usable]
+        gain = np.clip(np.median(ratio, axis=0), *_GAIN)
+        if np.abs(gain - 1.0).max() < 0.012:
+            return image
+        table = np.clip(np.rint(np.arange(256)[:, None] * gain), 0, 255).astype(np.uint8)[None]
+        even = np.asarray(cv2.LUT(image, table), dtype=np.uint8)
+        self._dimming = max(float(gain.max()), 1.0)
+        if np.abs(gain - 1.0).max() < _EVEN_FIELD:
+            return even
+        left = np.log(ratio.mean(axis=1)) - math.log(float(gain.mean()))
+        field = _slow_field(usable, left, (image.shape[1], image.shape[0]))
+        return np.asarray(cv2.multiply(even, cv2.merge([field] * 3), dtype=cv2.CV_8U), dtype=np.uint8)
+
+    def _jolted(self, figure: Image) -> bool:
+        if cv2.countNonZero(figure[::4, ::4]) * 16 <= _JOLT * figure.size:
+            self._high = 0
+            return False
+        self._high += 1
+        return self._high >= 2  # one frame may be a flash
+
+    def _without_ghosts(self, even: Image, figure: Image) -> Image:
+        if self._ghosts is None or self._ghostly is None:
+            return figure
+        like = cv2.absdiff(even, self._ghosts).max(axis=2) < _GHOST_STEP
+        figure = figure.copy()
+        figure[like & self._ghostly] = 0
+        return figure
+
+    def _shadow(self, even: Image, figure: Image) -> Image:
+        """Where the background shows through, but darker: same colour, same texture."""
+        assert self._background is not None
+        shadow = np.zeros_like(figure)
+        x, y, w, h = cv2.boundingRect(figure)
+        if w < 4 or h < 4:
+            return shadow
+        # Half the resolution does: what is asked is asked of a neighbourhood anyhow.
+        part = slice(y, y + h), slice(x, x + w)
+        half = (w + 1) // 2, (h + 1) // 2
+        now = cv2.resize(even[part], half, interpolation=cv2.INTER_AREA)
+        then = cv2.resize(self._background[part], half, interpolation=cv2.INTER_AREA)
+        bright_now = cv2.cvtColor(now, cv2.COLOR_BGR2GRAY).astype(np.float32)
+        bright_then = cv2.cvtColor(then, cv2.COLOR_BGR2GRAY).astype(np.float32)
+        left = (cv2.blur(bright_now, (3, 3)) + 2.0) / (cv2.blur(bright_then, (3, 3)) + 2.0)
+        dark = cv2.inRange(left, _SHADOW[0], _SHADOW[1])
+        if not cv2.countNonZero(dark):
+            return shadow
+        # What is left after the background was dimmed by the local light must be noise, in brightness and in colour.
+        dimmed = cv2.multiply(then, cv2.merge([left] * 3), dtype=cv2.CV_8U)
+        texture = cv2.blur(cv2.absdiff(bright_now, bright_then * left), (3, 3))
+        colour = cv2.blur(cv2.absdiff(now, dimmed), (3, 3))
+        same = cv2.inRange(texture, -1.0, _SHADOW_TEXTURE)
+        grey = cv2.inRange(colour, (0, 0, 0), (_SHADOW_CHROMA,) * 3)
+        all_three = cv2.bitwise_and(dark, cv2.bitwise_and(same, grey))
+        full = cv2.resize(all_three, (w, h), interpolation=cv2.INTER_NEAREST)
+        shadow[part] = cv2.bitwise_and(full, figure[part])
+        return shadow
+
+    def _teach(self, even: Image, figure: Image, protected: Sequence[Box], learning: bool) -> None:
+        assert self._background is not None
+        assert self._slow is not None
+        self._since += 1
+        every = max(round(_TEACH_S / self._period), 1)
+        if not learning and self._since < every:
+            return
+        lesson = even
+        if protected and not learning:
+            lesson = even.copy()
+            for box in protected:
+                rows, columns = _slices(box, even.shape)
+                lesson[rows, columns] = self._background[rows, columns]
+        rate = max(1.0 / self._seen, 0.02) if learning else self._since * self._period / _MEMORY_S
+        self._model.apply(lesson, learningRate=min(rate, 0.5))
+        # The model's own picture mixes what it has seen; this one only takes what the model calls background.
+        kept = np.full(figure.shape, 255, np.uint8) if self._seen * self._period < 1.0 else cv2.bitwise_not(figure)
+        cv2.accumulateWeighted(lesson, self._slow, min(max(rate, 0.02), 0.5), kept)
+        self._background = np.asarray(cv2.convertScaleAbs(self._slow), dtype=np.uint8)
+        self._since = 0
+
+
+def usual(pictures: Sequence[Image]) -> Image:
+    """What is behind it all in pictures (n of (H, W, 3)): of each value the middle of the closest third.
+
+    Unlike the median it holds where something passes for more than half of the time, as what passes differs.
+    """
+    stack = np.stack(pictures)
+    count = len(stack)
+    share = max(round(_CLOSEST * count), 1)
+    found = np.empty(stack.shape[1:], np.uint8)
+    for row in range(0, stack.shape[1], _STRIP):
+        values = np.sort(stack[:, row : row + _STRIP], axis=0)
+        width = values[share - 1 :] - values[: count - share + 1]
+        start = width.argmin(axis=0)
+        found[row : row + _STRIP] = np.take_along_axis(values, (start + share // 2)[None], axis=0)[0]
+    return found
+
+
+def _slow_field(usable: Bools, left: Floats, size: tuple[int, int]) -> npt.NDArray[np.float32]:
+    """A gain for every pixel of a picture (width, height), of second order in the place.
+
+    left: (n,) logarithms of the gains that are left at the pixels of a coarse grid which are ``usable``. What stands
+    before the background is outvoted.
+    """
+    y, x = np.nonzero(usable)
+    across, down = 2.0 * x / usable.shape[1] - 1.0, 2.0 * y / usable.shape[0] - 1.0
+    terms = np.stack([np.ones_like(across), across, down, across**2, across * down, down**2], axis=1)
+    found = np.zeros(6)
+    scale = 0.25
+    for _ in range(8):
+        weight = 1.0 / (1.0 + ((left - terms @ found) / scale) ** 2) ** 2
+        found = np.linalg.solve((terms * weight[:, None]).T @ terms + 1e-3 * np.eye(6), terms.T @ (weight * left))
+        scale = max(0.6 * scale, 0.04)
+    u = 2.0 * np.arange(size[0]) / size[0] - 1.0
+    v = (2.0 * np.arange(size[1]) / size[1] - 1.0)[:, None]
+    log_gain = found[0] + found[1] * u + found[2] * v + found[3] * u * u + found[4] * u * v + found[5] * v * v
+    return np.asarray(np.exp(log_gain), dtype=np.float32)
+
+
+def _slices(box: Box, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    x, y, w, h = box
+    left, top = max(math.floor(x), 0), max(math.floor(y), 0)
+    return slice(top, min(math.ceil(y + h), shape[0])), slice(left, min(math.ceil(x + w), shape[1]))
+
+
+def is_ghost(image: Image, background: Image, box: Box, figure: Image) -> bool:
+    """Whether a silhouette is the place of something that has gone: its rim is an edge of the background's picture."""
+    rows, columns = _slices(box, image.shape)
+    mask = figure[rows, columns]
+    if mask.size == 0:
+        return False
+    rim = cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) > 0
+    if rim.sum() < 10:
+        return False
+    return bool(_edges(background[rows, columns])[rim].mean() > 1.25 * _edges(image[rows, columns])[rim].mean())
+
+
+def _edges(part: Image) -> Floats:
+    grey = cv2.cvtColor(part, cv2.COLOR_BGR2GRAY).astype(np.float32)
+    return np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)).astype(np.float64)

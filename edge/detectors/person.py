@@ -1,0 +1,255 @@
+"""The observation node's eye: people before a fixed camera, with head, foot, representative point and clothes.
+
+After section 2 and 3.1.1 of the paper on distributed human tracking: silhouettes against a model of the background,
+the maximum of their distance transform as representative point, the head's top, the foot point, the torso's colour,
+and the distance from head to foot as size. Silhouettes of several people are taken apart by what height people have
+at that place and by where those who are followed were expected (``bodies``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from edge.detectors.base import Detection, Prediction
+from edge.detectors.bodies import Body, explain, lone_people
+from edge.detectors.following import Follower, Following
+from edge.detectors.foreground import Foreground, Layers, ModelName, is_ghost
+from edge.detectors.matching import match_predictions
+from edge.detectors.stature import Stature
+from protocols.geometry.types import Floats
+
+Image = npt.NDArray[np.uint8]
+_MOST_PIXELS = 700_000  # a larger picture is looked at smaller
+_GHOST_AFTER_S = 1.0
+_U_STD, _V_STD = 0.035, 0.08  # of the representative point, of the size; not measured
+_FLOOR_STD = 0.6  # px
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    body: Body
+    follower: Follower
+
+
+class PersonDetector:
+    """People before one fixed camera.
+
+    model: of the background, mog2 or knn. fps: of the pictures, where their times are not told. sure_only: report
+    only who has been seen several times and has moved; else everybody, with a lower score (see ``is_sure``).
+    prefix: of the labels; those of several cameras must differ, as they do not know each other's people.
+    """
+
+    def __init__(
+        self,
+        model: ModelName = "mog2",
+        fps: float = 25.0,
+        *,
+        sure_only: bool = True,
+        prefix: str = "p",
+        most_pixels: int = _MOST_PIXELS,
+    ) -> None:
+        self._fps = fps if fps > 0 and math.isfinite(fps) else 25.0
+        self._foreground = Foreground(model, self._fps)
+        self._following = Following(prefix, must_move=0.35)
+        self._sure_only = sure_only
+        self._most_pixels = most_pixels
+        self._stature: Stature | None = None
+        self._size = (0, 0)
+        self._shrink = 1.0
+        self._time = -1.0
+        self._sure: set[str] = set()
+        self._learns = True  # how tall people are
+
+    @property
+    def jolts(self) -> int:
+        """How often the camera was pushed or the light changed at once, and everything was learnt anew."""
+        return self._foreground.jolts
+
+    def is_sure(self, label: str) -> bool:
+        """Whether somebody who was reported under this label turned out to be one: seen again, and moving."""
+        return label in self._sure
+
+    def prime(self, pictures: Sequence[Image]) -> None:
+        """Learn the background from pictures of a longer time, before the first one is looked at."""
+        if pictures:
+            self._fit_to(pictures[0])
+            self._foreground.prime([self._smaller(picture) for picture in pictures])
+
+    def rewind(self) -> None:
+        """Begin again at an earlier time with what was learnt of the place, and nobody in the picture."""
+        self._following.clear()
+        self._time = -1.0
+        if self._stature is not None:
+            self._stature.settle()
+            self._learns = not self._stature.known
+
+    def detect(
+        self, image: Image, time_s: float | None = None, predictions: Sequence[Prediction] = ()
+    ) -> list[Detection]:
+        """People in an image (H, W, 3) BGR taken at ``time_s`` on the camera's clock; the surest first.
+
+        predictions: where the tracking expects its targets in this picture; whoever is found there carries its id.
+        """
+        self._fit_to(image)
+        now = self._time + 1.0 / self._fps if time_s is None else time_s
+        if not now > self._time:
+            now = self._time + 1.0 / self._fps
+        self._time = now
+        small = self._smaller(image)
+        layers = self._foreground.look(small, [one.box for one in self._following.all if one.sure and one.moved])
+        if layers.fresh:
+            self._following.clear()
+            return []
+        figure = _clean(layers.figure, self._typical())
+        found = self._explain(small, layers, figure, now)
+        detections = [self._report(small, figure, one) for one in found if self._worth_telling(one)]
+        detections.sort(key=lambda one: -one.score)
+        return match_predictions(detections, predictions)
+
+    def _worth_telling(self, one: _Found) -> bool:
+        """Seen several times, and moving, or else of the height that people have here."""
+        assert self._stature is not None
+        if one.follower.sure and one.follower.moved:
+            self._sure.add(one.follower.name)
+            return True
+        fits = one.body.alone and self._stature.known and not one.body.cut
+        return not self._sure_only or (one.follower.sure and fits)
+
+    def _fit_to(self, image: Image) -> None:
+        size = image.shape[1], image.shape[0]
+        if size == self._size:
+            return
+        self._size = size
+        self._shrink = min(1.0, math.sqrt(self._most_pixels / (size[0] * size[1])))
+        small = round(size[0] * self._shrink), round(size[1] * self._shrink)
+        self._stature = Stature(*small)
+        self._following.clear()
+
+    def _smaller(self, image: Image) -> Image:
+        if self._shrink == 1.0:
+            return image
+        size = round(image.shape[1] * self._shrink), round(image.shape[0] * self._shrink)
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+    def _typical(self) -> float:
+        heights = [one.box[3] for one in self._following.all if one.sure]
+        return float(np.median(heights)) if heights else 0.25 * self._size[1] * self._shrink
+
+    def _explain(self, image: Image, layers: Layers, figure: Image, now: float) -> list[_Found]:
+        assert self._stature is not None
+        following = self._following
+        followers = list(following.all)
+        for u, v, tall in lone_people(figure) if self._learns else ():
+            self._stature.learn(u, v, tall)
+        bodies = explain(figure, layers.shadow, self._stature, [one.expected(now) for one in followers])
+        colours = [_torso(image, figure, body) for body in bodies]
+        given = [followers[body.expected] if body.expected >= 0 else None for body in bodies]
+        owners = following.assign([body.box for body in bodies], colours, now, given)
+        found = []
+        for body, owner, colour in zip(bodies, owners, colours, strict=True):
+            if owner.time < now or owner.hits == 1:
+                if owner.time < now:
+                    trust = 0.9 if body.alone and not body.cut else 0.6 if body.seen > 0.6 else 0.35
+                    owner.see(body.box, now, colour if body.seen > 0.6 else None, trust)
+                found.append(_Found(body, owner))
+            old = not owner.moved and now - owner.born > _GHOST_AFTER_S and owner.hits % 5 == 0
+            if old and is_ghost(image, layers.background, body.box, figure):
+                self._foreground.haunt(image, body.box)
+        following.forget(now, (image.shape[1], image.shape[0]))
+        return found
+
+    def _report(self, image: Image, figure: Image, one: _Found) -> Detection:
+        body, follower = one.body, one.follower
+        box = body.box
+        features = silhouette_features(figure, box)
+        scale = 1.0 / self._shrink
+        head, foot = (features.head, features.foot)
+        size = math.hypot(head[0] - foot[0], head[1] - foot[1]) * scale
+        u_std = math.hypot(_U_STD * size, _FLOOR_STD)
+        v_std = math.hypot(_V_STD * size, _FLOOR_STD)
+        if not body.alone:
+            u_std, v_std = 2.0 * u_std, 1.5 * v_std
+        colour = follower.colour
+        score = 0.95 if body.alone else 0.4 + 0.5 * min(body.fill, 1.0) * body.seen
+        if not (follower.sure and follower.moved):
+            score *= 0.5
+
+        def back(place: tuple[float, float]) -> tuple[float, float]:
+            return (place[0] + 0.5) * scale - 0.5, (place[1] + 0.5) * scale - 0.5
+
+        u, v = back(features.middle)
+        return Detection(
+            u=u,
+            v=v,
+            size=size,
+            score=float(np.clip(score, 0.0, 1.0)),
+            label=follower.name,
+            colour=None
+            if colour is None
+            else (round(float(colour[2])), round(float(colour[1])), round(float(colour[0]))),
+            covariance=(u_std**2, 0.0, v_std**2),
+            kind="person",
+            head=back(head),
+            foot=back(foot),
+            box=(box[0] * scale, box[1] * scale, box[2] * scale, box[3] * scale),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """Of one silhouette, pixels (u, v): the representative point, the head's top, the foot point."""
+
+    middle: tuple[float, float]
+    head: tuple[float, float]
+    foot: tuple[float, float]
+
+
+def silhouette_features(figure: Image, box: tuple[float, float, float, float]) -> Features:
+    """The paper's features of the silhouette (H, W) 0/255 in a box x, y, w, h [px] (section 3.1.1, fig. 4 and 5).
+
+    Where a part of the box holds no silhouette, the box itself tells.
+    """
+    x, y, w, h = box
+    left, top = max(math.floor(x), 0), max(math.floor(y), 0)
+    part = figure[top : max(math.ceil(y + h), 0), left : max(math.ceil(x + w), 0)]
+    whole = Features((x + 0.5 * w - 0.5, y + 0.35 * h), (x + 0.5 * w - 0.5, y - 0.5), (x + 0.5 * w - 0.5, y + h - 0.5))
+    if part.size == 0 or not part.any():
+        return whole
+    # A frame of zeros, so that the picture's border and a neighbour's part are borders too.
+    framed = cv2.copyMakeBorder(part, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    distance = cv2.distanceTransform(framed, cv2.DIST_L2, 5)[1:-1, 1:-1]
+    peak = float(distance.max())
+    rows, columns = np.nonzero(distance >= peak - 0.25)
+    middle = left + float(columns.mean()), top + float(rows.mean())
+    rows_all, columns_all = np.nonzero(part)
+    rows_all = rows_all + top
+    upper = rows_all <= y + 0.1 * h
+    lower = rows_all >= y + 0.7 * h
+    head_u = left + float(columns_all[upper].mean()) if upper.any() else middle[0]
+    foot_u = left + float(columns_all[lower].mean()) if lower.any() else middle[0]
+    return Features(middle, (head_u, y - 0.5), (foot_u, y + h - 0.5))
+
+
+def _clean(figure: Image, typical: float) -> Image:
+    """Without specks, and with a body's parts joined (a belt of the wall's colour cuts nobody in two)."""
+    calm = cv2.medianBlur(figure, 3)
+    tall = int(np.clip(0.1 * typical, 3, 15)) | 1
+    joined = cv2.morphologyEx(calm, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_RECT, (3, tall)))
+    return np.asarray(joined, dtype=np.uint8)
+
+
+def _torso(image: Image, figure: Image, body: Body) -> Floats | None:
+    """Mean colour (3,) BGR of the clothes between shoulders and hips; None where none of it is seen."""
+    x, y, w, h = body.box
+    rows = slice(max(int(y + 0.2 * h), 0), max(int(y + 0.5 * h) + 1, 0))
+    columns = slice(max(int(x + 0.25 * w), 0), max(int(x + 0.75 * w) + 1, 0))
+    mask = figure[rows, columns]
+    if mask.size == 0 or cv2.countNonZero(mask) < 4:
+        return None
+    return np.array(cv2.mean(np.ascontiguousarray(image[rows, columns]), np.ascontiguousarray(mask))[:3])

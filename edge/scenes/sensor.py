@@ -1,0 +1,44 @@
+"""What every drawn camera shares: the rays of its pixels, and the noise of its sensor."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Floats
+
+PEDESTAL = 20
+"""The noise is stored with it, so that one saturating 8-bit addition applies it."""
+_BANK_MARGIN = 96  # px by which the noise picture exceeds the image: 9216 different crops
+
+
+def pixel_rays(lens: Intrinsics, u: Floats, v: Floats) -> Floats:
+    """Unit vectors (h, w, 3) in camera axes of pixels (h, w), (h, w)."""
+    flat = lens.unproject(np.column_stack([u.ravel(), v.ravel()]))
+    rays = np.column_stack([flat, np.ones(len(flat))])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return np.asarray(rays.reshape(*u.shape, 3))
+
+
+class SensorNoise:
+    """Gaussian noise of a sensor of (width, height) px; std in 8-bit steps."""
+
+    def __init__(self, width: int, height: int, std: float, rng: np.random.Generator) -> None:
+        self._size = width, height
+        self._rng = rng
+        shape = (height + _BANK_MARGIN, width + _BANK_MARGIN, 3)
+        noise = rng.standard_normal(shape, dtype=np.float32) * std + PEDESTAL
+        self._bank = np.clip(np.rint(noise), 0, 255).astype(np.uint8)
+
+    def add(self, dimmed: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        """The noisy picture of one from which PEDESTAL has been taken; it saturates as a sensor does."""
+        dy, dx = self._rng.integers(0, _BANK_MARGIN, 2)
+        width, height = self._size
+        return np.asarray(cv2.add(dimmed, self._bank[dy : dy + height, dx : dx + width]), dtype=np.uint8)
+
+
+def dimmed(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """A picture less PEDESTAL, for ``SensorNoise.add``."""
+    return np.asarray(np.maximum(picture, PEDESTAL) - np.uint8(PEDESTAL), dtype=np.uint8)

@@ -1,0 +1,285 @@
+"""The person detector on rendered rooms and on pictures made for one question each."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from deploy.cli import run
+from edge import scenes
+from edge.detectors.base import Detection, Prediction
+from edge.detectors.bodies import explain
+from edge.detectors.foreground import Foreground
+from edge.detectors.matching import match_predictions
+from edge.detectors.person import PersonDetector, silhouette_features
+from edge.detectors.stature import Stature
+from edge.detectors.vehicle import VehicleDetector
+from tests.people_boxes import judge
+
+Image = npt.NDArray[np.uint8]
+HEIGHT, WIDTH = 240, 320
+
+
+def street(seed: int = 0) -> Image:
+    """A textured background."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.integers(60, 190, (30, 40, 3), dtype=np.uint8)
+    return np.asarray(cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+
+
+def noisy(picture: Image, rng: np.random.Generator, gain: float = 1.0) -> Image:
+    return np.clip(picture * gain + rng.normal(0.0, 2.0, picture.shape), 0, 255).astype(np.uint8)
+
+
+def put_person(
+    picture: Image, u: float, foot: float, tall: float, colour: tuple[int, int, int] = (30, 30, 160)
+) -> None:
+    """Head, trunk and legs, as flat shapes."""
+    cv2.circle(picture, (round(u), round(foot - 0.93 * tall)), max(round(0.07 * tall), 1), (120, 150, 200), -1)
+    top, hip = round(foot - 0.86 * tall), round(foot - 0.45 * tall)
+    cv2.rectangle(picture, (round(u - 0.12 * tall), top), (round(u + 0.12 * tall), hip), colour, -1)
+    cv2.rectangle(picture, (round(u - 0.09 * tall), hip), (round(u + 0.09 * tall), round(foot)), (40, 30, 30), -1)
+
+
+def walk(
+    detector: PersonDetector, frames: int, *, start: int = 0, people: int = 1, gain: float = 1.0
+) -> list[Detection]:
+    """Let people of 50 px cross the street, 60 px apart; what is seen in the last frame."""
+    rng = np.random.default_rng(1)
+    found: list[Detection] = []
+    for index in range(start, start + frames):
+        picture = street()
+        for who in range(people):
+            put_person(picture, 30.0 + 60.0 * who + 1.5 * index, 150.0, 50.0)
+        found = detector.detect(noisy(picture, rng, gain), index / 10.0)
+    return found
+
+
+def learnt(detector: PersonDetector) -> PersonDetector:
+    rng = np.random.default_rng(0)
+    detector.prime([noisy(street(), rng) for _ in range(12)])
+    return detector
+
+
+@pytest.mark.parametrize("model", ["mog2", "knn"])
+def test_a_small_walker_is_found_with_head_foot_and_clothes(model: str) -> None:
+    found = walk(learnt(PersonDetector(model, 10.0)), 25)  # type: ignore[arg-type]
+    assert len(found) == 1
+    one = found[0]
+    u = 30.0 + 1.5 * 24
+    assert one.kind == "person"
+    assert one.head is not None
+    assert one.foot is not None
+    assert one.head == pytest.approx((u, 100.0), abs=3.0)
+    assert one.foot == pytest.approx((u, 150.0), abs=3.0)
+    assert (one.u, one.v) == pytest.approx((u, 120.0), abs=9.0)
+    assert one.size == pytest.approx(50.0, abs=4.0)
+    assert one.colour is not None
+    assert one.colour[0] > 120 > one.colour[2]
+
+
+def test_nobody_is_reported_in_an_empty_street_under_changing_light() -> None:
+    detector = learnt(PersonDetector("mog2", 10.0))
+    rng = np.random.default_rng(2)
+    for index in range(60):
+        assert not detector.detect(noisy(street(), rng, 1.0 - 0.006 * index), index / 10.0)
+    assert detector.jolts == 0
+
+
+def test_two_in_one_silhouette_are_two() -> None:
+    stature = Stature(WIDTH, HEIGHT)
+    for index in range(60):
+        stature.learn(20.0 + 4 * index, 100.0 + index, 60.0)
+    figure = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    put_person(figure, 100.0, 150.0, 60.0, (255, 255, 255))
+    put_person(figure, 114.0, 152.0, 60.0, (255, 255, 255))
+    mask = np.where(figure.any(axis=2), np.uint8(255), np.uint8(0)).astype(np.uint8)
+    shadow = np.zeros_like(mask)
+    bodies = explain(mask, shadow, stature, [])
+    assert sorted(round(body.box[0] + 0.5 * body.box[2]) for body in bodies) == pytest.approx([100, 114], abs=4)
+    alone = np.zeros_like(mask)
+    alone[:, :107] = mask[:, :107]
+    assert len(explain(alone, shadow, stature, [])) == 1
+
+
+def test_somebody_cut_in_two_by_the_colour_of_the_wall_is_one() -> None:
+    rng = np.random.default_rng(3)
+    detector = learnt(PersonDetector("mog2", 10.0))
+    found: list[Detection] = []
+    for index in range(25):
+        picture, behind = street(), street()
+        put_person(picture, 30.0 + 2.0 * index, 170.0, 80.0)
+        picture[132:136] = behind[132:136]
+        found = detector.detect(noisy(picture, rng), index / 10.0)
+    assert len(found) == 1
+    assert found[0].size == pytest.approx(80.0, abs=6.0)
+
+
+def test_who_is_there_when_the_camera_starts_is_found_within_seconds_and_leaves_no_ghost() -> None:
+    detector = PersonDetector("mog2", 10.0)
+    assert not walk(detector, 1)
+    found = walk(detector, 59, start=1, people=2)
+    assert len(found) == 2
+    rng = np.random.default_rng(5)
+    for index in range(60, 120):
+        left = detector.detect(noisy(street(), rng), index / 10.0)
+    assert not left
+
+
+def test_who_stops_does_not_sink_into_the_background() -> None:
+    detector = learnt(PersonDetector("mog2", 10.0))
+    walk(detector, 30)
+    rng = np.random.default_rng(6)
+    picture = street()
+    put_person(picture, 75.0, 150.0, 50.0)
+    for index in range(30, 330):
+        found = detector.detect(noisy(picture, rng), index / 10.0)
+    assert len(found) == 1
+
+
+def test_a_camera_that_is_pushed_begins_anew_instead_of_reporting_the_picture() -> None:
+    detector = learnt(PersonDetector("mog2", 10.0))
+    walk(detector, 20)
+    rng = np.random.default_rng(7)
+    other = street(9)
+    for index in range(20, 60):
+        found = detector.detect(noisy(other, rng), index / 10.0)
+        assert not any(one.size > 120 for one in found)
+    assert detector.jolts == 1
+    assert not found
+
+
+def test_a_shadow_is_not_part_of_a_body() -> None:
+    rng = np.random.default_rng(8)
+    model = Foreground("mog2", 10.0)
+    model.prime([noisy(street(), rng) for _ in range(12)])
+    picture = street()
+    picture[150:165, 100:180] = (picture[150:165, 100:180] * 0.65).astype(np.uint8)
+    put_person(picture, 100.0, 150.0, 60.0)
+    layers = model.look(noisy(picture, rng))
+    cast = layers.figure[153:163, 115:175]
+    assert (cast > 0).mean() < 0.1
+    assert (layers.shadow[153:163, 115:175] > 0).mean() > 0.7
+    assert (layers.figure[105:145, 95:105] > 0).mean() > 0.9
+
+
+def test_features_are_the_papers() -> None:
+    """A disc's distance transform peaks in its middle; head and foot are its ends."""
+    figure = np.zeros((100, 100), np.uint8)
+    cv2.circle(figure, (50, 40), 15, 255, -1)
+    cv2.rectangle(figure, (48, 40), (52, 80), 255, -1)
+    features = silhouette_features(figure, (35.0, 25.0, 31.0, 56.0))
+    assert features.middle == pytest.approx((50.0, 40.0), abs=1.0)
+    assert features.head == pytest.approx((50.0, 24.5), abs=1.0)
+    assert features.foot == pytest.approx((50.0, 80.5), abs=1.0)
+
+
+def test_predictions_are_matched_once_each_and_far_ones_not_at_all() -> None:
+    spread = (16.0, 0.0, 16.0)
+    seen = [Detection(10.0, 10.0, covariance=spread), Detection(20.0, 10.0, covariance=spread), Detection(200.0, 9.0)]
+    told = [
+        Prediction(12.0, 10.0, spread, "a"),
+        Prediction(21.0, 11.0, spread, "b"),
+        Prediction(90.0, 90.0, spread, "c"),
+    ]
+    assert [one.target for one in match_predictions(seen, told)] == ["a", "b", ""]
+    broken = [Prediction(float("nan"), 10.0, spread, "x"), Prediction(10.0, 10.0, (0.0, 0.0, 0.0), "y")]
+    assert [one.target for one in match_predictions([Detection(10.0, 10.0)], broken)] == [""]
+    far_too_small = [Prediction(10.0, 10.0, spread, "z", size=1.0)]
+    assert match_predictions([Detection(10.0, 10.0, size=200.0)], far_too_small)[0].target == ""
+
+
+@pytest.mark.xfail(strict=False, reason="precision and recall are about 0.8; see edge/README.md")
+def test_people_of_a_rendered_room_are_found_where_they_are() -> None:
+    scene = scenes.get_people(11, None, 2)
+    camera = scene.cameras[0]
+    renderer = scene.renderer(camera.name, np.random.default_rng(0))
+    detector = PersonDetector("mog2", camera.fps)
+    right = wrong = missed = 0
+    for index in range(130):
+        moment = 5.0 + index / camera.fps
+        found = detector.detect(renderer.render(moment), moment)
+        if index < 50:
+            continue
+        boxes = [box for box in scene.boxes(camera.name, moment) if np.isfinite(box).all() and box[3] > 40]
+        hits = sum(any(_overlap(one.box, box) >= 0.5 for box in boxes) for one in found if one.box is not None)
+        right, wrong, missed = right + hits, wrong + len(found) - hits, missed + max(len(boxes) - hits, 0)
+    assert right / (right + wrong) > 0.9
+    assert right / (right + missed) > 0.9
+
+
+def _overlap(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
+    x, y, w, h = np.asarray(a)
+    x2, y2, w2, h2 = np.asarray(b)
+    across = min(x + w, x2 + w2) - max(x, x2)
+    down = min(y + h, y2 + h2) - max(y, y2)
+    if across <= 0 or down <= 0:
+        return 0.0
+    return float(across * down / (w * h + w2 * h2 - across * down))
+
+
+def car(picture: Image, u: float, v: float) -> None:
+    cv2.rectangle(picture, (round(u - 25), round(v - 12)), (round(u + 25), round(v + 12)), (200, 210, 215), -1)
+    cv2.rectangle(picture, (round(u - 8), round(v - 9)), (round(u + 10), round(v + 9)), (60, 50, 40), -1)
+
+
+def test_cars_before_a_fixed_camera_are_counted_one_label_each() -> None:
+    rng = np.random.default_rng(10)
+    detector = VehicleDetector("mog2", 10.0)
+    detector.prime([noisy(street(), rng) for _ in range(12)])
+    labels: dict[str, int] = {}
+    for index in range(110):
+        picture = street()
+        car(picture, -30.0 + 5.0 * index, 80.0)
+        car(picture, 380.0 - 5.0 * (index - 30), 180.0)
+        for one in detector.detect(noisy(picture, rng), index / 10.0):
+            labels[one.label] = labels.get(one.label, 0) + 1
+    assert len(labels) == 2
+    assert min(labels.values()) > 40
+
+
+@pytest.mark.xfail(strict=False, reason="the place that a car has left is told beside it from a moving camera")
+def test_a_car_is_found_from_a_moving_camera_and_the_ground_is_not() -> None:
+    rng = np.random.default_rng(11)
+    coarse = rng.integers(40, 210, (90, 160, 3), dtype=np.uint8)
+    ground = np.asarray(cv2.resize(coarse, (1280, 720), interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+    detector = VehicleDetector("mog2", 10.0)
+    near = far = 0
+    for index in range(60):
+        whole = ground.copy()
+        u, v = 200.0 + 7.0 * index, 260.0
+        car(whole, u, v)
+        left, top = 60 + 3 * index, 120 + index
+        view = noisy(whole[top : top + HEIGHT, left : left + WIDTH], rng)
+        for one in detector.detect(view, index / 10.0):
+            if np.hypot(one.u + left - u, one.v + top - v) < 20.0:
+                near += 1
+            else:
+                far += 1
+    assert detector.moving
+    assert near >= 20
+    assert far <= 0.1 * near
+
+
+CARS = Path(__file__).parents[3] / "shared/data/street-cars/cars.mp4"
+
+
+@pytest.mark.skipif(not CARS.is_file(), reason="no recording of a street here")
+def test_the_four_cars_of_a_street_are_four_labels_and_its_paint_is_none(tmp_path: Path) -> None:
+    out = tmp_path / "cars.csv"
+    assert run(["detect", "vehicle", str(CARS), "--out", str(out), "--json"]) == 0
+    with out.open() as lines:
+        assert {row["label"] for row in csv.DictReader(lines)} == {"t0", "t1", "t2", "t3"}
+
+
+def test_who_counts_is_judged_as_pedestrian_benchmarks_do() -> None:
+    """One found, one missed, one wrong; a hidden one that is found, and a hidden one that is not, change nothing."""
+    boxes = np.array([[0, 0, 10, 30], [50, 0, 10, 30], [100, 0, 10, 30], [150, 0, 10, 30]], dtype=np.float64)
+    counts = np.array([True, True, False, False])
+    found = [np.array([1.0, 1, 10, 30]), np.array([100.0, 2, 10, 30]), np.array([200.0, 0, 10, 30])]
+    assert judge(boxes, counts, found)[:3] == (1, 1, 1)
