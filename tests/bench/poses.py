@@ -58,16 +58,19 @@ def ratio(
     left_out = sightings.wrong.astype(bool)
     if arrived:
         left_out = left_out | ~np.isin(np.arange(1, points + 1)[: len(left_out)], list(net.arrived))
-    best = joint_optimum(world, sightings.without(left_out))
-    return errors(world, net.published())[0] / errors(world, best.poses)[0]
+    best = errors(world, joint_optimum(world, sightings.without(left_out)).poses)[0]
+    # The yardstick begins at the truth: one that took no step (a point that starts behind a camera) is none.
+    return errors(world, net.published())[0] / best if best > 0.0 else float("nan")
 
 
 def _told(values: list[float]) -> str:
     good = [v for v in values if np.isfinite(v)]
-    failed = len(values) - len(good) + sum(v > 3.0 for v in good)
+    unmeasured = sum(np.isnan(v) for v in values)
+    failed = len(values) - len(good) - unmeasured + sum(v > 3.0 for v in good)
     if not good:
         return f"all {len(values)} failed"
-    return f"{np.mean(good):.3f} / {np.max(good):.2f}, failed {failed} of {len(values)}"
+    without = f", {unmeasured} without a yardstick" if unmeasured else ""
+    return f"{np.mean(good):.3f} / {np.max(good):.2f}, failed {failed} of {len(values)}{without}"
 
 
 def growing(seed: int) -> list[float]:
