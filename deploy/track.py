@@ -8,11 +8,13 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
 
-from edge.devices.recording import IMAGE_SUFFIXES, Recording
+from edge.devices.base import Frame
+from edge.devices.recording import IMAGE_SUFFIXES
 from edge.uav.tracker import Box, Estimate, Image, State, Telemetry, Tracker
 from protocols.clocks import NANOSECONDS
 from protocols.errors import InputError
@@ -25,6 +27,13 @@ GROUND_COLUMNS = ("north", "east", "speed", "course", "std_m")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _POSITION = ("north", "east", "down")
 _AHEAD_S = 0.6  # a file's samples are handed over that much early: the clocks may differ by half a second
+
+
+class Pictures(Protocol):
+    """An opened recording."""
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """The next picture; None after the last."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,7 +176,7 @@ def count_frames(video: Path) -> int:
 
 
 def follow(
-    recording: Recording,
+    recording: Pictures,
     tracker: Tracker,
     target: Box,
     *,

@@ -43,10 +43,11 @@ class Simulation:
 
 
 def start_uav(config: UavConfig, bus: Bus, stop: threading.Event, beat: Callable[[], None] | None = None) -> int:
-    """Run a UAV agent until it is stopped or its recording ends."""
+    """Run a UAV agent until it is stopped or its recording ends. beat: called with every frame."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     import cv2
 
+    from deploy.notify import Watched
     from edge.uav_agent import Looking, UavAgent
 
     cv2.setNumThreads(1)
@@ -60,18 +61,20 @@ def start_uav(config: UavConfig, bus: Bus, stop: threading.Event, beat: Callable
             print("syncline: without matrix and body_from_camera in rig the telemetry is not used", flush=True)
         size, fps = (info.width, info.height), info.fps or 30.0
         link = make_link(config)
-        watch = _Watched()
+        watch = _Shown()
         stream: Stream | None = None
         server: VideoServer | None = None
         if config.video_out is not None:
             server, stream = _serve_video(config, watch, stack)
+        # With frames and not with every round: a camera that was unplugged must trip the watchdog.
+        watched = device if beat is None else Watched(device, beat)
         agent = make_agent(
-            config, device, link, Looking(size, fps, lens, mounting, config.seed, config.model, _quality(config)),
+            config, watched, link, Looking(size, fps, lens, mounting, config.seed, config.model, _quality(config)),
             stream=stream, shown=watch.take if server is not None else None,
         )  # fmt: skip
         watch.tell = server.changed if server is not None else lambda: None
         assert isinstance(agent, UavAgent)
-        agent.run(bus, stop, beat)
+        agent.run(bus, stop)
     return EXIT_DONE
 
 
@@ -163,21 +166,24 @@ def simulation(flight: FlightConfig, size: tuple[int, int] = (640, 480)) -> Simu
     from edge.uav.world.patrol import patrol
 
     world = patrol(flight.seed, flight.seconds, size)
-    gimbal = None
-    start = None
-    yaw = 0.0
-    if flight.flies == "follow" or flight.gimbal:
-        ground = world.target.ground[0]
-        start = np.array([ground[0], ground[1], -_HOVER_M])
-        yaw = float(world.target.course[0])
-    if flight.gimbal:
+    if flight.flies == "path" and not flight.gimbal:
+        return Simulation(world, SimulatedAircraft(world.flight, seed=flight.seed))
+    ground, yaw = world.target.ground[0], float(world.target.course[0])
+    start = np.array([ground[0], ground[1], -_HOVER_M])
+    gimbal = pilot = None
+    if flight.flies == "follow":
+        # As a pilot would, it flies above the car until it is told where that is.
+        pilot = world.target_at
+        if flight.gimbal:
+            gimbal = (-0.5 * math.pi, yaw)
+    else:
         # Beside the way, so that the car is looked at from aside.
-        assert start is not None
         back = _HOVER_M / math.tan(-_GIMBAL_PITCH)
         start[:2] -= back * np.array([math.cos(yaw), math.sin(yaw)])
         gimbal = (_GIMBAL_PITCH, yaw)
-    path = world.flight if flight.flies == "path" and not flight.gimbal else None
-    return Simulation(world, SimulatedAircraft(path, start=start, yaw=yaw, gimbal=gimbal, seed=flight.seed))
+    camera = None if flight.gimbal else np.asarray(world.body_from_camera)
+    aircraft = SimulatedAircraft(start=start, yaw=yaw, pilot=pilot, camera=camera, gimbal=gimbal, seed=flight.seed)
+    return Simulation(world, aircraft)
 
 
 @contextmanager
@@ -266,7 +272,7 @@ def _quality(config: UavConfig) -> int | None:
     return None if config.images is None else config.images.quality
 
 
-class _Watched:
+class _Shown:
     """The newest picture and estimate, for the operator's video; drawn and compressed only if somebody watches."""
 
     def __init__(self) -> None:
@@ -293,7 +299,7 @@ class _Watched:
         return data.tobytes() if good else None
 
 
-def _serve_video(config: UavConfig, watch: _Watched, stack: ExitStack) -> tuple[VideoServer, Stream]:
+def _serve_video(config: UavConfig, watch: _Shown, stack: ExitStack) -> tuple[VideoServer, Stream]:
     from edge.mavlink.camera import Stream
     from edge.video_server import PATH, VideoServer
 

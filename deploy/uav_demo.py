@@ -10,7 +10,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -40,6 +40,7 @@ _MINE = ("config", "logs", LOG, RESULT)
 _STARTING_S, _SELECTING_S, _STOPPING_S = 60.0, 60.0, 40.0
 _SPARE_S = 150.0  # of the world's time beyond what is shown: for starting and selecting
 _NEAR_PX = 20.0
+_GEO, _GEO_NEAR_M = "CAMERA_TRACKING_GEO_STATUS", 5.0
 
 
 @dataclass(slots=True)
@@ -59,6 +60,8 @@ class Outcome:
     in_frame, in_near: frames that show a part of the car, and those of them within 20 px. out_frames, out_length: that
     show nothing of it, and within one car length. claims_out: says visible from the third frame out on. median_m: of
     the place on the ground, in and out. offset_error_s: of the map between the vehicle's clock and the camera's.
+    geo_near: share of the CAMERA_TRACKING_GEO_STATUS that came within three times their accuracy, or 5 m, of where the
+    car was when they came; geo_median_m: how far off they were.
     """
 
     frames: int
@@ -73,13 +76,16 @@ class Outcome:
     offset_error_s: float | None
     latency_p99_s: float | None
     statuses: int
+    geo_near: float | None = None
+    geo_median_m: float | None = None
 
     @property
     def good(self) -> bool:
         """Whether the demo shows what it promises."""
         enough = self.in_frames >= 15 and (self.in_near or 0.0) >= 0.8
         honest = self.claims_out is None or self.claims_out <= 0.1
-        return enough and honest and (self.out_length is None or self.out_frames < 5 or self.out_length >= 0.5)
+        told = self.geo_near is not None and self.geo_near >= 0.8
+        return enough and honest and told and (self.out_length is None or self.out_frames < 5 or self.out_length >= 0.5)
 
 
 def run_town(out: Path, seconds: float, seed: int, show: Callable[[Progress], None]) -> Outcome:
@@ -107,8 +113,12 @@ def run_town(out: Path, seconds: float, seed: int, show: Callable[[Progress], No
             # A busy machine takes its time to start: the world goes on meanwhile.
             _select(station, processes, world, epoch, progress, show)
             began = time.monotonic()
+            told_geo: list[tuple[float, float, float, float]] = []
             while (elapsed := time.monotonic() - began) < seconds:
+                heard = station.counts.get(_GEO, 0)
                 station.poll(0.05)
+                if station.told is not None and station.told.geo is not None and station.counts.get(_GEO, 0) > heard:
+                    told_geo.append((time.time() - epoch, *station.told.geo))
                 for received in targets.drain():
                     assert isinstance(received.message, pb.TargetState)
                     progress.frames += 1
@@ -127,7 +137,8 @@ def run_town(out: Path, seconds: float, seed: int, show: Callable[[Progress], No
         finally:
             station.close()
             processes.kill()
-    outcome = compare(out / LOG, world, FlightConfig().boot_s, statuses)
+    near, median = compare_geo(told_geo, world)
+    outcome = replace(compare(out / LOG, world, FlightConfig().boot_s, statuses), geo_near=near, geo_median_m=median)
     write_atomically(out / RESULT, as_json(outcome) + "\n")
     return outcome
 
@@ -176,6 +187,23 @@ def compare(log: Path, world: World, boot_s: float, statuses: int = 0) -> Outcom
     )
 
 
+def compare_geo(told: list[tuple[float, float, float, float]], world: World) -> tuple[float | None, float | None]:
+    """Share of places that are near enough, and their median error [m]; None without any.
+
+    told: world time [s], latitude, longitude [degrees], accuracy [m].
+    """
+    from edge.mavlink.autopilot import ORIGIN
+
+    errors, accuracies = [], []
+    for moment, latitude, longitude, accuracy in told:
+        if 0.0 <= moment <= world.time(world.length - 1):
+            place, _ = world.target_at(moment)
+            errors.append(float(np.hypot(*(ORIGIN.local(latitude, longitude, 0.0)[:2] - place))))
+            accuracies.append(accuracy)
+    table = np.array(errors)
+    return _share(table <= np.maximum(3.0 * np.array(accuracies), _GEO_NEAR_M)), _median(table)
+
+
 def as_json(outcome: Outcome) -> str:
     """The outcome as one JSON object."""
     import json
@@ -207,6 +235,8 @@ def print_outcome(outcome: Outcome, out: Path) -> None:
     table.add_row("says visible while out", percent(outcome.claims_out), "<= 10 %")
     ground = f"{metres(outcome.median_in_m)} / {metres(outcome.median_out_m)}"
     table.add_row("place on the ground, in / out (median)", ground, "")
+    geo = f"{percent(outcome.geo_near)}, median {metres(outcome.geo_median_m)}"
+    table.add_row("latitude, longitude as told over MAVLink: within 3 accuracies or 5 m", geo, ">= 80 %")
     if outcome.offset_error_s is not None:
         table.add_row("vehicle clock against camera clock", f"{1e3 * outcome.offset_error_s:+.1f} ms off", "")
     if outcome.latency_p99_s is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from deploy.track import TelemetryFile
-from edge.devices.recording import Recording
+from deploy.track_log import open_pictures
 from edge.uav.tracker import Telemetry
 from protocols.catalogue import TELEMETRY
 from protocols.clocks import NANOSECONDS
@@ -68,8 +68,7 @@ def onto_video(
 
     samples = told.samples
     tilt = usual_tilt(samples, body_from_camera)
-    recording = Recording(video, fps=fps, intrinsics=lens)
-    recording.open()
+    recording, _ = open_pictures(video, fps, lens)
     try:
         size = (recording.info.width, recording.info.height)
         seen = SeenTurning(size, lens)

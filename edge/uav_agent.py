@@ -49,6 +49,7 @@ _INFO_S, _STATUS_S = 2.0, 1.0
 _SILENT_S = 2.0  # without a frame the agent is degraded
 _LINK_STALE_S = 1.5  # without the vehicle nothing is commanded
 _STEP_BACK_S = 0.2
+_UNTOLD_DELAY_S = 0.03  # std of what a frame and an attitude are late by, until the pictures have told
 TOPICS = {
     topic.message: topic
     for topic in (FLIGHT_IMAGE, TELEMETRY, TARGET_COMMAND, TARGET, TARGET_CLOUD, ROAD_MAP, UAV_INFO, STATUS)
@@ -125,8 +126,8 @@ class UavAgent:
         self.latencies: deque[float] = deque(maxlen=900)
         """From a frame's arrival to its status on the link [s]."""
 
-    def run(self, bus: Bus, stop: threading.Event, beat: Callable[[], None] | None = None) -> None:
-        """Work until ``stop`` is set or the device has ended. beat: called while it does, for a watchdog.
+    def run(self, bus: Bus, stop: threading.Event) -> None:
+        """Work until ``stop`` is set or the device has ended.
 
         Raises InputError where the device cannot be opened, BusDead where the bus has died.
         """
@@ -138,7 +139,7 @@ class UavAgent:
                 Ear(self._link) as ear,
             ):
                 self._publish = outbox.put
-                self._loop(stop, ear, outbox, beat or _nothing)
+                self._loop(stop, ear, outbox)
         finally:
             self._device.close()
             self._link.close()
@@ -234,13 +235,12 @@ class UavAgent:
             version=VERSION,
         )
 
-    def _loop(self, stop: threading.Event, ear: Ear, outbox: Outbox, beat: Callable[[], None]) -> None:
+    def _loop(self, stop: threading.Event, ear: Ear, outbox: Outbox) -> None:
         sequence = 0
         next_info = next_status = -math.inf
         while not (stop.is_set() or self._device.ended):
             frame = self._device.read(_READ_S)
             self.step(ear.drain(), frame)
-            beat()
             now = self._now_ns() / NANOSECONDS
             if now >= next_info:
                 next_info = now + _INFO_S
@@ -269,7 +269,9 @@ class UavAgent:
             return
         self._telemetry_ns = mapped
         self._last_sample_s = self._now_ns() / NANOSECONDS
-        std = sample.std_s if self.aligner is None or self.aligner.found is None else self.aligner.found.std
+        std = math.hypot(sample.std_s, _UNTOLD_DELAY_S)
+        if self.aligner is not None and self.aligner.found is not None:
+            std = self.aligner.found.std
         message = pb.VehicleTelemetry(
             **self._head(),
             device_time_ns=mapped,
@@ -425,10 +427,6 @@ class UavAgent:
         """What every input message begins with; counts the inputs."""
         order, self._order = self._order, self._order + 1
         return {"schema_version": SCHEMA_VERSION, "agent": self._agent, "boot_id": self.boot_id, "order": order}
-
-
-def _nothing() -> None:
-    """Nobody watches."""
 
 
 def now_of(frame: Frame, clock: CameraHostClock, fallback: int) -> int:

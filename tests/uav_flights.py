@@ -116,6 +116,7 @@ class Flight:
     key: bytes | None = None
     jpeg_quality: int | None = None
     noise_rad: float = 0.001
+    piloted: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -124,6 +125,8 @@ class Flight:
             path,
             start=self.start,
             yaw=self.yaw,
+            pilot=self.world.target_at if self.flies == "follow" and self.piloted else None,
+            camera=np.asarray(self.world.body_from_camera) if self.gimbal is None else None,
             gimbal=self.gimbal,
             pushes=self.pushes,
             noise_rad=self.noise_rad,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -39,7 +40,8 @@ def track(
     Parameters
     ----------
     video
-        A video file, or a folder of pictures in the order of their names.
+        A video file, a folder of pictures in the order of their names, or a .mcap log of a UAV agent with [images],
+        which also knows the lens and the mounting.
     target
         The car's box in the first tracked frame, x,y,w,h in pixels; x,y is its top left.
     out
@@ -68,9 +70,9 @@ def track(
     check_folder(out)
     _check(video, start, fps, seed)
     from deploy import track as tracking
+    from deploy.track_log import LoggedPictures, open_pictures
     from deploy.track_overlay import Overlay
     from deploy.track_scores import read_truth, score
-    from edge.devices.recording import Recording
     from edge.uav import models
     from edge.uav.tracker import Telemetry
 
@@ -89,6 +91,15 @@ def track(
         told = read_own_clock(telemetry)
     elif telemetry is not None:
         told = tracking.read_telemetry(telemetry)
+    rate = fps
+    if rate is None and camera is not None and camera.fps > 0 and video.is_dir():
+        rate = camera.fps
+    recording, counted = open_pictures(video, rate, lens)
+    same_log = False
+    if isinstance(recording, LoggedPictures):
+        lens = recording.lens
+        mounting = recording.body_from_camera if mounting is None else mounting
+        same_log = telemetry is not None and telemetry.resolve() == video.resolve()
     if told is not None and telemetry is not None:
         if model == "ground" and (lens is None or mounting is None):
             what = "telemetry says nothing without the camera's matrix and body_from_camera"
@@ -96,14 +107,13 @@ def track(
         if told.left_out:
             warnings.append(f"{telemetry}: {told.left_out} rows hold no sample and were left out")
         samples = told.samples
-    rate = fps
-    if rate is None and camera is not None and camera.fps > 0 and video.is_dir():
-        rate = camera.fps
-    recording = Recording(video, fps=rate, intrinsics=lens)
-    recording.open()
     size = (recording.info.width, recording.info.height)
-    count = tracking.count_frames(video)
-    if told is not None and own_clock:
+    count = tracking.count_frames(video) if counted is None else counted
+    if told is not None and same_log and isinstance(recording, LoggedPictures):
+        # The agent has put both on one clock already.
+        first_s = recording.first_s
+        samples = tuple(replace(sample, time=sample.time - first_s) for sample in told.samples)
+    elif told is not None and own_clock:
         samples = ()
         if lens is not None and mounting is not None:
             from deploy.uav_telemetry import onto_video
@@ -162,9 +172,6 @@ def _check(video: Path, start: int, fps: float | None, seed: int) -> None:
         raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
     if fps is not None and not 0.1 <= fps <= 10_000:
         raise InputError(f"--fps {fps:g} is out of range", remedy="give frames a second")
-    if video.suffix.lower() == ".mcap":
-        what = "a Syncline log holds observations, not pictures"
-        raise InputError(what, file=video, remedy="give the video that was recorded beside it")
 
 
 def _tell(

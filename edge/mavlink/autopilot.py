@@ -36,6 +36,8 @@ _RATES = {
 _FASTEST_HZ = 100.0
 _UNIX_AT_START = 1_700_000_000.0
 _SENDERS = 8
+ORIGIN = Origin(47.3977, 8.5456, 488.0)
+"""Where the simulated aircraft's local frame stands, unless told otherwise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +99,7 @@ class Autopilot:
     ) -> None:
         self._airframe, self._transport = airframe, transport
         self.system = system
-        self.origin = origin or Origin(47.3977, 8.5456, 488.0)
+        self.origin = origin or ORIGIN
         self.faults = faults or Faults()
         self._random = random.Random(seed)
         self._boot_s = boot_s

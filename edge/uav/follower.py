@@ -16,6 +16,7 @@ import numpy as np
 from google.protobuf.message import Message
 
 from edge.uav import models
+from edge.uav.georeference import Georeference
 from edge.uav.navigation import Origin, from_quaternion
 from edge.uav.tracker import Box, Estimate, Image, State, Telemetry, Tracker
 from protocols.clocks import NANOSECONDS
@@ -55,6 +56,8 @@ class Follower:
         self._agent, self._boot = agent, boot_id
         self._size, self._fps, self._seed, self._model = size, fps, seed, model
         self._lens, self._mounting = lens, body_from_camera
+        usable = lens is not None and body_from_camera is not None
+        self._georeference = Georeference(lens, body_from_camera) if usable else None  # type: ignore[arg-type]
         self._samples: deque[Telemetry] = deque(maxlen=_REMEMBERED)
         self._tracker: Tracker | None = None
         self._image: Image | None = None
@@ -89,7 +92,7 @@ class Follower:
         self._image, self._frame, self._time_ns = image, frame, device_time_ns
         if self._tracker is None:
             return []
-        self.estimate = self._tracker.handle_frame(image, device_time_ns / NANOSECONDS)
+        self.estimate = self._in_vehicles_frame(self._tracker.handle_frame(image, device_time_ns / NANOSECONDS))
         return self._say()
 
     def box_about(self, x: float, y: float) -> Box:
@@ -112,6 +115,8 @@ class Follower:
             self.origin = Origin(*message.origin)
         sample = Telemetry(message.device_time_ns / NANOSECONDS, turned, position)
         self._samples.append(sample)
+        if self._georeference is not None:
+            self._georeference.add(sample)
         if self._tracker is not None:
             self._tracker.handle_telemetry(sample)
 
@@ -131,8 +136,15 @@ class Follower:
             self.refused += 1  # what was followed goes on being followed
             return []
         self._targets += 1
-        self._tracker, self.estimate = tracker, estimate
+        if self._georeference is not None:
+            self._georeference.clear()
+        self._tracker, self.estimate = tracker, self._in_vehicles_frame(estimate)
         return self._say()
+
+    def _in_vehicles_frame(self, estimate: Estimate) -> Estimate:
+        if self._georeference is None:
+            return estimate
+        return self._georeference.corrected(estimate, self._time_ns / NANOSECONDS)
 
     def _say(self) -> list[Message]:
         estimate = self.estimate
@@ -190,6 +202,8 @@ class Follower:
         chosen = chosen[:: max(1, -(-len(chosen) // _ROAD_POINTS))]
         message.pixels.extend(pixels[chosen].ravel())
         if ground is not None:
+            if self._georeference is not None and self._georeference.offset is not None:
+                ground = ground + self._georeference.offset
             message.ground.extend(ground[chosen].ravel())
         return message
 

@@ -22,7 +22,6 @@ _SEARCH_S = 0.7
 _WINDOW_S = 24.0
 _FIRST_S, _EVERY_S = 6.0, 2.0
 _GOOD_STD_S = 0.0045  # good enough to stop looking for a while
-_USABLE_STD_S = 0.02
 _REST_S = 60.0
 _CAREFUL_S = 0.015  # by more than this the map is not moved under a tracker that works with it
 _STEP_S = 0.15  # by more, and what was known is void
@@ -107,9 +106,6 @@ class Aligner:
         answer = find_offset(turning, samples, self._mounting, (-_SEARCH_S, _SEARCH_S))
         if isinstance(answer, str):
             self.why = answer
-            return
-        if answer.std > _USABLE_STD_S:
-            self.why = f"known to {1e3 * answer.std:.0f} ms only"
             return
         self.why = ""
         old = self.found

@@ -1,11 +1,14 @@
 """The UAV agent: how quick it is, how well it finds the telemetry's clock, and whether its loops close.
 
-    python -m tests.bench.uav_agent [--only latency,offset,tlog,gimbal,follow] [--seeds 4] [--first-seed 700]
+    python -m tests.bench.uav_agent [--only latency,offset,tlog,gimbal,follow,fixed] [--seeds 4] [--first-seed 700]
 
 latency: CPU from a frame's arrival to its status on the link, 640x480 with a target. offset: error of the map from the
 vehicle's clock to the camera's, 26 s after the start, on the simulated aircraft. tlog: the same on flight/plane.tlog,
-beside frames drawn from its attitude. gimbal, follow: pushes that take the car out of the picture, and how often the
-agent's own commands bring it back within 12 s. Leaves with status 1 if a figure is missed.
+beside frames drawn from its attitude, 40 s at a time; standing on the ground: refused, or true. gimbal, follow: pushes
+that take the car out of the picture, and how often the agent's own commands bring it back within 12 s; gimbal: it is
+turned away; follow: a gust of 20 m/s carries an aircraft away whose camera hangs level and looks down, and is not
+pointed. fixed (only if asked for): the same with the camera on the airframe, which looks away from where it
+accelerates. Leaves with status 1 if a figure is missed.
 """
 
 from __future__ import annotations
@@ -35,6 +38,11 @@ FPS = 30.0
 _BACK_S = 12.0
 _PITCH = np.deg2rad(-62.0)
 _HEIGHT = 62.0
+_PUSHES_S, _FLIGHT_S = (8.0, 24.0), 40.0
+_GUST = 20.0  # m/s
+_IN_THE_AIR = (574.0, 595.0, 616.0)  # s since its start; before, plane.tlog's aircraft stands on the ground
+_ON_THE_GROUND = 300.0
+_LOOKED_AT_S = 40.0
 
 
 def latency(seeds: list[int]) -> bool:
@@ -89,10 +97,10 @@ def tlog(data: Path) -> bool:
     lens = Intrinsics(640, 480, np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 239.5], [0.0, 0.0, 1.0]]))
     ground = _texture()
     good = True
-    for begin in (150.0, 300.0, 450.0):
+    for begin in (*_IN_THE_AIR, _ON_THE_GROUND):
         seen = SeenTurning((640, 480), lens)
         tilt = usual_tilt(samples, BODY_FROM_DOWN_CAMERA)
-        for k in range(round(40.0 * FPS)):
+        for k in range(round(_LOOKED_AT_S * FPS)):
             moment = begin + 0.1234 + k / FPS
             camera = BODY_FROM_DOWN_CAMERA.T @ turned(moment).as_matrix().T
             place = np.array([3.0 * np.sin(0.2 * moment), 12.0 * k / FPS - 200.0, -80.0])
@@ -100,11 +108,11 @@ def tlog(data: Path) -> bool:
         answer = find_offset(seen.turning(), samples, BODY_FROM_DOWN_CAMERA)
         if isinstance(answer, str):
             print(f"tlog: from {begin:.0f} s: refused: {answer}", flush=True)
-            good = False
+            good &= begin == _ON_THE_GROUND
             continue
         error = answer.offset - begin - 0.1234
         print(f"tlog: from {begin:.0f} s: {1e3 * error:+.1f} ms, says +-{1e3 * answer.std:.1f} ms (asked for: 5 ms)")
-        good &= abs(error) <= 0.005
+        good &= abs(error) <= (3.0 * answer.std if begin == _ON_THE_GROUND else 0.005)
     return good
 
 
@@ -127,28 +135,31 @@ def _draw(ground: np.ndarray, lens: Intrinsics, camera_from_ned: np.ndarray, pla
 def loops(seeds: list[int], kind: str) -> bool:
     """Push the camera away from the car; count how often it comes back by the agent's own commands."""
     back = exits = 0
+    longest = 0.0
     for seed in seeds:
-        world = patrol(seed, 34.0)
+        world = patrol(seed, _FLIGHT_S + 0.5)
         rng = np.random.default_rng(seed)
         yaw = float(world.target.course[0])
         start = np.array([*world.target.ground[0], -_HEIGHT])
         pushes = []
-        for begin in (8.0, 19.0):
+        for begin in _PUSHES_S:
             angle = rng.uniform(-np.pi, np.pi)
             if kind == "gimbal":
                 turn = (float(rng.choice([-1.0, 1.0]) * 0.1), float(rng.choice([-1.0, 1.0]) * rng.uniform(0.7, 1.0)))
                 pushes.append(Push(begin, 0.9, turn=turn))
             else:
-                speed = 16.0
-                pushes.append(Push(begin, 3.0, velocity=(speed * float(np.cos(angle)), speed * float(np.sin(angle)))))
+                pushes.append(Push(begin, 3.0, velocity=(_GUST * float(np.cos(angle)), _GUST * float(np.sin(angle)))))
         gimbal = None
         if kind == "gimbal":
             start[:2] -= _HEIGHT / np.tan(-_PITCH) * np.array([np.cos(yaw), np.sin(yaw)])
             gimbal = (float(_PITCH), yaw)
+        elif kind == "follow":
+            gimbal = (-0.5 * np.pi, yaw)
         control = ControlConfig(gimbal=kind == "gimbal", follow=kind != "gimbal", coast_s=15.0)
         flight = Flight(
-            world, control=control, flies="follow", gimbal=gimbal, start=start, yaw=yaw, pushes=tuple(pushes), seed=seed
-        )
+            world, control=control, flies="follow", gimbal=gimbal, start=start, yaw=yaw, pushes=tuple(pushes),
+            seed=seed, piloted=kind != "gimbal",
+        )  # fmt: skip
         inside: list[tuple[float, float]] = []
 
         def watch(frame: int, flight: Flight = flight, inside: list[tuple[float, float]] = inside) -> None:
@@ -160,18 +171,24 @@ def loops(seeds: list[int], kind: str) -> bool:
             print(f"{kind}: seed {seed}: no target could be selected")
             exits += len(pushes)
             continue
-        flight.run(33.5)
+        flight.run(_FLIGHT_S)
         table = np.array(inside)
         for push in pushes:
-            after = (table[:, 0] > push.begin) & (table[:, 0] < push.begin + push.seconds + _BACK_S)
+            # Up to the next push at most: what that one does is not this one's.
+            until = min([push.begin + push.seconds + _BACK_S, *(p.begin for p in pushes if p.begin > push.begin)])
+            after = (table[:, 0] > push.begin) & (table[:, 0] < until)
             away = table[after & (table[:, 1] == 0.0), 0]
             if not len(away):
                 continue
             exits += 1
+            longest = max(longest, float(away[-1] - away[0]))
             back += bool((table[after & (table[:, 0] > away[-1]), 1] > 0.9).any())
         print(f"{kind}: seed {seed}: {back} of {exits} so far", flush=True)
     share = back / exits if exits else 0.0
-    print(f"{kind}: the car is back in the picture after {back} of {exits} exits (asked for: 90 %)")
+    print(
+        f"{kind}: the car is back in the picture after {back} of {exits} exits (asked for: 90 %), "
+        f"from first out to last out at most {longest:.1f} s"
+    )
     return exits > 0 and share >= 0.9
 
 
@@ -189,6 +206,7 @@ def main() -> int:
         "tlog": lambda: tlog(options.data),
         "gimbal": lambda: loops(seeds, "gimbal"),
         "follow": lambda: loops(seeds, "follow"),
+        "fixed": lambda: loops(seeds, "fixed"),
     }
     unknown = set(options.only.split(",")) - set(parts)
     if unknown:

@@ -21,6 +21,7 @@ from pymavlink import mavutil
 from deploy import uav
 from deploy.config import load
 from deploy.uav_config import FlightConfig, UavConfig
+from edge.mavlink.autopilot import ORIGIN
 from edge.uav.world.world import World
 from protocols.bus.memory import MemoryBus, MemoryHub
 from protocols.catalogue import TOPICS
@@ -122,13 +123,13 @@ def built_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def newest_frame(subscriptions: Any) -> int:
+    assert eventually(lambda: subscriptions["flight_image"].wait(0.1))
     images = [received.message for received in subscriptions["flight_image"].drain()]
     return int(images[-1].frame)
 
 
 def select(gcs: Gcs, world: World, subscriptions: Any) -> None:
     width, height = world.size
-    assert eventually(lambda: subscriptions["flight_image"].wait(0.1))
     for _ in range(40):
         box = world.truth(newest_frame(subscriptions)).box
         corners = (box.x / width, box.y / height, (box.x + box.width) / width, (box.y + box.height) / height)
@@ -158,7 +159,11 @@ def test_a_ground_station_selects_a_car_and_hears_where_it_is_also_out_of_the_pi
         seen = gcs.wait("CAMERA_TRACKING_IMAGE_STATUS", lambda m: m.tracking_status == ACTIVE)
         assert 0.0 <= seen.rec_top_x < seen.rec_bottom_x <= 1.0
         place = gcs.wait("CAMERA_TRACKING_GEO_STATUS", lambda m: m.tracking_status == ACTIVE and m.lat != 0x7FFFFFFF)
+        north, east, _ = ORIGIN.local(1e-7 * place.lat, 1e-7 * place.lon, 0.0)
+        frame = newest_frame(subscriptions)
+        lately = world.target.ground[max(frame - 60, 0) : frame + 1]  # where the car was within the last two seconds
         assert 0.0 < place.h_acc < 5.0
+        assert np.hypot(*(lately - [north, east]).T).min() < max(3.0 * place.h_acc, 1.0)
         # The flight loses the car within 12 s.
         away = gcs.wait("CAMERA_TRACKING_IMAGE_STATUS", lambda m: m.tracking_status == ACTIVE | COASTING, 30.0)
         assert np.isnan(away.rec_top_x) or away.rec_bottom_x <= 1.0

@@ -101,6 +101,12 @@ class World:
         """Of a frame on the video's clock [s]; frame 0 is at 0."""
         return frame / self.fps
 
+    def target_at(self, time: float) -> tuple[Floats, Floats]:
+        """Place and velocity (2,) of the target at any moment [s]: north, east [m, m/s]."""
+        i = int(np.clip(np.floor(time * self.fps), 0, self.length - 2))
+        velocity = (self.target.ground[i + 1] - self.target.ground[i]) * self.fps
+        return self.target.ground[i] + (time - self.time(i)) * velocity, velocity
+
     def frame(self, i: int) -> npt.NDArray[np.uint8]:
         """The picture (h, w, 3) BGR of frame ``i``."""
         return self.draw(i)

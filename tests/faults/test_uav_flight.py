@@ -111,7 +111,10 @@ def test_an_aircraft_that_may_be_told_to_follow_is_told_and_stops_when_the_opera
     assert sent > 10
     told = flight.station.last("CAMERA_TRACKING_GEO_STATUS")
     north, east, _ = flight.autopilot.origin.local(1e-7 * told.lat, 1e-7 * told.lon, 0.0)
-    assert np.hypot(*(world.target.ground[flight.frame] - [north, east])) < 6.0
+    lately = world.target.ground[flight.frame - 10 : flight.frame + 1]  # it is told five times a second
+    assert np.hypot(*(lately - [north, east]).T).min() < min(max(3.0 * told.h_acc, 0.5), 3.0)
+    moment, place, _ = flight.aircraft._target  # type: ignore[misc]
+    assert np.hypot(*(place[:2] - world.target_at(moment)[0])) < 2.0
     car = world.target.ground[flight.frame] - world.target.ground[flight.frame - 30]
     moving = flight.aircraft.pose(flight.time).velocity[:2]
     assert float(moving @ car) / float(np.linalg.norm(car)) > 2.0  # from a standstill, after the car
@@ -121,22 +124,3 @@ def test_an_aircraft_that_may_be_told_to_follow_is_told_and_stops_when_the_opera
     flight.run(4.0)
     assert flight.autopilot.counters["follow_targets"] == sent
     assert flight.agent.status(0).message == "stopped by the operator"
-
-
-def test_with_a_key_an_unsigned_station_commands_nothing(world: World) -> None:
-    key = bytes(range(32))
-    flight = Flight(world, key=key)
-    flight.run(1.5)
-    flight.station.codec.signing.sign_outgoing = False
-    stranger = mavlink.MAVLink_command_long_message(
-        1, 100, mavlink.MAV_CMD_CAMERA_TRACK_POINT, 0, 0.5, 0.5, 0, 0, 0, 0, 0
-    )
-    # Past the autopilot, straight onto the agent's wire.
-    assert flight.agent_pipe.other is not None
-    flight.agent_pipe.other.send(bytes(stranger.pack(flight.station.codec)), None)
-    flight.run(1.7)
-    assert flight.link.counters["refused.unsigned"] == 1
-    assert not flight.agent.follower.following
-    flight.station.codec.signing.sign_outgoing = True
-    assert flight.select()
-    assert flight.agent.follower.following
