@@ -1,8 +1,13 @@
-"""Runs the fault tests and prints the matrix: `python -m tests.faults [pytest arguments]`; `make faults`."""
+"""Runs the fault tests and prints the matrix: `python -m tests.faults [pytest arguments]`; `make faults`.
+
+What failed is tried once more, one test after the other: these tests kill, freeze and impair processes, and two of them
+at once on two cores impair each other. What passes only then is told.
+"""
 
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import tempfile
 import time
@@ -12,13 +17,19 @@ import pytest
 
 from tests.faults.matrix import VARIABLE, table
 
+_HERE = str(Path(__file__).parent)
+
 
 def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "matrix.jsonl"
         os.environ[VARIABLE] = str(file)
         began = time.monotonic()
-        status = pytest.main([str(Path(__file__).parent), *sys.argv[1:]])
+        status = pytest.main([_HERE, *sys.argv[1:]])
+        if status == pytest.ExitCode.TESTS_FAILED:
+            print("\nSECOND TRY of what failed, one test after the other:", flush=True)
+            again = [sys.executable, "-m", "pytest", _HERE, "--last-failed", "--last-failed-no-failures", "none"]
+            status = subprocess.run(again, check=False).returncode
         print(f"\n{table(file)}\n\n{time.monotonic() - began:.0f} s, {os.cpu_count()} cores")
     return int(status)
 
