@@ -28,7 +28,7 @@ def get(name: str, seed: int, cameras: int | None = None, mixed_fps: bool = Fals
     from edge.scenes.marker import marker_field, marker_room
 
     if name not in NAMES:
-        raise InputError(f"there is no scene {name!r}", remedy=f"use one of {', '.join(NAMES)}")
+        raise InputError(f"there is no scene {name!r}", remedy=f"use one of {', '.join((*NAMES, PEOPLE))}, or town")
     if cameras is not None and cameras < 2:
         raise InputError(f"a scene needs at least 2 cameras, not {cameras}", remedy="give --cameras 2 or more")
     if name == "marker-outdoor":
