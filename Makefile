@@ -37,6 +37,10 @@ bench: $(STAMP)
 faults: $(STAMP)
 	$(BIN)/python -m tests.faults -n 2 --dist loadfile
 
+# The live view, the page of `quick` and the report in headless Chromium; without one the tests skip, loudly.
+browser: $(STAMP)
+	$(BIN)/python -m pytest tests/browser
+
 # A million and more damaged inputs for every decoder of what others send; seed by the time, told in the output.
 fuzz: $(STAMP)
 	$(BIN)/python -m tests.faults.fuzz
