@@ -32,7 +32,7 @@ from hub.nodes.two_cameras import Relative
 from protocols.geometry.pose import Pose, Similarity
 from protocols.geometry.types import Floats
 
-_BATCH = 24
+_BATCH = 32
 """Observations that are taken in together: the cost of a batch hardly depends on its size."""
 _PATIENCE = 4
 """Updates that an observation waits at the longest."""
