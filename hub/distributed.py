@@ -16,6 +16,7 @@ from hub.nodes.local import LocalNetwork
 from hub.nodes.messages import Reference, SharedObservation
 from hub.nodes.node import PoseNode
 from hub.nodes.pairing import GAP
+from hub.nodes.spread import each_once, joined, position_stds
 from hub.poses.adjust import adjust
 from hub.poses.gauge import fix_gauge
 from hub.poses.graph import ClockGraph
@@ -189,7 +190,7 @@ def with_node_poses(found: Calibration, rig: Rig, nodes: NodeHost) -> Calibratio
 def node_calibration(rig: Rig, nodes: NodeHost | None) -> Calibration:
     """The network's poses as a calibration, where no timing is sought.
 
-    Position stds are 0: a host knows no more than its own cameras' information.
+    Position stds are of all cameras together, from what every edge has learnt.
 
     Raises Refused while fewer than two cameras have settled.
     """
@@ -199,16 +200,23 @@ def node_calibration(rig: Rig, nodes: NodeHost | None) -> Calibration:
     refused |= {} if nodes is None else nodes.refused
     if len(names) < 2:
         raise Refused("fewer than two pose nodes have settled", refused)
+    assert nodes is not None
+    edges = each_once(nodes.learnt())
+    tied = joined(names, edges)
+    refused |= {name: "what its pose node has learnt is not known here yet" for name in names if name not in tied}
+    names = [name for name in names if name in tied]
+    if len(names) < 2:
+        raise Refused("fewer than two pose nodes have settled", refused)
     rig, aside = trusted(rig, names, [poses[name] for name in names])
     gauge = fix_gauge(rig, names, [poses[name] for name in names])
+    stds = position_stds({name: poses[name] for name in names}, edges, gauge.similarity, gauge.information)
     cameras = {}
     for name in names:
-        assert nodes is not None
         lens = rig.cameras[name].intrinsics
         assert lens is not None
         rate, offset, std = nodes.clock(name)
         pose = gauge.similarity.pose(poses[name])
-        cameras[name] = CameraCalibration(name, lens, pose, TimeMap(rate, offset), std, np.zeros(3), 0.0)
+        cameras[name] = CameraCalibration(name, lens, pose, TimeMap(rate, offset), std, stds[name], 0.0)
     return Calibration(
         cameras=cameras,
         reference=names[0],

@@ -347,6 +347,7 @@ def _node_edge(edge: pb.NodeEdge) -> None:
     ):
         _vector(values, name, (length,))
     _number(edge.count, "count", 0.0)
+    _number(edge.chi2, "chi2", 0.0)
 
 
 def _node_anchor(anchor: pb.NodeAnchor) -> None:

@@ -41,7 +41,8 @@ _MEMORY = 200_000.0
 class Summary:
     """Half chi2 of a relative pose about ``anchor``: ½ eᵀ hessian e + gradientᵀ e, e = anchor.step_to(pose).
 
-    bearings: no sizes, so the length of ``centre`` is free: a pose is first rescaled to the anchor's.
+    bearings: no sizes, so the length of ``centre`` is free: a pose is first rescaled to the anchor's. chi2: what the
+    observations that count left over, 1 dof each, with sizes 3.
     """
 
     anchor: Relative
@@ -49,6 +50,7 @@ class Summary:
     gradient: Floats
     count: float
     bearings: bool
+    chi2: float = 0.0
 
     def step_to(self, pose: Relative) -> Floats:
         """e (6,) of a pose."""
@@ -84,13 +86,14 @@ class Summary:
             summary = self._in_unit(factor)
         step = summary.anchor.step_to(pose)
         gradient = summary.gradient + summary.hessian @ step
-        return Summary(pose, summary.hessian, gradient, summary.count, summary.bearings)
+        return Summary(pose, summary.hessian, gradient, summary.count, summary.bearings, summary.chi2)
 
     def _in_unit(self, factor: float) -> Summary:
         """Lengths times ``factor``: an exact rescaling (METHODS C, step 3)."""
         scale = np.array([1.0, 1.0, 1.0, 1.0 / factor, 1.0 / factor, 1.0 / factor])
         hessian = self.hessian * scale * scale[:, None]
-        return Summary(self.anchor.scaled(factor), hessian, self.gradient * scale, self.count, self.bearings)
+        anchor = self.anchor.scaled(factor)
+        return Summary(anchor, hessian, self.gradient * scale, self.count, self.bearings, self.chi2)
 
 
 @dataclass(slots=True, eq=False)
@@ -248,6 +251,7 @@ class Edge:
             summary.gradient * fade + certain[36:],
             summary.count * fade + taken,
             summary.bearings,
+            summary.chi2 * fade + float(terms.chi2[inside].sum()),
         )
         self.short.add(bounded, count)
         self.long.add(bounded, count)
@@ -274,8 +278,10 @@ class Edge:
         gate = gate_of(weights)
         terms = linearise(point, rows, weights)
         hessian, gradient = total(terms, gate)
-        count = float(robust_weight(terms, gate).sum())
-        self.summary = Summary(point, hessian, gradient, count, not bool((weights[:, [1, 3]] > 0).any()))
+        weight = robust_weight(terms, gate)
+        bearings = not bool((weights[:, [1, 3]] > 0).any())
+        chi2 = float((weight * terms.chi2)[terms.ahead].sum())
+        self.summary = Summary(point, hessian, gradient, float(weight.sum()), bearings, chi2)
 
     def _still_good(self, predicted: Relative | None) -> bool:
         """Nothing new, and the network's prediction hardly moved against what the edge knows."""

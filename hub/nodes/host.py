@@ -15,10 +15,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from google.protobuf.message import Message
 
+from hub.nodes.edge import Summary
 from hub.nodes.messages import Notice, Reference, SharedObservation, StateMessage
 from hub.nodes.node import PoseNode
 from hub.nodes.pairing import GAP
-from hub.nodes.wire import edges_from_wire, edges_to_wire, number_of, state_from_wire, state_to_wire
+from hub.nodes.wire import edges_from_wire, edges_to_wire, name_of, number_of, state_from_wire, state_to_wire
 from protocols.clocks import NANOSECONDS
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
@@ -186,6 +187,21 @@ class NodeHost:
             if state.pose is not None and state.frame == frame and state.settled >= _SETTLED
             if camera not in self.refused
         }
+
+    def learnt(self) -> dict[str, dict[str, Summary]]:
+        """What every node of the network has learnt of its neighbours, as far as heard, by name."""
+        out: dict[str, dict[str, Summary]] = {}
+        for camera in sorted({*self._edges, *self._hosted}):
+            hosted, told = self._hosted.get(camera), self._edges.get(camera)
+            if hosted is not None:
+                edges = hosted.node.neighbours().items()
+                known = {other: edge.summary for other, edge in edges if edge.summary is not None}
+            elif told is not None and told.epoch == self._states[camera].epoch:
+                known = edges_from_wire(list(told.edges))
+            else:
+                continue
+            out[camera] = {name_of(other): summary for other, summary in known.items()}
+        return out
 
     def clock(self, camera: str) -> tuple[float, float, float]:
         """(rate, offset, std) of the camera's time map as the nodes use it."""

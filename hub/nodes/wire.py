@@ -110,6 +110,7 @@ def edges_to_wire(summaries: Mapping[int, Summary]) -> list[pb.NodeEdge]:
             gradient=summary.gradient.tolist(),
             count=summary.count,
             bearings=summary.bearings,
+            chi2=summary.chi2,
         )
         for neighbour, summary in summaries.items()
     ]
@@ -125,6 +126,6 @@ def edges_from_wire(edges: list[pb.NodeEdge]) -> dict[int, Summary]:
         anchor = Relative(so3.exp(np.array(edge.rotation)), np.array(edge.centre))
         if (hessian.diagonal() >= 0.0).all():
             out[number_of(edge.neighbour)] = Summary(
-                anchor, hessian, np.array(edge.gradient), edge.count, edge.bearings
+                anchor, hessian, np.array(edge.gradient), edge.count, edge.bearings, edge.chi2
             )
     return out

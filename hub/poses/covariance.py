@@ -11,6 +11,7 @@ from hub.poses.linear import BAND, eliminate
 from hub.poses.problem import CAMERA_PARAMETERS, OFFSET, RATE, Problem, State
 from hub.splines import SUPPORT
 from protocols.geometry import so3
+from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 
 
@@ -42,7 +43,7 @@ def covariance(problem: Problem, state: State, prior: MotionPrior, references: F
     if problem.freedom.pose:
         known = np.zeros((len(state.cameras) * CAMERA_PARAMETERS,) * 2) if references is None else references
         information = information + known[np.ix_(columns, columns)]
-        held = held_rows(state, known)[:, columns]
+        held = held_rows([camera.pose for camera in state.cameras], known)[:, columns]
     if held is not None and len(held):
         _, _, vt = np.linalg.svd(held)
         tangent = vt[len(held) :].T
@@ -77,25 +78,25 @@ def turn_stds(covariance: Covariance, state: State) -> Floats:
     return out
 
 
-def gauge_generators(state: State) -> Floats:
+def gauge_generators(poses: list[Pose]) -> Floats:
     """(17 n, 7): how all cameras move under a small translation, rotation and scaling of the world."""
     rows = []
-    for camera in state.cameras:
+    for pose in poses:
         block = np.zeros((CAMERA_PARAMETERS, 7))
         block[3:6, :3] = np.eye(3)
-        block[:3, 3:6] = -camera.pose.rotation
-        block[3:6, 3:6] = -so3.hat(camera.pose.position)
-        block[3:6, 6] = camera.pose.position
+        block[:3, 3:6] = -pose.rotation
+        block[3:6, 3:6] = -so3.hat(pose.position)
+        block[3:6, 6] = pose.position
         rows.append(block)
     return np.concatenate(rows)
 
 
-def held_rows(state: State, references: Floats) -> Floats:
+def held_rows(poses: list[Pose], references: Floats) -> Floats:
     """Constraint rows (q, 17 n) on the gauge directions that the references leave open."""
-    generators = gauge_generators(state)
+    generators = gauge_generators(poses)
     default = np.zeros((7, len(generators)))
     default[np.arange(6), np.arange(6)] = 1.0
-    apart = state.cameras[1].pose.position - state.cameras[0].pose.position
+    apart = poses[1].position - poses[0].position
     apart = apart / np.linalg.norm(apart)
     default[6, 3:6] = -apart
     default[6, CAMERA_PARAMETERS + 3 : CAMERA_PARAMETERS + 6] = apart

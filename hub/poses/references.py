@@ -55,7 +55,7 @@ def _step(
     state: State,
 ) -> Floats:
     matrix = reduced + terms.information[np.ix_(columns, columns)]
-    held = held_rows(state, terms.information)[:, columns]
+    held = held_rows([camera.pose for camera in state.cameras], terms.information)[:, columns]
     if not len(held):
         return np.asarray(np.linalg.solve(matrix, right))
     tangent = np.linalg.svd(held)[2][len(held) :].T

@@ -262,7 +262,7 @@ class AgentStatus(_message.Message):
     def __init__(self, schema_version: _Optional[int] = ..., agent: _Optional[str] = ..., role: _Optional[str] = ..., boot_id: _Optional[str] = ..., sequence: _Optional[int] = ..., state: _Optional[str] = ..., message: _Optional[str] = ..., counters: _Optional[_Mapping[str, float]] = ..., gauges: _Optional[_Mapping[str, float]] = ..., version: _Optional[str] = ...) -> None: ...
 
 class NodeEdge(_message.Message):
-    __slots__ = ("neighbour", "rotation", "centre", "hessian", "gradient", "count", "bearings")
+    __slots__ = ("neighbour", "rotation", "centre", "hessian", "gradient", "count", "bearings", "chi2")
     NEIGHBOUR_FIELD_NUMBER: _ClassVar[int]
     ROTATION_FIELD_NUMBER: _ClassVar[int]
     CENTRE_FIELD_NUMBER: _ClassVar[int]
@@ -270,6 +270,7 @@ class NodeEdge(_message.Message):
     GRADIENT_FIELD_NUMBER: _ClassVar[int]
     COUNT_FIELD_NUMBER: _ClassVar[int]
     BEARINGS_FIELD_NUMBER: _ClassVar[int]
+    CHI2_FIELD_NUMBER: _ClassVar[int]
     neighbour: str
     rotation: _containers.RepeatedScalarFieldContainer[float]
     centre: _containers.RepeatedScalarFieldContainer[float]
@@ -277,7 +278,8 @@ class NodeEdge(_message.Message):
     gradient: _containers.RepeatedScalarFieldContainer[float]
     count: float
     bearings: bool
-    def __init__(self, neighbour: _Optional[str] = ..., rotation: _Optional[_Iterable[float]] = ..., centre: _Optional[_Iterable[float]] = ..., hessian: _Optional[_Iterable[float]] = ..., gradient: _Optional[_Iterable[float]] = ..., count: _Optional[float] = ..., bearings: _Optional[bool] = ...) -> None: ...
+    chi2: float
+    def __init__(self, neighbour: _Optional[str] = ..., rotation: _Optional[_Iterable[float]] = ..., centre: _Optional[_Iterable[float]] = ..., hessian: _Optional[_Iterable[float]] = ..., gradient: _Optional[_Iterable[float]] = ..., count: _Optional[float] = ..., bearings: _Optional[bool] = ..., chi2: _Optional[float] = ...) -> None: ...
 
 class NodeAnchor(_message.Message):
     __slots__ = ("camera", "epoch", "sequence", "rotation", "position", "world_rotation", "world_position", "rotation_std", "position_std", "aside")

@@ -75,6 +75,9 @@ def test_two_hosts_carry_one_network_and_one_goes_on_when_the_other_dies() -> No
     assert len(before) == 5
     assert max(before) < 3.0
     assert before == site.errors("b")
+    stds = node_calibration(known_rig(site.world), site.hosts["a"]).cameras
+    for camera, off in zip(("cam2", "cam3", "cam4"), before[2:], strict=True):
+        assert 0.0 < off < 4.0 * float(np.linalg.norm(stds[camera].position_std)) < 6.0
     taken = site.hosts["a"].counters["taken_over"]
     site.kill("b")
     site.tick(1)
