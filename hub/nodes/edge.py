@@ -65,7 +65,7 @@ class Summary:
 
     def best_step(self) -> Floats:
         """From the anchor to the minimum (6,); directions without information stay."""
-        return _solve(self.hessian, -self.gradient)
+        return solve_semidefinite(self.hessian, -self.gradient)
 
     def excess(self, pose: Relative) -> float:
         """How much half chi2 at ``pose`` lies above the minimum.
@@ -386,7 +386,7 @@ def _well_told(pose: Relative, rows: Floats, weights: Floats) -> bool:
     return bool(turn < _TURN_STD and centre < _CENTRE_STD)
 
 
-def _solve(hessian: Floats, right: Floats) -> Floats:
+def solve_semidefinite(hessian: Floats, right: Floats) -> Floats:
     """Solution of a positive semidefinite system (6, 6); directions without information get about 0."""
     scale = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-300))
     normalised = hessian * scale * scale[:, None]
