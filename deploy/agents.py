@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from deploy.config import CameraConfig, HubConfig, OakConfig, SimulatedConfig
+from deploy.config import CameraConfig, HubConfig, OakConfig, PiConfig, SimulatedConfig, UsbConfig
 from deploy.outputs import write_outputs, write_refusal
 from edge.detectors.base import Detector
 from edge.devices.base import Device
@@ -44,6 +44,7 @@ def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event, beat: Ca
         stop,
         known=known,
         pictures_hz=config.pictures_hz,
+        picture_width=config.picture_width,
         predictions=config.detector != "marker",
     )
     return EXIT_DONE
@@ -54,6 +55,12 @@ def _detector(config: CameraConfig, lens: Intrinsics | None, fps: float) -> Dete
         from edge.detectors.marker import MarkerDetector, MarkerModel
 
         marker = config.marker
+        if marker.mode != "colour":
+            from deploy.detecting import other_marker
+
+            return other_marker(
+                marker.mode, marker.threshold, marker.dictionary, marker.label, marker.min_size, marker.max_size
+            )
         model = MarkerModel.default() if marker.colour is None else MarkerModel.of_colour(*marker.colour)
         return MarkerDetector(
             replace(model, label=marker.label),
@@ -77,9 +84,9 @@ def _fps(config: CameraConfig) -> float:
     """What the configuration says of the frame rate; 25 where it says nothing."""
     if config.driver == "video" and config.video is not None and config.video.fps is not None:
         return config.video.fps
-    if config.driver == "oak" and config.oak is not None:
-        return config.oak.fps
-    return 25.0
+    tables = {"oak": config.oak, "usb": config.usb, "picamera2": config.picamera2, "rtsp": config.rtsp}
+    table = tables.get(config.driver)
+    return 25.0 if table is None or table.fps is None else table.fps
 
 
 def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable[[], None] = lambda: None) -> int:
@@ -134,6 +141,27 @@ def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:
         oak = config.oak or OakConfig()
         settings = OakSettings(oak.device, oak.socket, oak.size, oak.fps, oak.exposure_us, oak.iso, oak.focus)
         return OakCamera(settings, intrinsics=intrinsics)
+    if config.driver == "usb":
+        from edge.devices.usb import UsbSettings, open_usb
+
+        usb = config.usb or UsbConfig()
+        place = f"/dev/video{usb.device}" if usb.device.isdigit() else str(usb.device)
+        return open_usb(
+            UsbSettings(place, usb.size, usb.fps, usb.pixels, usb.exposure_us, usb.gain, usb.readout_s),
+            intrinsics=intrinsics,
+        )
+    if config.driver == "picamera2":
+        from edge.devices.picamera import PiCamera, PiSettings
+
+        pi = config.picamera2 or PiConfig()
+        made = PiSettings(pi.camera, pi.size, pi.fps, pi.exposure_us, pi.gain, pi.readout_s)
+        return PiCamera(made, intrinsics=intrinsics)
+    if config.driver == "rtsp":
+        from edge.devices.network import open_network
+
+        assert config.rtsp is not None  # the configuration has seen to that
+        url, transport = config.rtsp.url, config.rtsp.transport
+        return open_network(url, transport=transport, fps=config.rtsp.fps, intrinsics=intrinsics)
     from edge.devices.pacing import RealTime
     from edge.devices.video import open_video
 

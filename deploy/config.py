@@ -21,10 +21,13 @@ __all__ = [
     "MarkerConfig",
     "MovingConfig",
     "OakConfig",
+    "PiConfig",
     "RecorderConfig",
     "RouterConfig",
+    "RtspConfig",
     "SimulatedConfig",
     "Source",
+    "UsbConfig",
     "VideoConfig",
     "ViewConfig",
     "effective_toml",
@@ -96,7 +99,9 @@ class RecorderConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     part_s, part_mb: begin a new file, name-000.mcap, name-001.mcap, …, when the present one is so old or so large
     [MB]; None = one file. min_free_mb, min_free_percent: recording ends, with a whole log, before less than this is
     free on the disk.
-    foxglove: also write calibration, transforms, scene and annotations as Foxglove and rerun know them.
+    foxglove: also write pictures, calibration, transforms, scene and annotations as Foxglove and rerun know them.
+    pictures_hz: at most so many small pictures of each camera are recorded a second, 8 kB each; 0 = none, and none are
+    asked of the cameras.
     """
 
     id: str = "recorder"
@@ -106,6 +111,7 @@ class RecorderConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     min_free_mb: Annotated[float, Meta(ge=0.0, le=1e9)] = 200.0
     min_free_percent: Annotated[float, Meta(ge=0.0, le=100.0)] = 5.0
     foxglove: bool = True
+    pictures_hz: Annotated[float, Meta(ge=0.0, le=30.0)] = 1.0
 
 
 class SimulatedConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -151,14 +157,67 @@ class VideoConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True
     loop: bool = False
 
 
+Size = tuple[Annotated[int, Meta(ge=16, le=16_384)], Annotated[int, Meta(ge=16, le=16_384)]]
+Microseconds = Annotated[int, Meta(ge=1, le=1_000_000)]
+Readout = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+
+class UsbConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[usb]: a V4L2 camera with the kernel's stamps. What is absent stays as the camera is set.
+
+    device: /dev/video0, a stable name of udev's, or a number. size: [w, h]. exposure_us: fixed, so that mid-exposure
+    keeps still. gain: the camera's own units. readout_s: first to last row of a rolling shutter; 0 = not known.
+    """
+
+    device: Source = Source("/dev/video0")
+    size: Size | None = None
+    fps: Hertz | None = None
+    pixels: Literal["MJPG", "YUYV", "GREY"] = "MJPG"
+    exposure_us: Microseconds | None = None
+    gain: Annotated[int, Meta(ge=0, le=1_000_000)] | None = None
+    readout_s: Readout = 0.0
+
+
+class PiConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[picamera2]: a camera on a Raspberry Pi's ribbon cable.
+
+    camera: its number. size: [w, h]. exposure_us, gain: fixed; without exposure_us the camera chooses. readout_s: first
+    to last row; None = the shortest frame that this mode of the sensor can take.
+    """
+
+    camera: Annotated[int, Meta(ge=0, le=15)] = 0
+    size: Size = (1280, 720)
+    fps: Hertz = 30.0
+    exposure_us: Microseconds | None = 5000
+    gain: Annotated[float, Meta(ge=1.0, le=64.0)] | None = None
+    readout_s: Readout | None = None
+
+
+class RtspConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[rtsp]: a network camera: RTSP, or motion JPEG over HTTP.
+
+    url: rtsp://user:password@address/path or http://…. transport: tcp loses nothing, udp is a little faster. fps:
+    None = what the stream says.
+    """
+
+    url: Annotated[str, Meta(pattern=r"^[a-z0-9]+://[^\s]+$", max_length=2048)]
+    transport: Literal["tcp", "udp"] = "tcp"
+    fps: Hertz | None = None
+
+
 class MarkerConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """[marker]: what the marker looks like; what is absent is taken from the picture.
 
-    colour: sRGB, 0..255. min_size, max_size: diameter in the image [px].
+    mode: "colour", one ball of a colour; "bright", an LED or a retro-reflector beside a lamp; "tag", AprilTags or
+    ArUco tags, each labelled by its number, as in tag7. colour: sRGB, 0..255, of a ball. threshold: grey level that a
+    bright marker exceeds. dictionary: family of the tags. min_size, max_size: diameter, of a tag its side [px].
     """
 
     label: Annotated[str, Meta(min_length=1, max_length=64)] = "marker"
+    mode: Literal["colour", "bright", "tag"] = "colour"
     colour: tuple[Byte, Byte, Byte] | None = None
+    threshold: Annotated[int, Meta(ge=30, le=254)] = 200
+    dictionary: Annotated[str, Meta(pattern=r"^[0-9a-z_]{1,32}\Z")] = "apriltag_36h11"
     min_size: Pixels | None = None
     max_size: Pixels | None = None
 
@@ -177,16 +236,21 @@ class MovingConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class CameraConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One camera agent. rig: a rig.toml to take this camera's intrinsics and known pose from.
 
-    pictures_hz: small pictures a second on the bus while a view is open; 0 = none, ever.
+    pictures_hz: small pictures a second on the bus while a view or a recorder wants them; 0 = none, ever.
+    picture_width: of these [px].
     """
 
     id: str
     rig: Path | None = None
     pictures_hz: Annotated[float, Meta(ge=0.0, le=30.0)] = 2.0
-    driver: Literal["simulated", "video", "oak"] = "simulated"
+    picture_width: Annotated[int, Meta(ge=64, le=640)] = 320
+    driver: Literal["simulated", "video", "usb", "picamera2", "rtsp", "oak"] = "simulated"
     detector: Literal["marker", "person", "vehicle"] = "marker"
     simulated: SimulatedConfig | None = None
     video: VideoConfig | None = None
+    usb: UsbConfig | None = None
+    picamera2: PiConfig | None = None
+    rtsp: RtspConfig | None = None
     oak: OakConfig | None = None
     marker: MarkerConfig = msgspec.field(default_factory=MarkerConfig)
     moving: MovingConfig = msgspec.field(default_factory=MovingConfig)
@@ -195,6 +259,8 @@ class CameraConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True
         super().__post_init__()
         if self.driver == "video" and self.video is None:
             raise ValueError('driver = "video" needs a [video] table with source = "…"')
+        if self.driver == "rtsp" and self.rtsp is None:
+            raise ValueError('driver = "rtsp" needs an [rtsp] table with url = "rtsp://…"')
 
 
 class HubConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import tomli_w
 
@@ -117,6 +118,26 @@ def marker_detector(model: MarkerModel, lens: Intrinsics | None, size: tuple[int
     """The detector of one camera; a lens of another image size than the video's says nothing of it."""
     fits = lens is not None and (lens.width, lens.height) == size
     return MarkerDetector(model, lens if fits else None)
+
+
+def other_marker(
+    mode: Literal["bright", "tag"],
+    threshold: int = 200,
+    dictionary: str = "apriltag_36h11",
+    label: str = "marker",
+    min_size: float | None = None,
+    max_size: float | None = None,
+) -> Detector:
+    """The detector of a marker that is no coloured ball; see ``deploy.config.MarkerConfig``. Raises InputError."""
+    if mode == "tag":
+        from edge.detectors.tag import TagDetector, TagModel
+
+        tags = TagModel(dictionary, "tag" if label == "marker" else label)
+        return TagDetector(tags if min_size is None else replace(tags, min_size=min_size))
+    from edge.detectors.bright import BrightDetector, BrightModel
+
+    light = BrightModel(threshold, min_size or 0.0, label=label)
+    return BrightDetector(light if max_size is None else replace(light, max_size=max_size))
 
 
 def read_marker(file: Path) -> MarkerModel:

@@ -7,21 +7,22 @@ a thread of their own, so that nothing the bus does can hold up a capture.
 from __future__ import annotations
 
 import math
-import queue
 import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from google.protobuf.message import Message
 
+from edge.clock_quality import ClockWatcher
 from edge.detectors.base import Detection, Detector
-from edge.devices.base import Device, Frame, Returning
+from edge.devices.base import Device, Frame, Returning, Warm
+from edge.outbox import Outbox
 from edge.picture_watch import PictureWatch
-from edge.pictures import picture_message
+from edge.pictures import WIDTH, picture_message
 from edge.predictions import Predictions
-from protocols.bus.base import Bus, Publisher
+from protocols.bus.base import Bus
 from protocols.catalogue import CAMERA_INFO, OBSERVATION, PICTURE, PREDICTION, STATUS, Topic
 from protocols.clocks import NANOSECONDS
 from protocols.errors import InputError
@@ -34,11 +35,9 @@ ROLE = "camera"
 _READ_TIMEOUT_S = 0.1  # how long a stop may wait for a silent camera
 _INFO_PERIOD_S = 2.0
 _STATUS_PERIOD_S = 1.0
-_UNPLUGGABLE = frozenset({"video", "oak"})  # drivers of real devices, which do not end of themselves
-_IDLE_S = 0.2  # how often it is asked whether there is something to complain of
-_LOOK_S = 1.0  # how often it is asked whether anybody watches
+# Drivers of real devices, which do not end of themselves.
+_UNPLUGGABLE = frozenset({"video", "usb", "picamera2", "rtsp", "oak"})
 _OUTBOX = 1024
-_FLUSH_S = 2.0
 
 
 class CameraAgent:
@@ -46,7 +45,8 @@ class CameraAgent:
 
     device: is opened by ``run`` and closed after it. camera: its id. now_ns: a monotonic clock for rates and latencies;
     it never stamps an observation. known: what the rig file knows of this camera beforehand. boot_id: a new one
-    each time the process starts, by default. pictures_hz: small pictures a second while somebody watches; 0 = never.
+    each time the process starts, by default. pictures_hz, picture_width: small pictures a second while somebody wants
+    them, and their width [px]; 0 = never.
     predictions: whether the detector is told what the hub's tracking expects.
     """
 
@@ -61,6 +61,7 @@ class CameraAgent:
         known: RigCamera | None = None,
         boot_id: str | None = None,
         pictures_hz: float = 2.0,
+        picture_width: int = WIDTH,
         predictions: bool = False,
     ) -> None:
         self._follows = predictions
@@ -73,6 +74,7 @@ class CameraAgent:
         self._known = known
         self.boot_id = uuid.uuid4().hex if boot_id is None else boot_id
         self._sequence = 0
+        self._picture_width = picture_width
         self._picture_ns = 0 if pictures_hz <= 0.0 else round(NANOSECONDS / pictures_hz)
         self._last_frame: int | None = None
         self._recent: deque[tuple[int, float]] = deque(maxlen=300)  # (arrival, latency) of the last frames
@@ -86,6 +88,8 @@ class CameraAgent:
         self._next_status = 0
         self._told = ""
         self._stopping = False
+        self._exposure_ns = 0
+        self._clock = ClockWatcher()
 
     def run(self, stop: threading.Event) -> None:
         """Publish until ``stop`` is set or the device has ended.
@@ -95,18 +99,19 @@ class CameraAgent:
         self._device.open()
         info = self._device.info
         self._watch = PictureWatch(live=info.clock != "stream", period_s=1.0 / info.fps if info.fps > 0.0 else 0.0)
-        outbox = _Outbox(self._bus, self._camera, self._due_status)
+        topics = (OBSERVATION, CAMERA_INFO, STATUS, PICTURE)
+        outbox: Outbox = Outbox(self._bus, self._camera, topics, _OUTBOX, beat=lambda: self._due_status(outbox))
         if self._follows:
             self._predictions = Predictions(self._bus.subscribe(PREDICTION), self._camera, self.boot_id)
         try:
-            with self._bus.announce(ROLE, self._camera, self.boot_id), outbox:
+            with self._clock, self._bus.announce(ROLE, self._camera, self.boot_id), outbox:
                 self._loop(stop, outbox)
         finally:
             if self._predictions is not None:
                 self._predictions.close()
             self._device.close()
 
-    def _loop(self, stop: threading.Event, outbox: _Outbox) -> None:
+    def _loop(self, stop: threading.Event, outbox: Outbox) -> None:
         next_info = next_picture = self._now_ns()
         self._watch.start(next_info / NANOSECONDS)
         while not (stop.is_set() or self._device.ended):
@@ -115,8 +120,10 @@ class CameraAgent:
             if frame is not None and self._watch.fresh(frame, now / NANOSECONDS):
                 outbox.put(OBSERVATION, self._observe(frame))
                 self._recent.append((now, (self._now_ns() - now) / NANOSECONDS))
-                if self._picture_ns and now >= next_picture and outbox.watched:
-                    outbox.put(PICTURE, picture_message(frame, self._camera, self.boot_id))
+                self._exposure_ns = frame.exposure_ns
+                self._watch.look(frame, now / NANOSECONDS)
+                if self._picture_ns and now >= next_picture and outbox.wants(PICTURE):
+                    outbox.put(PICTURE, picture_message(frame, self._camera, self.boot_id, self._picture_width))
                     next_picture = now + self._picture_ns
             if now >= next_info:
                 outbox.put(CAMERA_INFO, self._info())
@@ -131,7 +138,7 @@ class CameraAgent:
         if unplugged:
             raise InputError(f"camera {self._camera} is gone", remedy="plug it in, and start its agent again")
 
-    def _due_status(self, outbox: _Outbox) -> pb.AgentStatus | None:
+    def _due_status(self, outbox: Outbox) -> Iterator[tuple[Topic, Message]]:
         """The status where one is due: each second, and at once when a complaint begins or ends.
 
         Called by the outbox's thread, because a device that hangs holds up the agent's own.
@@ -140,12 +147,12 @@ class CameraAgent:
         complaint = self._watch.complaint(now / NANOSECONDS)
         told = complaint.partition(" for ")[0]
         if self._stopping or (now < self._next_status and told == self._told):
-            return None
+            return
         with self._status_lock:
             self._told, self._next_status = told, now + round(_STATUS_PERIOD_S * NANOSECONDS)
             status = self._status("degraded" if complaint else "running", complaint, self._status_sequence, outbox)
             self._status_sequence += 1
-        return status
+        yield STATUS, status
 
     def _observe(self, frame: Frame) -> pb.Observation:
         """The message of one frame, also when nothing is seen in it."""
@@ -194,12 +201,12 @@ class CameraAgent:
             add_known(message, known)
         return message
 
-    def _status(self, state: str, text: str, sequence: int, outbox: _Outbox) -> pb.AgentStatus:
+    def _status(self, state: str, text: str, sequence: int, outbox: Outbox) -> pb.AgentStatus:
         counters = {
             "frames": self.frames,
             "dropped": self.dropped,
-            "published": outbox.sent,
-            "unpublished": outbox.lost,
+            "published": outbox.sent[OBSERVATION],
+            "unpublished": outbox.lost[OBSERVATION],
             "detections": self.detections,
             "empty": self.empty,
             "repeated": self._watch.repeated,
@@ -207,10 +214,14 @@ class CameraAgent:
         }
         if isinstance(self._device, Returning):
             counters["reconnections"] = self._device.reconnections
-        gauges = {"fps": 0.0, "latency_s": 0.0}
-        if outbox.heard is not None:
-            gauges["heard"] = float(outbox.heard)
-        if outbox.heard is False and not text:
+        gauges = {"fps": 0.0, "latency_s": 0.0, **self._clock.gauges(self._device.info.clock)}
+        if self._exposure_ns > 0:
+            gauges["exposure_s"] = self._exposure_ns / NANOSECONDS
+        if isinstance(self._device, Warm) and (temperature := self._device.temperature) is not None:
+            gauges["temperature_c"] = temperature
+        if outbox.wanted is not None:
+            gauges["heard"] = float(outbox.wants(OBSERVATION))
+        if gauges.get("heard") == 0.0 and not text:
             # A put that the router's rules deny returns as if all were well.
             text = "nobody hears this camera: no hub is there, or the router's access rules do not let it speak"
         recent = self._recent.copy()
@@ -232,80 +243,6 @@ class CameraAgent:
         )
 
 
-class _Outbox:
-    """Hands messages to the bus in a thread of its own; when full it loses the newest, and counts it.
-
-    sent, lost: observations that went out, and that did not. An observation that is lost leaves a gap in the
-    sequence, so that its receivers know too. watched: whether somebody wants pictures; heard: whether
-    somebody is subscribed to the observations, None until it has been asked. status: asked five times a
-    second for a status to send.
-    """
-
-    def __init__(self, bus: Bus, camera: str, status: Callable[[_Outbox], Message | None]) -> None:
-        self._bus, self._camera, self._status = bus, camera, status
-        self._queue: queue.Queue[tuple[Topic, Message] | None] = queue.Queue(_OUTBOX)
-        self._thread = threading.Thread(target=self._run, name=f"outbox {camera}", daemon=True)
-        self._error: Exception | None = None
-        self.sent = 0
-        self.lost = 0
-        self.watched = False
-        self.heard: bool | None = None
-
-    def put(self, topic: Topic, message: Message) -> None:
-        """Never waits. Raises what the bus has raised."""
-        if self._error is not None:
-            raise self._error
-        try:
-            self._queue.put_nowait((topic, message))
-        except queue.Full:
-            self.lost += topic is OBSERVATION
-
-    def check(self) -> None:
-        """Raises what the bus has raised."""
-        if self._error is not None:
-            raise self._error
-
-    def __enter__(self) -> _Outbox:
-        self._thread.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Send what is left, within 2 s."""
-        try:
-            self._queue.put(None, timeout=_FLUSH_S)
-            self._thread.join(_FLUSH_S)
-        except queue.Full:
-            pass  # the bus hangs; the thread is a daemon and the process may end
-        if kind is None and self._error is not None:
-            raise self._error
-
-    def _run(self) -> None:
-        publishers: dict[str, Publisher] = {}
-        try:
-            for topic in (OBSERVATION, CAMERA_INFO, STATUS, PICTURE):
-                publishers[topic.name] = self._bus.publisher(topic, self._camera)
-            look = 0.0
-            while True:
-                status = self._status(self)
-                if status is not None:
-                    publishers[STATUS.name].put(status)
-                try:
-                    item = self._queue.get(timeout=_IDLE_S)
-                except queue.Empty:
-                    continue
-                if item is None:
-                    break
-                topic, message = item
-                publishers[topic.name].put(message)
-                if time.monotonic() >= look:
-                    look = time.monotonic() + _LOOK_S
-                    self.watched = publishers[PICTURE.name].wait_matched(0.0)
-                    self.heard = publishers[OBSERVATION.name].wait_matched(0.0)
-                self.sent += topic is OBSERVATION
-        except Exception as error:  # noqa: BLE001 - it belongs to the thread that runs the agent
-            self._error = error
-
-
 def run_camera_agent(
     device: Device,
     detector: Detector,
@@ -317,6 +254,7 @@ def run_camera_agent(
     known: RigCamera | None = None,
     boot_id: str | None = None,
     pictures_hz: float = 2.0,
+    picture_width: int = WIDTH,
     predictions: bool = False,
 ) -> CameraAgent:
     """Run an agent to its end and return it with its counts; see ``CameraAgent`` for the arguments."""
@@ -329,6 +267,7 @@ def run_camera_agent(
         known=known,
         boot_id=boot_id,
         pictures_hz=pictures_hz,
+        picture_width=picture_width,
         predictions=predictions,
     )
     agent.run(stop)

@@ -31,7 +31,8 @@ def camera(config: Path, /, *, print_config: PrintConfig = False) -> int:
     Parameters
     ----------
     config
-        TOML file: id, site, [bus], driver ("simulated" or "video") with its table, detector, rig.
+        TOML file: id, site, [bus], driver ("simulated", "video", "usb", "picamera2", "rtsp" or "oak") with its table,
+        detector, [marker], rig.
     print_config
         Show the configuration with all defaults filled in, and stop.
     """

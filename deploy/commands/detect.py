@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from deploy.progress import progress_bar
-from edge.detectors.base import Detection
+from edge.detectors.base import Detection, Detector
 from protocols.errors import EXIT_DONE, InputError, Refused
 
 _REMEDIES = {
     "marker": "use a brightly coloured ball that is whole in the picture, or show it with --teach --target x,y,w,h",
+    "bright": "a shorter exposure in a darker room, or a lower --threshold",
+    "tag": "give the tags' family with --dictionary, and keep a white margin round them",
     "person": "nobody was seen moving before a fixed camera",
     "vehicle": "nothing was seen moving",
 }
@@ -25,6 +28,9 @@ def detect(
     *,
     out: Path,
     camera: str | None = None,
+    mode: Literal["colour", "bright", "tag"] = "colour",
+    threshold: int | None = None,
+    dictionary: str | None = None,
     teach: Annotated[bool, Parameter(negative="")] = False,
     target: str | None = None,
     start: int = 0,
@@ -51,6 +57,8 @@ def detect(
 
     Example: syncline detect marker cam0.mp4 --teach --target 612,300,40,40 --out observations.csv
 
+    Example: syncline detect marker cam0.mp4 --mode tag --out observations.csv
+
     Example: syncline detect person street.mp4 --out observations.csv --overlay seen.mp4
 
     Parameters
@@ -63,6 +71,14 @@ def detect(
         The CSV file to write.
     camera
         The camera's name in it; default: the video's name.
+    mode
+        Of a marker. colour: a ball. bright: an LED, or a retro-reflector beside the camera's lamp, in a picture that is
+        darker otherwise. tag: AprilTags or ArUco tags, each labelled by its number: tag7; u, v is the tag's centre,
+        size the side that it would have seen straight on.
+    threshold
+        Grey level from 30 to 254 that a bright marker exceeds; 200 by default.
+    dictionary
+        Family of the tags: apriltag_36h11 by default, apriltag_16h5, 4x4_50, 5x5_100, 6x6_250, ...
     teach
         Learn the marker's colour from --target first, and keep it as marker.toml beside --out.
     target
@@ -89,6 +105,7 @@ def detect(
     shown = {"--teach": teach or None, "--target": target, "--marker": marker, "--colour": colour, "--rig": rig}
     if what != "marker" and (useless := [option for option, value in shown.items() if value is not None]):
         raise InputError(f"{useless[0]} means nothing for `detect {what}`", remedy="leave it out")
+    _check_mode(what, mode, shown, threshold, dictionary)
     if fps is not None and not 0.1 <= fps <= 10_000:
         raise InputError(f"--fps {fps:g} is out of range", remedy="give frames a second")
     if out.is_dir():
@@ -131,7 +148,11 @@ def detect(
             tell(f"frame {frame}" + (f" of {total}" if total else ""), frame / total if total else 0.0)
 
         if what == "marker":
-            detector = detecting.marker_detector(model, lens, film.info.size)
+            detector: Detector = (
+                detecting.marker_detector(model, lens, film.info.size)
+                if mode == "colour"
+                else detecting.other_marker(mode, threshold or 200, dictionary or "apriltag_36h11")
+            )
             drawn: dict[int, list[tuple[str, Detection]]] = {}
             found = detecting.detect_in(film, name, detector, told, seen=drawn if overlay else None)
             if overlay is not None:
@@ -143,7 +164,9 @@ def detect(
             moving = detecting_moving.make_detector(what, background, film.info.fps)
             found = detecting_moving.find_moving(film, name, moving, tell, overlay)
     if not found.rows:
-        raise Refused(f"{video}: no {what} in any of {found.frames} frames; {_REMEDIES[what]}")
+        raise Refused(
+            f"{video}: no {what} in any of {found.frames} frames; {_REMEDIES[mode if mode in _REMEDIES else what]}"
+        )
     write_together({**files, out: detecting.observations_text(found.rows, extra)})
     warnings = [f"{video}: {warning}" for warning in found.warnings]
     if json:
@@ -171,6 +194,21 @@ def detect(
         print(f"warning: {warning}")
     print(f"written: {', '.join(str(file) for file in (out, *files))}")
     return EXIT_DONE
+
+
+def _check_mode(
+    what: str, mode: str, shown: Mapping[str, object], threshold: int | None, dictionary: str | None
+) -> None:
+    """Raise InputError for options that mean nothing together."""
+    if mode != "colour" and what != "marker":
+        raise InputError(f"--mode means nothing for `detect {what}`", remedy="leave it out")
+    if mode != "colour" and (useless := [option for option, value in shown.items() if value is not None]):
+        raise InputError(f"{useless[0]} means nothing for a marker of --mode {mode}", remedy="leave it out")
+    for option, value, owner in (("--threshold", threshold, "bright"), ("--dictionary", dictionary, "tag")):
+        if value is not None and mode != owner:
+            raise InputError(f"{option} belongs to --mode {owner}", remedy=f"add --mode {owner}, or leave it out")
+    if threshold is not None and not 30 <= threshold <= 254:
+        raise InputError(f"--threshold {threshold} is out of range", remedy="give a grey level from 30 to 254")
 
 
 def _colour(text: str) -> tuple[int, int, int]:

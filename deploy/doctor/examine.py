@@ -30,7 +30,7 @@ def examine(file: Path | None, role: str | None = None) -> Iterator[Finding]:
     if config is None:
         return
     driver = getattr(config, "driver", "")
-    yield machine.packages((kind, "oak") if driver == "oak" else (kind,))
+    yield machine.packages((kind, driver) if driver in machine.PACKAGES else (kind,))
     yield machine.disk(getattr(config, "out", None) or Path.cwd(), getattr(config, "min_free_mb", 0.0))
     yield machine.clock(certificates=config.bus.tls is not None)
     yield from _sight(config, driver)
@@ -54,6 +54,8 @@ def _sight(config: Any, driver: str) -> Iterator[Finding]:
     if driver == "oak" and not (config.oak and config.oak.device):
         yield machine.oak_usb()
     source = str(config.video.source) if driver == "video" and config.video else ""
+    if driver == "usb":
+        source = str(config.usb.device) if config.usb else "/dev/video0"
     if source.startswith("/dev/") or source.isdecimal():
         yield machine.usb(source)
     from deploy.agents import make_device

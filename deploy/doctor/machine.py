@@ -17,6 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from deploy.doctor.finding import Finding, ok, skip, warn, wrong
+from edge.clock_quality import kernel_clock
 
 PACKAGES: dict[str, tuple[str, ...]] = {
     "": ("numpy", "zenoh", "msgspec", "google.protobuf"),
@@ -25,11 +26,12 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "hub": ("cv2", "scipy", "plotly", "mcap"),
     "recorder": ("mcap", "zstandard", "foxglove_schemas_protobuf"),
     "oak": ("depthai",),
+    "usb": ("linuxpy",),
+    "rtsp": ("av",),
 }
-_EXTRAS = {"pymavlink": "uav", "serial": "uav", "depthai": "oak"}
+_EXTRAS = {"pymavlink": "uav", "serial": "uav", "depthai": "oak", "linuxpy": "v4l2", "av": "video"}
 _HOT_C = 80.0
 _LOW_MB = 2000.0
-_STA_UNSYNC = 0x0040
 _SANE_UNIX_S = 1_735_689_600.0  # 2025: before that a clock was never set
 Run = Callable[[Sequence[str]], tuple[int, str]]
 
@@ -188,27 +190,6 @@ def _text(file: Path) -> str:
         return file.read_text(encoding="utf-8").strip()
     except (OSError, ValueError):
         return ""
-
-
-class _Timex(ctypes.Structure):
-    """The beginning of the kernel's struct timex (adjtimex(2)); the rest is room."""
-
-    _fields_ = [
-        ("modes", ctypes.c_uint),
-        ("offset", ctypes.c_long),
-        ("freq", ctypes.c_long),
-        ("maxerror", ctypes.c_long),
-        ("esterror", ctypes.c_long),
-        ("status", ctypes.c_int),
-        ("room", ctypes.c_char * 512),
-    ]
-
-
-def kernel_clock() -> tuple[bool, float]:
-    """(synchronised, largest error [s]) as the kernel sees its clock, whoever disciplines it."""
-    timex = _Timex()
-    ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))
-    return not timex.status & _STA_UNSYNC, timex.maxerror / 1e6
 
 
 def clock(

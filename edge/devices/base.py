@@ -89,6 +89,15 @@ class Returning(Protocol):
         """How often it came back."""
 
 
+@runtime_checkable
+class Warm(Protocol):
+    """What a device that measures its own heat can say besides."""
+
+    @property
+    def temperature(self) -> float | None:
+        """[°C]; None where it does not tell."""
+
+
 def check_size(intrinsics: Intrinsics | None, width: int, height: int, what: str) -> None:
     """Raise InputError where intrinsics are for another image size than the source ``what`` has."""
     if intrinsics is not None and (intrinsics.width, intrinsics.height) != (width, height):

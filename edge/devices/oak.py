@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame, check_size
+from edge.devices.returning import Connection, Gone, ReturningCamera
 from protocols.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
-_RETRY_S = 1.0
 _QUEUE = 4  # newest frames: what is older than that has been waited for in vain
-_FIRST_FRAME_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +48,12 @@ class Stream:
     queue: Any
 
 
-class OakCamera:
+class OakCamera(ReturningCamera):
     """A camera on an OAK board; see ``edge.devices.base.Device``.
 
     Stamps are the host's CLOCK_MONOTONIC, to which depthai maps the board's clock: that clock goes on when the board
     is plugged in again, as the board's own does not. connect: makes the stream; tests give a host-only one.
-    sleep, now: a monotonic clock [s] for trying again.
+    now_ns: a monotonic clock; sleep: for trying again.
     """
 
     def __init__(
@@ -63,132 +62,65 @@ class OakCamera:
         *,
         intrinsics: Intrinsics | None = None,
         connect: Callable[[OakSettings], Stream] | None = None,
-        now: Callable[[], float] = time.monotonic,
+        now_ns: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._settings = settings
-        self._intrinsics = intrinsics
-        self._connect = connect or open_stream
-        self._now, self._sleep = now, sleep
-        self._stream: Stream | None = None
-        self._first: Frame | None = None
-        self._info: DeviceInfo | None = None
-        self._last = -1
-        self._last_s = 0.0
-        self._offset = 0  # added to the board's frame numbers, which begin anew after a reconnection
-        self._again = 0.0
-        self._ended = False
-        self.reconnections = 0
+        name = settings.device or "OAK camera"
+        make = connect or open_stream
 
-    @property
-    def info(self) -> DeviceInfo:
-        """Size as the first picture has it."""
-        if self._info is None:
-            raise RuntimeError("open the camera first")
-        return self._info
+        def connected() -> Connection:
+            try:
+                return OakConnection(make(settings))
+            except ImportError:
+                raise InputError("depthai is not installed", remedy='pip install "syncline[oak]"') from None
+            except RuntimeError as error:
+                raise InputError(f"{name} does not answer: {_one_line(error)}", remedy=_REMEDY) from None
 
-    @property
-    def ended(self) -> bool:
-        """True once closed: an unplugged board is waited for."""
-        return self._ended
+        def describe(connection: Connection, first: Frame) -> DeviceInfo:
+            height, width = first.image.shape[:2]
+            check_size(intrinsics, width, height, name)
+            return DeviceInfo(width, height, settings.fps, "oak", "monotonic", intrinsics)
 
-    @property
-    def away(self) -> bool:
-        """Whether the board is gone, and is tried again with every ``read``."""
-        return self._stream is None and self._info is not None and not self._ended
+        super().__init__(name, connected, describe, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
 
-    def open(self) -> None:
-        """Raises InputError where no board answers or no picture comes."""
-        name = self._settings.device or "OAK camera"
-        try:
-            self._stream = self._connect(self._settings)
-        except ImportError:
-            raise InputError("depthai is not installed", remedy='pip install "syncline[oak]"') from None
-        except RuntimeError as error:
-            raise InputError(f"{name} does not answer: {_one_line(error)}", remedy=_REMEDY) from None
-        self._ended = False
-        began = self._now()
-        while self._first is None and self._now() - began < _FIRST_FRAME_S:
-            self._first = self._next(0.5)
-        if self._first is None:
-            self.close()
-            raise InputError(f"{name} gives no picture", remedy=_REMEDY)
-        height, width = self._first.image.shape[:2]
-        check_size(self._intrinsics, width, height, name)
-        self._info = DeviceInfo(width, height, self._settings.fps, "oak", "monotonic", self._intrinsics)
 
-    def read(self, timeout_s: float) -> Frame | None:
-        """The next picture; None while the board is away, which is tried again each second."""
-        if self._ended:
-            return None
-        if self._first is not None:
-            frame, self._first = self._first, None
-            return frame
-        if self._stream is None:
-            self._reconnect(timeout_s)
-            return None
-        return self._next(timeout_s)
+class OakConnection:
+    """The pictures of one open stream."""
 
-    def close(self) -> None:
-        """Release the board."""
-        self._release()
-        self._ended = True
+    def __init__(self, stream: Stream) -> None:
+        self._stream = stream
 
-    def _next(self, timeout_s: float) -> Frame | None:
+    def take(self, timeout_s: float) -> Frame | None:
         import depthai as dai
 
-        assert self._stream is not None
         try:
             picture = self._stream.queue.get(timedelta(seconds=timeout_s))
         except (RuntimeError, dai.MessageQueue.QueueException):  # the link is gone
-            self._lose()
-            return None
+            raise Gone from None
         if picture is None:
             if not self._stream.pipeline.isRunning():
-                self._lose()
+                raise Gone
             return None
-        return self._frame(picture)
-
-    def _frame(self, picture: Any) -> Frame:
-        import depthai as dai
-
         middle = picture.getTimestamp(dai.CameraExposureOffset.MIDDLE)
-        seconds = middle / timedelta(seconds=1)
-        number = int(picture.getSequenceNum()) + self._offset
-        if number <= self._last:
-            # Plugged in again: the board counts anew, and what was missed meanwhile is a gap.
-            passed = max(round((seconds - self._last_s) * self._settings.fps), 1)
-            self._offset += self._last + passed - number
-            number = self._last + passed
-        self._last, self._last_s = number, seconds
         return Frame(
             image=np.ascontiguousarray(_bgr(picture.getCvFrame()), dtype=np.uint8),
             device_time_ns=(middle // timedelta(microseconds=1)) * 1000,
-            frame=number,
+            frame=int(picture.getSequenceNum()),
             exposure_ns=(picture.getExposureTime() // timedelta(microseconds=1)) * 1000,
         )
 
-    def _lose(self) -> None:
-        self._release()
-        self._again = self._now()
+    def close(self) -> None:
+        with suppress(RuntimeError):
+            self._stream.pipeline.stop()
 
-    def _reconnect(self, timeout_s: float) -> None:
-        if self._now() < self._again:
-            self._sleep(min(timeout_s, max(self._again - self._now(), 0.0)))
-            return
-        self._again = self._now() + _RETRY_S
+    @property
+    def temperature(self) -> float | None:
+        """Of the board's chip [°C]; None where it does not tell."""
+        device = getattr(self._stream.pipeline, "getDefaultDevice", lambda: None)()
         try:
-            self._stream = self._connect(self._settings)
-        except RuntimeError:
-            self._again = self._now() + _RETRY_S
-            return
-        self.reconnections += 1
-
-    def _release(self) -> None:
-        stream, self._stream = self._stream, None
-        if stream is not None:
-            with suppress(RuntimeError):
-                stream.pipeline.stop()
+            return None if device is None else float(device.getChipTemperature().average)
+        except (RuntimeError, AttributeError):
+            return None
 
 
 _REMEDY = (

@@ -1,6 +1,6 @@
 """How well and how fast the shipped marker detector works on rendered frames, whose truth is known.
 
-    python -m tests.bench.marker_detector [--quick]
+    python -m tests.bench.marker_detector [--quick] [--only ball|others]
 
 Errors are against the projection of the ball's centre at mid-exposure. ``nees`` is the squared error divided by the
 reported covariance, 1 if the covariance is right. Look-alikes (balls and boxes of other hues, wood) are in every frame.
@@ -16,10 +16,13 @@ import cv2
 import numpy as np
 
 from edge import scenes
+from edge.detectors.bright import BrightDetector
 from edge.detectors.marker import MarkerDetector
+from edge.detectors.tag import TagDetector
 from edge.scenes.marker import MarkerScene
 from edge.scenes.rendering import MarkerRenderer
 from protocols.geometry.types import Floats
+from tests.rendered_markers import add_look_alikes, add_spot, add_tag, dim_room, exposed, tag_image
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,6 +111,57 @@ def _speed(width: int, height: int, frames: int) -> float:
     return float(np.median(taken))
 
 
+def _others(frames: int, seed: int) -> None:
+    """Points of light and tags: drawn into textured rooms with look-alikes, noise 4, seeds of their own."""
+    rng = np.random.default_rng(seed)
+    tag = tag_image(cv2.aruco.DICT_APRILTAG_36h11, 17, 400)
+    print("frames  missed  false  rms px  median px  p95 px  nees  CPU ms  case")
+    lights = [
+        ("light, sharp", 1.0, 700.0, 0.0),
+        ("light, smeared 8 px", 1.5, 1500.0, 8.0),
+        ("light, soft", 3.0, 500.0, 0.0),
+    ]
+    tags = [
+        ("tag, side 24 px", 24.0, 0.0),
+        ("tag, side 50 px", 50.0, 0.0),
+        ("tag, side 50 px, smeared 4 px", 50.0, 4.0),
+    ]
+    for title, *what in [*lights, *tags]:
+        detector = BrightDetector() if len(what) == 3 else TagDetector()
+        errors, nees, seconds, missed, false = [], [], [], 0, 0
+        for index in range(frames):
+            picture = dim_room(seed + index, 640, 480, 50.0)
+            truth, turn = rng.uniform((90, 90), (550, 390)), rng.uniform(0.0, 2.0 * np.pi)
+            smear = what[-1] * np.array([np.cos(turn), np.sin(turn)])
+            add_look_alikes(picture, rng, (truth[0], truth[1]))
+            if len(what) == 3:
+                add_spot(picture, truth[0], truth[1], what[0], what[1], (smear[0], smear[1]))
+            else:
+                add_tag(picture, tag, truth, what[0], rng.uniform(-0.7, 0.7, 3), smear)
+                picture = cv2.GaussianBlur(picture, (0, 0), 0.6)
+            image = exposed(np.asarray(picture, dtype=np.float64), 4.0, rng)
+            began = time.process_time()
+            found = detector.detect(image)
+            seconds.append(time.process_time() - began)
+            if not found:
+                missed += 1
+                continue
+            error = np.array([found[0].u, found[0].v]) - truth
+            if not float(np.hypot(*error)) < 5.0:
+                false += 1
+                continue
+            assert found[0].covariance is not None
+            uu, uv, vv = found[0].covariance
+            errors.append(error)
+            nees.append(float(error @ np.linalg.solve(np.array([[uu, uv], [uv, vv]]), error)) / 2.0)
+        table = np.array(errors)
+        r = np.hypot(*table.T)
+        print(
+            f"{frames:6d}  {missed:6d}  {false:5d}  {np.sqrt(np.mean(table**2)):6.3f}  {np.median(r):9.3f}  "
+            f"{np.percentile(r, 95):6.3f}  {np.mean(nees):4.2f}  {1e3 * np.median(seconds):6.1f}  {title}"
+        )
+
+
 def _render_speed(frames: int) -> float:
     scene = scenes.get("marker", 0)
     renderer = scene.renderer("cam0", np.random.default_rng(0))
@@ -123,9 +177,15 @@ def main() -> None:
     """Print the table."""
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument("--quick", action="store_true", help="a quarter of the frames")
-    quick = arguments.parse_args().quick
+    arguments.add_argument("--only", choices=("ball", "others"), help="the coloured ball; lights and tags")
+    options = arguments.parse_args()
+    quick = options.quick
     cv2.setNumThreads(1)
     frames = 15 if quick else 60
+    if options.only != "ball":
+        _others(30 if quick else 100, 5000)
+    if options.only == "others":
+        return
     cases = [
         ("room, noise 4", {"name": "marker"}),
         ("room, noise 2", {"name": "marker", "noise": 2.0}),

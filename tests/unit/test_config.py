@@ -101,7 +101,7 @@ def _resolved(config: msgspec.Struct, folder: Path) -> dict[str, Path]:
         ),
         (
             'id = "a"\n[marker]\nshape = "ball"',
-            "agent.toml:3: unknown key marker.shape; use one of label, colour",
+            "agent.toml:3: unknown key marker.shape; use one of label, mode, colour",
         ),
         ('id = "a"\n[bus]\nmode = "mesh"', "invalid enum value 'mesh'; use one of peer, client, router"),
         ('site = "x"', "agent.toml: id is missing; add id = …"),

@@ -326,6 +326,7 @@ def test_a_live_camera_stamps_on_arrival(monkeypatch: pytest.MonkeyPatch) -> Non
     assert device.info.fps == 0.0
     frames = [device.read(0.0) for _ in range(2)]
     assert [(frame.frame, frame.device_time_ns) for frame in frames if frame] == [(0, 2 * 10**8), (1, 3 * 10**8)]
+    assert "time of capture: stamped on arrival" in device.info.unknown
 
 
 def test_an_unplugged_camera_is_sought_ever_more_slowly_and_counts_what_it_missed(
@@ -363,8 +364,9 @@ def test_a_camera_that_comes_back_as_another_ends(monkeypatch: pytest.MonkeyPatc
         device.read(0.1)
     plug.inside, plug.size = True, (8, 6, 3)
     plug.sleep(5.0)
+    device.read(0.1)  # finds it
     with pytest.raises(InputError, match="came back as 6x8, it was 6x4; plug the same camera in"):
-        device.read(0.1)
+        device.read(0.1)  # sees its picture
 
 
 def test_a_password_does_not_reach_the_error(monkeypatch: pytest.MonkeyPatch) -> None:

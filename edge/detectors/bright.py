@@ -1,0 +1,255 @@
+"""Finds a point of light: an LED, or a retro-reflector beside the lens's own lamp.
+
+Bright blobs are the candidates; one is a point of light if it is small, compact and stands alone on something much
+darker. Its place is the centroid of what is brighter than the background. That is where the light was on average during
+the exposure, so that a smeared spot has its mid-exposure place, and clipping at white, alike on all sides, does not
+move it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from edge.detectors.base import Detection, Prediction
+from protocols.geometry.types import Floats
+
+_CANDIDATES = 12  # blobs that are measured, brightest first
+_MOST_BLOBS = 2000  # a picture with more is overexposed or noise
+_RING = 3.0  # px around a spot from which its background is taken,
+_PASSES = 2
+_HALF = 0.5  # of the contrast: what is brighter is the spot
+_WHITE = 250.0  # grey levels at which a sensor clips
+_CUT = 0.3  # of the contrast: fainter than that is background and its texture
+_GAP = 1.5  # px: after as much of its own fringe
+_MIN_CONTRAST = 80.0  # grey levels above the background
+_MAX_ASPECT = 6.0  # of a smear's length to its width
+_FLARE = 0.35  # of the contrast: how bright the ring may be against what lies farther out
+_FAR = 6.0  # px: that far out
+_FLOOR_PX = 0.02  # std of the centre that remains without noise: pixels are not equal, their gaps are blind
+_UNEVEN = 0.02  # of the contrast: gain that differs from pixel to pixel, and a spot's own grain
+_SENSOR_STD = 4.0  # grey levels that a sensor's own noise may be
+_PATCH = 16.0  # px² over which a background's texture errs together
+_QUANTUM = 1.0 / 12.0  # variance of rounding to whole grey levels
+
+
+@dataclass(frozen=True, slots=True)
+class BrightModel:
+    """What a point of light looks like.
+
+    threshold: grey level (0..255, of the brightest channel) that its middle exceeds. min_size, max_size: diameter
+    [px] of what exceeds it. label: what detections carry. most: how many are reported, best first.
+    """
+
+    threshold: int = 200
+    min_size: float = 0.0
+    max_size: float = 60.0
+    label: str = "marker"
+    most: int = 1
+
+
+class BrightDetector:
+    """Points of light in single pictures; keeps no state."""
+
+    def __init__(self, model: BrightModel | None = None) -> None:
+        self._model = BrightModel() if model is None else model
+
+    def detect(
+        self, image: npt.NDArray[np.uint8], time_s: float | None = None, predictions: Sequence[Prediction] = ()
+    ) -> list[Detection]:
+        """Detections in an image (H, W, 3) uint8 BGR, best first."""
+        level = _brightest(image)
+        _, mask = cv2.threshold(level, float(self._model.threshold), 255.0, cv2.THRESH_BINARY)
+        if not cv2.countNonZero(mask):
+            return []
+        count, _, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+        if count > _MOST_BLOBS:
+            return []
+        found = []
+        for index in _order(np.asarray(stats, dtype=np.int32), self._model):
+            left, top, width, height = (int(value) for value in stats[index, :4])
+            spot = self._measure(image, level, left, top, width, height)
+            if spot is not None:
+                found.append(spot)
+        found.sort(key=lambda one: one.score, reverse=True)
+        return found[: self._model.most]
+
+    def _measure(
+        self, image: npt.NDArray[np.uint8], level: npt.NDArray[np.uint8], left: int, top: int, w: int, h: int
+    ) -> Detection | None:
+        """Measure the blob in a box [px]; None where it is no point of light."""
+        margin = math.ceil(0.75 * max(w, h) + 2.0 * (_GAP + _RING))
+        x0, y0, x1, y1 = left - margin, top - margin, left + w + margin, top + h + margin
+        if x0 < 0 or y0 < 0 or x1 > level.shape[1] or y1 > level.shape[0]:
+            return None  # cut by the border, or so near to it that its background is unknown
+        patch = level[y0:y1, x0:x1].astype(np.float64)
+        y, x = np.mgrid[: patch.shape[0], : patch.shape[1]].astype(np.float64)
+        own = _blob_at(patch > self._model.threshold, margin, w, h)
+        for _ in range(_PASSES):
+            shape = _Ellipse.of(own, x, y)
+            if shape.aspect > _MAX_ASPECT:
+                return None
+            distance = shape.distance(x, y)
+            edge = _GAP + 0.25 * shape.width
+            ring = (distance > edge) & (distance <= edge + _RING)
+            background, noise = _plane(patch, x, y, ring)
+            inside = distance <= edge
+            above = np.where(inside, patch - background, 0.0)
+            contrast = float(above.max(initial=0.0))
+            if contrast < _MIN_CONTRAST:
+                return None
+            # The threshold cuts a smear where it will; its own half height is the same at both ends.
+            own = _blob_at((patch - background > _HALF * contrast) & (distance <= edge + _RING), margin, w, h)
+            if not own.any():
+                return None
+        if float(patch[inside].max()) >= _WHITE:
+            # Clipped, it is as bright everywhere; without its background it would lean to where that is darker.
+            above = np.minimum(above, _WHITE - float(background[inside].max()))
+        excess = np.maximum(above - _CUT * contrast, 0.0)
+        mass = float(excess.sum())
+        if mass <= 0.0:
+            return None
+        # A lamp behind glass, a window's corner: what surrounds a point of light is as dark as what lies farther out.
+        around = float(np.median(patch[ring]))
+        if _beyond(level, x0, y0, x1, y1) < around - _FLARE * contrast:
+            return None
+        if float((patch[ring] > self._model.threshold).mean()) > 0.02:
+            return None  # part of something larger
+        area = int(own.sum())
+        u, v = float((excess * x).sum() / mass), float((excess * y).sum() / mass)
+        size = 2.0 * math.sqrt(area / math.pi)
+        fill = area / max(_Ellipse.of(own, x, y).area, 1e-9)
+        if fill < 0.6:
+            return None
+        colour = cv2.mean(image[y0:y1, x0:x1], own.astype(np.uint8))
+        return Detection(
+            u=x0 + u,
+            v=y0 + v,
+            size=size,
+            score=float(np.clip(contrast / 255.0, 0.0, 1.0) * min(fill, 1.0)),
+            label=self._model.label,
+            colour=(round(colour[2]), round(colour[1]), round(colour[0])),
+            covariance=_covariance(excess, ring, x - u, y - v, mass, noise),
+            kind="marker",
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Ellipse:
+    """That of a blob's second moments: centre [px], axes (2, 2) as rows, half-lengths (2,) [px], longest first."""
+
+    centre: Floats
+    axes: Floats
+    half: Floats
+
+    @classmethod
+    def of(cls, mask: npt.NDArray[np.bool_], x: Floats, y: Floats) -> _Ellipse:
+        points = np.stack([x[mask], y[mask]])
+        centre = points.mean(axis=1)
+        spread = (points - centre[:, None]) @ (points - centre[:, None]).T / points.shape[1] + np.eye(2) / 12.0
+        values, vectors = np.linalg.eigh(spread)
+        return cls(centre, vectors.T[::-1], 2.0 * np.sqrt(values[::-1]))
+
+    @property
+    def aspect(self) -> float:
+        return float(self.half[0] / self.half[1])
+
+    @property
+    def width(self) -> float:
+        """Across a smear [px]."""
+        return float(2.0 * self.half[1])
+
+    @property
+    def area(self) -> float:
+        return float(math.pi * self.half[0] * self.half[1])
+
+    def distance(self, x: Floats, y: Floats) -> Floats:
+        """From the ellipse, negative inside [px]; of a long one measured from its middle line."""
+        along, across = np.tensordot(self.axes, np.stack([x - self.centre[0], y - self.centre[1]]), axes=1)
+        beyond = np.maximum(np.abs(along) - (self.half[0] - self.half[1]), 0.0)
+        return np.asarray(np.hypot(beyond, across) - self.half[1])
+
+
+def _brightest(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """The brightest channel (H, W): a blue LED is bright too."""
+    blue, green, red = cv2.split(image)
+    return np.asarray(cv2.max(cv2.max(blue, green), red), dtype=np.uint8)
+
+
+def _order(stats: npt.NDArray[np.int32], model: BrightModel) -> list[int]:
+    """Blobs that are small and compact enough to be measured, largest first."""
+    area = stats[:, 4].astype(np.float64)
+    diameter = 2.0 * np.sqrt(area / np.pi)
+    good = (diameter >= model.min_size) & (diameter <= model.max_size)
+    good &= np.maximum(stats[:, 2], stats[:, 3]) <= _MAX_ASPECT * model.max_size
+    good[0] = False
+    order = np.argsort(-area)
+    return [int(index) for index in order if good[index]][:_CANDIDATES]
+
+
+def _blob_at(mask: npt.NDArray[np.bool_], margin: int, w: int, h: int) -> npt.NDArray[np.bool_]:
+    """The parts of a mask that reach into the box (w, h) at ``margin`` from its corner."""
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    touched = np.zeros(count, dtype=bool)
+    touched[labels[margin : margin + h, margin : margin + w].ravel()] = True
+    touched[0] = False
+    return np.asarray(touched[labels], dtype=np.bool_)
+
+
+def _plane(patch: Floats, x: Floats, y: Floats, ring: npt.NDArray[np.bool_]) -> tuple[Floats, float]:
+    """Background (h, w) of a patch as a plane through its ring, robustly, and the scatter about it."""
+    basis = np.stack([np.ones(int(ring.sum())), x[ring] - x.mean(), y[ring] - y.mean()], axis=1)
+    values = patch[ring]
+    weight = np.ones_like(values)
+    model, scale = np.zeros(3), 0.0
+    for _ in range(4):
+        weighted = basis * weight[:, None]
+        model = np.linalg.solve(weighted.T @ basis + 1e-6 * np.eye(3), weighted.T @ values)
+        stray = values - basis @ model
+        scale = 1.4826 * float(np.median(np.abs(stray))) + 0.3
+        weight = 1.0 / (1.0 + (stray / (2.0 * scale)) ** 2) ** 2
+    # Texture counts as noise here, also what was outvoted: nobody knows how it goes on behind the spot.
+    scale = max(scale, float(np.sqrt(np.mean((values - basis @ model) ** 2))))
+    return model[0] + model[1] * (x - x.mean()) + model[2] * (y - y.mean()), scale
+
+
+def _beyond(level: npt.NDArray[np.uint8], x0: int, y0: int, x1: int, y1: int) -> float:
+    """Median of a frame some pixels wide around a patch; what is outside of the image is left out."""
+    wide = math.ceil(_FAR)
+    top, bottom = max(y0 - wide, 0), min(y1 + wide, level.shape[0])
+    left, right = max(x0 - wide, 0), min(x1 + wide, level.shape[1])
+    parts = [level[top:y0, left:right], level[y1:bottom, left:right], level[y0:y1, left:x0], level[y0:y1, x1:right]]
+    values = np.concatenate([part.ravel() for part in parts])
+    return float(np.median(values)) if values.size else 0.0
+
+
+def _covariance(
+    excess: Floats,
+    ring: npt.NDArray[np.bool_],
+    x: Floats,
+    y: Floats,
+    mass: float,
+    noise: float,
+) -> tuple[float, float, float]:
+    """(uu, uv, vv) [px²] of a centroid; x, y: of each pixel from it.
+
+    Each pixel's grey level errs by itself and moves the centroid by its own distance; the background errs as a whole
+    as much as its plane is uncertain, and moves it by the sum of all distances.
+    """
+    # What the ring scatters beyond the sensor's noise is texture, which errs in patches and not pixel by pixel.
+    texture = max(noise * noise - _SENSOR_STD**2, 0.0)
+    patchy = noise * noise + (_PATCH - 1.0) * texture
+    variance = patchy + _QUANTUM + (_UNEVEN * np.abs(excess)) ** 2
+    arms = np.stack([x, y]) * (excess > 0.0) / mass
+    own = np.einsum("ahw,bhw,hw->ab", arms, arms, variance)
+    basis = np.stack([np.ones_like(x), x, y])
+    of_ring = np.einsum("ahw,bhw,hw->ab", basis, basis, ring.astype(np.float64))
+    lever = np.einsum("ahw,bhw->ab", arms, basis)
+    plane = lever @ np.linalg.inv(of_ring) @ lever.T * (patchy + _QUANTUM)
+    total = own + plane + _FLOOR_PX**2 * np.eye(2)
+    return float(total[0, 0]), float(total[0, 1]), float(total[1, 1])

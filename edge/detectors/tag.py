@@ -1,0 +1,254 @@
+"""Finds AprilTag and ArUco tags through OpenCV and measures their centres to a small part of a pixel.
+
+OpenCV finds and reads them. Each of the four sides is then measured anew: across the black border, at many places along
+it, the length that is dark tells where the border is, without a threshold and unmoved by even motion blur. A line is
+fitted to each side; the diagonals of the four corners meet in the projection of the tag's centre, also seen aslant, as
+the mean of the corners does not. The scatter about the lines gives the covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from edge.detectors.base import Detection, Prediction
+from protocols.errors import InputError
+from protocols.geometry.types import Floats
+
+DICTIONARIES = (
+    "apriltag_16h5", "apriltag_25h9", "apriltag_36h10", "apriltag_36h11",
+    "4x4_50", "4x4_100", "4x4_250", "4x4_1000", "5x5_50", "5x5_100", "5x5_250", "5x5_1000",
+    "6x6_50", "6x6_100", "6x6_250", "6x6_1000", "7x7_50", "7x7_100", "7x7_250", "7x7_1000",
+)  # fmt: skip
+"""Families of tags, by the names that OpenCV gives them."""
+_FROM, _TO = 0.12, 0.88  # part of a side that is measured: corners are mixtures of two sides
+_PASSES = 2
+_STEP = 0.5  # px across a side
+_LEAST_CONTRAST = 20.0  # grey levels between the border and what surrounds it
+_MIN_SIDE = 8.0  # px
+_ROUGH = 0.12  # of a side: a side that strays farther from its line is none
+_FLOOR_PX = 0.008  # std of the centre that remains without noise,
+_FLOOR_SIDE = 0.9  # and px² over the side: of a small tag neither black nor white is seen pure,
+_FLOOR_SMEAR = 0.012  # and its share of a smeared border's width
+_SHARP = 2.0  # px that lens and sampling make of a sharp border
+_INDEPENDENT = 1.5  # px along a side within which samples err together
+
+
+@dataclass(frozen=True, slots=True)
+class TagModel:
+    """Which tags are looked for.
+
+    dictionary: one of DICTIONARIES. prefix: detections are labelled by it and the tag's number, as in tag7.
+    min_size: px of a side. most: how many are reported, largest first.
+    """
+
+    dictionary: str = "apriltag_36h11"
+    prefix: str = "tag"
+    min_size: float = _MIN_SIDE
+    most: int = 64
+
+
+class TagDetector:
+    """Tags in single pictures; keeps no state. Raises InputError for a dictionary that OpenCV does not know."""
+
+    def __init__(self, model: TagModel | None = None) -> None:
+        self._model = TagModel() if model is None else model
+        self._detector = _detector(self._model.dictionary)
+
+    def detect(
+        self, image: npt.NDArray[np.uint8], time_s: float | None = None, predictions: Sequence[Prediction] = ()
+    ) -> list[Detection]:
+        """Detections in an image (H, W, 3) uint8 BGR, largest first."""
+        if min(image.shape[:2]) < 2 * _MIN_SIDE:
+            return []
+        grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+        corners, ids, _ = self._detector.detectMarkers(grey)
+        found = []
+        for quad, number in zip(corners, () if ids is None else np.ravel(ids), strict=True):
+            one = self._measure(grey, np.asarray(quad, dtype=np.float64).reshape(4, 2), int(number))
+            if one is not None:
+                found.append(one)
+        found.sort(key=lambda one: one.size, reverse=True)
+        return found[: self._model.most]
+
+    def _measure(self, grey: npt.NDArray[np.uint8], quad: Floats, number: int) -> Detection | None:
+        sides = _sides(grey, quad)
+        if sides is None:
+            return None
+        lines, covariances, contrast, stray, width = sides
+        corners = _corners(lines)
+        if corners is None or np.abs(corners - quad).max() > 3.0 + 0.1 * _side(quad):
+            return None
+        centre, size = _centre(corners)
+        if size < self._model.min_size or stray > _ROUGH * size:
+            return None
+        floor = _FLOOR_PX**2 + (_FLOOR_SIDE / size) ** 2 + (_FLOOR_SMEAR * max(width - _SHARP, 0.0)) ** 2
+        covariance = _propagated(lines, covariances) + floor * np.eye(2)
+        left, top = corners.min(axis=0)
+        right, bottom = corners.max(axis=0)
+        return Detection(
+            u=float(centre[0]),
+            v=float(centre[1]),
+            size=size,
+            score=float(np.clip(contrast / 128.0, 0.05, 1.0)),
+            label=f"{self._model.prefix}{number}",
+            covariance=(float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])),
+            kind="marker",
+            box=(float(left), float(top), float(right - left), float(bottom - top)),
+        )
+
+
+def _detector(name: str) -> Any:
+    family = f"DICT_{name.upper()}"
+    if name not in DICTIONARIES or not hasattr(cv2.aruco, family):
+        raise InputError(f"{name!r} is no dictionary of tags", remedy=f"use one of {', '.join(DICTIONARIES)}")
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, family)), parameters)
+
+
+def _side(quad: Floats) -> float:
+    return float(np.linalg.norm(quad - np.roll(quad, -1, axis=0), axis=1).mean())
+
+
+def _sides(grey: npt.NDArray[np.uint8], quad: Floats) -> tuple[Floats, Floats, float, float, float] | None:
+    """Lines of the four sides, their covariances, contrast and scatter; None where a side cannot be measured.
+
+    lines: (4, 2, 2): a point on each and its unit direction. covariances: (4, 2, 2) of the offset at that point [px²]
+    and of the turn [rad²]. contrast: of the weakest side. scatter: of the worst, in px.
+    The last is how wide the widest border is, in px.
+    """
+    lines = np.zeros((4, 2, 2))
+    covariances = np.zeros((4, 2, 2))
+    contrast, worst, widest = np.inf, 0.0, 0.0
+    # A cell of the smallest families is a sixth of the side: nothing beyond it is the border.
+    half = float(np.clip(0.08 * _side(quad), 1.0, 6.0))
+    corners = quad
+    for _ in range(_PASSES):
+        middle = corners.mean(axis=0)
+        for index in range(4):
+            start, end = corners[index], corners[(index + 1) % 4]
+            length = float(np.linalg.norm(end - start))
+            if length < _MIN_SIDE:
+                return None
+            along = (end - start) / length
+            outward = np.array([along[1], -along[0]])
+            point = 0.5 * (start + end)
+            outward *= 1.0 if outward @ (point - middle) > 0.0 else -1.0
+            count = max(int((_TO - _FROM) * length), 6)
+            places = (np.linspace(_FROM, _TO, count) - 0.5) * length
+            rim = _rim(grey, point + places[:, None] * along, outward, half)
+            if rim is None:
+                return None
+            offset, weakest, width = rim
+            line, covariance, scatter = _line(places, offset, length / count)
+            contrast, worst, widest = min(contrast, weakest), max(worst, scatter), max(widest, width)
+            lines[index] = point + line[0] * outward, along + line[1] * outward
+            lines[index, 1] /= np.linalg.norm(lines[index, 1])
+            covariances[index] = covariance
+        found = _corners(lines)
+        if found is None:
+            return None
+        corners = found
+    return (lines, covariances, contrast, worst, widest) if contrast >= _LEAST_CONTRAST else None
+
+
+def _rim(
+    grey: npt.NDArray[np.uint8], points: Floats, outward: Floats, half: float
+) -> tuple[Floats, float, float] | None:
+    """Where dark turns to light (n,), along ``outward`` from points (n, 2) [px], its contrast, and its width [px]."""
+    steps = np.arange(-half, half + 1e-9, _STEP)
+    places = points[:, None] + steps[:, None] * outward
+    low = np.floor(places.min(axis=(0, 1))).astype(int) - 1
+    high = np.ceil(places.max(axis=(0, 1))).astype(int) + 2
+    if (low < 0).any() or high[0] > grey.shape[1] or high[1] > grey.shape[0]:
+        return None
+    crop = grey[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+    local = (places - low).astype(np.float32)
+    profile = cv2.remap(crop, local[..., 0], local[..., 1], cv2.INTER_LINEAR).astype(np.float64)
+    ends = max(len(steps) // 5, 1)
+    # Border and paper are even along a side: one level for each, but for light that changes slowly.
+    dark, light = np.median(profile[:, :ends]), np.median(profile[:, -ends:])
+    if light - dark < _LEAST_CONTRAST:
+        return None
+    share = np.clip((light - profile) / (light - dark), -0.5, 1.5)
+    weight = np.full(len(steps), _STEP)
+    weight[[0, -1]] = 0.5 * _STEP
+    mixed = np.clip(share * (1.0 - share), 0.0, None) @ weight
+    return share @ weight - half, float(light - dark), 6.0 * float(np.median(mixed))  # a ramp of width w holds w / 6
+
+
+def _line(places: Floats, offset: Floats, spacing: float) -> tuple[Floats, Floats, float]:
+    """Robust line (offset, slope) through offsets (n,) at places (n,), its covariance (2, 2), the scatter [px]."""
+    design = np.column_stack([np.ones_like(places), places])
+    weight = np.ones_like(places)
+    line: Floats = np.zeros(2)
+    scatter = 0.0
+    for _ in range(4):
+        weighted = design * weight[:, None]
+        line = np.asarray(np.linalg.solve(weighted.T @ design, weighted.T @ offset), dtype=np.float64)
+        residual = offset - design @ line
+        scatter = 1.4826 * float(np.median(np.abs(residual))) * np.sqrt(len(places) / (len(places) - 2.0)) + 1e-3
+        weight = 1.0 / (1.0 + (residual / (2.5 * scatter)) ** 2) ** 2
+    together = max(1.0, _INDEPENDENT / spacing)
+    information = (design * weight[:, None]).T @ design
+    covariance = np.asarray(scatter**2 * together * np.linalg.inv(information), dtype=np.float64)
+    return line, covariance, scatter
+
+
+def _corners(lines: Floats) -> Floats | None:
+    """Corners (4, 2) where each side meets the one before it; None where two are parallel."""
+    corners = np.zeros((4, 2))
+    for index in range(4):
+        (p, d), (q, e) = lines[index - 1], lines[index]
+        across = d[0] * e[1] - d[1] * e[0]
+        if abs(across) < 0.05:
+            return None
+        away = q - p
+        corners[index] = p + d * (away[0] * e[1] - away[1] * e[0]) / across
+    return corners
+
+
+def _centre(corners: Floats) -> tuple[Floats, float]:
+    """Where the diagonals meet (2,), and the side [px] that the tag would have if it were not seen aslant.
+
+    About its centre the picture of the tag is nearly affine; the direction in which it is not foreshortened is the
+    longer axis of the ellipse that a circle on it becomes.
+    """
+    square = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]], dtype=np.float32)
+    h = np.asarray(cv2.getPerspectiveTransform(square, corners.astype(np.float32)), dtype=np.float64)
+    (p, q), (r, s) = (corners[0], corners[2]), (corners[1], corners[3])
+    a, b = q - p, s - r
+    across = a[0] * b[1] - a[1] * b[0]
+    t = ((r - p)[0] * b[1] - (r - p)[1] * b[0]) / across
+    centre = p + t * a
+    affine = h[:2, :2] / h[2, 2] - np.outer(h[:2, 2], h[2, :2]) / h[2, 2] ** 2
+    return np.asarray(centre), float(np.linalg.svd(affine, compute_uv=False)[0])
+
+
+def _propagated(lines: Floats, covariances: Floats) -> Floats:
+    """Covariance (2, 2) of the centre [px²] from those of the sides."""
+    reference = _corners(lines)
+    assert reference is not None
+    middle, _ = _centre(reference)
+    total = np.zeros((2, 2))
+    for index in range(4):
+        jacobian = np.zeros((2, 2))
+        normal = np.array([lines[index, 1, 1], -lines[index, 1, 0]])
+        for column, step in enumerate((1e-3, 1e-5)):
+            moved = lines.copy()
+            if column == 0:
+                moved[index, 0] += step * normal
+            else:
+                moved[index, 1] += step * normal
+            corners = _corners(moved)
+            if corners is None:
+                return total
+            jacobian[:, column] = (_centre(corners)[0] - middle) / step
+        total = total + jacobian @ covariances[index] @ jacobian.T
+    return np.asarray(total)

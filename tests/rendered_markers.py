@@ -1,0 +1,119 @@
+"""Points of light and tags drawn at known sub-pixel places, with look-alikes, blur and noise: the truth of tests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.special import erf
+
+from protocols.geometry.types import Floats
+
+Image = npt.NDArray[np.uint8]
+
+
+def dim_room(seed: int, width: int = 640, height: int = 480, level: float = 90.0) -> Floats:
+    """A textured background (H, W, 3) that is nowhere brighter than about twice ``level``."""
+    rng = np.random.default_rng([seed, 77])
+    picture = np.full((height, width, 3), level)
+    for scale, strength in ((8, 12.0), (40, 25.0), (160, 30.0)):
+        coarse = rng.normal(0.0, strength, (height // scale + 2, width // scale + 2, 3)).astype(np.float32)
+        picture += cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    for _ in range(12):  # furniture: edges
+        x, y = rng.integers(0, width - 40), rng.integers(0, height - 40)
+        w, h = rng.integers(20, 160, 2)
+        picture[y : y + h, x : x + w] *= rng.uniform(0.5, 1.4)
+    return np.clip(picture, 0.0, 180.0)
+
+
+def add_spot(
+    picture: Floats, u: float, v: float, sigma: float, peak: float, smear: tuple[float, float] = (0.0, 0.0)
+) -> None:
+    """A round spot integrated over each pixel, moved by ``smear`` [px] during the exposure about (u, v)."""
+    height, width = picture.shape[:2]
+    steps = 1 if smear == (0.0, 0.0) else 32
+    columns, rows = np.arange(width), np.arange(height)
+    for step in range(steps):
+        part = (step + 0.5) / steps - 0.5
+
+        def covered(axis: Floats | npt.NDArray[np.int_], centre: float) -> Floats:
+            scaled = sigma * np.sqrt(2.0)
+            return np.asarray(0.5 * (erf((axis + 0.5 - centre) / scaled) - erf((axis - 0.5 - centre) / scaled)))
+
+        light = np.outer(covered(rows, v + part * smear[1]), covered(columns, u + part * smear[0]))
+        picture += (peak * 2.0 * np.pi * sigma**2 / steps * light)[..., None]
+
+
+def exposed(picture: Floats, noise: float, rng: np.random.Generator) -> Image:
+    """What a sensor makes of it: noise, clipped at white, whole grey levels."""
+    noisy = np.clip(picture, 0.0, 400.0) + rng.normal(0.0, noise, picture.shape)
+    return np.clip(np.rint(np.minimum(noisy, 255.0)), 0, 255).astype(np.uint8)
+
+
+def add_look_alikes(picture: Floats, rng: np.random.Generator, keep_off: Sequence[float], reach: float = 50.0) -> None:
+    """Windows, lamps, tubes and dim reflections, none within ``reach`` px of (u, v) = keep_off."""
+    height, width = picture.shape[:2]
+    for kind in ("window", "tube", "lamp", "glimmer", "glimmer"):
+        for _ in range(100):
+            x, y = rng.uniform(90, width - 90), rng.uniform(90, height - 90)
+            if np.hypot(x - keep_off[0], y - keep_off[1]) > reach + 90.0:
+                break
+        column, row = int(x), int(y)
+        if kind == "window":
+            picture[row - 45 : row + 45, column - 35 : column + 35] = 255.0
+        elif kind == "tube":
+            picture[row : row + 4, column - 70 : column + 70] = 255.0
+        elif kind == "lamp":
+            add_spot(picture, x, y, 30.0, 300.0)
+        else:
+            add_spot(picture, x, y, 1.5, 60.0)
+
+
+def tag_image(dictionary: int, number: int, pixels: int = 640) -> Image:
+    """A tag with its white margin of one cell in eight, grey (pixels, pixels)."""
+    inner = pixels * 8 // 10
+    drawn = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(dictionary), number, inner)
+    margin = (pixels - inner) // 2
+    return np.asarray(cv2.copyMakeBorder(drawn, *[margin] * 4, cv2.BORDER_CONSTANT, value=255), dtype=np.uint8)
+
+
+def add_tag(picture: Floats, tag: Image, centre: Floats, side: float, tilt: Floats, smear: Floats) -> Floats:
+    """Draw a tag whose middle is at ``centre`` [px] and whose black square would be ``side`` px seen straight on.
+
+    tilt: (3,) rotation vector from facing the camera, seen through a lens of 800 px. smear: (2,) px during
+    the exposure. Returns its four black corners (4, 2).
+    """
+    rotation, _ = cv2.Rodrigues(np.asarray(tilt, dtype=np.float64))
+    focal = 800.0
+    depth = focal / side
+    pixels = tag.shape[0]
+    inner = pixels * 8 // 10 / pixels
+    flat = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * 0.5
+
+    def seen(corners: Floats, shift: Floats) -> Floats:
+        points = np.column_stack([corners, np.zeros(4)]) @ rotation.T + [0.0, 0.0, depth]
+        return np.asarray(focal * points[:, :2] / points[:, 2:] + centre + shift)
+
+    corners_of_image = np.array(
+        [[-0.5, -0.5], [pixels - 0.5, -0.5], [pixels - 0.5, pixels - 0.5], [-0.5, pixels - 0.5]]
+    )
+    steps = 1 if not np.any(smear) else 12
+    fine = 4
+    height, width = picture.shape[:2]
+    total = np.zeros((height, width))
+    cover = np.zeros((height, width))
+    for step in range(steps):
+        part = ((step + 0.5) / steps - 0.5) * np.asarray(smear)
+        quad = seen(flat / inner, part)
+        large = (quad + 0.5) * fine - 0.5
+        warp = cv2.getPerspectiveTransform(corners_of_image.astype(np.float32), large.astype(np.float32))
+        size = (width * fine, height * fine)
+        drawn = cv2.warpPerspective(tag, warp, size, flags=cv2.INTER_AREA)
+        mask = cv2.warpPerspective(np.full_like(tag, 255), warp, size, flags=cv2.INTER_NEAREST)
+        total += cv2.resize(drawn, (width, height), interpolation=cv2.INTER_AREA).astype(float) / steps
+        cover += cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA).astype(float) / (255.0 * steps)
+    paper = 30.0 + total * 190.0 / 255.0
+    picture[...] = picture * (1.0 - cover[..., None]) + (paper * np.minimum(cover, 1.0))[..., None]
+    return seen(flat, np.zeros(2))
