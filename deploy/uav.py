@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from deploy.uav_config import FlightConfig, UavConfig
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from edge.mavlink.link import Link
     from edge.uav.tracker import Estimate, Image
     from edge.uav.world.world import World
-    from edge.video_server import VideoServer
 
 _HOVER_M = 62.0
 _GIMBAL_PITCH = math.radians(-62.0)
@@ -48,6 +47,7 @@ def start_uav(config: UavConfig, bus: Bus, stop: threading.Event, beat: Callable
     import cv2
 
     from deploy.notify import Watched
+    from deploy.uav_video import Shown, serve_video
     from edge.uav_agent import Looking, UavAgent
 
     cv2.setNumThreads(1)
@@ -61,18 +61,17 @@ def start_uav(config: UavConfig, bus: Bus, stop: threading.Event, beat: Callable
             print("syncline: without matrix and body_from_camera in rig the telemetry is not used", flush=True)
         size, fps = (info.width, info.height), info.fps or 30.0
         link = make_link(config)
-        watch = _Shown()
+        shown = Shown()
         stream: Stream | None = None
-        server: VideoServer | None = None
         if config.video_out is not None:
-            server, stream = _serve_video(config, watch, stack)
+            stream = serve_video(config.video_out, size, fps, shown, stack)
         # With frames and not with every round: a camera that was unplugged must trip the watchdog.
         watched = device if beat is None else Watched(device, beat)
         agent = make_agent(
-            config, watched, link, Looking(size, fps, lens, mounting, config.seed, config.model, _quality(config)),
-            stream=stream, shown=watch.take if server is not None else None,
+            config, watched, link, Looking(size, fps, lens, mounting, config.seed, config.model, _quality(config),
+                                           config.pictures_hz, config.picture_width),
+            stream=stream, shown=shown.take if stream is not None else None,
         )  # fmt: skip
-        watch.tell = server.changed if server is not None else lambda: None
         assert isinstance(agent, UavAgent)
         agent.run(bus, stop)
     return EXIT_DONE
@@ -270,41 +269,3 @@ def _rig_camera(config: UavConfig) -> tuple[Intrinsics | None, Floats | None]:
 
 def _quality(config: UavConfig) -> int | None:
     return None if config.images is None else config.images.quality
-
-
-class _Shown:
-    """The newest picture and estimate, for the operator's video; drawn and compressed only if somebody watches."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._newest: tuple[Image, Estimate | None, str] | None = None
-        self.tell: Callable[[], None] = lambda: None
-
-    def take(self, image: Image, estimate: Estimate | None, line: str) -> None:
-        with self._lock:
-            # Layers speak of the tracker's present frame only.
-            self._newest = (image, None if estimate is None else replace(estimate, layers={}), line)
-        self.tell()
-
-    def jpeg(self, quality: int) -> bytes | None:
-        import cv2
-
-        from edge.uav.operator_view import draw
-
-        with self._lock:
-            newest = self._newest
-        if newest is None:
-            return None
-        good, data = cv2.imencode(".jpg", draw(*newest), [cv2.IMWRITE_JPEG_QUALITY, quality])
-        return data.tobytes() if good else None
-
-
-def _serve_video(config: UavConfig, watch: _Shown, stack: ExitStack) -> tuple[VideoServer, Stream]:
-    from edge.mavlink.camera import Stream
-    from edge.video_server import PATH, VideoServer
-
-    out = config.video_out
-    assert out is not None
-    host, _, port = out.listen.rpartition(":")
-    server = stack.enter_context(VideoServer(host, int(port), lambda: watch.jpeg(out.quality)))
-    return server, Stream("mjpeg", out.uri or f"http://{host}:{server.port}{PATH}")

@@ -68,16 +68,20 @@ class ControlConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class VideoOutConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[video_out]: the picture with the estimate on it, as motion JPEG over HTTP.
+    """[video_out]: the picture with the estimate on it.
 
-    listen: "address:port". beyond_loopback: whether others than this machine may watch; nobody is asked for a
-    password. uri: what ground stations are told; None = http://<listen>/stream.mjpg. quality: of the JPEGs.
+    stream: "rtsp" = H.264 as ground stations open it by themselves (needs the extra video), "mjpeg" = motion JPEG over
+    HTTP, for browsers. listen: "address:port". beyond_loopback: whether others than this machine may watch; nobody is
+    asked for a password. uri: what ground stations are told; None = rtsp://<listen>/overlay or
+    http://<listen>/stream.mjpg. quality: of the JPEGs. kbps: most of the H.264.
     """
 
+    stream: Literal["mjpeg", "rtsp"] = "mjpeg"
     listen: str = "127.0.0.1:8560"
     beyond_loopback: bool = False
     uri: Annotated[str, Meta(max_length=159)] | None = None
     quality: Annotated[int, Meta(ge=20, le=95)] = 75
+    kbps: Annotated[int, Meta(ge=100, le=20_000)] = 2000
 
     def __post_init__(self) -> None:
         host, _, port = self.listen.rpartition(":")
@@ -87,6 +91,10 @@ class VideoOutConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=T
             raise ValueError(
                 f"listen {self.listen!r} is open to the network; take 127.0.0.1, or set beyond_loopback = true"
             )
+        if self.uri is None and host in ("0.0.0.0", "[::]"):
+            raise ValueError(f"listen {self.listen!r} is no address that can be called; add the uri that stations open")
+        if self.uri is not None and not self.uri.startswith(("rtsp://", "http://", "https://")):
+            raise ValueError(f"uri {self.uri!r} is none that stations open; begin it with rtsp:// or http://")
 
 
 class ImagesConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -133,7 +141,8 @@ class UavConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The UAV agent. rig: a rig.toml with this camera's matrix and body_from_camera, found by the agent's id.
 
     mount: "fixed" = on the airframe, "gimbal" = the attitude is the gimbal's, and body_from_camera is from its axes
-    (default: looks along its x axis). model, seed: of the tracker.
+    (default: looks along its x axis). model, seed: of the tracker. pictures_hz, picture_width: small pictures a second
+    on the bus while a view or a recorder wants them, and their width [px]; 0 = none, ever.
     """
 
     id: str
@@ -149,6 +158,8 @@ class UavConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
     control: ControlConfig = msgspec.field(default_factory=ControlConfig)
     video_out: VideoOutConfig | None = None
     images: ImagesConfig | None = None
+    pictures_hz: Annotated[float, Meta(ge=0.0, le=30.0)] = 2.0
+    picture_width: Annotated[int, Meta(ge=64, le=640)] = 320
 
     def __post_init__(self) -> None:
         super().__post_init__()

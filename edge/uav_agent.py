@@ -18,16 +18,20 @@ from google.protobuf.message import Message
 from edge.devices.base import Device, Frame, Image
 from edge.mavlink.camera import CameraComponent, Select, Stop
 from edge.mavlink.control import Aim, Control
+from edge.mavlink.ear import Ear
 from edge.mavlink.link import Heard, Link
 from edge.mavlink.vehicle import Sample, Vehicle
+from edge.outbox import Outbox
+from edge.pictures import WIDTH, picture_message
 from edge.uav.follower import Follower, decoded
 from edge.uav.navigation import to_quaternion
 from edge.uav.time_map import Aligner, CameraHostClock
 from edge.uav.tracker import Box, Estimate, State, Telemetry
-from edge.uav_threads import Ear, Outbox
+from edge.uav_told import line, show
 from protocols.bus.base import Bus
 from protocols.catalogue import (
     FLIGHT_IMAGE,
+    PICTURE,
     ROAD_MAP,
     STATUS,
     TARGET,
@@ -45,6 +49,7 @@ from protocols.version import VERSION
 
 ROLE = "uav"
 _READ_S = 0.02
+_OUTBOX = 2048
 _INFO_S, _STATUS_S = 2.0, 1.0
 _SILENT_S = 2.0  # without a frame the agent is degraded
 _LINK_STALE_S = 1.5  # without the vehicle nothing is commanded
@@ -52,7 +57,7 @@ _STEP_BACK_S = 0.2
 _UNTOLD_DELAY_S = 0.03  # std of what a frame and an attitude are late by, until the pictures have told
 TOPICS = {
     topic.message: topic
-    for topic in (FLIGHT_IMAGE, TELEMETRY, TARGET_COMMAND, TARGET, TARGET_CLOUD, ROAD_MAP, UAV_INFO, STATUS)
+    for topic in (FLIGHT_IMAGE, TELEMETRY, TARGET_COMMAND, TARGET, TARGET_CLOUD, ROAD_MAP, UAV_INFO, STATUS, PICTURE)
 }
 
 
@@ -61,6 +66,7 @@ class Looking:
     """The camera and how it works. lens, body_from_camera: None where not known.
 
     jpeg_quality: of the pictures on the bus, which are then also what the tracker sees; None: none are sent.
+    pictures_hz, picture_width: small pictures a second while somebody wants them, and their width [px]; 0 = never.
     """
 
     size: tuple[int, int]
@@ -70,6 +76,8 @@ class Looking:
     seed: int = 0
     model: str = "ground"
     jpeg_quality: int | None = None
+    pictures_hz: float = 2.0
+    picture_width: int = WIDTH
 
 
 class UavAgent:
@@ -135,10 +143,10 @@ class UavAgent:
         try:
             with (
                 bus.announce(ROLE, self._agent, self.boot_id),
-                Outbox(bus, self._agent, TOPICS) as outbox,
+                Outbox(bus, self._agent, TOPICS.values(), _OUTBOX) as outbox,
                 Ear(self._link) as ear,
             ):
-                self._publish = outbox.put
+                self._publish = lambda message: outbox.put(TOPICS[message.DESCRIPTOR.name], message)
                 self._loop(stop, ear, outbox)
         finally:
             self._device.close()
@@ -236,21 +244,24 @@ class UavAgent:
         )
 
     def _loop(self, stop: threading.Event, ear: Ear, outbox: Outbox) -> None:
-        sequence = 0
-        next_info = next_status = -math.inf
+        sequence, looking = 0, self._looking
+        next_info = next_status = next_picture = -math.inf
         while not (stop.is_set() or self._device.ended):
             frame = self._device.read(_READ_S)
             self.step(ear.drain(), frame)
             now = self._now_ns() / NANOSECONDS
+            if frame is not None and now >= next_picture and outbox.wants(PICTURE) and looking.pictures_hz > 0.0:
+                next_picture = now + 1.0 / looking.pictures_hz
+                self._publish(picture_message(frame, self._agent, self.boot_id, looking.picture_width))
             if now >= next_info:
                 next_info = now + _INFO_S
                 self._publish(self.info())
             if now >= next_status:
                 next_status = now + _STATUS_S
-                self._publish(self.status(sequence, unpublished=outbox.lost))
+                self._publish(self.status(sequence, unpublished=outbox.lost.total()))
                 sequence += 1
         ended = "the recording has ended" if self._device.ended and not stop.is_set() else "stopped"
-        self._publish(self.status(sequence, ended, outbox.lost))
+        self._publish(self.status(sequence, ended, outbox.lost.total()))
 
     def _take_sample(self, sample: Sample) -> None:
         camera_ns = self.camera_clock.camera_ns(sample.host_ns)
@@ -315,7 +326,7 @@ class UavAgent:
         if self.aligner is not None:
             self.aligner.handle_frame(image, frame.device_time_ns / NANOSECONDS, self.follower.following)
         if self._shown is not None:
-            self._shown(frame.image, self.follower.estimate, self._line())
+            self._shown(frame.image, self.follower.estimate, line(self.follower.estimate))
 
     def _obey(self, order: Select | Stop) -> bool:
         """What the operator asks for; whether it could be done."""
@@ -383,45 +394,10 @@ class UavAgent:
 
     def _update_shown(self) -> None:
         """What the camera component tells."""
-        shown, estimate, vehicle = self.camera.shown, self.follower.estimate, self._vehicle
-        width, height = self._looking.size
+        vehicle = self._vehicle
         boot_ns = self._now_ns() + vehicle.clock.offset_ns if vehicle.clock.known else 0
-        shown.boot_ms = (boot_ns // 1_000_000) & 0xFFFFFFFF
-        origin, place = vehicle.origin, vehicle.position
-        shown.camera = None
-        if origin is not None and place is not None:
-            shown.camera = origin.world(float(place[0]), float(place[1]), float(place[2]))
-        if vehicle.attitude is not None:
-            shown.quaternion = to_quaternion(vehicle.attitude.ned_from_body)
-        shown.centre = shown.half = shown.geo = shown.velocity = None
-        shown.h_acc = shown.distance = shown.course = math.nan
-        shown.state = "idle" if estimate is None else estimate.state.value
-        if estimate is None or estimate.state is State.LOST:
-            return
-        if math.isfinite(estimate.x) and math.isfinite(estimate.width) and math.isfinite(estimate.height):
-            shown.centre = ((estimate.x + 0.5) / width, (estimate.y + 0.5) / height)
-            shown.half = (0.5 * estimate.width / width, 0.5 * estimate.height / height)
-        if not (math.isfinite(estimate.north) and math.isfinite(estimate.east)):
-            return
-        shown.h_acc = math.sqrt(2.0) * estimate.std_m  # of the distance; std_m is of one coordinate
-        if origin is not None:
-            shown.geo = origin.world(estimate.north, estimate.east, 0.0)
-        if math.isfinite(estimate.course):
-            shown.course = estimate.course
-            north, east = estimate.speed * math.cos(estimate.course), estimate.speed * math.sin(estimate.course)
-            shown.velocity = (north, east)
-        if place is not None:
-            shown.distance = float(np.linalg.norm(np.array([estimate.north, estimate.east, 0.0]) - place))
-
-    def _line(self) -> str:
-        """One line for the operator's picture."""
-        estimate = self.follower.estimate
-        if estimate is None:
-            return "no target"
-        text = estimate.state.value
-        if math.isfinite(estimate.speed) and estimate.state is not State.LOST:
-            text += f"  {3.6 * estimate.speed:.0f} km/h  +-{estimate.std_m:.1f} m"
-        return text
+        self.camera.shown.boot_ms = (boot_ns // 1_000_000) & 0xFFFFFFFF
+        show(self.camera.shown, self.follower.estimate, vehicle, self._looking.size)
 
     def _head(self) -> dict[str, Any]:
         """What every input message begins with; counts the inputs."""

@@ -66,7 +66,7 @@ def demo(
     if not 5.0 <= seconds <= 3600.0:
         raise InputError(f"--seconds {seconds:g} is out of range", remedy="give 5 to 3600")
     if scene == "town":
-        return _town(out, seconds, seed, view=view, as_json=json)
+        return _town(out, seconds, seed, view_port if view else None, as_json=json)
     from deploy.demo import DemoSettings, Fleet
 
     settings = DemoSettings(scene, seed, cameras, seconds, out, view_port if view else None)
@@ -95,15 +95,18 @@ def demo(
     return EXIT_DONE if comparison.good else EXIT_REFUSED
 
 
-def _town(out: Path, seconds: float, seed: int, *, view: bool, as_json: bool) -> int:
-    if view:
-        raise InputError("--view shows rigs, not a flight", remedy="leave it out")
-    from deploy.uav_demo import as_json as to_json
-    from deploy.uav_demo import print_outcome, run_town
+def _town(out: Path, seconds: float, seed: int, view_port: int | None, *, as_json: bool) -> int:
+    from deploy.uav_demo import run_town
     from deploy.uav_demo_display import Display
+    from deploy.uav_demo_outcome import as_json as to_json
+    from deploy.uav_demo_outcome import print_outcome
 
     with Display(seconds, quiet=as_json) as show:
-        outcome = run_town(out, seconds, seed, show)
+
+        def viewed(address: str) -> None:
+            print(f"live view: open {address}", file=sys.stderr if as_json else sys.stdout, flush=True)
+
+        outcome = run_town(out, seconds, seed, show, view_port=view_port, viewed=viewed)
     if as_json:
         print(to_json(outcome))
     else:

@@ -280,6 +280,7 @@ class CameraComponent:
             round(hfov) if math.isfinite(hfov) else 0,
             self._stream.kind.encode(),
             self._stream.uri.encode()[:159],
+            mavlink.VIDEO_STREAM_ENCODING_H264 if rtsp else mavlink.VIDEO_STREAM_ENCODING_UNKNOWN,
         )
 
     def _video_stream_status(self) -> Any:

@@ -25,8 +25,8 @@ _SURE = 12.0  # by how much the log-likelihood of the answer must beat the other
 _BESIDE_S = 0.35  # offsets that near to the answer are no others
 _LEAST_S = 2.0  # seconds of pictures that overlap
 _FINE_S = 0.002
+_MISSING = 2.5  # usual distances between samples, after which some are missing
 _USELESS_S = 0.02  # std of an answer that is none: at a turn of 30 degrees a second it is half a degree
-_MODESTY = 1.6  # errors over the std that the curvature gives, in simulated flights: the noise is not white
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +124,7 @@ def _picture_angles(seen: Turning, origin: float) -> _Angles:
     index = np.clip(np.searchsorted(begins, grid, side="right") - 1, 0, len(begins) - 1)
     inside = (grid >= begins[index] - 1e-9) & (grid <= ends[index] + 1e-9)
     nodes = np.r_[begins[0], ends]
-    values = np.column_stack([np.interp(grid, nodes, np.r_[0.0, summed[:, axis]]) for axis in range(3)])
+    values = _between(nodes, np.vstack([np.zeros(3), summed]), grid)
     values[~inside] = np.nan
     return _Angles(0.0, values)
 
@@ -147,9 +147,27 @@ def _told_angles(telemetry: Sequence[Telemetry], body_from_camera: Floats) -> _A
         times, camera_from_ned = _smooth(times, camera_from_ned)
     steps = _logs(camera_from_ned[1:] @ np.swapaxes(camera_from_ned[:-1], 1, 2))
     summed = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
-    values = np.column_stack([np.interp(at, times, summed[:, axis]) for axis in range(3)])
+    values = _between(times, summed, at)
     values[gaps[index] > _LONGEST_GAP_S] = np.nan
     return _Angles(float(at[0]), values)
+
+
+def _between(times: Floats, values: Floats, at: Floats) -> Floats:
+    """Values (n, 3) at ``times``, by cubic splines at the moments ``at`` between them; straight across what is missing.
+
+    Straight lines are flattest half-way: two such rows agree best with corner on corner, and an offset found from
+    pictures and attitudes of like rates would be drawn by up to 4 ms to where they fall together.
+    """
+    from scipy.interpolate import CubicSpline
+
+    out = np.column_stack([np.interp(at, times, values[:, axis]) for axis in range(3)])
+    gaps = np.diff(times)
+    breaks = np.flatnonzero(gaps > _MISSING * np.median(gaps))
+    for first, last in zip(np.r_[0, breaks + 1], np.r_[breaks, len(times) - 1], strict=True):
+        inside = (at >= times[first]) & (at <= times[last])
+        if last - first >= 3 and inside.any():
+            out[inside] = CubicSpline(times[first : last + 1], values[first : last + 1])(at[inside])
+    return out
 
 
 def _logs(rotations: Floats) -> Floats:
@@ -272,7 +290,8 @@ def _refine(
     bend, slope, _ = np.polyfit(tries[k - 2 : k + 3] - tries[k], score[k - 2 : k + 3], 2)
     shift = float(np.clip(-slope / (2.0 * bend), -2 * _FINE_S, 2 * _FINE_S)) if bend > 0 else 0.0
     wide_bend = np.polyfit(tries - tries[k], score, 2)[0]
-    std = _MODESTY / float(np.sqrt(max(2.0 * wide_bend, 1.0)))
+    # The curvature of the log-likelihood, whose seconds count as pieces of ``piece`` each: the noise is not white.
+    std = 1.0 / float(np.sqrt(max(2.0 * wide_bend, 1.0)))
     agreement = 1.0 - float((cost[k] * weight).sum() / max((energy * weight).sum(), 1e-12))
     return float(tries[k]) + shift, std, float(np.clip(agreement, 0.0, 1.0))
 

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from deploy.uav_config import ControlConfig
+from deploy.uav_demo_outcome import compare
+from deploy.uav_demo_report import write_report
 from deploy.uav_replay import replay_through_uav
 from edge.mavlink.autopilot import Faults
+from edge.uav.tracker import State
 from edge.uav.world.patrol import patrol
 from edge.uav.world.world import World
 from edge.uav_agent import TOPICS
@@ -124,3 +128,55 @@ def test_an_aircraft_that_may_be_told_to_follow_is_told_and_stops_when_the_opera
     flight.run(4.0)
     assert flight.autopilot.counters["follow_targets"] == sent
     assert flight.agent.status(0).message == "stopped by the operator"
+
+
+def test_the_demos_report_shows_map_and_pictures_of_what_was_recorded(world: World, tmp_path: Path) -> None:
+    flight = Flight(world, jpeg_quality=80, camera_ahead_s=0.0)
+    flight.run(1.5)
+    assert flight.select()
+    flight.run(16.0)
+    log = recorded(flight, tmp_path / "demo.mcap")
+    outcome = compare(log, world, flight.boot_s)
+    assert outcome.out_frames > 10, "the flight loses the car every 12 s"
+    write_report(tmp_path / "report.html", log, outcome, world)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert page.count("data:image/jpeg;base64,") == 4
+    assert "found again" in page
+    assert page.count("<circle") > 0.9 * outcome.frames  # every place that was told
+    assert f"out of it ({outcome.out_frames} frames)" in page
+    assert "://" not in page.replace("http://www.w3.org", "")  # one file that needs nothing else
+
+
+def test_commands_stop_while_the_link_is_silent_or_no_frames_come_and_when_the_target_is_lost(world: World) -> None:
+    start = np.array([*world.target.ground[0], -62.0])
+    flight = Flight(
+        world, control=ControlConfig(follow=True), flies="follow", start=start, yaw=float(world.target.course[0])
+    )
+    control = flight.agent._control
+
+    def sent(seconds: float) -> int:
+        before = control.counters["follow_targets"]
+        flight.run(flight.time + seconds)
+        return control.counters["follow_targets"] - before
+
+    flight.run(1.5)
+    assert flight.select()
+    flight.run(2.5)
+    step, flight.autopilot.step = flight.autopilot.step, lambda time: None  # type: ignore[method-assign]
+    flight.run(4.1)
+    assert sent(0.5) == 0
+    assert control.why == "the link is stale"
+    flight.autopilot.step = step  # type: ignore[method-assign]
+    flight.run(5.0)
+    assert sent(0.5) > 0
+    estimate = flight.agent.follower.estimate
+    assert estimate is not None
+    flight.frames_lost = lambda frame: True
+    flight.agent.follower.estimate = replace(estimate, state=State.LOST)
+    assert sent(0.5) == 0
+    assert control.why == "the target is lost"
+    flight.agent.follower.estimate = estimate
+    assert sent(0.5) > 0
+    flight.run(flight.time + 1.2)  # more than two seconds without a frame
+    assert sent(0.5) == 0
+    assert control.why == "no frames"

@@ -184,3 +184,26 @@ def test_a_ground_station_selects_a_car_and_hears_where_it_is_also_out_of_the_pi
     assert status.counters["camera.selections"] == 1
     assert status.counters["camera.refused.box"] == 1
     assert not any(name.startswith("sent.") and value for name, value in status.counters.items())
+
+
+def test_the_operators_video_is_told_as_rtsp_and_opencv_opens_it(tmp_path: Path) -> None:
+    pytest.importorskip("av", reason="PyAV is not installed: there is no RTSP stream to open")
+    import cv2
+
+    with agent(tmp_path, '[video_out]\nstream = "rtsp"\nlisten = "127.0.0.1:0"\n') as (gcs, world, subscriptions, _):
+        assert gcs.command(M.MAV_CMD_REQUEST_MESSAGE, M.MAVLINK_MSG_ID_VIDEO_STREAM_INFORMATION) == 0
+        info = gcs.wait("VIDEO_STREAM_INFORMATION")
+        assert (info.type, info.encoding) == (M.VIDEO_STREAM_TYPE_RTSP, M.VIDEO_STREAM_ENCODING_H264)
+        assert (info.resolution_h, info.resolution_v) == world.size
+        stream = cv2.VideoCapture(info.uri, cv2.CAP_FFMPEG)
+        try:
+            pictures = [stream.read()[1] for _ in range(10)]
+        finally:
+            stream.release()
+        jpeg = [r.message for r in subscriptions["flight_image"].drain()][-1].jpeg
+        flown = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+        for picture in pictures:
+            assert picture.shape == (world.size[1], world.size[0], 3)
+            # Of the same town, within two seconds: its colours are those of the camera's own pictures.
+            np.testing.assert_allclose(picture.mean(axis=(0, 1)), flown.mean(axis=(0, 1)), atol=25.0)
+        assert picture[:40, :160].max() > 200  # the line of text

@@ -273,6 +273,24 @@ def straight_fit(speed: float, time: float = 0.0, across: float = 0.0) -> Motion
     return MotionFit(time, np.zeros(2), np.array([speed, 0.0]), np.array([0.0, across]), 0.2, 0.3, 0.05, 20)
 
 
+def test_the_speed_at_which_it_was_found_again_is_no_opinion_of_its_speed_later() -> None:
+    """Found again at 7 units/s, it drove on at 10 round a bend: the fit stayed near 7, and it was lost."""
+    seen, place = Sightings(), np.zeros(2)
+    seen.begin_anew(np.array([7.0, 0.0]), 0.4)
+    for k in range(240):
+        course = 0.5 * np.pi * min(k / 120, 1.0)
+        step = (10.0 if k > 30 else 7.0) / 30 * np.array([np.cos(course), np.sin(course)])
+        place = place + step
+        seen.add(k / 30, place, 0.22)
+        fit = seen.fit()
+        if k == 4:
+            first = fit
+    assert first is not None
+    assert fit is not None
+    assert first.velocity == pytest.approx([7.0, 0.0], abs=0.6)  # a few sightings tell little else
+    assert fit.velocity == pytest.approx([0.0, 10.0], abs=0.2)
+
+
 def test_who_is_out_of_sight_slows_down_for_a_bend_and_not_on_the_straight() -> None:
     rng = np.random.default_rng(0)
     for way, low, high in ((bending_way(15.0), 0.0, 8.6), (straight_way(), 9.3, 10.7)):

@@ -68,6 +68,7 @@ class Sightings:
         self._places: deque[Floats] = deque(maxlen=_MOST)
         self._stds: deque[float] = deque(maxlen=_MOST)
         self._prior: tuple[Floats, float] | None = None
+        self._since: float | None = None  # when the prior was true
         self._fits: deque[MotionFit] = deque()
 
     def __len__(self) -> int:
@@ -75,12 +76,14 @@ class Sightings:
 
     def add(self, time: float, place: Floats, std: float) -> None:
         """One sighting: (2,) ground, std of one coordinate."""
+        if not self._times:
+            self._since = time
         self._times.append(time)
         self._places.append(np.asarray(place, dtype=np.float64))
         self._stds.append(std)
 
     def begin_anew(self, velocity: Floats, std: float) -> None:
-        """After a gap: only what is seen from now on counts, with a prior for the velocity (2,)."""
+        """After a gap: only what is seen from now on counts, with a prior for the velocity (2,) by then."""
         self._times.clear()
         self._places.clear()
         self._stds.clear()
@@ -118,11 +121,16 @@ class Sightings:
             return None
         places = np.array(self._places)[recent]
         stds = np.array(self._stds)[recent]
-        mean, spread = self._prior or (np.zeros(2), _SPEED_STD)
         design = np.column_stack([np.ones_like(t), t, 0.5 * t * t])
         # A film in quick motion, or units that are not metres: what is fast also changes its speed fast.
         pace = float(np.hypot(*(places[-1] - places[0]))) / float(t[-1] - t[0])
         agility = max(_ACCELERATION_STD, _AGILITY * pace)
+        mean, spread = np.zeros(2), _SPEED_STD
+        if self._prior is not None and self._since is not None:
+            # It was true when the target was found again: since then the driver has braked and steered.
+            mean, spread = self._prior[0], float(np.hypot(self._prior[1], agility * (times[-1] - self._since)))
+            if spread > _SPEED_STD:
+                mean, spread = np.zeros(2), _SPEED_STD
         information = np.diag([1e-8, 1.0 / spread**2, 1.0 / agility**2])
         right0 = np.zeros((3, 2))
         right0[1] = mean / spread**2
