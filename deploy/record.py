@@ -10,11 +10,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from math import inf
 from pathlib import Path
 
 from deploy.config import RecorderConfig, effective_toml
 from protocols.bus.base import Bus, Received, Subscription
-from protocols.catalogue import STATUS, TOPICS
+from protocols.catalogue import PICTURE, STATUS, TOPICS
+from protocols.clocks import NANOSECONDS
 from protocols.errors import InputError
 from protocols.gate import SCHEMA_VERSION
 from protocols.log.rotation import RotatingWriter
@@ -84,7 +86,10 @@ def run_recorder(
     if full:
         raise InputError(f"not recorded: {full}", file=path, remedy="make room, or lower min_free_mb")
     with _writer(config, path, bus.site, boot) as writer, bus.announce(ROLE, config.id, boot):
-        subscriptions = [bus.subscribe(topic) for topic in TOPICS if topic.recorded]
+        # Cameras send pictures only where somebody wants them.
+        wanted = [topic for topic in TOPICS if topic.recorded and (config.pictures_hz > 0.0 or topic is not PICTURE)]
+        subscriptions = [bus.subscribe(topic) for topic in wanted]
+        thinned = Thinned(config.pictures_hz)
         publisher = bus.publisher(STATUS, config.id)
         status = pb.AgentStatus(
             schema_version=SCHEMA_VERSION, agent=config.id, role=ROLE, boot_id=boot, state="running", version=VERSION
@@ -93,7 +98,7 @@ def run_recorder(
         next_sync = next_status = time.monotonic()
         try:
             while not stop.is_set() and not (stop_when is not None and stop_when(messages)) and not full:
-                messages += _record(writer, bus.site, subscriptions)
+                messages += _record(writer, bus.site, subscriptions, thinned)
                 now = time.monotonic()
                 if now >= next_sync:
                     next_sync = now + _SYNC_S
@@ -108,7 +113,7 @@ def run_recorder(
                 beat()
                 if not full:
                     stop.wait(_TICK_S)
-            messages += _record(writer, bus.site, subscriptions)
+            messages += _record(writer, bus.site, subscriptions, thinned)
             counters = _counters(subscriptions, messages)
         finally:
             publisher.close()
@@ -151,9 +156,30 @@ def _too_full(config: RecorderConfig, path: Path, free: Callable[[Path], int]) -
     return ""
 
 
-def _record(writer: LogWriter | RotatingWriter, site: str, subscriptions: list[Subscription]) -> int:
+class Thinned:
+    """Lets through at most ``hz`` pictures of each camera a second; what else there is, always."""
+
+    def __init__(self, hz: float) -> None:
+        # A picture that comes a little early is the one that was due.
+        self._apart_ns = 0.9 * NANOSECONDS / hz if hz > 0.0 else inf
+        self._last: dict[str, int] = {}
+
+    def keeps(self, received: Received) -> bool:
+        """Whether to record it."""
+        if received.topic is not PICTURE:
+            return True
+        last = self._last.get(received.agent)
+        # A clock that was set back does not end the pictures.
+        if last is not None and 0 <= received.arrival_ns - last < self._apart_ns:
+            return False
+        self._last[received.agent] = received.arrival_ns
+        return True
+
+
+def _record(writer: LogWriter | RotatingWriter, site: str, subscriptions: list[Subscription], thinned: Thinned) -> int:
     """Write what has arrived, in the order of arrival over all topics."""
-    batch: list[Received] = [received for subscription in subscriptions for received in subscription.drain()]
+    arrived = [received for subscription in subscriptions for received in subscription.drain()]
+    batch = [received for received in arrived if thinned.keeps(received)]
     batch.sort(key=lambda received: received.arrival_ns)
     for received in batch:
         writer.write(received.topic, received.agent, site, received.message, received.arrival_ns)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,6 +22,7 @@ from protocols.geometry.types import Floats
 from protocols.log.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import (
+    AdjustmentStep,
     Calibration,
     CameraCalibration,
     PairReport,
@@ -107,6 +109,7 @@ def _from_folder(folder: Path, session: Path | None) -> Answer:
         pairs=pairs,
         warnings=warnings + ((missing,) if missing else ()),
         cpu_seconds=float(document.get("cpu_seconds") or 0.0),
+        convergence=_steps(document.get("convergence")),
         residuals={name: residuals_of(camera, tables, observations) for name, camera in cameras.items()},
     )
     return Answer(calibration, rig or known, observations, command, missing, history_of(place))
@@ -215,6 +218,16 @@ def _pair(pair: Any) -> PairReport:
         number("inliers"),
         number("rms_px"),
     )
+
+
+def _steps(value: Any) -> tuple[AdjustmentStep, ...]:
+    """The adjustment's steps; what is none is left out, as in files of older versions."""
+    steps = []
+    for one in value if isinstance(value, list) else []:
+        residual = one.get("residual_px") if isinstance(one, dict) else None
+        if isinstance(residual, int | float) and math.isfinite(residual) and residual > 0.0:
+            steps.append(AdjustmentStep(str(one.get("stage") or ""), float(residual)))
+    return tuple(steps)
 
 
 def _table(value: Any) -> dict[str, Any]:

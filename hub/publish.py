@@ -91,6 +91,7 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
         solver=solution.solver,
         version=VERSION,
         refused=solution.refused,
+        convergence=scaffold.state.steps,
         trajectories=tuple(
             _table(
                 problem,

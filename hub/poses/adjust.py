@@ -44,6 +44,7 @@ from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
+from protocols.session.calibration import AdjustmentStep
 
 _WIDTH = 4.0  # Cauchy width in sigma of the 2-D residual: nearly efficient for Gaussian noise
 _CUT = 5.0  # rows beyond this many sigma are false detections
@@ -86,9 +87,11 @@ def adjust(
     """
     prior = motion_prior(problem, state, first=True)
     robust = True
+    steps = list(state.steps)
     for turn in range(rounds):
         last = turn == rounds - 1
-        state = _minimise(problem, state, prior, robust, iterations if last else max(4, iterations // 3), _ROUGH)
+        most = iterations if last else max(4, iterations // 3)
+        state = _minimise(problem, state, prior, robust, most, _ROUGH, steps, roughly)
         state = replace(state, sigma=noise(problem, state))
         prior = motion_prior(problem, state)
         if turn >= rounds - 2:
@@ -96,8 +99,8 @@ def adjust(
             robust = False
         if progress is not None:
             progress(f"adjustment {turn + 1}/{rounds}: {float(np.median(state.sigma)):.2f} px")
-    state = _minimise(problem, state, prior, robust, iterations, _ROUGH if roughly else _FINE)
-    return problem, replace(state, sigma=noise(problem, state)), prior
+    state = _minimise(problem, state, prior, robust, iterations, _ROUGH if roughly else _FINE, steps, roughly)
+    return problem, replace(state, sigma=noise(problem, state), steps=tuple(steps)), prior
 
 
 def predict(rows: Rows, camera: CameraState, path: Trajectory) -> Floats:
@@ -424,10 +427,24 @@ def _moved_camera(camera: CameraState, step: Floats) -> CameraState:
 
 
 def _minimise(
-    problem: Problem, state: State, prior: MotionPrior, robust: bool, iterations: int, least_gain: float
+    problem: Problem,
+    state: State,
+    prior: MotionPrior,
+    robust: bool,
+    iterations: int,
+    least_gain: float,
+    steps: list[AdjustmentStep],
+    growing: bool,
 ) -> State:
+    """Levenberg-Marquardt; appends where it begins and every step that it takes to ``steps``."""
     damping = 1e-4
     system, cost = build_system(problem, state, prior, robust)
+    counting = max(2 * sum(len(part.time) if robust else int(part.use.sum()) for part in problem.rows), 1)
+    stage = (
+        "first poses" if growing else "free lenses" if problem.freedom.lens else "robust" if robust else "fitting rows"
+    )
+    pixels = float(np.sqrt(np.mean(state.sigma**2)))
+    steps.append(AdjustmentStep(stage, pixels * float(np.sqrt(cost / counting))))
     for _ in range(iterations):
         try:
             path_step, camera_step = solve(system, damping, gauge_tangent(problem, state))
@@ -439,6 +456,7 @@ def _minimise(
         if np.isfinite(trial_cost) and trial_cost < cost:
             gain = cost - trial_cost
             state, system, cost = trial, trial_system, trial_cost
+            steps.append(AdjustmentStep(stage, pixels * float(np.sqrt(cost / counting))))
             damping = max(damping / 10.0, 1e-12)
             if gain < least_gain * cost:
                 break

@@ -11,6 +11,7 @@ from hub.splines import SplineBasis
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats, Ints
+from protocols.session.calibration import AdjustmentStep
 
 CAMERA_PARAMETERS = 17
 """Columns of one camera: rotation 0..2, position 3..5, offset 6, rate 7, log focal length 8, k1 9; of a lens that was
@@ -77,11 +78,12 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Everything that the adjustment moves. sigma: (cameras,) noise of one pixel coordinate."""
+    """Everything that the adjustment moves. sigma: (cameras,) noise of one pixel coordinate. steps: the way here."""
 
     cameras: tuple[CameraState, ...]
     trajectories: tuple[Trajectory, ...]
     sigma: Floats
+    steps: tuple[AdjustmentStep, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,11 +1,12 @@
-"""How the answer settled while the cameras filmed: each clock's std after every calibration of a live hub."""
+"""How the answer settled: the misfit after every step of the adjustment, and each clock's std while cameras filmed."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
-from hub.report.svg import THIN, drawing, line, number, points, short, text, time_axis
+from hub.report.svg import THIN, at, drawing, line, number, points, short, text, time_axis
+from protocols.session.calibration import AdjustmentStep
 
 _WIDTH, _LEFT, _RIGHT, _HEIGHT = 1000.0, 84.0, 190.0, 250.0
 _DASHES = ("", "9 4", "2 4", "14 4 2 4", "5 2", "1 3")
@@ -62,3 +63,83 @@ def convergence(history: tuple[Step, ...], reference: str) -> str:
     parts.append(text(_LEFT + inner / 2, _HEIGHT - 6, "seconds since the recording began", "tick", "middle"))
     first = number(series[next(iter(series))][0][0], 1)
     return drawing(_WIDTH, max(_HEIGHT, place + 10), parts, f"Std of the clocks after every answer, from {first} s on")
+
+
+_STAGES = {
+    "first poses": "cameras added",
+    "robust": "all rows, robust",
+    "fitting rows": "the rows that fit",
+    "free lenses": "lenses freed",
+}
+
+
+def adjustment(steps: tuple[AdjustmentStep, ...]) -> str:
+    """The misfit after every step of the last adjustment, on a logarithmic scale; "" for fewer than two.
+
+    A round begins where a line ends: rows and noise are weighed anew there. Each stage has its own mark and name.
+    """
+    steps = tuple(step for step in steps if math.isfinite(step.residual_px) and step.residual_px > 0.0)
+    if len(steps) < 2:
+        return ""
+    values = [step.residual_px for step in steps]
+    levels = _levels(min(values), max(values))
+    low, high = math.log10(levels[0]), math.log10(levels[-1])
+    inner, bottom, top = _WIDTH - _LEFT - 30.0, _HEIGHT - 38, 26.0
+
+    def x(index: int) -> float:
+        return _LEFT + 12.0 + (inner - 24.0) * index / (len(steps) - 1)
+
+    def y(residual: float) -> float:
+        return bottom - (bottom - top) * (math.log10(residual) - low) / (high - low)
+
+    parts = []
+    for level in levels:
+        parts.append(line(_LEFT, y(level), _LEFT + inner, y(level), "grid"))
+        parts.append(text(_LEFT - 8, y(level) + 4, f"{level:g}{THIN}px", "tick", "end"))
+    stages = list(dict.fromkeys(step.stage for step in steps))
+    begin = 0
+    for index, step in enumerate(steps):
+        if index and step.stage == steps[index - 1].stage:
+            continue
+        if index:
+            middle = (x(index - 1) + x(index)) / 2
+            ends = f'x1="{at(middle)}" y1="{at(top)}" x2="{at(middle)}" y2="{at(bottom)}"'
+            parts.append(f'<line class="grid" {ends} stroke-dasharray="4 4"/>')
+        parts.append(text(x(index), top - 10, _STAGES.get(step.stage, step.stage), "tick"))
+    for index in range(1, len(steps) + 1):
+        # A round starts with the state that the one before left, weighed anew: no line leads there.
+        if (
+            index == len(steps)
+            or steps[index].residual_px >= values[index - 1]
+            or (steps[index].stage != steps[index - 1].stage)
+        ):
+            run = range(begin, index)
+            parts.append(
+                f'<polyline class="median" points="{points([x(i) for i in run], [y(values[i]) for i in run])}"/>'
+            )
+            begin = index
+    for index, step in enumerate(steps):
+        parts.append(_mark(x(index), y(step.residual_px), stages.index(step.stage)))
+    last = number(values[-1], 3)
+    parts.append(text(x(len(steps) - 1), y(values[-1]) - 10, f"{last}{THIN}px", "tick", "end"))
+    parts.append(text(_LEFT + inner / 2, _HEIGHT - 12, f"{len(steps)} steps of the adjustment", "tick", "middle"))
+    return drawing(
+        _WIDTH, _HEIGHT, parts, f"Misfit after each of {len(steps)} steps of the adjustment, {last} px at last"
+    )
+
+
+def _levels(low: float, high: float) -> list[float]:
+    """1, 2 and 5 times powers of ten from below ``low`` to above ``high``; two at least."""
+    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1
+    steps = [step * 10.0**power for power in range(first, last + 1) for step in (1.0, 2.0, 5.0)]
+    begin = max(index for index, step in enumerate(steps) if step <= low)
+    end = min(index for index, step in enumerate(steps) if step >= high and index > begin)
+    return steps[begin : end + 1]
+
+
+def _mark(x: float, y: float, kind: int) -> str:
+    """A circle, a square or a diamond."""
+    if kind % 3 == 0:
+        return f'<circle class="dot" cx="{at(x)}" cy="{at(y)}" r="3.5"/>'
+    turn = f' transform="rotate(45 {at(x)} {at(y)})"' if kind % 3 == 2 else ""
+    return f'<rect class="dot" x="{at(x - 3.2)}" y="{at(y - 3.2)}" width="6.4" height="6.4"{turn}/>'

@@ -85,8 +85,8 @@ def _calibration_page(
         ),
         _section(
             "Convergence",
-            "How sharply each clock was known as the recording went on: the std after every answer of the hub.",
-            "" if rig.shared_clock else convergence.convergence(history, calibration.reference),
+            "",
+            _convergence(calibration, rig, history),
         ),
         _section(
             "Pairs",
@@ -223,6 +223,23 @@ def _pairs(calibration: Calibration) -> str:
     if pair_graph.is_matrix(calibration):
         return f"{legend}{drawn}{listed}"
     return f'{legend}<div class="graph"><div>{drawn}</div><div>{listed}</div></div>'
+
+
+def _convergence(calibration: Calibration, rig: Rig, history: tuple[Step, ...]) -> str:
+    steps = convergence.adjustment(calibration.convergence)
+    clocks = "" if rig.shared_clock else convergence.convergence(history, calibration.reference)
+    return "".join(
+        f'<p class="lead">{lead}</p>{figure}'
+        for lead, figure in (
+            (
+                "The misfit after every step of the adjustment, in pixels: it falls, and ends level. Where it jumps "
+                "between steps, rows and noise were weighed anew.",
+                steps,
+            ),
+            ("The std of each clock after every answer of the hub, as the recording went on.", clocks),
+        )
+        if figure
+    )
 
 
 def _words() -> str:

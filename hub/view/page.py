@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hub.view.export import calibration_file
+from hub.view.flight_picture import draw, padded, words
+from hub.view.flights import FlightView
 from hub.view.panels import camera_details, camera_table, overview
 from hub.view.scene import Options, decoded
 from hub.view.state import CameraView, ViewState
@@ -63,6 +65,8 @@ class Page:
         self._overview = gui.add_html("")
         if player is not None:
             self._add_timeline(player)
+        self._flights: dict[str, _FlightPanel] = {}
+        self._filled = False
         self._table = gui.add_html("")
         self._note: Any = None
         if player is None:
@@ -91,6 +95,27 @@ class Page:
             self._show_picture(camera)
         if self._player is not None:
             self._show_time(self._player)
+
+    def update_flights(self, state: ViewState, now: float) -> None:
+        """Bring the drones' pictures up to date."""
+        for name in [name for name in self._flights if name not in state.flights]:
+            self._flights.pop(name).remove()
+        for name, flight in state.flights.items():
+            if name not in self._flights:
+                self._flights[name] = _FlightPanel(self._server, name, self._overview.order + 0.5)
+            drawn = self._flights[name].update(flight, now)
+            if drawn is not None and not state.cameras:
+                self._fill(drawn)
+        if self._filled and (state.cameras or not state.flights):
+            self._fill(None)
+
+    def _fill(self, drawn: Any) -> None:
+        """A drone's picture on the whole page, where no rig is to be seen in 3-D; None takes it away."""
+        self._filled = drawn is not None
+        for client in self._server.get_clients().values():
+            # A browser stretches it to its window.
+            image = None if drawn is None else padded(drawn, client.camera.aspect)
+            client.scene.set_background_image(image, format="jpeg", jpeg_quality=75)
 
     def _set(self, handle: Any, text: str) -> None:
         if self._texts.get(id(handle)) != text:
@@ -181,15 +206,56 @@ class Page:
             self._time.value = value
 
 
+class _FlightPanel:
+    """One drone: its picture with what is believed of its target, and that in words."""
+
+    def __init__(self, server: viser.ViserServer, name: str, order: float) -> None:
+        gui = server.gui
+        self._folder: Any = gui.add_folder(f"Drone {name}", order=order)
+        with self._folder:
+            self._picture: Any = gui.add_image(draw(FlightView(name), None), format="jpeg", jpeg_quality=75)
+            self._words: Any = gui.add_html("")
+        self._drawn: tuple[int, ...] = ()
+        self._decoded: tuple[int, Any] = (0, None)
+        self._text = ""
+
+    def update(self, flight: FlightView, now: float) -> Any:
+        """Draw what is new; returns the drawing, None where it is the one before."""
+        drawing = None
+        target, cloud, _ = flight.at_picture()
+        # By identity too: after a jump in a replay the counts begin anew.
+        key = (
+            id(flight),
+            flight.pictures,
+            -1 if target is None else target.sequence,
+            -1 if cloud is None else cloud.sequence,
+        )
+        if key != self._drawn:
+            self._drawn = key
+            if flight.picture is None:
+                self._decoded = (0, None)
+            elif self._decoded[0] != id(flight.picture):
+                self._decoded = (id(flight.picture), decoded(flight.picture.jpeg))
+            drawing = self._picture.image = draw(flight, self._decoded[1])
+        text = words(flight, now)
+        if text != self._text:
+            self._text = self._words.content = text
+        return drawing
+
+    def remove(self) -> None:
+        """Take it away."""
+        self._folder.remove()
+
+
 def marked(image: Any, camera: CameraView) -> Any:
-    """A picture (H, W, 3) RGB with rings around what was detected last."""
+    """A picture (H, W, 3) RGB with rings around what was detected in it."""
     import cv2
 
     picture = camera.picture
     assert picture is not None
     scale = image.shape[1] / picture.width
     out = image.copy()
-    for u, v, size in camera.detections[:64]:
+    for u, v, size in camera.in_picture()[:64]:
         centre = (round((u + 0.5) * scale), round((v + 0.5) * scale))
         radius = max(8, round(0.5 * size * scale) + 5)
         for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):

@@ -12,7 +12,19 @@ from google.protobuf.message import Message
 
 from hub.messages import calibration_message, track_messages
 from hub.view.state import ViewState
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, STATUS, TRACK
+from protocols.catalogue import (
+    CALIBRATION,
+    CAMERA_INFO,
+    FLIGHT_IMAGE,
+    OBSERVATION,
+    PICTURE,
+    ROAD_MAP,
+    STATUS,
+    TARGET,
+    TARGET_CLOUD,
+    TRACK,
+    UAV_INFO,
+)
 from protocols.clocks import NANOSECONDS
 from protocols.errors import InputError
 from protocols.log.reader import LogReader
@@ -25,6 +37,11 @@ BEFORE_S = 20.0
 
 Timed = tuple[float, Message]
 """Seconds since the recording began, and a message."""
+
+
+_KEPT = (CAMERA_INFO, CALIBRATION, STATUS, UAV_INFO)
+_TOPICS = [*_KEPT, OBSERVATION, TRACK, TARGET]
+_DRAWN = [PICTURE, FLIGHT_IMAGE, TARGET_CLOUD, ROAD_MAP]
 
 
 class Recording(Protocol):
@@ -50,10 +67,10 @@ class LogRecording:
         self._kept: list[Timed] = []
         first: int | None = None
         last = 0
-        for logged in self._reader.messages([CAMERA_INFO, CALIBRATION, STATUS, OBSERVATION, TRACK]):
+        for logged in self._reader.messages(_TOPICS):
             first = logged.log_time_ns if first is None else first
             last = max(last, logged.log_time_ns)
-            if logged.topic in (CAMERA_INFO, CALIBRATION, STATUS):
+            if logged.topic in _KEPT:
                 self._kept.append(((logged.log_time_ns - first) / NANOSECONDS, logged.message))
         if first is None:
             raise InputError("nothing in this log to look at", file=path, remedy="record cameras or a hub")
@@ -78,7 +95,7 @@ class LogRecording:
     def messages(self, start: float) -> Iterator[Timed]:
         """Everything from ``start`` on."""
         begin = self._first + round(start * NANOSECONDS)
-        for logged in self._reader.messages([CAMERA_INFO, CALIBRATION, STATUS, OBSERVATION, TRACK], begin):
+        for logged in self._reader.messages([*_TOPICS, *_DRAWN], begin):
             yield (logged.log_time_ns - self._first) / NANOSECONDS, logged.message
 
 

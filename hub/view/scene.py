@@ -12,6 +12,7 @@ from hub.view.state import CameraState, CameraView, ViewState
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
+from protocols.log.small_pictures import jpeg_size
 
 if TYPE_CHECKING:
     import viser
@@ -25,7 +26,10 @@ COLOURS: dict[CameraState, tuple[int, int, int]] = {
 }
 _PATHS = ((214, 96, 20), (30, 130, 90), (120, 70, 170), (20, 120, 160), (170, 40, 90))
 _PICTURES_A_SECOND = 24.0  # over all cameras: decoding and encoding one costs 2 ms
+_MOST_PIXELS = 16_000_000  # of a picture; a few bytes of JPEG may claim 4 thousand million
 _PATH_S = 20.0  # so much of a path is drawn
+_ELEVATION = math.radians(35.0)  # of the first look
+_HALF_FIELD = 0.9 * math.tan(math.radians(75.0) / 2)  # of a new browser's camera in viser, less a margin for labels
 
 
 class Options:
@@ -109,14 +113,13 @@ class SceneDrawing:
             position=tuple(floor),
             wxyz=_turn_z_to(up),
         )
-        middle = np.mean(np.concatenate(points), axis=0) if points else (low + high) / 2
+        path = np.concatenate(points) if points else np.empty((0, 3))
+        # A path's few wild points are not worth standing farther away; every camera is.
+        near = path[((path >= low) & (path <= high)).all(axis=1)]
+        away, middle = standpoint(np.concatenate([centres, near]), up, 0.1 * extent)
         if self._framed is None or np.linalg.norm(self._framed[0] - middle) > self._framed[1] / 3:
             # Look again only where the scene is another than the one that was looked at.
             self._framed = (middle, extent)
-            side = np.cross(up, [1.0, 0.0, 0.0])
-            side = np.cross(up, [0.0, 1.0, 0.0]) if np.linalg.norm(side) < 0.1 else side
-            side = side / np.linalg.norm(side)
-            away = middle + 0.95 * extent * side + 0.65 * extent * up + 0.25 * extent * np.cross(side, up)
             self._server.initial_camera.position = tuple(away)
             self._server.initial_camera.look_at = tuple(middle)
             self._server.initial_camera.up = tuple(up)
@@ -275,6 +278,29 @@ class SceneDrawing:
                 del self._drawn[key]
 
 
+def standpoint(points: Floats, up: Floats, radius: float) -> tuple[Floats, Floats]:
+    """Where to stand to see all of points (n, 3), each with ``radius`` about it, and where to look: (3,), (3,).
+
+    From above at 35 degrees, with the broad side of what is to be seen across the picture. A point at depth d is seen
+    within d tan(half the field of view) of the axis, so each asks for a distance of its own.
+    """
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    about = points - middle
+    level = about - np.outer(about @ up, up)
+    _, _, axes = np.linalg.svd(level)
+    broad = axes[0] - (axes[0] @ up) * up
+    if np.linalg.norm(broad) < 0.1:
+        broad = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    # The axis of a singular vector has no sign of its own: the same scene shall always be seen from the same side.
+    broad = broad / np.linalg.norm(broad)
+    broad = broad * math.copysign(1.0, broad[int(np.argmax(np.abs(broad)))])
+    towards = math.cos(_ELEVATION) * np.cross(broad, up) + math.sin(_ELEVATION) * up
+    depth = about @ towards
+    beside = np.maximum(np.abs(about @ broad), np.abs(about @ np.cross(towards, broad)))
+    distance = float(np.max((beside + radius) / _HALF_FIELD + depth + radius))
+    return middle + distance * towards, middle
+
+
 def _meeting(starts: Floats, ends: Floats, tolerance: float) -> Floats | None:
     """The point (3,) next to all rays (n, 3) to (n, 3), None where they do not meet within ``tolerance``.
 
@@ -294,9 +320,12 @@ def _meeting(starts: Floats, ends: Floats, tolerance: float) -> Floats | None:
 
 
 def decoded(jpeg: bytes) -> Any:
-    """A JPEG as (H, W, 3) RGB; None where it is none."""
+    """A JPEG as (H, W, 3) RGB; None where it is none, or one that would fill the memory."""
     import cv2
 
+    size = jpeg_size(jpeg)
+    if size is None or size[0] * size[1] > _MOST_PIXELS:
+        return None
     image = cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), cv2.IMREAD_COLOR) if jpeg else None
     return None if image is None else np.ascontiguousarray(image[..., ::-1])
 

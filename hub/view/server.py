@@ -20,7 +20,19 @@ from hub.view.player import Player, Recording
 from hub.view.scene import Options, SceneDrawing
 from hub.view.state import ViewState
 from protocols.bus.base import Bus, Subscription
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, COMMAND, OBSERVATION, PICTURE, STATUS, TRACK
+from protocols.catalogue import (
+    CALIBRATION,
+    CAMERA_INFO,
+    COMMAND,
+    OBSERVATION,
+    PICTURE,
+    ROAD_MAP,
+    STATUS,
+    TARGET,
+    TARGET_CLOUD,
+    TRACK,
+    UAV_INFO,
+)
 from protocols.clocks import NANOSECONDS
 from protocols.errors import InputError
 from protocols.gate import SCHEMA_VERSION
@@ -91,7 +103,7 @@ def run_view(
     """Show what the bus says until ``stop`` is set; send what is clicked. each: called ten times a second."""
     state = ViewState()
     name, boot = new_id(), uuid.uuid4().hex
-    topics = (CAMERA_INFO, OBSERVATION, CALIBRATION, TRACK, STATUS)
+    topics = (CAMERA_INFO, OBSERVATION, CALIBRATION, TRACK, STATUS, UAV_INFO, TARGET, TARGET_CLOUD, ROAD_MAP)
     subscriptions = [bus.subscribe(topic) for topic in topics]
     commands = bus.publisher(COMMAND, name)
     watch = bus.watch_agents()
@@ -183,6 +195,7 @@ class _Pace:
         if now >= self._draw:
             self._draw = now + (_DRAW_S if watched else _ALONE_S)
             view.scene.update(state, moment)
+            view.page.update_flights(state, moment)
         if now >= self._panel:
             self._panel = now + (_PANEL_S if watched else _ALONE_S)
             view.page.update(state, moment)

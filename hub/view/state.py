@@ -13,6 +13,7 @@ import numpy as np
 from google.protobuf.message import Message
 
 from hub.guidance import Guidance
+from hub.view.flights import FlightView
 from protocols.clocks import NANOSECONDS
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
@@ -32,8 +33,8 @@ CameraState = Literal["solved", "refused", "collecting", "silent", "gone"]
 class CameraView:
     """One camera. Times are the view's own [s]; offset_std_ms and the rest are None until a hub told them.
 
-    lost: frames that never came, by the sequence numbers. detections: of the last frame: u, v, size [px]. still: it is
-    a calibration from a file that is looked at, so that no frame is missed.
+    lost: frames that never came, by the sequence numbers. detections: of the last frame: u, v, size [px]; by_frame: of
+    the last frames. still: it is a calibration from a file that is looked at, so that no frame is missed.
     """
 
     name: str
@@ -46,6 +47,7 @@ class CameraView:
     last_frame: float | None = None
     last_seen: float | None = None
     detections: list[tuple[float, float, float]] = field(default_factory=list)
+    by_frame: deque[tuple[int, list[tuple[float, float, float]]]] = field(default_factory=lambda: deque(maxlen=128))
     arrivals: deque[float] = field(default_factory=lambda: deque(maxlen=256))
     calibration: pb.CameraCalibration | None = None
     refused: str = ""
@@ -64,6 +66,12 @@ class CameraView:
             return None
         rotation = so3.exp(np.array(found.rotation))
         return Pose(rotation, -rotation.T @ np.array(found.translation))
+
+    def in_picture(self) -> list[tuple[float, float, float]]:
+        """What was detected in the very frame of the picture, which is older than the last one; u, v, size [px]."""
+        if self.picture is None:
+            return []
+        return next((found for frame, found in reversed(self.by_frame) if frame == self.picture.frame), [])
 
     def fps(self, now: float) -> float:
         """Frames a second over the last seconds."""
@@ -111,6 +119,7 @@ class ViewState:
         self.cameras: dict[str, CameraView] = {}
         self.paths: dict[str, PathView] = {}
         self.agents: dict[str, AgentView] = {}
+        self.flights: dict[str, FlightView] = {}
         self.calibration: pb.Calibration | None = None
         self.solved: pb.Calibration | None = None
         self.guidance = Guidance()
@@ -123,8 +132,15 @@ class ViewState:
         elif isinstance(message, pb.Track):
             self._follow(message)
         elif isinstance(message, pb.Picture):
+            if message.camera in self.flights:
+                self.flights[message.camera].look(message, now)
+                return
             camera = self._camera(message.camera)
             camera.picture, camera.pictures = message, camera.pictures + 1
+        elif isinstance(message, (pb.TargetState, pb.TargetCloud, pb.RoadMap, pb.UavInfo, pb.FlightImage)):
+            self._flight(message.agent).handle(message, now)
+        elif isinstance(message, pb.AgentStatus) and message.role == "uav":
+            self._flight(message.agent).status = message
         elif isinstance(message, pb.CameraInfo):
             self._camera(message.camera).info = message
             self.guidance.handle(message)
@@ -139,6 +155,11 @@ class ViewState:
             camera = self._camera(agent)
             if alive or camera.boot in ("", boot):
                 camera.alive = alive
+        elif role == "uav":
+            if alive:
+                self._flight(agent)
+            elif agent in self.flights and self.flights[agent].boot in ("", boot):
+                del self.flights[agent]
         elif not alive and agent in self.agents and self.agents[agent].status.boot_id == boot:
             del self.agents[agent]
 
@@ -149,6 +170,8 @@ class ViewState:
     def headline(self) -> str:
         """One line on the whole site."""
         found = self.calibration
+        if not self.cameras and self.flights:
+            return f"{len(self.flights)} drone{'s' if len(self.flights) > 1 else ''}"
         if not self.cameras:
             return "waiting for cameras"
         if found is None:
@@ -165,11 +188,22 @@ class ViewState:
             self.cameras = {key: self.cameras[key] for key in sorted(self.cameras)}
         return self.cameras[name]
 
+    def _flight(self, name: str) -> FlightView:
+        if name not in self.flights:
+            self.flights[name] = FlightView(name)
+            # A picture may have come before anybody said that it is a drone's.
+            camera = self.cameras.get(name)
+            if camera is not None and not camera.frames and camera.info is None:
+                self.flights[name].picture = camera.picture
+                del self.cameras[name]
+        return self.flights[name]
+
     def _observe(self, message: pb.Observation, now: float) -> None:
         camera = self._camera(message.camera)
         if message.boot_id != camera.boot:
             camera.restarts += bool(camera.boot)
             camera.boot, camera.sequence, camera.alive = message.boot_id, message.sequence - 1, True
+            camera.by_frame.clear()
         if message.sequence <= camera.sequence:
             return  # heard twice, or healed out of order
         camera.lost += message.sequence - camera.sequence - 1
@@ -178,6 +212,7 @@ class ViewState:
         camera.last_frame = now
         camera.arrivals.append(now)
         camera.detections = [(one.u, one.v, one.size) for one in message.detections]
+        camera.by_frame.append((message.frame, camera.detections))
         if message.detections:
             camera.seen += 1
             camera.last_seen = now

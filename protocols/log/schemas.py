@@ -19,6 +19,8 @@ VIEW_KINDS = {
     "scene": "SceneUpdate",
     "annotations": "ImageAnnotations",
     "expected": "ImageAnnotations",
+    "image": "CompressedImage",
+    "points": "PointCloud",
 }
 
 

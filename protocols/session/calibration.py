@@ -49,6 +49,19 @@ class Known:
     scale: str
 
 
+@dataclass(frozen=True, slots=True)
+class AdjustmentStep:
+    """One step that the adjustment took, or the start of a round.
+
+    stage: "first poses" (cameras are added), "robust", "fitting rows" or "free lenses". residual_px: the misfit by
+    which it went, of one pixel coordinate, in pixels: the root of the mean weighted square, times the noise by which it
+    was weighted.
+    """
+
+    stage: str
+    residual_px: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PairReport:
     """One pair of cameras, as in result.json.
@@ -83,6 +96,7 @@ class Calibration:
     reference: camera whose clock is the reference. scale: "metric" or "arbitrary" (then the first camera is
     the world and the first baseline is 1). refused: reasons by camera. cpu_seconds: of the solver.
     residuals: per camera (n, 5): camera time, u, v, and the residual du, dv [px] of the rows that count.
+    convergence: the steps of the last adjustment, in order.
     """
 
     cameras: dict[str, CameraCalibration]
@@ -97,6 +111,7 @@ class Calibration:
     warnings: tuple[str, ...] = ()
     cpu_seconds: float = 0.0
     residuals: dict[str, Floats] = field(default_factory=dict)
+    convergence: tuple[AdjustmentStep, ...] = ()
 
 
 def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:

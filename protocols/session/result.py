@@ -44,6 +44,7 @@ def result_document(calibration: Calibration, rig: Rig, *, command: str = "") ->
             "labels": [_summary(table) for table in calibration.trajectories],
         },
         pairs=[_pair(pair) for pair in calibration.pairs],
+        convergence=[{"stage": step.stage, "residual_px": step.residual_px} for step in calibration.convergence],
         warnings=list(calibration.warnings),
         cpu_seconds=calibration.cpu_seconds,
     )
@@ -81,6 +82,7 @@ def refusal_document(
         cameras={},
         trajectory={"file": None, "labels": []},
         pairs=[_pair(pair) for pair in pairs],
+        convergence=[],
         warnings=list(warnings),
         cpu_seconds=cpu_seconds,
     )

@@ -15,10 +15,10 @@ pytest.importorskip("viser")
 from hub.view.player import LogRecording
 from hub.view.server import ViewServer, run_replay, run_view
 from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION
+from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, PICTURE, TARGET, UAV_INFO
 from tests.browser.conftest import Tab
 from tests.integration.test_view_server import TOKEN, solved
-from tests.samples import camera_info, eventually, observation
+from tests.samples import camera_info, eventually, observation, picture, target_state, uav_info
 from tests.unit.test_view_state import log_of
 
 _BLUE = np.array([190, 110, 30])  # BGR of a camera that is solved
@@ -82,6 +82,48 @@ def film(agents: MemoryBus, stop: threading.Event) -> None:
         index += 1
 
 
+def test_a_drones_picture_with_the_car_outside_it(tab: Tab) -> None:
+    """The panel says it in words, and the page shows the estimate where it is: to the right of the picture."""
+    network, stop, view = MemoryHub(), threading.Event(), ViewServer(port=0)
+    good, data = cv2.imencode(".jpg", np.full((240, 320, 3), 128, np.uint8))
+    assert good
+    with MemoryBus(network) as agents, MemoryBus(network) as bus:
+        loop = threading.Thread(target=run_view, args=(bus, view, stop))
+        loop.start()
+        publishers = {topic: agents.publisher(topic, "drone") for topic in (UAV_INFO, TARGET, PICTURE)}
+
+        def fly(state: str, x: float, sequence: int) -> None:
+            target, shown = target_state("drone", sequence), picture("drone")
+            target.frame = shown.frame = sequence
+            target.state, target.centre[:], target.std_px = state, [x, 240.0], 5.0
+            shown.width, shown.height, shown.jpeg = 640, 480, data.tobytes()
+            publishers[TARGET].put(target)
+            publishers[PICTURE].put(shown)
+
+        try:
+            tab.page.goto(view.address)
+            assert eventually(lambda: publishers[PICTURE].wait_matched(0.0)), "pictures are asked for while one looks"
+            publishers[UAV_INFO].put(uav_info("drone"))
+            for number, (state, x) in enumerate((("visible", 100.0), ("coasting", 780.0))):
+                fly(state, x, number)
+                tab.page.wait_for_selector(f"[data-flight=drone][data-target={state}]")
+            assert "right of the picture" in tab.page.inner_text("[data-flight=drone]")
+            assert "no picture" not in tab.page.inner_text("[data-flight=drone]")
+            tab.page.wait_for_timeout(2500)
+            image = cv2.imdecode(np.frombuffer(tab.shot("drone"), dtype=np.uint8), cv2.IMREAD_COLOR)
+            assert image is not None
+            scene = image[200:, :700].astype(np.int64)
+            orange = np.argwhere(np.abs(scene - (50, 175, 255)).max(axis=2) < 60)
+            grey = np.argwhere(np.abs(scene - 128).max(axis=2) < 8)
+            assert len(orange) > 50
+            assert len(grey) > 10_000
+            assert orange[:, 1].min() > grey[:, 1].max(), "outside, on the right"
+        finally:
+            stop.set()
+            loop.join(20.0)
+            view.close()
+
+
 def test_without_the_token_the_browser_sees_nothing(chromium: Any) -> None:
     view = ViewServer(port=0, token=TOKEN)
     tab = Tab(chromium)
@@ -115,6 +157,9 @@ def test_a_log_is_moved_along_its_timeline(tab: Tab, tmp_path: Path) -> None:
         page.get_by_role("button", name="Pause").click()
         page.get_by_role("button", name="Play").wait_for()
         page.wait_for_selector("[data-state=collecting]")
+        guide = page.inner_text("[data-syncline=guide]")
+        assert "cam0" in guide, "what to do next, while it is not solved"
+        assert "%" in guide, "with how much of its view has seen the marker"
         time = page.get_by_role("textbox").first
         time.fill("30")
         time.press("Enter")

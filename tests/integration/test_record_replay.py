@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import signal
 import subprocess
 import sys
@@ -25,7 +26,7 @@ from protocols.bus.memory import MemoryBus, MemoryHub
 from protocols.bus.router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import CAMERA_INFO, OBSERVATION, STATUS, TOPICS
+from protocols.catalogue import CAMERA_INFO, OBSERVATION, PICTURE, STATUS, TOPICS
 from protocols.errors import InputError
 from protocols.log.reader import Logged, LogReader
 from protocols.log.writer import LogWriter
@@ -95,6 +96,37 @@ def test_every_recorded_topic_is_in_the_log_and_the_recorder_is_seen(tmp_path: P
     assert result.messages == result.counters["recorded"] == sum(1 for _ in reader.messages())
     assert result.counters["dropped"] == result.counters["lost"] == 0
     assert reader.metadata()["syncline"]["boot_id"] == alive.boot_id
+
+
+@pytest.mark.parametrize(("hz", "kept"), [(2.0, [0, 10, 20, 30]), (30.0, list(range(40))), (0.0, [])])
+def test_pictures_are_thinned_and_not_even_asked_for_at_rate_0(tmp_path: Path, hz: float, kept: list[int]) -> None:
+    """Forty pictures, 20 a second by the bus's clock."""
+    now = iter(range(0, 1_000_000_000_000, 50_000_000))
+    hub = MemoryHub(clock_ns=lambda: next(now))
+    with MemoryBus(hub) as agents, MemoryBus(hub) as bus:
+        publisher = agents.publisher(PICTURE, "cam0")
+        results: list[RecorderResult] = []
+        stop = threading.Event()
+        config = RecorderConfig(out=tmp_path / "a.mcap", pictures_hz=hz)
+        loop = threading.Thread(target=lambda: results.append(run_recorder(config, bus, stop)))
+        loop.start()
+        try:
+            wanted = len(RECORDED) - (not kept)
+            assert eventually(lambda: len(hub.subscriptions) == wanted)
+            assert publisher.wait_matched(0.0) == bool(kept), "a camera sends only what somebody wants"
+            for index in range(40):
+                message = SAMPLES[PICTURE]()
+                message.frame = index
+                publisher.put(message)
+        finally:
+            stop.set()
+            loop.join(20.0)
+    frames = [item.message.frame for item in LogReader(tmp_path / "a.mcap").messages([PICTURE])]  # type: ignore[attr-defined]
+    if hz == 2.0:  # the recorder's own messages take some ticks of this clock
+        assert 3 <= len(frames) <= 6
+        assert min(b - a for a, b in itertools.pairwise(frames)) >= 8
+    else:
+        assert frames == kept
 
 
 def test_log_times_are_the_times_of_arrival(tmp_path: Path) -> None:

@@ -41,6 +41,17 @@ def test_a_report_made_again_tells_the_same(solved: Path, tmp_path: Path, capsys
     assert text.split("<h1>")[1].split("</h1>")[0] == original.split("<h1>")[1].split("</h1>")[0]
 
 
+def test_the_answer_keeps_how_it_converged(solved: Path) -> None:
+    answer = load_answer(solved / "out", solved / "session", lambda text, share: None)
+    assert isinstance(answer.outcome, Calibration)
+    steps = answer.outcome.convergence
+    assert {step.stage for step in steps} >= {"first poses", "robust", "fitting rows"}
+    assert steps[-1].residual_px == pytest.approx(steps[-2].residual_px, rel=1e-3), "it ends level"
+    rms = float(np.sqrt(np.mean([camera.rms_px**2 for camera in answer.outcome.cameras.values()])))
+    assert steps[-1].residual_px == pytest.approx(rms / np.sqrt(2), rel=0.1), "of one coordinate"
+    assert f"{len(steps)} steps of the adjustment" in (solved / "out" / "report.html").read_text(encoding="utf-8")
+
+
 def test_residuals_worked_out_again_agree_with_the_rms_of_the_answer(solved: Path) -> None:
     answer = load_answer(solved / "out", solved / "session", lambda text, share: None)
     assert isinstance(answer.outcome, Calibration)

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from hub.report import build_report, measures
+from hub.report.convergence import adjustment
 from hub.report.remedies import remedy_for
 from hub.report.svg import number, short, ticks
 from hub.report.verdict import judge, judge_refusal
 from protocols.errors import Refused
-from protocols.session.calibration import Calibration
+from protocols.session.calibration import AdjustmentStep, Calibration
 from protocols.session.observations import Observations
 from tests.unit.solved_session import REFUSED, solved_session
 
@@ -208,3 +209,18 @@ def test_numbers_are_written_for_people() -> None:
     assert number(float("nan")) == "–"
     assert [short(value) for value in (0.00123, 0.5, 12.3456, 12345.6)] == ["0.00123", "0.500", "12.3", "12346"]
     assert ticks(-0.9, 0.9, 4) == [-0.5, 0.0, 0.5]
+
+
+def test_every_step_of_the_adjustment_is_a_mark_and_each_stage_has_its_own() -> None:
+    stages = [("first poses", (8.0, 2.0, 0.7)), ("robust", (0.6, 0.5)), ("fitting rows", (0.55, 0.5, 0.5))]
+    steps = tuple(AdjustmentStep(stage, residual) for stage, values in stages for residual in values)
+    figure = adjustment(steps)
+    assert figure.count("<circle") == 3
+    assert figure.count("<rect") == 5
+    assert figure.count("rotate(45") == 3, "diamonds are told from squares"
+    for name in ("cameras added", "all rows, robust", "the rows that fit"):
+        assert name in figure
+    heights = [float(y) for y in re.findall(r'<circle[^>]* cy="([\d.]+)"', figure)]
+    assert heights == sorted(heights), "less misfit is lower"
+    assert adjustment(steps[:1]) == ""
+    assert adjustment((AdjustmentStep("robust", float("nan")), AdjustmentStep("robust", 0.0))) == ""

@@ -13,6 +13,7 @@ from hub.view.page import marked
 from hub.view.panels import ago, camera_details, camera_table, overview
 from hub.view.planes import pixel_of
 from hub.view.player import CalibrationRecording, LogRecording, Player
+from hub.view.scene import standpoint
 from hub.view.server import answer_to, commands_for
 from hub.view.state import SILENT_S, ViewState
 from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, TRACK
@@ -235,10 +236,31 @@ def test_a_ray_meets_the_pixel_that_was_clicked() -> None:
     assert pixel_of(origin, np.array([5.0, 0.0, 1.0]), 0, (640, 480)) is None
 
 
-def test_the_ring_is_where_the_detection_is() -> None:
+def test_the_first_look_has_every_camera_and_the_path_in_it() -> None:
+    """In a square window of 75 degrees, nothing nearer to its edge than a tenth of it."""
+    generator = np.random.default_rng(5)
+    for trial in range(50):
+        up = np.eye(3)[trial % 3]
+        points = generator.normal(0.0, [3.0, 1.0, 0.4], (int(generator.integers(2, 30)), 3)) + 7.0
+        eye, middle = standpoint(points, up, 0.0)
+        ahead = (middle - eye) / np.linalg.norm(middle - eye)
+        across = np.cross(ahead, up) / np.linalg.norm(np.cross(ahead, up))
+        seen = points - eye
+        depth = seen @ ahead
+        assert depth.min() > 0.0
+        places = np.column_stack([seen @ across, seen @ np.cross(across, ahead)]) / depth[:, None]
+        edge = np.tan(np.radians(37.5))
+        assert np.abs(places).max() == pytest.approx(0.9 * edge), "and not farther away than it must be"
+
+
+def test_the_ring_is_where_the_detection_is_in_the_pictures_own_frame() -> None:
+    """The picture is of frame 7; by the time it is drawn the marker is elsewhere."""
     state = ViewState()
     state.handle(picture("cam0"), 0.0)
     state.handle(observation("cam0"), 0.0)
+    later = observation("cam0", 1)
+    later.detections[0].u = 900.0
+    state.handle(later, 0.1)
     camera = state.cameras["cam0"]
     image = np.full((180, 320, 3), 128, dtype=np.uint8)
     drawn = marked(image, camera)
