@@ -3,6 +3,10 @@
 The first observations are kept raw and linearised again and again, where the network says that the neighbour stands
 as soon as that agrees with them (the network knows better than one edge); later ones are streamed into the summary,
 a quadratic about ``summary.anchor``. Memory is constant: at most ``RAW`` rows, then a few hundred bytes.
+
+Both ends of an edge write it the same way, as the camera with the lower number sees the other. Were each to write it
+in its own axes, the two would agree near the optimum only: far from it their stiff pulls are not those of one cost, and
+a network that begins bent swings ever wider instead of relaxing.
 """
 
 from __future__ import annotations
@@ -65,7 +69,7 @@ class Summary:
 
     def best_step(self) -> Floats:
         """From the anchor to the minimum (6,); directions without information stay."""
-        return solve_semidefinite(self.hessian, -self.gradient)
+        return _solve(self.hessian, -self.gradient)
 
     def excess(self, pose: Relative) -> float:
         """How much half chi2 at ``pose`` lies above the minimum.
@@ -128,12 +132,14 @@ class Window:
 class Edge:
     """One neighbour's edge. ``add`` observations; then ``flush_raw``, or `stream` for those that keep none.
 
-    raw: how many observations are kept raw. An edge that could not begin by then keeps every second, fourth, … of
+    seen_by: the neighbour has the lower number, so all is written as it sees this camera. raw: how many observations
+    are kept raw. An edge that could not begin by then keeps every second, fourth, … of
     what comes, until they tell the pose.
     """
 
-    def __init__(self, neighbour: int, rng: np.random.Generator, raw: int = RAW) -> None:
+    def __init__(self, neighbour: int, rng: np.random.Generator, raw: int = RAW, *, seen_by: bool = False) -> None:
         self.neighbour = neighbour
+        self.seen_by = seen_by
         self.raw = raw
         self.summary: Summary | None = None
         self.began = False
@@ -175,12 +181,16 @@ class Edge:
 
     def add(self, row: tuple[float, ...]) -> None:
         """A row of 10: x, y, log size in this camera and in the neighbour; then the four weights."""
-        self._pending.append(row)
+        self._pending.append((*row[3:6], *row[0:3], *row[8:10], *row[6:8]) if self.seen_by else row)
+
+    def from_here(self, pose: Relative) -> Relative:
+        """The neighbour as this camera sees it, of a pose as the edge writes it."""
+        return pose.inverse() if self.seen_by else pose
 
     def reset(self, *, badly: bool = False) -> None:
         """Forget everything: one of the cameras moved, or the edge began ``badly``: then look at a longer stretch."""
         stride = min(2 * self._stride, _LONGEST_STRIDE) if badly else 1
-        self.__init__(self.neighbour, self._rng, self.raw)  # type: ignore[misc]
+        self.__init__(self.neighbour, self._rng, self.raw, seen_by=self.seen_by)  # type: ignore[misc]
         self._stride = stride
 
     def resume(self, summary: Summary) -> None:
@@ -217,6 +227,8 @@ class Edge:
         mine = np.concatenate([rows[:, 0:2], ones], axis=1) * np.exp(-rows[:, 2:3])
         theirs = np.concatenate([rows[:, 3:5], ones], axis=1) * np.exp(-rows[:, 5:6])
         own, other = np.linalg.norm(mine, axis=1) / weights[:, 1], np.linalg.norm(theirs, axis=1) / weights[:, 3]
+        if self.seen_by:
+            mine, theirs = theirs, mine
         return mine, theirs, np.hypot(own, other)
 
     def aim(self, predicted: Relative | None) -> Relative:
@@ -386,7 +398,7 @@ def _well_told(pose: Relative, rows: Floats, weights: Floats) -> bool:
     return bool(turn < _TURN_STD and centre < _CENTRE_STD)
 
 
-def solve_semidefinite(hessian: Floats, right: Floats) -> Floats:
+def _solve(hessian: Floats, right: Floats) -> Floats:
     """Solution of a positive semidefinite system (6, 6); directions without information get about 0."""
     scale = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-300))
     normalised = hessian * scale * scale[:, None]

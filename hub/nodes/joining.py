@@ -29,14 +29,14 @@ def placed(camera: int, offers: list[Offer], frame: int) -> Pose | None:
     state, edge = max(offers, key=lambda offer: strength(offer[1]))
     assert edge.summary is not None
     assert state.pose is not None
-    best = edge.summary.anchor.moved(edge.summary.best_step())
+    best = edge.from_here(edge.summary.anchor.moved(edge.summary.best_step()))
     if not edge.summary.bearings:
         return placed_by(state.pose, best)
     partner = next((offer for offer in offers if offer[0].camera == frame and offer[0].partner == camera), None)
     if partner is not None:
         assert partner[1].summary is not None
         assert partner[0].pose is not None
-        seen = partner[1].summary.anchor
+        seen = partner[1].from_here(partner[1].summary.anchor)
         return placed_by(partner[0].pose, seen.scaled(1.0 / float(np.linalg.norm(seen.centre))))
     if len(offers) < 2:
         return None
@@ -45,7 +45,7 @@ def placed(camera: int, offers: list[Offer], frame: int) -> Pose | None:
     for other, its in offers:
         assert its.summary is not None
         assert other.pose is not None
-        centre = its.summary.anchor.centre
+        centre = its.from_here(its.summary.anchor).centre
         rays.append((other.pose, centre / np.linalg.norm(centre)))
     met = ray_meeting(rays, rotation)
     return None if met is None else Pose(rotation, met[0])

@@ -160,7 +160,7 @@ class PoseNode:
             neighbour.edge.linearise_again(self._predicted(neighbour))
 
     def summaries(self) -> dict[int, Summary]:
-        """What has been learnt of each neighbour, for another host to go on with."""
+        """What has been learnt with each neighbour, for another host to go on with, as the edges write it."""
         edges = self.neighbours().items()
         return {camera: edge.summary for camera, edge in edges if edge.summary is not None and edge.began}
 
@@ -229,7 +229,9 @@ class PoseNode:
     def _neighbour(self, camera: int) -> Neighbour:
         found = self._neighbours.get(camera)
         if found is None:
-            found = self._neighbours[camera] = Neighbour(Edge(camera, self._rng, self._raw))
+            found = self._neighbours[camera] = Neighbour(
+                Edge(camera, self._rng, self._raw, seen_by=camera < self.camera)
+            )
         return found
 
     def _pair(self, neighbour: Neighbour, row: tuple[float, ...]) -> list[Out]:
@@ -257,7 +259,7 @@ class PoseNode:
         other = self._standing(neighbour)
         if other is None or self.pose is None or self.settled < _TRUST_AFTER or neighbour.state is None:
             return None
-        return relative(self.pose, other) if neighbour.state.settled >= _TRUST_AFTER else None
+        return _between(neighbour.edge, self.pose, other) if neighbour.state.settled >= _TRUST_AFTER else None
 
     def _standing(self, neighbour: Neighbour) -> Pose | None:
         """The neighbour's pose if it is in this camera's frame."""
@@ -364,7 +366,7 @@ class PoseNode:
         for neighbour in self._neighbours.values():
             other, summary = self._standing(neighbour), neighbour.edge.summary
             if other is not None and summary is not None:
-                terms.append(Term(summary, other))
+                terms.append(Term(summary, other, neighbour.edge.seen_by))
         mine = self._anchors.get(self.camera)
         if mine is not None and not self.reference_aside and self.settled >= _JUDGED_AT:
             for anchor in usable(self._anchors):
@@ -435,7 +437,7 @@ class PoseNode:
         for neighbour in self._neighbours.values():
             other, summary = self._standing(neighbour), neighbour.edge.summary
             if other is not None and summary is not None and neighbour.edge.began:
-                judged.append((summary.excess(relative(self.pose, other)), neighbour.edge))
+                judged.append((summary.excess(_between(neighbour.edge, self.pose, other)), neighbour.edge))
         against = sum(excess > _CONTRADICTED for excess, _ in judged)
         if against > 0.5 * len(judged) and self.frame != self.camera:
             # Most edges contradict the pose: it was joined by edges that were wrong then. Leave, and join again.
@@ -483,7 +485,7 @@ class PoseNode:
             other, edge = self._standing(neighbour), neighbour.edge
             if other is None or edge.summary is None or not edge.streaming or self._predicted(neighbour) is None:
                 continue
-            by_step, _, _ = one_term(self.pose, Term(edge.summary, other))
+            by_step, _, _ = one_term(self.pose, Term(edge.summary, other, edge.seen_by))
             motions.append(Motion(edge, by_step))
         step = camera_moved(motions)
         if step is None:
@@ -498,3 +500,8 @@ class PoseNode:
             self.reference_aside = True
             out.append(Notice(self.camera, "reference set aside", "the camera no longer stands where it was surveyed"))
         return out
+
+
+def _between(edge: Edge, own: Pose, other: Pose) -> Relative:
+    """Two cameras' relative pose as their edge writes it."""
+    return relative(other, own) if edge.seen_by else relative(own, other)

@@ -10,15 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hub.nodes.edge import Summary, solve_semidefinite
+from hub.nodes.edge import Summary
 from hub.nodes.two_cameras import Relative, small_log
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
-
-_FAR = 30.0
-"""Half chi2 from which an edge's quadratic is not taken at its word (see `eased`)."""
-_HALVINGS = 12
 
 
 def relative(own: Pose, other: Pose) -> Relative:
@@ -89,46 +85,14 @@ def one_term(pose: Pose, term: Term) -> tuple[Floats, Floats, Floats]:
     return by_step, summary.hessian @ e + summary.gradient, e
 
 
-def eased(summary: Summary, e: Floats, centre: Floats) -> tuple[Floats, Floats]:
-    """Information (6, 6) and pull (6,) of an edge at its step ``e`` with the neighbour at ``centre``.
-
-    Far from its optimum an edge is not quadratic: a turn by a carries the neighbour off the tangent by a² / 2 of its
-    distance, and the two ends, which measure it in their own axes, would pull at odds, so stiffly that a network that
-    begins bent swings ever wider. So up to that much is taken for another error of the edge: as little as leaves it no
-    farther off than `_FAR`, so that it never pulls less than one that is just not far. Not for bearings only: there
-    the weak directions turn far while the strong ones fit, and networks stayed held off their optimum.
-    """
-    best = solve_semidefinite(summary.hessian, -summary.gradient)
-    off = e - best
-    if 0.5 * float(off @ summary.hessian @ off) <= _FAR:
-        return summary.hessian, summary.hessian @ e + summary.gradient
-    turn, shift = float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:]))
-    spread = np.empty(6)
-    spread[:3] = 0.25 * turn * turn + 1e-9
-    spread[3:] = turn * (0.5 * turn * float(np.linalg.norm(centre)) + shift) + 1e-9
-    values, vectors = np.linalg.eigh(summary.hessian * spread * spread[:, None])
-    values = np.maximum(values, 0.0)
-    along = (vectors.T @ (off / spread)) ** 2 * values
-    # (H⁻¹ + share S)⁻¹ in axes where S is 1 and H diagonal.
-    low, high = 0.0, 1.0
-    if 0.5 * float((along / (1.0 + values)).sum()) < _FAR:
-        for _ in range(_HALVINGS):
-            share = 0.5 * (low + high)
-            far = 0.5 * float((along / (1.0 + share * values)).sum()) > _FAR
-            low, high = (share, high) if far else (low, share)
-    turned = vectors / spread[:, None]
-    information = (turned * (values / (1.0 + high * values))) @ turned.T
-    return information, information @ off
-
-
 def normal_equations(pose: Pose, terms: list[Term]) -> tuple[Floats, Floats]:
     """Information (6, 6) and gradient (6,) of half chi2 by this camera's step: `one_term` over all, stacked."""
     hessian, gradient = np.zeros((6, 6)), np.zeros(6)
-    plain = [term for term in terms if not (term.seen_by or term.summary.bearings)]
-    if plain:
-        hessian, gradient = _stacked_terms(pose, plain)
+    sized = [term for term in terms if not term.summary.bearings]
+    if sized:
+        hessian, gradient = _stacked_terms(pose, sized)
     for term in terms:
-        if term.seen_by or term.summary.bearings:
+        if term.summary.bearings:
             by_step, pull, _ = one_term(pose, term)
             hessian = hessian + by_step.T @ term.summary.hessian @ by_step
             gradient = gradient + by_step.T @ pull
@@ -137,8 +101,14 @@ def normal_equations(pose: Pose, terms: list[Term]) -> tuple[Floats, Floats]:
 
 def _stacked_terms(pose: Pose, terms: list[Term]) -> tuple[Floats, Floats]:
     information = np.array([term.summary.hessian for term in terms])
-    rotation = np.array([term.other.rotation for term in terms]) @ pose.rotation.T
-    centre = (np.array([term.other.position for term in terms]) - pose.position) @ pose.rotation.T
+    others = np.array([term.other.rotation for term in terms])
+    apart = np.array([term.other.position for term in terms]) - pose.position
+    seen_by = np.array([term.seen_by for term in terms])
+    # As `relative` has them, of the one that sees.
+    rotation = others @ pose.rotation.T
+    centre = apart @ pose.rotation.T
+    rotation[seen_by] = rotation[seen_by].transpose(0, 2, 1)
+    centre[seen_by] = -np.einsum("nij,nj->ni", others[seen_by], apart[seen_by])
     anchor = np.array([term.summary.anchor.rotation for term in terms])
     e = np.empty((len(terms), 6))
     turned = rotation @ anchor.transpose(0, 2, 1)
@@ -151,11 +121,10 @@ def _stacked_terms(pose: Pose, terms: list[Term]) -> tuple[Floats, Floats]:
     by_step[:, 4, 0], by_step[:, 4, 2] = -centre[:, 2], centre[:, 0]
     by_step[:, 5, 0], by_step[:, 5, 1] = centre[:, 1], -centre[:, 0]
     by_step[:, 3, 3] = by_step[:, 4, 4] = by_step[:, 5, 5] = -1.0
-    by_e = (information @ e[:, :, None])[:, :, 0]
-    pull = by_e + np.array([term.summary.gradient for term in terms])
-    # The anchor is about where the optimum is: only edges far from it need a closer look.
-    for far in np.flatnonzero(np.einsum("ni,ni->n", e, by_e) > _FAR).tolist():
-        information[far], pull[far] = eased(terms[far].summary, e[far], centre[far])
+    by_step[seen_by] = 0.0
+    by_step[seen_by, 0, 0] = by_step[seen_by, 1, 1] = by_step[seen_by, 2, 2] = 1.0
+    by_step[seen_by, 3:, 3:] = rotation[seen_by].transpose(0, 2, 1)
+    pull = (information @ e[:, :, None])[:, :, 0] + np.array([term.summary.gradient for term in terms])
     turned_step = by_step.transpose(0, 2, 1)
     hessian = (turned_step @ information @ by_step).sum(axis=0)
     gradient = (turned_step @ pull[:, :, None]).sum(axis=0)[:, 0]

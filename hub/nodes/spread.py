@@ -18,7 +18,7 @@ _LEAST_OBSERVATIONS = 50.0
 _SINGULAR = 1e-12
 
 Edges = Mapping[tuple[str, str], Summary]
-"""What the first camera has learnt of the second; each pair once."""
+"""By pair, the camera with the lower number (and name) first, as `hub.nodes.edge` writes it."""
 
 
 def each_once(learnt: Mapping[str, Mapping[str, Summary]]) -> dict[tuple[str, str], Summary]:
@@ -26,11 +26,9 @@ def each_once(learnt: Mapping[str, Mapping[str, Summary]]) -> dict[tuple[str, st
     out: dict[tuple[str, str], Summary] = {}
     for camera, edges in learnt.items():
         for other, summary in edges.items():
-            back = out.get((other, camera))
-            if back is not None and back.count >= summary.count:
-                continue
-            out.pop((other, camera), None)
-            out[camera, other] = summary
+            pair = (min(camera, other), max(camera, other))
+            if pair not in out or out[pair].count < summary.count:
+                out[pair] = summary
     return out
 
 
