@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -52,7 +54,7 @@ def _bent(truth: list[Pose], rng: np.random.Generator, degrees: float) -> list[P
     axis = rng.standard_normal(3)
     twist = so3.exp(np.radians(degrees) / CAMERAS * axis / np.linalg.norm(axis))
     out = [_in_targets(truth[0])]
-    for last, pose in zip(truth, truth[1:], strict=False):
+    for last, pose in pairwise(truth):
         seen, before = relative(_in_targets(last), _in_targets(pose)), out[-1]
         out.append(
             Pose(seen.rotation @ twist @ before.rotation, before.position + before.rotation.T @ twist.T @ seen.centre)
