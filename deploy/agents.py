@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 from deploy.config import CameraConfig, HubConfig, OakConfig, PiConfig, SimulatedConfig, UsbConfig
@@ -34,8 +36,13 @@ def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event, beat: Ca
     cv2.setNumThreads(1)  # one core a camera: several agents share a board
     known = _known_camera(config)
     device = make_device(config, None if known is None else known.intrinsics)
-    lens = device.info.intrinsics if config.driver == "simulated" else None if known is None else known.intrinsics
-    detector = _detector(config, lens, device.info.fps if config.driver == "simulated" else _fps(config))
+    if config.driver == "log":
+        device.open()  # the lens and the rate are in the log
+        if damage := getattr(device, "damage", ""):
+            print(f"{config.id}: the log is damaged, its good part is played: {damage}", file=sys.stderr, flush=True)
+    told = device.info if config.driver in ("simulated", "log") else None
+    lens = told.intrinsics if told is not None else None if known is None else known.intrinsics
+    detector = _detector(config, lens, _fps(config) if told is None or told.fps <= 0.0 else told.fps)
     run_camera_agent(
         Watched(device, beat),
         detector,
@@ -51,6 +58,13 @@ def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event, beat: Ca
 
 
 def _detector(config: CameraConfig, lens: Intrinsics | None, fps: float) -> Detector:
+    network = config.driver == "oak" and config.oak is not None and config.oak.nn is not None
+    if (network or config.detector != "marker") and find_spec("scipy") is None:
+        what = "oak.nn" if network else f'detector = "{config.detector}"'
+        raise InputError(
+            f"{what} needs SciPy, which a camera's bundle goes without",
+            remedy="pip install scipy, or make the bundle with --extra scipy",
+        )
     if config.detector == "marker":
         from edge.detectors.marker import MarkerDetector, MarkerModel
 
@@ -139,7 +153,19 @@ def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:
         from edge.devices.oak import OakCamera, OakSettings
 
         oak = config.oak or OakConfig()
-        settings = OakSettings(oak.device, oak.socket, oak.size, oak.fps, oak.exposure_us, oak.iso, oak.focus)
+        settings = OakSettings(
+            oak.device,
+            oak.socket,
+            oak.size,
+            oak.fps,
+            oak.exposure_us,
+            oak.iso,
+            oak.focus,
+            oak.nn,
+            oak.labels,
+            oak.confidence,
+            prefix=config.id[:48],
+        )
         return OakCamera(settings, intrinsics=intrinsics)
     if config.driver == "usb":
         from edge.devices.usb import UsbSettings, open_usb
@@ -163,6 +189,13 @@ def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:
         url, transport = config.rtsp.url, config.rtsp.transport
         return open_network(url, transport=transport, fps=config.rtsp.fps, intrinsics=intrinsics)
     from edge.devices.pacing import RealTime
+
+    if config.driver == "log":
+        from edge.devices.logged import LoggedCamera
+
+        assert config.log is not None  # the configuration has seen to that
+        pace = None if config.log.fast else RealTime(time.time())
+        return LoggedCamera(config.log.file, config.log.camera or config.id, pace=pace, intrinsics=intrinsics)
     from edge.devices.video import open_video
 
     assert config.video is not None  # the configuration has seen to that

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from email.message import Message
 from email.parser import HeaderParser
-from importlib.metadata import PackageNotFoundError, requires
+from importlib.metadata import PackageNotFoundError, metadata, requires
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,7 +39,7 @@ _EVERY = (
 )
 _LOG = ("mcap", "zstandard", "foxglove-schemas-protobuf")
 NEEDS: dict[str, tuple[str, ...]] = {
-    "camera": (*_EVERY, "opencv-python-headless"),
+    "camera": (*_EVERY, "opencv-python-headless", "mcap"),
     "uav": (*_EVERY, "opencv-python-headless", "pymavlink", "pyserial"),
     "hub": (*_EVERY, *_LOG, "opencv-python-headless", "scipy", "plotly"),
     "recorder": (*_EVERY, *_LOG),
@@ -49,8 +49,9 @@ NEEDS: dict[str, tuple[str, ...]] = {
 BUDGET_MB = {"camera": 350.0, "uav": 350.0}
 """Installed, without an OAK board's depthai."""
 _WARM = {
-    "camera": "deploy.agents, deploy.notify, edge.camera_agent, edge.detectors.marker, edge.devices.video, "
-    "protocols.bus.zenoh_bus",
+    "camera": "deploy.agents, deploy.detecting, deploy.notify, edge.camera_agent, edge.detectors.bright, "
+    "edge.detectors.marker, edge.detectors.tag, edge.devices.logged, edge.devices.network, edge.devices.picamera, "
+    "edge.devices.usb, edge.devices.video, protocols.bus.zenoh_bus",
     "uav": "deploy.uav, deploy.notify, edge.uav_agent, edge.mavlink.link, edge.uav.models.ground, edge.devices.video, "
     "protocols.bus.zenoh_bus",
     "hub": "deploy.agents, hub.agent, hub.calibrate, hub.nodes.host, hub.report, protocols.bus.zenoh_bus",
@@ -115,7 +116,9 @@ class Bundle:
 
 
 def make_bundle(role: str, target: Target, out: Path, extras: Sequence[str] = (), keep_budget: bool = True) -> Bundle:
-    """Gather wheels and write ``out``. extras: optional groups of the project, such as ``oak``.
+    """Gather wheels and write ``out``.
+
+    extras: optional groups of the project, such as ``oak``, or packages that else only other roles get, such as scipy.
 
     Raises InputError where the wheels can't be had, Refused where a board's role has grown over its budget.
     """
@@ -166,7 +169,15 @@ def _requirements(role: str, target: Target, extras: Iterable[str]) -> Iterable[
         declared = [Requirement(text) for text in requires("syncline") or ()]
     except PackageNotFoundError:
         raise InputError("Syncline is not installed as a package", remedy="pip install -e . in the checkout") from None
-    wanted = {canonicalize_name(name) for name in NEEDS[role]}
+    groups = {
+        str(name).lower() for name in (metadata("syncline").get_all("Provides-Extra") or ()) if str(name) != "dev"
+    }
+    packages = {canonicalize_name(one.name) for one in declared if one.marker is None}
+    strange = [extra for extra in extras if extra not in groups and canonicalize_name(extra) not in packages]
+    if strange:
+        told = ", ".join(sorted(groups))
+        raise InputError(f"no extra {', '.join(strange)}", remedy=f"use {told}, or a package of the project's")
+    wanted = {canonicalize_name(name) for name in (*NEEDS[role], *(one for one in extras if one not in groups))}
     found = set()
     for requirement in declared:
         name = canonicalize_name(requirement.name)

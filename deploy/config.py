@@ -18,6 +18,7 @@ __all__ = [
     "CameraConfig",
     "HealthConfig",
     "HubConfig",
+    "LogConfig",
     "MarkerConfig",
     "MovingConfig",
     "OakConfig",
@@ -138,6 +139,8 @@ class OakConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     device: IP address, device id or USB path; "" = the only one there is. size: [w, h]. exposure_us, iso: fixed, so
     that mid-exposure and brightness keep still. focus: lens position 0..255, fixed; None = a lens that cannot move.
+    nn: archive of a detection network (.tar.xz) that then runs on the board in place of a detector on the host. labels:
+    which of its classes are told; none = all. confidence: the least of a detection.
     """
 
     device: str = ""
@@ -147,6 +150,13 @@ class OakConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
     exposure_us: Annotated[int, Meta(ge=1, le=500_000)] = 5000
     iso: Annotated[int, Meta(ge=100, le=6400)] = 400
     focus: Byte | None = None
+    nn: Path | None = None
+    labels: tuple[Annotated[str, Meta(min_length=1, max_length=64)], ...] = ()
+    confidence: Fraction = 0.5
+
+    def __post_init__(self) -> None:
+        if self.labels and self.nn is None:
+            raise ValueError("labels are of a network; give its archive as nn")
 
 
 class VideoConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -205,6 +215,18 @@ class RtspConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True)
     fps: Hertz | None = None
 
 
+class LogConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[log]: the pictures of one camera in a recorded log.
+
+    file: the log, or the folder of its parts. camera: as the log names it; None = the agent's id. fast: as fast as they
+    are read; else by the times at which they were taken.
+    """
+
+    file: Path
+    camera: Annotated[str, Meta(min_length=1, max_length=64)] | None = None
+    fast: bool = False
+
+
 class MarkerConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """[marker]: what the marker looks like; what is absent is taken from the picture.
 
@@ -244,7 +266,7 @@ class CameraConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True
     rig: Path | None = None
     pictures_hz: Annotated[float, Meta(ge=0.0, le=30.0)] = 2.0
     picture_width: Annotated[int, Meta(ge=64, le=640)] = 320
-    driver: Literal["simulated", "video", "usb", "picamera2", "rtsp", "oak"] = "simulated"
+    driver: Literal["simulated", "video", "usb", "picamera2", "rtsp", "oak", "log"] = "simulated"
     detector: Literal["marker", "person", "vehicle"] = "marker"
     simulated: SimulatedConfig | None = None
     video: VideoConfig | None = None
@@ -252,6 +274,7 @@ class CameraConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True
     picamera2: PiConfig | None = None
     rtsp: RtspConfig | None = None
     oak: OakConfig | None = None
+    log: LogConfig | None = None
     marker: MarkerConfig = msgspec.field(default_factory=MarkerConfig)
     moving: MovingConfig = msgspec.field(default_factory=MovingConfig)
 
@@ -261,6 +284,8 @@ class CameraConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True
             raise ValueError('driver = "video" needs a [video] table with source = "…"')
         if self.driver == "rtsp" and self.rtsp is None:
             raise ValueError('driver = "rtsp" needs an [rtsp] table with url = "rtsp://…"')
+        if self.driver == "log" and self.log is None:
+            raise ValueError('driver = "log" needs a [log] table with file = "….mcap"')
 
 
 class HubConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):

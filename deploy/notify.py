@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from edge.devices.base import Device, DeviceInfo, Frame, Returning
+from edge.devices.base import Device, DeviceInfo, Frame, Returning, Warm
 
 ALIVE_FILE = "SYNCLINE_ALIVE_FILE"
 """Environment variable: a file whose time of change says when data flowed last."""
@@ -125,6 +125,11 @@ class Watched:
     def reconnections(self) -> int:
         """The device's."""
         return self._device.reconnections if isinstance(self._device, Returning) else 0
+
+    @property
+    def temperature(self) -> float | None:
+        """The device's; None of one that does not measure it."""
+        return self._device.temperature if isinstance(self._device, Warm) else None
 
     def open(self) -> None:
         """Open the device."""

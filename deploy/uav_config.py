@@ -166,6 +166,8 @@ class UavConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
         _check_id(self.id, "id")
         if self.driver == "video" and self.video is None:
             raise ValueError('driver = "video" needs a [video] table with source = "…"')
+        if self.oak is not None and self.oak.nn is not None:
+            raise ValueError("oak.nn is for camera agents: this one follows by its own tracker; remove nn")
         if self.control.gimbal and self.mount != "gimbal":
             raise ValueError('control.gimbal needs a camera on a gimbal; set mount = "gimbal", or switch it off')
         if self.driver == "simulated" and (self.simulated or FlightConfig()).gimbal != (self.mount == "gimbal"):

@@ -11,7 +11,7 @@ import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 from google.protobuf.message import Message
 
@@ -161,7 +161,9 @@ class CameraAgent:
         self._last_frame = frame.frame
         self.frames += 1
         expected = [] if self._predictions is None else self._predictions.at(frame.device_time_ns)
-        seen = self._detector.detect(frame.image, frame.device_time_ns / NANOSECONDS, expected)
+        seen: Sequence[Detection] | None = frame.found
+        if seen is None:
+            seen = self._detector.detect(frame.image, frame.device_time_ns / NANOSECONDS, expected)
         found = [detection for detection in seen if _usable(detection)]
         self.detections += len(found)
         self.empty += not found
@@ -193,6 +195,8 @@ class CameraAgent:
         )
         known = self._known
         lens = info.intrinsics if known is None or known.intrinsics is None else known.intrinsics
+        if lens is not None and (lens.width, lens.height) != (info.width, info.height) and info.intrinsics is not None:
+            lens = info.intrinsics  # of smaller pictures than the rig file is about
         if lens is not None:
             message.matrix.extend(lens.matrix.ravel().tolist())
             message.distortions.extend(lens.distortions.tolist())

@@ -14,6 +14,7 @@ import numpy as np
 from google.protobuf.message import Message
 
 from hub.calibrate import calibrate
+from hub.clock_claims import ClockClaims
 from hub.clock_epochs import EPOCH_ROWS, ClockEpochs
 from hub.distributed import node_calibration, with_node_poses
 from hub.guidance import Guidance
@@ -91,6 +92,8 @@ class LiveHub:
         self.refusal: Refused | None = None
         self.counters: Counter[str] = Counter()
         self.clocks = ClockEpochs()
+        self.claims = ClockClaims()
+        self._solved_boots: dict[str, str] = {}
         self._stepped = False
         self.guidance = Guidance()
         self.tracking = LiveTracking() if self.settings.track else None
@@ -104,7 +107,11 @@ class LiveHub:
 
     def handle(self, message: Message, arrival: float | None = None) -> None:
         """Take one message from the bus or a log. arrival: when it came [s, any one clock]; None = not known."""
+        if isinstance(message, pb.AgentStatus):
+            self.claims.handle(message)
+            return
         if isinstance(message, pb.Observation):
+            self.claims.handle(message)
             message, event = self.clocks.sort(message, arrival)
             if event is not None:
                 self.counters[f"clock_{event.kind}s"] += 1
@@ -115,7 +122,7 @@ class LiveHub:
             self.tracking.handle(message)
         if isinstance(message, pb.CameraInfo):
             self._infos[message.camera] = message
-        if isinstance(message, pb.Observation) and any(tracked_kind(d) for d in message.detections):
+        if isinstance(message, pb.Observation) and any(d.kind and tracked_kind(d) for d in message.detections):
             self._walkers.handle(message)
             message = without_tracked(message)
         self._builder.handle(message)
@@ -136,6 +143,12 @@ class LiveHub:
             self.tracking = LiveTracking()
         if self._known is not None:
             self._take_over(self._known)
+
+    def clock_contradictions(self) -> list[str]:
+        """Cameras whose machines claim of their clocks what the calibration contradicts, one line each."""
+        if self.calibration is None:
+            return []
+        return self.claims.contradictions(self.calibration, self._solved_boots)
 
     def missing(self) -> str:
         """What is missing before solving is worth a try; "" if nothing."""
@@ -194,6 +207,7 @@ class LiveHub:
             rig, observations = self._session()
             self.session = (rig, observations)
             self.calibration = self._answer(rig, observations)
+            self._solved_boots = self._boots(self.calibration)
             self.refusal = None
         except Refused as refusal:
             self.counters["refused"] += 1

@@ -31,8 +31,8 @@ def camera(config: Path, /, *, print_config: PrintConfig = False) -> int:
     Parameters
     ----------
     config
-        TOML file: id, site, [bus], driver ("simulated", "video", "usb", "picamera2", "rtsp" or "oak") with its table,
-        detector, [marker], rig.
+        TOML file: id, site, [bus], driver ("simulated", "video", "usb", "picamera2", "rtsp", "oak" or "log") with its
+        table, detector, [marker], rig.
     print_config
         Show the configuration with all defaults filled in, and stop.
     """
@@ -40,9 +40,13 @@ def camera(config: Path, /, *, print_config: PrintConfig = False) -> int:
     if print_config:
         print(effective_toml(settings), end="")
         return EXIT_DONE
-    from deploy.agents import start_camera
 
-    return _with_bus(settings, lambda bus, stop, beat: start_camera(settings, bus, stop, beat))
+    def start(bus: Any, stop: Any, beat: Any) -> int:
+        from deploy.agents import start_camera  # a refusal does not wait for it
+
+        return start_camera(settings, bus, stop, beat)
+
+    return _with_bus(settings, start)
 
 
 def uav(config: Path, /, *, print_config: PrintConfig = False) -> int:
@@ -87,9 +91,13 @@ def hub(config: Path, /, *, print_config: PrintConfig = False) -> int:
     if print_config:
         print(effective_toml(settings), end="")
         return EXIT_DONE
-    from deploy.agents import start_hub
 
-    return _with_bus(settings, lambda bus, stop, beat: start_hub(settings, bus, stop, beat))
+    def start(bus: Any, stop: Any, beat: Any) -> int:
+        from deploy.agents import start_hub
+
+        return start_hub(settings, bus, stop, beat)
+
+    return _with_bus(settings, start)
 
 
 def record(config: Path, /, *, print_config: PrintConfig = False) -> int:

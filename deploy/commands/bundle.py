@@ -36,7 +36,8 @@ def bundle(
     role
         What the board will run.
     extra
-        Optional groups of the project to take along: oak, video, view. May be given several times.
+        What to take along besides: oak, v4l2 (driver "usb"), video (driver "rtsp"), view; or a package, such as scipy
+        for the detectors of people and vehicles. May be given several times.
     out
         Folder to carry over; by default named by version, role and platform.
     json

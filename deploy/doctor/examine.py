@@ -30,7 +30,7 @@ def examine(file: Path | None, role: str | None = None) -> Iterator[Finding]:
     if config is None:
         return
     driver = getattr(config, "driver", "")
-    yield machine.packages((kind, driver) if driver in machine.PACKAGES else (kind,))
+    yield machine.packages((kind, driver))
     yield machine.disk(getattr(config, "out", None) or Path.cwd(), getattr(config, "min_free_mb", 0.0))
     yield machine.clock(certificates=config.bus.tls is not None)
     yield from _sight(config, driver)

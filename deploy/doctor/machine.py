@@ -26,9 +26,11 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "hub": ("cv2", "scipy", "plotly", "mcap"),
     "recorder": ("mcap", "zstandard", "foxglove_schemas_protobuf"),
     "oak": ("depthai",),
-    "usb": ("linuxpy",),
     "rtsp": ("av",),
+    "log": ("mcap",),
 }
+_BETTER = {"usb": (("linuxpy", "frames are stamped on arrival, and lost ones are not seen"),)}
+"""What a driver goes without, but worse."""
 _EXTRAS = {"pymavlink": "uav", "serial": "uav", "depthai": "oak", "linuxpy": "v4l2", "av": "video"}
 _HOT_C = 80.0
 _LOW_MB = 2000.0
@@ -53,6 +55,9 @@ def packages(kinds: Sequence[str], there: Callable[[str], bool] = lambda name: f
     wanted = [name for kind in ("", *kinds) for name in PACKAGES.get(kind, ())]
     gone = [name for name in wanted if not _there(name, there)]
     if not gone:
+        worse = [one for kind in kinds for one in _BETTER.get(kind, ()) if not _there(one[0], there)]
+        for name, what in worse:
+            return warn("packages", f"{name} missing: {what}", f'pip install "syncline[{_EXTRAS[name]}]"')
         return ok("packages", f"{len(wanted)} of {len(wanted)} are there")
     extras = sorted({_EXTRAS[name] for name in gone if name in _EXTRAS})
     how = f'pip install "syncline[{",".join(extras)}]"' if extras else "pip install --force-reinstall syncline"

@@ -27,14 +27,18 @@ DICTIONARIES = (
 )  # fmt: skip
 """Families of tags, by the names that OpenCV gives them."""
 _FROM, _TO = 0.12, 0.88  # part of a side that is measured: corners are mixtures of two sides
-_PASSES = 2
+_PASSES = 3
+_REACH = 0.07  # of the tag, on both sides of its border: what lies beyond a cell's middle smears into it from elsewhere
 _STEP = 0.5  # px across a side
 _LEAST_CONTRAST = 20.0  # grey levels between the border and what surrounds it
 _MIN_SIDE = 8.0  # px
 _ROUGH = 0.12  # of a side: a side that strays farther from its line is none
 _FLOOR_PX = 0.008  # std of the centre that remains without noise,
-_FLOOR_SIDE = 0.9  # and px² over the side: of a small tag neither black nor white is seen pure,
-_FLOOR_SMEAR = 0.012  # and its share of a smeared border's width
+_FLOOR_SIDE = 0.65  # and px² over the side: of a small tag neither black nor white is seen pure,
+_FLOOR_SMEAR = 0.006  # and its share of a smeared border's width;
+_FULL, _FULLER = 0.68, 0.05  # a border over more than that part of its profile leaves neither black nor white pure
+_FLOOR_FULL = 0.1  # and adds, a step of that, this share of its width;
+_FLOOR_PALE = 0.18  # so does, of its profile's half, the contrast that a side lacks against the best of the four
 _SHARP = 2.0  # px that lens and sampling make of a sharp border
 _INDEPENDENT = 1.5  # px along a side within which samples err together
 
@@ -80,14 +84,14 @@ class TagDetector:
         sides = _sides(grey, quad)
         if sides is None:
             return None
-        lines, covariances, contrast, stray, width = sides
+        lines, covariances, contrast, stray, width, unclear = sides
         corners = _corners(lines)
         if corners is None or np.abs(corners - quad).max() > 3.0 + 0.1 * _side(quad):
             return None
         centre, size = _centre(corners)
         if size < self._model.min_size or stray > _ROUGH * size:
             return None
-        floor = _FLOOR_PX**2 + (_FLOOR_SIDE / size) ** 2 + (_FLOOR_SMEAR * max(width - _SHARP, 0.0)) ** 2
+        floor = _FLOOR_PX**2 + (_FLOOR_SIDE / size) ** 2 + (_FLOOR_SMEAR * max(width - _SHARP, 0.0)) ** 2 + unclear**2
         covariance = _propagated(lines, covariances) + floor * np.eye(2)
         left, top = corners.min(axis=0)
         right, bottom = corners.max(axis=0)
@@ -116,21 +120,21 @@ def _side(quad: Floats) -> float:
     return float(np.linalg.norm(quad - np.roll(quad, -1, axis=0), axis=1).mean())
 
 
-def _sides(grey: npt.NDArray[np.uint8], quad: Floats) -> tuple[Floats, Floats, float, float, float] | None:
+def _sides(grey: npt.NDArray[np.uint8], quad: Floats) -> tuple[Floats, Floats, float, float, float, float] | None:
     """Lines of the four sides, their covariances, contrast and scatter; None where a side cannot be measured.
 
     lines: (4, 2, 2): a point on each and its unit direction. covariances: (4, 2, 2) of the offset at that point [px²]
     and of the turn [rad²]. contrast: of the weakest side. scatter: of the worst, in px.
-    The last is how wide the widest border is, in px.
+    The last are how wide the widest border is, and the std that remains where one is smeared over a whole cell, in px.
     """
     lines = np.zeros((4, 2, 2))
     covariances = np.zeros((4, 2, 2))
-    contrast, worst, widest = np.inf, 0.0, 0.0
-    # A cell of the smallest families is a sixth of the side: nothing beyond it is the border.
-    half = float(np.clip(0.08 * _side(quad), 1.0, 6.0))
+    contrast, worst, widest, unclear = np.inf, 0.0, 0.0, 0.0
     corners = quad
     for _ in range(_PASSES):
         middle = corners.mean(axis=0)
+        contrast, worst, widest, unclear = np.inf, 0.0, 0.0, 0.0
+        contrasts, halves = np.zeros(4), np.zeros(4)
         for index in range(4):
             start, end = corners[index], corners[(index + 1) % 4]
             length = float(np.linalg.norm(end - start))
@@ -140,13 +144,19 @@ def _sides(grey: npt.NDArray[np.uint8], quad: Floats) -> tuple[Floats, Floats, f
             outward = np.array([along[1], -along[0]])
             point = 0.5 * (start + end)
             outward *= 1.0 if outward @ (point - middle) > 0.0 else -1.0
+            # Border and margin are one cell wide, a ninth to a sixth of what this side is away from the opposite one.
+            across = 2.0 * float(outward @ (point - middle))
+            half = float(np.clip(_REACH * across, 1.0, 6.0))
             count = max(int((_TO - _FROM) * length), 6)
             places = (np.linspace(_FROM, _TO, count) - 0.5) * length
             rim = _rim(grey, point + places[:, None] * along, outward, half)
             if rim is None:
                 return None
             offset, weakest, width = rim
+            full = max(width / (2.0 * half) - _FULL, 0.0) / _FULLER
+            unclear = max(unclear, _FLOOR_FULL * full * max(width - _SHARP, 0.0))
             line, covariance, scatter = _line(places, offset, length / count)
+            contrasts[index], halves[index] = weakest, half
             contrast, worst, widest = min(contrast, weakest), max(worst, scatter), max(widest, width)
             lines[index] = point + line[0] * outward, along + line[1] * outward
             lines[index, 1] /= np.linalg.norm(lines[index, 1])
@@ -155,7 +165,9 @@ def _sides(grey: npt.NDArray[np.uint8], quad: Floats) -> tuple[Floats, Floats, f
         if found is None:
             return None
         corners = found
-    return (lines, covariances, contrast, worst, widest) if contrast >= _LEAST_CONTRAST else None
+    pale = _FLOOR_PALE * float((halves * (1.0 - contrasts / contrasts.max())).max())
+    unclear = float(np.hypot(unclear, pale))
+    return (lines, covariances, contrast, worst, widest, unclear) if contrast >= _LEAST_CONTRAST else None
 
 
 def _rim(

@@ -8,6 +8,7 @@ from typing import Literal, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+from edge.detectors.base import Detection
 from protocols.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
@@ -27,12 +28,14 @@ class Frame:
     device_time_ns: mid-exposure of the middle row, on the device's own clock of arbitrary epoch.
     frame: the device's frame number; a gap is a dropped frame.
     exposure_ns: 0 = not known.
+    found: what the device itself detected in it; None = it does not look.
     """
 
     image: Image
     device_time_ns: int
     frame: int
     exposure_ns: int = 0
+    found: tuple[Detection, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 from edge.devices.base import DeviceInfo, Frame
@@ -207,7 +207,7 @@ class ReturningCamera:
     def _numbered(self, frame: Frame) -> Frame:
         fps = 0.0 if self._info is None else self._info.fps
         number = self._numbers.next(frame.frame, frame.device_time_ns, fps)
-        return Frame(frame.image, frame.device_time_ns, number, frame.exposure_ns)
+        return replace(frame, frame=number)
 
     def _lose(self) -> None:
         connection, self._connection = self._connection, None

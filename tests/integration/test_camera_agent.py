@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deploy.notify import Watched
 from edge import scenes
 from edge.camera_agent import CameraAgent, run_camera_agent
 from edge.detectors.base import Detection
@@ -240,3 +241,29 @@ def test_a_simulated_camera_from_pixels_to_messages() -> None:
     error = np.linalg.norm(found - truth, axis=1)
     assert np.median(error) < 0.15
     assert np.mean(error < 1.0) > 0.98
+
+
+class Hot(ListedDevice):
+    """Tells its temperature and never ends."""
+
+    temperature: float | None = 61.5
+
+
+@pytest.mark.parametrize("watched", [False, True], ids=["the device", "the device as the commands run it"])
+def test_exposure_and_temperature_are_told_where_the_device_tells_them(watched: bool) -> None:
+    def last(device: ListedDevice) -> Any:
+        hub = MemoryHub()
+        statuses = MemoryBus(hub).subscribe(STATUS)
+        run_camera_agent(
+            Watched(device, lambda: None) if watched else device, Given(), MemoryBus(hub), "cam0", threading.Event()
+        )
+        return messages(statuses)[-1]
+
+    gauges = last(Hot([0, 1])).gauges
+    assert gauges["exposure_s"] == pytest.approx(0.004)
+    assert gauges["temperature_c"] == 61.5
+    silent = Hot([0])
+    silent.temperature = None
+    assert "temperature_c" not in last(silent).gauges
+    assert "temperature_c" not in last(ListedDevice([0])).gauges
+    assert "exposure_s" not in last(ListedDevice([])).gauges, "no frame, no exposure"

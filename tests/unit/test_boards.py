@@ -28,11 +28,12 @@ DRIVERS = {
     "rtsp": "NetworkCamera",
     "picamera2": "PiCamera",
     "video": "Recording",
+    "log": "LoggedCamera",
 }
 
 
 def test_every_board_of_the_readme_has_an_example() -> None:
-    assert [file.stem for file in BOARDS] == ["gopro-file", "ip-camera", "oak", "pi-camera", "usb-webcam"]
+    assert [file.stem for file in BOARDS] == ["gopro-file", "ip-camera", "logged", "oak", "pi-camera", "usb-webcam"]
 
 
 @pytest.mark.parametrize("file", BOARDS, ids=lambda file: file.stem)
@@ -59,8 +60,12 @@ def test_the_markers_mode_chooses_its_detector(mode: str, kind: type, tmp_path: 
     [
         ('driver = "rtsp"', "needs an [rtsp] table"),
         ('driver = "rtsp"\n[rtsp]\nurl = "camera"', "rtsp.url"),
+        ('driver = "log"', "needs a [log] table"),
+        ('driver = "log"\n[log]\nfile = "a.mcap"\nrate = 2', "log.rate"),
         ('driver = "usb"\n[usb]\npixels = "H264"', "use one of"),
         ('driver = "picamera2"\n[picamera2]\nexposure_us = 0', "picamera2.exposure_us"),
+        ('driver = "oak"\n[oak]\nlabels = ["person"]', "give its archive as nn"),
+        ('driver = "oak"\n[oak]\nnn = "a.tar.xz"\nconfidence = 2', "oak.confidence"),
         ('[marker]\nmode = "bright"\nthreshold = 255', "marker.threshold"),
     ],
 )
@@ -112,3 +117,14 @@ def test_dim_light_noise_and_water_are_no_blur() -> None:
     rng = np.random.default_rng(2)
     noise = [rng.integers(40, 200, (48, 64, 3), dtype=np.uint8) for _ in range(90)]
     assert not any(text for _, text in watched(noise))
+
+
+@pytest.mark.parametrize(
+    "text", ['detector = "person"', 'detector = "vehicle"', 'driver = "oak"\n[oak]\nnn = "a.tar.xz"']
+)
+def test_what_a_boards_bundle_goes_without_is_told(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "cam.toml"
+    file.write_text(f'id = "a"\n{text}\n')
+    monkeypatch.setattr("deploy.agents.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"needs SciPy.*--extra scipy"):
+        detector_of(load(file, CameraConfig), None, 30.0)

@@ -139,6 +139,28 @@ def test_a_tags_covariance_matches_the_errors(tags: tuple[int, Floats, Floats, F
     assert 0.15 < tags[2].mean() < 2.0
 
 
+@pytest.mark.parametrize(("smear", "least"), [(4.0, 0.05), (5.0, 0.1)])
+def test_a_tag_smeared_over_its_narrow_cells_says_that_it_is_off(smear: float, least: float) -> None:
+    """Seen aslant its cells are 4.6 px wide: such a smear leaves neither black nor white pure, on two of four sides.
+
+    Centres were off by 0.1 to 0.5 px, and their covariance said 0.03.
+    """
+    tag = tag_image(FAMILY, 17, 400)
+    ratios = []
+    for index in range(8):
+        rng = np.random.default_rng([8, index])
+        picture = dim_room(900 + index, 240, 240, 50.0)
+        truth = rng.uniform(110, 130, 2)
+        add_tag(picture, tag, truth, 50.0, np.array([0.05, 0.75, 0.0]), np.array([smear, 0.3]))
+        found = TagDetector().detect(exposed(cv2.GaussianBlur(picture, (0, 0), 0.6), 4.0, rng))
+        if found:
+            assert found[0].covariance is not None
+            assert np.sqrt(found[0].covariance[0]) > least
+            ratios.append(deviation(found[0], truth)[1])
+    assert len(ratios) >= 5
+    assert np.mean(ratios) < 2.5
+
+
 def test_a_tags_size_is_that_seen_straight_on(tags: tuple[int, Floats, Floats, Floats]) -> None:
     assert tags[3] == pytest.approx(1.0, abs=0.02)
 

@@ -22,12 +22,19 @@ def test_what_a_role_needs_is_what_the_project_declares(role: str) -> None:
 
 def test_boards_go_without_what_only_hubs_need() -> None:
     for role in BUDGET_MB:
-        assert not {"scipy", "plotly", "mcap"} & set(NEEDS[role])
+        assert not {"scipy", "plotly"} & set(NEEDS[role])
+    assert "mcap" not in NEEDS["uav"]
+    assert "mcap" in NEEDS["camera"], "the driver of logged pictures"
 
 
 def test_extras_come_along() -> None:
     target = Target("aarch64", "3.11")
-    assert "depthai" in {requirement.name for requirement in _requirements("camera", target, ("oak",))}
+    plain = {requirement.name for requirement in _requirements("camera", target, ())}
+    for extra, package in (("oak", "depthai"), ("v4l2", "linuxpy"), ("video", "av"), ("scipy", "scipy")):
+        more = {requirement.name for requirement in _requirements("camera", target, (extra,))}
+        assert more - plain == {package}
+    with pytest.raises(InputError, match=r"no extra oac; use .*oak"):
+        list(_requirements("camera", target, ("oak", "oac")))
 
 
 def test_the_lock_is_judged_by_the_board(tmp_path: Path) -> None:

@@ -46,6 +46,16 @@ def test_packages() -> None:
     check(machine.packages(("uav",), lambda name: name != "pymavlink"), "fail", 'pip install "syncline[uav]"')
     check(machine.packages(("camera", "oak"), lambda name: name != "depthai"), "fail", 'pip install "syncline[oak]"')
     check(machine.packages(("hub",), lambda name: name != "scipy"), "fail", "syncline bundle")
+    check(machine.packages(("camera", "log"), lambda name: name != "mcap"), "fail", "force-reinstall")
+    check(machine.packages(("camera", "simulated"), lambda name: name != "linuxpy"), "ok")
+
+
+def test_a_usb_camera_goes_without_linuxpy_but_worse() -> None:
+    without = machine.packages(("camera", "usb"), lambda name: name != "linuxpy")
+    check(without, "warn", 'pip install "syncline[v4l2]"')
+    assert "stamped on arrival" in without.text
+    check(machine.packages(("camera", "usb"), lambda name: True), "ok")
+    check(machine.packages(("camera", "usb"), lambda name: name not in ("linuxpy", "cv2")), "fail", "force-reinstall")
 
 
 def cpu_root(tmp_path: Path, flags: str, heat: int | None = None) -> Path:

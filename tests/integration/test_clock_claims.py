@@ -1,0 +1,124 @@
+"""Machines that claim synchronised clocks, held against what the pictures say: contradictions are told."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from hub.agent import run_hub, status_message
+from hub.live import LiveHub
+from protocols.bus.memory import MemoryBus, MemoryHub
+from protocols.catalogue import CAMERA_INFO, OBSERVATION, STATUS
+from protocols.clocks import CameraTime
+from protocols.messages import syncline_pb2 as pb
+from tests.integration.test_live_hub import SETTINGS, feed, messages
+from tests.rigs import Session, simulate
+from tests.samples import eventually
+
+UNIX_S = 1.7e9
+PICTURES_SAY = "the pictures say"
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    return simulate(72, 3, 20)
+
+
+@pytest.fixture(scope="module")
+def hub(session: Session) -> LiveHub:
+    made = LiveHub(SETTINGS)
+    feed(made, messages(session))
+    assert made.calibration is not None
+    assert len(made.calibration.cameras) == 3
+    return made
+
+
+def claim(
+    session: Session, camera: str, off_s: float = 0.0, error_s: float = 0.002, boot: str = "boot0", tied: bool = True
+) -> pb.AgentStatus:
+    """The status of a machine whose Unix time is wrong by ``off_s`` and that says it is right to ``error_s``."""
+    newest = max(t for t, name in zip(session.time, session.camera, strict=True) if name == camera)
+    unix = UNIX_S + session.clocks[camera].reference_from_camera(CameraTime(newest)) + off_s
+    message = pb.AgentStatus(schema_version=1, agent=camera, role="camera", boot_id=boot, state="running")
+    message.gauges["clock_synchronised"] = float(tied)
+    message.gauges["unix_minus_camera_s"] = unix - newest
+    if tied:
+        message.gauges["clock_error_s"] = error_s
+    return message
+
+
+def told(hub: LiveHub, *claims: pb.AgentStatus) -> list[str]:
+    for one in ("cam0", "cam1", "cam2"):
+        hub.handle(pb.AgentStatus(agent=one, role="camera"))  # claims nothing any more
+    for one in claims:
+        hub.handle(one)
+    return hub.clock_contradictions()
+
+
+def test_a_clock_that_is_wrong_is_told_with_what_it_claims_and_by_how_much(hub: LiveHub, session: Session) -> None:
+    others = claim(session, "cam0"), claim(session, "cam2", error_s=0.0005)
+    (text,) = told(hub, *others, claim(session, "cam1", off_s=1.3))
+    assert text.startswith("cam1's clock says it is synchronised to 2 ms and cam")
+    assert "the pictures say 1.3 s off" in text
+    for off_s in (1.3, -1.3):
+        (of_two,) = told(hub, others[0], claim(session, "cam1", off_s=off_s))
+        text = "cam1's clock says it is synchronised to 2 ms and cam0's to 2 ms, the pictures say 1.3 s"
+        assert of_two.startswith(text), "the reference is what the others are told against"
+    (reference,) = told(hub, claim(session, "cam0", off_s=40.0), others[1], claim(session, "cam1"))
+    assert reference.startswith("cam0's clock"), "where two of three agree, it is the third"
+    assert "the pictures say 40 s off" in reference
+
+
+def test_nothing_is_told_where_nothing_contradicts(hub: LiveHub, session: Session) -> None:
+    right = [claim(session, name) for name in ("cam0", "cam1", "cam2")]
+    assert told(hub, *right) == []
+    assert told(hub, right[0], claim(session, "cam1", off_s=0.05)) == [], "a camera's own delay may be that much"
+    assert told(hub, right[0], claim(session, "cam1", off_s=1.3, error_s=1.5)) == [], "it claims no more"
+    assert told(hub, right[0], claim(session, "cam1", off_s=1.3, tied=False)) == [], "it claims nothing"
+    assert told(hub, right[0], claim(session, "cam1", off_s=1.3, boot="boot1")) == [], "another clock than was solved"
+    assert told(hub, claim(session, "cam1", off_s=1.3)) == [], "nobody to compare with"
+    assert told(LiveHub(SETTINGS), *right) == [], "nothing is known yet"
+
+
+def test_it_moves_no_estimate(hub: LiveHub, session: Session) -> None:
+    assert hub.calibration is not None
+    before = {name: camera.time_map for name, camera in hub.calibration.cameras.items()}
+    told(hub, claim(session, "cam0"), claim(session, "cam1", off_s=1.3))
+    hub.tick(2e6, final=True)
+    assert {name: camera.time_map for name, camera in hub.calibration.cameras.items()} == before
+
+
+def test_the_hubs_status_says_so(hub: LiveHub, session: Session) -> None:
+    told(hub, claim(session, "cam0"), claim(session, "cam1", off_s=1.3))
+    text = status_message(hub, "hub", "b", 0, []).message
+    assert PICTURES_SAY in text
+    assert text.endswith("3 cameras calibrated")
+
+
+def test_a_running_hub_hears_it_from_the_cameras_statuses(session: Session) -> None:
+    network, stop = MemoryHub(), threading.Event()
+    with MemoryBus(network) as bus, MemoryBus(network) as own:
+        statuses = bus.subscribe(STATUS)
+        worker = threading.Thread(target=run_hub, args=(LiveHub(SETTINGS), own, "hub", stop))
+        worker.start()
+        try:
+            topics = {"CameraInfo": CAMERA_INFO, "Observation": OBSERVATION}
+            publishers = {}
+            for message in messages(session):
+                name = message.DESCRIPTOR.name, message.camera  # type: ignore[attr-defined]
+                if name not in publishers:
+                    publishers[name] = bus.publisher(topics[name[0]], name[1])
+                publishers[name].put(message)
+            for one in (claim(session, "cam0"), claim(session, "cam1", off_s=1.3)):
+                bus.publisher(STATUS, one.agent).put(one)
+            heard: list[str] = []
+
+            def said() -> bool:
+                heard.extend(r.message.message for r in statuses.drain() if r.agent == "hub")
+                return any(PICTURES_SAY in text for text in heard)
+
+            assert eventually(said, 60.0), heard[-3:]
+        finally:
+            stop.set()
+            worker.join(60.0)
