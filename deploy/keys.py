@@ -110,15 +110,57 @@ def issue(
     BusConfig(mode=mode, connect=tuple(entry["connect"]), listen=tuple(entry.get("listen", ())), tls=tls).endpoints()
     now = datetime.now(UTC)
     until = now + timedelta(days=days)
+    entry.pop("revoked", None)
+    common = certificate_name(role, agent, generation_of(entry))
     own = folder / f"{role}-{agent}"
     own.mkdir(exist_ok=True)
     own.chmod(0o700)
-    sign(folder, own, name, now - _EARLY, until, entry.get("hosts", []))
+    sign(folder, own, common, now - _EARLY, until, entry.get("hosts", []))
     entry["until"] = until.isoformat(timespec="seconds")
     agents[name] = entry
     _write_site(folder, site, agents)
     _write_configurations(folder, site, agents)
     return Issued(role, agent, own, until)
+
+
+def revoke(folder: Path, role: str, agent: str) -> list[Path]:
+    """Take an agent's certificates back: the rules forget their name, and the next one gets a new name.
+
+    Returns the routers' files of rules, which must reach the routers: until then the agent may do what it could.
+    Twice is once; it writes the rules again, should the first time have been cut short. Raises InputError where there
+    is no such agent.
+    """
+    name = certificate_name(role, agent)
+    site, agents = read_site(folder)
+    entry = agents.get(name)
+    if entry is None:
+        raise InputError(
+            f"{role} {agent!r} has no certificate",
+            file=folder / SITE_FILE,
+            remedy=f"those that have one: {', '.join(sorted(agents)) or 'none yet'}",
+        )
+    if not entry.get("revoked"):
+        entry["generation"] = generation_of(entry) + 1
+        entry["revoked"] = True
+        _write_site(folder, site, agents)
+    own = folder / f"{role}-{agent}"
+    for file in (own / CERTIFICATE_FILE, own / KEY_FILE):
+        file.unlink(missing_ok=True)
+    _write_configurations(folder, site, agents)
+    routers = [a for a in agents.values() if a["role"] == "router" and not a.get("revoked")]
+    files = [folder / f"router-{a['id']}" / ZENOH_FILE for a in routers]
+    return [file for file in files if file.is_file()]
+
+
+def generation_of(entry: dict[str, Any]) -> int:
+    """Which generation of certificates an agent is at, from 1; ``revoked`` says that it has none of it yet.
+
+    Raises ValueError where a file says something else.
+    """
+    generation = entry.get("generation", 1)
+    if not isinstance(generation, int) or not 1 <= generation < 10**6:
+        raise ValueError(generation)
+    return generation
 
 
 def read_site(folder: Path) -> tuple[str, dict[str, dict[str, Any]]]:
@@ -127,6 +169,8 @@ def read_site(folder: Path) -> tuple[str, dict[str, dict[str, Any]]]:
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
         agents = {certificate_name(a["role"], a["id"]): dict(a) for a in document["agents"]}
+        for entry in agents.values():
+            generation_of(entry)
         return valid_id(document["site"], "site"), agents
     except OSError:
         raise InputError("holds no authority", file=folder, remedy="make one with `syncline keys init`") from None
@@ -141,9 +185,11 @@ def _write_site(folder: Path, site: str, agents: dict[str, dict[str, Any]]) -> N
 
 def _write_configurations(folder: Path, site: str, agents: dict[str, dict[str, Any]]) -> None:
     """Every agent's [bus] table and every router's rules: each router must know of every agent."""
-    rules = access_rules(site, [(a["role"], a["id"]) for a in agents.values()])
-    listening = [end for a in agents.values() if a["role"] == "router" for end in _reached(a)]
-    for entry in agents.values():
+    valid = [a for a in agents.values() if not a.get("revoked")]
+    named = {(a["role"], a["id"]): generation_of(a) for a in valid}
+    rules = access_rules(site, named, named)
+    listening = [end for a in valid if a["role"] == "router" for end in _reached(a)]
+    for entry in valid:
         own = folder / f"{entry['role']}-{entry['id']}"
         if not own.is_dir():
             continue  # moved to its machine and taken away here

@@ -5,10 +5,12 @@ from __future__ import annotations
 import tempfile
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from deploy import keys
+from protocols.bus.access import certificate_name
 from protocols.bus.router import Router, free_endpoint
 from protocols.bus.selftest import Finding, try_agents, try_stranger
 from protocols.bus.settings import BusConfig, TlsConfig
@@ -34,11 +36,28 @@ def check_site(folder: Path) -> list[Finding]:
     config = BusConfig(mode="router", tls=tls_of(place), access=place / keys.ZENOH_FILE)
     tried = [(agents[n]["role"], agents[n]["id"], tls_of(p)) for n, p in here.items() if n not in routers]
     found = try_agents(config, site, tried)
+    with tempfile.TemporaryDirectory() as made:
+        found += try_agents(config, site, revoked(folder, agents, Path(made)), revoked=True)
     endpoint = free_endpoint().replace("tcp/", "tls/")
     with Router(config=msgspec.structs.replace(config, listen=(endpoint,))), tempfile.TemporaryDirectory() as made:
         for what, tls in strangers(folder, Path(made)).items():
             found.append(try_stranger(endpoint, what, tls))
     return found
+
+
+def revoked(folder: Path, agents: dict[str, dict[str, Any]], made: Path) -> list[tuple[str, str, TlsConfig]]:
+    """The last certificate that was revoked of each agent, as (role, id, files): made again in ``made``."""
+    out = []
+    now = datetime.now(UTC)
+    for name, entry in sorted(agents.items()):
+        generation = keys.generation_of(entry) - 1
+        if generation:
+            own = made / name
+            own.mkdir()
+            old = certificate_name(entry["role"], entry["id"], generation)
+            keys.sign(folder, own, old, now - timedelta(minutes=5), now + timedelta(hours=1), ())
+            out.append((entry["role"], entry["id"], tls_of(own)))
+    return out
 
 
 def strangers(folder: Path, made: Path) -> dict[str, TlsConfig | None]:

@@ -154,10 +154,18 @@ def _colour(colour: pb.Colour) -> None:
 
 
 def _detection(detection: pb.Detection) -> None:
-    _number(detection.u, "u", -MAX_PIXEL, MAX_PIXEL)
-    _number(detection.v, "v", -MAX_PIXEL, MAX_PIXEL)
-    _number(detection.size, "size", 0.0, MAX_PIXEL)
-    _number(detection.score, "score", 0.0, 1.0)
+    # The commonest message there is: one comparison for all four, and what is wrong only where something is.
+    # No number that is not finite passes it.
+    if not (
+        -MAX_PIXEL <= detection.u <= MAX_PIXEL
+        and -MAX_PIXEL <= detection.v <= MAX_PIXEL
+        and 0.0 <= detection.size <= MAX_PIXEL
+        and 0.0 <= detection.score <= 1.0
+    ):
+        _number(detection.u, "u", -MAX_PIXEL, MAX_PIXEL)
+        _number(detection.v, "v", -MAX_PIXEL, MAX_PIXEL)
+        _number(detection.size, "size", 0.0, MAX_PIXEL)
+        _number(detection.score, "score", 0.0, 1.0)
     if detection.label:
         _text(detection.label, "label", MAX_LABEL)
     if detection.HasField("colour"):

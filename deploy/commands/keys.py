@@ -21,6 +21,7 @@ KEYS = App(
     "Example: syncline keys init keys --site yard\n\n"
     "Example: syncline keys issue keys --role router --id r0 --listen tls/192.168.1.5:7447\n\n"
     "Example: syncline keys issue keys --role camera --id cam0\n\n"
+    "Example: syncline keys revoke keys --role camera --id cam0\n\n"
     "Example: syncline keys check keys",
     help_format="plaintext",
 )
@@ -98,6 +99,38 @@ def issue(
         print(f"run it with: syncline router {issued.folder / keys.ROUTER_FILE}")
     else:
         print(f"copy that folder to its machine and begin its configuration with {keys.BUS_FILE} there")
+    return EXIT_DONE
+
+
+@KEYS.command
+def revoke(folder: Path, /, *, role: Role, id: str, json: Json = False) -> int:
+    """Take an agent's certificates back: routers that have the new rules let them say and hear nothing.
+
+    Zenoh reads no lists of revoked certificates, so a revoked one still opens a connection until it expires: keep
+    --days short. Its name is never used again; `keys issue` gives the agent a new one.
+
+    Example: syncline keys revoke keys --role camera --id cam0
+
+    Parameters
+    ----------
+    folder
+        The authority, from `keys init`.
+    role
+        What the agent is.
+    id
+        Its id.
+    json
+        Print JSON.
+    """
+    from deploy import keys
+
+    files = keys.revoke(folder, role, id)
+    if json:
+        print(json_module.dumps({"revoked": f"{role}.{id}", "rules": [str(file) for file in files]}))
+        return EXIT_DONE
+    print(f"{role} {id}: revoked")
+    for file in files:
+        print(f"bring {file} to its router: `syncline router` takes it up by itself, zenohd when it is started again")
     return EXIT_DONE
 
 

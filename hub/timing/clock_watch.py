@@ -79,7 +79,9 @@ class ClockWatch:
 
         device_ns: the frame's device time. arrival: when it came [s, one clock for all cameras]; None = not known.
         """
-        clock = self._clocks.setdefault((camera, boot), _Clock([(0, boot)]))
+        clock = self._clocks.get((camera, boot))
+        if clock is None:
+            clock = self._clocks[camera, boot] = _Clock([(0, boot)])
         if clock.last is not None and sequence <= clock.last[0]:
             name = next((name for first, name in reversed(clock.epochs) if first <= sequence), boot)
             return name, None

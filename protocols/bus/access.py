@@ -41,18 +41,30 @@ def _keys(*patterns: str) -> list[str]:
     return [key for pattern in patterns for key in (pattern, f"{pattern.removesuffix('/**')}/**/@adv/**")]
 
 
-def certificate_name(role: str, agent: str) -> str:
-    """The common name of an agent's certificate; raises InputError where it cannot be one."""
+def certificate_name(role: str, agent: str, generation: int = 1) -> str:
+    """The common name of an agent's certificate; raises InputError where it cannot be one.
+
+    generation: one more than how often certificates of this agent were revoked. Zenoh 1.10.2 reads no list of revoked
+    certificates, but its rules go by this name: so whoever was revoked gets a new one, and the rules forget the old.
+    """
     if role not in ROLES:
         raise InputError(f"there is no role {role!r}", remedy=f"use one of {', '.join(ROLES)}")
-    name = f"{role}.{valid_id(agent)}"
+    name = f"{role}.{valid_id(agent)}" + (f".{generation}" if generation > 1 else "")
     if len(name) > 64:
         raise InputError(f"id {agent!r} is too long for a certificate", remedy="use at most 55 characters")
     return name
 
 
-def access_rules(site: str, agents: Iterable[tuple[str, str]]) -> dict[str, Any]:
-    """Zenoh's ``access_control`` for a site's agents, each (role, id)."""
+def owner_of(name: str) -> str:
+    """``<role>.<id>`` of a certificate's common name, whatever its generation."""
+    return ".".join(name.split(".")[:2])
+
+
+def access_rules(
+    site: str, agents: Iterable[tuple[str, str]], generations: Mapping[tuple[str, str], int] | None = None
+) -> dict[str, Any]:
+    """Zenoh's ``access_control`` for a site's agents, each (role, id). generations: where it is not the first."""
+    generations = generations or {}
     base = f"syncline/{valid_id(site, 'site')}"
     everything = _keys(f"{base}/**")
     rules: list[dict[str, Any]] = [
@@ -68,7 +80,7 @@ def access_rules(site: str, agents: Iterable[tuple[str, str]]) -> dict[str, Any]
     ]
     subjects, policies = [], []
     for role, agent in sorted(set(agents)):
-        name = certificate_name(role, agent)
+        name = certificate_name(role, agent, generations.get((role, agent), 1))
         own = [f"{base}/{key.format(id=agent)}" for key in _SAYS[role]]
         own += [f"{base}/agent/{agent}/**", f"{base}/alive/{role}/{agent}/*"]
         rules.append(

@@ -46,11 +46,16 @@ def should_publish(role: str, agent: str, topic: Topic, as_id: str) -> bool:
     return agent == as_id and first in _PUBLISHERS.get(role, ())
 
 
-def try_agents(router: BusConfig, site: str, agents: Sequence[tuple[str, str, TlsConfig]]) -> list[Finding]:
+def try_agents(
+    router: BusConfig, site: str, agents: Sequence[tuple[str, str, TlsConfig]], *, revoked: bool = False
+) -> list[Finding]:
     """Try every topic with every certificate, in its own name and in another's, and what each hears.
 
-    router: tls and access as the router to be has them; it runs on a free loopback port here.
+    router: tls and access as the router to be has them; it runs on a free loopback port here. revoked: these may do
+    nothing, although they are let in until their certificates expire.
     """
+    if not agents:
+        return []
     endpoint = free_endpoint().replace("tcp/", "tls/")
     config = msgspec.structs.replace(router, mode="router", listen=(endpoint,), connect=())
     found: list[Finding] = []
@@ -63,14 +68,21 @@ def try_agents(router: BusConfig, site: str, agents: Sequence[tuple[str, str, Tl
             ear = watcher.declare_subscriber(f"syncline/{site}/**", lambda sample: heard.add(str(sample.key_expr)))
         stack.callback(release, ear)
         for role, agent, tls in agents:
-            found += _try_one(endpoint, site, role, agent, tls, watcher, heard)
+            found += _try_one(endpoint, site, role, agent, tls, watcher, heard, revoked)
     return found
 
 
 def _try_one(
-    endpoint: str, site: str, role: str, agent: str, tls: TlsConfig, watcher: zenoh.Session, heard: set[str]
+    endpoint: str,
+    site: str,
+    role: str,
+    agent: str,
+    tls: TlsConfig,
+    watcher: zenoh.Session,
+    heard: set[str],
+    revoked: bool,
 ) -> list[Finding]:
-    who = f"{role} {agent}"
+    who = f"{role} {agent}" + (" (revoked)" if revoked else "")
     try:
         session = open_session(BusConfig(mode="client", connect=(endpoint,), tls=tls), timeout_s=3.0)
     except InputError as error:
@@ -97,8 +109,10 @@ def _try_one(
     for topic, name in tried:
         through = topic.key_for(site, name) in heard
         whose = "its own" if name == agent else "another's"
-        out.append(Finding(who, f"says {whose} {topic.name}", should_publish(role, agent, topic, name), through))
-    out.append(Finding(who, "hears the others", role in ("hub", "record", "view", "uav", "router"), probe in told))
+        wanted = not revoked and should_publish(role, agent, topic, name)
+        out.append(Finding(who, f"says {whose} {topic.name}", wanted, through))
+    hearing = not revoked and role in ("hub", "record", "view", "uav", "router")
+    out.append(Finding(who, "hears the others", hearing, probe in told))
     return out
 
 

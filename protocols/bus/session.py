@@ -20,7 +20,12 @@ from protocols.errors import InputError
 MAX_MESSAGE_SIZE = 4 * 1024 * 1024
 LEASE_MS = 1900
 """A frozen process counts as gone after this, and is told of within 2 s; a killed one at once."""
-_ATTEMPT_MS = 500
+_ATTEMPTS_MS = (100, 1000, 2000)
+"""A client's attempts to reach its router. The first is short, so that who is refused is told of it at once; the later
+ones are long enough for a link of 300 ms, over which a handshake takes four times that."""
+_OPEN_MS = 4000
+"""Of one attempt to connect. TCP doubles its pauses where a first packet is lost, so that an attempt that began while a
+link was bad sleeps for seconds after it is good again; a new one does not. Long enough for a link of 800 ms."""
 _PAUSE_S = 0.1
 
 
@@ -74,9 +79,10 @@ def open_session(
     connect, listen = config.endpoints()
     if config.tls is not None:
         check_files(config.tls)
-    settings = _settings(config, connect, listen)
-    began = time.monotonic()
+    began, attempt = time.monotonic(), 0
     while True:
+        settings = _settings(config, connect, listen, _ATTEMPTS_MS[min(attempt, len(_ATTEMPTS_MS) - 1)])
+        attempt += 1
         if stop is not None and stop():
             raise BusStopped("stopped before the bus was open")
         try:
@@ -101,12 +107,12 @@ def open_session(
         time.sleep(_PAUSE_S)
 
 
-def _settings(config: BusConfig, connect: tuple[str, ...], listen: tuple[str, ...]) -> zenoh.Config:
+def _settings(config: BusConfig, connect: tuple[str, ...], listen: tuple[str, ...], attempt_ms: int) -> zenoh.Config:
     client = config.mode == "client"
     values: dict[str, Any] = {
         "mode": config.mode,
         "connect/endpoints": list(connect),
-        "connect/timeout_ms": _ATTEMPT_MS if client else -1,
+        "connect/timeout_ms": attempt_ms if client else -1,
         "connect/exit_on_failure": client,
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
         "listen/endpoints": list(listen),
@@ -120,6 +126,7 @@ def _settings(config: BusConfig, connect: tuple[str, ...], listen: tuple[str, ..
         # Else idle sockets lock out others for ten seconds.
         "transport/unicast/accept_pending": 2000,
         "transport/unicast/accept_timeout": 2000,
+        "transport/unicast/open_timeout": _OPEN_MS,
         "transport/unicast/max_sessions": config.max_sessions,
     }
     if config.tls is not None:

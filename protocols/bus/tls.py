@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from protocols.bus.access import owner_of
 from protocols.bus.settings import TlsConfig, parts_of
 from protocols.errors import InputError
 
@@ -69,7 +70,7 @@ def days_left(certificate: Path) -> float:
 
 
 def common_name(certificate: Path) -> str:
-    """The certificate's common name: ``<role>.<id>`` where `syncline keys` made it."""
+    """The certificate's common name, ``<role>.<id>`` or ``<role>.<id>.<generation>`` where `syncline keys` made it."""
     for pairs in _decoded(certificate).get("subject", ()):
         for name, value in pairs:
             if name == "commonName":
@@ -80,7 +81,7 @@ def common_name(certificate: Path) -> str:
 def check_owner(tls: TlsConfig, role: str, agent: str) -> None:
     """Raise InputError where the certificate is another agent's: the router would drop all it says, in silence."""
     name = common_name(tls.certificate)
-    if name != f"{role}.{agent}":
+    if owner_of(name) != f"{role}.{agent}":
         raise InputError(
             f"bus.tls: the certificate is {name!r}'s, this is {role} {agent!r}",
             file=tls.certificate,

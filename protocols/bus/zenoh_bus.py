@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import Any, Self, TypeAlias
 
@@ -13,19 +15,21 @@ import zenoh.ext
 import zenoh.handlers
 from google.protobuf.message import Message
 
-from protocols.bus.backfill import Backfill
+from protocols.bus.backfill import Backfill, Question
 from protocols.bus.base import AgentEvent, BusDead, Received, Refusal
 from protocols.bus.delivery import cache_size
 from protocols.bus.inbox import Inbox, Roll, subscription_key
 from protocols.bus.session import close_session, open_session, release, zenoh_call
 from protocols.bus.settings import BusConfig
 from protocols.catalogue import Delivery, Topic, liveliness_key, valid_id
-from protocols.gate import Reason, Rejected, encode
+from protocols.gate import Reason, Rejected, encode, parse_key
 
 HEARTBEAT_S = 0.5
 """How soon a subscriber learns that the last message before a silence is missing."""
 _POLL_S = 0.005
 _FETCH_S = 2.0
+_GAP_S = 10.0
+_MOST_KEYS, _KEYS_AT_ONCE = 8192, 64
 
 _Source: TypeAlias = tuple[str, int]
 """A publisher as Zenoh names it: session and entity."""
@@ -81,6 +85,41 @@ class ZenohPublisher:
         release(self._matcher, self._publisher)
 
 
+class _Keys:
+    """Declares the keys that messages arrive under.
+
+    Zenoh 1.10.2 remembers where a message goes for declared keys only. For all others it compares the key with every
+    one that it knows of, for each message: with 1,000 cameras that is 110 us of CPU, more than all the rest.
+    """
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._met: set[str] = set()
+        self._new: deque[str] = deque()
+        self._declared: list[zenoh.KeyExpr] = []
+
+    def meet(self, key: str) -> None:
+        """Take note of a message's key; from a callback, so nothing is declared here."""
+        if key not in self._met and len(self._met) < _MOST_KEYS:
+            self._met.add(key)
+            self._new.append(key)
+
+    def declare(self) -> None:
+        """Declare some of the new ones."""
+        for _ in range(min(len(self._new), _KEYS_AT_ONCE)):
+            key = self._new.popleft()
+            if parse_key(key) is None:  # it came through a wildcard: the gate refuses it
+                continue
+            with zenoh_call(f"declare {key}"):
+                self._declared.append(self._session.declare_keyexpr(key))
+
+    def close(self) -> None:
+        """Undeclare them; after the session this is no error."""
+        while self._declared:
+            with suppress(BusDead), zenoh_call("undeclare"):
+                self._session.undeclare(self._declared.pop())
+
+
 class ZenohSubscription:
     """See ``protocols.bus.base.Subscription``."""
 
@@ -88,7 +127,8 @@ class ZenohSubscription:
         self._session = session
         self._inbox = Inbox(topic, clock_ns)
         self._reliable = topic.delivery is Delivery.RELIABLE
-        self._backfill: Backfill[_Source] = Backfill(self._push, self._fetch)
+        self._backfill: Backfill[_Source] = Backfill(self._push, self._ask, self._inbox.lose)
+        self._keys = _Keys(session)
         recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
         with zenoh_call(f"subscribe {key}"):
             self._subscriber: zenoh.ext.AdvancedSubscriber[None] = zenoh.ext.declare_advanced_subscriber(
@@ -98,9 +138,6 @@ class ZenohSubscription:
                 # No max_samples: it would also cap what is recovered after an outage.
                 history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
                 recovery=recovery if self._reliable else None,
-            )
-            self._misses: zenoh.ext.SampleMissListener[None] | None = (
-                self._subscriber.sample_miss_listener(self._miss) if self._reliable else None
             )
 
     # All callbacks run on threads of Zenoh's: an exception there is printed and swallowed, and a slow
@@ -112,6 +149,7 @@ class ZenohSubscription:
         if source is None:
             self._inbox.refuse(Rejected(Reason.PLAIN_PUBLISHER, "not from an advanced publisher"), key)
             return
+        self._keys.meet(key)
         name = (str(source.source_id.zid), source.source_id.eid)
         if self._reliable:
             self._backfill.take(name, source.source_sn, key, sample.payload.to_bytes())
@@ -121,11 +159,10 @@ class ZenohSubscription:
     def _push(self, source: _Source, key: str, payload: bytes) -> None:
         self._inbox.push(key, payload, source[0])
 
-    def _miss(self, miss: zenoh.ext.Miss) -> None:
-        self._inbox.lose(miss.nb)
-
-    def _fetch(self, key: str, source: _Source, first: int) -> None:
-        """Ask one publisher's cache for what came before message ``first``."""
+    def _ask(self, question: Question[_Source]) -> None:
+        """Ask one publisher's cache; its answers come on a thread of Zenoh's."""
+        source, lock, served = question.source, threading.Lock(), False
+        still_open = 1 if question.witness is None else 2
 
         def answer(reply: zenoh.Reply) -> None:
             sample = reply.ok
@@ -133,21 +170,40 @@ class ZenohSubscription:
                 number = sample.source_info.source_sn
                 self._backfill.answer(source, number, str(sample.key_expr), sample.payload.to_bytes())
 
-        try:
-            with zenoh_call(f"fetch {key}"):
+        def witnessed(reply: zenoh.Reply) -> None:
+            nonlocal served
+            served = served or reply.ok is not None
+
+        def done() -> None:
+            nonlocal still_open
+            with lock:
+                still_open -= 1
+                ended = still_open == 0
+            if ended:
+                self._backfill.finish(source, question.number, served)
+
+        def get(low: int, high: int, take: Callable[[zenoh.Reply], None]) -> None:
+            with zenoh_call(f"fetch {question.key}"):
                 self._session.get(
-                    f"{key}/@adv/pub/{source[0]}/{source[1]}/**?_sn=..{first - 1}",
-                    zenoh.handlers.Callback(answer, drop=lambda: self._backfill.finish(source)),
+                    f"{question.key}/@adv/pub/{source[0]}/{source[1]}/**?_sn={low}..{high}",
+                    zenoh.handlers.Callback(take, drop=done),
                     consolidation=zenoh.ConsolidationMode.NONE,
                     accept_replies=zenoh.ReplyKeyExpr.ANY,
-                    timeout=_FETCH_S,
+                    timeout=_FETCH_S if question.witness is None else _GAP_S,
                 )
+
+        try:
+            get(question.low, question.high, answer)
+            if question.witness is not None:
+                # After the other on the same way: where this one is answered, that one has been.
+                get(question.witness, question.witness, witnessed)
         except BusDead:
-            self._backfill.finish(source)
+            self._backfill.finish(source, question.number, served=False)
 
     def drain(self) -> list[Received]:
         """Everything since the last call."""
-        self._backfill.release_overdue()
+        self._keys.declare()
+        self._backfill.tend()
         return self._inbox.drain()
 
     def wait(self, timeout_s: float) -> bool:
@@ -165,7 +221,8 @@ class ZenohSubscription:
 
     def close(self) -> None:
         """Undeclare: a process with an open callback never exits."""
-        release(self._misses, self._subscriber)
+        release(self._subscriber)
+        self._keys.close()
 
 
 class ZenohWatch:

@@ -131,7 +131,9 @@ class SessionBuilder:
 
     def _observe(self, message: pb.Observation) -> None:
         boots = self._boots.setdefault(message.camera, {})
-        boot = boots.setdefault(message.boot_id, _Boot())
+        boot = boots.get(message.boot_id)
+        if boot is None:
+            boot = boots[message.boot_id] = _Boot()
         if message.sequence in boot.seen or message.sequence < boot.forgotten:
             self.counters["duplicates"] += 1
             return

@@ -38,6 +38,7 @@ def resident_mb(pid: int | str = "self") -> float:
 
 def hub(endpoint: str) -> None:
     """The hub's process: counts, latencies and memory as lines of JSON, one a second, until its input ends."""
+    from hub.agent import settle_memory
     from hub.live import LiveHub, LiveSettings
 
     estimator = LiveHub(LiveSettings(window_s=10.0, interval_s=1e9))
@@ -46,6 +47,7 @@ def hub(endpoint: str) -> None:
         subscriptions = [guarded.subscribe(topic) for topic in (CAMERA_INFO, OBSERVATION)]
         ended = threading.Event()
         threading.Thread(target=lambda: (sys.stdin.read(), ended.set()), daemon=True).start()
+        settle_memory()
         print(json.dumps({"ready": True}), flush=True)
         next_line, latencies, loop = time.monotonic() + 1.0, [], [0.0]
         while not ended.is_set():
@@ -144,6 +146,7 @@ def measure(cameras: int, rate: float, seconds: float) -> dict[str, float]:
         "p50_ms": latencies[len(latencies) // 2],
         "p99_ms": latencies[int(0.99 * len(latencies))],
         "loop_max_ms": max(line["loop_ms"] for line in warm),
+        "hub_cpu_us": 1e6 * (warm[-1]["cpu_s"] - warm[0]["cpu_s"]) / sum(len(line["latencies"]) for line in warm[1:]),
         "hub_cpu": (warm[-1]["cpu_s"] - warm[0]["cpu_s"]) / (len(warm) - 1),
         "hub_mb": warm[-1]["mb"],
         "growth_mb": late - early,

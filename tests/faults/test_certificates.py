@@ -17,6 +17,7 @@ from deploy import keys
 from deploy.cli import run
 from deploy.keys_check import check_site, tls_of
 from protocols.bus.access import access_rules
+from protocols.bus.base import Publisher
 from protocols.bus.router import Router, free_endpoint
 from protocols.bus.settings import BusConfig, parts_of
 from protocols.bus.tls import why_refused
@@ -30,10 +31,17 @@ from tests.samples import observation
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A site with a router, a hub and two cameras."""
+    """A site with a router, a hub, two cameras, a drone and a view."""
     folder = tmp_path_factory.mktemp("keys") / "keys"
     keys.make_site(folder, "yard")
-    for role, agent in (("router", "r0"), ("hub", "hub"), ("camera", "cam0"), ("camera", "cam1")):
+    for role, agent in (
+        ("router", "r0"),
+        ("hub", "hub"),
+        ("camera", "cam0"),
+        ("camera", "cam1"),
+        ("uav", "d0"),
+        ("view", "v0"),
+    ):
         keys.issue(folder, role, agent)
     return folder
 
@@ -57,6 +65,87 @@ def test_the_self_test_finds_every_rule_kept(site: Path, capsys: pytest.CaptureF
     measured("what each certificate may do", "deny by default", f"{len(findings)} tried, {len(wrong)} wrong")
     assert wrong == []
     assert len(findings) > 60
+    allowed = {(finding.who, finding.what) for finding in findings if finding.found}
+    orders = {who for who, what in allowed if what.endswith(" command")}
+    records = {who for who, what in allowed if what.endswith(" target_command")}
+    assert orders == {"view v0"}, "what agents obey: only a view's own"
+    assert records == {"uav d0"}, "what a drone was told by radio: only its own record of it"
+
+
+def test_a_revoked_certificate_may_do_nothing_and_its_successor_everything(site: Path, tmp_path: Path) -> None:
+    """Through a router that runs all the time."""
+    import shutil
+
+    copy = tmp_path / "keys"
+    shutil.copytree(site, copy)
+    stolen = tmp_path / "stolen"
+    shutil.copytree(copy / "camera-cam0", stolen)
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    keys.issue(copy, "router", "r0", listen=[endpoint])
+
+    def client(folder: Path) -> BusConfig:
+        return BusConfig(mode="client", connect=(endpoint,), tls=tls_of(folder))
+
+    with Process("-m", "deploy", "router", str(copy / "router-r0" / keys.ROUTER_FILE)) as process:
+        assert process.line().startswith("relays at")
+        with (
+            open_bus("yard", client(copy / "hub-hub"), timeout_s=10.0) as hub,
+            open_bus("yard", client(stolen), timeout_s=10.0) as thief,
+        ):
+            subscription = hub.subscribe(OBSERVATION)
+            stealing, number = thief.publisher(OBSERVATION, "cam0"), 0
+
+            def heard(publisher: Publisher) -> bool:
+                nonlocal number
+                publisher.put(observation("cam0", number))
+                number += 1
+                time.sleep(0.05)
+                return bool(subscription.drain())
+
+            wait_until(lambda: heard(stealing))
+            began = time.monotonic()
+            assert run(["keys", "revoke", str(copy), "--role", "camera", "--id", "cam0"]) == 0
+            assert process.line().startswith("relays at"), "the router has taken up the new rules"
+            seconds = time.monotonic() - began
+            keys.issue(copy, "camera", "cam0")
+            assert process.line().startswith("relays at")
+            with open_bus("yard", client(copy / "camera-cam0"), timeout_s=10.0) as camera:
+                own = camera.publisher(OBSERVATION, "cam0")
+                wait_until(lambda: heard(own))
+            while subscription.drain():
+                time.sleep(0.5)
+            assert not any(heard(stealing) for _ in range(40))
+    tried = [finding for finding in check_site(copy) if finding.who == "camera cam0 (revoked)"]
+    assert len(tried) > 20
+    assert [finding.what for finding in tried if finding.found] == ["connects"]
+    assert all(finding.wanted == finding.found for finding in tried)
+    measured(
+        "revoked certificate",
+        "may do nothing",
+        f"nothing of {len(tried) - 1} tried; {seconds:.2f} s from `keys revoke` to a running router's new rules",
+    )
+
+
+def test_revoking_twice_is_once_and_a_damaged_authority_is_told(
+    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import shutil
+
+    copy = tmp_path / "keys"
+    shutil.copytree(site, copy)
+    words = ["keys", "revoke", str(copy), "--role", "camera", "--id", "cam1"]
+    assert run(words) == run(words) == 0
+    keys.issue(copy, "camera", "cam1")
+    rules = (copy / "router-r0" / keys.ZENOH_FILE).read_text(encoding="utf-8")
+    assert '"camera.cam1.2"' in rules
+    assert '"camera.cam1"' not in rules
+    site_file = copy / keys.SITE_FILE
+    site_file.write_text(site_file.read_text(encoding="utf-8").replace('"generation": 2', '"generation": "x"'))
+    capsys.readouterr()
+    assert run(words) == 2
+    text = capsys.readouterr().err
+    assert "is not what `syncline keys` writes" in text
+    assert len(text.strip().splitlines()) == 1
 
 
 def test_the_self_test_finds_a_rule_that_is_too_wide(site: Path, tmp_path: Path) -> None:
@@ -224,6 +313,8 @@ def test_a_key_that_others_may_read_is_refused(site: Path, tmp_path: Path, capsy
         (["issue", "{there}", "--role", "camera", "--id", "cam0", "--days", "0"], "no lifetime for a certificate"),
         (["issue", "{there}", "--role", "router", "--id", "r9", "--listen", "http://x"], "is not an endpoint"),
         (["check", "{new}"], "holds no authority"),
+        (["revoke", "{new}", "--role", "camera", "--id", "cam0"], "holds no authority"),
+        (["revoke", "{there}", "--role", "camera", "--id", "cam7"], "camera 'cam7' has no certificate"),
     ],
 )
 def test_bad_use_is_told_in_one_line(

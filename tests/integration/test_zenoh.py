@@ -11,6 +11,7 @@ import time
 import pytest
 import zenoh
 
+from protocols.bus.backfill import Question
 from protocols.bus.base import AgentEvent, Bus, BusDead, BusStopped, Received
 from protocols.bus.router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
@@ -44,6 +45,54 @@ def test_a_history_that_begins_in_the_middle_is_made_whole(monkeypatch: pytest.M
             assert sequences(own) == list(range(100))
             publisher.put(observation(camera, 100))
         assert sequences(collect(subscription, 2)) == [100, 100]
+
+
+def test_a_gap_that_zenoh_gave_up_is_asked_for_until_the_cache_has_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A connection that breaks ends Zenoh's own question without an answer, and what was missing would be lost."""
+    take, ask = ZenohSubscription._take, ZenohSubscription._ask
+    asked: list[Question[tuple[str, int]]] = []
+
+    def with_a_gap(self: ZenohSubscription, sample: zenoh.Sample) -> None:
+        if sample.source_info is None or not 10 <= sample.source_info.source_sn < 30:
+            take(self, sample)
+
+    def broken_at_first(self: ZenohSubscription, question: Question[tuple[str, int]]) -> None:
+        asked.append(question)
+        if len(asked) == 1:
+            self._backfill.finish(question.source, question.number, served=False)
+        else:
+            ask(self, question)
+
+    monkeypatch.setattr(ZenohSubscription, "_take", with_a_gap)
+    monkeypatch.setattr(ZenohSubscription, "_ask", broken_at_first)
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(OBSERVATION)
+        publisher = matched(sending.publisher(OBSERVATION, "cam0"))
+        for index in range(100):
+            publisher.put(observation("cam0", index))
+        assert sequences(collect(subscription, 100)) == list(range(100))
+        assert len(asked) == 2
+        assert subscription.counters["lost"] == 0
+
+
+def test_keys_that_messages_arrive_under_are_declared_once_and_forgotten() -> None:
+    """Else Zenoh seeks the way of every message anew among all keys."""
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(OBSERVATION)
+        for camera in ("cam0", "cam1"):
+            publisher = matched(sending.publisher(OBSERVATION, camera))
+            for index in range(5):
+                publisher.put(observation(camera, index))
+        collect(subscription, 10)
+        subscription.drain()
+        keys = subscription._keys
+        assert sorted(map(str, keys._declared)) == [OBSERVATION.key_for("local", name) for name in ("cam0", "cam1")]
+        subscription.close()
+        assert keys._declared == []
 
 
 def test_what_cannot_be_recovered_is_counted_exactly() -> None:
