@@ -29,6 +29,9 @@ _CANDIDATES = 6  # blobs that are measured, largest first
 _MIN_AREA = 6.0  # px²: below, colour noise looks like that
 _MAX_SHARE = 0.2  # of the image: above, it is a wall
 _MIN_SCORE = 0.35
+_WIDEST_BALL = 0.3  # tan of half its angle: beyond, a camera stands next to it
+_TURN = 2.0 * np.pi * np.arange(24) / 24
+_RIM = np.column_stack([np.cos(_TURN), np.sin(_TURN)])
 _BOX = cv2.getStructuringElement(cv2.MORPH_RECT, (3, 3))
 
 
@@ -87,7 +90,7 @@ class MarkerDetector:
     """Finds the marker in single pictures.
 
     model: what it looks like. intrinsics: where given, the centre is corrected from that of the ball's
-    outline to the projection of its centre, which differ by perspective (``_outline_to_centre``).
+    outline to the projection of its centre, which differ by perspective and distortion (``_outline_to_centre``).
     most: how many blobs at the most are reported, best first; one marker is one.
     min_size, max_size: diameters [px] outside of which a blob is not the marker.
     """
@@ -189,14 +192,23 @@ def _solidity(moments: dict[str, float]) -> float:
 def _outline_to_centre(centre: Floats, size: float, lens: Intrinsics) -> Floats:
     """From the centre (2,) [px] of a ball's outline to the projection of the ball's centre.
 
-    The image plane cuts the cone around a ball of angular radius a in an ellipse whose centre lies farther from the
-    principal point than the ball's centre, by 1 / (1 - tan²(a) / cos²(b)) at the angle b off the axis.
+    The cone around a ball goes through the whole lens, not through its slope alone: a pinhole's picture of it is an
+    ellipse whose centre lies farther out than the ball's, barrel distortion takes some of that back, and a fisheye
+    nearly all of it. size: diameter of the disc of equal area [px].
     """
     x, y = lens.unproject(centre[None])[0]
-    jacobian = lens.pixel_jacobian(np.array([[x, y]]))[0]
-    secant2 = 1.0 + x * x + y * y
-    # size ≈ 2 r/z · sqrt(sec b) in normalised units
-    ratio2 = (0.5 * size) ** 2 / abs(np.linalg.det(jacobian)) / np.sqrt(secant2)
-    if not np.isfinite(ratio2):
+    towards = np.array([x, y, 1.0])
+    secant = float(np.linalg.norm(towards))
+    slope = abs(float(np.linalg.det(lens.pixel_jacobian(towards[None, :2])[0])))
+    # A small solid angle w is sec³ w in normalised coordinates.
+    spread = 0.5 * size / np.sqrt(slope * secant**3)  # tan of the cone's half-angle
+    if not (np.isfinite(spread) and spread < _WIDEST_BALL):
         return centre
-    return np.asarray(centre - jacobian @ np.array([x, y]) * ratio2)
+    across = np.array([1.0, 0.0, -x]) / np.hypot(1.0, x)
+    along = np.cross(towards / secant, across)
+    rim = lens.project(towards / secant + spread * (_RIM @ np.stack([across, along]))) - centre
+    if not np.isfinite(rim).all():
+        return centre
+    following = np.roll(rim, -1, axis=0)
+    area = rim[:, 0] * following[:, 1] - rim[:, 1] * following[:, 0]
+    return np.asarray(centre - area @ (rim + following) / (3.0 * area.sum()))

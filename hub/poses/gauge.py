@@ -2,7 +2,7 @@
 
 Nothing known: the first camera is the world and the first baseline is 1. ``up`` alone turns the world so
 that z points up: ``up = [x, y, z]`` is a direction in the first camera's axes unless poses are known, a
-camera's name means that camera is levelled (its -y axis points up).
+camera's name means that this camera knows it: by ``up`` of its own table, else it is levelled (-y points up).
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def _default(rig: Rig, names: list[str], poses: list[Pose]) -> Similarity:
         if isinstance(up, str):
             if up not in names:
                 raise Refused(f"up names {up}, which could not be solved")
-            upward = poses[names.index(up)].rotation.T @ np.array([0.0, -1.0, 0.0])
+            upward = poses[names.index(up)].rotation.T @ rig.up_seen_by(up)
         else:
             upward = first.rotation.T @ up
         ahead = first.rotation[2] - upward * (first.rotation[2] @ upward)
@@ -216,7 +216,7 @@ def reference_residuals(rig: Rig, names: list[str], poses: list[Pose]) -> Callab
             apart = s.scale * float(np.linalg.norm(poses[a].position - poses[b].position))
             out.append(np.array([(apart - length) / (_EXACT * length)]))
         if isinstance(rig.up, str) and rig.up in names:
-            level = s.rotation @ poses[names.index(rig.up)].rotation.T @ np.array([0.0, -1.0, 0.0])
+            level = s.rotation @ poses[names.index(rig.up)].rotation.T @ rig.up_seen_by(rig.up)
             # The whole difference, not the cross product: upside down must not look level.
             out.append((level - np.array([0.0, 0.0, 1.0])) / _UP_STD)
         return np.concatenate(out) if out else np.zeros(0)

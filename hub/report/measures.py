@@ -201,7 +201,7 @@ def up_in_world(calibration: Calibration, rig: Rig) -> Floats:
     levelled = np.array([0.0, -1.0, 0.0])
     poses = {name: camera.pose for name, camera in calibration.cameras.items()}
     if isinstance(rig.up, str) and rig.up in poses:
-        return np.asarray(poses[rig.up].rotation.T @ levelled)
+        return np.asarray(poses[rig.up].rotation.T @ rig.up_seen_by(rig.up))
     surveyed = any(camera.rotation is not None or camera.position is not None for camera in rig.cameras.values())
     if rig.up is not None and not isinstance(rig.up, str):
         return rig.up if surveyed else np.array([0.0, 0.0, 1.0])

@@ -31,6 +31,7 @@ class RigCamera:
     position: centre in the world [rig units]. rotation: (3, 3) camera from world.
     position_std: (3,) [rig units]. rotation_std: (3,) [rad]. body_from_camera: (3, 3).
     focal_std: relative std of the focal length where the lens is a guess (a data sheet's); 0 = it was measured.
+    up: (3,) unit vector, away from the ground in the camera's own axes, as its accelerometer shows at rest.
     table: the camera's table as it stands in the file, with keys this version does not know.
     """
 
@@ -44,6 +45,7 @@ class RigCamera:
     rotation_std: Floats | None = None
     body_from_camera: Floats | None = None
     focal_std: float = 0.0
+    up: Floats | None = None
     table: dict[str, Any] = field(default_factory=dict)
 
 
@@ -52,7 +54,8 @@ class Rig:
     """All cameras in the file's order, and the metadata that fixes gauge and scale.
 
     units: of every length. clock: "independent" or "shared". distances: (camera, camera, length). wands: (label, label,
-    length), two points that keep their distance. up: a world vector (3,), or the name of a levelled camera, or None.
+    length), two points that keep their distance. up: a world vector (3,), or the name of a camera that knows it
+    (``up_seen_by``), or None.
     """
 
     cameras: dict[str, RigCamera]
@@ -68,6 +71,11 @@ class Rig:
     def shared_clock(self) -> bool:
         """Whether rows of the same time correspond."""
         return self.clock == "shared"
+
+    def up_seen_by(self, camera: str) -> Floats:
+        """Up (3,) in a camera's axes: what its table tells, else it is levelled."""
+        told = self.cameras[camera].up
+        return np.array([0.0, -1.0, 0.0]) if told is None else told
 
 
 class _Table:
@@ -215,7 +223,11 @@ def _read_distances(meta: _Table, cameras: dict[str, RigCamera]) -> tuple[tuple[
 def _read_up(meta: _Table, cameras: dict[str, RigCamera]) -> Floats | str | None:
     up = meta.values.get("up")
     if up is None:
-        return None
+        knowing = [name for name, camera in cameras.items() if camera.up is not None]
+        if len(knowing) > 1:
+            told = ", ".join(knowing)
+            raise meta.fail(None, f"several cameras tell up ({told})", f'say which one counts: up = "{knowing[0]}"')
+        return knowing[0] if knowing else None
     if isinstance(up, str):
         if up not in cameras:
             raise meta.fail("up", f"up names an unknown camera {up!r}", "use a camera of this file, or [x, y, z]")
@@ -253,8 +265,18 @@ def _read_camera(table: _Table) -> RigCamera:
         rotation_std=table.std("rotation_std", "radians, or three"),
         body_from_camera=_read_body(table),
         focal_std=_read_focal_std(table),
+        up=_read_up_of_camera(table),
         table=dict(table.values),
     )
+
+
+def _read_up_of_camera(table: _Table) -> Floats | None:
+    vector = table.numbers("up", 3, "[x, y, z], a direction in this camera's axes (x right, y down, z ahead)")
+    if vector is None:
+        return None
+    if float(np.linalg.norm(vector)) < 1e-9:
+        raise table.fail("up", "up has no direction", "give up = [x, y, z] in this camera's axes; levelled: [0, -1, 0]")
+    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def _read_focal_std(table: _Table) -> float:

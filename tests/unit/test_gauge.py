@@ -141,6 +141,22 @@ def test_a_levelled_camera_says_where_up_is(name: str) -> None:
     assert np.linalg.det(gauge.similarity.rotation) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("surveyed", [False, True])
+def test_a_camera_that_knows_where_up_is_need_not_be_levelled(surveyed: bool) -> None:
+    """Two positions leave a turn about the line between them open; gravity in cam1's axes closes it."""
+    truth, internal, similarity = world(6)
+    told = truth[1].rotation @ [0.0, 0.0, 1.0]
+    known: dict[str, dict[str, Floats]] = {"cam1": {"up": told}}
+    if surveyed:
+        known["cam0"] = {"position": truth[0].position}
+        known["cam1"]["position"] = truth[1].position
+    gauge = fix_gauge(rig(known, up="cam1"), NAMES, internal)
+    pose = gauge.similarity.pose(internal[1])
+    np.testing.assert_allclose(pose.rotation.T @ told, [0, 0, 1], atol=1e-6)
+    if surveyed:
+        np.testing.assert_allclose(gauge.similarity.rotation, similarity.rotation, atol=1e-5)
+
+
 def test_up_as_a_vector_of_the_first_camera_turns_the_world_upright() -> None:
     _, internal, _ = world(3)
     up = np.array([0.1, -0.9, 0.2]) / np.linalg.norm([0.1, -0.9, 0.2])

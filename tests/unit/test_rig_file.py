@@ -128,6 +128,21 @@ def test_up_is_a_unit_vector_or_a_camera(tmp_path: Path) -> None:
     assert read(tmp_path, f'{CAM0}[metadata]\nup = "cam0"\n').up == "cam0"
 
 
+def test_a_camera_may_know_where_up_is(tmp_path: Path) -> None:
+    found = read(tmp_path, f"{CAM0}up = [0, -2.0, 0]\n")
+    assert found.up == "cam0"
+    np.testing.assert_array_equal(found.up_seen_by("cam0"), [0, -1, 0])
+    levelled = read(tmp_path, f'{CAM0}[metadata]\nup = "cam0"\n')
+    np.testing.assert_array_equal(levelled.up_seen_by("cam0"), [0, -1, 0])
+    with pytest.raises(InputError, match="up has no direction"):
+        read(tmp_path, f"{CAM0}up = [0, 0, 0]\n")
+    other = CAM0.replace("cam0", "cam1")
+    with pytest.raises(InputError, match="several cameras tell up"):
+        read(tmp_path, f"{CAM0}up = [0, -1, 0]\n{other}up = [0, -1, 0]\n")
+    both = f'{CAM0}up = [0, -1, 0]\n{other}up = [1, 0, 0]\n[metadata]\nup = "cam1"\n'
+    np.testing.assert_array_equal(read(tmp_path, both).up_seen_by("cam1"), [1, 0, 0])
+
+
 def test_shared_clock(tmp_path: Path) -> None:
     assert read(tmp_path, f'{CAM0}[metadata]\nclock = "shared"\n').shared_clock
 
