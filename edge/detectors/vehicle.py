@@ -34,6 +34,11 @@ _GROWS = 2.5  # times: a silhouette this much larger than a vehicle is more than
 _DIFFERENT = 26  # 8-bit steps
 _STALE_FRAMES = 20
 _CARRY = 0.12  # share of a frame in the carried background
+_PAST_FRAMES = 2  # what did not change for so long, and up to twice that, stands
+_FLANK, _FLANKED = (
+    5,
+    0.25,
+)  # px beside a thing that stands, and the share of it that moves, by which it is no ground yet
 _POSITION_STD, _FLOOR_STD = 0.04, 1.0  # of the size; px
 
 
@@ -165,6 +170,10 @@ class VehicleDetector:
         if self._moving:
             raw = self._carried.residual(image)
         else:
+            if self._given is None and len(self._moves) < _DECIDE:
+                self._carried.residual(image)  # in case the camera turns out to move
+            else:
+                self._carried.forget()
             layers = self._foreground.look(image, [one.box for one in self._following.all if one.sure and one.moved])
             raw = None if layers.fresh else layers.figure
         if raw is None:
@@ -243,6 +252,10 @@ class _Carried:
         self._mean: npt.NDArray[np.float32] | None = None
         self._age: npt.NDArray[np.float32] | None = None
         self._stale: npt.NDArray[np.float32] = np.zeros((1, 1), np.float32)
+        self._past: npt.NDArray[np.float32] | None = None
+        self._coming: npt.NDArray[np.float32] | None = None
+        self._coming_age = 0
+        self._past_age = _PAST_FRAMES
         self._motion: Floats | None = np.eye(3)
         self.shift = 0.0
 
@@ -252,6 +265,11 @@ class _Carried:
         if self._last is not None and self._last.shape == grey.shape:
             self._motion = self._find(grey)
         self._last = grey
+
+    def forget(self) -> None:
+        """What the ground looks like; how the picture moves stays known."""
+        self._mean = self._past = self._coming = None
+        self._coming_age, self._past_age = 0, _PAST_FRAMES
 
     def _find(self, grey: Image) -> Floats | None:
         assert self._last is not None
@@ -289,23 +307,74 @@ class _Carried:
             return None if self._motion is None else np.zeros(image.shape[:2], np.uint8)
         mean = cv2.warpPerspective(self._mean, self._motion, size, flags=cv2.INTER_LINEAR)
         age = cv2.warpPerspective(self._age, self._motion, size, flags=cv2.INTER_NEAREST)
-        known = age > 0.5
         # An edge may lie a pixel off: a colour of the near neighbourhood is the background's too.
         box = np.ones((3, 3), np.uint8)
         high, low = cv2.dilate(mean, box), cv2.erode(mean, box)
         beyond = np.maximum(soft - high, low - soft).max(axis=2)
-        different = (beyond > _DIFFERENT) & (age > 3.5)
+        # Ground that has just come into the picture may have had something on it.
+        changed, settled = beyond > _DIFFERENT, age > self._past_age + 0.5
+        different = changed & settled
+        age[changed & ~settled] = 0.0
+        known = age > 0.5
         rate = np.where(known, np.maximum(1.0 / (age + 1.0), _CARRY), 1.0).astype(np.float32)
         # What passes is not learnt; where something stood at first and left, the ground differs for long: begin there.
         stale = cv2.warpPerspective(self._stale, self._motion, size, flags=cv2.INTER_NEAREST)
         stale = np.where(different, stale + 1.0, 0.0).astype(np.float32)
-        begin = stale > _STALE_FRAMES
+        left_behind = self._left_behind(soft, different, size)
+        different &= ~left_behind
+        begin = (stale > _STALE_FRAMES) | left_behind
         rate[different] = 0.0
         rate[begin] = 1.0
         self._stale = np.where(begin, np.float32(0.0), stale).astype(np.float32)
         self._mean = np.asarray(mean + rate[..., None] * (soft - mean), dtype=np.float32)
         self._age = np.where(known, age + 1.0, 1.0).astype(np.float32)
         return np.where(different, np.uint8(255), np.uint8(0)).astype(np.uint8)
+
+    def _left_behind(
+        self, soft: npt.NDArray[np.float32], different: npt.NDArray[np.bool_], size: tuple[int, int]
+    ) -> npt.NDArray[np.bool_]:
+        """Where ground has come to light that something stood on at first (H, W).
+
+        It differs from the background and stands, and so does all beside it: the even paint of a vehicle stands too,
+        but not its edges.
+        """
+        none = np.zeros(different.shape, dtype=np.bool_)
+        assert self._motion is not None
+        if self._coming is None:
+            self._coming = soft
+            return none
+        self._coming = np.asarray(cv2.warpPerspective(self._coming, self._motion, size), dtype=np.float32)
+        self._coming_age += 1
+        if self._past is not None:
+            self._past_age += 1
+            self._past = np.asarray(cv2.warpPerspective(self._past, self._motion, size), dtype=np.float32)
+        past = self._past
+        if self._coming_age >= _PAST_FRAMES:
+            self._past, self._past_age = self._coming, self._coming_age
+            self._coming, self._coming_age = soft, 0
+        if past is None or not different.any():
+            return none
+        box = np.ones((3, 3), np.uint8)
+        beyond = np.maximum(soft - cv2.dilate(past, box), cv2.erode(past, box) - soft).max(axis=2)
+        moves = beyond > 0.5 * _DIFFERENT
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(
+            (different & ~moves).astype(np.uint8), connectivity=8
+        )
+        out = none
+        for index in range(1, count):
+            x, y, w, h, area = (int(value) for value in stats[index])
+            if area < _FLANK * _FLANK:
+                continue
+            left, right = moves[y : y + h, max(x - _FLANK, 0) : x], moves[y : y + h, x + w : x + w + _FLANK]
+            above, below = moves[max(y - _FLANK, 0) : y, x : x + w], moves[y + h : y + h + _FLANK, x : x + w]
+            if not any(_moves(side) for side in (left, right, above, below)):
+                out |= labels == index
+        return out
+
+
+def _moves(side: npt.NDArray[np.bool_]) -> bool:
+    """Whether enough beside a thing moves; beyond the picture's border nothing is known."""
+    return side.size > 0 and float(side.mean()) > _FLANKED
 
 
 def _travel(pictures: Sequence[Image]) -> float | None:

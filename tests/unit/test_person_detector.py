@@ -243,8 +243,8 @@ def test_cars_before_a_fixed_camera_are_counted_one_label_each() -> None:
     assert min(labels.values()) > 40
 
 
-@pytest.mark.xfail(strict=False, reason="the place that a car has left is told beside it from a moving camera")
-def test_a_car_is_found_from_a_moving_camera_and_the_ground_is_not() -> None:
+@pytest.mark.parametrize("speed", [7.0, 3.0, 1.5])
+def test_a_car_is_found_from_a_moving_camera_and_the_ground_is_not(speed: float) -> None:
     rng = np.random.default_rng(11)
     coarse = rng.integers(40, 210, (90, 160, 3), dtype=np.uint8)
     ground = np.asarray(cv2.resize(coarse, (1280, 720), interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
@@ -252,11 +252,13 @@ def test_a_car_is_found_from_a_moving_camera_and_the_ground_is_not() -> None:
     near = far = 0
     for index in range(60):
         whole = ground.copy()
-        u, v = 200.0 + 7.0 * index, 260.0
+        u, v = 200.0 + speed * index, 260.0
         car(whole, u, v)
         left, top = 60 + 3 * index, 120 + index
         view = noisy(whole[top : top + HEIGHT, left : left + WIDTH], rng)
         for one in detector.detect(view, index / 10.0):
+            if u + 30.0 - left > WIDTH:
+                continue  # cut by the border, its middle is elsewhere
             if np.hypot(one.u + left - u, one.v + top - v) < 20.0:
                 near += 1
             else:
