@@ -20,6 +20,7 @@ from protocols.session.rig import Rig, RigCamera
 
 _REMEMBERED = 16_384
 """Sequences of one run that a live hub remembers to know duplicates by: nine minutes at 30 Hz."""
+_MASK = (1 << _REMEMBERED) - 1
 SETTLED_ROWS = 90
 """Detections from which on a restarted camera's new clock is worth solving."""
 
@@ -29,12 +30,32 @@ class _Boot:
     """One run of one camera's agent: one clock. rows: (device time ns, frame, u, v, size, label)."""
 
     rows: deque[tuple[int, int, float, float, float, str]] = field(default_factory=deque)
-    seen: set[int] = field(default_factory=set)
     last_ns: int = -(2**63)
     """Clocks may count from anywhere, also below zero."""
     frames: int = 0
-    forgotten: int = 0
-    """Sequences below this one are taken for known."""
+    seen: set[int] = field(default_factory=set)
+    highest: int = -1
+    bits: int = 0
+    """Bit k: sequence ``highest - k`` was heard."""
+
+    def knows(self, sequence: int) -> bool:
+        """Whether it was heard before; from now on it was. Remembers all."""
+        if sequence in self.seen:
+            return True
+        self.seen.add(sequence)
+        return False
+
+    def knows_lately(self, sequence: int) -> bool:
+        """The same in constant memory, for a hub that runs for months: what is very old is taken for known."""
+        ahead = sequence - self.highest
+        if ahead > 0:
+            self.bits = ((self.bits << ahead) | 1) & _MASK if ahead < _REMEMBERED else 1
+            self.highest = sequence
+            return False
+        if -ahead >= _REMEMBERED or self.bits >> -ahead & 1:
+            return True
+        self.bits |= 1 << -ahead
+        return False
 
 
 class SessionBuilder:
@@ -134,14 +155,10 @@ class SessionBuilder:
         boot = boots.get(message.boot_id)
         if boot is None:
             boot = boots[message.boot_id] = _Boot()
-        if message.sequence in boot.seen or message.sequence < boot.forgotten:
+        known = boot.knows if self._window_ns is None else boot.knows_lately
+        if known(message.sequence):
             self.counters["duplicates"] += 1
             return
-        boot.seen.add(message.sequence)
-        if self._window_ns is not None and len(boot.seen) > 2 * _REMEMBERED:
-            # A live hub runs for months: what is so old could come again only from nowhere.
-            boot.forgotten = max(boot.seen) - _REMEMBERED
-            boot.seen = {number for number in boot.seen if number >= boot.forgotten}
         boot.frames += 1
         labels: set[str] = set()
         # One row a label and frame: of several detections the surest is the point, the rest are doubtful.

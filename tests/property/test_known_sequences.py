@@ -1,0 +1,19 @@
+"""Duplicates are known in constant memory as they are by remembering all, as long as they are not very old."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protocols.session.builder import _REMEMBERED, _Boot
+
+
+@given(st.lists(st.integers(0, 40_000), max_size=200))
+def test_a_live_hub_knows_the_duplicates_that_a_set_knows(sequences: list[int]) -> None:
+    live, all_of_them = _Boot(), _Boot()
+    highest = -1
+    for sequence in sequences:
+        told, known = live.knows_lately(sequence), all_of_them.knows(sequence)
+        assert told == (known or sequence <= highest - _REMEMBERED)
+        highest = max(highest, sequence)
+    assert live.bits.bit_length() <= _REMEMBERED
