@@ -33,7 +33,7 @@ _STATUS_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class RecorderResult:
-    """What was recorded. counters: recorded, dropped, lost, rejected.<reason>, summed over all topics.
+    """What was recorded. counters: recorded, dropped, lost, skipped, rejected.<reason>, summed over all topics.
 
     path: the log, or the first of its parts. stopped: why it ended before it was told to; "" if it did not.
     """
@@ -196,7 +196,7 @@ def _counters(subscriptions: list[Subscription], messages: int) -> dict[str, int
 
 def _report(status: pb.AgentStatus, subscriptions: list[Subscription], messages: int, size: int, full: str) -> None:
     counters = _counters(subscriptions, messages)
-    missing = counters.get("dropped", 0) + counters.get("lost", 0)
+    missing = counters.get("dropped", 0) + counters.get("lost", 0) + counters.get("skipped", 0)
     status.state = "degraded" if missing else "running"
     status.message = f"{missing} messages are missing from the log" if missing else f"{messages} messages"
     if full:

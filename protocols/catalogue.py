@@ -32,8 +32,9 @@ class Topic:
     message: name of the protobuf message in ``syncline.v1``.
     rate_hz: nominal messages a second from one publisher (0 = on change).
     recorded: whether the recorder writes it.
-    queue: messages that a subscriber holds before the oldest is dropped (and counted).
+    queue: messages that a subscriber holds before the oldest is dropped (and counted); 64 MiB is the other bound.
     stale_after_s: silence after which a publisher that is alive counts as stale; 0 = never.
+    bulky: pictures: they wait in a lane of their own on every link, behind everything else.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Topic:
     delivery: Delivery
     queue: int
     stale_after_s: float
+    bulky: bool = False
 
     def key_for(self, site: str, agent: str) -> str:
         """The concrete key of one publisher."""
@@ -54,7 +56,7 @@ class Topic:
         return f"syncline/{valid_id(site, 'site')}/{self.key.format(id='*')}"
 
 
-OBSERVATION = Topic("observation", "camera/{id}/observation", "Observation", 30.0, True, Delivery.RELIABLE, 8192, 2.0)
+OBSERVATION = Topic("observation", "camera/{id}/observation", "Observation", 30.0, True, Delivery.RELIABLE, 65_536, 2.0)
 CAMERA_INFO = Topic("camera_info", "camera/{id}/info", "CameraInfo", 0.5, True, Delivery.LATEST, 256, 10.0)
 RIG_INFO = Topic("rig_info", "hub/{id}/rig", "RigInfo", 0.1, True, Delivery.LATEST, 16, 60.0)
 CALIBRATION = Topic("calibration", "hub/{id}/calibration", "Calibration", 0.5, True, Delivery.LATEST, 64, 0.0)
@@ -63,8 +65,8 @@ STATUS = Topic("status", "agent/{id}/status", "AgentStatus", 1.0, True, Delivery
 NODE_STATE = Topic("node_state", "node/{id}/state", "NodeState", 10.0, True, Delivery.LATEST, 4096, 2.0)
 COMMAND = Topic("command", "view/{id}/command", "Command", 0.1, False, Delivery.RELIABLE, 64, 0.0)
 PREDICTION = Topic("prediction", "hub/{id}/prediction", "Prediction", 20.0, True, Delivery.LATEST, 16, 0.0)
-PICTURE = Topic("picture", "camera/{id}/picture", "Picture", 4.0, True, Delivery.LATEST, 128, 5.0)
-FLIGHT_IMAGE = Topic("flight_image", "uav/{id}/image", "FlightImage", 30.0, True, Delivery.LATEST, 64, 2.0)
+PICTURE = Topic("picture", "camera/{id}/picture", "Picture", 4.0, True, Delivery.LATEST, 512, 5.0, bulky=True)
+FLIGHT_IMAGE = Topic("flight_image", "uav/{id}/image", "FlightImage", 30.0, True, Delivery.LATEST, 512, 2.0, bulky=True)
 TELEMETRY = Topic("telemetry", "uav/{id}/telemetry", "VehicleTelemetry", 50.0, True, Delivery.RELIABLE, 8192, 2.0)
 TARGET_COMMAND = Topic("target_command", "uav/{id}/command", "TargetCommand", 0.1, True, Delivery.RELIABLE, 64, 0.0)
 TARGET = Topic("target", "uav/{id}/target", "TargetState", 30.0, True, Delivery.RELIABLE, 4096, 0.0)

@@ -86,8 +86,8 @@ class Subscription(Protocol):
     def counters(self) -> Mapping[str, int]:
         """Counts since the start.
 
-        received: passed the gate. dropped: this queue was full. lost: never came, by the publisher's
-        count. rejected.<reason>: stopped at the gate.
+        received: passed the gate. dropped: this queue was full. lost: never came, by the publisher's count.
+        skipped: the same of a topic of which only the newest counts. rejected.<reason>: stopped at the gate.
         """
 
     def refusals(self) -> list[Refusal]:

@@ -11,6 +11,8 @@ from protocols.bus.base import AgentEvent, Received, Refusal
 from protocols.catalogue import Topic, valid_id
 from protocols.gate import MAX_PAYLOAD, Reason, Rejected, admit, parse_key
 
+MOST_BYTES = 64 * 1024 * 1024
+"""What one inbox holds at most, however few messages that is: a reader that stands still fills no machine."""
 _TOLD = 256
 """Refusals that are kept for telling; all of them are counted."""
 
@@ -26,6 +28,7 @@ class Inbox:
         self._clock_ns = clock_ns
         self._capacity = topic.queue
         self._queue: deque[tuple[str, bytes, int, str]] = deque()
+        self._bytes = 0
         self._refusals: list[Refusal] = []
         self._ready = threading.Condition()
         self._counts: Counter[str] = Counter(received=0, dropped=0, lost=0)
@@ -37,8 +40,9 @@ class Inbox:
             return
         now = self._clock_ns()
         with self._ready:
-            if len(self._queue) >= self._capacity:
-                self._queue.popleft()
+            self._bytes += len(payload)
+            while self._queue and (len(self._queue) >= self._capacity or self._bytes > MOST_BYTES):
+                self._bytes -= len(self._queue.popleft()[1])
                 self._counts["dropped"] += 1
             self._queue.append((key, payload, now, source))
             self._ready.notify_all()
@@ -63,10 +67,15 @@ class Inbox:
         with self._ready:
             self._counts["lost"] += count
 
+    def skip(self, count: int) -> None:
+        """Count messages that never came of a topic of which the newest is enough."""
+        with self._ready:
+            self._counts["skipped"] += count
+
     def drain(self) -> list[Received]:
         """Take everything that is queued and let it through the gate."""
         with self._ready:
-            queue, self._queue = self._queue, deque()
+            queue, self._queue, self._bytes = self._queue, deque(), 0
         messages: list[Received] = []
         for key, payload, arrival_ns, source in queue:
             try:

@@ -123,6 +123,10 @@ def _settings(config: BusConfig, connect: tuple[str, ...], listen: tuple[str, ..
         "transport/shared_memory/enabled": False,
         "transport/link/rx/max_message_size": MAX_MESSAGE_SIZE,
         "transport/link/tx/lease": LEASE_MS,
+        # Batches of 64 KiB that wait for the link before anything is dropped: a machine that is busy for a moment loses
+        # nothing, and a slow link is not a second behind.
+        "transport/link/tx/queue/size/data": 4,
+        "transport/link/tx/queue/size/data_low": 8,
         # Else idle sockets lock out others for ten seconds.
         "transport/unicast/accept_pending": 2000,
         "transport/unicast/accept_timeout": 2000,

@@ -51,6 +51,7 @@ class ZenohPublisher:
                 key,
                 encoding=zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(f"syncline.v1.{topic.message}"),
                 congestion_control=congestion,
+                priority=zenoh.Priority.DATA_LOW if topic.bulky else zenoh.Priority.DATA,
                 cache=zenoh.ext.CacheConfig(max_samples=cache),
                 # Also where nothing is recovered: it numbers the messages, which a plain publisher does not.
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(
@@ -128,6 +129,7 @@ class ZenohSubscription:
         self._inbox = Inbox(topic, clock_ns)
         self._reliable = topic.delivery is Delivery.RELIABLE
         self._backfill: Backfill[_Source] = Backfill(self._push, self._ask, self._inbox.lose)
+        self._newest: dict[_Source, int] = {}
         self._keys = _Keys(session)
         recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
         with zenoh_call(f"subscribe {key}"):
@@ -154,7 +156,18 @@ class ZenohSubscription:
         if self._reliable:
             self._backfill.take(name, source.source_sn, key, sample.payload.to_bytes())
         else:
+            self._count_gap(name, source.source_sn)
             self._push(name, key, sample.payload.to_bytes())
+
+    def _count_gap(self, source: _Source, number: int) -> None:
+        """Of a topic that is not recovered: what never came is counted all the same."""
+        newest = self._newest.get(source)
+        if newest is None and len(self._newest) >= _MOST_KEYS:
+            self._newest.clear()
+        if newest is None or newest < number:
+            if newest is not None and number > newest + 1:
+                self._inbox.skip(number - newest - 1)
+            self._newest[source] = number
 
     def _push(self, source: _Source, key: str, payload: bytes) -> None:
         self._inbox.push(key, payload, source[0])

@@ -19,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
@@ -202,6 +203,7 @@ def load(folder: Path, seconds: float, rate_hz: int = 5000, streams: int = 4, pi
         for publisher in (*publishers.values(), *images.values()):
             publisher.wait_matched(10.0)  # what is put before anybody listens is no loss of the recorder's
         began, sent_images = time.monotonic(), 0
+        told: list[Any] = []
         for number in range(rounds):
             item = items[number % len(items)]
             item.sequence = item.frame = number
@@ -215,8 +217,16 @@ def load(folder: Path, seconds: float, rate_hz: int = 5000, streams: int = 4, pi
                     publisher.put(image)
                     sent_images += 1
             time.sleep(max(0.0, began + (number + 1) * len(cameras) / rate_hz - time.monotonic()))
+            if number % 500 == 0:
+                told = [received.message for received in statuses.drain()] or told
         took = time.monotonic() - began
-        time.sleep(1.0)
+        # What is still on its way is no loss: the recorder is stopped when it has had nothing new for two seconds.
+        heard, quiet = -1, time.monotonic()
+        while time.monotonic() - quiet < 2.0 and time.monotonic() - began < took + 60.0:
+            time.sleep(0.1)
+            told = [received.message for received in statuses.drain()] or told
+            if told and told[-1].counters["recorded"] - told[-1].sequence != heard:
+                heard, quiet = told[-1].counters["recorded"] - told[-1].sequence, time.monotonic()
         before = os.times()
         process.send_signal(signal.SIGTERM)
         process.communicate()
@@ -232,6 +242,8 @@ def load(folder: Path, seconds: float, rate_hz: int = 5000, streams: int = 4, pi
     )
     print(f"{sent - counts['observation']} of {sent} and {sent_images - counts['image']} of {sent_images} ", end="")
     print(f"not in the log; recorder {cpu / took:.0%} of a core, log {path.stat().st_size / 1e6:.0f} MB")
+    if told:
+        print(f"  the recorder itself counted: {dict(told[-1].counters)}")
     path.unlink()
 
 

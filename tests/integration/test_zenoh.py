@@ -13,11 +13,13 @@ import zenoh
 
 from protocols.bus.backfill import Question
 from protocols.bus.base import AgentEvent, Bus, BusDead, BusStopped, Received
+from protocols.bus.inbox import MOST_BYTES, Inbox
 from protocols.bus.router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.zenoh_bus import ZenohSubscription, open_bus
-from protocols.catalogue import OBSERVATION
+from protocols.catalogue import FLIGHT_IMAGE, OBSERVATION
 from protocols.errors import InputError
+from protocols.messages import syncline_pb2 as pb
 from tests.integration.receiving import collect, matched, sequences
 from tests.samples import eventually, observation
 
@@ -114,6 +116,54 @@ def test_what_cannot_be_recovered_is_counted_exactly() -> None:
         assert eventually(accounted), (len(received), subscription.counters)
         assert sequences(received) == sorted(set(sequences(received)))
         assert sequences(received)[-1] == total - 1
+
+
+def test_pictures_that_the_link_had_no_room_for_are_counted() -> None:
+    """Of a topic of which the newest counts nothing is fetched again, but what never came is no secret."""
+    endpoint, data = free_endpoint(), b"\xff\xd8" + bytes(400_000) + b"\xff\xd9"
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(FLIGHT_IMAGE)
+        publisher = matched(sending.publisher(FLIGHT_IMAGE, "drone"))
+        image = pb.FlightImage(schema_version=1, agent="drone", boot_id="b", width=640, height=480, jpeg=data)
+        orders: list[int] = []
+
+        def send() -> None:
+            image.frame = image.order = image.order + 1
+            publisher.put(image)
+            orders.extend(item.message.order for item in subscription.drain())  # type: ignore[attr-defined]
+
+        def accounted() -> bool:
+            send()  # until one arrives, nobody can know of those before it
+            counters = subscription.counters
+            return bool(orders) and len(orders) + counters.get("skipped", 0) + counters["dropped"] == orders[-1]
+
+        for _ in range(400):
+            send()
+        assert eventually(accounted), (orders[-10:], len(orders), subscription.counters)
+        assert orders == sorted(set(orders))
+        assert subscription.counters["lost"] == 0
+
+
+def test_a_gap_of_a_topic_that_is_not_recovered_is_counted_once() -> None:
+    with open_bus("local", BusConfig(mode="peer")) as bus:
+        subscription = bus.subscribe(FLIGHT_IMAGE)
+        for number in (5, 6, 9, 8, 10, 10):  # who comes late hears nothing of what was before
+            subscription._count_gap(("session", 1), number)
+        subscription._count_gap(("other", 1), 400)
+        assert subscription.counters["skipped"] == 2
+
+
+def test_a_reader_that_stands_still_holds_so_many_bytes_and_no_more() -> None:
+    inbox = Inbox(OBSERVATION)
+    for index in range(100):
+        inbox.push("syncline/local/camera/cam0/observation", bytes([index]) * 1_000_000)
+    kept = MOST_BYTES // 1_000_000
+    assert inbox.counters["dropped"] == 100 - kept
+    inbox.drain()
+    for index in range(kept):
+        inbox.push("syncline/local/camera/cam0/observation", bytes([index]) * 1_000_000)
+    assert inbox.counters["dropped"] == 100 - kept
 
 
 def test_an_outage_of_the_router_loses_nothing() -> None:
