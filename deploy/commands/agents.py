@@ -140,12 +140,14 @@ def _with_bus(settings: Any, start: Any) -> int:
     A bus that has died ends the process with one line and status 1, for its supervisor to start it again.
     """
     from deploy.health import Health
+    from deploy.heap import steady_heap
     from deploy.notify import Notifier
     from deploy.supervised import checked, serve_health
     from protocols.bus.base import BusDead, BusStopped
     from protocols.bus.guard import GuardedBus
     from protocols.bus.zenoh_bus import open_bus
 
+    steady_heap(give_back=isinstance(settings, HubConfig | RecorderConfig))
     checked(settings)
     stop = stop_on_signals()
     notifier = Notifier.from_environment()

@@ -27,7 +27,7 @@ def configurations(folder: Path, endpoint: str, cameras: int) -> dict[str, tuple
     bus = f'[bus]\nmode = "client"\nconnect = ["{endpoint}"]\noutage_s = 20.0\n'
     texts = {
         "hub": ("hub", f'id = "hub"\nwindow_s = 20.0\ninterval_s = 5.0\n{bus}'),
-        "recorder": ("record", f'out = "{folder}"\npart_mb = 50.0\n{bus}'),
+        "recorder": ("record", f'out = "{folder}"\npart_mb = 50.0\npart_s = 60.0\n{bus}'),
     }
     began = time.time()
     for index in range(cameras):
@@ -46,6 +46,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Memory of a rig's processes over time.")
     parser.add_argument("--seconds", type=float, default=900.0)
     parser.add_argument("--cameras", type=int, default=3)
+    parser.add_argument("--csv", type=Path, help="write every size there")
     words = parser.parse_args()
     sizes: dict[str, list[tuple[float, float]]] = {}
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
@@ -65,11 +66,17 @@ def main() -> None:
         for process in reversed(processes.values()):
             process.child.send_signal(signal.SIGTERM)
     print(f"{words.seconds:.0f} s, growth after the first {words.seconds / 3:.0f} s")
-    print("| process | MB at the end | MB/h |\n|---|---|---|")
+    marks = [words.seconds * share for share in (1 / 3, 2 / 3, 1.0)]
+    print(f"| process | MB at {', '.join(f'{mark:.0f}' for mark in marks)} s | MB/h |\n|---|---|---|")
     for agent, rows in sizes.items():
         warm = np.array([row for row in rows if row[0] > words.seconds / 3.0])
         slope = float(np.polyfit(warm[:, 0] / 3600.0, warm[:, 1], 1)[0])
-        print(f"| {agent} | {rows[-1][1]:.1f} | {slope:+.1f} |")
+        told = ", ".join(f"{min(rows, key=lambda row: abs(row[0] - mark))[1]:.1f}" for mark in marks)
+        print(f"| {agent} | {told} | {slope:+.1f} |")
+    if words.csv:
+        with words.csv.open("w", encoding="utf-8") as file:
+            file.write("process,seconds,megabytes\n")
+            file.writelines(f"{agent},{at:.1f},{size:.3f}\n" for agent, rows in sizes.items() for at, size in rows)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,36 @@
+"""The C library's heap under an agent's kind of load."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+GROWTH = """
+import os, sys
+from deploy.heap import steady_heap
+if sys.argv[1] == "steady" and not steady_heap(give_back=True):
+    print("cannot"); sys.exit()
+import numpy as np
+def mb():
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+del (large := [np.ones(2_000_000)])[:]  # from here on the C library thinks that 16 MB are an everyday size
+before, kept = mb(), []
+blocks = [(np.ones(40_000), np.ones(2_000)) for _ in range(100)]  # 320 kB each that go, and 16 kB behind that stay
+kept = [small for _, small in blocks]
+del blocks
+print(mb() - before - 100 * 0.016)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc only")
+def test_what_a_solver_frees_goes_back_to_the_system() -> None:
+    def grown(how: str) -> str:
+        done = subprocess.run([sys.executable, "-c", GROWTH, how], capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    if grown("steady") == "cannot":
+        pytest.skip("no glibc")
+    assert float(grown("steady")) < 2.0
