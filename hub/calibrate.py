@@ -15,6 +15,7 @@ from hub.lens import LARGEST_STD, refocused, self_calibrated
 from hub.pairs import Progress, rate_warnings, solve_pairs, timing_told
 from hub.paper_poses import all_sized, place_by_paper
 from hub.poses import covariance as cov
+from hub.poses import readout
 from hub.poses.adjust import adjust, motion_prior, noise, residual_norms
 from hub.poses.graph import ClockGraph, ClockGuess, average_clocks, components
 from hub.poses.initialise import Scaffold, agreement, grow, place_known
@@ -104,9 +105,14 @@ def calibrate(
 
 
 def with_known_lenses(rig: Rig, known: Known) -> Rig:
-    """The rig with the intrinsics of a known calibration, which may have been refined since."""
+    """The rig with the intrinsics of a known calibration, which may have been refined since, and its readouts."""
     cameras = {
-        name: replace(camera, intrinsics=known.cameras[name].intrinsics, focal_std=0.0)
+        name: replace(
+            camera,
+            intrinsics=known.cameras[name].intrinsics,
+            focal_std=0.0,
+            readout=known.cameras[name].readout or camera.readout,
+        )
         if name in known.cameras
         else camera
         for name, camera in rig.cameras.items()
@@ -348,6 +354,11 @@ def _adjust_all(scaffold: Scaffold, tell: Progress) -> Scaffold:
     freed_problem, freed_state, _ = adjust(freed, state, rounds=3, progress=lambda text: tell(text, 0.85))
     if _prefers(freed_problem, freed_state, problem, state):
         problem, state = freed_problem, freed_state
+    if problem.freedom.clock and readout.worth_freeing(problem, state, motion_prior(problem, state)):
+        tell("adjusting the readouts", 0.9)
+        read_problem, read_state, _ = adjust(readout.freed(problem), state, rounds=2)
+        if readout.plausible(read_state) and _prefers(read_problem, read_state, problem, state, 1):
+            problem, state = read_problem, read_state
     return replace_solution(scaffold, problem, state)
 
 
@@ -356,14 +367,14 @@ def replace_solution(scaffold: Scaffold, problem: Problem, state: State) -> Scaf
     return Scaffold(scaffold.names, scaffold.labels, problem, state)
 
 
-def _prefers(freed: Problem, freed_state: State, fixed: Problem, fixed_state: State) -> bool:
-    """Whether focal length and k1 are worth their parameters (Bayesian information criterion).
+def _prefers(freed: Problem, freed_state: State, fixed: Problem, fixed_state: State, each: int = 2) -> bool:
+    """Whether ``each`` parameters a camera (focal length and k1) are worth it (Bayesian information criterion).
 
     The robust likelihood of all rows under each answer's own noise decides.
     """
     rows = sum(len(part.time) for part in fixed.rows)
     gain = _deviance(fixed, fixed_state) - _deviance(freed, freed_state)
-    return bool(gain > 2 * len(fixed_state.cameras) * np.log(max(rows, 2)))
+    return bool(gain > each * len(fixed_state.cameras) * np.log(max(rows, 2)))
 
 
 def _deviance(problem: Problem, state: State) -> float:

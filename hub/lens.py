@@ -35,7 +35,8 @@ _K1_STD, _K2_STD = 0.15, 0.05
 _EQUAL = 0.02  # what noise leaves of the difference of the singular values, relative
 _SCALES = (-0.5, -0.25, 0.0, 0.25, 0.5)  # of log focal length, where the search begins
 _LEAST_CAMERAS = 3  # two lenses of which nothing is known: axes that meet leave them open
-_SAME = 0.01  # a focal length that moved less is settled
+_SAME = 0.01  # a focal length that moved less is settled,
+_SAME_PX = 0.01  # and so are balls whose centres moved less by it
 
 
 def self_calibrated(rig: Rig, prepared: Prepared, pairs: list[PairSolution]) -> tuple[Prepared, list[PairSolution]]:
@@ -116,6 +117,7 @@ def moved_in(prepared: Prepared, guessed: Mapping[str, Camera]) -> Prepared:
     return replace(
         prepared,
         cameras={name: both[name] for name in prepared.order if name in both},
+        rows=prepared.rows | {name: prepared.seen_through(name, camera.intrinsics) for name, camera in guessed.items()},
         lensless={name: camera for name, camera in prepared.lensless.items() if name not in guessed},
         refused={name: reason for name, reason in prepared.refused.items() if name not in guessed},
     )
@@ -128,12 +130,20 @@ def refocused(
     changed = {
         name: _with_lens(prepared, name, lens, prepared.cameras[name].guess)
         for name, lens in lenses.items()
-        if prepared.cameras[name].guess is not None
-        and abs(np.log(lens.focal / prepared.cameras[name].intrinsics.focal)) > _SAME
+        if prepared.cameras[name].guess is not None and _differ(prepared, name, lens)
     }
     if not changed:
         return prepared, pairs, False
     return moved_in(prepared, changed), [_with_pose(pair, prepared, changed) for pair in pairs], True
+
+
+def _differ(prepared: Prepared, name: str, lens: Intrinsics) -> bool:
+    """Whether a camera's lens is another than the one that its tracks were made with."""
+    if abs(np.log(lens.focal / prepared.cameras[name].intrinsics.focal)) > _SAME:
+        return True
+    now = [part.pixels for part in prepared.rows[name]]
+    again = [part.pixels for part in prepared.seen_through(name, lens)]
+    return bool(np.sqrt(np.mean((np.concatenate(now) - np.concatenate(again)) ** 2)) > _SAME_PX)
 
 
 def _robust(ratio: Floats) -> Floats:
@@ -151,7 +161,7 @@ def _with_lens(prepared: Prepared, name: str, lens: Intrinsics, prior: LensPrior
     """A camera seen through another lens: its tracks are made again of the raw rows."""
     camera = prepared.camera(name)
     tracks = dict(camera.tracks)
-    for part in prepared.rows[name]:
+    for part in prepared.seen_through(name, lens):
         label = prepared.labels[part.label]
         smooth = _smooth(part, lens)
         if smooth is not None:

@@ -47,7 +47,8 @@ def solve_pairs(
     many = len(names) > _FEW and not prepared.shared_clock
     pairs: dict[tuple[str, str], PairSolution] = {}
     told = _ToldClocks()
-    for done, (a, b) in enumerate(_most_promising_first(prepared, todo, tell) if many else todo):
+    sort = len(todo) > 1 and not prepared.shared_clock
+    for done, (a, b) in enumerate(_most_promising_first(prepared, todo, tell) if sort else todo):
         tell(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
         near = None if prepared.shared_clock else told.lag(prepared, a, b)
         answer = _solve(prepared, (a, b), known, near=near)

@@ -60,8 +60,8 @@ class PointBasis:
             weights[:, 0] = 1.0
         return index, weights, found
 
-    def weights_both(self, time: Floats) -> tuple[Ints, Floats, Floats, Bools]:
-        """As `weights` for the value and the first derivative, which is 0."""
+    def weights_both(self, time: Floats, beyond: float = 0.0) -> tuple[Ints, Floats, Floats, Bools]:
+        """As `weights` for the value and the first derivative, which is 0; nothing is ``beyond`` a point."""
         index, weights, found = self.weights(time)
         return index, weights, np.zeros_like(weights), found
 

@@ -11,7 +11,9 @@ from hub.points import sampled_track
 from hub.poses.initialise import Camera
 from hub.poses.problem import Rows
 from hub.timing.tracks import SmoothTrack, Track, smooth_track, without_jumps
+from protocols.geometry.ball import outline_to_centre
 from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Floats
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, RigCamera
 
@@ -24,7 +26,9 @@ class Prepared:
 
     lensless: cameras without measured intrinsics, of which by themselves only the timing can be found; their
     normalised coordinates are those of a nominal lens, and they are among the refused. paces: of cameras whose
-    seconds are no seconds. All times in here are ``pace * (t_camera - epoch)``.
+    seconds are no seconds. outlines: by camera and label index, pixels (n, 2) as they were seen and sizes (n,) of
+    cameras whose rows are centres of balls' outlines; ``rows`` holds them moved as far as the lens is known. All times
+    in here are ``pace * (t_camera - epoch)``.
     """
 
     cameras: dict[str, Camera]
@@ -37,6 +41,7 @@ class Prepared:
     warnings: tuple[str, ...] = ()
     lensless: dict[str, Camera] = field(default_factory=dict)
     paces: dict[str, float] = field(default_factory=dict)
+    outlines: dict[str, dict[int, tuple[Floats, Floats]]] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -50,6 +55,13 @@ class Prepared:
     def pace(self, name: str) -> float:
         """Seconds in here for one second that the camera's clock tells."""
         return self.paces.get(name, 1.0)
+
+    def seen_through(self, name: str, lens: Intrinsics) -> list[Rows]:
+        """The camera's rows as centres of balls, if they are outlines', once its lens is known."""
+        seen = self.outlines.get(name)
+        if not seen:
+            return self.rows[name]
+        return [replace(part, pixels=outline_to_centre(*seen[part.label], lens)) for part in self.rows[name]]
 
     def paced(self, names: list[str], factor: float) -> Prepared:
         """The same with the clocks of ``names`` made to run ``factor`` times as fast."""
@@ -71,6 +83,7 @@ def prepare(rig: Rig, observations: Observations) -> Prepared:
     lensless: dict[str, Camera] = {}
     rows: dict[str, list[Rows]] = {}
     epochs: dict[str, float] = {}
+    outlines: dict[str, dict[int, tuple[Floats, Floats]]] = {}
     labels = observations.labels
     start = min((float(track.time[0]) for track in observations.tracks.values()), default=0.0)
     warnings: list[str] = []
@@ -90,27 +103,48 @@ def prepare(rig: Rig, observations: Observations) -> Prepared:
         epoch = start if rig.shared_clock else min(float(track.time[0]) for track in tracks)
         smooth: dict[str, Track] = {}
         mine = []
+        # A rolling shutter that was told: every row of the image has its own time, the camera's is the middle row's.
+        # Rows that correspond by their times (a shared clock) keep them.
+        readout = 0.0 if rig.shared_clock else rig_camera.readout or 0.0
+        last_row = max(rig_camera.size[1] - 1, 1)
         for track in tracks:
-            normalised = lens.unproject(track.pixels)
+            pixels = track.pixels
+            if rig_camera.ball_outline:
+                outlines.setdefault(name, {})[labels.index(track.label)] = pixels, track.size
+                if not unknown:
+                    pixels = outline_to_centre(pixels, track.size, lens)
+            time = track.time + readout * (np.clip(track.pixels[:, 1], 0, last_row) / last_row - 0.5)
+            normalised = lens.unproject(pixels)
             cleaned: Track | None
             if rig.shared_clock:
                 cleaned = sampled_track(track.time, normalised, lens.focal, epoch)
             else:
-                cleaned = smooth_track(track.time, normalised, lens.focal, epoch)
+                # False detections that jump down the image may overtake the next frame's.
+                rising = time if bool((np.diff(time) > 0).all()) else track.time
+                cleaned = smooth_track(rising, normalised, lens.focal, epoch)
             if cleaned is None:
                 continue
             smooth[track.label] = cleaned
             use = np.ones(len(track), dtype=np.bool_)
-            mine.append(Rows(-1, labels.index(track.label), track.time - epoch, track.pixels, use))
+            mine.append(Rows(-1, labels.index(track.label), time - epoch, pixels, use))
         if not smooth:
             few = f"too few connected observations ({sum(len(track) for track in tracks)} rows)"
             refused[name] = f"{NO_INTRINSICS}; and {few}" if unknown else few
             continue
         epochs[name] = epoch
         rows[name] = mine
-        (lensless if unknown else cameras)[name] = Camera(name, lens, smooth)
+        (lensless if unknown else cameras)[name] = Camera(name, lens, smooth, timed=rig_camera.readout is not None)
     return Prepared(
-        cameras, rows, epochs, labels, refused, tuple(rig.cameras), rig.shared_clock, tuple(warnings), lensless
+        cameras,
+        rows,
+        epochs,
+        labels,
+        refused,
+        tuple(rig.cameras),
+        rig.shared_clock,
+        tuple(warnings),
+        lensless,
+        outlines=outlines,
     )
 
 

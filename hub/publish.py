@@ -12,7 +12,7 @@ from hub.points import SAME_TIME, PointBasis
 from hub.poses import covariance as cov
 from hub.poses.adjust import motion_prior, predict, residual_norms
 from hub.poses.gauge import fix_gauge, given_world, transform_state, weighed
-from hub.poses.problem import CAMERA_PARAMETERS, FOCAL, Problem, State
+from hub.poses.problem import CAMERA_PARAMETERS, FOCAL, READOUT, Problem, State
 from hub.poses.references import adjust_to_references
 from hub.poses.sigma import honest
 from hub.poses.trust import trusted
@@ -56,6 +56,7 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
     prior = motion_prior(problem, state)
     covariance = cov.covariance(problem, honest(problem, state, prior), prior, gauge.information)
     lens_stds = focal_stds(problem, state, covariance)
+    readout_stds = np.sqrt(np.maximum(np.diag(covariance.cameras)[READOUT::CAMERA_PARAMETERS], 0.0))
     reference = _reference(rig, names)
     epochs = [solution.prepared.epochs[name] for name in names]
     paces = [solution.prepared.pace(name) for name in names]
@@ -80,6 +81,8 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
             else solution.known.cameras[name].position_std,
             rms_px=_rms(problem, state, i),
             focal_std=float(lens_stds[i]),
+            readout=_readout(rig, name, state.cameras[i].readout / paces[i]),
+            readout_std=float(readout_stds[i]) / paces[i],
         )
         for i, name in enumerate(names)
     }
@@ -107,7 +110,12 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
             for label, name in enumerate(scaffold.labels)
         ),
         pairs=tuple(_pair_report(pair, cameras, problem, state, names, solution) for pair in solution.pairs),
-        warnings=solution.prepared.warnings + solution.warnings + aside + gauge.warnings + _lenses_told(cameras),
+        warnings=solution.prepared.warnings
+        + solution.warnings
+        + aside
+        + gauge.warnings
+        + _lenses_told(cameras)
+        + _readouts_told(cameras),
         residuals={name: _residual_rows(problem, state, i, epochs[i], paces[i]) for i, name in enumerate(names)},
     )
 
@@ -141,6 +149,7 @@ def _reordered(problem: Problem, state: State, order: list[int]) -> tuple[Proble
         clock_reference=place[problem.clock_reference],
         anchors=(place[problem.anchors[0]], place[problem.anchors[1]]),
         guessed=tuple(problem.lens_prior(i) for i in order),
+        timed=tuple(problem.timed[i] for i in order) if problem.timed else (),
     )
     return moved, replace(state, cameras=tuple(state.cameras[i] for i in order), sigma=state.sigma[order])
 
@@ -162,6 +171,22 @@ def _lenses_told(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
         f"{100 * camera.focal_std:.2g} % (std)"
         for name, camera in cameras.items()
         if camera.focal_std > 0.0
+    )
+
+
+def _readout(rig: Rig, name: str, found: float) -> float:
+    """Seconds from the first row to the last: as it was told, else as the path told it; 0 where neither did."""
+    told = rig.cameras[name].readout
+    return found if told is None else told
+
+
+def _readouts_told(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
+    """One sentence for each rolling shutter that the path told."""
+    return tuple(
+        f"{name}: its rolling shutter was found from the path: {1e3 * camera.readout:.1f} ms from the first row to the "
+        f"last ± {1e3 * camera.readout_std:.1f} ms (std)"
+        for name, camera in cameras.items()
+        if camera.readout_std > 0.0
     )
 
 

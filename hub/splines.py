@@ -65,17 +65,20 @@ class SplineBasis:
         """(s,) index of each stretch's first control point."""
         return np.asarray(np.r_[0, np.cumsum(self.intervals + 3)[:-1]].astype(np.int64))
 
-    def locate(self, time: Floats) -> tuple[Ints, Floats, Bools, Floats]:
-        """First control point (n,), place in the knot interval (n,) in [0, 1], inside a stretch (n,), width (n,)."""
+    def locate(self, time: Floats, beyond: float = 0.0) -> tuple[Ints, Floats, Bools, Floats]:
+        """First control point (n,), place in the knot interval (n,) in [0, 1], inside a stretch (n,), width (n,).
+
+        beyond: knot intervals by which the polynomials at a stretch's ends go on; there the place is outside [0, 1].
+        """
         known = np.isfinite(time)
         time = np.where(known, time, self.starts[0])
-        stretch = np.searchsorted(self.starts, time, side="right") - 1
+        stretch = np.searchsorted(self.starts - beyond * self.widths, time, side="right") - 1
         inside = known & (stretch >= 0)
         stretch = np.maximum(stretch, 0)
         width = self.widths[stretch]
         place = (time - self.starts[stretch]) / width
         count = self.intervals[stretch]
-        inside &= place <= count + 1e-9
+        inside &= place <= count + beyond + 1e-9
         interval = np.clip(np.floor(place), 0, count - 1).astype(np.int64)
         return self.offsets[stretch] + interval, place - interval, inside, width
 
@@ -90,9 +93,12 @@ class SplineBasis:
             weights /= (width**derivative)[:, None]
         return index, weights, inside
 
-    def weights_both(self, time: Floats) -> tuple[Ints, Floats, Floats, Bools]:
-        """First control point (n,), the weights of value and of first derivative (n, 4) each, inside (n,)."""
-        index, u, inside, width = self.locate(time)
+    def weights_both(self, time: Floats, beyond: float = 0.0) -> tuple[Ints, Floats, Floats, Bools]:
+        """First control point (n,), the weights of value and of first derivative (n, 4) each, inside (n,).
+
+        beyond: as for `locate`.
+        """
+        index, u, inside, width = self.locate(time, beyond)
         return index, basis_weights(u), basis_weights(u, 1) / width[:, None], inside
 
     def evaluate(self, control: Floats, time: Floats, derivative: int = 0) -> Floats:

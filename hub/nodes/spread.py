@@ -45,7 +45,7 @@ def joined(names: list[str], edges: Edges) -> set[str]:
 def position_stds(poses: Mapping[str, Pose], edges: Edges, world: Similarity, references: Floats) -> dict[str, Floats]:
     """Std (3,) of each camera's position in the world, all cameras and edges solved for together.
 
-    poses: in the network's frame; all tied by ``edges``. world: world from network. references: (17 n, 17 n) what the
+    poses: in the network's frame; all tied by ``edges``. world: world from network. references: (18 n, 18 n) what the
     rig tells, in the order of ``poses``; the gauge that it leaves open is held by the first camera and the first
     baseline. Where the observations leave over more or less than they should, the stds grow or shrink with it.
     Infinite where the edges don't fix a camera.

@@ -33,6 +33,7 @@ from hub.poses.problem import (
     OFFSET,
     P1,
     RATE,
+    READOUT,
     CameraState,
     LensPrior,
     Problem,
@@ -49,6 +50,9 @@ from protocols.session.calibration import AdjustmentStep
 _WIDTH = 4.0  # Cauchy width in sigma of the 2-D residual: nearly efficient for Gaussian noise
 _CUT = 5.0  # rows beyond this many sigma are false detections
 _LEAST_SIGMA = 0.05  # px
+# Knot intervals by which the path goes on beyond its ends while clocks move: a row that a step takes off the path costs
+# as much as a gross error, so that one row at an end would hold every clock where it is.
+_BEYOND = 0.5
 _ROUGH, _FINE = 1e-4, 1e-7  # gain, as a share of the cost, at which a round and the last one end
 
 
@@ -105,7 +109,7 @@ def adjust(
 
 def predict(rows: Rows, camera: CameraState, path: Trajectory) -> Floats:
     """Pixels (n, 2) at which the camera should have seen the point; NaN where the path is not known."""
-    points = path.at(camera.reference_time(rows.time))
+    points = path.at(camera.reference_time(camera.shot(rows.time, rows.pixels)))
     return camera.intrinsics.project(camera.pose.camera_from_world(points))
 
 
@@ -205,8 +209,9 @@ def motion_prior(problem: Problem, state: State, first: bool = False) -> MotionP
 
 def linearise(rows: Rows, camera: CameraState, path: Trajectory, columns: int = CAMERA_PARAMETERS) -> Linearised:
     """Residuals of the used rows and their derivatives by the point (n, 2, 3) and the camera (n, 2, columns)."""
-    time = rows.time[rows.use]
-    index, weights, slopes, inside = path.basis.weights_both(camera.reference_time(time))
+    pixels = rows.pixels[rows.use]
+    time = camera.shot(rows.time[rows.use], pixels)
+    index, weights, slopes, inside = path.basis.weights_both(camera.reference_time(time), _BEYOND)
     around = path.control[index[:, None] + np.arange(weights.shape[1])]
     point = np.einsum("nk,nki->ni", weights, around)
     velocity = np.einsum("nk,nki->ni", slopes, around)
@@ -232,6 +237,7 @@ def linearise(rows: Rows, camera: CameraState, path: Trajectory, columns: int = 
     along = (by_point * velocity[:, None, :]).sum(axis=2)
     by_camera[:, :, OFFSET] = along
     by_camera[:, :, RATE] = along * (time - camera.centre)[:, None]
+    by_camera[:, :, READOUT] = along * (camera.rate * camera.below_middle(pixels))[:, None]
     by_camera[:, :, FOCAL] = projected - lens.matrix[:2, 2]
     radius2 = (flat**2).sum(axis=1)
     if lens.fisheye:
@@ -249,7 +255,7 @@ def linearise(rows: Rows, camera: CameraState, path: Trajectory, columns: int = 
         x, y = flat.T
         tangents = np.stack([2 * x * y, radius2 + 2 * y * y, radius2 + 2 * x * x, 2 * x * y], axis=-1).reshape(-1, 2, 2)
         by_camera[:, :, P1:] = 0.0 if lens.fisheye else (tangents @ lens.matrix[:2, :2].T).transpose(0, 2, 1)
-    return Linearised(projected - rows.pixels[rows.use], by_point, by_camera, index, weights, valid)
+    return Linearised(projected - pixels, by_point, by_camera, index, weights, valid)
 
 
 def build_system(problem: Problem, state: State, prior: MotionPrior, robust: bool) -> tuple[BorderedSystem, float]:
@@ -334,6 +340,8 @@ def _add_camera_priors(problem: Problem, state: State, system: BorderedSystem) -
     for camera, (now, nominal) in enumerate(zip(state.cameras, problem.nominal, strict=True)):
         base = camera * CAMERA_PARAMETERS
         terms = [(RATE, now.rate - 1.0, freedom.rate_std)]
+        if freedom.readout:
+            terms.append((READOUT, now.readout, freedom.readout_std))
         guess = problem.lens_prior(camera)
         if guess is not None:
             terms.append((FOCAL, float(np.log(now.intrinsics.focal / guess.focal)), guess.focal_std))
@@ -423,6 +431,7 @@ def _moved_camera(camera: CameraState, step: Floats) -> CameraState:
         intrinsics=lens,
         offset=camera.offset + float(step[OFFSET]),
         rate=camera.rate + float(step[RATE]),
+        readout=camera.readout + float(step[READOUT]),
     )
 
 

@@ -19,7 +19,7 @@ from protocols.geometry.types import Floats
 class Covariance:
     """Joint covariance of all camera parameters, and what is needed for the path's.
 
-    cameras: (17 n, 17 n), zero where a parameter was held. carried: (3 m, p) A⁻¹ B over the free columns.
+    cameras: (18 n, 18 n), zero where a parameter was held. carried: (3 m, p) A⁻¹ B over the free columns.
     free: (p, p) covariance of the free columns. blocks: (k, 24, 24) blocks of A⁻¹ about the diagonal.
     """
 
@@ -32,7 +32,7 @@ class Covariance:
 def covariance(problem: Problem, state: State, prior: MotionPrior, references: Floats | None = None) -> Covariance:
     """Covariance at the solution.
 
-    references: (17 n, 17 n) information of surveyed positions, attitudes and distances. Gauge directions
+    references: (18 n, 18 n) information of surveyed positions, attitudes and distances. Gauge directions
     that they leave open are held by convention: the first camera's pose and the first baseline.
     """
     system, _ = build_system(problem, state, prior, robust=False)
@@ -79,7 +79,7 @@ def turn_stds(covariance: Covariance, state: State) -> Floats:
 
 
 def gauge_generators(poses: list[Pose]) -> Floats:
-    """(17 n, 7): how all cameras move under a small translation, rotation and scaling of the world."""
+    """(18 n, 7): how all cameras move under a small translation, rotation and scaling of the world."""
     rows = []
     for pose in poses:
         block = np.zeros((CAMERA_PARAMETERS, 7))
@@ -92,7 +92,7 @@ def gauge_generators(poses: list[Pose]) -> Floats:
 
 
 def held_rows(poses: list[Pose], references: Floats) -> Floats:
-    """Constraint rows (q, 17 n) on the gauge directions that the references leave open."""
+    """Constraint rows (q, 18 n) on the gauge directions that the references leave open."""
     generators = gauge_generators(poses)
     default = np.zeros((7, len(generators)))
     default[np.arange(6), np.arange(6)] = 1.0

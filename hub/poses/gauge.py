@@ -30,7 +30,7 @@ _CONTRADICTION = 0.1  # … and refused if they are off by more than this share 
 class Gauge:
     """The similarity to the published world, and what the references say.
 
-    scale: "metric" or "arbitrary". information: (17 n, 17 n) of the references in the published world.
+    scale: "metric" or "arbitrary". information: (18 n, 18 n) of the references in the published world.
     warnings: references that don't fit the others.
     """
 
@@ -270,7 +270,7 @@ def _extent(poses: list[Pose]) -> float:
 class ReferenceTerms:
     """What the references say of the cameras' parameters in the published world.
 
-    information: (17 n, 17 n). gradient: (17 n,) of half their cost, cost: their squared residuals in sigma.
+    information: (18 n, 18 n). gradient: (18 n,) of half their cost, cost: their squared residuals in sigma.
     """
 
     information: Floats

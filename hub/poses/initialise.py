@@ -37,12 +37,14 @@ _STRETCH_GAP = 1.0  # s: the path is cut where nobody saw the point for longer
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """What initialisation knows of one camera. tracks: by label. guess: prior of a lens that was not measured."""
+    """What initialisation knows of one camera. tracks: by label. guess: prior of a lens that was not measured.
+    timed: whether its readout was told, and is in its times already."""
 
     name: str
     intrinsics: Intrinsics
     tracks: Mapping[str, Track]
     guess: LensPrior | None = None
+    timed: bool = False
 
 
 @dataclass(slots=True, eq=False)
@@ -164,6 +166,7 @@ def settle(
         anchors=(names.index(anchors[0]), names.index(anchors[1])),
         freedom=freedom or Freedom(),
         guessed=tuple(cameras[name].guess for name in names),
+        timed=tuple(cameras[name].timed for name in names),
     )
     state = State(tuple(states), tuple(trajectories), np.full(len(names), 2.0))
     if not used:

@@ -111,13 +111,18 @@ def eliminate(system: BorderedSystem, damping: float = 0.0) -> Elimination:
     return Elimination(factor, np.asarray(carried), np.asarray(0.5 * (reduced + reduced.T)))
 
 
+def cho_solve_path(parts: Elimination, right: Floats) -> Floats:
+    """A⁻¹ right, (3 n,) of (3 n,)."""
+    return np.asarray(cho_solve_banded((parts.factor, False), right, check_finite=False))
+
+
 def solve(system: BorderedSystem, damping: float, tangent: Floats | None) -> tuple[Floats, Floats]:
     """Damped step (path (3 n,), cameras (p,)) that lowers the cost.
 
     tangent: (p, q) orthonormal directions that the cameras may move in (the gauge is held); None = all.
     """
     parts = eliminate(system, damping)
-    path = cho_solve_banded((parts.factor, False), system.gradient_path, check_finite=False)
+    path = cho_solve_path(parts, system.gradient_path)
     right = -(system.gradient_cameras - system.border.T @ path)
     matrix = parts.reduced + damping * np.diag(np.diag(system.corner)) + 1e-12 * np.eye(len(right))
     if len(right) == 0:

@@ -13,11 +13,12 @@ from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.session.calibration import AdjustmentStep
 
-CAMERA_PARAMETERS = 17
-"""Columns of one camera: rotation 0..2, position 3..5, offset 6, rate 7, log focal length 8, k1 9; of a lens that was
-not measured also the principal point 10, 11, k2 12, k3 13, log fy/fx 14 and, of a pinhole lens, p1, p2 15, 16."""
-OFFSET, RATE, FOCAL, K1, CENTRE, K2, K3, ASPECT, P1 = 6, 7, 8, 9, 10, 12, 13, 14, 15
-GIVEN_PARAMETERS = 10
+CAMERA_PARAMETERS = 18
+"""Columns of one camera: rotation 0..2, position 3..5, offset 6, rate 7, log focal length 8, k1 9, readout 10; of a
+lens that was not measured also the principal point 11, 12, k2 13, k3 14, log fy/fx 15 and, of a pinhole lens, p1, p2
+16, 17."""
+OFFSET, RATE, FOCAL, K1, READOUT, CENTRE, K2, K3, ASPECT, P1 = 6, 7, 8, 9, 10, 11, 13, 14, 15, 16
+GIVEN_PARAMETERS = 11
 """Columns of a camera whose lens is given; the others are never free."""
 
 
@@ -27,7 +28,8 @@ class CameraState:
 
     The time map is kept about ``centre``, a time in the middle of what the camera saw, so that offset and
     rate hardly depend on each other: ``t = rate * (t_camera - centre) + offset`` with t the internal
-    reference time [s] and t_camera less the camera's epoch.
+    reference time [s] and t_camera less the camera's epoch. readout: seconds from the image's first row to its last,
+    negative where the last is read first; the camera's time is that of the middle row.
     """
 
     intrinsics: Intrinsics
@@ -35,6 +37,16 @@ class CameraState:
     rate: float
     offset: float
     centre: float
+    readout: float = 0.0
+
+    def below_middle(self, pixels: Floats) -> Floats:
+        """How far (n,) pixels (n, 2) are below the image's middle: -0.5 in its first row, 0.5 in its last."""
+        height = max(self.intrinsics.height - 1, 1)
+        return np.asarray(np.clip(pixels[:, 1], 0, height) / height - 0.5)
+
+    def shot(self, time: Floats, pixels: Floats) -> Floats:
+        """Camera times (n,) at which pixels (n, 2) of images of ``time`` (n,) were read."""
+        return time + self.readout * self.below_middle(pixels) if self.readout else time
 
     def reference_time(self, time: Floats) -> Floats:
         """Internal reference times (n,) of camera times (n,) less the epoch."""
@@ -113,24 +125,28 @@ class Freedom:
     """What may move, and priors.
 
     pose, clock, lens: whether poses, time maps, and focal length with k1 are estimated.
-    focal_std: prior std of log focal length. k1_std: prior std of k1. rate_std: prior std of a rate.
+    readout: whether rolling-shutter readouts are. focal_std: prior std of log focal length. k1_std: prior std of k1.
+    rate_std: prior std of a rate. readout_std: prior std [s] of a readout about 0.
     """
 
     pose: bool = True
     clock: bool = True
     lens: bool = False
+    readout: bool = False
     focal_std: float = 0.01
     k1_std: float = 0.02
     rate_std: float = 5e-3
+    readout_std: float = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
     """Observations and what is fixed.
 
-    rows: all observations. nominal: intrinsics as given (priors of the lens). clock_reference: index of the
-    camera whose clock is the internal time. anchors: two cameras whose pose and distance fix the gauge.
-    freedom: what may move. guessed: by camera, priors of lenses that were not measured, None = given; () = all are.
+    rows: all observations. nominal: intrinsics as given (priors of the lens). clock_reference: index of the camera
+    whose clock is the internal time. anchors: two cameras whose pose and distance fix the gauge. freedom: what may
+    move. guessed: by camera, priors of lenses that were not measured, None = given; () = all are. timed: by camera,
+    whether its readout was told, so that its rows' times count it already; () = none was.
     """
 
     rows: tuple[Rows, ...]
@@ -139,6 +155,7 @@ class Problem:
     anchors: tuple[int, int]
     freedom: Freedom = field(default_factory=Freedom)
     guessed: tuple[LensPrior | None, ...] = ()
+    timed: tuple[bool, ...] = ()
 
     def lens_prior(self, camera: int) -> LensPrior | None:
         """The prior of a lens that was not measured; None = the lens is given."""
@@ -155,6 +172,8 @@ class Problem:
                 columns += [base + OFFSET, base + RATE]
             if self.freedom.lens or self.lens_prior(camera) is not None:
                 columns += [base + FOCAL, base + K1]
+            if self.freedom.readout and not (self.timed and self.timed[camera]):
+                columns.append(base + READOUT)
             if self.lens_prior(camera) is not None:
                 columns += range(base + CENTRE, base + (P1 if self.nominal[camera].fisheye else CAMERA_PARAMETERS))
         return np.array(columns, dtype=np.int64)

@@ -39,15 +39,15 @@ def honest(problem: Problem, state: State, prior: MotionPrior) -> State:
     if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
         return state
     found = covariance(problem, state, prior)
-    absorbed, together = np.zeros(len(state.cameras)), np.ones(len(state.cameras))
+    absorbed, alike = np.zeros(len(state.cameras)), np.ones(len(state.cameras))
     numbers = np.zeros(len(state.cameras))
     for rows in problem.rows:
         numbers[rows.camera] += 2.0 * float(np.count_nonzero(rows.use))
         absorbed[rows.camera] += _absorbed(problem, state, found, rows)
     for camera in range(len(state.cameras)):
-        together[camera] = _together(problem, state, camera)
+        alike[camera] = together(problem, state, camera)
     left = np.maximum(1.0 - absorbed / np.maximum(numbers, 1.0), _LEAST_LEFT)
-    return replace(state, sigma=state.sigma * np.sqrt(together / left))
+    return replace(state, sigma=state.sigma * np.sqrt(alike / left))
 
 
 def _absorbed(problem: Problem, state: State, found: Covariance, rows: Rows) -> float:
@@ -76,7 +76,7 @@ def _absorbed(problem: Problem, state: State, found: Covariance, rows: Rows) -> 
     return trace / float(state.sigma[rows.camera]) ** 2 * len(used) / len(pick)
 
 
-def _together(problem: Problem, state: State, camera: int) -> float:
+def together(problem: Problem, state: State, camera: int) -> float:
     """How many residuals in a row count as one: 1 + 2 sum of their correlations, as far as these stand out."""
     found = 1.0
     for rows in problem.rows:

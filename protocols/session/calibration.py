@@ -28,7 +28,8 @@ class CameraCalibration:
 
     time_map: reference clock from camera clock. time_offset_std: std [s] of that map in the middle of the
     camera's observed span. position_std: (3,) [rig units]. rms_px: root mean square reprojection error.
-    focal_std: relative std of a focal length that the path told; 0 = the lens was given.
+    focal_std: relative std of a focal length that the path told; 0 = the lens was given. readout: seconds from the
+    image's first row to its last; 0 = not known. readout_std: its std where the path told it, else 0.
     """
 
     name: str
@@ -39,6 +40,8 @@ class CameraCalibration:
     position_std: Floats
     rms_px: float
     focal_std: float = 0.0
+    readout: float = 0.0
+    readout_std: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,7 +135,7 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
         table = dict(rig.cameras[name].table) if name in rig.cameras else {}
         # A surveyed position stays an input: the answer is the translation, and two that differ by the
         # survey's error would contradict each other.
-        for key in ("position", "position_std", "rotation_std", "focal_std"):
+        for key in ("position", "position_std", "rotation_std", "focal_std", "ball_outline"):
             table.pop(key, None)
         table |= {
             "name": name,
@@ -151,6 +154,10 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
             table["fisheye"] = True
         if camera.focal_std > 0.0:
             table["focal_std"] = camera.focal_std
+        if camera.readout != 0.0:
+            table["readout"] = camera.readout
+        if camera.readout_std > 0.0:
+            table["readout_std"] = camera.readout_std
         tables[name] = table
     if calibration.refused:
         metadata["refused"] = dict(calibration.refused)
@@ -222,6 +229,7 @@ def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
             time_offset_std=float(figures["time_offset_std"]),
             position_std=np.zeros(3) if std is None else std,
             rms_px=float(figures["rms_px"]),
+            readout=camera.readout or 0.0,
         )
     return rig, cameras
 

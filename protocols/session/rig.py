@@ -19,6 +19,8 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 CLOCKS = ("independent", "shared")
 MEASURED = 0.02
 """A focal length of no larger relative std counts as measured."""
+LONGEST_READOUT = 0.06
+"""Seconds: no rolling shutter takes longer from an image's first row to its last."""
 _LARGEST = 1e12  # no length, angle or pixel of a rig comes near
 _AGREE = 1e-3  # relative: position and translation may differ by rounding, not by more
 
@@ -32,6 +34,9 @@ class RigCamera:
     position_std: (3,) [rig units]. rotation_std: (3,) [rad]. body_from_camera: (3, 3).
     focal_std: relative std of the focal length where the lens is a guess (a data sheet's); 0 = it was measured.
     up: (3,) unit vector, away from the ground in the camera's own axes, as its accelerometer shows at rest.
+    ball_outline: whether its rows are centres of balls' outlines of diameter ``size``, seen before the lens was known:
+    the projection of a ball's centre is elsewhere (``protocols/geometry/ball.py``).
+    readout: seconds from the first row of an image to its last (rolling shutter); None = not told.
     table: the camera's table as it stands in the file, with keys this version does not know.
     """
 
@@ -46,6 +51,8 @@ class RigCamera:
     body_from_camera: Floats | None = None
     focal_std: float = 0.0
     up: Floats | None = None
+    ball_outline: bool = False
+    readout: float | None = None
     table: dict[str, Any] = field(default_factory=dict)
 
 
@@ -266,6 +273,8 @@ def _read_camera(table: _Table) -> RigCamera:
         body_from_camera=_read_body(table),
         focal_std=_read_focal_std(table),
         up=_read_up_of_camera(table),
+        ball_outline=_read_ball_outline(table),
+        readout=_read_readout(table),
         table=dict(table.values),
     )
 
@@ -277,6 +286,27 @@ def _read_up_of_camera(table: _Table) -> Floats | None:
     if float(np.linalg.norm(vector)) < 1e-9:
         raise table.fail("up", "up has no direction", "give up = [x, y, z] in this camera's axes; levelled: [0, -1, 0]")
     return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _read_ball_outline(table: _Table) -> bool:
+    value = table.values.get("ball_outline", False)
+    if not isinstance(value, bool):
+        raise table.fail("ball_outline", f"ball_outline = {value!r}", "give true or false")
+    return value
+
+
+def _read_readout(table: _Table) -> float | None:
+    value = table.values.get("readout")
+    if value is None:
+        return None
+    if (
+        not isinstance(value, int | float)
+        or isinstance(value, bool)
+        or not -LONGEST_READOUT <= value <= LONGEST_READOUT
+    ):
+        remedy = "give the seconds from the image's first row to its last, as 0.02; below 0 if the last is read first"
+        raise table.fail("readout", f"readout = {value!r}", remedy)
+    return float(value)
 
 
 def _read_focal_std(table: _Table) -> float:

@@ -28,7 +28,7 @@ from protocols.geometry.types import Floats
 from protocols.session.calibration import CameraCalibration, read_calibration, write_calibration, write_trajectory
 from protocols.session.observations import Observations, read_observations
 from protocols.session.rig import read_rig
-from tests.bench import scoring
+from tests.bench import board_rotation, scoring
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEFAULT_DATA = REPOSITORY.parent / "shared" / "data"
@@ -257,7 +257,29 @@ def webcams(session: Path) -> bool:
         )
     if missing:
         print(f"  refused: {', '.join(missing)}")
+    for line in _board_lags(session, offsets):
+        print(f"  {line}")
     return good
+
+
+def _board_lags(session: Path, offsets: dict[str, float]) -> list[str]:
+    """What the board's attitude alone says of each camera's pictures against its stamps, beside the offsets [ms]."""
+    rig = read_rig(session / "rig.toml")
+    seen = read_observations(session / "observations.csv", rig.cameras)
+    turns = {
+        name: board_rotation.attitudes(seen, name, camera.intrinsics)
+        for name, camera in rig.cameras.items()
+        if name in offsets and camera.intrinsics is not None
+    }
+    lines = []
+    for a, b in itertools.combinations(turns, 2):
+        found = board_rotation.lag(turns[a], turns[b])
+        if found is not None:
+            told = f"{-_MS * found[0]:+.0f} ± {_MS * found[1]:.0f} ms"
+            lines.append(
+                f"{b} against {a}: {told} by the board's attitude alone, {offsets[b] - offsets[a]:+.0f} ms here"
+            )
+    return lines
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

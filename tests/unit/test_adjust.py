@@ -73,7 +73,7 @@ def world(seed: int = 0, labels: int = 2, lens: bool = True, shake: float = 0.0)
 def nudged(camera: CameraState, column: int, by: float) -> CameraState:
     """One camera parameter moved, through the function that the solver itself uses."""
     guess = LensPrior(500.0, 0.1, (0.0, 0.0), 9.0, 0.0, 0.1, 0.0, 0.1)
-    problem = Problem((), (camera.intrinsics,) * 2, 1, (0, 1), Freedom(lens=True), (guess, guess))
+    problem = Problem((), (camera.intrinsics,) * 2, 1, (0, 1), Freedom(lens=True, readout=True), (guess, guess))
     both = State((camera, camera), (), np.ones(2))
     columns = problem.free_columns().tolist()
     step = np.zeros(len(columns))
@@ -212,7 +212,7 @@ def test_a_guessed_lens_is_free_under_its_own_prior_and_the_others_are_not() -> 
     guess = LensPrior(1.1 * lens.focal, 0.2, (300.0, 250.0), 5.0, 0.05, 0.1, -0.02, 0.04)
     one = replace(problem, guessed=(None, guess, None))
     added = set(one.free_columns().tolist()) - set(problem.free_columns().tolist())
-    assert added == {CAMERA_PARAMETERS + column for column in (FOCAL, *range(K1, CAMERA_PARAMETERS))}
+    assert added == {CAMERA_PARAMETERS + column for column in (FOCAL, K1, *range(CENTRE, CAMERA_PARAMETERS))}
     loose = replace(
         one, guessed=(None, LensPrior(lens.focal, 1e9, (0.0, 0.0), 1e9, 0.0, 1e9, 0.0, 1e9, 1e9, 1e9, 1e9), None)
     )
@@ -363,3 +363,19 @@ def test_the_time_offset_column_is_the_velocity() -> None:
     line = linearise(rows, camera, state.trajectories[0])
     lever = (rows.time[rows.use] - camera.centre)[:, None]
     np.testing.assert_allclose(line.by_camera[:, :, RATE], line.by_camera[:, :, OFFSET] * lever, atol=1e-9)
+
+
+def test_a_row_that_a_clock_moves_off_the_end_of_the_path_still_pulls() -> None:
+    problem, state, _ = world(6)
+    rows = problem.rows[0]
+    camera, path = state.cameras[rows.camera], state.trajectories[rows.label]
+    first = float(np.min(rows.time[rows.use]))
+    # The camera's clock goes back until its first row lies a fifth of a knot interval before the path.
+    late = float(camera.reference_time(np.array([first]))[0]) - path.basis.begin + 0.2 * path.basis.spacing
+    early = replace(camera, offset=camera.offset - late)
+    assert np.isnan(path.at(early.reference_time(np.array([first])))).all()
+    line = linearise(rows, early, path)
+    assert line.valid.all()
+    assert np.isfinite(line.residual).all()
+    far = linearise(rows, replace(early, offset=early.offset - path.basis.spacing), path)
+    assert not far.valid.all()
