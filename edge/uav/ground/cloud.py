@@ -18,12 +18,14 @@ FREE = -1
 _SIDEWAYS = 3.4  # acceleration that a driver accepts in a bend, where nothing else is known [units/s²]
 _AHEAD = (1.0, 5.0, 10.0, 18.0)  # where on its way a driver looks for bends [units]
 _BRAKING = 2.5  # for one [units/s²]
+_MOST_SIDEWAYS = 6.0  # more makes tyres slip [units/s²]
 _SETTLE_S = 2.5  # within which the speed goes back to what the driver likes
 _HURRY = 2.0  # most acceleration for that [units/s²]
 _FASTEST = 60.0
 _UNKNOWN_BEND = 0.008  # std of the curvature of road that was never seen [1/unit]
 _VELOCITY_STD = (0.7, 3.0)  # least and most of what a cloud is taken to know of its velocity [units/s]
 _GOES_ON = 0.35  # of the acceleration at the last sighting
+_TELLING = 1.5  # of its stds from which it tells something
 _MEANT = 1.0  # a change of speed that is meant to last [units/s²]
 _MOOD_S = 1.5  # how long a change of speed lasts
 
@@ -135,13 +137,18 @@ def scattered(place: Floats, std: float, count: int, rng: np.random.Generator) -
     )
 
 
-def drawn(fit: MotionFit, place: Floats, std: float, count: int, rng: np.random.Generator) -> Cloud:
-    """A cloud about a place (2,) with the motion of a fit, as uncertain as the fit is."""
+def drawn(
+    fit: MotionFit, place: Floats, std: float, count: int, rng: np.random.Generator, goes_on: float = _GOES_ON
+) -> Cloud:
+    """A cloud about a place (2,) with the motion of a fit, as uncertain as the fit is.
+
+    goes_on: share of the acceleration that does.
+    """
     velocity = fit.velocity + rng.normal(0.0, fit.velocity_std, (count, 2))
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
     heading = np.arctan2(velocity[:, 1], velocity[:, 0])
     shrink = 1.0 / (1.0 + np.square(fit.acceleration_std / max(2.0, 0.17 * fit.speed)))
-    along = _GOES_ON * shrink * fit.along + rng.normal(0.0, min(fit.acceleration_std, 1.0), count)
+    along = goes_on * shrink * fit.along + rng.normal(0.0, min(fit.acceleration_std, 1.0), count)
     curvature = np.full(count, fit.turn_rate / max(fit.speed, 2.0)) + rng.normal(0.0, 0.01, count)
     return Cloud(
         place + rng.normal(0.0, std, (count, 2)),
@@ -189,7 +196,7 @@ def driven(cloud: Cloud, dt: float, ways: list[Way], seen: bool, rng: np.random.
         limit = np.full(int(on.sum()), _FASTEST)
         for ahead in _AHEAD:
             bend = np.maximum(np.abs(way.bend(cloud.along[on] + ahead)), 1e-3)
-            limit = np.minimum(limit, np.sqrt(cloud.sideways[on] / bend + 2.0 * _BRAKING * max(ahead - _AHEAD[0], 0.0)))
+            limit = np.minimum(limit, np.sqrt(cloud.sideways[on] / bend + _lost_by(ahead)))
         excess = np.maximum(speed[on] - limit, 0.0)
         speed[on] = speed[on] - np.minimum(excess, 3.5 * dt)
         along[on] = cloud.along[on] + speed[on] * dt
@@ -221,6 +228,22 @@ def on_ways(cloud: Cloud, ways: list[Way], share: float, rng: np.random.Generato
     free = rng.random(n) >= share
     bend = np.where(free, cloud.curvature, rng.normal(0.0, _UNKNOWN_BEND, n))
     return replace(cloud, way=np.where(free, FREE, drawn_way), along=along, across=across, curvature=bend)
+
+
+def unhurried(cloud: Cloud, ways: list[Way]) -> Cloud:
+    """The cloud of a driver who does not brake: who would have to for a bend ahead accepts more across than thought."""
+    sideways = cloud.sideways.copy()
+    for k, way in enumerate(ways):
+        on = cloud.way == k
+        for ahead in _AHEAD:
+            needed = np.abs(way.bend(cloud.along[on] + ahead)) * (np.square(cloud.speed[on]) - _lost_by(ahead))
+            sideways[on] = np.maximum(sideways[on], np.minimum(needed, _MOST_SIDEWAYS))
+    return replace(cloud, sideways=sideways)
+
+
+def _lost_by(ahead: float) -> float:
+    """By how much the square of the speed can fall before a bend so far ahead [units²/s²]."""
+    return 2.0 * _BRAKING * max(ahead - _AHEAD[0], 0.0)
 
 
 def rerouted(cloud: Cloud, old: list[Way], new: list[Way], rng: np.random.Generator) -> Cloud:
@@ -266,14 +289,22 @@ def pulled(
 
 
 def launched(
-    cloud: Cloud, fit: MotionFit, ahead: float, count: int, rng: np.random.Generator, driving: Driving | None = None
+    cloud: Cloud,
+    fit: MotionFit,
+    ahead: float,
+    count: int,
+    rng: np.random.Generator,
+    driving: Driving | None = None,
+    on_ways: bool = True,
 ) -> Cloud:
     """The cloud that loses sight of its target: places as they are, motion of the fit, as uncertain as it is.
 
-    driving: what is known of how it drives.
+    driving: what is known of how it drives. on_ways: whether ways are known, whose bends say how its speed goes on;
+    where they are not, a change of speed that is surely seen is meant to last.
     """
     chosen = cloud.take(systematic(cloud.weights, count, rng))
-    sent = drawn(fit, np.zeros(2), 0.0, count, rng)
+    sure = 0.0 if on_ways else float(np.clip(abs(fit.along) / max(fit.acceleration_std, 1e-6) - _TELLING, 0.0, 1.0))
+    sent = drawn(fit, np.zeros(2), 0.0, count, rng, _GOES_ON + (1.0 - _GOES_ON) * sure)
     if fit.speed < 0.7:
         return replace(chosen, speed=sent.speed, acceleration=0.0 * sent.acceleration, way=sent.way)
     mood = _moods(count, rng)
@@ -285,7 +316,10 @@ def launched(
         heading=sent.heading,
         speed=speed,
         # Who changes the speed now means it.
-        cruise=np.maximum(habits.cruise + np.where(np.abs(mood) > _MEANT, _MOOD_S * mood, 0.0), 0.0),
+        cruise=np.maximum(
+            habits.cruise + np.where(np.abs(mood) > _MEANT, _MOOD_S * mood, 0.0) + sure * _MOOD_S * sent.acceleration,
+            0.0,
+        ),
         sideways=habits.sideways,
         acceleration=acceleration,
         curvature=sent.curvature,

@@ -91,8 +91,10 @@ def judge(
             else:
                 # Of two that both may be it, the more alike wins in time.
                 peak = min(peak, _PATIENT) * float(np.exp(_BETTER * (candidate.score - most_alike)))
-                off = velocity - motion[0]
-                squared = squared + np.square(off).sum(axis=1) / (motion[1] ** 2 + _MOTION_STD**2)
+                off = np.square(velocity - motion[0]).sum(axis=1) / (motion[1] ** 2 + _MOTION_STD**2)
+                # Where an oncoming car passes is not where the target is.
+                there[j] &= off < _THERE**2
+                squared = squared + off
                 if is_shaped(candidate):
                     off_angle = (cloud.heading - candidate.angle + np.pi) % (2 * np.pi) - np.pi
                     squared = squared + np.square(off_angle / _TURN_STD)
@@ -100,8 +102,11 @@ def judge(
     none = 1.0 - chance
     likelihood = none + gain.sum(axis=0)
     if again:
-        for candidate, tracklet in zip(candidates, tracklets, strict=True):
-            likelihood = _limited(cloud, likelihood, candidate, tracklet, length)
+        for candidate, tracklet, own in zip(candidates, tracklets, gain, strict=True):
+            # Where another car is the target is not; but a leaf that is a little alike leaves room for it.
+            car = candidate.score > _SCORE_AGAIN and candidate.shape > _SHAPE_AGAIN
+            least = np.zeros(len(cloud)) if car else likelihood - own
+            likelihood = _limited(cloud, likelihood, least, candidate, tracklet, length)
     if not len(candidates):
         return Verdict(None, 0.0, likelihood, False)
     mass = gain @ cloud.weights
@@ -127,11 +132,14 @@ def judge(
     return Verdict(best if good else None, float(posterior[k]), likelihood, crowded)
 
 
-def _limited(cloud: Cloud, likelihood: Floats, candidate: Candidate, tracklet: Tracklet, length: float) -> Floats:
+def _limited(
+    cloud: Cloud, likelihood: Floats, least: Floats, candidate: Candidate, tracklet: Tracklet, length: float
+) -> Floats:
     """The likelihood with what one look-alike says in all bounded: some other car looks the same, frame after frame.
 
     The odds of the particles about it may grow by _SAYS_AT_MOST over what they were when it was first seen, and by what
-    the others lose for not being seen where they should be.
+    the others lose for not being seen where they should be. least: (n,) what is left to them at least: a cloud that
+    comes to where something hardly alike stands is not driven off.
     """
     about = np.square(cloud.place - candidate.ground).sum(axis=1) < length**2
     before = float(cloud.weights[about].sum())
@@ -144,4 +152,4 @@ def _limited(cloud: Cloud, likelihood: Floats, candidate: Candidate, tracklet: T
     odds = float(cloud.weights[about] @ likelihood[about]) / rest
     if odds <= tracklet.odds_limit:
         return likelihood
-    return np.where(about, likelihood * (tracklet.odds_limit / odds), likelihood)
+    return np.where(about, np.maximum(likelihood * (tracklet.odds_limit / odds), least), likelihood)

@@ -18,6 +18,7 @@ _NUMBER = 400
 _ON_WAYS = 0.92  # of the particles, where the target drove on the road
 _TURNING, _BRAKED = 0.36, 0.4  # chance of a turn where there is one, and how much more for one who brakes
 _TELLING = 1.5  # std of an acceleration that tells something
+_BRAKES = -0.7  # acceleration along of one who does [units/s²]
 _MADE_OF_ROAD = 0.5  # share of the trail that must be road for ways to count
 
 
@@ -56,10 +57,14 @@ class Outlook:
         rng: np.random.Generator,
     ) -> Cloud:
         """The cloud that sets out."""
-        if fit is not None:
-            cloud = clouds.launched(cloud, fit, time - fit.time, _NUMBER, rng, driving)
         self.ways = self._trace(road, time)
-        return clouds.on_ways(cloud, self.ways, _ON_WAYS, rng) if self.ways else cloud
+        if fit is not None:
+            cloud = clouds.launched(cloud, fit, time - fit.time, _NUMBER, rng, driving, on_ways=bool(self.ways))
+        if not self.ways:
+            return cloud
+        cloud = clouds.on_ways(cloud, self.ways, _ON_WAYS, rng)
+        brakes = fit is not None and fit.along < _BRAKES
+        return cloud if brakes else clouds.unhurried(cloud, self.ways[:1])
 
     def again(self, cloud: Cloud, time: float, road: RoadMap, rng: np.random.Generator) -> Cloud:
         """As more of the road comes into view the ways are traced again, always from the same start."""

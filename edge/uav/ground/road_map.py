@@ -61,9 +61,19 @@ class RoadMap:
         self._odds[:] = 0.0
         self._smooth = None
 
-    def take_colours(self, other: RoadMap) -> None:
-        """What another map learnt of colours: the ground may be counted anew, asphalt stays asphalt."""
+    def take(self, other: RoadMap, new_from_old: Floats) -> None:
+        """What another map knows, in another ground frame. new_from_old: (3, 3) homography of the ground."""
         self._road, self._all, self._table = other._road, other._all, other._table
+        new = np.array(
+            [[CELL, 0.0, self._origin[0] + 0.5 * CELL], [0.0, CELL, self._origin[1] + 0.5 * CELL], [0, 0, 1]]
+        )
+        old = np.array(
+            [[CELL, 0.0, other._origin[0] + 0.5 * CELL], [0.0, CELL, other._origin[1] + 0.5 * CELL], [0, 0, 1]]
+        )
+        cells = inverse(new) @ new_from_old @ old
+        moved = cv2.warpPerspective(other._odds, cells, (_SIZE, _SIZE), flags=cv2.INTER_NEAREST)
+        self._odds = np.asarray(moved, np.float32)
+        self._smooth = None
 
     @property
     def ready(self) -> bool:

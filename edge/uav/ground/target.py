@@ -23,7 +23,7 @@ _WHOLE = 0.97  # share of the footprint in the picture that is all of it
 _MOST_CELLS = 100  # half size of a patch
 _CLEAR = 0.1  # by how much the score may fall short of the usual one while nothing hides a part of the target
 _HIDES = 0.6  # std of the place in target lengths, for each unit that the score is short beyond that
-_USUAL_RATE, _USUAL_RATE_UNCLEAR = 0.1, 0.02  # of the usual score, a frame
+_USUAL_RATE, _USUAL_RATE_LESS = 0.1, 0.02  # of the usual score, a frame
 
 
 class Target:
@@ -75,7 +75,7 @@ class Target:
 
     def grow_used(self, score: float) -> None:
         """Take the score of a sure sighting of the whole target: what is usual follows it, slowly where it is less."""
-        rate = _USUAL_RATE if self.is_clear(score) else _USUAL_RATE_UNCLEAR
+        rate = _USUAL_RATE if score > self._usual else _USUAL_RATE_LESS
         self._usual += rate * (min(score, 1.0) - self._usual)
 
     def cut(self, image: Picture, middle: Floats, half: float, angle: float | None = None) -> Patch | None:

@@ -24,6 +24,8 @@ _EDGE_REACH = 9.0
 _SMOOTH = 2  # steps to each side over which a bend is measured
 _SIDE_RADII = (7.0, 11.0)
 _SIDE_LOOK = 16.0  # of a side road that must be seen to count
+_LANE_POINTS = 6  # points of a turn, the last, from which the lane is told
+_MOST_ASIDE = 5.0  # a lane farther aside is not one of this road's [ground units]
 
 _CURVATURES = _SHARPEST * np.sinh(np.linspace(-2.2, 2.2, 29)) / np.sinh(2.2)
 
@@ -96,8 +98,9 @@ def trace(
     found = [main]
     for side in _sides(road, main[0], main[1]):
         index, points, headings = side
+        points = _into_lane(road, points, headings, keep)
         rest = max(length - STEP * (index + len(points)), 0.0)
-        tail = _follow(road, points[-1], float(headings[-1]), 0.0, max(rest, 3 * STEP), (np.nan, np.nan))
+        tail = _follow(road, points[-1], float(headings[-1]), 0.0, max(rest, 3 * STEP), keep)
         found.append(
             (
                 np.concatenate([main[0][:index], points, tail[0][1:]]),
@@ -169,6 +172,27 @@ def _side_shift(road: RoadMap, at: Floats, heading: float, keep: tuple[float, fl
     if not errors:
         return 0.0
     return float(np.clip(0.35 * np.mean(errors), -0.4, 0.4))
+
+
+def _into_lane(road: RoadMap, points: Floats, headings: Floats, keep: tuple[float, float]) -> Floats:
+    """A turn (m, 2) moved aside so that it ends as far from the nearer edge of the side road as the car keeps now.
+
+    Who drives on the right drives on the right there too.
+    """
+    near = 0 if not np.isfinite(keep[1]) or keep[0] <= keep[1] else 1
+    if not np.isfinite(keep[near]):
+        return points
+    found = edges(road, points[-_LANE_POINTS:], headings[-_LANE_POINTS:])[near]
+    found = found[np.isfinite(found)]
+    if len(found) < 3:
+        return points
+    aside = (float(np.median(found)) - keep[near]) * (1.0 if near == 0 else -1.0)
+    if abs(aside) > _MOST_ASIDE:
+        return points
+    # Over the turn itself, smoothly.
+    share = np.clip(np.arange(1, len(points) + 1) / max(len(points) - _LANE_POINTS, 1), 0.0, 1.0)
+    right = np.column_stack([-np.sin(headings), np.cos(headings)])
+    return np.asarray(points + (aside * share * share * (3.0 - 2.0 * share))[:, None] * right)
 
 
 def _sides(road: RoadMap, points: Floats, headings: Floats) -> list[tuple[int, Floats, Floats]]:

@@ -38,7 +38,7 @@ _FIRST_NUMBER = 400
 _PULL = 0.35  # of the motion towards the fit, a frame
 _PULL_PLACE = 0.2  # of the place, the same
 _ALIGN_AFTER = 0.6  # way travelled before the direction of motion counts, in target lengths
-_UNCLEAR = 4.0  # times the noise of a place that counts towards the motion, where a part of the target is hidden
+_UNCLEAR = 10.0  # times the noise of a place that counts towards the motion, where a part of the target is hidden
 _FREE_FOR = 12  # frames for which a car whose motion was never seen may have gone anywhere
 _STEADY = 8  # frames seen in a row after which the ground frame may begin anew
 _AGAIN = 3  # frames unseen after which finding the target is finding it again
@@ -414,7 +414,7 @@ class GroundTracker:
         self._survey.clear()
         self._trail = [p for p in transfer(change, np.array(self._trail)) if np.isfinite(p).all()]
         old, self._road = self._road, RoadMap(near[0])
-        self._road.take_colours(old)
+        self._road.take(old, change)
 
     def _estimate(self, time: float) -> Estimate:
         """What is known now."""

@@ -14,6 +14,8 @@ LENGTH, WIDTH = 4.5, 1.9
 MIDDLE_HEIGHT = 0.7  # of the point that is called the car's centre [m]
 _BODY_TOP, _ROOF_TOP = 0.85, 1.45
 _SHIFT = 4  # bits of sub-pixel that OpenCV's polygons take
+_NEAREST = LENGTH  # depth of a car's middle before the camera below which it is not drawn [m]
+_FARTHEST = 1e5  # a corner beyond is no pixel's any more [px]
 
 COLOURS_BGR = {
     "red": (42, 38, 186),
@@ -112,7 +114,9 @@ def _placed(ground: Floats, course: float) -> Floats:
 def draw(
     image: npt.NDArray[np.uint8], matrix: Floats, ground: Floats, course: float, colour: tuple[int, int, int]
 ) -> None:
-    """Draw a car into ``image``. matrix: (3, 4) projection, pixels from NED."""
+    """Draw a car into ``image``. matrix: (3, 4) projection, pixels from NED; nothing of a car that is not before it."""
+    if float((matrix[2, :3] @ np.array([ground[0], ground[1], -MIDDLE_HEIGHT])) + matrix[2, 3]) < _NEAREST:
+        return
     shadow = np.column_stack([_SHADOW, np.zeros(len(_SHADOW))]) @ _turn(course).T
     shadow[:, :2] += ground + _SHADOW_SHIFT
     _fill(image, _project(matrix, shadow), (38, 38, 40))
@@ -137,5 +141,5 @@ def _project(matrix: Floats, points: Floats) -> Floats:
 
 
 def _fill(image: npt.NDArray[np.uint8], outline: Floats, colour: tuple[int, int, int]) -> None:
-    fixed = np.rint(outline * (1 << _SHIFT)).astype(np.int32)
+    fixed = np.rint(np.clip(outline, -_FARTHEST, _FARTHEST) * (1 << _SHIFT)).astype(np.int32)
     cv2.fillConvexPoly(image, fixed, colour, cv2.LINE_AA, _SHIFT)

@@ -112,8 +112,8 @@ def corner(stage: Stage, begin: float) -> tuple[Curve, float, list[Road]]:
     way = curve(
         [Bend(begin, angle, rng.uniform(6.5, 8.0) if right else rng.uniform(9.0, 11.0))], BEHIND, AHEAD, stage.course
     )
-    old, new = stage.course, stage.course + angle
-    main = Road(straight(-0.5 * LANE * right_of(old), old, -140.0, 170.0))
-    later = way.at(np.array([begin + 40.0]))[0][0]
-    other = Road(straight(later - 0.5 * LANE * right_of(new), new, -190.0, 290.0))
+    # At the origin it may turn already: the roads lie along the way before the turn and after it.
+    places, (old, new) = way.at(np.array([begin - 10.0, begin + 40.0]))
+    main = Road(straight(places[0] - 0.5 * LANE * right_of(old), old, -130.0, 180.0))
+    other = Road(straight(places[1] - 0.5 * LANE * right_of(new), new, -190.0, 290.0))
     return way, angle, [main, other]
