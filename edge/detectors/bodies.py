@@ -8,6 +8,7 @@ placing and coordinate descent in place of its mean field.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -28,6 +29,9 @@ _EMPTY, _SHADOW = -0.45, -0.08
 _NEW, _KEPT = 0.55, 0.28  # gain of a template, of its area, that makes it worth its place
 _COUNTS = (2.5, 1.0, 1.0)  # a head is small, but says most about where somebody stands
 _BEYOND = 1.0  # by how much a silhouette that goes on above the head or below the feet speaks against a template
+_TORSO = (0.1, 0.2, 0.5)  # as _BARS
+_COLOUR, _LOOKS = 45.0, 1.0  # 8-bit steps by which clothes differ from themselves; weight of a torso's pixel
+_ROUNDS = 3  # of seeking those whom nobody expected
 _REACH = 0.14  # of the height: how far somebody may be from where it is expected
 _PULL = 3.0  # of its area, by the square of that distance over the height
 _SHORT, _LONG = 0.9, 1.12  # of the usual height at a place, that one who is followed may have
@@ -77,11 +81,19 @@ class _Placed:
         return self.foot - self.tall
 
 
-def explain(figure: Image, shadow: Image, stature: Stature, expected: list[Box]) -> list[Body]:
+def explain(
+    figure: Image,
+    shadow: Image,
+    stature: Stature,
+    expected: list[Box],
+    image: Image | None = None,
+    clothes: Sequence[Floats | None] = (),
+) -> list[Body]:
     """People in a clean silhouette picture (H, W) 0/255.
 
     shadow: (H, W) what is only darker than the background: somebody may stand there in dark clothes, or a shadow lie.
-    expected: boxes [px] where some should be.
+    expected: boxes [px] where some should be; clothes: their torsos' mean colours (3,), as far as known, in ``image``
+    (H, W, 3).
     """
     if not stature.known:
         return _by_shape(figure, expected)
@@ -95,6 +107,11 @@ def explain(figure: Image, shadow: Image, stature: Stature, expected: list[Box])
     filled = small.astype(np.float32) / 255.0
     weight = filled + _SHADOW * dim.astype(np.float32) / 255.0
     weight += _EMPTY * np.clip(1.0 - filled - dim.astype(np.float32) / 255.0, 0.0, 1.0)
+    colours = None
+    if image is not None and len(clothes) == len(expected):
+        # Finer than the clothes' pattern need not be.
+        blurred = image if scale == 1.0 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        colours = np.asarray(cv2.blur(blurred, (5, 5)), dtype=np.uint8)
     bodies: list[Body] = []
     for rows, columns, mine in _clusters(small, stature, scales, expected):
         whole = _whole(figure, (rows, columns), scales, stature) if len(mine) < 2 else None
@@ -104,6 +121,8 @@ def explain(figure: Image, shadow: Image, stature: Stature, expected: list[Box])
             bodies.append(replace(whole, expected=owner))
             continue
         scene = _Cluster(weight[rows, columns], filled[rows, columns], (columns.start, rows.start), scales, stature)
+        if colours is not None:
+            scene.dress(colours[rows, columns], {index: clothes[index] for index in mine})
         placed = scene.explain([(index, expected[index]) for index in mine])
         bodies += scene.bodies(placed, figure)
     return bodies
@@ -234,10 +253,30 @@ class _Cluster:
         self._weight, self._filled = weight, filled
         self._origin, self._scales, self._stature = origin, scales, stature
         self._covered = np.zeros(weight.shape, np.int16)
+        self._looks: dict[int, npt.NDArray[np.float32]] = {}
         self._sums = cv2.integral(weight)
         wide, high = stature.size
         self._limits = -origin[0], round(wide * scales[0]) - origin[0], -origin[1], round(high * scales[1]) - origin[1]
         self._at_bottom = self._limits[3] <= weight.shape[0] + 1
+
+    def dress(self, colours: Image, clothes: dict[int, Floats | None]) -> None:
+        """Let those who are expected be known by their clothes. colours: (h, w, 3) of this part."""
+        for index, one in clothes.items():
+            if one is not None:
+                away = np.square(colours.astype(np.float32) - one.astype(np.float32)).sum(axis=2) / _COLOUR**2
+                self._looks[index] = np.asarray(1.0 - np.minimum(away, 2.0), dtype=np.float32)
+
+    def _dressed(self, one: _Placed, u: Floats, foot: Floats, tall: Floats) -> Floats | float:
+        """How many pixels of the torso, where no other hides it, have its colours, less those that have not."""
+        looks = self._looks.get(one.expected)
+        if looks is None:
+            return 0.0
+        sums = cv2.integral(np.where(self._covered == 0, looks * self._filled, np.float32(0.0)))
+        h, w = self._weight.shape
+        half, high, low = _TORSO
+        a, b = (np.rint(u + side * half * tall).astype(np.intp).clip(0, w) for side in (-1.0, 1.0))
+        c, d = (np.rint(foot - (1.0 - part) * tall).astype(np.intp).clip(0, h) for part in (high, low))
+        return np.asarray(_LOOKS * (sums[d, b] - sums[c, b] - sums[d, a] + sums[c, a]), dtype=np.float64)
 
     def explain(self, expected: list[tuple[int, Box]]) -> list[_Placed]:
         """The templates that explain the silhouettes, nearest last expectations first."""
@@ -253,20 +292,37 @@ class _Cluster:
         if len(placed) > 1:
             self._descend(placed, 2)
         grid = self._grid()
-        while len(placed) < _MOST:
-            new = self._best_new(*grid)
-            if new is None:
+        # Who is expected and not there must not keep others out; of those who come some are not worth their place once
+        # all have settled, and what they covered is free again.
+        for _ in range(_ROUNDS):
+            before = len(placed)
+            placed = self._worthy(placed)
+            gone = before - len(placed)
+            came = 0
+            while len(placed) < _MOST:
+                new = self._best_new(*grid)
+                if new is None:
+                    break
+                self._cover(new, 1)
+                placed.append(new)
+                came += 1
+                self._descend(placed, 1)
+            if not came and not gone:
                 break
-            self._cover(new, 1)
-            placed.append(new)
-            self._descend(placed, 1)
+        return self._worthy(placed)
+
+    def _worthy(self, placed: list[_Placed]) -> list[_Placed]:
+        """Those who explain enough that no other does, the least sure asked first; the others' pixels are free."""
+        for one in placed:
+            self._cover(one, -1)
+            one.gain = self._gain(one) / (_AREA * one.tall**2)
+            self._cover(one, 1)
         for one in sorted(placed, key=lambda each: each.gain):
             self._cover(one, -1)
-            worth = self._gain(one) / (_AREA * one.tall**2)
-            if worth < (_KEPT if one.expected >= 0 else 0.7 * _NEW):
+            one.gain = self._gain(one) / (_AREA * one.tall**2)
+            if one.gain < (_KEPT if one.expected >= 0 else 0.7 * _NEW):
                 placed = [each for each in placed if each is not one]
                 continue
-            one.gain = worth
             self._cover(one, 1)
         return placed
 
@@ -315,7 +371,8 @@ class _Cluster:
         return np.asarray(inner + _EMPTY * beyond, dtype=np.float64)
 
     def _gain(self, one: _Placed) -> float:
-        return float(self._gains(np.array([one.u]), np.array([one.foot]), np.array([one.tall]))[0])
+        u, foot, tall = np.array([one.u]), np.array([one.foot]), np.array([one.tall])
+        return float((self._gains(u, foot, tall) + self._dressed(one, u, foot, tall))[0])
 
     def _settle(self, one: _Placed) -> None:
         """Move a template to the best place near, drawn to where it is expected."""
@@ -323,7 +380,7 @@ class _Cluster:
         steps = np.linspace(-reach, reach, 9)
         u, foot = (values.ravel() for values in np.meshgrid(one.u + steps, one.foot + steps))
         tall = one.stature * self._heights(u, foot)
-        gains = self._gains(u, foot, tall)
+        gains = self._gains(u, foot, tall) + self._dressed(one, u, foot, tall)
         home = one.home or (one.u, one.foot)
         pull = _PULL if one.home is not None else 0.3
         away = ((u - home[0]) ** 2 + (foot - home[1]) ** 2) / one.tall**2

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ ModelName = Literal["mog2", "knn"]
 _TEACH_S = 0.4  # the model learns this often
 _MEMORY_S = 30.0  # and forgets over that time
 _BEGIN_S = 1.0  # in which a new model learns fast, and after which it begins again from what was there most of the time
-_REVIEWS_S = (_BEGIN_S, 4.0, 12.0)  # when that is done, each time better
+_REVIEWS_S = (_BEGIN_S, 2.0, 4.0, 8.0, 16.0)  # when that is done, each time better
 _REVIEWED = 24  # pictures that a review looks at
 _CLOSEST = 0.34  # of the pictures that show a place's background, at least
 _STRIP = 32  # rows at once
@@ -37,6 +37,10 @@ _DIM_STEP = 11  # 8-bit steps, times the gain: a dim picture's noise is raised w
 _SHADOW = (0.42, 0.95)  # light that a shadow leaves
 _SHADOW_TEXTURE = 7.0  # 8-bit steps that are noise
 _SHADOW_CHROMA = 9.0  # 8-bit steps by which a shadow changes colours
+_SHADOW_PIXEL = 14.0  # the same of one pixel, with its noise
+_NEAR, _WINDOW = 5, 9  # pixels of half the picture: in which a shadow must show the texture of what it falls on
+_SHOWN, _HIDDEN = 0.4, 2.5  # share of the texture that a shadow shows at least; standard deviations
+_LEAST_NOISE = 2.0  # 8-bit steps
 _GHOST_STEP = 22  # 8-bit steps
 
 
@@ -87,6 +91,7 @@ class Foreground:
         self._slow: npt.NDArray[np.float32] | None = None  # the background, in parts of a step
         self._album: list[Image] = []
         self._reviews = list(_REVIEWS_S)
+        self._stride = 1
 
     def prime(self, pictures: Sequence[Image]) -> None:
         """Learn from pictures spread over a longer time, so that what was here and there for a moment is not in it."""
@@ -109,17 +114,17 @@ class Foreground:
 
     def _review(self, even: Image) -> None:
         """A young model's picture has everybody in it who was there at first: keep some pictures, and start over."""
-        age = self._seen * self._period
-        every = max(round(self._reviews[0] / self._period / _REVIEWED), 1)
-        if self._seen % every == 0:
+        if self._seen % self._stride == 0:
             self._album.append(even.copy())
-        if age < self._reviews[0]:
+        if len(self._album) > _REVIEWED:
+            # Evenly over all the time since the beginning.
+            self._album, self._stride = self._album[::2], 2 * self._stride
+        if self._seen * self._period < self._reviews[0]:
             return
-        album, left, seen = self._album, self._reviews[1:], self._seen
+        album, stride, left, seen = self._album, self._stride, self._reviews[1:], self._seen
         self.prime(album)
-        self._seen, self._reviews = seen, left
-        # The later reviews span the first's time too.
-        self._album = album[::3] if left else []
+        self._seen, self._reviews, self._stride = seen, left, stride
+        self._album = album if left else []
 
     def look(self, image: Image, protected: Sequence[Box] = ()) -> Layers:
         """Split a picture (H, W, 3) BGR. protected: x, y, w, h [px] of what must not be learnt."""
@@ -226,7 +231,15 @@ class Foreground:
         same = cv2.inRange(texture, -1.0, _SHADOW_TEXTURE)
         grey = cv2.inRange(colour, (0, 0, 0), (_SHADOW_CHROMA,) * 3)
         all_three = cv2.bitwise_and(dark, cv2.bitwise_and(same, grey))
-        full = cv2.resize(all_three, (w, h), interpolation=cv2.INTER_NEAREST)
+        raised = np.asarray(cv2.resize(figure[part], half, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
+        seems = np.asarray(all_three, dtype=np.uint8)
+        light = np.asarray(left, dtype=np.float32)
+        hidden = _hides_texture(bright_now, bright_then, light, seems, raised == 0)
+        sure = cv2.subtract(seems, hidden)
+        # At the rim of a body the neighbourhood is half the body's: there every pixel speaks for itself.
+        alike = cv2.subtract(cv2.inRange(cv2.absdiff(now, dimmed), (0, 0, 0), (_SHADOW_PIXEL,) * 3), hidden)
+        rim = cv2.bitwise_and(cv2.dilate(sure, np.ones((3, 3), np.uint8)), cv2.bitwise_and(alike, dark))
+        full = cv2.resize(cv2.bitwise_or(sure, rim), (w, h), interpolation=cv2.INTER_NEAREST)
         shadow[part] = cv2.bitwise_and(full, figure[part])
         return shadow
 
@@ -267,6 +280,36 @@ def usual(pictures: Sequence[Image]) -> Image:
         start = width.argmin(axis=0)
         found[row : row + _STRIP] = np.take_along_axis(values, (start + share // 2)[None], axis=0)[0]
     return found
+
+
+def _hides_texture(
+    now: npt.NDArray[np.float32],
+    then: npt.NDArray[np.float32],
+    left: npt.NDArray[np.float32],
+    candidate: Image,
+    quiet: Bools,
+) -> Image:
+    """Where what seems a shadow does not show the background's texture: trousers of the floor's colour.
+
+    now, then: (h, w) brightness and the background's; left: share of its light; candidate: 255 where a shadow may lie;
+    quiet: where nothing stands. A shadow's picture is the background's times ``left``, cloth has nothing of it:
+    over a window their correlation, sum(n t) / sum(t t), is 1 or 0, where n is the brightness and t the background's
+    times ``left``, both less their means nearby: of a shadow's soft rim, which has slopes of its own, little is left.
+    Where a film was compressed a shadow shows less: _SHOWN. It must be seen to show less than that, beyond the noise.
+    """
+    inside: npt.NDArray[np.float32] = (candidate > 0).astype(np.float32)
+
+    def total(values: npt.NDArray[Any], size: int) -> npt.NDArray[np.float32]:
+        return np.asarray(cv2.boxFilter(values, cv2.CV_32F, (size, size), normalize=False), dtype=np.float32)
+
+    near = np.maximum(total(inside, _NEAR), np.float32(1.0))
+    fine_now = (now - total(now * inside, _NEAR) / near) * inside
+    fine_then = left * (then - total(then * inside, _NEAR) / near) * inside
+    noise = 1.48 * float(np.median(np.abs(now[quiet] - then[quiet]))) if quiet.any() else 3.0
+    texture = np.maximum(total(fine_then * fine_then, _WINDOW), np.float32(1e-3))
+    shown = total(fine_then * fine_now, _WINDOW) / texture
+    surely = (_SHOWN - shown) * np.sqrt(texture) > _HIDDEN * max(noise, _LEAST_NOISE)
+    return np.asarray(np.where(surely & (shown < 0.4 * _SHOWN), 255, 0), dtype=np.uint8)
 
 
 def _slow_field(usable: Bools, left: Floats, size: tuple[int, int]) -> npt.NDArray[np.float32]:

@@ -147,7 +147,8 @@ class PersonDetector:
         followers = list(following.all)
         for u, v, tall in lone_people(figure) if self._learns else ():
             self._stature.learn(u, v, tall)
-        bodies = explain(figure, layers.shadow, self._stature, [one.expected(now) for one in followers])
+        boxes = [one.expected(now) for one in followers]
+        bodies = explain(figure, layers.shadow, self._stature, boxes, image, [one.colour for one in followers])
         colours = [_torso(image, figure, body) for body in bodies]
         given = [followers[body.expected] if body.expected >= 0 else None for body in bodies]
         owners = following.assign([body.box for body in bodies], colours, now, given)
