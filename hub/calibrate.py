@@ -16,9 +16,10 @@ from hub.pairs import Progress, rate_warnings, solve_pairs, timing_told
 from hub.paper_poses import all_sized, place_by_paper
 from hub.poses import covariance as cov
 from hub.poses import readout
-from hub.poses.adjust import adjust, motion_prior, noise, residual_norms
+from hub.poses.adjust import adjust, noise, residual_norms
 from hub.poses.graph import ClockGraph, ClockGuess, average_clocks, components
 from hub.poses.initialise import Scaffold, agreement, grow, place_known
+from hub.poses.motion import motion_prior
 from hub.poses.problem import Freedom, Problem, State
 from hub.prepare import NO_INTRINSICS, Prepared, prepare
 from hub.publish import focal_stds, lone_pair_report, publish

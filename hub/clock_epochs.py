@@ -43,17 +43,19 @@ class ClockEpochs:
     def present(self, calibration: Calibration, boots: dict[str, str]) -> tuple[Calibration, dict[str, str]]:
         """The calibration with every time map moved to the epoch in which its camera's clock is now.
 
-        t_reference = rate * (t_new - step) + offset, so the offset moves by -rate * step; the std grows by the step's.
+        t_old = t_new - step - drift * (t_new - at), from the event's moment ``at`` on; the std grows by the step's.
         """
         cameras, names = dict(calibration.cameras), dict(boots)
         for name, camera in calibration.cameras.items():
-            offset, std = camera.time_map.time_offset, camera.time_offset_std
+            rate, offset = camera.time_map.clock_rate, camera.time_map.time_offset
+            std = camera.time_offset_std
             for event in self._watch.since(name, boots.get(name, "")):
-                offset -= camera.time_map.clock_rate * event.step_s
+                offset -= rate * (event.step_s - event.rate * event.at_s)
+                rate *= 1.0 - event.rate
                 std = math.hypot(std, event.std_s)
                 names[name] = event.boot
             if names.get(name) != boots.get(name):
-                time_map = TimeMap(time_offset=offset, clock_rate=camera.time_map.clock_rate)
+                time_map = TimeMap(time_offset=offset, clock_rate=rate)
                 cameras[name] = replace(camera, time_map=time_map, time_offset_std=std)
         return replace(calibration, cameras=cameras), names
 

@@ -10,8 +10,9 @@ import numpy as np
 from hub.pairs import pair_lag
 from hub.points import SAME_TIME, PointBasis
 from hub.poses import covariance as cov
-from hub.poses.adjust import motion_prior, predict, residual_norms
+from hub.poses.adjust import predict, residual_norms
 from hub.poses.gauge import fix_gauge, given_world, transform_state, weighed
+from hub.poses.motion import motion_prior
 from hub.poses.problem import CAMERA_PARAMETERS, FOCAL, READOUT, Problem, State
 from hub.poses.references import adjust_to_references
 from hub.poses.sigma import honest

@@ -18,9 +18,8 @@ from hub.poses.linear import (
     border_block,
     path_gradient,
     solve,
-    third_difference_band,
-    third_differences,
 )
+from hub.poses.motion import MotionPrior, motion_prior, motion_terms
 from hub.poses.problem import (
     ASPECT,
     CAMERA_PARAMETERS,
@@ -54,13 +53,6 @@ _LEAST_SIGMA = 0.05  # px
 # as much as a gross error, so that one row at an end would hold every clock where it is.
 _BEYOND = 0.5
 _ROUGH, _FINE = 1e-4, 1e-7  # gain, as a share of the cost, at which a round and the last one end
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MotionPrior:
-    """Weights (m,) of the squared third differences, one array a label."""
-
-    weights: tuple[Floats, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,30 +175,6 @@ def _without_single_views(parts: list[Rows], state: State) -> list[Rows]:
     return out
 
 
-def motion_prior(problem: Problem, state: State, first: bool = False) -> MotionPrior:
-    """Strength of the motion prior from the third differences where at least two cameras see.
-
-    first: before the path can be trusted, only a whisper that closes holes.
-    """
-    weights = []
-    for label, path in enumerate(state.trajectories):
-        size = path.basis.size
-        count = len(path.basis.interval_starts())
-        differences = third_differences(path.basis, path.control)
-        seen = np.zeros((len(state.cameras), size), dtype=np.bool_)
-        for rows in problem.rows:
-            if rows.label == label:
-                index, _, inside = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[rows.use]))[:3]
-                seen[rows.camera, index[inside]] = True
-        both = seen.sum(axis=0)[path.basis.interval_starts()] >= 2
-        chosen = differences[both] if both.sum() >= 4 else differences
-        variance = float(np.mean(chosen**2)) if len(chosen) else 1.0
-        scale = float(np.median(np.ptp(path.control, axis=0))) or 1.0
-        variance = max(variance, (1e-6 * scale) ** 2)
-        weights.append(np.full(count, (1e-3 if first else 1.0) / variance))
-    return MotionPrior(tuple(weights))
-
-
 def linearise(rows: Rows, camera: CameraState, path: Trajectory, columns: int = CAMERA_PARAMETERS) -> Linearised:
     """Residuals of the used rows and their derivatives by the point (n, 2, 3) and the camera (n, 2, columns)."""
     pixels = rows.pixels[rows.use]
@@ -276,7 +244,7 @@ def build_system(problem: Problem, state: State, prior: MotionPrior, robust: boo
     cost = 0.0
     for label, path in enumerate(state.trajectories):
         part = slice(bases[label], bases[label + 1])
-        band, gradient, value = _motion_terms(path, prior.weights[label])
+        band, gradient, value = motion_terms(path, prior.weights[label], prior.scales[label] if prior.scales else None)
         system.band[:, part] += band
         system.gradient_path[part] += gradient
         cost += value
@@ -322,16 +290,6 @@ def _outer(left: Floats, right: Floats) -> Floats:
     out = left[:, 0, :, None] * right[:, 0, None, :]
     out += left[:, 1, :, None] * right[:, 1, None, :]
     return out
-
-
-def _motion_terms(path: Trajectory, weight: Floats) -> tuple[Floats, Floats, float]:
-    band = third_difference_band(path.basis, weight)
-    differences = third_differences(path.basis, path.control)
-    pulls = weight[:, None] * differences
-    index = path.basis.interval_starts()
-    rows = np.tile(np.array([-1.0, 3.0, -3.0, 1.0]), (len(index), 1))
-    gradient = path_gradient(index, rows, pulls, 3 * path.basis.size)
-    return band, gradient, float((pulls * differences).sum())
 
 
 def _add_camera_priors(problem: Problem, state: State, system: BorderedSystem) -> float:

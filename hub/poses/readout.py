@@ -12,8 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from hub.poses.adjust import MotionPrior, build_system, gauge_tangent
+from hub.poses.adjust import build_system, gauge_tangent
 from hub.poses.linear import cho_solve_path, eliminate
+from hub.poses.motion import MotionPrior
 from hub.poses.problem import CAMERA_PARAMETERS, READOUT, Problem, State
 from hub.poses.sigma import together
 from protocols.geometry.types import Bools, Floats

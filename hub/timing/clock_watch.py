@@ -12,7 +12,7 @@ solved by itself.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -36,8 +36,8 @@ _NAME = 63
 class ClockEvent:
     """A new epoch of a camera's clock.
 
-    boot: its name from now on; before: the epoch that ended. step_s: new clock less old clock. std_s: of it.
-    rate: new rate over old one, less 1 (0 for a step).
+    boot: its name from now on; before: the epoch that ended. step_s: new clock less old clock, when it was told. std_s:
+    of it. rate: new rate over old one, less 1 (0 for a step). at_s: when it was told, on the new clock.
     """
 
     camera: str
@@ -47,6 +47,7 @@ class ClockEvent:
     step_s: float
     std_s: float
     rate: float = 0.0
+    at_s: float = 0.0
 
 
 @dataclass(slots=True)
@@ -91,7 +92,7 @@ class ClockWatch:
         event = self._step(clock, camera, sequence, frame, time, arrival)
         clock.last = (sequence, frame, time, arrival)
         if event is None and arrival is not None and self._bin(clock, time, arrival):
-            event = self._drift(clock, camera, sequence)
+            event = self._drift(clock, camera, sequence, time)
         if event is not None:
             self._events.append(event)
         return clock.epochs[-1][1], event
@@ -149,10 +150,11 @@ class ClockWatch:
             clock.bins[-1] = (clock.bins[-1][0], delay)
         return False
 
-    def _drift(self, clock: _Clock, camera: str, sequence: int) -> ClockEvent | None:
+    def _drift(self, clock: _Clock, camera: str, sequence: int, time: float) -> ClockEvent | None:
         done = np.array(list(clock.bins)[:-1])
         if len(done) < _RECENT + _BASE:
             return None
+        first = float(done[0, 0])
         done = done - done[0]
         base, recent = done[:-_RECENT], done[-_RECENT:]
         before, sigma_before = _slope(base)
@@ -163,7 +165,9 @@ class ClockWatch:
         change, sigma = now - before, float(np.sqrt(sigma_before**2 + sigma_now**2 + wander**2))
         if not max(DRIFT, _SIGMAS * sigma) < abs(change) < MOST_DRIFT:
             return None
-        return self._begin(clock, camera, "drift", sequence, 0.0, abs(change) * _RECENT * _BIN_S, -change)
+        shift, change = _bent(done, time - first)
+        event = self._begin(clock, camera, "drift", sequence, -shift, abs(change) * _BIN_S + sigma_now, -change)
+        return replace(event, at_s=clock.origin_ns * 1e-9 + time)
 
     def _begin(
         self,
@@ -181,6 +185,22 @@ class ClockWatch:
         clock.epochs.append((sequence, name))
         clock.bins.clear()
         return ClockEvent(camera, kind, before, name, step, float(std), rate)
+
+
+def _bent(bins: Floats, now: float) -> tuple[float, float]:
+    """How far delays (n, 2) have left their old line at time ``now``, and by how much they rise faster since they bent.
+
+    The line with one bend within the last _RECENT bins that fits best; its place is one of a grid, six to a bin.
+    """
+    time, delay = bins[:, 0], bins[:, 1]
+    best, found = np.inf, (0.0, 0.0)
+    for bend in np.linspace(time[-_RECENT - 1], time[-3], 6 * (_RECENT - 2) + 1):
+        rows = np.column_stack([np.ones_like(time), time, np.maximum(time - bend, 0.0)])
+        line = np.linalg.lstsq(rows, delay, rcond=None)[0]
+        left = float(((rows @ line - delay) ** 2).sum())
+        if left < best:
+            best, found = left, (float(line[2]) * (now - float(bend)), float(line[2]))
+    return found
 
 
 def _slope(bins: Floats) -> tuple[float, float]:

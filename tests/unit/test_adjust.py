@@ -9,7 +9,6 @@ import pytest
 
 from hub.poses import linear
 from hub.poses.adjust import (
-    MotionPrior,
     adjust,
     build_system,
     gauge_tangent,
@@ -19,6 +18,7 @@ from hub.poses.adjust import (
 )
 from hub.poses.covariance import _inverse_blocks
 from hub.poses.linear import BAND, BorderedSystem, eliminate, solve
+from hub.poses.motion import MotionPrior
 from hub.poses.problem import (
     ASPECT,
     CAMERA_PARAMETERS,

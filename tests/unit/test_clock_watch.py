@@ -7,7 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from hub.clock_epochs import ClockEpochs
 from hub.timing.clock_watch import ClockEvent, ClockWatch
+from protocols.clocks import TimeMap
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.calibration import Calibration, CameraCalibration
+from tests.rigs import random_lens, random_poses
 
 PERIOD_NS = 33_333_333
 
@@ -106,3 +111,29 @@ def test_frames_that_are_held_up_more_and_more_are_no_drift(seed: int) -> None:
         return 1.0 + float(np.interp(true, np.arange(200), wander)) + swamped * max(0.0, true - 60.0)
 
     assert _drifting(120.0, late) == []
+
+
+@pytest.mark.parametrize("ppm", [200.0, -200.0])
+def test_a_map_follows_a_drift_from_when_it_is_told(ppm: float) -> None:
+    """Until the new epoch is solved by itself the old map is bent as the clock was: within 1 ms 20 s later."""
+    rng = np.random.default_rng(8)
+    epochs, origin, changed = ClockEpochs(), 1.7e9, 30.0
+    shown = lambda true: true + 1e-6 * ppm * max(0.0, true - changed)  # noqa: E731
+    told = None
+    for frame in range(30 * 40):
+        true = frame / 30.0
+        message = pb.Observation(
+            camera="cam0", boot_id="b", sequence=frame, frame=frame, device_time_ns=round((origin + shown(true)) * 1e9)
+        )
+        _, event = epochs.sort(message, 5.0 + true + 2e-3 + float(rng.exponential(3e-4)))
+        told = true if told is None and event is not None else told
+    assert told is not None
+    time_map, pose = TimeMap(time_offset=-origin, clock_rate=1.0), random_poses(rng, 1)[0]
+    eye = CameraCalibration("cam0", random_lens(rng), pose, time_map, 1e-4, np.zeros(3), 0.5)
+    known = Calibration({"cam0": eye}, "cam1", "metric", "m", "joint", "1")
+    present, _ = epochs.present(known, {"cam0": "b"})
+    now = present.cameras["cam0"]
+    for true in (told, told + 10.0, told + 20.0):
+        off = now.time_map.clock_rate * (origin + shown(true)) + now.time_map.time_offset - true
+        assert abs(off) < 1e-3
+    assert now.time_offset_std > 1e-4

@@ -9,7 +9,8 @@ import pytest
 
 from hub.calibrate import calibrate
 from hub.poses import covariance as cov
-from hub.poses.adjust import MotionPrior, adjust
+from hub.poses.adjust import adjust
+from hub.poses.motion import MotionPrior
 from hub.poses.problem import CAMERA_PARAMETERS, CameraState, Problem, Rows, State, Trajectory
 from hub.splines import SplineBasis, fit_spline
 from protocols.geometry.types import Floats
