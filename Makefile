@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 
-.PHONY: demo test lint types contracts check proto lock bench faults fuzz soak browser clean
+.PHONY: demo test lint types contracts check proto lock bench benches faults fuzz soak browser clean
 
 demo: $(STAMP)
 	$(BIN)/syncline demo --out demo-out
@@ -30,8 +30,18 @@ contracts: $(STAMP)
 
 check: test lint types contracts
 
-bench: $(STAMP)
-	$(BIN)/python -m tests.bench $(if $(QUICK),--quick) --data $(DATA)
+# Speed and scale beside what a user would pick, one table: `make bench`, `make bench QUICK=1`, `make bench KEEP=1`.
+# The peers (extra `bench`, opencv-contrib in a folder of its own) are fetched once; what cannot be had is left out.
+bench: $(STAMP) $(VENV)/.peers
+	$(BIN)/python -m tests.bench $(if $(QUICK),--quick) $(if $(KEEP),--keep) --data $(DATA)
+
+$(VENV)/.peers: $(STAMP)
+	-$(BIN)/python -m tests.bench.peers
+	@touch $@
+
+# How good the answers are: every bench of accuracy in turn.
+benches: $(STAMP)
+	$(BIN)/python -m tests.bench.every $(if $(QUICK),--quick) --data $(DATA)
 
 # Faults of links, processes, clocks, cameras, disks; enemies with and without certificates: the matrix with its figures.
 faults: $(STAMP)

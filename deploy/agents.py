@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from deploy.config import CameraConfig, HubConfig, OakConfig, PiConfig, SimulatedConfig, UsbConfig
-from deploy.outputs import write_outputs, write_refusal
+from deploy.heap import trim
 from edge.detectors.base import Detector
 from edge.devices.base import Device
 from protocols.bus.base import Bus
@@ -116,7 +116,8 @@ def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable
     settings = LiveSettings(config.window_s, config.interval_s, solve=config.solve, track=config.track)
     hub = LiveHub(settings, rig, None if known is not None else nodes, known)
     export = None if config.out is None else partial(_export, out=config.out)
-    run_hub(hub, bus, config.id, stop, rig=rig, beat=beat, export=export)
+    # A solve leaves holes behind it, which would add up.
+    run_hub(hub, bus, config.id, stop, rig=rig, beat=beat, export=export, solved=lambda _: trim())
     if config.out is not None:
         write_last(hub, config.out)
     return EXIT_DONE
@@ -133,6 +134,8 @@ def _export(hub: object, out: Path) -> str:
 
 def write_last(hub: object, out: Path) -> None:
     """The hub's last answer, or its last refusal, as the files that `calibrate` writes."""
+    # Only here: with it comes the report, which costs a camera agent a fifth of a second of its start.
+    from deploy.outputs import write_outputs, write_refusal
     from hub.live import LiveHub
 
     assert isinstance(hub, LiveHub)

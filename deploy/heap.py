@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from contextlib import suppress
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of glibc's mallopt
 _ARENAS = 2
@@ -26,3 +27,9 @@ def steady_heap(*, give_back: bool) -> bool:
     if give_back:
         done = bool(set_option(_MMAP_THRESHOLD, _LARGE)) and bool(set_option(_TRIM_THRESHOLD, _LARGE)) and done
     return done
+
+
+def trim() -> None:
+    """Give free pages back to the system, also those between blocks that are in use; about a millisecond."""
+    with suppress(AttributeError, OSError):
+        ctypes.CDLL(None).malloc_trim(0)

@@ -95,8 +95,10 @@ def write_refusal(
     )
     if echo_json:
         print(json.dumps(document, allow_nan=False))
-    else:
-        print_advice(rig, observations)
+        return
+    for warning in (*warnings, *refusal.warnings):
+        print(f"warning: {warning}")
+    print_advice(rig, observations)
 
 
 def wide_console(markup: bool = False) -> Any:

@@ -16,10 +16,11 @@ import cv2
 import tomli_w
 
 from deploy.detecting import MARKER_FILE, Found, detect_in, marker_detector, observations_text, read_marker
-from edge.detectors.marker import MarkerModel
+from edge.detectors.marker import REVISION, MarkerModel
 from edge.devices.film import VIDEO_SUFFIXES, Film, has_pyav
 from protocols.errors import InputError
 from protocols.files import write_together
+from protocols.geometry.camera import Intrinsics
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, read_folder
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, read_rig, read_toml
@@ -128,7 +129,13 @@ def gather_session(
         warnings += [f"{video.path.name}: {warning}" for warning in one.warnings]
         if not one.rows and not several:
             warnings.append(f"{video.path.name}: no {detector} in any of its frames")
-        tables[video.camera] = _table(video, one, tables.get(video.camera, {}), warnings)
+        table = _table(video, one, tables.get(video.camera, {}), warnings)
+        lens = _measured_lens(given, video.camera)
+        # A ball's centre is not its outline's: with no lens to move it by, the solver does it with the one it finds.
+        table.pop("ball_outline", None)
+        if detector == "marker" and (lens is None or (lens.width, lens.height) != one.size):
+            table["ball_outline"] = True
+        tables[video.camera] = table
     metadata = tables.pop("metadata", {})
     # Keys of [metadata] must not land in the last camera's table: it goes first.
     rig_text = tomli_w.dumps({"metadata": metadata, **tables} if metadata else tables)
@@ -168,6 +175,13 @@ def _given_rig(folder: Path) -> tuple[Rig | None, dict[str, Any]]:
     return rig, tables if metadata is None else {**tables, "metadata": metadata}
 
 
+def _measured_lens(given: Rig | None, camera: str) -> Intrinsics | None:
+    """A camera's lens as far as it was measured: a guess says nothing of a picture's pixels."""
+    if given is None or camera not in given.cameras or given.cameras[camera].focal_std > 0.0:
+        return None
+    return given.cameras[camera].intrinsics
+
+
 def _table(video: VideoFile, found: Found, given: dict[str, Any], warnings: list[str]) -> dict[str, Any]:
     """A camera's table of rig.toml: what is given, completed by what the video tells."""
     table = {"name": video.camera, "size": list(found.size), "fps": found.fps, **given}
@@ -204,7 +218,7 @@ def _detect_all(
             tell(f"{video.path.name} {text}", sum(shares.values()) / len(shares))
 
     def look(video: VideoFile) -> None:
-        lens = given.cameras[video.camera].intrinsics if given and video.camera in given.cameras else None
+        lens = _measured_lens(given, video.camera)
         told_lens = None if lens is None else [lens.matrix.tolist(), lens.distortions.tolist()]
         key = _key(video, model if kind == "marker" else None, told_lens, kind)
         before = _kept(session, video.camera, state.get(video.camera), key)
@@ -271,7 +285,7 @@ def _several(found: Found) -> int:
 
 def _key(video: VideoFile, model: MarkerModel | None, lens: Any, kind: str) -> str:
     """Changes with whatever changes a video's detections."""
-    table = None if model is None else model.to_table()
+    table = None if model is None else {"revision": REVISION, **model.to_table()}
     about = [VERSION, has_pyav(), video.path.name, video.size, video.mtime_ns, table, lens, kind]
     return hashlib.sha256(json.dumps(about).encode()).hexdigest()
 

@@ -115,6 +115,9 @@ def _load(
             for line in () if quiet else gathered.told:
                 print(line)
             return gathered.rig, gathered.observations, gathered.warnings
+        if not (session / "rig.toml").exists():
+            remedy = "put one video a camera in it, or rig.toml and observations.csv"
+            raise InputError("this folder holds neither videos nor a session", file=session, remedy=remedy)
     if marker is not None:
         raise InputError("--marker goes with a folder of videos", remedy="leave it out for a session")
     if detector != "marker":

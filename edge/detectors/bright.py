@@ -87,9 +87,10 @@ class BrightDetector:
         x0, y0, x1, y1 = left - margin, top - margin, left + w + margin, top + h + margin
         if x0 < 0 or y0 < 0 or x1 > level.shape[1] or y1 > level.shape[0]:
             return None  # cut by the border, or so near to it that its background is unknown
-        patch = level[y0:y1, x0:x1].astype(np.float64)
-        y, x = np.mgrid[: patch.shape[0], : patch.shape[1]].astype(np.float64)
-        own = _blob_at(patch > self._model.threshold, margin, w, h)
+        brightest = level[y0:y1, x0:x1]
+        channels = np.moveaxis(image[y0:y1, x0:x1].astype(np.float64), 2, 0)
+        y, x = np.mgrid[: brightest.shape[0], : brightest.shape[1]].astype(np.float64)
+        own = _blob_at(brightest > self._model.threshold, margin, w, h)
         for _ in range(_PASSES):
             shape = _Ellipse.of(own, x, y)
             if shape.aspect > _MAX_ASPECT:
@@ -97,28 +98,34 @@ class BrightDetector:
             distance = shape.distance(x, y)
             edge = _GAP + 0.25 * shape.width
             ring = (distance > edge) & (distance <= edge + _RING)
-            background, noise = _plane(patch, x, y, ring)
             inside = distance <= edge
-            above = np.where(inside, patch - background, 0.0)
-            contrast = float(above.max(initial=0.0))
+            background = np.stack([_plane(channel, x, y, ring) for channel in channels])
+            stray = channels - background
+            # Each channel counts by what the light adds to it: its background errs apart from the others'.
+            peaks = np.maximum(stray[:, inside].max(axis=1), 0.0)
+            share = peaks / max(float(peaks.sum()), 1e-9)
+            contrast = float(share @ peaks)
             if contrast < _MIN_CONTRAST:
                 return None
             # The threshold cuts a smear where it will; its own half height is the same at both ends.
-            own = _blob_at((patch - background > _HALF * contrast) & (distance <= edge + _RING), margin, w, h)
+            light = np.tensordot(share, stray, axes=1)
+            own = _blob_at((light > _HALF * contrast) & (distance <= edge + _RING), margin, w, h)
             if not own.any():
                 return None
-        if float(patch[inside].max()) >= _WHITE:
-            # Clipped, it is as bright everywhere; without its background it would lean to where that is darker.
-            above = np.minimum(above, _WHITE - float(background[inside].max()))
-        excess = np.maximum(above - _CUT * contrast, 0.0)
+        # Texture counts as noise here, also what was outvoted: nobody knows how it goes on behind the spot.
+        noise = float(np.sqrt(np.mean(light[ring] ** 2)))
+        # A clipped channel is as bright everywhere; without its background it would lean to where that is darker.
+        flat = np.where(channels[:, inside].max(axis=1) >= _WHITE, _WHITE - background[:, inside].max(axis=1), np.inf)
+        above = np.where(inside, np.tensordot(share, np.minimum(stray, flat[:, None, None]), axes=1), 0.0)
+        excess = np.maximum(above - _CUT * float(above.max()), 0.0)
         mass = float(excess.sum())
         if mass <= 0.0:
             return None
         # A lamp behind glass, a window's corner: what surrounds a point of light is as dark as what lies farther out.
-        around = float(np.median(patch[ring]))
+        around = float(np.median(brightest[ring]))
         if _beyond(level, x0, y0, x1, y1) < around - _FLARE * contrast:
             return None
-        if float((patch[ring] > self._model.threshold).mean()) > 0.02:
+        if float((brightest[ring] > self._model.threshold).mean()) > 0.02:
             return None  # part of something larger
         area = int(own.sum())
         u, v = float((excess * x).sum() / mass), float((excess * y).sum() / mass)
@@ -134,7 +141,7 @@ class BrightDetector:
             score=float(np.clip(contrast / 255.0, 0.0, 1.0) * min(fill, 1.0)),
             label=self._model.label,
             colour=(round(colour[2]), round(colour[1]), round(colour[0])),
-            covariance=_covariance(excess, ring, x - u, y - v, mass, noise),
+            covariance=_covariance(excess, ring, x - u, y - v, mass, noise, _SENSOR_STD * float(np.linalg.norm(share))),
             kind="marker",
         )
 
@@ -201,21 +208,19 @@ def _blob_at(mask: npt.NDArray[np.bool_], margin: int, w: int, h: int) -> npt.ND
     return np.asarray(touched[labels], dtype=np.bool_)
 
 
-def _plane(patch: Floats, x: Floats, y: Floats, ring: npt.NDArray[np.bool_]) -> tuple[Floats, float]:
-    """Background (h, w) of a patch as a plane through its ring, robustly, and the scatter about it."""
+def _plane(patch: Floats, x: Floats, y: Floats, ring: npt.NDArray[np.bool_]) -> Floats:
+    """Background (h, w) of a patch as a plane through its ring, robustly."""
     basis = np.stack([np.ones(int(ring.sum())), x[ring] - x.mean(), y[ring] - y.mean()], axis=1)
     values = patch[ring]
     weight = np.ones_like(values)
-    model, scale = np.zeros(3), 0.0
+    model = np.zeros(3)
     for _ in range(4):
         weighted = basis * weight[:, None]
         model = np.linalg.solve(weighted.T @ basis + 1e-6 * np.eye(3), weighted.T @ values)
         stray = values - basis @ model
         scale = 1.4826 * float(np.median(np.abs(stray))) + 0.3
         weight = 1.0 / (1.0 + (stray / (2.0 * scale)) ** 2) ** 2
-    # Texture counts as noise here, also what was outvoted: nobody knows how it goes on behind the spot.
-    scale = max(scale, float(np.sqrt(np.mean((values - basis @ model) ** 2))))
-    return model[0] + model[1] * (x - x.mean()) + model[2] * (y - y.mean()), scale
+    return np.asarray(model[0] + model[1] * (x - x.mean()) + model[2] * (y - y.mean()))
 
 
 def _beyond(level: npt.NDArray[np.uint8], x0: int, y0: int, x1: int, y1: int) -> float:
@@ -235,14 +240,15 @@ def _covariance(
     y: Floats,
     mass: float,
     noise: float,
+    sensor: float,
 ) -> tuple[float, float, float]:
-    """(uu, uv, vv) [px²] of a centroid; x, y: of each pixel from it.
+    """(uu, uv, vv) [px²] of a centroid; x, y: of each pixel from it. sensor: the part of ``noise`` that is no texture.
 
     Each pixel's grey level errs by itself and moves the centroid by its own distance; the background errs as a whole
     as much as its plane is uncertain, and moves it by the sum of all distances.
     """
     # What the ring scatters beyond the sensor's noise is texture, which errs in patches and not pixel by pixel.
-    texture = max(noise * noise - _SENSOR_STD**2, 0.0)
+    texture = max(noise * noise - sensor**2, 0.0)
     patchy = noise * noise + (_PATCH - 1.0) * texture
     variance = patchy + _QUANTUM + (_UNEVEN * np.abs(excess)) ** 2
     arms = np.stack([x, y]) * (excess > 0.0) / mass

@@ -21,17 +21,17 @@ from edge.detectors.base import Detection, Prediction
 from edge.detectors.colour import ColourModel, codes, taught
 from edge.detectors.outline import measure_outline
 from protocols.errors import InputError
+from protocols.geometry.ball import outline_to_centre
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools
 
+REVISION = 2
+"""Of what is measured: kept detections of another revision are not this detector's."""
 _STEP = 2  # of the coarse pass [px]
 _CANDIDATES = 6  # blobs that are measured, largest first
 _MIN_AREA = 6.0  # px²: below, colour noise looks like that
 _MAX_SHARE = 0.2  # of the image: above, it is a wall
 _MIN_SCORE = 0.35
-_WIDEST_BALL = 0.3  # tan of half its angle: beyond, a camera stands next to it
-_TURN = 2.0 * np.pi * np.arange(24) / 24
-_RIM = np.column_stack([np.cos(_TURN), np.sin(_TURN)])
 _BOX = cv2.getStructuringElement(cv2.MORPH_RECT, (3, 3))
 
 
@@ -90,7 +90,7 @@ class MarkerDetector:
     """Finds the marker in single pictures.
 
     model: what it looks like. intrinsics: where given, the centre is corrected from that of the ball's
-    outline to the projection of its centre, which differ by perspective and distortion (``_outline_to_centre``).
+    outline to the projection of its centre, which differ by perspective and distortion (``outline_to_centre``).
     most: how many blobs at the most are reported, best first; one marker is one.
     min_size, max_size: diameters [px] outside of which a blob is not the marker.
     """
@@ -156,7 +156,8 @@ class MarkerDetector:
             return None
         centre, covariance = outline.centre, outline.covariance
         if self._intrinsics is not None:
-            centre = _outline_to_centre(centre, outline.diameter, self._intrinsics)
+            sizes = np.array([outline.diameter])
+            centre = outline_to_centre(centre[None], sizes, self._intrinsics)[0]
         blue, green, red = patch[mask > 0].mean(axis=0)
         return Detection(
             u=float(centre[0]),
@@ -187,28 +188,3 @@ def _solidity(moments: dict[str, float]) -> float:
     spread = np.array([[moments["mu20"], moments["mu11"]], [moments["mu11"], moments["mu02"]]]) / area
     ellipse = 4.0 * np.pi * np.sqrt(np.linalg.det(spread + np.eye(2) / 12.0))
     return float(min(area / ellipse, 1.0))
-
-
-def _outline_to_centre(centre: Floats, size: float, lens: Intrinsics) -> Floats:
-    """From the centre (2,) [px] of a ball's outline to the projection of the ball's centre.
-
-    The cone around a ball goes through the whole lens, not through its slope alone: a pinhole's picture of it is an
-    ellipse whose centre lies farther out than the ball's, barrel distortion takes some of that back, and a fisheye
-    nearly all of it. size: diameter of the disc of equal area [px].
-    """
-    x, y = lens.unproject(centre[None])[0]
-    towards = np.array([x, y, 1.0])
-    secant = float(np.linalg.norm(towards))
-    slope = abs(float(np.linalg.det(lens.pixel_jacobian(towards[None, :2])[0])))
-    # A small solid angle w is sec³ w in normalised coordinates.
-    spread = 0.5 * size / np.sqrt(slope * secant**3)  # tan of the cone's half-angle
-    if not (np.isfinite(spread) and spread < _WIDEST_BALL):
-        return centre
-    across = np.array([1.0, 0.0, -x]) / np.hypot(1.0, x)
-    along = np.cross(towards / secant, across)
-    rim = lens.project(towards / secant + spread * (_RIM @ np.stack([across, along]))) - centre
-    if not np.isfinite(rim).all():
-        return centre
-    following = np.roll(rim, -1, axis=0)
-    area = rim[:, 0] * following[:, 1] - rim[:, 1] * following[:, 0]
-    return np.asarray(centre - area @ (rim + following) / (3.0 * area.sum()))

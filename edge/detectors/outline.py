@@ -30,10 +30,17 @@ _FLOOR_SHADE = 0.003  # and its share of the radius: shading that the model of a
 _FLOOR_SMEAR = 0.015  # and its share of a smeared rim's width
 _SHARP = 2.5  # px that noise and sampling make of a sharp rim
 _CORRELATION = 2.0  # px along the rim within which rays err together
+_CHROMA = 0.6  # how much colour differences count against luma: cameras and encoders tell them at half the resolution
+
+_COLOUR_STD = 1.6  # of ball's and background's colours at a rim, over a part of it [8-bit steps]
+_ALIKE_ANGLE = 0.6  # rad along the rim over which such errors are alike
 
 _ANGLE = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
 _DIRECTION = np.column_stack([np.cos(_ANGLE), np.sin(_ANGLE)])
+_LUMA = np.array([[0.114, 0.587, 0.299], [0.5, -0.331, -0.169], [-0.081, -0.419, 0.5]])  # Y, Cb, Cr of BGR
+_METRIC = (_LUMA / np.linalg.norm(_LUMA, axis=1)[:, None] * np.array([[1.0], [_CHROMA], [_CHROMA]])).T
 _DESIGN = np.column_stack([np.ones(_RAYS), np.cos(_ANGLE), np.sin(_ANGLE), np.cos(2.0 * _ANGLE), np.sin(2.0 * _ANGLE)])
+_ALIKE = np.exp((np.cos(_ANGLE[:, None] - _ANGLE) - 1.0) / _ALIKE_ANGLE**2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,13 +67,14 @@ def measure_outline(image: npt.NDArray[np.uint8], centre: Floats, radius: float)
     centre = np.asarray(centre, dtype=np.float64).copy()
     shape = np.array([radius, 0.0, 0.0])  # mean radius and its second harmonic
     width = np.full(_RAYS, 1.0 + 0.5 * radius)  # of the rim; generous until it has been seen
+    doubt = np.zeros(_RAYS)
     weight = np.ones(_RAYS)
     residual = np.zeros(_RAYS)
     spread = 0.0
     for index in range(_PASSES):
         rim = _DESIGN[:, [0, 3, 4]] @ shape
         half = np.minimum(1.25 + 0.6 * width, 0.75 * rim + 1.0)
-        offset, seen = _rims(image, centre, rim, half)
+        offset, seen, doubt = _rims(image, centre, rim, half)
         if offset is None:
             return None
         correction, weight, residual, spread = _fit(offset, np.maximum(seen, 1.5))
@@ -79,7 +87,7 @@ def measure_outline(image: npt.NDArray[np.uint8], centre: Floats, radius: float)
             return None
         width = _opposite_mean(seen)
     rim = _DESIGN[:, [0, 3, 4]] @ shape
-    covariance = _covariance(weight, spread, width, float(shape[0]))
+    covariance = _covariance(weight, spread, width, float(shape[0]), doubt)
     return Outline(
         centre=centre,
         diameter=float(2.0 * np.sqrt(np.mean(rim * rim))),
@@ -90,8 +98,10 @@ def measure_outline(image: npt.NDArray[np.uint8], centre: Floats, radius: float)
     )
 
 
-def _rims(image: npt.NDArray[np.uint8], centre: Floats, rim: Floats, half: Floats) -> tuple[Floats | None, Floats]:
-    """Where the rim is on each ray, relative to ``rim`` (n,) [px], and how wide (n,) [px].
+def _rims(
+    image: npt.NDArray[np.uint8], centre: Floats, rim: Floats, half: Floats
+) -> tuple[Floats | None, Floats, Floats]:
+    """Where the rim is on each ray, relative to ``rim`` (n,) [px], how wide (n,) [px], and how doubtful (n,) [px].
 
     half: (n,) half-width of the part of a ray that may be mixed [px].
     """
@@ -106,14 +116,14 @@ def _rims(image: npt.NDArray[np.uint8], centre: Floats, rim: Floats, half: Float
     right, bottom = int(x.max()) + 3, int(y.max()) + 3
     crop = image[top:bottom, left:right]
     if crop.shape[0] < 4 or crop.shape[1] < 4:
-        return None, half
+        return None, half, half
     samples = cv2.remap(crop, x - left, y - top, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     colour = samples.astype(np.float64)
     pure = along <= -half[:, None]
     pure |= radius < 0.4 * rim[:, None]  # of a ball smeared by its own diameter the middle is the best there is
     pure &= radius > 0.0
     if pure.sum() < _FEWEST:
-        return None, half
+        return None, half, half
     front = _shaded(colour, radius / rim[:, None], pure)
     beyond = (along >= half[:, None]) & (along <= half[:, None] + _OUTER_BAND)
     behind = _band_mean(colour, beyond, 1)
@@ -122,15 +132,28 @@ def _rims(image: npt.NDArray[np.uint8], centre: Floats, rim: Floats, half: Float
     share = np.clip((half[:, None] - np.abs(along)) / _STEP + 0.5, 0.0, 1.0) * _STEP
     covered = (cover * share).sum(axis=1)
     mixed = (np.clip(cover * (1.0 - cover), 0.0, None) * share).sum(axis=1)
-    return covered - 0.5 * share.sum(axis=1), 6.0 * mixed  # a ramp of width w holds w / 6
+    doubt = _doubt(front[:, np.searchsorted(along, 0.0)], behind) * half
+    return covered - 0.5 * share.sum(axis=1), 6.0 * mixed, doubt  # a ramp of width w holds w / 6
+
+
+def _doubt(front: Floats, behind: Floats) -> Floats:
+    """Std (n,) of the share by colours (n, 3) that are wrong by `_COLOUR_STD`: large where the two are alike."""
+    front, behind = front @ _METRIC, behind @ _METRIC
+    loose = (_PIXEL_STD / _SHADE_STD) ** 2
+    ff = (front * front).sum(axis=-1) + loose
+    bb = (behind * behind).sum(axis=-1) + loose
+    fb = (front * behind).sum(axis=-1) + loose
+    return np.asarray(_COLOUR_STD * np.sqrt((ff + bb + 2.0 * fb) / np.maximum(4.0 * (ff * bb - fb * fb), 1e-6)))
 
 
 def _mixture(colour: Floats, front: Floats, behind: Floats) -> Floats:
     """Share of ``front`` in colours (…, 3) mixed of front and behind.
 
     Least squares for ``colour = p front + q behind`` with p + q near 1, share = p / (p + q): brightness of the
-    ball (shading) and of the background (texture) may stray along the ray without moving the rim.
+    ball (shading) and of the background (texture) may stray along the ray without moving the rim. Luma counts more than
+    chroma: a Bayer sensor and every video tell colours at half the resolution, and encoders blur their edges.
     """
+    colour, front, behind = colour @ _METRIC, front @ _METRIC, behind @ _METRIC
     loose = (_PIXEL_STD / _SHADE_STD) ** 2
     ff = (front * front).sum(axis=-1) + loose
     bb = (behind * behind).sum(axis=-1) + loose
@@ -211,12 +234,15 @@ def _fit(offset: Floats, width: Floats) -> tuple[Floats, Floats, Floats, float]:
     return coefficients, weight, residual, spread
 
 
-def _covariance(weight: Floats, spread: float, width: Floats, radius: float) -> Floats:
-    """Covariance (2, 2) of the centre [px²] from the scatter of the rims about the curve."""
+def _covariance(weight: Floats, spread: float, width: Floats, radius: float, doubt: Floats) -> Floats:
+    """Covariance (2, 2) of the centre [px²] from the scatter of the rims about the curve, and from what neighbouring
+    rays may err alike: ``doubt`` (n,) [px].
+    """
     prior = width.mean() / np.maximum(width, 1.5)
     together = max(1.0, _CORRELATION * _RAYS / (2.0 * np.pi * radius))
     effective = np.minimum(weight, prior)
     information = (_DESIGN * effective[:, None]).T @ _DESIGN
-    covariance = np.linalg.inv(information + 1e-9 * np.eye(5))[1:3, 1:3]
+    inverse = np.linalg.inv(information + 1e-9 * np.eye(5))
+    alike = ((inverse @ (_DESIGN * effective[:, None]).T)[1:3]) * doubt
     floor = _FLOOR_PX**2 + (_FLOOR_SHADE * radius) ** 2 + (_FLOOR_SMEAR * max(float(width.max()) - _SHARP, 0.0)) ** 2
-    return np.asarray(spread**2 * together * covariance + floor * np.eye(2))
+    return np.asarray(spread**2 * together * inverse[1:3, 1:3] + alike @ _ALIKE @ alike.T + floor * np.eye(2))

@@ -1,100 +1,141 @@
-"""Every bench in turn, each in a process of its own: `make bench`, `make bench QUICK=1`, `make bench DATA=FOLDER`.
+"""Speed and scale beside what a user would pick for the same work: one table, all in one run.
 
-    python -m tests.bench [--quick] [--data FOLDER] [--only pair_timing,poses]
+    python -m tests.bench [--quick] [--data FOLDER] [--only timing,joint] [--keep] [--json FILE]
 
-Quick: fewer trials, a few minutes. Benches that need recordings say so where FOLDER has none. Leaves with status
-1 if a bench did: figures that are missed, or a bench that could not be run.
+`make bench`, `make bench QUICK=1`, `make bench KEEP=1`. Each section runs in a process of its own, one after the other.
+Ratio: how many times better ours is, above 1 we are ahead; CPU seconds wherever a process computes, wall where
+processes talk or start. Every run is written to bench-out/ with the machine's facts; --keep makes it the one that later
+runs are compared with (tests/bench/kept/): what fell by more than a fifth is shown. What was not run is told, and why.
+Leaves with status 1 if a section could not be run at all; a missed figure is a figure.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
-import platform
 import subprocess
 import sys
+import tempfile
 import time
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from tests.bench.real_rigs import DEFAULT_DATA, REPOSITORY
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
 
+from tests.bench.peers import CONTRIB  # noqa: E402
+from tests.bench.real_rigs import DEFAULT_DATA, REPOSITORY  # noqa: E402
+from tests.bench.speed.rows import Section, fallen, machine, table  # noqa: E402
 
-@dataclass(frozen=True, slots=True)
-class Bench:
-    """quick, full: arguments. data: whether it takes --data."""
-
-    what: str
-    quick: tuple[str, ...] = ()
-    full: tuple[str, ...] = ()
-    data: bool = False
-
-
-BENCHES = {
-    "marker_detector": Bench("marker detector on rendered frames", ("--quick",)),
-    "pair_timing": Bench(
-        "two cameras over random rigs",
-        ("--trials", "10", "--strangers", "1", "--regimes", "clean,dropped,10 %,30/25,everything,overlap"),
-        ("--jobs", "2"),
-    ),
-    "real_rigs": Bench("drone flights and webcams", data=True),
-    "simulated_rigs": Bench(
-        "five cameras, twenty cameras, pairs cut short",
-        ("--sessions", "4", "--seconds", "120", "--only", "five,twenty"),
-        data=True,
-    ),
-    "video_folder": Bench(
-        "a folder of videos, with and without measured lenses",
-        ("--seconds", "15", "--cameras", "4", "--size", "640x360"),
-    ),
-    "waving": Bench("how long and how fast a marker is waved", ("--seeds", "1")),
-    "lenses": Bench("focal lengths that nobody measured", ("--sessions", "3")),
-    "poses": Bench("distributed poses against the joint optimum", ("--quick", "--rows", "section4,bearings")),
-    "logs": Bench("logs: rates, kill -9, damage", ("--quick",)),
-    "view": Bench("help, first calibration, first paint, what watching costs", ("--quick",)),
-    "people_detector": Bench("people before one camera, beside MOG2 alone", ("--seeds", "1", "--seconds", "20")),
-    "people_tracking": Bench(
-        "people followed, what clocks are worth, walkers as markers", ("--quick", "--seconds", "30")
-    ),
-    "uav_tracker": Bench(
-        "one car from a drone, simulated",
-        ("--seeds", "1", "--models", "ground", "--scenarios", "exit-bend,exit-straight"),
-        ("--jobs", "2"),
-    ),
-    "uav_agent": Bench(
-        "UAV agent: latency, clocks, closed loops", ("--only", "latency,offset", "--seeds", "1"), data=True
-    ),
-    "uav_aerial": Bench("one car from a drone, real video", ("--models", "ground"), data=True),
+SECTIONS = {
+    "timing": "two cameras that share no clock",
+    "drones": "two recorded flights, the whole command",
+    "joint": "ten cameras adjusted together",
+    "nodes": "pose nodes",
+    "uav": "UAV tracker",
+    "detectors": "marker and person detectors",
+    "bus": "edge to hub",
+    "hubs": "a hub with up to 1,000 cameras",
+    "recorder": "recorder",
+    "processes": "memory and starts of real processes",
 }
+KEPT = Path(__file__).parent / "kept"
+_LONGEST_S = {True: 240.0, False: 3600.0}
+
+
+def run(name: str, quick: bool, data: Path, file: Path) -> Section | str:
+    """One section; the reason where it could not be run."""
+    command = [sys.executable, "-m", "tests.bench.speed", name, "--data", str(data), "--rows", str(file)]
+    path = [str(CONTRIB)] if name == "uav" and CONTRIB.is_dir() else []
+    path += [os.environ["PYTHONPATH"]] if os.environ.get("PYTHONPATH") else []
+    environment = {**os.environ, **({"PYTHONPATH": os.pathsep.join(path)} if path else {})}
+    try:
+        done = subprocess.run(
+            [*command, "--quick"] if quick else command,
+            cwd=REPOSITORY,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=_LONGEST_S[quick],
+        )
+    except subprocess.TimeoutExpired:
+        return f"not done after {_LONGEST_S[quick]:.0f} s"
+    if done.returncode != 0:
+        lines = done.stderr.strip().splitlines()
+        return f"status {done.returncode}: {lines[-1] if lines else ''}"
+    return Section.from_json(json.loads(file.read_text(encoding="utf-8")))
 
 
 def main() -> int:
+    """Run the sections, print the table, keep it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--data", type=Path, default=DEFAULT_DATA)
-    parser.add_argument("--only", default=",".join(BENCHES))
+    parser.add_argument("--quick", action="store_true", help="small work: within 3 minutes on an idle machine")
+    parser.add_argument("--data", type=Path, default=DEFAULT_DATA, help="folder of the recordings")
+    parser.add_argument("--only", default=",".join(SECTIONS), help="sections, by comma")
+    parser.add_argument("--keep", action="store_true", help="compare later runs with this one")
+    parser.add_argument("--json", type=Path, help="where to write the run; default bench-out/quick.json or full.json")
     options = parser.parse_args()
-    wanted = options.only.split(",")
-    unknown = [name for name in wanted if name not in BENCHES]
+    wanted = [name for name in options.only.split(",") if name]
+    unknown = [name for name in wanted if name not in SECTIONS]
     if unknown:
-        parser.error(f"no bench named {', '.join(unknown)}; there are {', '.join(BENCHES)}")
-    print(f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}")
-    failed = []
-    for name in wanted:
-        bench = BENCHES[name]
-        arguments = [*(bench.quick if options.quick else bench.full)]
-        if bench.data:
-            arguments += ["--data", str(options.data.resolve())]
-        shown = " ".join(["python -m", f"tests.bench.{name}", *(f'"{a}"' if " " in a else a for a in arguments)])
-        print(f"\n=== {bench.what}: {shown}", flush=True)
-        began = time.perf_counter()
-        status = subprocess.run([sys.executable, "-m", f"tests.bench.{name}", *arguments], cwd=REPOSITORY).returncode
-        if status:
-            failed.append(name)
-        print(f"=== {time.perf_counter() - began:.0f} s", flush=True)
-    if failed:
-        print(f"figures missed, or not run: {', '.join(failed)}")
+        parser.error(f"no section named {', '.join(unknown)}; there are {', '.join(SECTIONS)}")
+    facts = machine()
+    print(", ".join(f"{name} {value}" for name, value in facts.items()), flush=True)
+    whole, failed, began = Section(), [], time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        for name in wanted:
+            start = time.perf_counter()
+            found = run(name, options.quick, options.data.resolve(), Path(folder) / f"{name}.json")
+            print(f"{name}: {SECTIONS[name]}, {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
+            if isinstance(found, str):
+                failed.append(name)
+                whole.missing.append(f"{SECTIONS[name]} ({name}): {found}")
+            else:
+                whole.rows += found.rows
+                whole.missing += found.missing
+    for name in SECTIONS:
+        if name not in wanted:
+            whole.missing.append(f"{SECTIONS[name]} ({name}): not asked for")
+    facts["load_at_end"] = round(os.getloadavg()[0], 2)
+    print(f"\n{table(whole.rows)}\n")
+    for line in whole.missing:
+        print(f"not run: {line}")
+    missed = [row.key for row in whole.rows if row.holds(row.must) is False]
+    asked = sum(row.holds(row.must) is not None for row in whole.rows)
+    print(f"{asked - len(missed)} of {asked} musts met{': missed ' + '; '.join(missed) if missed else ''}")
+    load = facts["load_at_begin"]
+    print(f"{time.perf_counter() - began:.0f} s; load {load} at the begin, {facts['load_at_end']} at the end")
+    if load > 0.5 * (facts["cores"] or 1):
+        print("machine busy: ratios of one run can be compared, absolute times cannot")
+    _compare_and_keep(whole, facts, options)
     return 1 if failed else 0
+
+
+def _compare_and_keep(whole: Section, facts: dict[str, Any], options: argparse.Namespace) -> None:
+    kind = "quick" if options.quick else "full"
+    kept_file = KEPT / f"{kind}.json"
+    kept = json.loads(kept_file.read_text(encoding="utf-8")) if kept_file.is_file() else None
+    if kept is not None:
+        worse = fallen(whole.rows, kept["rows"])
+        where = f"the kept {kind} run ({kept['machine']['processor'] or kept['machine']['machine']})"
+        print(f"fell by more than a fifth against {where}:" if worse else f"nothing fell against {where}")
+        for line in worse:
+            print(f"  {line}")
+    rows = {row.key: row.kept() for row in whole.rows}
+    run_file = options.json or REPOSITORY / "bench-out" / f"{kind}.json"
+    run_file.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps({"machine": facts, "rows": rows, "not_run": whole.missing}, indent=1, ensure_ascii=False) + "\n"
+    run_file.write_text(text, encoding="utf-8")
+    print(f"written to {run_file}")
+    if options.keep:
+        # What was not run this time stays as it was kept.
+        merged = {**(kept["rows"] if kept else {}), **rows}
+        text = json.dumps({"machine": facts, "rows": merged, "not_run": whole.missing}, indent=1, ensure_ascii=False)
+        KEPT.mkdir(exist_ok=True)
+        kept_file.write_text(text + "\n", encoding="utf-8")
+        print(f"kept as {kept_file.relative_to(REPOSITORY)}")
 
 
 if __name__ == "__main__":

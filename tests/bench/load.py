@@ -36,13 +36,13 @@ def resident_mb(pid: int | str = "self") -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def hub(endpoint: str) -> None:
+def hub(endpoint: str, site: str = "local") -> None:
     """The hub's process: counts, latencies and memory as lines of JSON, one a second, until its input ends."""
     from hub.agent import settle_memory
     from hub.live import LiveHub, LiveSettings
 
     estimator = LiveHub(LiveSettings(window_s=10.0, interval_s=1e9))
-    with open_bus("local", BusConfig(mode="client", connect=(endpoint,)), timeout_s=10.0) as bus:
+    with open_bus(site, BusConfig(mode="client", connect=(endpoint,)), timeout_s=10.0) as bus:
         guarded = GuardedBus(bus, time.monotonic)
         subscriptions = [guarded.subscribe(topic) for topic in (CAMERA_INFO, OBSERVATION)]
         ended = threading.Event()
@@ -69,10 +69,10 @@ def hub(endpoint: str) -> None:
                 latencies, loop = [], [0.0]
 
 
-def feed(endpoint: str, cameras: int, rate: float, seconds: float) -> None:
+def feed(endpoint: str, cameras: int, rate: float, seconds: float, site: str = "local") -> None:
     """All cameras, in the order of their turn, each over one of ten sessions."""
     config = BusConfig(mode="client", connect=(endpoint,), outage_s=10.0)
-    buses = [open_bus("local", config, timeout_s=10.0) for _ in range(_SESSIONS)]
+    buses = [open_bus(site, config, timeout_s=10.0) for _ in range(_SESSIONS)]
     names = [f"cam{index:04d}" for index in range(cameras)]
     hz = rate / cameras
     publishers = [buses[i % _SESSIONS].publisher(OBSERVATION, name, rate_hz=hz) for i, name in enumerate(names)]
@@ -164,11 +164,12 @@ def main() -> None:
     parser.add_argument("--data")
     parser.add_argument("--role", choices=["hub", "feed"])
     parser.add_argument("--endpoint", default="")
+    parser.add_argument("--site", default="local")
     words = parser.parse_args()
     if words.role == "hub":
-        hub(words.endpoint)
+        hub(words.endpoint, words.site)
     elif words.role == "feed":
-        feed(words.endpoint, words.cameras, words.rate, words.seconds)
+        feed(words.endpoint, words.cameras, words.rate, words.seconds, words.site)
     else:
         found = measure(words.cameras, words.rate, 15.0 if words.quick else words.seconds)
         for name, value in found.items():

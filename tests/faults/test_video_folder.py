@@ -1,18 +1,23 @@
-"""A folder with a video that does not belong: whose marker moved on another day, before the same lenses.
+"""What is dear to try of folders of videos: one of another day among them, and lenses found from outlines.
 
-Here and not among the commands' tests because a camera that nothing ties is sought dearly, at every rate.
+Here and not among the commands' tests because a camera that nothing ties is sought dearly, at every rate, and because
+lenses that nobody measured are sought twice.
 """
 
 from __future__ import annotations
 
 import csv
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import tomli_w
 
 from deploy.cli import run
+from hub.calibrate import calibrate
 from tests.films import film_scene
+from tests.unit.test_ball_outline import ball_session
 
 
 def test_a_video_of_another_day_is_refused_by_name_and_the_rest_goes_on(tmp_path: Path) -> None:
@@ -30,3 +35,13 @@ def test_a_video_of_another_day_is_refused_by_name_and_the_rest_goes_on(tmp_path
     with (out / "session" / "observations.csv").open(newline="") as file:
         seen = [row for row in csv.DictReader(file) if row["camera"] == "yesterday"]
     assert len(seen) > 50  # the ball is in it: only the motion is another
+
+
+def test_without_any_lens_outlines_tell_the_same_lenses_as_centres() -> None:
+    full, seen = ball_session(0.25)
+    focal: list[list[float]] = []
+    for outline, observations in ((True, seen), (False, full.observations())):
+        cameras = {n: replace(c, intrinsics=None, ball_outline=outline) for n, c in full.rig.cameras.items()}
+        found = calibrate(replace(full.rig, cameras=cameras), observations)
+        focal.append([found.cameras[name].intrinsics.focal for name in full.rig.cameras])
+    assert np.abs(np.log(focal[0]) - np.log(focal[1])).max() < 3e-4  # taken as centres, they are 1e-3 apart

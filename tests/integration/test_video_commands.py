@@ -136,6 +136,14 @@ def test_a_lens_for_another_picture_size_is_not_used_and_told(tmp_path: Path, ca
     assert rig["a"]["size"] == [160, 32]
     assert "matrix" not in rig["a"]
     assert rig["metadata"] == {"units": "cm"}
+    assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 3
+    assert "warning: a.mp4 is 160x32" in capsys.readouterr().out  # also where nobody reads JSON
+
+
+def test_an_empty_folder_is_told_what_belongs_in_it(tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "videos").mkdir()
+    assert run(["calibrate", str(tmp_path / "videos"), "--out", str(tmp_path / "out")]) == 2
+    assert "neither videos nor a session" in capsys.readouterr().err
 
 
 def test_one_video_alone_is_told_at_once(tmp_path: Path, capsys: Capture) -> None:

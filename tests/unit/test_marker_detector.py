@@ -85,6 +85,19 @@ def test_pixel_convention_is_that_of_pixel_centres(u: float, v: float, radius: f
     assert found.colour == (pytest.approx(246, abs=30), pytest.approx(112, abs=20), pytest.approx(22, abs=30))
 
 
+def test_the_less_the_ball_stands_out_the_less_sure_its_centre_is() -> None:
+    clear = ball(128, 96, 60.5, 50.25, 12.0)
+    alike = clear.copy()
+    alike[:50][np.all(clear[:50] == 120, axis=2)] = (50, 90, 140)  # above, a wall of its hue
+    told = []
+    for image in (clear, alike, np.round(0.3 * clear).astype(np.uint8)):
+        (found,) = MarkerDetector().detect(image)
+        assert found.covariance is not None
+        told.append(found.covariance[0] + found.covariance[2])
+    assert told[1] > 1.2 * told[0]
+    assert told[2] > 2.0 * told[0]
+
+
 def test_a_ball_cut_by_the_border_is_not_reported() -> None:
     assert MarkerDetector().detect(ball(128, 96, 3.0, 40.0, 8.0)) == []
     assert MarkerDetector().detect(ball(128, 96, 60.0, 93.0, 8.0)) == []

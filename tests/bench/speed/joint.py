@@ -1,0 +1,259 @@
+"""The joint adjustment of ten cameras, beside scipy's and Ceres' least squares on the same cost from the same start.
+
+One spline path, ten poses, nine time maps; noise and motion prior held, so that all minimise one and the same sum. The
+start: true poses turned by 0.2° and shifted by 2 cm, clocks 2 ms off, the path triangulated from those. Each is
+timed until it stops; a peer that stops above our cost by more than 1e-4 of it is told so. Ceres is called from Python
+(pyceres, ``ceres.py``), so its residuals are made by our own vectorised code; what is compared is its CPU without any
+evaluation of residuals and derivatives, ours with.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.sparse import coo_array, csr_array
+
+from hub.poses.adjust import Linearised, MotionPrior, _minimise, build_system, linearise, motion_prior, moved
+from hub.poses.graph import ClockGraph, ClockGuess
+from hub.poses.initialise import _camera_state, settle
+from hub.poses.linear import THIRD_DIFFERENCE, third_differences
+from hub.poses.problem import CAMERA_PARAMETERS, GIVEN_PARAMETERS, RATE, Freedom, Problem, State
+from hub.prepare import prepare
+from protocols.geometry import so3
+from protocols.geometry.pose import Pose
+from protocols.geometry.types import Floats, Ints
+from tests import rigs
+from tests.bench.speed.rows import Limit, Row, Section
+
+_CAMERAS = 10
+SIGMA_PX = 0.5
+_EDGE_S = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """One problem and where it is begun."""
+
+    problem: Problem
+    start: State
+    prior: MotionPrior
+
+    @property
+    def rows(self) -> int:
+        """Observations that count."""
+        return sum(int(part.use.sum()) for part in self.problem.rows)
+
+    def cost(self, state: State) -> float:
+        """The sum that all minimise."""
+        return build_system(self.problem, state, self.prior, False)[1]
+
+
+def make(seed: int, seconds: float, cameras: int = _CAMERAS) -> Task:
+    """A rig of which everything is known, and a start that is a little off."""
+    rng = np.random.default_rng([seed, 16])
+    session = rigs.simulate(seed, cameras, seconds, fps=(30.0,), drops=0.0, late=0.5, noise=SIGMA_PX)
+    prepared = prepare(session.rig, session.observations())
+    clocks, poses, names = {}, {}, list(prepared.cameras)
+    for name, camera in prepared.cameras.items():
+        (track,) = camera.tracks.values()
+        true, epoch = session.clocks[name], prepared.epochs[name]
+        centre = float(np.mean(track.time[[0, -1]]))
+        offset = true.clock_rate * (centre + epoch) + true.time_offset + rng.normal(0, 2e-3)
+        clocks[name] = ClockGuess(true.clock_rate, offset, centre)
+        pose, turn = session.poses[name], so3.exp(np.radians(rng.normal(0, 0.2, 3)))
+        poses[name] = Pose(turn @ pose.rotation, pose.position + rng.normal(0, 0.02, 3))
+    apart = poses[names[1]].position - poses[names[0]].position
+    turn = _onto_x(apart)
+    poses = {name: Pose(pose.rotation @ turn.T, turn @ pose.position) for name, pose in poses.items()}
+    graph = ClockGraph(clocks, (), ())
+    placed = {name: _camera_state(prepared.cameras[name], graph, poses[name]) for name in poses}
+    scaffold = settle(prepared.cameras, placed, prepared.rows, prepared.labels, (names[0], names[1]), None)
+    state = replace(scaffold.state, sigma=np.full(len(names), SIGMA_PX))
+    problem = replace(scaffold.problem, freedom=Freedom())
+    basis = state.trajectories[0].basis
+    rows = []
+    for part in problem.rows:
+        at = state.cameras[part.camera].reference_time(part.time)
+        rows.append(part.using((at > basis.begin + _EDGE_S) & (at < basis.end - _EDGE_S)))
+    problem = replace(problem, rows=tuple(rows))
+    return Task(problem, state, motion_prior(problem, state))
+
+
+def _onto_x(direction: Floats) -> Floats:
+    """A rotation (3, 3) that brings a direction onto the x axis."""
+    x = direction / np.linalg.norm(direction)
+    y = np.cross(x, [0.0, 0.0, 1.0])
+    y /= np.linalg.norm(y)
+    return np.stack([x, y, np.cross(x, y)])
+
+
+def ours(task: Task) -> State:
+    """The same loop as `adjust` runs, to its fine end."""
+    return _minimise(task.problem, task.start, task.prior, False, 40, 1e-7, [], False)
+
+
+class Stacked:
+    """The same sum as a vector of residuals over one vector of steps from the start: path first, then cameras."""
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        columns = task.problem.free_columns()
+        # What holds the gauge: the first camera, and the second one's place along the baseline, which is the x axis.
+        first, second = (camera * CAMERA_PARAMETERS for camera in task.problem.anchors)
+        held = np.r_[first : first + 6, second + 3]
+        self.moves = ~np.isin(columns, held)
+        self.columns = columns[self.moves]
+        self.path = 3 * task.start.trajectories[0].basis.size
+        self.size = self.path + len(self.columns)
+        self.place = np.full(len(task.start.cameras) * CAMERA_PARAMETERS, -1)
+        self.place[self.columns] = self.path + np.arange(len(self.columns))
+        self.root = np.sqrt(task.prior.weights[0])
+
+    def state(self, x: Floats) -> State:
+        """The state that a vector means."""
+        cameras = np.zeros(len(self.moves))
+        cameras[self.moves] = x[self.path :]
+        return moved(self.task.problem, self.task.start, x[: self.path], cameras)
+
+    def lines(self, x: Floats) -> list[Linearised]:
+        """Residuals and derivatives by camera."""
+        state = self.state(x)
+        path = state.trajectories[0]
+        return [linearise(part, state.cameras[part.camera], path, GIVEN_PARAMETERS) for part in self.task.problem.rows]
+
+    def residual(self, x: Floats) -> Floats:
+        """(rows,) all residuals in units of their noise, the priors' behind them."""
+        state = self.state(x)
+        parts = [line.residual.ravel() / SIGMA_PX for line in self.lines(x)]
+        path = state.trajectories[0]
+        parts.append((self.root[:, None] * third_differences(path.basis, path.control)).ravel())
+        parts.append(np.array([(camera.rate - 1.0) / Freedom().rate_std for camera in state.cameras]))
+        return np.concatenate(parts)
+
+    def jacobian(self, x: Floats) -> csr_array:
+        """Derivatives (rows, size)."""
+        rows: list[Ints] = []
+        columns: list[Ints] = []
+        values: list[Floats] = []
+        top = 0
+        for part, line in zip(self.task.problem.rows, self.lines(x), strict=True):
+            count = len(line.index)
+            number = top + np.arange(2 * count).reshape(count, 2)
+            at = 3 * (line.index[:, None] + np.arange(4))[:, :, None] + np.arange(3)
+            block = line.by_point[:, :, None, :] * line.weights[:, None, :, None] / SIGMA_PX
+            shape = (count, 2, 4, 3)
+            rows.append(np.broadcast_to(number[:, :, None, None], shape).ravel())
+            columns.append(np.broadcast_to(at[:, None], shape).ravel())
+            values.append(block.ravel())
+            mine = self.place[part.camera * CAMERA_PARAMETERS : part.camera * CAMERA_PARAMETERS + GIVEN_PARAMETERS]
+            free = np.flatnonzero(mine >= 0)
+            rows.append(np.repeat(number.ravel(), len(free)))
+            columns.append(np.tile(mine[free], 2 * count))
+            values.append((line.by_camera[:, :, free] / SIGMA_PX).ravel())
+            top += 2 * count
+        starts = self.task.start.trajectories[0].basis.interval_starts()
+        number = top + np.arange(3 * len(starts)).reshape(-1, 3)
+        for k, coefficient in enumerate(THIRD_DIFFERENCE):
+            rows.append(number.ravel())
+            columns.append((3 * (starts + k)[:, None] + np.arange(3)).ravel())
+            values.append(np.repeat(coefficient * self.root, 3))
+        top += 3 * len(starts)
+        for camera in range(len(self.task.start.cameras)):
+            column = self.place[camera * CAMERA_PARAMETERS + RATE]
+            if column >= 0:
+                rows.append(np.array([top + camera]))
+                columns.append(np.array([column]))
+                values.append(np.array([1.0 / Freedom().rate_std]))
+        top += len(self.task.start.cameras)
+        shape2 = (top, self.size)
+        entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+        return csr_array(coo_array(entries, shape=shape2))
+
+    def pattern(self, x: Floats) -> csr_array:
+        """Where derivatives may stand: the control points on either side too, for rows that cross a knot."""
+        filled = self.jacobian(x).tocoo()
+        rows, columns = [filled.coords[0]], [filled.coords[1]]
+        path = filled.coords[1] < self.path
+        for shift in (-3, 3):
+            other = filled.coords[1][path] + shift
+            inside = (other >= 0) & (other < self.path)
+            rows.append(filled.coords[0][path][inside])
+            columns.append(other[inside])
+        at = (np.concatenate(rows), np.concatenate(columns))
+        return csr_array(coo_array((np.ones(len(at[0])), at), shape=filled.shape))
+
+
+def scipy_sparse(task: Task, limit_s: float, given: bool) -> tuple[float, State, bool]:
+    """CPU, where it ended, and whether it ended by itself. given: our derivatives; else differences by its sparsity."""
+    whole = Stacked(task)
+    start = np.zeros(whole.size)
+    last = [start]
+
+    class Late(Exception):
+        """Out of time."""
+
+    began = time.process_time()
+
+    def residual(x: Floats) -> Floats:
+        if time.process_time() - began > limit_s:
+            raise Late
+        last[0] = x
+        return whole.residual(x)
+
+    how: dict[str, Any] = {"jac": whole.jacobian} if given else {"jac_sparsity": whole.pattern(start)}
+    ended = True
+    try:
+        how |= {"x_scale": "jac", "tr_solver": "lsmr", "ftol": 1e-7, "xtol": 1e-12, "gtol": 1e-12}
+        found = least_squares(residual, start, **how)
+        last[0] = found.x
+    except Late:
+        ended = False
+    return time.process_time() - began, whole.state(last[0]), ended
+
+
+def measure(quick: bool, data: Path) -> Section:
+    """One rig; the peers' limits of time are many times ours."""
+    del data
+    seconds = 30.0 if quick else 600.0
+    task = make(16, seconds)
+    found = Section()
+    best, state = float("inf"), task.start
+    for _ in range(3 if quick else 2):
+        began = time.process_time()
+        state = ours(task)
+        best = min(best, time.process_time() - began)
+    reached = task.cost(state)
+    length = f"{seconds / 60:g} min" if seconds >= 60 else f"{seconds:g} s"
+    work = f"joint adjustment, {_CAMERAS} cameras × {length} at 30 fps"
+    size = f"{task.rows} rows, {Stacked(task).size} unknowns"
+
+    def told(other: State, ended: bool = True) -> str:
+        above = task.cost(other) / reached - 1.0
+        late = "" if ended else ", out of time"
+        return "" if ended and above < 1e-4 else f"stopped {100 * above:.2g} % above our cost{late}"
+
+    cpu, other, ended = scipy_sparse(task, (20.0 if quick else 30.0) * max(best, 0.5), given=False)
+    found.rows.append(
+        Row(work, best, "s", "scipy least_squares, its sparsity", cpu, must=Limit("ratio", 5.0),
+            note="; ".join(part for part in (size, told(other, ended)) if part))
+    )  # fmt: skip
+    cpu, other, ended = scipy_sparse(task, (20.0 if quick else 30.0) * max(best, 0.5), given=True)
+    found.rows.append(Row(work, best, "s", "scipy, given our derivatives", cpu, note=told(other, ended)))
+    try:
+        from tests.bench.speed import ceres
+
+        solved = ceres.solve(Stacked(task))
+    except ImportError:
+        found.missing.append(f"{work} beside Ceres: pyceres is not installed (extra bench)")
+        return found
+    note = f"its own CPU without evaluations; {solved.whole_s:.2g} s with its residuals made in Python"
+    found.rows.append(
+        Row(work, best, "s", "Ceres alone (pyceres)", solved.alone_s, reach=Limit("ratio", 1.0),
+            note="; ".join(part for part in (note, told(solved.state)) if part))
+    )  # fmt: skip
+    return found

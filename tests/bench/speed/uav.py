@@ -1,0 +1,70 @@
+"""The UAV tracker beside OpenCV's CSRT, KCF and MIL on the same flight: CPU a frame while the car is in the picture.
+
+Run with a folder that holds opencv-contrib first on the path (``make bench`` makes it): ours then runs on it too.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import cv2
+
+from edge.uav.tracker import Tracker
+from edge.uav.world import scenarios
+from tests.bench import uav_rivals
+from tests.bench.speed.rows import Limit, Row, Section
+from tests.bench.uav_tracker import Options, make
+
+_RIVALS = ("csrt", "kcf", "mil")
+_LIMITS = {(640, 480): (10.0, 3.0), (1280, 720): (15.0, 5.0)}
+
+
+def flight(size: tuple[int, int], frames: int, rivals: tuple[str, ...]) -> dict[str, float]:
+    """CPU ms a frame of each tracker over one flight; the car goes round a bend and leaves the picture."""
+    world = scenarios.get("exit-bend", 16, size=size, frames=30)
+    samples = world.telemetry(30.0, time_offset=0.0)
+    trackers: dict[str, Tracker] = {"ground": make("ground", world, True, Options(("ground",)))}
+    trackers |= {name: uav_rivals.Rival(name) for name in rivals}
+    spent = dict.fromkeys(trackers, 0.0)
+    count = dict.fromkeys(trackers, 0)
+    arrived = 0
+    for i in range(min(frames, world.length)):
+        image, truth = world.frame(i), world.truth(i)
+        fresh = []
+        while arrived < len(samples) and samples[arrived].time <= world.time(i):
+            fresh.append(samples[arrived])
+            arrived += 1
+        for name, tracker in trackers.items():
+            if name != "ground" and truth.inside < 0.5:
+                continue
+            began = time.process_time()
+            for sample in fresh:
+                tracker.handle_telemetry(sample)
+            if i == 0:
+                tracker.begin(image, world.time(0), truth.box)
+            else:
+                tracker.handle_frame(image, world.time(i))
+                spent[name] += time.process_time() - began
+                count[name] += 1
+    return {name: 1e3 * spent[name] / max(count[name], 1) for name in trackers}
+
+
+def measure(quick: bool, data: Path) -> Section:
+    """Both sizes, the rivals that this OpenCV has."""
+    del data
+    cv2.setNumThreads(1)
+    rivals = tuple(name for name in _RIVALS if uav_rivals.available(name))
+    found = Section()
+    for name in _RIVALS:
+        if name not in rivals:
+            found.missing.append(f"UAV tracker beside {name.upper()}: needs opencv-contrib (`make bench` fetches it)")
+    for size, (must, reach) in _LIMITS.items():
+        ms = flight(size, 60 if quick else 150, rivals)
+        limits = {"must": Limit("ours", must), "reach": Limit("ours", reach)}
+        work = f"UAV tracker {size[0]}×{size[1]}, a frame"
+        if not rivals:
+            found.rows.append(Row(work, ms["ground"], "ms", **limits))
+        for number, name in enumerate(rivals):
+            found.rows.append(Row(work, ms["ground"], "ms", name.upper(), ms[name], **(limits if number == 0 else {})))
+    return found
