@@ -11,21 +11,29 @@ import sys
 import tempfile
 from pathlib import Path
 
+import tomli_w
+
 from deploy.cli import run
 from deploy.process_replay import replay_through_hub
+from deploy.simulated import camera_tables
 from deploy.uav_replay import replay_through_uav
+from edge.scenes import get_people
+from edge.scenes.people import PeopleScene
 from edge.uav.world.patrol import patrol
 from edge.uav.world.world import World
 from edge.uav_agent import TOPICS
 from hub.live import LiveSettings
-from protocols.catalogue import TARGET
+from protocols.catalogue import CAMERA_INFO, OBSERVATION, TARGET, TRACK, Topic
+from protocols.clocks import NANOSECONDS
 from protocols.log.reader import LogReader
 from protocols.log.writer import LogWriter
+from tests.people_traffic import film
 from tests.uav_flights import Flight
 
 LOGS = Path(__file__).parent / "logs"
 MARKER_SEED, MARKER_CAMERAS, MARKER_S = 11, 3, 12.0
 TOWN_SEED, TOWN_S = 3, 8.0
+PEOPLE_SEED, PEOPLE_CAMERAS, PEOPLE_S = 22, 4, 6.0
 AGENT = "drone"
 
 
@@ -65,9 +73,41 @@ def town_answer(log: Path, out: Path) -> Path:
     whole = out.with_name(f"whole-{out.name}")
     _, missing = replay_through_uav(log, whole)
     assert missing == 0
+    return only(TARGET, whole, out)
+
+
+def people() -> PeopleScene:
+    """The room that three people walk about in."""
+    return get_people(PEOPLE_SEED, PEOPLE_CAMERAS, 3)
+
+
+def people_log(folder: Path) -> Path:
+    """The room of people: what four cameras reported of them; beside it the calibration by which they are followed."""
+    scene = people()
+    _, tables = camera_tables(scene, "people")
+    tables["metadata"]["up"] = [0.0, 0.0, 1.0]
+    (folder / "known.toml").write_text(tomli_w.dumps(tables), encoding="utf-8")
+    traffic = film(scene, PEOPLE_S, PEOPLE_SEED)
+    with LogWriter(folder / "people.mcap") as log:
+        for info in traffic.infos:
+            log.write(CAMERA_INFO, info.camera, "local", info, 0)
+        for arrival, message in traffic.arrivals:
+            log.write(OBSERVATION, message.camera, "local", message, round(arrival * NANOSECONDS))
+    return folder / "people.mcap"
+
+
+def people_answer(log: Path, out: Path) -> Path:
+    """Where a hub that knows the cameras says that everybody is."""
+    whole = out.with_name(f"whole-{out.name}")
+    replay_through_hub(log, whole, calibration=log.with_name("known.toml"))
+    return only(TRACK, whole, out)
+
+
+def only(topic: Topic, whole: Path, out: Path) -> Path:
+    """One topic of a log, which goes."""
     with LogWriter(out) as writer:
-        for logged in LogReader(whole).messages([TARGET]):
-            writer.write(TARGET, logged.agent, logged.site, logged.message, logged.log_time_ns)
+        for logged in LogReader(whole).messages([topic]):
+            writer.write(topic, logged.agent, logged.site, logged.message, logged.log_time_ns)
     whole.unlink()
     return out
 
@@ -90,6 +130,7 @@ def main() -> int:
         for kind, log, answer in (
             ("marker", marker_log(folder), marker_answer),
             ("town", town_log(folder), town_answer),
+            ("people", people_log(folder), people_answer),
         ):
             new = answer(log, folder / f"{kind}-answer.mcap")
             kept = LOGS / f"{kind}-answer.mcap"
