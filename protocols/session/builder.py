@@ -19,8 +19,7 @@ from protocols.session.observations import DEFAULT_LABEL, Observations, gather_t
 from protocols.session.rig import Rig, RigCamera
 
 _REMEMBERED = 16_384
-"""Sequences of one run that a live hub remembers to know duplicates by: nine minutes at 30 Hz."""
-_MASK = (1 << _REMEMBERED) - 1
+"""Sequences of one run that a live hub remembers to know duplicates by: nine minutes at 30 Hz; 2 KiB a camera."""
 SETTLED_ROWS = 90
 """Detections from which on a restarted camera's new clock is worth solving."""
 
@@ -35,8 +34,8 @@ class _Boot:
     frames: int = 0
     seen: set[int] = field(default_factory=set)
     highest: int = -1
-    bits: int = 0
-    """Bit k: sequence ``highest - k`` was heard."""
+    ring: bytearray | None = None
+    """Bit ``sequence % _REMEMBERED``: heard, of the last so many sequences up to the highest."""
 
     def knows(self, sequence: int) -> bool:
         """Whether it was heard before; from now on it was. Remembers all."""
@@ -47,15 +46,21 @@ class _Boot:
 
     def knows_lately(self, sequence: int) -> bool:
         """The same in constant memory, for a hub that runs for months: what is very old is taken for known."""
+        if self.ring is None:
+            self.ring = bytearray(_REMEMBERED // 8)  # all of it at once: what grows for an hour looks like a leak
         ahead = sequence - self.highest
-        if ahead > 0:
-            self.bits = ((self.bits << ahead) | 1) & _MASK if ahead < _REMEMBERED else 1
-            self.highest = sequence
-            return False
-        if -ahead >= _REMEMBERED or self.bits >> -ahead & 1:
+        if -ahead >= _REMEMBERED:
             return True
-        self.bits |= 1 << -ahead
-        return False
+        if ahead >= _REMEMBERED:
+            self.ring[:] = bytes(_REMEMBERED // 8)
+        else:
+            for between in range(self.highest + 1, sequence):
+                self.ring[between % _REMEMBERED >> 3] &= ~(1 << (between & 7))
+        self.highest = max(self.highest, sequence)
+        byte, bit = sequence % _REMEMBERED >> 3, 1 << (sequence & 7)
+        known = ahead <= 0 and bool(self.ring[byte] & bit)
+        self.ring[byte] |= bit
+        return known
 
 
 class SessionBuilder:

@@ -16,4 +16,4 @@ def test_a_live_hub_knows_the_duplicates_that_a_set_knows(sequences: list[int]) 
         told, known = live.knows_lately(sequence), all_of_them.knows(sequence)
         assert told == (known or sequence <= highest - _REMEMBERED)
         highest = max(highest, sequence)
-    assert live.bits.bit_length() <= _REMEMBERED
+    assert live.ring is None or len(live.ring) == _REMEMBERED // 8
