@@ -42,6 +42,8 @@ _MOST = 12  # people in one silhouette
 _LIKE = 0.7  # share of template and silhouette that one who stands alone has in common
 _SLIM, _STOUT = 1.15, 7.0  # height to breadth of one who stands alone, where nothing is known of the place
 _LEAST_HEIGHT = 12.0  # px
+_TRIM = 0.3
+_LONE, _GROUPED = 0.1, 0.17
 BREADTH = 0.36  # of a person's box, of the height
 
 
@@ -451,8 +453,9 @@ class _Cluster:
         columns = own.sum(axis=0)
         full = np.flatnonzero(columns >= max(0.04 * one.tall, 1))
         if len(full) and seen > 0.6:
-            left = float(np.clip(full[0], one.u - 0.33 * one.tall, one.u - 0.1 * one.tall))
-            right = float(np.clip(full[-1] + 1, one.u + 0.1 * one.tall, one.u + 0.33 * one.tall))
+            least = _LONE if alone else _GROUPED
+            left = float(np.clip(full[0], one.u - 0.33 * one.tall, one.u - least * one.tall))
+            right = float(np.clip(full[-1] + 1, one.u + least * one.tall, one.u + 0.33 * one.tall))
         if alone:
             rows = np.flatnonzero(own.sum(axis=1) >= max(0.03 * one.tall, 1))
             if len(rows):
@@ -461,6 +464,11 @@ class _Cluster:
                     top = first
                 if abs(last - bottom) < 0.2 * one.tall:
                     bottom = last
+        elif seen > 0.6:
+            # Legs end where the silhouette does, unless what is below is hidden or taken for a shadow.
+            rows = np.flatnonzero(own.sum(axis=1) >= max(0.03 * one.tall, 1))
+            if len(rows) and 0.0 < bottom - float(rows[-1] + 1) < _TRIM * one.tall:
+                bottom = float(rows[-1] + 1)
         fx, fy = self._scales
         x, y = (left + self._origin[0]) / fx, (top + self._origin[1]) / fy
         w, h = (right - left) / fx, (bottom - top) / fy
