@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from google.protobuf.message import Message
@@ -20,6 +20,7 @@ from hub.distributed import node_calibration, with_node_poses
 from hub.guidance import Guidance
 from hub.messages import calibration_message, refusal_message, track_messages
 from hub.nodes.host import NodeHost
+from hub.timing.clock_bend import Bends
 from hub.tracking.camera import tracked_kind
 from hub.tracking.live import LiveTracking
 from hub.tracking.walkers import Walkers
@@ -92,6 +93,7 @@ class LiveHub:
         self.refusal: Refused | None = None
         self.counters: Counter[str] = Counter()
         self.clocks = ClockEpochs()
+        self._bends = Bends()
         self.claims = ClockClaims()
         self._solved_boots: dict[str, str] = {}
         self._stepped = False
@@ -116,6 +118,7 @@ class LiveHub:
             if event is not None:
                 self.counters[f"clock_{event.kind}s"] += 1
                 self._builder.settle_after(event.boot, EPOCH_ROWS)
+                self._bends.handle(event)
                 self._stepped = True
         self.guidance.handle(message)
         if self.tracking is not None:
@@ -126,6 +129,8 @@ class LiveHub:
             self._walkers.handle(message)
             message = without_tracked(message)
         self._builder.handle(message)
+        if isinstance(message, pb.Observation):
+            self._go_on_with_old_clock(message)
         if self.nodes is not None:
             self.nodes.handle(message)
         if isinstance(message, pb.Observation):
@@ -239,12 +244,34 @@ class LiveHub:
         """The rig and what was seen: of the marker, or, where there is none, of people who walk."""
         if self._marked() or not self.settings.solve:
             rig, observations = self._builder.build()
+            observations = self._straightened(observations)
         else:
             rig = Rig({name: rig_camera(self._infos[name]) for name in sorted(self._infos)})
             observations = self._walkers.observations()
             if not len(observations):
                 raise Refused("nobody who walks can be told from the others by colour, or two cameras see nobody alike")
         return merged(rig, self._rig), observations
+
+    def _go_on_with_old_clock(self, message: pb.Observation) -> None:
+        """Keep the frame for the epoch before a bend of the clock too, as that would have stamped it."""
+        old = self._bends.on_old_clock(message.camera, message.boot_id, message.device_time_ns)
+        if old is None:
+            return
+        if self._bends.serving(message.camera, self._builder.boot(message.camera)) is None:
+            return
+        copy = pb.Observation()
+        copy.CopyFrom(message)
+        copy.boot_id, copy.device_time_ns = old
+        self._builder.handle(copy)
+
+    def _straightened(self, observations: Observations) -> Observations:
+        """Observations with what a clock stamped between its bend and the alarm put right."""
+        bends = {name: self._bends.serving(name, self._builder.boot(name)) for name in self._bends.cameras}
+        tracks = {
+            key: track if (bend := bends.get(key[0])) is None else replace(track, time=bend.straightened(track.time))
+            for key, track in observations.tracks.items()
+        }
+        return replace(observations, tracks=tracks)
 
     def _boots(self, calibration: Calibration) -> dict[str, str]:
         source = self._builder if self._marked() else self._walkers
@@ -289,7 +316,9 @@ class LiveHub:
     def _answer(self, rig: Rig, observations: Observations) -> Calibration:
         if not self.settings.solve:
             return node_calibration(rig, self.nodes)
-        found = calibrate(rig, observations, lambda text, share: self.working())
+        source = self._builder if self._marked() else self._walkers
+        claims = self.claims.of({name: source.boot(name) for name in rig.cameras})
+        found = calibrate(rig, observations, lambda text, share: self.working(), claims=claims)
         if self.nodes is None:
             return found
         boots = self._boots(found)

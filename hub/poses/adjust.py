@@ -411,7 +411,7 @@ def _minimise(
         "first poses" if growing else "free lenses" if problem.freedom.lens else "robust" if robust else "fitting rows"
     )
     pixels = float(np.sqrt(np.mean(state.sigma**2)))
-    steps.append(AdjustmentStep(stage, pixels * float(np.sqrt(cost / counting))))
+    steps.append(AdjustmentStep(stage, pixels * float(np.sqrt(max(cost, 0.0) / counting))))
     for _ in range(iterations):
         try:
             path_step, camera_step = solve(system, damping, gauge_tangent(problem, state))
@@ -423,9 +423,9 @@ def _minimise(
         if np.isfinite(trial_cost) and trial_cost < cost:
             gain = cost - trial_cost
             state, system, cost = trial, trial_system, trial_cost
-            steps.append(AdjustmentStep(stage, pixels * float(np.sqrt(cost / counting))))
+            steps.append(AdjustmentStep(stage, pixels * float(np.sqrt(max(cost, 0.0) / counting))))
             damping = max(damping / 10.0, 1e-12)
-            if gain < least_gain * cost:
+            if gain < least_gain * abs(cost):  # below 0 where the prior's pull on the scale outweighs the rows
                 break
         else:
             damping = max(damping * 10.0, 1e-8)

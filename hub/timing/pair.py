@@ -20,6 +20,7 @@ from hub.timing.scan import PairMoments, Scan, busiest, candidates, grid_tracks,
 from hub.timing.significance import OWN_LAGS, Chance, bandwidth, chance
 from hub.timing.tracks import SmoothTrack
 from hub.timing.two_view import Geometry, RelativePose, Uncalibrated
+from hub.timing.verdict import at_noise, distinct, doubts, hopeless, judge, needed_inliers, sound
 from protocols.geometry.types import Floats
 
 _LEAST_SAMPLES = 12
@@ -37,6 +38,15 @@ _NEAR_PX = 10.0  # what may belong to the geometry of the scan in pieces
 _MOSTLY_ONE = 0.85  # of a track's rows: with fewer on one path there may be another
 _OTHER_LAGS = 0.5  # s from the best: what is no part of it
 _LEAST_OTHER_LAGS = 3.0  # s
+_NO_BETTER = (
+    1.1  # times what the fundamental matrix leaves: an essential one that comes so near is not in a wrong minimum
+)
+_MUCH_WORSE = 4.0  # times the same: so much a wrong minimum leaves at the right lag
+_SAME_COST, _OFTEN = 0.01, 3  # starts that end in the same minimum
+_SHARPLY_SEEN = 50.0  # s: over longer recordings a rate 0.1 % off (29.97 for 30) slips by more than the scan bears
+_HARDLY_BETTER = 0.2  # of what lags with as much in common usually leave
+_SAME_LAG = 0.1  # s
+_REPEATS = 4  # lags at which the answer's own geometry is tried
 _FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
 _LABELLED_RATES = tuple(
     sorted(
@@ -78,8 +88,8 @@ def solve_pair(
         pieces = search.in_pieces(names)
         if pieces.solved and pieces.fit is not None and pieces.fit.support > 2.0 * first.fit.support:
             return pieces
-    if first.solved or not thorough or near is not None:
-        return first
+    if first.solved or not thorough or near is not None or (first.fit is not None and at_noise(first.fit, s)):
+        return first  # what fits to the noise for long is refused for what no other rate would mend
     if search.jumps():
         first = search.in_pieces(names)
         if first.solved:
@@ -133,10 +143,13 @@ class _Search:
         scan = scan_lags(moments, s.least_support, None if self.known is None else self.known.essential.T, near)
         chances = _Chances(moments, scan, self.known, self.bandwidth)
         fits: list[PairFit] = []
+        told_rate = rate in _LABELLED_RATES and self.span < _SHARPLY_SEEN
         good: tuple[float, float] | None = None  # evidence and scan cost of the best trustworthy fit so far
         for index in candidates(scan, s.per_stratum, s.at_most if near is None else _NEAR_CANDIDATES, near):
             offset, cost = float(scan.offset[index]), float(scan.cost[index])
-            if good is not None and _hopeless(float(scan.support[index]), cost, *good, s):
+            if good is not None and hopeless(float(scan.support[index]), cost, *good, s):
+                continue
+            if told_rate and not chances.promises(int(index), self._searched(scan, offset)):
                 continue
             start = moments.fundamental(int(index)).T if self.known is None else None  # s_b' M s_a
             fit = self._refine_candidate(b, offset, cost, start)
@@ -144,12 +157,17 @@ class _Search:
                 continue
             fit = chances.of(fit)
             fits.append(fit)
-            if _sound(fit, s) and (good is None or evidence(fit) > good[0]):
+            if sound(fit, s) and (good is None or evidence(fit) > good[0]):
                 good = (evidence(fit), cost)
         if not fits:
             return PairSolution(*names, _NO_FIT if near is None else _NO_FIT_NEAR)
-        ordered = _distinct(fits, s)
-        answer = _judge(names, ordered, 1.0 if near is not None else self._searched(scan, ordered[0]), s)
+        ordered = distinct(fits, s)
+        answer = judge(names, ordered, 1.0 if near is not None else self._searched(scan, ordered[0].lag), s)
+        if answer.solved and near is None:
+            again = [chances.of(fit) for fit in self._repeats(b, moments, scan, ordered[0])]
+            if again:
+                ordered = distinct(fits + again, s)
+                answer = judge(names, ordered, self._searched(scan, ordered[0].lag), s)
         if answer.solved and answer.fit is not None:
             answer = self._finish(answer, answer.fit, b)
         if rate != 1.0 and answer.fit is not None:
@@ -189,7 +207,7 @@ class _Search:
         fits.sort(key=lambda fit: -fit.support * fit.front)
         fit = fits[0]
         second = max((rival.support for rival in fits[1:] if abs(rival.offset - fit.offset) > 0.1), default=0.0)
-        reason = _doubts(fit, s)
+        reason = doubts(fit, s)
         if reason:
             pass
         elif fit.support < s.accept_pieces_support:
@@ -203,26 +221,52 @@ class _Search:
             return PairSolution(*names, reason, fit)
         return self._finish(PairSolution(*names, "ok", fit), fit, self.b, pieces=True)
 
-    def _searched(self, scan: Scan, fit: PairFit) -> float:
+    def _repeats(self, b: Sequence[SmoothTrack], moments: PairMoments, scan: Scan, best: PairFit) -> Iterator[PairFit]:
+        """Alignments at other lags that begin with the best one's own geometry.
+
+        A motion that repeats itself fits the same geometry a period later. The scan's own start there may end in a
+        minimum beside it, and would then speak for the wrong one of the two.
+        """
+        here = int(np.argmin(np.abs(scan.offset - best.lag)))
+        which = np.flatnonzero(scan.support > self.s.accept_ratio * scan.support[here])
+        cost = np.full(len(scan.offset), np.inf)
+        cost[which] = moments.costs_of(which, best.geometry.matrix.T)
+        own = float(cost[max(0, here - 1) : here + 2].min())
+        # As with any candidate: a lag between two steps of the grid costs no more than that.
+        hopeful = (np.abs(scan.offset - best.lag) > _SAME_LAG) & (cost < 25.0 * max(own, 4.0))
+        for index in _peaks(scan.offset, np.where(hopeful, 1.0 / (cost + 1.0), 0.0), _REPEATS):
+            fit = self._refine_candidate(b, float(scan.offset[index]), float(cost[index]), best.geometry)
+            if fit is not None:
+                yield fit
+
+    def _searched(self, scan: Scan, lag: float) -> float:
         """About how many independent alignments with as much common motion were looked at, rates included.
 
         Those with much more of it could hardly fit as well by chance.
         """
-        support = scan.support[int(np.argmin(np.abs(scan.offset - fit.lag)))]
+        support = scan.support[int(np.argmin(np.abs(scan.offset - lag)))]
         alike = (scan.support > 0.7 * support) & (scan.support < 1.4 * support)
         return max(1.0, self.tried * float(alike.sum()) * self.step / self.s.distinct_alignments)
 
     def _refine_candidate(
-        self, b: Sequence[SmoothTrack], offset: float, cost: float, start: Floats | None, *, pieces: bool = False
+        self,
+        b: Sequence[SmoothTrack],
+        offset: float,
+        cost: float,
+        start: Floats | Geometry | None,
+        *,
+        pieces: bool = False,
     ) -> PairFit | None:
         """Refine one lag from the moments' matrix and, with known lenses, from five-point hypotheses; the best wins.
+
+        start: that matrix (3, 3), ``s_bᵀ M s_a = 0``, or the one geometry to begin with.
 
         One start is not enough: one clean session in ten ends in a wrong minimum of the essential matrix,
         with the time right and the rotation tens of degrees off.
         """
         s, a = self.s, self.a
         few = Samples(a, b, offset, s, s.samples if pieces else s.few)
-        if pieces and start is not None:
+        if pieces and isinstance(start, np.ndarray):
             few.keep_near(start, 1.0, offset, _NEAR_PX)
         if few.count < _LEAST_SAMPLES:
             return None
@@ -231,14 +275,26 @@ class _Search:
         fixed = self.known is not None
         own = min(1.0, min(float(np.median([t.sigma_px for t in one])) for one in (a, b)) / s.sigma_px) ** 2
         best: Refined | None = None
-        for count, geometry in enumerate(self._starts(few, b, offset, scale, start)):
+        reached = 0
+        for count, (geometry, floor) in enumerate(self._starts(few, b, offset, scale, start)):
+            floor = 0.0 if pieces else floor  # its rows were chosen to suit that very matrix
+            if floor > _PROMISING * own or (best is not None and best.cost < _NO_BETTER * floor):
+                break
             if count >= _STARTS and (best is None or best.cost > _PROMISING * own):
                 break
             found = refine(few, geometry, few.centre - offset, scale, noise, fixed_geometry=fixed, iterations=14)
-            if found is not None and (best is None or found.cost < best.cost):
+            if found is None:
+                continue
+            if best is None or found.cost < (1.0 - _SAME_COST) * best.cost:
+                reached = 0
+            if best is None or found.cost < (1.0 + _SAME_COST) * best.cost:
+                reached += 1
+            if best is None or found.cost < best.cost:
                 best = found
-            if best is not None and best.cost < _AT_NOISE * own:
+            if best.cost < _AT_NOISE * own:
                 break  # nothing fits better than the noise allows
+            if reached >= _OFTEN and best.cost < _MUCH_WORSE * floor:
+                break  # all starts lead here, and it is no minimum with the geometry far off
         if best is None:
             return None
         rate = 1.0 / best.slowness
@@ -260,27 +316,36 @@ class _Search:
         return samples.judge(best.cost, rate, offset, best.geometry)
 
     def _starts(
-        self, few: Samples, b: Sequence[SmoothTrack], offset: float, scale: float, start: Floats | None
-    ) -> Iterator[Geometry]:
+        self, few: Samples, b: Sequence[SmoothTrack], offset: float, scale: float, start: Floats | Geometry | None
+    ) -> Iterator[tuple[Geometry, float]]:
+        """Geometries to refine, and a cost that none of them will come below (0 = not known).
+
+        Every essential matrix is a fundamental one, so that none leaves less than the best of these.
+        """
         if self.known is not None:
-            yield self.known
+            yield self.known, 0.0
+            return
+        if isinstance(start, RelativePose | Uncalibrated):
+            yield start, 0.0
             return
         here_a, here_b = few.at(1.0, offset)
         both = np.isfinite(here_b).all(axis=1)
         if both.sum() < _LEAST_SAMPLES or start is None:
             return
         if not self.calibrated:
-            yield Uncalibrated.of(start)
+            yield Uncalibrated.of(start), 0.0
             return
         here_a, here_b = here_a[both], here_b[both]
         threshold = 3.0 * self.s.sigma_px * scale / min(self.a[0].focal, b[0].focal)
-        yield two_view.decompose(start, here_a, here_b)
+        yield two_view.decompose(start, here_a, here_b), 0.0
         noise = Noise(self.s.sigma_px / self.a[0].focal, self.s.sigma_px / b[0].focal, self.s.rate_std)
         loose = refine(few, Uncalibrated.of(start), few.centre - offset, scale, noise, iterations=14)
+        floor = 0.0 if loose is None else loose.cost
         if loose is not None:
-            yield two_view.decompose(loose.geometry.matrix, here_a, here_b)
+            yield two_view.decompose(loose.geometry.matrix, here_a, here_b), floor
         for seed in range(_SEEDS):
-            yield from two_view.five_point(here_a, here_b, threshold, seed)
+            for geometry in two_view.five_point(here_a, here_b, threshold, seed):
+                yield geometry, floor
 
     def _finish(
         self, answer: PairSolution, fit: PairFit, b: Sequence[SmoothTrack], *, pieces: bool = False
@@ -336,15 +401,31 @@ class _Chances:
         self.bandwidth = bandwidth
         self.found: list[tuple[float, float, Chance | None]] = []
 
+    def promises(self, index: int, searched: float) -> bool:
+        """Whether a lag of the scan, as it is, fits better than the best of ``searched`` unrelated ones would."""
+        seconds = float(self.scan.support[index])
+        alike = (self.scan.support > 0.7 * seconds) & (self.scan.support < 1.4 * seconds) & np.isfinite(self.scan.cost)
+        if self.scan.cost[index] > _HARDLY_BETTER * np.median(self.scan.cost[alike]):
+            return False
+        chosen = self._chance(seconds, float(self.scan.offset[index]))
+        if chosen is None:
+            return True
+        one = chosen.log10_probability(float(self.scan.cost[index]), 1.0, self.bandwidth * seconds)
+        return bool(one + np.log10(searched) < 0.0)
+
+    def _chance(self, seconds: float, at: float) -> Chance | None:
+        chosen = next(
+            (c for long, lag, c in self.found if 0.8 * long < seconds < 1.25 * long and abs(lag - at) < 0.5), None
+        )
+        if chosen is None and seconds > 0:
+            chosen = chance(self.moments, self.scan, seconds, at, self.known)
+            self.found.append((seconds, at, chosen))
+        return chosen
+
     def of(self, fit: PairFit) -> PairFit:
         """The fit with the chance that unrelated stretches as long as its common motion leave no more than it does."""
         seconds, cycles = fit.moving_overlap, self.bandwidth * fit.moving_overlap
-        chosen = next(
-            (c for long, lag, c in self.found if 0.8 * long < seconds < 1.25 * long and abs(lag - fit.lag) < 0.5), None
-        )
-        if chosen is None and seconds > 0:
-            chosen = chance(self.moments, self.scan, seconds, fit.lag, self.known)
-            self.found.append((seconds, fit.lag, chosen))
+        chosen = self._chance(seconds, fit.lag)
         if chosen is None:
             return fit
         # The next best: any lag that leaves at least half as much in common.
@@ -360,80 +441,6 @@ class _Chances:
         )
 
 
-def _sound(fit: PairFit, s: PairSettings) -> bool:
-    return fit.inliers > 0.8 and fit.front > s.accept_in_front and fit.sigma_px < 4.0 * s.sigma_px
-
-
-def _hopeless(support: float, cost: float, best_evidence: float, best_cost: float, s: PairSettings) -> bool:
-    """Whether a candidate can neither win over a sound fit nor make it doubtful, so that refining it is idle.
-
-    Its evidence is at most the seconds in which both move; and what leaves tens of times the misfit of the
-    sound one is not brought down to it by a lag between two steps of the grid.
-    """
-    return 1.5 * support < s.accept_ratio * best_evidence or cost > 25.0 * max(best_cost, 4.0)
-
-
-def _distinct(fits: list[PairFit], s: PairSettings) -> list[PairFit]:
-    """Best first, alignments that are the same within 0.1 s once.
-
-    The best is the one that chance explains least; where the recordings are too short to tell, the one with
-    most evidence.
-    """
-
-    told = all(fit.log10_chance is not None for fit in fits)
-
-    def merit(fit: PairFit) -> tuple[float, float]:
-        if not told:
-            return (evidence(fit), 0.0)
-        agreeing = fit.inliers * fit.front * (fit.support >= s.accept_support)
-        return (-(fit.log10_chance or 0.0) * agreeing, evidence(fit))
-
-    ordered = sorted(fits, key=merit, reverse=True)
-    out: list[PairFit] = []
-    for fit in ordered:
-        if all(abs(fit.offset - other.offset) > 0.1 for other in out):
-            out.append(fit)
-    return out
-
-
-def needed_inliers(fit: PairFit, s: PairSettings) -> float:
-    """The share of the common motion that must agree: the less motion there is, the more of it."""
-    short = float(np.clip((s.plenty - fit.support) / (s.plenty - s.hardly), 0.0, 1.0))
-    return s.accept_inliers + short * (s.strict_inliers - s.accept_inliers)
-
-
-def _judge(names: tuple[str, str], fits: list[PairFit], searched: float, s: PairSettings) -> PairSolution:
-    best = fits[0]
-    others = tuple(fits[1:4])
-    rivals = [fit for fit in others if _rivals(fit, best, s)]
-    second = max((evidence(fit) / max(evidence(best), 1e-12) for fit in rivals), default=0.0)
-    by_chance = None if best.log10_chance is None else best.log10_chance + np.log10(searched)
-    # Regular motion fits nearly as well a period later. That is settled by the noise where there is enough of
-    # it and nothing else comes near what the tracks' own noise leaves.
-    settled = not rivals and best.support >= s.unchecked_support and best.sigma_px <= s.exact * best.own_px
-    doubts = _doubts(best, s)
-    apart = not rivals and best.log10_gap < s.accept_log10_gap
-    if doubts:
-        reason = doubts
-    elif best.inliers < needed_inliers(best, s):
-        reason = f"only {100 * best.inliers:.0f} % of the common motion agrees with one geometry"
-    elif by_chance is None and best.support < s.unchecked_support:
-        reason = (
-            f"the recordings overlap too little ({best.moving_overlap:.1f} s of motion) to tell one lag from another"
-        )
-    elif by_chance is not None and by_chance > s.accept_log10_chance and not (settled or apart):
-        reason = (
-            f"other lags fit nearly as well (one of them would by chance in {100 * min(1.0, 10.0**by_chance):.0f} % "
-            "of cases): too little or too regular common motion, or two different things"
-        )
-    elif second > s.accept_ratio:
-        rival = max(rivals, key=evidence)
-        reason = f"two alignments are about as good ({best.offset:.2f} s and {rival.offset:.2f} s)"
-    else:
-        return PairSolution(*names, "ok", best, others)
-    return PairSolution(*names, reason, best, others)
-
-
 def _peaks(offset: Floats, value: Floats, at_most: int) -> list[int]:
     """Indices of the highest values, none within 0.15 s of a higher one."""
     out: list[int] = []
@@ -443,35 +450,6 @@ def _peaks(offset: Floats, value: Floats, at_most: int) -> list[int]:
         if all(abs(offset[index] - offset[other]) > 0.15 for other in out):
             out.append(int(index))
     return out
-
-
-def _doubts(fit: PairFit, s: PairSettings) -> str:
-    """What speaks against an alignment taken by itself; "" for nothing."""
-    if fit.support < s.accept_support:
-        return f"only {fit.support:.1f} s of motion agree (of {fit.moving_overlap:.1f} s)"
-    if fit.sigma_px > s.largest_sigma_px:
-        return f"the best alignment leaves {fit.sigma_px:.1f} px"
-    if abs(fit.rate - 1.0) > s.largest_rate:
-        return f"the best alignment needs a clock that is {1e6 * abs(fit.rate - 1.0):.0f} ppm off"
-    if fit.front < s.accept_in_front:
-        return "the best geometry puts points behind a camera"
-    if fit.flat_px < s.flat_ratio * max(fit.sigma_px, s.sigma_px):
-        return "the motion lies in one plane (or the cameras stand in one place), which leaves the geometry open"
-    return ""
-
-
-def _rivals(fit: PairFit, best: PairFit, s: PairSettings) -> bool:
-    """Whether another alignment comes near the best one: in what it leaves, and in how unlikely that is."""
-    if best.sigma_px <= s.exact * best.own_px and best.support >= s.unchecked_support:
-        # What is left is the tracks' own noise, row for row: then a little more is a lot less likely.
-        limit = s.worse_than_noise * best.sigma_px
-    else:
-        limit = s.clearly_worse * max(best.sigma_px, s.sigma_px)
-    if fit.sigma_px > limit:
-        return False
-    if fit.log10_chance is None or best.log10_chance is None:
-        return True
-    return fit.log10_chance < best.log10_chance + s.clearly_likelier
 
 
 def judge_alignment(

@@ -133,12 +133,18 @@ class PairMoments:
 
     def costs_of(self, which: Ints, matrix: Floats) -> Floats:
         """Mean squared distance over noise (m,) that a known ``m_aᵀ F m_b = 0`` leaves at chosen lags."""
-        theta = in_grid(matrix, self.a, self.b)
-        out = np.empty(len(which))
-        for begin in range(0, len(which), _CHUNK):
-            part = which[begin : begin + _CHUNK]
-            out[begin : begin + _CHUNK] = fixed_costs(*self.matrices(part), theta)
-        return out
+        theta = in_grid(matrix, self.a, self.b).reshape(3, 3)
+        plane = np.diag([1.0, 1.0, 0.0])
+        misfit = np.zeros((len(_PAIRS), len(_PAIRS)))
+        np.add.at(misfit, (_OF_A, _OF_B), np.outer(theta, theta))
+        of_a, of_b = np.zeros(len(_PAIRS)), np.zeros(len(_PAIRS))
+        np.add.at(of_b, PAIR_OF, self.a.sigma**2 * theta.T @ plane @ theta)
+        np.add.at(of_a, PAIR_OF, self.b.sigma**2 * theta @ plane @ theta.T)
+        chosen = self.moments[:, :, which]
+        noise = of_b @ chosen[5] + of_a @ chosen[:, 5]
+        total = np.maximum(chosen[5, 5], 1e-9)
+        left = np.tensordot(misfit, chosen, 2)
+        return np.asarray(np.maximum(left / total, 0.0) / np.maximum(noise / total, 1e-30))
 
     def fundamental(self, which: int) -> Floats:
         """The best matrix (3, 3) at one lag, in normalised coordinates: ``m_aᵀ F m_b = 0``, norm 1."""

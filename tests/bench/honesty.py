@@ -4,8 +4,9 @@
 
 degenerate: eleven kinds of session in which something cannot be known; asked: wrong but accepted at most 0.1 %. An
 answer counts as wrong if a camera's clock is more than 5 ms off in the middle of what it saw, or its orientation more
-than 3 degrees. stds: over random rigs a regime, how often the truth lies within 1.96 stds; asked: 93 to 97 %. Paths are
-judged once a second, for neighbouring samples err together.
+than 3 degrees. The kinds take turns, so that an interrupted run has as many of each. stds: over random rigs a regime,
+how often the truth lies within 1.96 stds; asked: 93 to 97 %. Paths are judged once a second, for neighbouring samples
+err together.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -34,6 +36,7 @@ from tests import rigs  # noqa: E402
 
 _WRONG_S, _WRONG_RAD = 0.005, np.deg2rad(3.0)
 _WITHIN = 1.96
+_TELL_EACH = 5  # sessions of each kind
 Make = Callable[[int], rigs.Session]
 
 
@@ -152,18 +155,32 @@ DEGENERATE: tuple[tuple[str, Make, bool], ...] = (
 """Name, session, and whether a right answer may exist (else any answer counts as wrong)."""
 
 
-def judge(kind: int, seed: int) -> tuple[int, int, str, float, float]:
-    """(kind, seed, "refused" | "right" | "wrong", clock error [ms], orientation error [degrees])."""
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """One session without an answer. verdict: "refused", "right" or "wrong". cpu_s: of the whole command [s]."""
+
+    kind: int
+    seed: int
+    verdict: str
+    clock_ms: float
+    turn_degrees: float
+    cpu_s: float
+
+
+def judge(kind: int, seed: int) -> Judged:
+    """Calibrate one session as the command does, and hold the answer, if any, against the truth."""
     _, make, answerable = DEGENERATE[kind]
     session = make(seed)
+    begin = time.process_time()
     try:
         found = calibrate(session.rig, session.observations(), thorough=True)
     except Refused:
-        return kind, seed, "refused", 0.0, 0.0
+        return Judged(kind, seed, "refused", 0.0, 0.0, time.process_time() - begin)
+    spent = time.process_time() - begin
     lag = max(abs(session.clock_error(n, found.reference, c.time_map)) for n, c in found.cameras.items())
     turn = session.turn_error({name: camera.pose for name, camera in found.cameras.items()})
     right = answerable and lag < _WRONG_S and turn < _WRONG_RAD
-    return kind, seed, "right" if right else "wrong", 1e3 * lag, float(np.degrees(turn))
+    return Judged(kind, seed, "right" if right else "wrong", 1e3 * lag, float(np.degrees(turn)), spent)
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,6 +271,39 @@ def _histogram(z: Floats) -> str:
     return "".join(bars[round(8 * c / max(counts.max(), 1))] for c in counts)
 
 
+def tabled(told: list[Judged]) -> dict[str, object]:
+    """Counts of each verdict, and the seeds of the wrong ones, by kind."""
+    return {
+        DEGENERATE[kind][0]: dict(Counter(one.verdict for one in told if one.kind == kind))
+        | {"bad": [one.seed for one in told if one.kind == kind and one.verdict == "wrong"]}
+        for kind in sorted({one.kind for one in told})
+    }
+
+
+def _summary(told: list[Judged]) -> str:
+    wrong = sum(one.verdict == "wrong" for one in told)
+    share = 100.0 * wrong / max(len(told), 1)
+    return f"wrong but accepted: {wrong} of {len(told)} ({share:.2f} %; asked 0.1 %)"
+
+
+def _print_degenerate(told: list[Judged]) -> None:
+    for kind in sorted({one.kind for one in told}):
+        mine = [one for one in told if one.kind == kind]
+        counts = Counter(one.verdict for one in mine)
+        bad = [f"{one.seed}: {one.clock_ms:.1f} ms, {one.turn_degrees:.1f}°" for one in mine if one.verdict == "wrong"]
+        print(
+            f"{DEGENERATE[kind][0]:30} refused {counts['refused']:4}  right {counts['right']:4}  wrong "
+            f"{counts['wrong']:3}  {np.mean([one.cpu_s for one in mine]):5.2f} s of CPU each"
+            + (f"   ({'; '.join(bad[:6])})" if bad else "")
+        )
+    print(_summary(told), flush=True)
+
+
+def _keep(path: Path | None, kept: dict[str, object]) -> None:
+    if path is not None:
+        path.write_text(json.dumps(kept, indent=1))
+
+
 def main() -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -271,41 +321,47 @@ def main() -> None:
         return [i for i, name in enumerate(names) if not wanted or any(part in name for part in wanted)]
 
     kept: dict[str, object] = {}
-    seeds = lambda count: range(arguments.start, arguments.start + count)  # noqa: E731
+    seeds = range(arguments.start, arguments.start + max(arguments.sessions, arguments.runs))
     with ProcessPoolExecutor(arguments.jobs) as pool:
         if "degenerate" in arguments.only:
-            total: Counter[str] = Counter()
-            for kind in chosen([name for name, _, _ in DEGENERATE]):
-                found = list(pool.map(partial(judge, kind), seeds(arguments.sessions)))
-                counts = Counter(told for _, _, told, _, _ in found)
-                total += counts
-                bad = [f"{seed}: {lag:.1f} ms, {turn:.1f}°" for _, seed, told, lag, turn in found if told == "wrong"]
-                name = DEGENERATE[kind][0]
-                print(
-                    f"{name:30} refused {counts['refused']:4}  right {counts['right']:4}  wrong {counts['wrong']:3}"
-                    + (f"   ({'; '.join(bad[:6])})" if bad else ""),
-                    flush=True,
-                )
-                kept[name] = dict(counts) | {"bad": bad}
-            share = 100.0 * total["wrong"] / max(sum(total.values()), 1)
-            print(f"wrong but accepted: {total['wrong']} of {sum(total.values())} ({share:.2f} %; asked 0.1 %)")
+            kinds = chosen([name for name, _, _ in DEGENERATE])
+            todo = [(kind, seed) for seed in seeds[: arguments.sessions] for kind in kinds]
+            told: list[Judged] = []
+            try:
+                for one in pool.map(judge, *zip(*todo, strict=True)):
+                    told.append(one)
+                    if one.verdict == "wrong":
+                        print(f"wrong: {DEGENERATE[one.kind][0]}, {one}", flush=True)
+                    if len(told) % (_TELL_EACH * len(kinds)) == 0:
+                        kept |= tabled(told)
+                        print(f"{len(told)} of {len(todo)} sessions, {_summary(told)}", flush=True)
+                        _keep(arguments.json, kept)
+            except KeyboardInterrupt:
+                print(f"interrupted after {len(told)} of {len(todo)} sessions", flush=True)
+                pool.shutdown(cancel_futures=True)
+            kept |= tabled(told)
+            _print_degenerate(told)
+            _keep(arguments.json, kept)
+            if len(told) < len(todo):
+                return
         if "stds" in arguments.only:
             print("\nwithin 1.96 std (asked 93 to 97 %), and the histogram of z from -4 to 4")
             for regime in chosen([r.name for r in REGIMES]):
-                runs = list(pool.map(partial(scores, regime), seeds(arguments.runs)))
-                parts = [np.array([z for run in runs for z in run[1 + k]]) for k in range(3)]
-                told = [
+                runs = list(pool.map(partial(scores, regime), seeds[: arguments.runs]))
+                parts = [np.array([z for run in runs for z in (run[1], run[2], run[3])[k]]) for k in range(3)]
+                within = [
                     f"{label} {100 * np.mean(np.abs(z) < _WITHIN):5.1f} % {_histogram(z)}"
                     for label, z in zip(("clock", "position", "path"), parts, strict=True)
                 ]
                 refused = sum(not run[1] for run in runs)
-                print(f"{REGIMES[regime].name:26} " + "  ".join(told) + f"  refused {refused}/{len(runs)}", flush=True)
+                print(
+                    f"{REGIMES[regime].name:26} " + "  ".join(within) + f"  refused {refused}/{len(runs)}", flush=True
+                )
                 kept[REGIMES[regime].name] = {
                     label: {"within": float(np.mean(np.abs(z) < _WITHIN)), "rms": float(np.sqrt(np.mean(z**2)))}
                     for label, z in zip(("clock", "position", "path"), parts, strict=True)
                 }
-    if arguments.json:
-        arguments.json.write_text(json.dumps(kept, indent=1))
+                _keep(arguments.json, kept)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from hub.timing.pair import PairSolution, solve_pair
 from hub.timing.tracks import SmoothTrack, smooth_track
 from protocols.errors import Refused
 from protocols.geometry import so3
+from tests.bench.honesty import regular
 from tests.rigs import Path, Session, random_path, simulate
 
 
@@ -165,6 +166,23 @@ def test_a_motion_that_repeats_itself_is_refused_as_ambiguous() -> None:
     session = simulate(56, 2, 40, path=path)
     found = solve(session)
     assert not found.solved or abs(lag_error(session, found)) < 5e-3
+
+
+def test_a_repeating_motion_is_not_timed_by_a_whole_period_off() -> None:
+    """Repeats every 1.316 s; the scan's own start at the true lag ends beside it, one at its repetition does not."""
+    session = regular(60001)
+    found = solve(session)
+    assert not found.solved or abs(lag_error(session, found)) < 5e-3
+
+
+def test_an_answer_is_tried_at_the_lags_where_its_own_geometry_fits() -> None:
+    rng = np.random.default_rng(5)
+    path = Path(np.full((2, 3), 0.4) * [[1.0], [2.0]], rng.uniform(0, 6.28, (2, 3)), rng.uniform(0.2, 0.5, (2, 3)))
+    found = solve(simulate(5, 2, 20, path=path))
+    assert not found.solved
+    assert found.fit is not None
+    apart = [abs(abs(found.fit.offset - other.offset) / 2.5 % 1.0 - 0.5) for other in found.others]
+    assert max(apart) > 0.45  # whole periods of 2.5 s
 
 
 def test_a_refusal_says_why() -> None:

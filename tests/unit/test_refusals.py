@@ -11,8 +11,8 @@ import pytest
 
 import hub
 from hub.timing.alignment import PairFit, PairSettings
-from hub.timing.pair import _judge
 from hub.timing.two_view import RelativePose
+from hub.timing.verdict import judge
 
 ROOT = Path(hub.__file__).parent
 
@@ -84,17 +84,24 @@ TOLD = {
 
 @pytest.mark.parametrize("told", VERDICTS)
 def test_a_verdict_names_what_is_wrong(told: str) -> None:
-    assert _judge(("a", "b"), [GOOD], 20.0, PairSettings()).solved
-    answer = _judge(("a", "b"), [VERDICTS[told]], 20.0, PairSettings())
+    assert judge(("a", "b"), [GOOD], 20.0, PairSettings()).solved
+    answer = judge(("a", "b"), [VERDICTS[told]], 20.0, PairSettings())
     assert not answer.solved
     assert told in answer.status
 
 
 def test_two_alignments_alike_are_refused() -> None:
     rival = replace(GOOD, offset=5.0, support=14.8)
-    answer = _judge(("a", "b"), [GOOD, rival], 20.0, PairSettings())
+    answer = judge(("a", "b"), [GOOD, rival], 20.0, PairSettings())
     assert not answer.solved
     assert answer.status == "two alignments are about as good (2.00 s and 5.00 s)"
+
+
+def test_what_fits_as_well_for_longer_is_a_rival_whatever_chance_says() -> None:
+    longer = replace(GOOD, offset=5.0, support=19.0, log10_chance=-4.0)
+    answer = judge(("a", "b"), [GOOD, longer], 20.0, PairSettings())
+    assert answer.status == "two alignments are about as good (2.00 s and 5.00 s)"
+    assert judge(("a", "b"), [GOOD, replace(longer, support=14.0)], 20.0, PairSettings()).solved
 
 
 def test_every_kind_of_refusal_stands_in_the_code_and_in_the_faq() -> None:
@@ -109,7 +116,7 @@ def test_every_kind_of_refusal_stands_in_the_code_and_in_the_faq() -> None:
 
 def test_no_verdict_of_a_pair_is_left_out() -> None:
     """Every sentence with which a pair is refused is one of the kinds above."""
-    text = (ROOT / "timing" / "pair.py").read_text(encoding="utf-8")
+    text = "".join((ROOT / "timing" / name).read_text(encoding="utf-8") for name in ("pair.py", "verdict.py"))
     reasons = re.findall(r'(?:PairSolution\(\*names, |reason = \(?\s*|status=|return )f?"([a-z][^"]{20,})"', text)
     assert len(reasons) > 12
     for reason in reasons:

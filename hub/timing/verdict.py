@@ -1,0 +1,127 @@
+"""What is said of an alignment, alone and beside the others: accepted, or refused and why."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hub.timing.alignment import PairFit, PairSettings, PairSolution, evidence
+
+_NEARLY_ALL = 0.9
+
+
+def judge(names: tuple[str, str], fits: list[PairFit], searched: float, s: PairSettings) -> PairSolution:
+    """The first of ``fits``, best first, as answer of the cameras ``names``, or the reason why it is none.
+
+    searched: about how many independent alignments were looked at.
+    """
+    best = fits[0]
+    others = tuple(fits[1:4])
+    rivals = [fit for fit in fits[1:] if rival_of(fit, best, s)]
+    second = max((evidence(fit) / max(evidence(best), 1e-12) for fit in rivals), default=0.0)
+    by_chance = None if best.log10_chance is None else best.log10_chance + np.log10(searched)
+    # Regular motion fits nearly as well a period later. That is settled by the noise where there is enough of
+    # it and nothing else comes near what the tracks' own noise leaves.
+    settled = not rivals and best.support >= s.unchecked_support and best.sigma_px <= s.exact * best.own_px
+    doubt = doubts(best, s)
+    apart = not rivals and best.log10_gap < s.accept_log10_gap
+    if doubt:
+        reason = doubt
+    elif best.inliers < needed_inliers(best, s):
+        reason = f"only {100 * best.inliers:.0f} % of the common motion agrees with one geometry"
+    elif by_chance is None and best.support < s.unchecked_support:
+        reason = (
+            f"the recordings overlap too little ({best.moving_overlap:.1f} s of motion) to tell one lag from another"
+        )
+    elif by_chance is not None and by_chance > s.accept_log10_chance and not (settled or apart):
+        reason = (
+            f"other lags fit nearly as well (one of them would by chance in {100 * min(1.0, 10.0**by_chance):.0f} % "
+            "of cases): too little or too regular common motion, or two different things"
+        )
+    elif second > s.accept_ratio:
+        rival = max(rivals, key=evidence)
+        reason = f"two alignments are about as good ({best.offset:.2f} s and {rival.offset:.2f} s)"
+    else:
+        return PairSolution(*names, "ok", best, others)
+    return PairSolution(*names, reason, best, others)
+
+
+def doubts(fit: PairFit, s: PairSettings) -> str:
+    """What speaks against an alignment taken by itself; "" for nothing."""
+    if fit.support < s.accept_support:
+        return f"only {fit.support:.1f} s of motion agree (of {fit.moving_overlap:.1f} s)"
+    if fit.sigma_px > s.largest_sigma_px:
+        return f"the best alignment leaves {fit.sigma_px:.1f} px"
+    if abs(fit.rate - 1.0) > s.largest_rate:
+        return f"the best alignment needs a clock that is {1e6 * abs(fit.rate - 1.0):.0f} ppm off"
+    if fit.front < s.accept_in_front:
+        return "the best geometry puts points behind a camera"
+    if fit.flat_px < s.flat_ratio * max(fit.sigma_px, s.sigma_px):
+        return "the motion lies in one plane (or the cameras stand in one place), which leaves the geometry open"
+    return ""
+
+
+def rival_of(fit: PairFit, best: PairFit, s: PairSettings) -> bool:
+    """Whether another alignment comes near the best one: in what it leaves, and in how unlikely that is."""
+    if best.sigma_px <= s.exact * best.own_px and best.support >= s.unchecked_support:
+        # What is left is the tracks' own noise, row for row: then a little more is a lot less likely.
+        limit = s.worse_than_noise * best.sigma_px
+    else:
+        limit = s.clearly_worse * max(best.sigma_px, s.sigma_px)
+    if fit.sigma_px > limit:
+        return False
+    if fit.log10_chance is None or best.log10_chance is None:
+        return True
+    if fit.support > best.support and fit.inliers > _NEARLY_ALL and not doubts(fit, s):
+        return True  # as good for longer: chance, told from stretches of a motion that repeats itself, does not decide
+    return fit.log10_chance < best.log10_chance + s.clearly_likelier
+
+
+def needed_inliers(fit: PairFit, s: PairSettings) -> float:
+    """The share of the common motion that must agree: the less motion there is, the more of it."""
+    short = float(np.clip((s.plenty - fit.support) / (s.plenty - s.hardly), 0.0, 1.0))
+    return s.accept_inliers + short * (s.strict_inliers - s.accept_inliers)
+
+
+def distinct(fits: list[PairFit], s: PairSettings) -> list[PairFit]:
+    """Best first, alignments that are the same within 0.1 s once.
+
+    The best is the one that chance explains least; where the recordings are too short to tell, the one with
+    most evidence.
+    """
+    told = all(fit.log10_chance is not None for fit in fits)
+
+    def merit(fit: PairFit) -> tuple[float, float]:
+        if not told:
+            return (evidence(fit), 0.0)
+        agreeing = fit.inliers * fit.front * (fit.support >= s.accept_support)
+        return (-(fit.log10_chance or 0.0) * agreeing, evidence(fit))
+
+    ordered = sorted(fits, key=merit, reverse=True)
+    out: list[PairFit] = []
+    for fit in ordered:
+        if all(abs(fit.offset - other.offset) > 0.1 for other in out):
+            out.append(fit)
+    return out
+
+
+def sound(fit: PairFit, s: PairSettings) -> bool:
+    """Whether an alignment is good enough to measure others by."""
+    return fit.inliers > 0.8 and fit.front > s.accept_in_front and fit.sigma_px < 4.0 * s.sigma_px
+
+
+def at_noise(fit: PairFit, s: PairSettings) -> bool:
+    """Whether long common motion leaves no more than the tracks' own noise: then lag and rate are what they are."""
+    return (
+        fit.support >= s.unchecked_support
+        and fit.inliers > _NEARLY_ALL
+        and fit.sigma_px <= s.exact * max(fit.own_px, s.sigma_px)
+    )
+
+
+def hopeless(support: float, cost: float, best_evidence: float, best_cost: float, s: PairSettings) -> bool:
+    """Whether a candidate can neither win over a sound fit nor make it doubtful, so that refining it is idle.
+
+    Its evidence is at most the seconds in which both move; and what leaves tens of times the misfit of the
+    sound one is not brought down to it by a lag between two steps of the grid.
+    """
+    return 1.5 * support < s.accept_ratio * best_evidence or cost > 25.0 * max(best_cost, 4.0)
