@@ -2,7 +2,7 @@
 
 A time service keeps the Unix time; cameras are stamped by other clocks, which it does not touch but in their rate. What
 is told here is how well the host's Unix time is known, so that a person can see whether the estimate found from the
-pictures and the network's agree. No estimator takes it.
+pictures and the network's agree. The hub asks it only to choose among lags that the pictures leave open.
 """
 
 from __future__ import annotations

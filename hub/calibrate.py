@@ -6,10 +6,12 @@ No sockets, files or clocks: `calibrate` offline and the live hub run the same c
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hub.clock_claims import Claim
 from hub.distributed import PlacedByNodes
 from hub.lens import LARGEST_STD, refocused, self_calibrated
 from hub.pairs import Progress, rate_warnings, solve_pairs, timing_told
@@ -62,6 +64,7 @@ def calibrate(
     known: Known | None = None,
     thorough: bool = False,
     seed: int = 0,
+    claims: Mapping[str, Claim] | None = None,
 ) -> Calibration:
     """Timing and poses of all cameras from what they saw, with no guess.
 
@@ -70,6 +73,7 @@ def calibrate(
     thorough: whether cameras that nothing ties get a second, far dearer search: clock rates that a
     wrongly told frame rate makes (times made of frame numbers: a live camera's are not), and torn tracks.
     seed: of the samples by which pose nodes begin ("distributed"); the other solvers draw nothing at random.
+    claims: what cameras' machines say of their clocks; asked only where the pictures leave lags open.
     Raises Refused, with a reason for every camera and what is known of pairs, where fewer than two can be placed.
     """
     tell = progress or (lambda text, share: None)
@@ -82,7 +86,7 @@ def calibrate(
     elif solver == "paper" and known is None:
         pairs = paper_pairs(prepared, observations, tell)
     else:
-        prepared, pairs = solve_pairs(prepared, tell, thorough=thorough, known=known)
+        prepared, pairs = solve_pairs(prepared, tell, thorough=thorough, known=known, claims=claims)
         prepared = replace(
             prepared,
             refused=_with_timing(prepared, pairs),

@@ -1,8 +1,9 @@
-"""What cameras' machines claim of their clocks, held against what the pictures say. Only told; no estimate takes it.
+"""What cameras' machines claim of their clocks: held against what the pictures say, and asked where these say nothing.
 
 A time service ties a machine's clock to Unix time, t_unix = t_camera + m, and says within what. Two cameras that are
 both so tied are tied to each other, which the calibration has found too, from the pictures. Where the two contradict
-each other by more than both allow, a clock is wrong or a camera stamps late; the pictures are believed.
+each other by more than both allow, a clock is wrong or a camera stamps late; the pictures are believed. Only where
+they leave several lags open (a motion that repeats itself) the claim chooses among these (`hub/pairs.py`).
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from protocols.clocks import NANOSECONDS, CameraTime
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration
 
-_DELAY_S = 0.1  # a camera's own, which no time service knows: what is stamped on arrival is late by that
+CAMERA_DELAY = 0.1
+"""Seconds of a camera's own, which no time service knows: what is stamped on arrival is late by that."""
 _STDS = 3.0
 
 
@@ -51,16 +53,17 @@ class ClockClaims:
         else:
             self._claims.pop(message.agent, None)
 
+    def of(self, boots: Mapping[str, str]) -> dict[str, Claim]:
+        """The claims of the runs (boots) of cameras that are spoken of."""
+        return {name: claim for name, claim in self._claims.items() if claim.boot == boots.get(name)}
+
     def contradictions(self, calibration: Calibration, boots: Mapping[str, str]) -> list[str]:
         """One line for each camera whose claim the calibration contradicts. boots: those it speaks of.
 
         Of two cameras nobody can say which is wrong; of more, those away from the median are told.
         """
-        claims = {
-            name: self._claims[name]
-            for name in calibration.cameras
-            if name in self._claims and name in self._now and self._claims[name].boot == boots.get(name)
-        }
+        told_of = self.of(boots)
+        claims = {name: told_of[name] for name in calibration.cameras if name in told_of and name in self._now}
         if len(claims) < 2:
             return []
         first = next(iter(claims))
@@ -77,7 +80,7 @@ class ClockClaims:
         told = []
         for name, moment in moments.items():
             a, b = calibration.cameras[name], calibration.cameras[against]
-            allowed = claims[name].error + claims[against].error + _DELAY_S
+            allowed = claims[name].error + claims[against].error + CAMERA_DELAY
             allowed += _STDS * math.hypot(a.time_offset_std, b.time_offset_std)
             if not math.isfinite(moment) or not abs(moment - usual) > allowed:
                 continue

@@ -4,19 +4,23 @@ Times made of frame numbers with a wrong frame rate run 0.4 to 2.5 times as fast
 that in every pair is dear, so only cameras that nothing ties to the others are tried at such rates. What is
 found becomes the camera's pace: from then on its times are counted at it, and everything behind sees clocks
 that run about alike.
+
+Where the pictures leave several lags open (a motion that repeats itself), what time services say of the cameras'
+clocks may choose among them. It is asked last, so that it changes no answer that the pictures give.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
 
+from hub.clock_claims import CAMERA_DELAY, Claim
 from hub.poses.graph import components
 from hub.prepare import Prepared
-from hub.timing.pair import PairFit, PairSolution, solve_pair
+from hub.timing.pair import PairFit, PairSettings, PairSolution, evidence, solve_pair
 from hub.timing.promise import promise
 from hub.timing.shared import solve_shared_pair
 from hub.timing.tracks import smooth_only
@@ -32,15 +36,22 @@ _FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
 _SAME_RATIO = 0.01
 _FEW = 8  # cameras whose pairs are all looked at closely
 _MUCH = 8.0  # s of common motion
+_WIDEST_CLAIM = 0.5  # s on either side: a claim as vague as that chooses nothing
 
 
 def solve_pairs(
-    prepared: Prepared, tell: Progress, *, thorough: bool = False, known: Known | None = None
+    prepared: Prepared,
+    tell: Progress,
+    *,
+    thorough: bool = False,
+    known: Known | None = None,
+    claims: Mapping[str, Claim] | None = None,
 ) -> tuple[Prepared, list[PairSolution]]:
     """All pairs of cameras, lensless ones included, and the session at the paces that were found.
 
     thorough: whether to try rates that a wrongly told frame rate makes, for cameras that nothing ties.
-    known: given poses; then only lags and rates are sought where both have one.
+    known: given poses; then only lags and rates are sought where both have one. claims: what the cameras' machines
+    say of their clocks; it chooses where the pictures leave lags open, which a warning tells, and nowhere else.
     """
     names = prepared.names
     todo = list(itertools.combinations(names, 2))
@@ -55,12 +66,48 @@ def solve_pairs(
         # Where the others' clocks are right, a pair that sees much must agree; if not, it is heard for itself.
         if near is not None and not answer.solved and (not many or _sees_much(answer)):
             answer = _solve(prepared, (a, b), known)
+        if claims and not answer.solved and not prepared.shared_clock:
+            answer, warning = _chosen_by_claims(prepared, answer, known, claims)
+            prepared = replace(prepared, warnings=prepared.warnings + warning)
         pairs[a, b] = answer
         told.hear(answer)
     pairs = {both: pairs[both] for both in todo}  # in the rig's order
     if thorough and not prepared.shared_clock:
         prepared = _tie_at_other_rates(prepared, pairs, known, tell)
     return prepared, list(pairs.values())
+
+
+def _chosen_by_claims(
+    prepared: Prepared, answer: PairSolution, known: Known | None, claims: Mapping[str, Claim]
+) -> tuple[PairSolution, tuple[str, ...]]:
+    """The alignment about the lag that the two machines claim, if it explains what was seen as well as any does.
+
+    answer: of the search through all lags, unsolved. Returned unchanged, without a warning, where it found no
+    alignment at all, where nothing near the claim stands, or where what stands there agrees for less than half of
+    the time or leaves clearly more than the best does elsewhere: then the claim is wrong.
+    """
+    if answer.fit is None or answer.a not in claims or answer.b not in claims:
+        return answer, ()
+    one, other = claims[answer.a], claims[answer.b]
+    window = one.error + other.error + CAMERA_DELAY
+    if not window <= _WIDEST_CLAIM:
+        return answer, ()
+    # t_unix = t_a + m_a = t_b + m_b, on the session's times, which begin at each camera's epoch
+    lag = other.unix_minus_camera - one.unix_minus_camera + prepared.epochs[answer.b] - prepared.epochs[answer.a]
+    settings = PairSettings(near_window=window)
+    near = _solve(prepared, (answer.a, answer.b), known, near=lag, settings=settings)
+    best, fit = answer.fit, near.fit
+    if not near.solved or fit is None or abs(fit.lag - lag) > window:
+        return answer, ()
+    if evidence(fit) < settings.accept_ratio * evidence(best):
+        return answer, ()
+    if fit.sigma_px > settings.worse_than_noise * max(best.sigma_px, settings.sigma_px):
+        return answer, ()
+    warning = (
+        f"{answer.a}–{answer.b}: the motion alone leaves several lags open ({answer.status}); of them the one was "
+        f"taken that the machines' clocks claim, to {1e3 * window:.3g} ms"
+    )
+    return near, (warning,)
 
 
 def _sees_much(answer: PairSolution) -> bool:
@@ -117,6 +164,7 @@ def _solve(
     *,
     thorough: bool = False,
     near: float | None = None,
+    settings: PairSettings | None = None,
 ) -> PairSolution:
     a, b = (prepared.camera(name).tracks for name in names)
     if prepared.shared_clock:
@@ -126,7 +174,7 @@ def _solve(
         given = relative_pose(known.cameras[names[0]].pose, known.cameras[names[1]].pose)
     calibrated = all(name in prepared.cameras for name in names)
     return solve_pair(
-        smooth_only(a), smooth_only(b), names, known=given, calibrated=calibrated, thorough=thorough, near=near
+        smooth_only(a), smooth_only(b), names, settings, given, calibrated=calibrated, thorough=thorough, near=near
     )
 
 

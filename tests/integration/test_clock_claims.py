@@ -1,19 +1,20 @@
-"""Machines that claim synchronised clocks, held against what the pictures say: contradictions are told."""
+"""Machines that claim synchronised clocks: what the pictures say overrules them, what these leave open they choose."""
 
 from __future__ import annotations
 
 import threading
 
+import numpy as np
 import pytest
 
 from hub.agent import run_hub, status_message
-from hub.live import LiveHub
+from hub.live import LiveHub, LiveSettings
 from protocols.bus.memory import MemoryBus, MemoryHub
 from protocols.catalogue import CAMERA_INFO, OBSERVATION, STATUS
 from protocols.clocks import CameraTime
 from protocols.messages import syncline_pb2 as pb
 from tests.integration.test_live_hub import SETTINGS, feed, messages
-from tests.rigs import Session, simulate
+from tests.rigs import Path, Session, simulate
 from tests.samples import eventually
 
 UNIX_S = 1.7e9
@@ -79,6 +80,69 @@ def test_nothing_is_told_where_nothing_contradicts(hub: LiveHub, session: Sessio
     assert told(hub, right[0], claim(session, "cam1", off_s=1.3, boot="boot1")) == [], "another clock than was solved"
     assert told(hub, claim(session, "cam1", off_s=1.3)) == [], "nobody to compare with"
     assert told(LiveHub(SETTINGS), *right) == [], "nothing is known yet"
+
+
+def regular_session(seed: int, period: float = 2.5) -> Session:
+    """Two cameras that watch a motion which repeats itself exactly: lags a period apart fit alike."""
+    rng = np.random.default_rng(seed)
+    harmonic = np.arange(1.0, 4.0)[:, None] * np.ones((1, 3))
+    amplitude = rng.uniform(0.4, 1.0, (3, 3)) / harmonic
+    path = Path(harmonic / period, rng.uniform(0.0, 2.0 * np.pi, (3, 3)), 1.4 * amplitude / amplitude.sum(axis=0))
+    return simulate(seed, 2, 20, path=path, ppm=20.0)
+
+
+def hub_after(session: Session, *claims: pb.AgentStatus) -> LiveHub:
+    """The answer of a hub that has heard the claims before it solves for the first time."""
+    made = LiveHub(LiveSettings(interval_s=1e9))
+    for one in claims:
+        made.handle(one)
+    for message in messages(session):
+        made.handle(message)
+    made.tick(0.0, final=True)
+    return made
+
+
+@pytest.mark.parametrize("seed", [900, 902])
+def test_of_lags_that_a_regular_motion_leaves_open_the_claimed_one_is_taken_and_that_is_told(seed: int) -> None:
+    session = regular_session(seed)
+    silent = hub_after(session)
+    assert silent.calibration is None
+    assert silent.refusal is not None, "the motion alone leaves periods open"
+    claims = claim(session, "cam0", off_s=0.02), claim(session, "cam1", off_s=-0.03)
+    believed = hub_after(session, *claims).calibration
+    assert believed is not None
+    assert abs(session.clock_error("cam1", "cam0", believed.cameras["cam1"].time_map)) < 2e-3, "the pictures' precision"
+    (warning,) = [text for text in believed.warnings if "clocks claim" in text]
+    assert warning.startswith("cam0–cam1: the motion alone leaves several lags open")
+
+
+@pytest.mark.parametrize(
+    ("off_s", "error_s"),
+    [(3.0, 0.002), (-1.2, 0.002), (0.0, 0.5)],
+    ids=["no period", "half a period", "too vague to choose"],
+)
+def test_a_claim_that_fits_none_of_them_or_all_of_them_chooses_none(off_s: float, error_s: float) -> None:
+    session = regular_session(902)
+    hub = hub_after(session, claim(session, "cam0", error_s=error_s), claim(session, "cam1", off_s, error_s))
+    assert hub.calibration is None
+    assert hub.refusal is not None
+
+
+@pytest.mark.parametrize("off_s", [3.0, -0.4, 0.0])
+def test_where_the_pictures_tell_the_lag_no_claim_changes_it(session: Session, off_s: float) -> None:
+    silent = hub_after(session).calibration
+    claims = [claim(session, name, off_s=off_s * (name == "cam1")) for name in ("cam0", "cam1", "cam2")]
+    told_so = hub_after(session, *claims).calibration
+    assert silent is not None
+    assert told_so is not None
+    assert {n: c.time_map for n, c in told_so.cameras.items()} == {n: c.time_map for n, c in silent.cameras.items()}
+    assert told_so.warnings == silent.warnings
+
+
+def test_a_claim_of_another_run_of_the_agent_chooses_nothing() -> None:
+    session = regular_session(902)
+    hub = hub_after(session, claim(session, "cam0"), claim(session, "cam1", boot="boot1"))
+    assert hub.calibration is None
 
 
 def test_it_moves_no_estimate(hub: LiveHub, session: Session) -> None:
