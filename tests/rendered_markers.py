@@ -31,10 +31,18 @@ def dim_room(seed: int, width: int = 640, height: int = 480, level: float = 90.0
 def add_spot(
     picture: Floats, u: float, v: float, sigma: float, peak: float, smear: tuple[float, float] = (0.0, 0.0)
 ) -> None:
-    """A round spot integrated over each pixel, moved by ``smear`` [px] during the exposure about (u, v)."""
+    """A round spot integrated over each pixel, moved by ``smear`` [px] during the exposure about (u, v).
+
+    It ends 7 sigma from where it was, where a millionth of a millionth of it is left.
+    """
     height, width = picture.shape[:2]
     steps = 1 if smear == (0.0, 0.0) else 32
-    columns, rows = np.arange(width), np.arange(height)
+    reach = 7.0 * sigma + 1.0 + 0.5 * float(np.hypot(*smear))
+    columns = np.arange(max(int(u - reach), 0), min(int(u + reach) + 2, width))
+    rows = np.arange(max(int(v - reach), 0), min(int(v + reach) + 2, height))
+    if not len(columns) or not len(rows):
+        return
+    light = np.zeros((len(rows), len(columns)))
     for step in range(steps):
         part = (step + 0.5) / steps - 0.5
 
@@ -42,8 +50,9 @@ def add_spot(
             scaled = sigma * np.sqrt(2.0)
             return np.asarray(0.5 * (erf((axis + 0.5 - centre) / scaled) - erf((axis - 0.5 - centre) / scaled)))
 
-        light = np.outer(covered(rows, v + part * smear[1]), covered(columns, u + part * smear[0]))
-        picture += (peak * 2.0 * np.pi * sigma**2 / steps * light)[..., None]
+        light += np.outer(covered(rows, v + part * smear[1]), covered(columns, u + part * smear[0]))
+    here = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    picture[here] += (peak * 2.0 * np.pi * sigma**2 / steps * light)[..., None]
 
 
 def exposed(picture: Floats, noise: float, rng: np.random.Generator) -> Image:
@@ -101,12 +110,16 @@ def add_tag(picture: Floats, tag: Image, centre: Floats, side: float, tilt: Floa
     )
     steps = 1 if not np.any(smear) else 12
     fine = 4
-    height, width = picture.shape[:2]
+    corners = seen(flat / inner, np.zeros(2))
+    margin = 0.5 * np.abs(smear) + 4.0
+    left, top = np.maximum(np.floor(corners.min(axis=0) - margin).astype(int), 0)
+    right, bottom = np.minimum(np.ceil(corners.max(axis=0) + margin).astype(int) + 1, picture.shape[1::-1])
+    height, width = bottom - top, right - left
     total = np.zeros((height, width))
     cover = np.zeros((height, width))
     for step in range(steps):
         part = ((step + 0.5) / steps - 0.5) * np.asarray(smear)
-        quad = seen(flat / inner, part)
+        quad = seen(flat / inner, part) - [left, top]
         large = (quad + 0.5) * fine - 0.5
         warp = cv2.getPerspectiveTransform(corners_of_image.astype(np.float32), large.astype(np.float32))
         size = (width * fine, height * fine)
@@ -115,5 +128,6 @@ def add_tag(picture: Floats, tag: Image, centre: Floats, side: float, tilt: Floa
         total += cv2.resize(drawn, (width, height), interpolation=cv2.INTER_AREA).astype(float) / steps
         cover += cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA).astype(float) / (255.0 * steps)
     paper = 30.0 + total * 190.0 / 255.0
-    picture[...] = picture * (1.0 - cover[..., None]) + (paper * np.minimum(cover, 1.0))[..., None]
+    here = picture[top:bottom, left:right]
+    here[...] = here * (1.0 - cover[..., None]) + (paper * np.minimum(cover, 1.0))[..., None]
     return seen(flat, np.zeros(2))

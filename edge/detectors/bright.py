@@ -32,9 +32,11 @@ _MAX_ASPECT = 6.0  # of a smear's length to its width
 _FLARE = 0.35  # of the contrast: how bright the ring may be against what lies farther out
 _FAR = 6.0  # px: that far out
 _FLOOR_PX = 0.02  # std of the centre that remains without noise: pixels are not equal, their gaps are blind
+_COARSE, _COARSE_BY = 4.0, 0.5  # px: a spot narrower than that, and by that much, errs twice as far by the pixels' size
 _UNEVEN = 0.02  # of the contrast: gain that differs from pixel to pixel, and a spot's own grain
 _SENSOR_STD = 4.0  # grey levels that a sensor's own noise may be
-_PATCH = 16.0  # px² over which a background's texture errs together
+_PATCH = 16.0  # px² over which a background's texture errs together,
+_PLANE = 8.0  # px: behind a spot that is narrower a plane follows the texture
 _QUANTUM = 1.0 / 12.0  # variance of rounding to whole grey levels
 
 
@@ -141,7 +143,9 @@ class BrightDetector:
             score=float(np.clip(contrast / 255.0, 0.0, 1.0) * min(fill, 1.0)),
             label=self._model.label,
             colour=(round(colour[2]), round(colour[1]), round(colour[0])),
-            covariance=_covariance(excess, ring, x - u, y - v, mass, noise, _SENSOR_STD * float(np.linalg.norm(share))),
+            covariance=_covariance(
+                excess, ring, x - u, y - v, mass, noise, _SENSOR_STD * float(np.linalg.norm(share)), shape.width
+            ),
             kind="marker",
         )
 
@@ -241,14 +245,17 @@ def _covariance(
     mass: float,
     noise: float,
     sensor: float,
+    width: float,
 ) -> tuple[float, float, float]:
     """(uu, uv, vv) [px²] of a centroid; x, y: of each pixel from it. sensor: the part of ``noise`` that is no texture.
+    width: of the spot [px].
 
     Each pixel's grey level errs by itself and moves the centroid by its own distance; the background errs as a whole
     as much as its plane is uncertain, and moves it by the sum of all distances.
     """
     # What the ring scatters beyond the sensor's noise is texture, which errs in patches and not pixel by pixel.
-    texture = max(noise * noise - sensor**2, 0.0)
+    # What a plane misses of it grows with the square of the width that it spans.
+    texture = max(noise * noise - sensor**2, 0.0) * min(1.0, (width / _PLANE) ** 4)
     patchy = noise * noise + (_PATCH - 1.0) * texture
     variance = patchy + _QUANTUM + (_UNEVEN * np.abs(excess)) ** 2
     arms = np.stack([x, y]) * (excess > 0.0) / mass
@@ -257,5 +264,6 @@ def _covariance(
     of_ring = np.einsum("ahw,bhw,hw->ab", basis, basis, ring.astype(np.float64))
     lever = np.einsum("ahw,bhw->ab", arms, basis)
     plane = lever @ np.linalg.inv(of_ring) @ lever.T * (patchy + _QUANTUM)
-    total = own + plane + _FLOOR_PX**2 * np.eye(2)
+    floor = _FLOOR_PX * (1.0 + float(np.clip((_COARSE - width) / _COARSE_BY, 0.0, 1.0)))
+    total = own + plane + floor**2 * np.eye(2)
     return float(total[0, 0]), float(total[0, 1]), float(total[1, 1])

@@ -2,15 +2,15 @@
 
 A coarse pass classifies every second pixel by colour; each blob is then measured at full resolution. There the
 question is no longer which pixels are the target's but how much of each is: its coverage, from the local colours of
-target and background (``_coverage``). The centroid of coverage is unbiased under motion blur (a smeared ball's
-centroid is where the ball was on average) and does not follow the shading, as a centroid of brightness would.
+target and background (``outline``). That is unbiased under motion blur (a smeared ball is where it was on average) and
+does not follow the shading, as a centroid of brightness would.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -19,19 +19,22 @@ import numpy.typing as npt
 
 from edge.detectors.base import Detection, Prediction
 from edge.detectors.colour import ColourModel, codes, taught
-from edge.detectors.outline import measure_outline
+from edge.detectors.outline import Outline, measure_outline
 from protocols.errors import InputError
 from protocols.geometry.ball import outline_to_centre
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Bools
+from protocols.geometry.types import Bools, Floats
 
-REVISION = 2
+REVISION = 3
 """Of what is measured: kept detections of another revision are not this detector's."""
 _STEP = 2  # of the coarse pass [px]
 _CANDIDATES = 6  # blobs that are measured, largest first
 _MIN_AREA = 6.0  # px²: below, colour noise looks like that
 _MAX_SHARE = 0.2  # of the image: above, it is a wall
 _MIN_SCORE = 0.35
+_APART, _APART_SMEARED = 0.6, 0.04  # px between a blob's centroid and its outline's centre: not more, and of its smear
+_BLOB_STD, _BLOB_SHARE = 0.25, 0.2  # px: of a blob's centroid where they contradict each other, and of their distance
+_BORDER = 1  # px: nearer to the image's border a blob is cut
 _BOX = cv2.getStructuringElement(cv2.MORPH_RECT, (3, 3))
 
 
@@ -141,7 +144,7 @@ class MarkerDetector:
             return None
         moments = cv2.moments(mask, binaryImage=True)
         area = moments["m00"]
-        if area < _MIN_AREA:
+        if area < _MIN_AREA or _at_border(mask, x0, y0, image.shape):
             return None
         first = np.array([x0 + moments["m10"] / area, y0 + moments["m01"] / area])
         outline = measure_outline(image, first, np.sqrt(area / np.pi))
@@ -154,6 +157,7 @@ class MarkerDetector:
         score = outline.agreement * _solidity(moments)
         if score < _MIN_SCORE or not 0.5 < area / (np.pi * reach * reach) < 2.0:
             return None
+        outline = _unless_contradicted(outline, first, area)
         centre, covariance = outline.centre, outline.covariance
         if self._intrinsics is not None:
             sizes = np.array([outline.diameter])
@@ -180,6 +184,32 @@ def _main_blob(mask: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8] | None:
     filled = np.zeros_like(mask)
     cv2.drawContours(filled, [largest], -1, 1, thickness=cv2.FILLED)
     return filled
+
+
+def _unless_contradicted(outline: Outline, first: Floats, area: float) -> Outline:
+    """The outline, or, where the blob's centroid ``first`` (2,) contradicts it, the blob's centre and size.
+
+    The two err differently: a centroid of pixels of the marker's colour is coarse, but does not take a red ball that
+    touches an orange one for a part of it. Where they are far apart, the outline followed something else.
+    """
+    away = float(np.hypot(*(outline.centre - first)))
+    if away < _APART + _APART_SMEARED * outline.smear:
+        return outline
+    variance = _BLOB_STD**2 + (_BLOB_SHARE * away) ** 2
+    return replace(
+        outline,
+        centre=first,
+        diameter=math.sqrt(4.0 * area / math.pi),
+        covariance=outline.covariance + variance * np.eye(2),
+    )
+
+
+def _at_border(mask: npt.NDArray[np.uint8], left: int, top: int, shape: tuple[int, ...]) -> bool:
+    """Whether a blob (h, w) at (left, top) of an image reaches its border: what is left of a ball there can look like
+    a smaller, whole one."""
+    x, y, width, height = cv2.boundingRect(mask)
+    x, y = x + left, y + top
+    return x < _BORDER or y < _BORDER or x + width > shape[1] - _BORDER or y + height > shape[0] - _BORDER
 
 
 def _solidity(moments: dict[str, float]) -> float:

@@ -25,14 +25,16 @@ _PIXEL_STD = 6.0  # of a colour about the mixture of its two ends, by noise and 
 _SHADE_STD = 0.2  # relative: how much shading and texture brighten or darken either end along a ray
 _SHADE_RIDGE = 2.5
 _OUTER_BAND = 3.0  # px beyond the rim from which the background's colour is taken
-_FLOOR_PX = 0.03  # std of the centre that remains without noise or texture,
-_FLOOR_SHADE = 0.003  # and its share of the radius: shading that the model of a matt ball does not tell,
-_FLOOR_SMEAR = 0.015  # and its share of a smeared rim's width
-_SHARP = 2.5  # px that noise and sampling make of a sharp rim
-_CORRELATION = 2.0  # px along the rim within which rays err together
+_FLOOR_PX = 0.01  # std of the centre that remains without noise or texture,
+_FLOOR_SHADE = 0.002  # and its share of the radius: shading that the model of a matt ball does not tell,
+_FLOOR_SMEAR = 0.005  # and its share of what motion adds to a rim's width
+_SHARP = 2.2  # px that noise and sampling make of a sharp rim
+_CORRELATION = 3.5  # px along a sharp rim within which rays err together,
+_CORRELATION_GROWS = 1.5  # and the power of the rim's width with which it grows
+_LEAST_SMEARED = 4  # of the rays, one part in so many: motion along the rim leaves it as sharp as lens and encoder do
 _CHROMA = 0.6  # how much colour differences count against luma: cameras and encoders tell them at half the resolution
 
-_COLOUR_STD = 1.6  # of ball's and background's colours at a rim, over a part of it [8-bit steps]
+_COLOUR_STD = 0.7  # of ball's and background's colours at a sharp rim, over a part of it [8-bit steps]
 _ALIKE_ANGLE = 0.6  # rad along the rim over which such errors are alike
 
 _ANGLE = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
@@ -237,12 +239,18 @@ def _fit(offset: Floats, width: Floats) -> tuple[Floats, Floats, Floats, float]:
 def _covariance(weight: Floats, spread: float, width: Floats, radius: float, doubt: Floats) -> Floats:
     """Covariance (2, 2) of the centre [px²] from the scatter of the rims about the curve, and from what neighbouring
     rays may err alike: ``doubt`` (n,) [px].
+
+    How far rays err together, and how wrong colours are, depends on what made the picture. The rim tells it where
+    motion does not smear it: its width there is that of lens, sampling and encoder. Both grow with that width, as
+    measured on raw pictures, JPEG and H.264 alike (films in `tests/bench/marker_detector.py`).
     """
     prior = width.mean() / np.maximum(width, 1.5)
-    together = max(1.0, _CORRELATION * _RAYS / (2.0 * np.pi * radius))
+    blur = float(np.sort(width)[: _RAYS // _LEAST_SMEARED].mean())
+    wider = blur / _SHARP
+    together = max(1.0, _CORRELATION * wider**_CORRELATION_GROWS * _RAYS / (2.0 * np.pi * radius))
     effective = np.minimum(weight, prior)
     information = (_DESIGN * effective[:, None]).T @ _DESIGN
     inverse = np.linalg.inv(information + 1e-9 * np.eye(5))
-    alike = ((inverse @ (_DESIGN * effective[:, None]).T)[1:3]) * doubt
-    floor = _FLOOR_PX**2 + (_FLOOR_SHADE * radius) ** 2 + (_FLOOR_SMEAR * max(float(width.max()) - _SHARP, 0.0)) ** 2
+    alike = ((inverse @ (_DESIGN * effective[:, None]).T)[1:3]) * doubt * wider
+    floor = _FLOOR_PX**2 + (_FLOOR_SHADE * radius) ** 2 + (_FLOOR_SMEAR * (float(width.max()) - blur)) ** 2
     return np.asarray(spread**2 * together * inverse[1:3, 1:3] + alike @ _ALIKE @ alike.T + floor * np.eye(2))

@@ -33,12 +33,12 @@ _STEP = 0.5  # px across a side
 _LEAST_CONTRAST = 20.0  # grey levels between the border and what surrounds it
 _MIN_SIDE = 8.0  # px
 _ROUGH = 0.12  # of a side: a side that strays farther from its line is none
-_FLOOR_PX = 0.008  # std of the centre that remains without noise,
-_FLOOR_SIDE = 0.65  # and px² over the side: of a small tag neither black nor white is seen pure,
-_FLOOR_SMEAR = 0.006  # and its share of a smeared border's width;
+_FLOOR_PX = 0.004  # std of the centre that remains without noise,
+_FLOOR_SIDE = 0.3  # and px² over the side: of a small tag neither black nor white is seen pure,
+_FLOOR_SMEAR = 0.003  # and its share of a smeared border's width;
 _FULL, _FULLER = 0.68, 0.05  # a border over more than that part of its profile leaves neither black nor white pure
 _FLOOR_FULL = 0.1  # and adds, a step of that, this share of its width;
-_FLOOR_PALE = 0.18  # so does, of its profile's half, the contrast that a side lacks against the best of the four
+_FLOOR_PALE = 0.12  # so does, of its profile's half, the contrast that a side lacks against the best of the four
 _SHARP = 2.0  # px that lens and sampling make of a sharp border
 _INDEPENDENT = 1.5  # px along a side within which samples err together
 

@@ -1,17 +1,25 @@
 """How well and how fast the shipped marker detector works on rendered frames, whose truth is known.
 
-    python -m tests.bench.marker_detector [--quick] [--only ball|others]
+    python -m tests.bench.marker_detector [--quick] [--only ball|others] [--frames 100] [--seeds 4] [--first-seed 0]
 
 Errors are against the projection of the ball's centre at mid-exposure. ``nees`` is the squared error divided by the
-reported covariance, 1 if the covariance is right. Look-alikes (balls and boxes of other hues, wood) are in every frame.
+reported covariance, 1 if the covariance is right. Look-alikes (balls and boxes of other hues, wood) are in every frame;
+of as many frames more the ball itself is missing. ``--frames``: of each of a world's three cameras; of lights and tags
+as many are drawn a case as all worlds together have, in two dozen rooms that are mirrored and change colours. Films
+are consecutive frames through an encoder, "ultrafast" as ``tests/films.py`` writes them, and back.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import tempfile
 import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
+import av
 import cv2
 import numpy as np
 
@@ -22,13 +30,16 @@ from edge.detectors.tag import TagDetector
 from edge.scenes.marker import MarkerScene
 from edge.scenes.rendering import MarkerRenderer
 from protocols.geometry.types import Floats
-from tests.rendered_markers import add_look_alikes, add_spot, add_tag, dim_room, exposed, tag_image
+from tests.films import write_film_of
+from tests.rendered_markers import Image, add_look_alikes, add_spot, add_tag, dim_room, exposed, tag_image
+
+_ROOMS = 24  # drawn for lights and tags, each used mirrored and with its colours exchanged
 
 
 @dataclasses.dataclass(frozen=True)
 class Result:
     """Over frames in which the ball lies whole in the image. error: (n, 2) [px]. nees, size_ratio, smear [px],
-    seconds: (n,). missed: frames without a detection. false: detections more than 5 px away, of all frames."""
+    seconds: (n,). missed: frames without a detection. false: detections more than 5 px away, of all looked_at."""
 
     error: Floats
     nees: Floats
@@ -38,6 +49,7 @@ class Result:
     frames: int
     missed: int
     false: int
+    looked_at: int
 
     @property
     def rms(self) -> float:
@@ -52,8 +64,9 @@ def measure(
     frames: int = 40,
     noise: float = 4.0,
     exposure_s: float | None = None,
+    crf: int | None = None,
 ) -> Result:
-    """Detect the ball in rendered frames of three cameras of each world."""
+    """Detect the ball in rendered frames of three cameras of each world; crf: consecutive ones, through H.264."""
     rows: list[tuple[float, ...]] = []
     total = missed = false = 0
     for seed in seeds:
@@ -64,11 +77,16 @@ def measure(
         for camera in scene.cameras[:3]:
             renderer = MarkerRenderer(scene, camera.name, np.random.default_rng(seed), noise_std=noise)
             detector = MarkerDetector(intrinsics=camera.intrinsics)
-            for moment in np.linspace(1.0, 60.0, frames) + 0.013 * seed:
-                image = renderer.render(moment)
-                began = time.perf_counter()
+            moments = np.linspace(1.0, 60.0, frames) + 0.013 * seed
+            if crf is not None:
+                moments = 2.0 + 0.37 * seed + np.arange(frames) / 30.0
+            pictures: Iterator[Image] = (renderer.render(moment) for moment in moments)
+            if crf is not None:
+                pictures = _filmed(pictures, (camera.intrinsics.width, camera.intrinsics.height), crf)
+            for moment, image in zip(moments, pictures, strict=True):
+                began = time.process_time()
                 found = detector.detect(image)
-                seconds = time.perf_counter() - began
+                seconds = time.process_time() - began
                 pixel, size, smear, whole = _truth(scene, camera.name, moment)
                 total += whole
                 if not found:
@@ -83,7 +101,37 @@ def measure(
                     nees = float(error @ np.linalg.solve(np.array([[uu, uv], [uv, vv]]), error)) / 2.0
                     rows.append((*error, nees, best.size / size, smear, seconds))
     table = np.array(rows)
-    return Result(table[:, :2], table[:, 2], table[:, 3], table[:, 4], table[:, 5], total, missed, false)
+    return Result(
+        table[:, :2], table[:, 2], table[:, 3], table[:, 4], table[:, 5], total, missed, false, 3 * frames * len(seeds)
+    )
+
+
+def _filmed(pictures: Iterator[Image], size: tuple[int, int], crf: int) -> Iterator[Image]:
+    """What is left of consecutive pictures after an encoder."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "film.mp4"
+        write_film_of(file, size, ((index / 30.0, one) for index, one in enumerate(pictures)), crf=str(crf))
+        with av.open(str(file)) as container:
+            for frame in container.decode(video=0):
+                yield np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
+
+
+def without_ball(name: str, *, seeds: range, frames: int, noise: float = 4.0) -> tuple[int, int]:
+    """(frames, detections) of worlds from which the ball has gone: what is found there is a look-alike.
+
+    Look-alikes and the light differ from world to world, the noise from frame to frame.
+    """
+    total = found = 0
+    for seed in seeds:
+        scene = scenes.get(name, seed)
+        scene = dataclasses.replace(scene, path=dataclasses.replace(scene.path, centre=np.array([0.0, 0.0, 5000.0])))
+        for camera in scene.cameras[:3]:
+            renderer = MarkerRenderer(scene, camera.name, np.random.default_rng([seed, 1]), noise_std=noise)
+            detector = MarkerDetector(intrinsics=camera.intrinsics)
+            for _ in range(frames):
+                total += 1
+                found += len(detector.detect(renderer.render(0.0)))
+    return total, found
 
 
 def _truth(scene: MarkerScene, name: str, moment: float) -> tuple[Floats, float, float, bool]:
@@ -105,36 +153,46 @@ def _speed(width: int, height: int, frames: int) -> float:
     taken = []
     for moment in np.linspace(1.0, 30.0, frames):
         image = np.asarray(cv2.resize(renderer.render(moment), (width, height)), dtype=np.uint8)
-        began = time.perf_counter()
+        began = time.process_time()
         detector.detect(image)
-        taken.append(time.perf_counter() - began)
+        taken.append(time.process_time() - began)
     return float(np.median(taken))
 
 
 def _others(frames: int, seed: int) -> None:
-    """Points of light and tags: drawn into textured rooms with look-alikes, noise 4, seeds of their own."""
+    """Points of light and tags: drawn into textured rooms with look-alikes, noise 4, seeds of their own.
+
+    The last row of each kind is of rooms without any: what is found there is false too.
+    """
     rng = np.random.default_rng(seed)
+    rooms = [dim_room(seed + index, 640, 480, 50.0) for index in range(min(_ROOMS, frames))]
     tag = tag_image(cv2.aruco.DICT_APRILTAG_36h11, 17, 400)
     print("frames  missed  false  rms px  median px  p95 px  nees  CPU ms  case")
     lights = [
         ("light, sharp", 1.0, 700.0, 0.0),
         ("light, smeared 8 px", 1.5, 1500.0, 8.0),
         ("light, soft", 3.0, 500.0, 0.0),
+        ("no light", 1.0, 0.0, 0.0),
     ]
     tags = [
         ("tag, side 24 px", 24.0, 0.0),
         ("tag, side 50 px", 50.0, 0.0),
         ("tag, side 50 px, smeared 4 px", 50.0, 4.0),
+        ("no tag", 0.0, 0.0),
     ]
-    for title, *what in [*lights, *tags]:
+    cases: list[tuple[Any, ...]] = [*lights, *tags]
+    for title, *what in cases:
         detector = BrightDetector() if len(what) == 3 else TagDetector()
         errors, nees, seconds, missed, false = [], [], [], 0, 0
         for index in range(frames):
-            picture = dim_room(seed + index, 640, 480, 50.0)
+            picture = np.ascontiguousarray(rooms[index % len(rooms)][:: rng.choice([-1, 1]), :: rng.choice([-1, 1])])
+            picture = picture[..., rng.permutation(3)].copy()
             truth, turn = rng.uniform((90, 90), (550, 390)), rng.uniform(0.0, 2.0 * np.pi)
             smear = what[-1] * np.array([np.cos(turn), np.sin(turn)])
             add_look_alikes(picture, rng, (truth[0], truth[1]))
-            if len(what) == 3:
+            if title.startswith("no "):
+                pass
+            elif len(what) == 3:
                 add_spot(picture, truth[0], truth[1], what[0], what[1], (smear[0], smear[1]))
             else:
                 add_tag(picture, tag, truth, what[0], rng.uniform(-0.7, 0.7, 3), smear)
@@ -143,6 +201,9 @@ def _others(frames: int, seed: int) -> None:
             began = time.process_time()
             found = detector.detect(image)
             seconds.append(time.process_time() - began)
+            if title.startswith("no "):
+                false += bool(found)
+                continue
             if not found:
                 missed += 1
                 continue
@@ -154,6 +215,9 @@ def _others(frames: int, seed: int) -> None:
             uu, uv, vv = found[0].covariance
             errors.append(error)
             nees.append(float(error @ np.linalg.solve(np.array([[uu, uv], [uv, vv]]), error)) / 2.0)
+        if not errors:
+            print(f"{frames:6d}  {'–':>6}  {false:5d}{'':36}{1e3 * np.median(seconds):6.1f}  {title}")
+            continue
         table = np.array(errors)
         r = np.hypot(*table.T)
         print(
@@ -178,32 +242,43 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument("--quick", action="store_true", help="a quarter of the frames")
     arguments.add_argument("--only", choices=("ball", "others"), help="the coloured ball; lights and tags")
+    arguments.add_argument("--frames", type=int, default=100, help="of each camera of a world")
+    arguments.add_argument("--seeds", type=int, default=4, help="worlds")
+    arguments.add_argument("--first-seed", type=int, default=0)
     options = arguments.parse_args()
-    quick = options.quick
     cv2.setNumThreads(1)
-    frames = 15 if quick else 60
+    frames = max(options.frames // (4 if options.quick else 1), 2)
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
     if options.only != "ball":
-        _others(30 if quick else 100, 5000)
+        _others(3 * frames * options.seeds, 5000 + options.first_seed)
     if options.only == "others":
         return
     cases = [
         ("room, noise 4", {"name": "marker"}),
         ("room, noise 2", {"name": "marker", "noise": 2.0}),
         ("room, 20 ms exposure", {"name": "marker", "exposure_s": 0.020}),
-        ("field 1920x1080", {"name": "marker-outdoor", "seeds": range(1 if quick else 2)}),
+        ("room, film at crf 20", {"name": "marker", "crf": 20}),
+        ("room, film at crf 24", {"name": "marker", "crf": 24}),
+        ("field 1920x1080", {"name": "marker-outdoor"}),
+        ("field, film at crf 20", {"name": "marker-outdoor", "crf": 20}),
     ]
-    print("frames  missed  false  rms px  median px  p95 px  max px  nees  size ratio      case")
-    for title, options in cases:
-        result = measure(frames=frames, **options)  # type: ignore[arg-type]
+    print("frames  missed  false of frames  rms px  median px  p95 px  max px  nees  size ratio      CPU ms  case")
+    for title, case in cases:
+        result = measure(frames=frames, seeds=seeds, **case)  # type: ignore[arg-type]
         r = np.hypot(*result.error.T)
         print(
-            f"{result.frames:6d}  {result.missed:6d}  {result.false:5d}  {result.rms:6.3f}  {np.median(r):9.3f}  "
-            f"{np.percentile(r, 95):6.3f}  {r.max():6.3f}  {result.nees.mean():4.2f}  "
-            f"{result.size_ratio.mean():.3f} ± {result.size_ratio.std():.3f}  {title}"
+            f"{result.frames:6d}  {result.missed:6d}  {result.false:5d} of {result.looked_at:6d}  {result.rms:6.3f}  "
+            f"{np.median(r):9.3f}  {np.percentile(r, 95):6.3f}  {r.max():6.3f}  {result.nees.mean():4.2f}  "
+            f"{result.size_ratio.mean():.3f} ± {result.size_ratio.std():.3f}  "
+            f"{1e3 * np.median(result.seconds):6.1f}  {title}",
+            flush=True,
         )
+    for name in scenes.NAMES:
+        total, found = without_ball(name, seeds=seeds, frames=frames)
+        print(f"{total:6d}  {'–':>6}  {found:5d} of {total:6d}  {name} without the ball", flush=True)
     for width, height in ((640, 480), (1280, 720), (1920, 1080)):
         seconds = _speed(width, height, frames)
-        print(f"detect {width}x{height}: {1e3 * seconds:.1f} ms a frame, {1.0 / seconds:.0f} fps on one core")
+        print(f"detect {width}x{height}: {1e3 * seconds:.1f} ms of CPU a frame, {1.0 / seconds:.0f} fps on one core")
     seconds = _render_speed(frames)
     print(f"render 640x480: {1e3 * seconds:.1f} ms a frame, {1.0 / seconds:.0f} fps on one core")
 

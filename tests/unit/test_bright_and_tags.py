@@ -66,7 +66,7 @@ def test_a_coordinate_of_its_centre_is_right_to_about_a_tenth_of_a_pixel_also_sm
 
 
 def test_its_covariance_matches_the_errors(lights: tuple[int, int, Floats, Floats]) -> None:
-    assert 0.3 < lights[3].mean() < 2.0
+    assert 0.5 < lights[3].mean() < 2.0
 
 
 def test_look_alikes_alone_are_no_points_of_light() -> None:
@@ -136,7 +136,7 @@ def test_tags_are_read_and_their_centres_right_to_a_twentieth_of_a_pixel(
 
 
 def test_a_tags_covariance_matches_the_errors(tags: tuple[int, Floats, Floats, Floats]) -> None:
-    assert 0.15 < tags[2].mean() < 2.0
+    assert 0.4 < tags[2].mean() < 2.0
 
 
 @pytest.mark.parametrize(("smear", "least"), [(4.0, 0.05), (5.0, 0.1)])

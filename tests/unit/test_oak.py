@@ -6,6 +6,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from datetime import timedelta
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -85,6 +87,35 @@ def test_pictures_come_with_their_stamps_numbers_and_pixels(boards: Any) -> None
     assert abs(got[0].device_time_ns - 100_000_000_000) < 1_000_000_000
     camera.close()
     assert camera.ended
+
+
+def test_the_boards_heat_is_told_where_there_is_a_board_that_tells_it(boards: Any) -> None:
+    camera = OakCamera(SETTINGS, connect=boards(3))
+    assert camera.temperature is None, "not open"
+    camera.open()
+    assert camera.temperature is None, "depthai's host-only pipeline has no board"
+    camera.close()
+
+    class Board:
+        def __init__(self, degrees: float | None) -> None:
+            self.degrees = degrees
+
+        def getChipTemperature(self) -> Any:
+            if self.degrees is None:
+                raise RuntimeError("X_LINK_ERROR")
+            heat = dai.ChipTemperature()
+            heat.average = self.degrees
+            return heat
+
+    for degrees in (57.5, None):
+        stream = boards(3)(SETTINGS)
+        told = Stream(
+            SimpleNamespace(getDefaultDevice=partial(Board, degrees), stop=stream.pipeline.stop), stream.queue
+        )
+        camera = OakCamera(SETTINGS, connect=lambda _, told=told: told)
+        camera.open()
+        assert camera.temperature == degrees, "a board that is just going away tells nothing, and ends nobody"
+        camera.close()
 
 
 def test_the_stamp_is_of_mid_exposure() -> None:

@@ -221,6 +221,7 @@ def test_a_pi_cameras_stamp_is_of_its_first_rows_end() -> None:
     assert [frame.exposure_ns for frame in got] == [5_000_000, 7_000_000, 5_000_000]
     assert [frame.frame for frame in got] == [0, 1, 3], "what it lost is a gap"
     assert camera.info.readout_s == pytest.approx(0.02)
+    assert camera.temperature == 41.5
     assert pi.released == 3
     assert pi.orders == 4, "an order that timed out is waited for again, not given twice"
     assert pi.configured["controls"]["ExposureTime"] == 5000
