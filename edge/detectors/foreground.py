@@ -86,7 +86,7 @@ class Foreground:
         self._high = 0
         self._dimming = 1.0
         self._ghosts: Image | None = None
-        self._ghostly: Bools | None = None
+        self._ghostly: Image | None = None  # 255 where a ghost stands
         self._background: Image | None = None
         self._slow: npt.NDArray[np.float32] | None = None  # the background, in parts of a step
         self._album: list[Image] = []
@@ -161,9 +161,9 @@ class Foreground:
         """Take what stands in a box for background from now on: it is a place from which something has gone."""
         rows, columns = _slices(box, image.shape)
         if self._ghosts is None or self._ghostly is None:
-            self._ghosts, self._ghostly = image.copy(), np.zeros(image.shape[:2], dtype=bool)
+            self._ghosts, self._ghostly = image.copy(), np.zeros(image.shape[:2], np.uint8)
         self._ghosts[rows, columns] = self._even(image)[rows, columns]
-        self._ghostly[rows, columns] = True
+        self._ghostly[rows, columns] = 255
 
     def _even(self, image: Image) -> Image:
         """The picture in the background's light, from what most of the picture says.
@@ -201,10 +201,7 @@ class Foreground:
     def _without_ghosts(self, even: Image, figure: Image) -> Image:
         if self._ghosts is None or self._ghostly is None:
             return figure
-        like = cv2.absdiff(even, self._ghosts).max(axis=2) < _GHOST_STEP
-        figure = figure.copy()
-        figure[like & self._ghostly] = 0
-        return figure
+        return without_like(figure, even, self._ghosts, self._ghostly)
 
     def _shadow(self, even: Image, figure: Image) -> Image:
         """Where the background shows through, but darker: same colour, same texture."""
@@ -263,6 +260,13 @@ class Foreground:
         cv2.accumulateWeighted(lesson, self._slow, min(max(rate, 0.02), 0.5), kept)
         self._background = np.asarray(cv2.convertScaleAbs(self._slow), dtype=np.uint8)
         self._since = 0
+
+
+def without_like(figure: Image, now: Image, then: Image, where: Image) -> Image:
+    """A silhouette picture (H, W) 0/255 with 0 wherever ``where`` is 255 and two pictures (H, W, 3) are alike."""
+    step = _GHOST_STEP - 1
+    like = cv2.inRange(cv2.absdiff(now, then), (0, 0, 0), (step, step, step))
+    return np.asarray(cv2.bitwise_and(figure, cv2.bitwise_not(cv2.bitwise_and(like, where))), dtype=np.uint8)
 
 
 def usual(pictures: Sequence[Image]) -> Image:

@@ -14,7 +14,7 @@ from deploy.cli import run
 from edge import scenes
 from edge.detectors.base import Detection, Prediction
 from edge.detectors.bodies import explain
-from edge.detectors.foreground import Foreground
+from edge.detectors.foreground import Foreground, without_like
 from edge.detectors.matching import match_predictions
 from edge.detectors.person import PersonDetector, silhouette_features
 from edge.detectors.stature import Stature
@@ -299,6 +299,18 @@ def test_the_four_cars_of_a_street_are_four_labels_and_its_paint_is_none(tmp_pat
     assert run(["detect", "vehicle", str(CARS), "--out", str(out), "--json"]) == 0
     with out.open() as lines:
         assert {row["label"] for row in csv.DictReader(lines)} == {"t0", "t1", "t2", "t3"}
+
+
+def test_ghosts_are_taken_off_as_the_plain_expression_does() -> None:
+    rng = np.random.default_rng(3)
+    now = rng.integers(0, 256, (61, 83, 3), dtype=np.uint8)
+    then = np.clip(now.astype(int) + rng.integers(-24, 25, now.shape), 0, 255).astype(np.uint8)
+    figure, where = (255 * rng.integers(0, 2, (61, 83)).astype(np.uint8) for _ in range(2))
+    expected = figure.copy()
+    expected[(np.abs(now.astype(int) - then).max(axis=2) < 22) & (where > 0)] = 0
+    found = without_like(figure, now, then, where)
+    assert np.array_equal(found, expected)
+    assert 0 < np.count_nonzero(expected) < np.count_nonzero(figure)
 
 
 def test_who_counts_is_judged_as_pedestrian_benchmarks_do() -> None:
