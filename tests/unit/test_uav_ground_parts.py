@@ -179,6 +179,22 @@ def test_the_way_follows_a_bend_and_keeps_its_distance_from_the_edge() -> None:
     assert np.abs(radius[along_bend] - 23.3).max() < 1.5
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_crowns_over_the_lane_do_not_push_the_way_off_it(side: float) -> None:
+    """Four crowns hang over the lane and hide 2 to 3 units beyond its middle; the road below them goes straight on."""
+    road = RoadMap(np.zeros(2))
+    crowns = np.array([[6.0, 2.5], [13.0, 1.5], [22.0, 2.8], [30.0, 2.0]]) * [1.0, side]
+
+    def under_trees(points: Floats) -> Floats:
+        away = np.linalg.norm(points[:, None, :] - crowns, axis=2).min(axis=1)
+        return np.where((np.abs(points[:, 1]) < 3.5) & (away > 3.0), 3.0, -3.0)
+
+    paint(road, under_trees)
+    keep = (1.75, 5.25) if side > 0 else (5.25, 1.75)
+    way = trace(road, np.array([0.0, 1.75 * side]), 0.0, 0.0, 40.0, keep)[0]
+    assert np.abs(way.points[:, 1] - 1.75 * side).max() < 1.2
+
+
 def test_past_the_known_road_the_bend_goes_on_and_fades() -> None:
     road = RoadMap(np.zeros(2))
     paint(road, bend)
@@ -366,6 +382,20 @@ def test_a_look_alike_that_drives_the_other_way_is_not_taken_for_the_target() ->
         assert tracks[0].age == 6
         verdict = judge(cloud, seen, tracks, np.full(400, 0.3), lambda _: (0.25, 0.25), 4.5, True, lambda _: False)
         assert (verdict.best is not None) == taken
+
+
+@pytest.mark.parametrize(("share", "taken"), [(0.45, False), (1.0, True)])
+def test_half_a_look_alike_on_the_border_is_not_what_left(share: float, taken: bool) -> None:
+    """The border moves after the target, and what it cuts off with it."""
+    rng = np.random.default_rng(1)
+    cloud = clouds.scattered(np.zeros(2), 1.0, 400, rng)
+    cloud = replace(cloud, heading=rng.normal(0.0, 0.05, 400), speed=rng.normal(10.0, 0.7, 400))
+    tracklets = Tracklets()
+    for k in range(6):
+        seen = [replace(candidate(1.0 + 10.0 * (k - 5) / 30, 0.5, 0.77), seen=share)]
+        tracks = tracklets.update(k / 30, seen)
+    verdict = judge(cloud, seen, tracks, np.full(400, 0.03), lambda _: (0.25, 0.25), 4.5, True, lambda _: False)
+    assert (verdict.best is not None) == taken
 
 
 @pytest.mark.parametrize(("at", "taken"), [((38.0, 0.0), False), ((3.0, 0.5), True)])

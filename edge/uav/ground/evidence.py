@@ -21,6 +21,7 @@ _BELIEVE_AGAIN = 0.8  # the same after a while unseen
 _SCORE = 0.45  # and its least score; after a while unseen:
 _SCORE_AGAIN = 0.6
 _SHAPE_AGAIN = 0.45
+_CUT_LESS = 0.4  # by which a score counts less for each unit of the candidate that the picture's border cuts off
 _PATIENT = 25.0  # most that one frame says for a place where it is found again: a look-alike soon drives elsewhere
 _SAYS_AT_MOST = 100.0  # factor on the odds by one look-alike in all its frames
 _THERE = 3.0  # stds within which a particle is where a candidate is
@@ -82,7 +83,8 @@ def judge(
         there[j] = squared < (_THERE * usual) ** 2
         squared = squared / std**2
         middle = _MIDDLE_AGAIN if again else _MIDDLE
-        ratio = np.exp(np.clip(_SLOPE * (candidate.score - middle), _LEAST, _MOST))
+        score = _sure_score(candidate) if again else candidate.score
+        ratio = np.exp(np.clip(_SLOPE * (score - middle), _LEAST, _MOST))
         peak = 0.9 * ratio / (2 * np.pi * std**2) / _CLUTTER
         if again:
             motion = tracklets[j].velocity()
@@ -124,12 +126,20 @@ def judge(
     )
     good = (
         posterior[k] > (_BELIEVE_AGAIN if again else _BELIEVE)
-        and best.score > (_SCORE_AGAIN if again else _SCORE)
+        and (_sure_score(best) > _SCORE_AGAIN if again else best.score > _SCORE)
         and best.seen > _CUT
     )
     if again:
         good &= best.shape > _SHAPE_AGAIN and tracklets[k].age >= 3
     return Verdict(best if good else None, float(posterior[k]), likelihood, crowded)
+
+
+def _sure_score(candidate: Candidate) -> float:
+    """The score of what is found again, less where the picture's border cuts it off.
+
+    Half of anything is easily alike, and where the picture moves after the target its border drives as the target does.
+    """
+    return candidate.score - _CUT_LESS * (1.0 - min(candidate.seen, 1.0))
 
 
 def _limited(

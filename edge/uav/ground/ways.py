@@ -15,8 +15,12 @@ from protocols.geometry.types import Floats
 
 STEP = 1.5
 """Distance between the points of a way [ground units]."""
-_LOOK = 12.0  # length of a feeler
+_LOOK = 18.0  # length of a feeler
+_LEAST = -0.5  # what surely no road is worth: crowns of trees hang over a road that goes on below them
 _STRIPS = (-1.1, 0.0, 1.1)  # across, within the car's lane
+_ACROSS, _VERGE = 5, 0.8  # strips where the whole road's width is known, and how far within its edges they lie
+_WIDTHS = (3.0, 14.0)  # of a road, least and most
+_LANE_HALF = 1.3  # least distance of a car from an edge that is one
 _UNKNOWN = 1.35  # what never-seen ground is worth, asphalt being up to 1.5: less would bend ways back to what is known
 _SHARPEST = 0.16  # curvature of a feeler [1/unit]
 _DECAY = 14.0  # length over which curvature decays where nothing is known
@@ -25,6 +29,7 @@ _SMOOTH = 2  # steps to each side over which a bend is measured
 _SIDE_RADII = (7.0, 11.0)
 _SIDE_LOOK = 16.0  # of a side road that must be seen to count
 _LANE_POINTS = 6  # points of a turn, the last, from which the lane is told
+_DISAGREE = 0.8  # of what both edges say: more, and something hangs over one of them
 _MOST_ASIDE = 5.0  # a lane farther aside is not one of this road's [ground units]
 
 _CURVATURES = _SHARPEST * np.sinh(np.linspace(-2.2, 2.2, 29)) / np.sinh(2.2)
@@ -124,7 +129,7 @@ def _follow(
     safe = np.where(flat, 1.0, turn)
     ahead = np.where(flat, 1.0, np.sin(safe) / safe) * along
     aside = np.where(flat, 0.0, (1.0 - np.cos(safe)) / safe) * along
-    strips = np.array(_STRIPS)
+    strips = _strips(keep)
     lx = ahead[:, :, None] - np.sin(turn)[:, :, None] * strips
     ly = aside[:, :, None] + np.cos(turn)[:, :, None] * strips
     near = np.linspace(1.3, 0.7, len(along))[None, :, None]
@@ -135,7 +140,7 @@ def _follow(
         line = np.stack([at[0] + c * lx - s * ly, at[1] + s * lx + c * ly], axis=-1)
         odds = road.smooth_at(line.reshape(-1, 2)).reshape(lx.shape)
         seen = np.abs(odds) > 0.05
-        value = np.where(seen, np.clip(odds, -2.0, 1.5), _UNKNOWN)
+        value = np.where(seen, np.clip(odds, _LEAST, 1.5), _UNKNOWN)
         expected = curvature * np.exp(-STEP / _DECAY)
         score = (value * near).mean(axis=(1, 2))
         score = score - 60.0 * np.square(_CURVATURES - expected) - 14.0 * np.square(_CURVATURES)
@@ -159,6 +164,17 @@ def _follow(
     return np.array(points), np.array(headings), known
 
 
+def _strips(keep: tuple[float, float]) -> Floats:
+    """Offsets to the right at which a feeler looks: all of the road where both edges are known, else the lane.
+
+    A crown over the lane leaves the rest of the road in sight.
+    """
+    right, left = keep
+    if not (_WIDTHS[0] < right + left < _WIDTHS[1] and min(keep) > _LANE_HALF):
+        return np.array(_STRIPS)
+    return np.linspace(_VERGE - left, right - _VERGE, _ACROSS)
+
+
 def _side_shift(road: RoadMap, at: Floats, heading: float, keep: tuple[float, float]) -> float:
     """How far to the right to go so that the distances to the edges stay what they were; at most 0.4 a step."""
     if not (np.isfinite(keep[0]) or np.isfinite(keep[1])):
@@ -171,6 +187,9 @@ def _side_shift(road: RoadMap, at: Floats, heading: float, keep: tuple[float, fl
         errors.append(keep[1] - float(left[0]))
     if not errors:
         return 0.0
+    if len(errors) == 2 and abs(errors[0] - errors[1]) > _DISAGREE:
+        # What hangs over one edge brings it nearer, and leaves the other where it is.
+        errors = [min(errors, key=abs)]
     return float(np.clip(0.35 * np.mean(errors), -0.4, 0.4))
 
 
