@@ -156,10 +156,12 @@ def decompose(essential: Floats, a: Floats, b: Floats) -> RelativePose:
 
 
 def homography_residual(a: Floats, b: Floats) -> float:
-    """Robust distance (sigma of one coordinate, units of b) that the best homography leaves from a to b.
+    """Robust distance (sigma of one coordinate, units of a and b, which are alike) that the best homography leaves.
 
     Near the noise, it says that all points lie in one plane or the cameras stand in one place: then the
-    essential matrix is not determined. a, b: (n, 2), n >= 8; nan for fewer.
+    essential matrix is not determined. Distances are judged against what noise alike in both makes of them
+    (Sampson's: e^T (1 + J J^T)^-1 e, times 2 so that where J is a rotation it is the distance in b): a plane that is
+    seen nearly edge-on magnifies noise in both directions. a, b: (n, 2), n >= 8; nan for fewer.
     """
     if len(a) < 8:
         return float("nan")
@@ -181,7 +183,14 @@ def homography_residual(a: Floats, b: Floats) -> float:
         # The algebraic error grows with the depth; divided out, rows count by distance in the image.
         weight = 1.0 / np.abs(depth) / (1.0 + (distance / max(3.0 * float(np.median(distance)), 1e-12)) ** 2)
         weight /= weight.max()
-    return float(np.median(distance)) / 1.1774 / float(scale_b[0, 0])
+    # The map's derivative at each point, in units of b over units of a.
+    image = (moved[:, :2] / depth[:, None])[:, :, None]
+    slope = (homography[None, :2, :2] - image * homography[None, 2:, :2]) / depth[:, None, None]
+    slope *= float(scale_a[0, 0] / scale_b[0, 0])
+    error = image[:, :, 0] - hb[:, :2]
+    spread = np.eye(2) + slope @ slope.transpose(0, 2, 1)
+    squared = 2.0 * np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[:, :, None])[:, :, 0])
+    return float(np.median(np.sqrt(np.maximum(squared, 0.0)))) / 1.1774 / float(scale_b[0, 0])
 
 
 def five_point(a: Floats, b: Floats, threshold: float, seed: int, subset: int = 300) -> list[RelativePose]:

@@ -200,3 +200,26 @@ def test_without_lenses_nothing_is_behind_and_no_angle_known() -> None:
     _, a, b, _, _ = scene(2)
     assert two_view.in_front(uncalibrated(2), a, b).all()
     assert two_view.parallax(uncalibrated(2), a, b) == 0.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("tilt_degrees", [2.0, 5.0, 40.0])
+def test_a_plane_leaves_noise_also_where_it_is_seen_edge_on_and_a_body_leaves_more(
+    seed: int, tilt_degrees: float
+) -> None:
+    """Edge-on, a plane magnifies what noise there is; judged without that it passes for a body."""
+    rng = np.random.default_rng(seed)
+    focal, noise = 800.0, 0.5
+    tilt = np.radians(tilt_degrees)
+    across = rng.uniform(-1, 1, (400, 2))
+    # Points of a plane that both cameras, 1.5 apart sideways at its height, look along but for the tilt.
+    plane = np.stack([across[:, 0], np.sin(tilt) * across[:, 1], 6.0 + np.cos(tilt) * across[:, 1]], axis=1)
+    body = plane + np.array([0.0, 1.0, 0.0]) * rng.uniform(-0.5, 0.5, (400, 1))
+
+    def residual(points: Floats) -> float:
+        views = (points, (points - [1.5, 0.1, 0.0]) @ so3.exp(np.array([0.0, 0.25, 0.0])).T)
+        a, b = (focal * seen[:, :2] / seen[:, 2:] + rng.normal(0, noise, (400, 2)) for seen in views)
+        return two_view.homography_residual(a, b)
+
+    assert residual(plane) < 2.0 * noise
+    assert residual(body) > 6.0 * noise
