@@ -42,6 +42,8 @@ _MOST = 12  # people in one silhouette
 _LIKE = 0.7  # share of template and silhouette that one who stands alone has in common
 _SLIM, _STOUT = 1.15, 7.0  # height to breadth of one who stands alone, where nothing is known of the place
 _LEAST_HEIGHT = 12.0  # px
+_MERGE, _SPLIT = 0.45, 0.26  # distance of two who may be one, of the height; what one may explain less, of its area
+_STATURES = np.array([0.92, 1.0, 1.08, 1.16, 1.25, 1.35])
 _TRIM = 0.3
 _LONE, _GROUPED = 0.1, 0.17
 BREADTH = 0.36  # of a person's box, of the height
@@ -256,7 +258,7 @@ class _Cluster:
         self._origin, self._scales, self._stature = origin, scales, stature
         self._covered = np.zeros(weight.shape, np.int16)
         self._looks: dict[int, npt.NDArray[np.float32]] = {}
-        self._sums = cv2.integral(weight)
+        self._sums: npt.NDArray[np.float64] | None = None  # of the weight that nobody covers; None: not known yet
         wide, high = stature.size
         self._limits = -origin[0], round(wide * scales[0]) - origin[0], -origin[1], round(high * scales[1]) - origin[1]
         self._at_bottom = self._limits[3] <= weight.shape[0] + 1
@@ -266,18 +268,24 @@ class _Cluster:
         for index, one in clothes.items():
             if one is not None:
                 away = np.square(colours.astype(np.float32) - one.astype(np.float32)).sum(axis=2) / _COLOUR**2
-                self._looks[index] = np.asarray(1.0 - np.minimum(away, 2.0), dtype=np.float32)
+                self._looks[index] = np.asarray((1.0 - np.minimum(away, 2.0)) * self._filled, dtype=np.float32)
 
     def _dressed(self, one: _Placed, u: Floats, foot: Floats, tall: Floats) -> Floats | float:
         """How many pixels of the torso, where no other hides it, have its colours, less those that have not."""
         looks = self._looks.get(one.expected)
         if looks is None:
             return 0.0
-        sums = cv2.integral(np.where(self._covered == 0, looks * self._filled, np.float32(0.0)))
         h, w = self._weight.shape
         half, high, low = _TORSO
         a, b = (np.rint(u + side * half * tall).astype(np.intp).clip(0, w) for side in (-1.0, 1.0))
         c, d = (np.rint(foot - (1.0 - part) * tall).astype(np.intp).clip(0, h) for part in (high, low))
+        # Summed only where the torsos are that are asked for: that is little of a large group.
+        left, right, top, bottom = int(a.min()), int(b.max()), int(c.min()), int(d.max())
+        if left >= right or top >= bottom:
+            return 0.0
+        free = np.where(self._covered[top:bottom, left:right] == 0, looks[top:bottom, left:right], np.float32(0.0))
+        sums = cv2.integral(np.ascontiguousarray(free))
+        a, b, c, d = a - left, b - left, c - top, d - top
         return np.asarray(_LOOKS * (sums[d, b] - sums[c, b] - sums[d, a] + sums[c, a]), dtype=np.float64)
 
     def explain(self, expected: list[tuple[int, Box]]) -> list[_Placed]:
@@ -298,7 +306,7 @@ class _Cluster:
         # all have settled, and what they covered is free again.
         for _ in range(_ROUNDS):
             before = len(placed)
-            placed = self._worthy(placed)
+            placed = self._merged(self._worthy(placed))
             gone = before - len(placed)
             came = 0
             while len(placed) < _MOST:
@@ -327,6 +335,54 @@ class _Cluster:
                 continue
             self._cover(one, 1)
         return placed
+
+    def _merged(self, placed: list[_Placed]) -> list[_Placed]:
+        """With one template in place of two near each other wherever it explains nearly as much as both.
+
+        Of any height within what people may have where heights are not known well yet: somebody taller than is usual
+        at a place is else taken for two short ones.
+        """
+        for one in sorted(placed, key=lambda each: -each.tall):
+            for other in placed:
+                if other is one or not any(each is one for each in placed):
+                    continue
+                if abs(one.u - other.u) > _MERGE * one.tall or abs(one.foot - other.foot) > _MERGE * one.tall:
+                    continue
+                self._cover(one, -1)
+                self._cover(other, -1)
+                both = self._gain(one)
+                self._cover(one, 1)
+                both += self._gain(other)
+                self._cover(one, -1)
+                single = self._between(one, other)
+                if single.gain > both - _SPLIT * _AREA * max(one.tall, other.tall) ** 2:
+                    placed = [each for each in placed if each is not one and each is not other] + [single]
+                    self._cover(single, 1)
+                    return self._merged(placed)
+                self._cover(one, 1)
+                self._cover(other, 1)
+        return placed
+
+    def _between(self, one: _Placed, other: _Placed) -> _Placed:
+        """The best single template about where two are, of whoever of them is expected."""
+        steps = np.linspace(0.0, 1.0, 7)
+        low, high = min(one.top, other.top), max(one.foot, other.foot)
+        u, foot, stature = (
+            values.ravel()
+            for values in np.meshgrid(one.u + (other.u - one.u) * steps, high - 0.3 * (high - low) * steps, _STATURES)
+        )
+        tall = stature * self._heights(u, foot)
+        gains = self._gains(u, foot, tall)
+        best = int(np.argmax(gains))
+        owner = max((one, other), key=lambda each: (each.expected >= 0, each.tall))
+        return replace(
+            owner,
+            u=float(u[best]),
+            foot=float(foot[best]),
+            tall=float(tall[best]),
+            stature=float(stature[best]),
+            gain=float(gains[best]),
+        )
 
     def _inward(self, u: float, foot: float, tall: float) -> tuple[float, float, float]:
         fx, fy = self._scales
@@ -365,7 +421,10 @@ class _Cluster:
         a, b = np.rint(x0).astype(np.intp), np.rint(x1).astype(np.intp)
         c, d = np.rint(y0).astype(np.intp), np.rint(y1).astype(np.intp)
         ai, bi, ci, di = a.clip(0, w), b.clip(0, w), c.clip(0, h), d.clip(0, h)
-        inner = self._sums[di, bi] - self._sums[ci, bi] - self._sums[di, ai] + self._sums[ci, ai]
+        if self._sums is None:
+            self._sums = np.asarray(cv2.integral(np.where(self._covered == 0, self._weight, np.float32(0.0))))
+        sums = self._sums
+        inner = sums[di, bi] - sums[ci, bi] - sums[di, ai] + sums[ci, ai]
         # What is beyond the picture cannot be seen; what is only beyond this part is empty.
         left, right, top, bottom = self._limits
         al, bl, cl, dl = a.clip(left, right), b.clip(left, right), c.clip(top, bottom), d.clip(top, bottom)
@@ -411,7 +470,7 @@ class _Cluster:
             a, b = round(one.u - half * one.tall), round(one.u + half * one.tall)
             c, d = round(one.top + high * one.tall), round(one.top + low * one.tall)
             self._covered[max(c, 0) : max(d, 0), max(a, 0) : max(b, 0)] += by
-        self._sums = cv2.integral(np.where(self._covered == 0, self._weight, np.float32(0.0)))
+        self._sums = None
 
     def bodies(self, placed: list[_Placed], figure: Image) -> list[Body]:
         """The templates as bodies [px of the picture], with the breadth that their silhouettes have."""

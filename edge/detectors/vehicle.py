@@ -39,7 +39,7 @@ _FLANK, _FLANKED = (
     5,
     0.25,
 )  # px beside a thing that stands, and the share of it that moves, by which it is no ground yet
-_POSITION_STD, _FLOOR_STD = 0.04, 1.0  # of the size; px
+_POSITION_STD, _FLOOR_STD = 0.1, 1.0  # of the size, as a rendered town seen from above has it, shadows and all; px
 
 
 class VehicleDetector:
