@@ -72,7 +72,7 @@ def _markers(quick: bool, found: Section) -> None:
 
 
 def _people(quick: bool, found: Section) -> None:
-    pictures, _, fps = people_detector.film(716, 5, 5.0 if quick else 20.0)
+    pictures, _, _, fps = people_detector.film(716, 5, 12.0 if quick else 20.0)
     _, ours = people_detector.from_file(pictures, fps)
     model = cv2.createBackgroundSubtractorMOG2(500, 16.0, True)
     for picture in pictures[:: max(len(pictures) // 48, 1)]:

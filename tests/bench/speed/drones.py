@@ -17,7 +17,7 @@ def measure(quick: bool, data: Path) -> Section:
             found.missing.append(f"{name} from scratch: no recording in the data folder")
             continue
         try:
-            cpu = min(run_calibrate(session, "observations.csv").cpu for _ in range(1 if quick else 3))
+            cpu = min(run_calibrate(session, "observations.csv").cpu for _ in range(2 if quick else 3))
         except CommandFailed as error:
             found.missing.append(f"{name} from scratch: {error}")
             continue
