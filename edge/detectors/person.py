@@ -145,9 +145,12 @@ class PersonDetector:
         assert self._stature is not None
         following = self._following
         followers = list(following.all)
-        for u, v, tall in lone_people(figure) if self._learns else ():
-            self._stature.learn(u, v, tall)
         boxes = [one.expected(now) for one in followers]
+        moving = [box for box, one in zip(boxes, followers, strict=True) if one.sure and one.moved]
+        for u, v, tall in lone_people(figure) if self._learns else ():
+            # What has not moved may be the place that somebody has left.
+            if any(_stands(box, u, v, tall) for box in moving):
+                self._stature.learn(u, v, tall)
         bodies = explain(figure, layers.shadow, self._stature, boxes, image, [one.colour for one in followers])
         colours = [_torso(image, figure, body) for body in bodies]
         given = [followers[body.expected] if body.expected >= 0 else None for body in bodies]
@@ -235,6 +238,13 @@ def silhouette_features(figure: Image, box: tuple[float, float, float, float]) -
     head_u = left + float(columns_all[upper].mean()) if upper.any() else middle[0]
     foot_u = left + float(columns_all[lower].mean()) if lower.any() else middle[0]
     return Features(middle, (head_u, y - 0.5), (foot_u, y + h - 0.5))
+
+
+def _stands(box: tuple[float, float, float, float], u: float, v: float, tall: float) -> bool:
+    """Whether a foot point and height [px] are about those of a box x, y, w, h."""
+    x, y, w, h = box
+    near = abs(u - x - 0.5 * w) < 0.3 * h and abs(v - y - h) < 0.3 * h
+    return near and 0.6 * h < tall < 1.6 * h
 
 
 def _clean(figure: Image, typical: float) -> Image:
