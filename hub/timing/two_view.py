@@ -188,8 +188,11 @@ def homography_residual(a: Floats, b: Floats) -> float:
     slope = (homography[None, :2, :2] - image * homography[None, 2:, :2]) / depth[:, None, None]
     slope *= float(scale_a[0, 0] / scale_b[0, 0])
     error = image[:, :, 0] - hb[:, :2]
-    spread = np.eye(2) + slope @ slope.transpose(0, 2, 1)
-    squared = 2.0 * np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[:, :, None])[:, :, 0])
+    # In closed form: for points near the map's horizon 1 + J J^T is singular to within rounding.
+    determinant = 1.0 + np.square(slope).sum(axis=(1, 2)) + np.square(np.linalg.det(slope))
+    # J^T applied to the error turned by a right angle: the adjugate of J J^T.
+    along = np.einsum("nji,nj->ni", slope, np.stack([error[:, 1], -error[:, 0]], axis=1))
+    squared = 2.0 * (np.square(error).sum(axis=1) + np.square(along).sum(axis=1)) / determinant
     return float(np.median(np.sqrt(np.maximum(squared, 0.0)))) / 1.1774 / float(scale_b[0, 0])
 
 

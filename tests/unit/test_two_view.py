@@ -223,3 +223,20 @@ def test_a_plane_leaves_noise_also_where_it_is_seen_edge_on_and_a_body_leaves_mo
 
     assert residual(plane) < 2.0 * noise
     assert residual(body) > 6.0 * noise
+
+
+@pytest.mark.parametrize("kind", ["one point", "a line", "integers", "to infinity", "nothing alike"])
+def test_a_plane_is_asked_for_of_any_points_without_an_error(kind: str) -> None:
+    rng = np.random.default_rng(8)
+    a, b = rng.normal(0, 300, (60, 2)), rng.normal(0, 300, (60, 2))
+    if kind == "one point":
+        a = np.zeros_like(a)
+    elif kind == "a line":
+        a[:, 1], b[:, 0] = 2.0 * a[:, 0], 5.0
+    elif kind == "integers":
+        a, b = np.round(a / 300), np.round(b / 300)
+    elif kind == "to infinity":
+        b = a / np.where(np.abs(a[:, :1]) < 20, 1e-14, a[:, :1])
+    with np.errstate(all="ignore"):
+        left = two_view.homography_residual(a, b)
+    assert np.isnan(left) or left >= 0.0
