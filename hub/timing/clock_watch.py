@@ -27,7 +27,7 @@ MOST_DRIFT = 2e-3
 """Greatest change of rate that is one: no crystal does more. Beyond, frames are held up on their way, more and more."""
 _SIGMAS = 6.0
 _BIN_S = 1.0
-_RECENT, _BASE, _BINS = 8, 12, 40
+_RECENT, _BASE, _BINS = 6, 12, 40
 _PERIODS = 120
 _NAME = 63
 
