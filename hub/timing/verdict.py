@@ -110,9 +110,13 @@ def sound(fit: PairFit, s: PairSettings) -> bool:
 
 
 def at_noise(fit: PairFit, s: PairSettings) -> bool:
-    """Whether long common motion leaves no more than the tracks' own noise: then lag and rate are what they are."""
+    """Whether long common motion leaves no more than the tracks' own noise: then lag and rate are what they are.
+
+    Not at a rate that no clock has: there a frame rate was told wrongly, and is to be tried by itself.
+    """
     return (
-        fit.support >= s.unchecked_support
+        abs(fit.rate - 1.0) <= s.largest_rate
+        and fit.support >= s.unchecked_support
         and fit.inliers > _NEARLY_ALL
         and fit.sigma_px <= s.exact * max(fit.own_px, s.sigma_px)
     )
