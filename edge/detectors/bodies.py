@@ -28,6 +28,8 @@ _WORK_HEIGHT = 64.0  # px: larger people are looked for in a smaller picture
 _EMPTY, _SHADOW = -0.45, -0.08
 _NEW, _KEPT = 0.55, 0.28  # gain of a template, of its area, that makes it worth its place
 _COUNTS = (2.5, 1.0, 1.0)  # a head is small, but says most about where somebody stands
+_BOXES = np.array([*_BARS, (0.07, -0.1, -0.02), (0.1, 0.02, 0.12)]).T[:, :, None]
+"""The bars, and what must be empty: above the head (of the height from the head down), below the feet (from them)."""
 _BEYOND = 1.0  # by how much a silhouette that goes on above the head or below the feet speaks against a template
 _TORSO = (0.1, 0.2, 0.5)  # as _BARS
 _COLOUR, _LOOKS = 45.0, 1.0  # 8-bit steps by which clothes differ from themselves; weight of a torso's pixel
@@ -172,6 +174,11 @@ def _by_shape(figure: Image, expected: list[Box]) -> list[Body]:
             mine = [at for at, owner in enumerate(owners) if owner == one and expected[at][3] > 0.6 * h]
             bodies.append(Body((x, y, w, h), area / (w * h), 1.0, True, mine[0] if mine else -1, cut))
     return bodies
+
+
+def _within(values: Ints, low: int, high: int) -> Ints:
+    """``np.clip`` without its bookkeeping, which for arrays as short as these costs more than the work."""
+    return np.asarray(np.minimum(np.maximum(values, low), high))
 
 
 def _owner(labels: Ints | npt.NDArray[np.int32], box: Box) -> int:
@@ -408,27 +415,29 @@ class _Cluster:
 
     def _gains(self, u: Floats, foot: Floats, tall: Floats) -> Floats:
         """What templates (n,) would explain of what is not yet, less what they cover of nothing."""
-        top = foot - tall
-        total = np.zeros(len(u))
-        for (half, high, low), counts in zip(_BARS, _COUNTS, strict=True):
-            total += counts * self._sum(u - half * tall, top + high * tall, u + half * tall, top + low * tall)
-        crown = self._sum(u - 0.07 * tall, top - 0.1 * tall, u + 0.07 * tall, top - 0.02 * tall)
-        below = self._sum(u - 0.1 * tall, foot + 0.02 * tall, u + 0.1 * tall, foot + 0.12 * tall)
-        return total - _BEYOND * (np.maximum(crown, 0.0) + np.maximum(below, 0.0))
+        held = self._sum(u, np.stack([foot - tall] * 4 + [foot]), tall)
+        total = _COUNTS[0] * held[0] + _COUNTS[1] * held[1] + _COUNTS[2] * held[2]
+        return np.asarray(total - _BEYOND * (np.maximum(held[3], 0.0) + np.maximum(held[4], 0.0)), dtype=np.float64)
 
-    def _sum(self, x0: Floats, y0: Floats, x1: Floats, y1: Floats) -> Floats:
+    def _sum(self, u: Floats, base: Floats, tall: Floats) -> Floats:
+        """What each of the boxes of ``_BOXES`` holds: (5, n) for n templates; base: (5, n) where their heights begin.
+
+        All boxes at once: calls upon short arrays are most of what a template costs.
+        """
         h, w = self._weight.shape
-        a, b = np.rint(x0).astype(np.intp), np.rint(x1).astype(np.intp)
-        c, d = np.rint(y0).astype(np.intp), np.rint(y1).astype(np.intp)
-        ai, bi, ci, di = a.clip(0, w), b.clip(0, w), c.clip(0, h), d.clip(0, h)
+        half, high, low = _BOXES
+        a, b = np.rint(u - half * tall).astype(np.intp), np.rint(u + half * tall).astype(np.intp)
+        c, d = np.rint(base + high * tall).astype(np.intp), np.rint(base + low * tall).astype(np.intp)
+        ai, bi, ci, di = _within(a, 0, w), _within(b, 0, w), _within(c, 0, h), _within(d, 0, h)
         if self._sums is None:
             self._sums = np.asarray(cv2.integral(np.where(self._covered == 0, self._weight, np.float32(0.0))))
-        sums = self._sums
-        inner = sums[di, bi] - sums[ci, bi] - sums[di, ai] + sums[ci, ai]
+        sums = self._sums.ravel()
+        upper, lower = ci * (w + 1), di * (w + 1)
+        inner = sums[lower + bi] - sums[upper + bi] - sums[lower + ai] + sums[upper + ai]
         # What is beyond the picture cannot be seen; what is only beyond this part is empty.
         left, right, top, bottom = self._limits
-        al, bl, cl, dl = a.clip(left, right), b.clip(left, right), c.clip(top, bottom), d.clip(top, bottom)
-        beyond = (bl - al) * (dl - cl) - (bi - ai) * (di - ci)
+        wide = _within(b, left, right) - _within(a, left, right)
+        beyond = wide * (_within(d, top, bottom) - _within(c, top, bottom)) - (bi - ai) * (di - ci)
         return np.asarray(inner + _EMPTY * beyond, dtype=np.float64)
 
     def _gain(self, one: _Placed) -> float:
