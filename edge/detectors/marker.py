@@ -2,7 +2,8 @@
 
 A coarse pass classifies every second pixel by colour; each blob is then measured at full resolution. There the
 question is no longer which pixels are the target's but how much of each is: its coverage, from the local colours of
-target and background (``outline``). That is unbiased under motion blur (a smeared ball is where it was on average) and
+target and background (``outline``), the latter as it was before the target came where the camera stands still
+(``scenery``). That is unbiased under motion blur (a smeared ball is where it was on average) and
 does not follow the shading, as a centroid of brightness would.
 """
 
@@ -20,12 +21,13 @@ import numpy.typing as npt
 from edge.detectors.base import Detection, Prediction
 from edge.detectors.colour import ColourModel, codes, taught
 from edge.detectors.outline import Outline, measure_outline
+from edge.detectors.scenery import Scenery
 from protocols.errors import InputError
 from protocols.geometry.ball import outline_to_centre
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Bools, Floats
 
-REVISION = 3
+REVISION = 4
 """Of what is measured: kept detections of another revision are not this detector's."""
 _STEP = 2  # of the coarse pass [px]
 _CANDIDATES = 6  # blobs that are measured, largest first
@@ -35,6 +37,8 @@ _MIN_SCORE = 0.35
 _APART, _APART_SMEARED = 0.6, 0.04  # px between a blob's centroid and its outline's centre: not more, and of its smear
 _BLOB_STD, _BLOB_SHARE = 0.25, 0.2  # px: of a blob's centroid where they contradict each other, and of their distance
 _BORDER = 1  # px: nearer to the image's border a blob is cut
+_BESIDE = 8  # px beside a blob in which it may still be
+_NEAR = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * _BESIDE // _STEP + 1, 2 * _BESIDE // _STEP + 1))
 _BOX = cv2.getStructuringElement(cv2.MORPH_RECT, (3, 3))
 
 
@@ -90,7 +94,7 @@ def teach(image: npt.NDArray[np.uint8], box: tuple[float, float, float, float], 
 
 
 class MarkerDetector:
-    """Finds the marker in single pictures.
+    """Finds the marker in the pictures of one camera; of earlier ones it remembers what stands behind the marker.
 
     model: what it looks like. intrinsics: where given, the centre is corrected from that of the ball's
     outline to the projection of its centre, which differ by perspective and distortion (``outline_to_centre``).
@@ -112,27 +116,47 @@ class MarkerDetector:
         self._intrinsics = intrinsics
         self._most = most
         self._sizes = min_size, max_size
+        self._scenery = Scenery()
 
     def detect(
         self, image: npt.NDArray[np.uint8], time_s: float | None = None, predictions: Sequence[Prediction] = ()
     ) -> list[Detection]:
         coarse = self._table[codes(image[::_STEP, ::_STEP])]
         if not coarse.any():
+            self._learn(image, coarse, [])
             return []
         linked = cv2.dilate(coarse, _BOX)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(linked, connectivity=8)
         pixels = np.bincount(labels[coarse > 0], minlength=count)
         pixels[0] = 0
-        found = []
+        found, boxes = [], []
         for index in np.argsort(pixels)[::-1][:_CANDIDATES]:
             if pixels[index] * _STEP * _STEP > _MAX_SHARE * image.shape[0] * image.shape[1] or not pixels[index]:
                 continue
             left, top, width, height = (int(value) * _STEP for value in stats[index, :4])
+            boxes.append((left, top, width, height))
             detection = self._measure(image, left, top, width, height)
             if detection is not None:
                 found.append(detection)
+        self._learn(image, coarse, boxes)
         found.sort(key=lambda one: one.score * one.size, reverse=True)
         return found[: self._most]
+
+    def _learn(
+        self, image: npt.NDArray[np.uint8], coarse: npt.NDArray[np.uint8], boxes: list[tuple[int, int, int, int]]
+    ) -> None:
+        """Learn the scenery, but not what is of the marker's colour or near a blob of it."""
+        first, end = self._scenery.rows(image)
+        top = max((first - _BESIDE) // _STEP, 0)
+        near = coarse[top : (end + _BESIDE) // _STEP + 1]
+        if near.any():
+            near = cv2.dilate(near, _NEAR)
+        free = near[np.arange(first, end) // _STEP - top].repeat(_STEP, axis=1)[:, : image.shape[1]] == 0
+        for left, upper, width, height in boxes:
+            margin = _BESIDE + (width + height) // 4
+            above, below = max(upper - margin - first, 0), max(upper + height + margin - first, 0)
+            free[above:below, max(left - margin, 0) : left + width + margin] = False
+        self._scenery.learn(image, free)
 
     def _measure(self, image: npt.NDArray[np.uint8], left: int, top: int, width: int, height: int) -> Detection | None:
         """Measure the blob whose coarse bounding box is given [px]; None where it is no ball."""
@@ -147,7 +171,7 @@ class MarkerDetector:
         if area < _MIN_AREA or _at_border(mask, x0, y0, image.shape):
             return None
         first = np.array([x0 + moments["m10"] / area, y0 + moments["m01"] / area])
-        outline = measure_outline(image, first, np.sqrt(area / np.pi))
+        outline = measure_outline(image, first, np.sqrt(area / np.pi), self._scenery.of(image))
         if outline is None or not self._sizes[0] <= outline.diameter <= self._sizes[1]:
             return None
         reach = 0.5 * outline.diameter

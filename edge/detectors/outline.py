@@ -15,16 +15,23 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from protocols.geometry.types import Floats
+from edge.detectors.scenery import known_at
+from protocols.geometry.types import Bools, Floats
+
+Image = npt.NDArray[np.uint8]
 
 _RAYS = 48
 _FEWEST = 20  # samples of the ball alone
 _STEP = 0.5  # px between samples of a ray
 _PASSES = 3
 _PIXEL_STD = 6.0  # of a colour about the mixture of its two ends, by noise and texture [8-bit steps]
-_SHADE_STD = 0.2  # relative: how much shading and texture brighten or darken either end along a ray
+_SHADE_STD = 0.04  # relative: how much shading and texture brighten or darken either end along a ray
 _SHADE_RIDGE = 2.5
+_CURVED_RIDGE = 2.5
+_LARGE = 14.0  # px of radius from which a ball tells its shading that well; a smaller one less
+_INNER_BAND, _INNER_RIDGE = 1.0, 2.0  # px inside of the rim where the ball's model is put right, and px² of ridge
 _OUTER_BAND = 3.0  # px beyond the rim from which the background's colour is taken
+_AS_KNOWN = 8.0  # 8-bit steps by which a background may have changed since it was seen without the ball
 _FLOOR_PX = 0.01  # std of the centre that remains without noise or texture,
 _FLOOR_SHADE = 0.002  # and its share of the radius: shading that the model of a matt ball does not tell,
 _FLOOR_SMEAR = 0.005  # and its share of what motion adds to a rim's width
@@ -35,6 +42,7 @@ _LEAST_SMEARED = 4  # of the rays, one part in so many: motion along the rim lea
 _CHROMA = 0.6  # how much colour differences count against luma: cameras and encoders tell them at half the resolution
 
 _COLOUR_STD = 0.7  # of ball's and background's colours at a sharp rim, over a part of it [8-bit steps]
+_DOUBT_SHADE = 0.2  # as _SHADE_STD, of the colours of which that is the error
 _ALIKE_ANGLE = 0.6  # rad along the rim over which such errors are alike
 
 _ANGLE = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
@@ -60,11 +68,14 @@ class Outline:
     smear: float
 
 
-def measure_outline(image: npt.NDArray[np.uint8], centre: Floats, radius: float) -> Outline | None:
+def measure_outline(
+    image: Image, centre: Floats, radius: float, scenery: tuple[Image, Image] | None = None
+) -> Outline | None:
     """Fit the outline of a blob in an image (H, W, 3) BGR.
 
-    centre (2,), radius: of the blob, to about a third of its radius [px]. None where the fit runs away or leaves
-    the image.
+    centre (2,), radius: of the blob, to about a third of its radius [px]. scenery: what is behind it (H, W, 3) and how
+    often that was seen (H, W), if known; on rays where the image beyond the rim is another, it is not used. None where
+    the fit runs away or leaves the image.
     """
     centre = np.asarray(centre, dtype=np.float64).copy()
     shape = np.array([radius, 0.0, 0.0])  # mean radius and its second harmonic
@@ -76,7 +87,7 @@ def measure_outline(image: npt.NDArray[np.uint8], centre: Floats, radius: float)
     for index in range(_PASSES):
         rim = _DESIGN[:, [0, 3, 4]] @ shape
         half = np.minimum(1.25 + 0.6 * width, 0.75 * rim + 1.0)
-        offset, seen, doubt = _rims(image, centre, rim, half)
+        offset, seen, doubt = _rims(image, centre, rim, half, scenery)
         if offset is None:
             return None
         correction, weight, residual, spread = _fit(offset, np.maximum(seen, 1.5))
@@ -101,7 +112,7 @@ def measure_outline(image: npt.NDArray[np.uint8], centre: Floats, radius: float)
 
 
 def _rims(
-    image: npt.NDArray[np.uint8], centre: Floats, rim: Floats, half: Floats
+    image: Image, centre: Floats, rim: Floats, half: Floats, scenery: tuple[Image, Image] | None
 ) -> tuple[Floats | None, Floats, Floats]:
     """Where the rim is on each ray, relative to ``rim`` (n,) [px], how wide (n,) [px], and how doubtful (n,) [px].
 
@@ -126,29 +137,52 @@ def _rims(
     pure &= radius > 0.0
     if pure.sum() < _FEWEST:
         return None, half, half
-    front = _shaded(colour, radius / rim[:, None], pure)
+    told = min(float(rim.mean()) / _LARGE, 1.0) ** 2  # how well so large a ball tells its own shading
+    front = _shaded(colour, radius / rim[:, None], pure, _CURVED_RIDGE / told**2)
+    just_inside = pure & (along >= -half[:, None] - _INNER_BAND) & (along <= -half[:, None])
+    front = front + told**4 * _stray(colour - front, just_inside * np.maximum(radius, 0.0) * _STEP * _ANGLE[1])
     beyond = (along >= half[:, None]) & (along <= half[:, None] + _OUTER_BAND)
-    behind = _band_mean(colour, beyond, 1)
-    cover = np.clip(_mixture(colour, front, behind[:, None]), -0.25, 1.25)
+    behind = np.broadcast_to(_band_mean(colour, beyond, 1)[:, None], colour.shape)
+    if scenery is not None:
+        picture, looks = (one[top:bottom, left:right] for one in scenery)
+        seen = cv2.remap(picture, x - left, y - top, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        often = cv2.remap(looks, x - left, y - top, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        asked = (np.abs(along) <= half[:, None]) | beyond
+        behind = _known_or(
+            behind, seen.astype(np.float64), known_at(np.asarray(often, dtype=np.uint8)) | ~asked, beyond
+        )
+    cover = np.clip(_mixture(colour, front, behind, _SHADE_STD / told), -0.25, 1.25)
     # The end samples count by the part of their step that lies within the mixed stretch.
     share = np.clip((half[:, None] - np.abs(along)) / _STEP + 0.5, 0.0, 1.0) * _STEP
     covered = (cover * share).sum(axis=1)
     mixed = (np.clip(cover * (1.0 - cover), 0.0, None) * share).sum(axis=1)
-    doubt = _doubt(front[:, np.searchsorted(along, 0.0)], behind) * half
+    middle = np.searchsorted(along, 0.0)
+    doubt = _doubt(front[:, middle], behind[:, middle]) * half
     return covered - 0.5 * share.sum(axis=1), 6.0 * mixed, doubt  # a ramp of width w holds w / 6
+
+
+def _known_or(beside: Floats, seen: Floats, known: Bools, beyond: Bools) -> Floats:
+    """What is behind the ball at each sample (n, m, 3): as seen without it, made as bright as it is beside it now.
+
+    beside: (n, m, 3) each ray's colour beyond the rim, which stays where the scenery ``seen`` (n, m, 3) is not
+    ``known`` (n, m) all along the ray or differs there: the camera moved, or something else did.
+    """
+    change = beside[:, :1] - _band_mean(seen, beyond, 1)[:, None]
+    holds = known.all(axis=1) & (np.abs(change).max(axis=(1, 2)) < _AS_KNOWN)
+    return np.where(holds[:, None, None], seen + change, beside)
 
 
 def _doubt(front: Floats, behind: Floats) -> Floats:
     """Std (n,) of the share by colours (n, 3) that are wrong by `_COLOUR_STD`: large where the two are alike."""
     front, behind = front @ _METRIC, behind @ _METRIC
-    loose = (_PIXEL_STD / _SHADE_STD) ** 2
+    loose = (_PIXEL_STD / _DOUBT_SHADE) ** 2
     ff = (front * front).sum(axis=-1) + loose
     bb = (behind * behind).sum(axis=-1) + loose
     fb = (front * behind).sum(axis=-1) + loose
     return np.asarray(_COLOUR_STD * np.sqrt((ff + bb + 2.0 * fb) / np.maximum(4.0 * (ff * bb - fb * fb), 1e-6)))
 
 
-def _mixture(colour: Floats, front: Floats, behind: Floats) -> Floats:
+def _mixture(colour: Floats, front: Floats, behind: Floats, shade: float) -> Floats:
     """Share of ``front`` in colours (…, 3) mixed of front and behind.
 
     Least squares for ``colour = p front + q behind`` with p + q near 1, share = p / (p + q): brightness of the
@@ -156,7 +190,7 @@ def _mixture(colour: Floats, front: Floats, behind: Floats) -> Floats:
     chroma: a Bayer sensor and every video tell colours at half the resolution, and encoders blur their edges.
     """
     colour, front, behind = colour @ _METRIC, front @ _METRIC, behind @ _METRIC
-    loose = (_PIXEL_STD / _SHADE_STD) ** 2
+    loose = (_PIXEL_STD / shade) ** 2
     ff = (front * front).sum(axis=-1) + loose
     bb = (behind * behind).sum(axis=-1) + loose
     fb = (front * behind).sum(axis=-1) + loose
@@ -166,23 +200,25 @@ def _mixture(colour: Floats, front: Floats, behind: Floats) -> Floats:
     return np.asarray(p / np.maximum(p + q, 0.2 * (ff * bb - fb * fb) + 1e-6))
 
 
-def _shaded(colour: Floats, depth: Floats, pure: npt.NDArray[np.bool_]) -> Floats:
+def _shaded(colour: Floats, depth: Floats, pure: Bools, curved: float) -> Floats:
     """The ball's own colour (n, m, 3) at all samples, from those that show nothing else.
 
-    colour: (n, m, 3). depth: (n, m) distance from the centre in radii. pure: (n, m). A matt sphere in directed
-    and ambient light is as bright as a linear function of its normal (x, y, sqrt(1 - x² - y²)); that is fitted
-    to each channel, robustly, because a glint is not matt.
+    colour: (n, m, 3). depth: (n, m) distance from the centre in radii. pure: (n, m). curved: ridge of the second order.
+    A matt sphere is, in any light, as bright as a function of its normal (x, y, z = sqrt(1 - x² - y²)) of the second
+    order within some percent, for it averages over half of all directions; that is fitted to each channel, robustly,
+    because a glint is not matt.
     """
     inside = np.clip(depth, 0.0, 1.0)
     x, y = inside * _DIRECTION[:, :1], inside * _DIRECTION[:, 1:]
-    basis = np.stack([np.ones_like(x), x, y, np.sqrt(np.maximum(1.0 - inside * inside, 0.0))], axis=-1)
+    z = np.sqrt(np.maximum(1.0 - inside * inside, 0.0))
+    basis = np.stack([np.ones_like(x), x, y, z, x * y, x * z, y * z, x * x - y * y], axis=-1)
     known, values = basis[pure], colour[pure]
     # Samples crowd towards the centre of the fan of rays: each counts by the area that it stands for.
     area = depth[pure]
     weight = area
     # Without much of the ball to see, the tilts stay small: 2.5 px² of samples for each of them.
-    ridge = np.diag([1e-6, 1.0, 1.0, 1.0]) * _SHADE_RIDGE
-    model = np.zeros((4, 3))
+    ridge = np.diag([1e-6, *[_SHADE_RIDGE] * 3, *[curved] * 4])
+    model = np.zeros((8, 3))
     for _ in range(3):
         weighted = known * weight[:, None]
         model = np.linalg.solve(weighted.T @ known + ridge, weighted.T @ values)
@@ -192,7 +228,18 @@ def _shaded(colour: Floats, depth: Floats, pure: npt.NDArray[np.bool_]) -> Float
     return np.asarray(basis @ model)
 
 
-def _band_mean(colour: Floats, band: npt.NDArray[np.bool_], rays: int) -> Floats:
+def _stray(off: Floats, area: Floats) -> Floats:
+    """By how much a ray's ball (n, 1, 3) strays from the model just inside its rim, of ``off`` (n, m, 3).
+
+    area: (n, m) [px²] that each sample stands for there. A model within some percent of the ball's colour still moves
+    the rim where the background is nearly as bright: at the dark lower side of a ball over a wooden floor, always the
+    same way. Of few pixels it would be their noise.
+    """
+    count = _around(area.sum(axis=1)[:, None], 1)
+    return np.asarray((_around(np.einsum("nmk,nm->nk", off, area), 1) / (count + _INNER_RIDGE))[:, None])
+
+
+def _band_mean(colour: Floats, band: Bools, rays: int) -> Floats:
     """Mean colour (n, 3) over a band (n, m) of each ray's samples (n, m, 3) and of ``rays`` rays to either side."""
     share = band.astype(np.float64)
     total = np.einsum("nmk,nm->nk", colour, share)
