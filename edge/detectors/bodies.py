@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -41,6 +42,8 @@ _LOW, _HIGH, _BROAD, _BULK, _HEAD, _SLENDER = 0.85, 1.17, 0.62, 0.28, 0.22, 0.42
 """Of one whole silhouette: height, of the usual; breadth, area over height, breadth of the head, and
 breadth up to which no more is asked, of the height."""
 _MOST = 12  # people in one silhouette
+_PIECE, _PIECE_BESIDE, _PIECE_ALONG = 0.6, 0.15, 0.6
+"""Of the height of a silhouette: how tall a piece of it may be, and how far it may be from it, across and along."""
 _LIKE = 0.7  # share of template and silhouette that one who stands alone has in common
 _SLIM, _STOUT = 1.15, 7.0  # height to breadth of one who stands alone, where nothing is known of the place
 _LEAST_HEIGHT = 12.0  # px
@@ -138,13 +141,26 @@ def lone_people(figure: Image) -> list[tuple[float, float, float]]:
     """Foot points u, v and heights [px] of silhouettes that have the shape of one whole person."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(figure, connectivity=8)
     found = []
+    piece = _pieces(np.asarray(stats))
     for one in range(1, count):
         x, y, w, h = (int(value) for value in stats[one, :4])
-        if h < _LEAST_HEIGHT or _is_cut((x, y, w, h), figure.shape) or not 1.8 * w < h < 4.5 * w:
+        if h < _LEAST_HEIGHT or _is_cut((x, y, w, h), figure.shape) or not 1.8 * w < h < 4.5 * w or piece[one]:
             continue
         if _shaped(np.asarray(labels[y : y + h, x : x + w] == one, dtype=np.bool_)):
             found.append((x + 0.5 * w, float(y + h), float(h)))
     return found
+
+
+def _pieces(stats: npt.NDArray[Any]) -> Bools:
+    """Which silhouettes (n,) may be pieces of a much taller one near: (n, 5+) x, y, w, h, area; the first is no one."""
+    x, y, w, h = (stats[:, column].astype(np.float64) for column in range(4))
+    u, v = x + 0.5 * w, y + 0.5 * h
+    beside, along = _PIECE_BESIDE * h, _PIECE_ALONG * h
+    near = (u[:, None] > (x - beside)[None]) & (u[:, None] < (x + w + beside)[None])
+    near &= (v[:, None] > (y - along)[None]) & (v[:, None] < (y + h + along)[None])
+    near &= h[:, None] < _PIECE * h[None]
+    near[:, 0] = False
+    return np.asarray(near.any(axis=1))
 
 
 def _shaped(mask: Bools) -> bool:

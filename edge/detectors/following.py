@@ -21,7 +21,7 @@ class Follower:
     """One thing that is followed.
 
     box: x, y, w, h [px]. velocity: of its foot [px/s]. must_move: by how much of its lesser side before it counts as
-    something that moves.
+    something that moves. ghost: whether it seemed to be only the place of something that has gone.
     """
 
     name: str
@@ -33,6 +33,7 @@ class Follower:
     birthplace: tuple[float, float] = (0.0, 0.0)
     must_move: float = 0.35
     moved: bool = False
+    ghost: bool = False
     way: float = 0.0
     missed_since: float | None = None
     colour: Floats | None = None

@@ -8,6 +8,7 @@ stands still does not sink into the background.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -25,10 +26,12 @@ ModelName = Literal["mog2", "knn"]
 _TEACH_S = 0.4  # the model learns this often
 _MEMORY_S = 30.0  # and forgets over that time
 _BEGIN_S = 1.0  # in which a new model learns fast, and after which it begins again from what was there most of the time
-_REVIEWS_S = (_BEGIN_S, 2.0, 4.0, 8.0, 16.0)  # when that is done, each time better
+_REVIEWS_S = (_BEGIN_S, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)  # when that is done, each time better
+_PAUSE_S = 2.0  # a longer time between two pictures is a pause, and tells nothing of their rate
+_RENEWAL = 0.05  # share of the latest step in the period
 _REVIEWED = 24  # pictures that a review looks at
 _CLOSEST = 0.34  # of the pictures that show a place's background, at least
-_STRIP = 32  # rows at once
+_PASSING = 40  # 8-bit steps
 _JOLT = 0.4  # of the picture being foreground at once: the camera was pushed, or the light went on
 _SUBSAMPLE = 8
 _GAIN = (0.3, 3.3)
@@ -42,6 +45,10 @@ _NEAR, _WINDOW = 5, 9  # pixels of half the picture: in which a shadow must show
 _SHOWN, _HIDDEN = 0.4, 2.5  # share of the texture that a shadow shows at least; standard deviations
 _LEAST_NOISE = 2.0  # 8-bit steps
 _GHOST_STEP = 22  # 8-bit steps
+_BESIDE, _LEAST_RIM = 0.04, 10  # of the height: how far beside a rim is looked; pixels of it
+_FLUSHED_S, _CALM_S = 16.0, 0.4  # time in which those who were here at first are sought; in which nothing changed
+_VOTES, _RIM_REACH, _LEFT = 0.12, 7, 1.6  # share of the picture's height in which rims tell; pixels; as _GHOSTLY
+_GHOSTLY, _PLAIN = 1.4, 12.0  # times that it must stand out more in the background; 8-bit steps that it must there
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +75,8 @@ class Foreground:
     def __init__(self, model: ModelName = "mog2", fps: float = 25.0) -> None:
         self._name = model
         self._period = 1.0 / fps if fps > 0 and math.isfinite(fps) else 0.04
-        self._made = False
+        self._steps = 0  # between pictures of known times
+        self._time: float | None = None
         self.jolts = 0
         self._begin()
 
@@ -82,6 +90,7 @@ class Foreground:
         else:
             self._model = cv2.createBackgroundSubtractorKNN(500, 300.0, False)
         self._seen = 0
+        self._age = 0.0  # s since the first picture
         self._since = 0
         self._high = 0
         self._dimming = 1.0
@@ -92,6 +101,8 @@ class Foreground:
         self._album: list[Image] = []
         self._reviews = list(_REVIEWS_S)
         self._stride = 1
+        self._lately: deque[tuple[float, Image]] = deque()  # the pictures of the last moment, and when they were
+        self._flushed_at = 0.0
 
     def prime(self, pictures: Sequence[Image]) -> None:
         """Learn from pictures spread over a longer time, so that what was here and there for a moment is not in it."""
@@ -102,10 +113,10 @@ class Foreground:
         self._model.apply(middle, learningRate=1.0)
         for picture in pictures:
             # Whatever differs much from what is usual is passing.
-            odd = cv2.absdiff(picture, middle).max(axis=2) > 40
-            self._model.apply(np.where(odd[..., None], middle, picture), learningRate=0.03)
+            alike = cv2.inRange(cv2.absdiff(picture, middle), (0, 0, 0), (_PASSING,) * 3)
+            self._model.apply(cv2.copyTo(picture, alike, middle.copy()), learningRate=0.03)
         self._set_background(middle)
-        self._seen = 10**6
+        self._seen, self._age = 10**6, math.inf
         self._reviews = []
 
     def _set_background(self, picture: Image) -> None:
@@ -119,22 +130,41 @@ class Foreground:
         if len(self._album) > _REVIEWED:
             # Evenly over all the time since the beginning.
             self._album, self._stride = self._album[::2], 2 * self._stride
-        if self._seen * self._period < self._reviews[0]:
+        if self._age < self._reviews[0]:
             return
-        album, stride, left, seen = self._album, self._stride, self._reviews[1:], self._seen
+        album, stride, left, seen, age = self._album, self._stride, self._reviews[1:], self._seen, self._age
+        lately, flushed_at = self._lately, self._flushed_at
         self.prime(album)
-        self._seen, self._reviews, self._stride = seen, left, stride
+        self._seen, self._age, self._reviews, self._stride = seen, age, left, stride
+        self._lately, self._flushed_at = lately, flushed_at
         self._album = album if left else []
 
-    def look(self, image: Image, protected: Sequence[Box] = ()) -> Layers:
-        """Split a picture (H, W, 3) BGR. protected: x, y, w, h [px] of what must not be learnt."""
+    def look(self, image: Image, protected: Sequence[Box] = (), time_s: float | None = None) -> Layers:
+        """Split a picture (H, W, 3) BGR. protected: x, y, w, h [px] of what must not be learnt.
+
+        time_s: of the picture; None = one period after the last.
+        """
+        self._pass_time(time_s)
+        return self._look(image, protected)
+
+    def _pass_time(self, time_s: float | None) -> None:
+        step = self._period
+        if time_s is not None:
+            if self._time is not None and 0.0 < time_s - self._time < _PAUSE_S:
+                step = time_s - self._time
+                self._steps += 1
+                self._period += max(1.0 / self._steps, _RENEWAL) * (step - self._period)
+            self._time = time_s
+        self._age += step
+
+    def _look(self, image: Image, protected: Sequence[Box]) -> Layers:
         if self._background is not None and self._background.shape != image.shape:
             self._begin()
         if self._background is None:
             self._model.apply(image, learningRate=1.0)
             self._set_background(image.copy())
             assert self._background is not None
-            self._seen = 1
+            self._seen, self._age = 1, 0.0
             nothing = np.zeros(image.shape[:2], np.uint8)
             return Layers(nothing, nothing, self._background, True)
         even = self._even(image)
@@ -144,18 +174,47 @@ class Foreground:
             quiet = cv2.inRange(cv2.absdiff(even, self._background), (0, 0, 0), (step, step, step))
             figure = np.asarray(cv2.subtract(figure, quiet), dtype=np.uint8)
         self._seen += 1
-        learning = self._seen * self._period < _BEGIN_S
+        learning = self._age < _BEGIN_S
         if self._jolted(figure):
             self._begin()
             self.jolts += 1
-            return self.look(image)
+            return self._look(image, ())
         figure = self._without_ghosts(even, figure)
+        if self._reviews and self._age < _FLUSHED_S:
+            figure = self._flushed(even, figure)
+        else:
+            self._lately.clear()
         shadow = np.zeros_like(figure) if learning else self._shadow(even, figure)
         self._teach(even, figure, protected, learning)
         young = len(self._reviews) == len(_REVIEWS_S)
         if self._reviews:
             self._review(even)
         return Layers(np.asarray(cv2.subtract(figure, shadow), dtype=np.uint8), shadow, self._background, young)
+
+    def _flushed(self, even: Image, figure: Image) -> Image:
+        """The silhouettes without the places that those who were here at first have left; they are background now.
+
+        A silhouette may be both, somebody and the place that he came from: every part of it is judged by the rim near
+        it, and is a place that was left where nothing has changed lately.
+        """
+        assert self._background is not None
+        self._lately.append((self._age, even.copy()))
+        while len(self._lately) > 2 and self._lately[1][0] <= self._age - _CALM_S:
+            self._lately.popleft()
+        if self._age - self._lately[0][0] < _CALM_S or self._age - self._flushed_at < 0.5 * _CALM_S:
+            return figure
+        self._flushed_at = self._age
+        calm = cv2.inRange(cv2.absdiff(even, self._lately[0][1]), (0, 0, 0), (_GHOST_STEP,) * 3)
+        left = cv2.bitwise_and(cv2.bitwise_and(places_left(even, self._background, figure), figure), calm)
+        if not cv2.countNonZero(left):
+            return figure
+        if self._ghosts is None or self._ghostly is None:
+            self._ghosts, self._ghostly = even.copy(), np.zeros(figure.shape, np.uint8)
+        self._ghosts = np.asarray(cv2.copyTo(even, left, self._ghosts), dtype=np.uint8)
+        self._ghostly = np.asarray(cv2.bitwise_or(self._ghostly, left), dtype=np.uint8)
+        # The next review must not bring them back.
+        self._album = [np.asarray(cv2.copyTo(even, left, picture), dtype=np.uint8) for picture in self._album]
+        return np.asarray(cv2.subtract(figure, left), dtype=np.uint8)
 
     def haunt(self, image: Image, box: Box) -> None:
         """Take what stands in a box for background from now on: it is a place from which something has gone."""
@@ -256,7 +315,7 @@ class Foreground:
         rate = max(1.0 / self._seen, 0.02) if learning else self._since * self._period / _MEMORY_S
         self._model.apply(lesson, learningRate=min(rate, 0.5))
         # The model's own picture mixes what it has seen; this one only takes what the model calls background.
-        kept = np.full(figure.shape, 255, np.uint8) if self._seen * self._period < 1.0 else cv2.bitwise_not(figure)
+        kept = np.full(figure.shape, 255, np.uint8) if self._age < _BEGIN_S else cv2.bitwise_not(figure)
         cv2.accumulateWeighted(lesson, self._slow, min(max(rate, 0.02), 0.5), kept)
         self._background = np.asarray(cv2.convertScaleAbs(self._slow), dtype=np.uint8)
         self._since = 0
@@ -274,16 +333,38 @@ def usual(pictures: Sequence[Image]) -> Image:
 
     Unlike the median it holds where something passes for more than half of the time, as what passes differs.
     """
-    stack = np.stack(pictures)
-    count = len(stack)
+    count, shape = len(pictures), pictures[0].shape
     share = max(round(_CLOSEST * count), 1)
-    found = np.empty(stack.shape[1:], np.uint8)
-    for row in range(0, stack.shape[1], _STRIP):
-        values = np.sort(stack[:, row : row + _STRIP], axis=0)
-        width = values[share - 1 :] - values[: count - share + 1]
-        start = width.argmin(axis=0)
-        found[row : row + _STRIP] = np.take_along_axis(values, (start + share // 2)[None], axis=0)[0]
-    return found
+    values = [np.ascontiguousarray(picture).reshape(shape[0], -1) for picture in pictures]
+    for low, high in _comparisons(count):
+        one, other = values[low], values[high]
+        values[low], values[high] = np.asarray(cv2.min(one, other)), np.asarray(cv2.max(one, other))
+    found = values[share // 2].copy()
+    least = cv2.subtract(values[share - 1], values[0])
+    for start in range(1, count - share + 1):
+        width = cv2.subtract(values[start + share - 1], values[start])
+        cv2.copyTo(values[start + share // 2], cv2.compare(width, least, cv2.CMP_LT), found)
+        least = cv2.min(least, width)
+    return found.reshape(shape)
+
+
+def _comparisons(count: int) -> list[tuple[int, int]]:
+    """Pairs (low, high) of places that, put in order one after the other, sort so many values.
+
+    Batcher's odd-even merge sort: whole pictures are compared at once, which numpy's sort along them is slower than.
+    """
+    pairs = []
+    run = 1
+    while run < count:
+        gap = run
+        while gap >= 1:
+            for begin in range(gap % run, count - gap, 2 * gap):
+                for low in range(begin, begin + min(gap, count - begin - gap)):
+                    if low // (2 * run) == (low + gap) // (2 * run):
+                        pairs.append((low, low + gap))
+            gap //= 2
+        run *= 2
+    return pairs
 
 
 def _hides_texture(
@@ -344,17 +425,60 @@ def _slices(box: Box, shape: tuple[int, ...]) -> tuple[slice, slice]:
 
 
 def is_ghost(image: Image, background: Image, box: Box, figure: Image) -> bool:
-    """Whether a silhouette is the place of something that has gone: its rim is an edge of the background's picture."""
-    rows, columns = _slices(box, image.shape)
+    """Whether a silhouette is the place of something that has gone: it stands out from what is beside it in the
+    background's picture, and less in this one."""
+    x, y, w, h = box
+    reach = 2 * int(np.clip(round(_BESIDE * h), 2, 15)) + 1
+    rows, columns = _slices((x - reach, y - reach, w + 2 * reach, h + 2 * reach), image.shape)
     mask = figure[rows, columns]
     if mask.size == 0:
         return False
-    rim = cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) > 0
-    if rim.sum() < 10:
+    rim = cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
+    # Other silhouettes near have rims of their own.
+    inner = np.zeros(mask.shape, dtype=np.bool_)
+    top, left = max(math.floor(y), 0) - rows.start, max(math.floor(x), 0) - columns.start
+    inner[top : top + math.ceil(h) + 1, left : left + math.ceil(w) + 1] = True
+    rim &= inner
+    if rim.sum() < _LEAST_RIM:
         return False
-    return bool(_edges(background[rows, columns])[rim].mean() > 1.25 * _edges(image[rows, columns])[rim].mean())
+    before, now = (_stands_out(one[rows, columns], mask, reach)[rim] for one in (background, image))
+    return bool(np.median(before) > _GHOSTLY * np.median(now) and np.median(before) > _PLAIN)
 
 
-def _edges(part: Image) -> Floats:
-    grey = cv2.cvtColor(part, cv2.COLOR_BGR2GRAY).astype(np.float32)
-    return np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)).astype(np.float64)
+def places_left(image: Image, background: Image, figure: Image) -> Image:
+    """Where (H, W) 0/255 a silhouette picture shows what was in the background's picture, not what is in this one.
+
+    As ``is_ghost``, of every part by the rims near it. At half the resolution.
+    """
+    found = np.zeros_like(figure)
+    x, y, w, h = cv2.boundingRect(figure)
+    if w < _RIM_REACH or h < _RIM_REACH:
+        return found
+    wide = (2 * max(round(_VOTES * figure.shape[0] / 4), 2) + 1,) * 2
+    rows, columns = _slices((x - _RIM_REACH, y - _RIM_REACH, w + 2 * _RIM_REACH, h + 2 * _RIM_REACH), figure.shape)
+    figure, image, background = figure[rows, columns], image[rows, columns], background[rows, columns]
+    height, width = figure.shape
+    size = (width + 1) // 2, (height + 1) // 2
+    mask = np.asarray(cv2.medianBlur(cv2.resize(figure, size, interpolation=cv2.INTER_NEAREST), 5), dtype=np.uint8)
+    rim = cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)).astype(np.float32) / 255.0
+    smaller = (
+        np.asarray(cv2.resize(one, size, interpolation=cv2.INTER_AREA), dtype=np.uint8) for one in (background, image)
+    )
+    before, now = (cv2.boxFilter(rim * _stands_out(one, mask, _RIM_REACH), -1, wide) for one in smaller)
+    plain = _PLAIN * cv2.boxFilter(rim, -1, wide)
+    left = np.where((before > _LEFT * now) & (before > plain), mask, 0).astype(np.uint8)
+    found[rows, columns] = cv2.resize(left, (width, height), interpolation=cv2.INTER_NEAREST)
+    return found
+
+
+def _stands_out(part: Image, mask: Image, reach: int) -> npt.NDArray[np.float32]:
+    """By how much (h, w) colours (h, w, 3) near each pixel differ inside and outside a mask (h, w) 0/255."""
+    size = (reach, reach)
+
+    def mean(where: Image) -> npt.NDArray[np.float32]:
+        total = cv2.boxFilter(cv2.bitwise_and(part, part, mask=where), cv2.CV_32F, size, normalize=False)
+        count = cv2.boxFilter(where, cv2.CV_32F, size, normalize=False) / np.float32(255.0)
+        return np.asarray(cv2.divide(total, cv2.merge([np.maximum(count, np.float32(1.0))] * 3)), dtype=np.float32)
+
+    blue, green, red = cv2.split(cv2.absdiff(mean(mask), mean(np.asarray(cv2.bitwise_not(mask), dtype=np.uint8))))
+    return np.asarray(cv2.max(cv2.max(blue, green), red), dtype=np.float32)

@@ -26,9 +26,15 @@ from protocols.geometry.types import Floats
 
 Image = npt.NDArray[np.uint8]
 _MOST_PIXELS = 700_000  # a larger picture is looked at smaller
-_GHOST_AFTER_S = 1.0
+_GHOST_AFTER_S = 0.5
+_ASKED = 3  # sightings after which it is asked again whether somebody who has not moved is a ghost
 _U_STD, _V_STD = 0.024, 0.105  # of the representative point, of the size, as rendered rooms have it
 _FLOOR_STD = 0.6  # px
+_LEAST_TOLD = 12.0  # px: who is expected smaller tells no height
+_VAGUE = 0.12  # of the size: std of a place that is expected, above which it tells nothing
+_BELOW = 0.62  # of the height: the foot below the representative point that is expected
+_COMES_S, _COMES, _ALIKE = (0.2, 1.0), (0.12, 1.0), 0.15
+"""Who walks: seconds, way in heights, logarithm of the height between two sightings of him alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +71,7 @@ class PersonDetector:
         self._time = -1.0
         self._sure: set[str] = set()
         self._learns = True  # how tall people are
+        self._lone: list[tuple[float, float, float, float]] = []  # time, foot and height of those alone lately
 
     @property
     def jolts(self) -> int:
@@ -84,6 +91,7 @@ class PersonDetector:
     def rewind(self) -> None:
         """Begin again at an earlier time with what was learnt of the place, and nobody in the picture."""
         self._following.clear()
+        self._lone = []
         self._time = -1.0
         if self._stature is not None:
             self._stature.settle()
@@ -102,11 +110,13 @@ class PersonDetector:
             now = self._time + 1.0 / self._fps
         self._time = now
         small = self._smaller(image)
-        layers = self._foreground.look(small, [one.box for one in self._following.all if one.sure and one.moved])
+        followed = [one.box for one in self._following.all if one.sure and one.moved]
+        layers = self._foreground.look(small, followed, now)
         if layers.fresh:
             self._following.clear()
             return []
         figure = _clean(layers.figure, self._typical())
+        self._learn_from(predictions)
         found = self._explain(small, layers, figure, now)
         detections = [self._report(small, figure, one) for one in found if self._worth_telling(one)]
         detections.sort(key=lambda one: -one.score)
@@ -118,7 +128,7 @@ class PersonDetector:
         if one.follower.sure and one.follower.moved:
             self._sure.add(one.follower.name)
             return True
-        fits = self._stature.known and not one.body.cut
+        fits = self._stature.known and not one.body.cut and not one.follower.ghost
         return not self._sure_only or (one.follower.sure and fits)
 
     def _fit_to(self, image: Image) -> None:
@@ -137,6 +147,20 @@ class PersonDetector:
         size = round(image.shape[1] * self._shrink), round(image.shape[0] * self._shrink)
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
+    def _learn_from(self, predictions: Sequence[Prediction]) -> None:
+        """How tall people are here, by those whom calibrated cameras follow: this one need not have seen anybody alone.
+
+        Nobody is sought where he is predicted: a target that is none would find itself in whoever stands there.
+        """
+        assert self._stature is not None
+        for one in predictions if self._learns else ():
+            tall = one.size * self._shrink
+            a, _, c = one.covariance
+            if tall < _LEAST_TOLD or not math.sqrt(max(a, c)) < _VAGUE * one.size:
+                continue
+            foot = (one.v + 0.5) * self._shrink + _BELOW * tall
+            self._stature.told((one.u + 0.5) * self._shrink, foot, tall)
+
     def _typical(self) -> float:
         heights = [one.box[3] for one in self._following.all if one.sure]
         return float(np.median(heights)) if heights else 0.25 * self._size[1] * self._shrink
@@ -147,10 +171,12 @@ class PersonDetector:
         followers = list(following.all)
         boxes = [one.expected(now) for one in followers]
         moving = [box for box, one in zip(boxes, followers, strict=True) if one.sure and one.moved]
-        for u, v, tall in lone_people(figure) if self._learns else ():
+        lone = [(now, *one) for one in lone_people(figure)] if self._learns else []
+        for _, u, v, tall in lone:
             # What has not moved may be the place that somebody has left.
-            if any(_stands(box, u, v, tall) for box in moving):
+            if any(_stands(box, u, v, tall) for box in moving) or self._comes(now, u, v, tall):
                 self._stature.learn(u, v, tall)
+        self._lone = [one for one in self._lone if now - one[0] < _COMES_S[1]] + lone
         bodies = explain(figure, layers.shadow, self._stature, boxes, image, [one.colour for one in followers])
         colours = [_torso(image, figure, body) for body in bodies]
         given = [followers[body.expected] if body.expected >= 0 else None for body in bodies]
@@ -162,11 +188,20 @@ class PersonDetector:
                     trust = 0.9 if body.alone and not body.cut else 0.6 if body.seen > 0.6 else 0.35
                     owner.see(body.box, now, colour if body.seen > 0.6 else None, trust)
                 found.append(_Found(body, owner))
-            old = not owner.moved and now - owner.born > _GHOST_AFTER_S and owner.hits % 5 == 0
-            if old and is_ghost(image, layers.background, body.box, figure):
-                self._foreground.haunt(image, body.box)
+            if not owner.moved and owner.hits % _ASKED == 0:
+                owner.ghost = is_ghost(image, layers.background, body.box, figure)
+                if owner.ghost and now - owner.born > _GHOST_AFTER_S:
+                    self._foreground.haunt(image, body.box)
         following.forget(now, (image.shape[1], image.shape[0]))
         return found
+
+    def _comes(self, now: float, u: float, v: float, tall: float) -> bool:
+        """Whether somebody alone whose foot is here stood somewhere else a moment ago, as tall."""
+        for when, u2, v2, tall2 in self._lone:
+            away = math.hypot(u - u2, v - v2) / tall
+            if now - when >= _COMES_S[0] and _COMES[0] < away < _COMES[1] and abs(math.log(tall / tall2)) < _ALIKE:
+                return True
+        return False
 
     def _report(self, image: Image, figure: Image, one: _Found) -> Detection:
         body, follower = one.body, one.follower

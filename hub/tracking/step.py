@@ -32,6 +32,8 @@ _CONFIRMED_SUPPORT, _UNSEEN_S = 0.15, 0.5
 _COLOUR_RENEWAL = 0.02
 _SAME = 0.3
 """Shares of the size: a hypothesis so near a target is that target; two targets half as near are one."""
+_BODY, _BESIDE_S = 0.18, 1.0
+"""Share of the height that bodies which touch are apart at the least; how long two may seem nearer [s]."""
 _FLOOR_REACH, _FLOOR_SURE, _FLOOR_MEMORY = 0.35, 200.0, 5000.0
 _GROWTH = 1e-4
 _AT_ONCE_NS = 500_000_000
@@ -67,7 +69,7 @@ def step(state: State, frame: Frame, cameras: dict[str, TrackingCamera], world: 
     fresh[frame.camera.name] = frame.reference_ns
     state = replace(state, time_ns=frame.reference_ns, targets=targets, fresh=fresh, pool=pool)
     state = _discovered(state, frame, cameras, world)
-    state = _with_floor(state, world)
+    state = replace(_with_floor(state, world), targets=_beside(state.targets, elapsed, world))
     return _sorted_out(state, world)
 
 
@@ -229,6 +231,7 @@ def _founded(state: State, found: Found) -> State:
         chances=np.array([found.chances]),
         support=np.array([count / found.chances]),
         seen_by=seen_by,
+        beside_s=np.zeros(1),
     )
     return replace(state, targets=state.targets.joined(one), next_identity=state.next_identity + 1)
 
@@ -267,12 +270,26 @@ def _sorted_out(state: State, world: World) -> State:
     drop = ~known & (weak | (unseen > _TENTATIVE_S))
     drop |= known & (unseen > world.coast_s)
     drop |= known & (unseen > _UNSEEN_S) & ((targets.support < _CONFIRMED_SUPPORT) | (spread > broad))
-    drop |= _doubled(targets, size)
+    drop |= _doubled(targets, size) | (targets.beside_s > _BESIDE_S)
     drop |= ~np.isfinite(targets.mean).all(axis=1)
     if not drop.any():
         return state
     state = remember(state, known & drop & np.isfinite(targets.mean).all(axis=1), world.remember_s, world.most_gone)
     return replace(state, targets=state.targets.kept(~drop))
+
+
+def _beside(targets: Targets, elapsed: float, world: World) -> Targets:
+    """``beside_s`` after some time [s]: two cannot stand in each other for long, however often both are seen."""
+    if len(targets) < 2 or world.up is None:
+        return targets
+    size = np.exp(targets.mean[:, LOG_SIZE])
+    off = targets.mean[:, None, POSITION] - targets.mean[None, :, POSITION]
+    off = off - (off @ world.up)[..., None] * world.up
+    near = np.linalg.norm(off, axis=2) < _BODY * size[:, None]
+    upright = _UPRIGHT[targets.kind] & targets.confirmed
+    near &= upright[:, None] & upright[None, :] & (targets.number[None, :] < targets.number[:, None])
+    change = np.where(near.any(axis=1), elapsed, -elapsed)
+    return replace(targets, beside_s=np.maximum(targets.beside_s + change, 0.0))
 
 
 def _doubled(targets: Targets, size: Floats) -> Bools:

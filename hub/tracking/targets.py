@@ -24,7 +24,7 @@ class Targets:
     (n,) index in BODIES. mean, covariance: (n, 7), (n, 7, 7). colour: (n, 3) mean, NaN where none was told;
     colour_count: (n,). born_ns, seen_ns: (n,) reference times. hits, chances: (n,) observations, and frames that
     should have held one. support: (n,) recent share of hits. seen_by: (n, c) last time
-    [ns] by camera.
+    [ns] by camera. beside_s: (n,) for how long it has been where an older one is, less how long not.
     """
 
     identity: Ints
@@ -40,6 +40,7 @@ class Targets:
     chances: Ints
     support: Floats
     seen_by: Ints
+    beside_s: Floats
 
     def __len__(self) -> int:
         return len(self.identity)
@@ -75,6 +76,7 @@ class Targets:
             whole,
             np.zeros(0),
             np.zeros((0, cameras), dtype=np.int64),
+            np.zeros(0),
         )
 
 

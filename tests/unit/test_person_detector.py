@@ -13,8 +13,8 @@ import pytest
 from deploy.cli import run
 from edge import scenes
 from edge.detectors.base import Detection, Prediction
-from edge.detectors.bodies import explain
-from edge.detectors.foreground import Foreground, without_like
+from edge.detectors.bodies import explain, lone_people
+from edge.detectors.foreground import Foreground, is_ghost, places_left, usual, without_like
 from edge.detectors.matching import match_predictions
 from edge.detectors.person import PersonDetector, silhouette_features
 from edge.detectors.stature import Stature
@@ -30,6 +30,11 @@ def street(seed: int = 0) -> Image:
     rng = np.random.default_rng(seed)
     coarse = rng.integers(60, 190, (30, 40, 3), dtype=np.uint8)
     return np.asarray(cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+
+
+def wall() -> Image:
+    """A background without edges of its own."""
+    return np.asarray(cv2.GaussianBlur(street(), (0, 0), 12.0), dtype=np.uint8)
 
 
 def noisy(picture: Image, rng: np.random.Generator, gain: float = 1.0) -> Image:
@@ -194,8 +199,11 @@ def test_predictions_are_matched_once_each_and_far_ones_not_at_all() -> None:
     assert match_predictions([Detection(10.0, 10.0, size=200.0)], far_too_small)[0].target == ""
 
 
-@pytest.mark.xfail(strict=False, reason="precision and recall are between 0.8 and 0.95; see edge/README.md")
-def test_people_of_a_rendered_room_are_found_where_they_are() -> None:
+def test_two_people_of_a_rendered_room_are_found_where_they_are_five_seconds_after_the_start() -> None:
+    """Live, from the first picture on: the first five seconds, in which the place is learnt, do not count.
+
+    Two people who are whole in view most of the time; five hide each other, and then it takes longer (edge/README.md).
+    """
     scene = scenes.get_people(11, None, 2)
     camera = scene.cameras[0]
     renderer = scene.renderer(camera.name, np.random.default_rng(0))
@@ -299,6 +307,86 @@ def test_the_four_cars_of_a_street_are_four_labels_and_its_paint_is_none(tmp_pat
     assert run(["detect", "vehicle", str(CARS), "--out", str(out), "--json"]) == 0
     with out.open() as lines:
         assert {row["label"] for row in csv.DictReader(lines)} == {"t0", "t1", "t2", "t3"}
+
+
+def test_two_who_were_never_seen_alone_are_two_where_the_tracking_says_how_tall_people_are() -> None:
+    """Two who cross the street as one silhouette; somebody else is followed by other cameras."""
+
+    def crossing(*, told: bool) -> int:
+        detector, rng = learnt(PersonDetector("mog2", 10.0)), np.random.default_rng(1)
+        found: list[Detection] = []
+        for index in range(25):
+            picture = street()
+            for apart, colour in ((0.0, (30, 30, 160)), (17.0, (160, 60, 30))):
+                put_person(picture, 40.0 + apart + 1.5 * index, 170.0, 70.0, colour)
+            expected = [Prediction(200.0, 130.0 - 26.0 + 2 * index, (4.0, 0.0, 4.0), "person-1", size=52.0 + index)]
+            found = detector.detect(noisy(picture, rng), index / 10.0, expected if told else [])
+        return len(found)
+
+    assert crossing(told=False) < 2
+    assert crossing(told=True) == 2
+
+
+def test_the_place_that_somebody_left_is_told_from_him_where_both_are_one_silhouette() -> None:
+    """He stood at the left when the background was learnt, and now stands where he half hides that place."""
+    rng = np.random.default_rng(12)
+    before, now = wall(), wall()
+    put_person(before, 100.0, 200.0, 120.0)
+    put_person(now, 122.0, 200.0, 120.0)
+    before, now = noisy(before, rng), noisy(now, rng)
+    differ = np.where(cv2.absdiff(before, now).max(axis=2) > 25, np.uint8(255), np.uint8(0)).astype(np.uint8)
+    figure = np.asarray(cv2.morphologyEx(cv2.medianBlur(differ, 3), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)))
+    left = places_left(now, before, figure) > 0
+    ghost, body = figure.copy(), figure.copy()
+    ghost[:, 107:], body[:, :114] = 0, 0
+    assert left[ghost > 0].mean() > 0.5
+    assert left[body > 0].mean() < 0.1
+    assert is_ghost(now, before, (80.0, 80.0, 26.0, 120.0), ghost)
+    assert not is_ghost(now, before, (114.0, 80.0, 26.0, 120.0), body)
+
+
+def test_who_leaves_the_place_where_he_stood_at_first_leaves_no_one_behind() -> None:
+    """He stands for 3 s before a camera that was just switched on, then walks away from it: no second one stays."""
+    detector, rng = PersonDetector("mog2", 10.0), np.random.default_rng(13)
+    for index in range(100):
+        gone = max(index - 30, 0)
+        picture = wall()
+        put_person(picture, 120.0 + 2.0 * gone, 200.0 - 0.6 * gone, 110.0 - 0.5 * gone)
+        found = detector.detect(noisy(picture, rng), index / 10.0)
+        if index >= 55:
+            assert len(found) == 1
+            assert found[0].size == pytest.approx(110.0 - 0.5 * gone, rel=0.15)
+
+
+def test_pieces_of_somebody_tell_no_height() -> None:
+    figure = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    put_person(figure, 100.0, 150.0, 90.0, (255, 255, 255))
+    put_person(figure, 104.0, 176.0, 20.0, (255, 255, 255))
+    put_person(figure, 220.0, 176.0, 80.0, (255, 255, 255))
+    found = lone_people(np.where(figure.any(axis=2), np.uint8(255), np.uint8(0)).astype(np.uint8))
+    assert sorted(round(tall) for _, _, tall in found) == pytest.approx([80, 90], abs=2)
+    stature = Stature(WIDTH, HEIGHT)
+    for index in range(30):
+        stature.learn(20.0 + 4 * index, 100.0 + index, 12.0)
+    for index in range(15):
+        stature.learn(20.0 + 4 * index, 100.0 + 2 * index, 60.0 + index)
+    assert stature.at(np.array([100.0]), np.array([110.0]))[0] == pytest.approx(65.0, abs=6.0)
+
+
+def test_a_camera_s_rate_is_told_by_its_pictures() -> None:
+    """A second is a second, whatever rate was told beforehand: 10 pictures of 25 that were told."""
+    model, rng = Foreground("mog2", 25.0), np.random.default_rng(4)
+    fresh = [model.look(noisy(street(), rng), (), 7.0 + index / 10.0).fresh for index in range(30)]
+    assert fresh.index(False) == pytest.approx(11, abs=2)
+    assert not any(fresh[15:])
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 24])
+def test_what_is_usual_is_as_the_plain_expression_says(count: int) -> None:
+    pictures = list(np.random.default_rng(count).integers(0, 256, (count, 20, 30, 3), dtype=np.uint8))
+    ordered, share = np.sort(np.stack(pictures), axis=0), max(round(0.34 * count), 1)
+    start = (ordered[share - 1 :] - ordered[: count - share + 1]).argmin(axis=0)
+    assert np.array_equal(usual(pictures), np.take_along_axis(ordered, (start + share // 2)[None], axis=0)[0])
 
 
 def test_ghosts_are_taken_off_as_the_plain_expression_does() -> None:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from edge import scenes
-from hub.tracking.camera import TrackingCamera
+from hub.tracking.camera import TrackingCamera, frame_of
 from hub.tracking.discovery import Scale
 from hub.tracking.live import LiveTracking
-from hub.tracking.step import World
+from hub.tracking.step import World, step
 from hub.tracking.tracker import Tracker
 from hub.tracking.upright import UpFinder
 from protocols.clocks import NANOSECONDS, TimeMap
@@ -185,6 +186,35 @@ def test_a_name_survives_two_seconds_out_of_sight(traffic: Traffic) -> None:
             shown[t - begin > 5.0] = dict(zip([p.name for p in traffic.scene.people], names, strict=True))
     assert len(set(shown[False].values())) == 3
     assert shown[True] == shown[False]
+
+
+def test_two_names_in_one_place_become_the_older_one(traffic: Traffic) -> None:
+    """Every body is told twice, so that both names are seen as often as can be: nobody stands in another."""
+    cameras, world = cameras_of(traffic.scene, "cam0"), World(up=UP)
+    messages = list(traffic.messages())
+    state = follow(tracker_of(cameras, world), messages[: len(messages) // 2]).state
+    assert state.time_ns is not None
+    begun = state.time_ns
+    known = np.flatnonzero(state.targets.confirmed)
+    one = state.targets.kept(np.arange(len(state.targets)) == known[0])
+    twin = replace(one, identity=np.array([1000]), number=np.array([state.next_number]))
+    twin = replace(twin, mean=one.mean + 0.08 * np.eye(7)[:1])
+    state = replace(state, targets=state.targets.joined(twin), next_number=state.next_number + 1)
+    later = []
+    for message in messages:
+        doubled = pb.Observation()
+        doubled.CopyFrom(message)
+        doubled.detections.extend(message.detections)
+        frame = frame_of(cameras[message.camera], doubled)
+        if frame.reference_ns > begun:
+            later.append(frame)
+    numbers = []
+    for frame in sorted(later, key=lambda each: each.key):
+        state = step(state, frame, cameras, world)
+        numbers.append((frame.reference_ns - begun, set(state.targets.number[state.targets.confirmed].tolist())))
+    names = {int(number) for number in one.number} | {int(number) for number in twin.number}
+    assert all(names <= told for after, told in numbers if after < 0.8 * NANOSECONDS)
+    assert all(names & told == set(one.number.tolist()) for after, told in numbers if after > 2.5 * NANOSECONDS)
 
 
 def test_a_restarted_camera_is_not_believed(traffic: Traffic) -> None:
