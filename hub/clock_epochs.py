@@ -59,6 +59,10 @@ class ClockEpochs:
                 cameras[name] = replace(camera, time_map=time_map, time_offset_std=std)
         return replace(calibration, cameras=cameras), names
 
+    def event(self, boot: str) -> ClockEvent | None:
+        """The event that began the epoch ``boot``, as it is known by now; None if no event did."""
+        return self._watch.event(boot)
+
     def rates_ppm(self) -> dict[str, float]:
         """How much slower than the hub's clock each camera's runs, over the last seconds."""
         rates = {camera: self._watch.rate(camera, boot) for camera, boot in self._runs.items()}

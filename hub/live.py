@@ -266,7 +266,8 @@ class LiveHub:
 
     def _straightened(self, observations: Observations) -> Observations:
         """Observations with what a clock stamped between its bend and the alarm put right."""
-        bends = {name: self._bends.serving(name, self._builder.boot(name)) for name in self._bends.cameras}
+        serving = {name: self._bends.serving(name, self._builder.boot(name)) for name in self._bends.cameras}
+        bends = {name: bend.amended(self.clocks.event(bend.after)) for name, bend in serving.items() if bend}
         tracks = {
             key: track if (bend := bends.get(key[0])) is None else replace(track, time=bend.straightened(track.time))
             for key, track in observations.tracks.items()

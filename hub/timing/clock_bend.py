@@ -8,7 +8,7 @@ clock never showed so, are put right too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,13 +16,16 @@ from hub.timing.clock_watch import ClockEvent
 from protocols.geometry.types import Floats
 
 _SECOND_NS = 1_000_000_000
+_SPLIT_S = 1e-5
+"""More than rounding, less than between two frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bend:
     """From ``at_s`` [s, the clock's own time] on the clock runs ``1 + rate`` times as fast; told at ``told_s``.
 
-    before, after: names of the epoch that ended there and of the one that began.
+    before, after: names of the epoch that ended there and of the one that began. put: ``at_s`` and ``rate`` as first
+    told, by which frames were put on the old clock as they came.
     """
 
     before: str
@@ -30,23 +33,37 @@ class Bend:
     at_s: float
     rate: float
     told_s: float
+    put: tuple[float, float]
 
     @classmethod
     def of(cls, event: ClockEvent) -> Bend:
         """The bend of an event of kind "drift". Raises ValueError for one that changes no rate."""
         if event.rate == 0.0:
             raise ValueError(f"{event.kind} of {event.camera}: the rate stays")
-        return cls(event.before, event.boot, event.at_s - event.step_s / event.rate, event.rate, event.at_s)
+        at = event.at_s - event.step_s / event.rate
+        return cls(event.before, event.boot, at, event.rate, event.at_s, (at, event.rate))
+
+    def amended(self, event: ClockEvent | None) -> Bend:
+        """The same bend as ``event`` tells it by now; None = nothing new."""
+        if event is None or event.rate == 0.0:
+            return self
+        return replace(self, at_s=event.at_s - event.step_s / event.rate, rate=event.rate)
 
     def on_old_clock(self, device_ns: int) -> int:
         """What the old clock would show [ns] where the new one shows ``device_ns``, a time after the bend."""
-        at_ns = round(self.at_s * _SECOND_NS)
-        return device_ns - round(self.rate * (device_ns - at_ns))
+        at_s, rate = self.put
+        return device_ns - round(rate * (device_ns - round(at_s * _SECOND_NS)))
 
     def straightened(self, time: Floats) -> Floats:
-        """Times (n,) [s] of the old epoch with those that were taken between the bend and ``told_s`` put right."""
-        bent = (time > self.at_s) & (time < self.told_s)
-        return np.asarray(np.where(bent, time - self.rate * (time - self.at_s), time))
+        """Times (n,) [s] of the old epoch, put right.
+
+        Those between the bend and ``told_s`` are as the clock showed them, later ones as they were put.
+        """
+        at, rate = self.put
+        came_late = time > self.told_s - rate * (self.told_s - at) - _SPLIT_S
+        right = came_late if self.put == (self.at_s, self.rate) else np.zeros(time.shape, dtype=np.bool_)
+        shown = np.where(came_late, at + (time - at) / (1.0 - rate), time)
+        return np.asarray(np.where(right | (shown <= self.at_s), time, shown - self.rate * (shown - self.at_s)))
 
 
 class Bends:

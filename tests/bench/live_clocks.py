@@ -1,30 +1,37 @@
 """The live hub's clocks: against the offline answer on the same rows, while a clock drifts, and when one steps.
 
-    python -m tests.bench.live_clocks [--sessions 8] [--start 0] [--only window,drift,step]
+    python -m tests.bench.live_clocks [--sessions 8] [--start 0] [--only window,drift,step,steady,links]
 
 Three cameras, 0.5 px, clocks of any epoch; messages arrive in the order in which they were made. window: error of the
 live hub's last clocks over 20 s, over that of `calibrate` on the rows of those 20 s as they were made (asked: 1.2).
 drift: one clock runs 200 ppm faster from the 30th second on; the largest error of the published map at that camera's
-present time (asked: 1 ms), when it is published, and whenever a frame comes while it is the newest. step: one clock
-jumps by 0.3 to 30 s (asked: told within 5 s, both sides kept apart).
+present time (asked: 1 ms), when it is published, and whenever a frame comes while it is the newest; and the same where
+nothing drifts. step: one clock jumps by 0.3 to 30 s (asked: told within 5 s, both sides kept apart). steady: no clock
+changes, and frames are 5 to 30 ms late; published maps against those of the same hub that hears of no arrivals, which
+can correct nothing. links: the watch over clocks alone, ten minutes a session over each of several links: alarms that
+are false, and when 200 ppm are told.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import numpy as np  # noqa: E402
+from scipy.signal import lfilter  # noqa: E402
 
 from hub.calibrate import calibrate  # noqa: E402
 from hub.live import LiveHub, LiveSettings  # noqa: E402
+from hub.timing.clock_watch import ClockWatch  # noqa: E402
 from protocols.clocks import NANOSECONDS  # noqa: E402
 from protocols.errors import Refused  # noqa: E402
+from protocols.geometry.types import Floats  # noqa: E402
 from protocols.messages import syncline_pb2 as pb  # noqa: E402
 from tests import rigs  # noqa: E402
 
@@ -47,8 +54,10 @@ class Change:
         return own if after <= 0.0 else own + self.step_s + self.rate * after
 
 
-def stream(session: rigs.Session, change: Change, seed: int) -> Iterator[tuple[float, pb.Observation | pb.CameraInfo]]:
-    """(true time, message) in the order of arrival; arrivals are _DELAY_S after it, with a scatter."""
+def stream(
+    session: rigs.Session, change: Change, seed: int, scatter_s: float = _SCATTER_S
+) -> Iterator[tuple[float, pb.Observation | pb.CameraInfo]]:
+    """(true time, message) in the order in which they were made; arrivals are _DELAY_S after it, with a scatter."""
     for name, camera in session.rig.cameras.items():
         lens = camera.intrinsics
         assert lens is not None
@@ -66,7 +75,7 @@ def stream(session: rigs.Session, change: Change, seed: int) -> Iterator[tuple[f
             ),
         )
     true = np.array([session.true_time(c, float(t)) for c, t in zip(session.camera, session.time, strict=True)])
-    scatter = np.random.default_rng([seed, 3]).exponential(_SCATTER_S, len(true))
+    scatter = np.random.default_rng([seed, 3]).exponential(scatter_s, len(true))
     counts: dict[str, int] = {}
     for i in np.argsort(true):
         name = session.camera[i]
@@ -147,8 +156,13 @@ class Followed:
     drifts: int
 
 
-def follow(seed: int, change: Change, seconds: float, right_ms: float) -> Followed:
-    """One session in which a clock changes; the map of every calibration is judged at once."""
+def follow(
+    seed: int, change: Change, seconds: float, right_ms: float, scatter_s: float = _SCATTER_S, heard: bool = True
+) -> Followed:
+    """One session in which a clock changes; the map of every calibration is judged at once.
+
+    heard: whether the hub knows when messages arrived.
+    """
     session = rigs.simulate(seed, 3, seconds, late=2.0, fps=(30.0,))
     hub = LiveHub(LiveSettings(window_s=30.0, interval_s=4.0))
     told = right = None
@@ -162,8 +176,8 @@ def follow(seed: int, change: Change, seconds: float, right_ms: float) -> Follow
         shown = change.shown(session.shown(CHANGED, true), true)
         return 1e3 * abs(float(camera.clock_rate) * shown + float(camera.time_offset) - session.shown(reference, true))
 
-    for true, message in stream(session, change, seed):
-        hub.handle(message, true + _DELAY_S)
+    for true, message in stream(session, change, seed, scatter_s):
+        hub.handle(message, true + _DELAY_S if heard else None)
         after = true - CHANGES_AT_S
         if told is None and hub.counters["clock_steps"] + hub.counters["clock_drifts"]:
             told = after
@@ -182,10 +196,12 @@ def follow(seed: int, change: Change, seconds: float, right_ms: float) -> Follow
     return Followed(told, right, errors, aged, hub.counters["clock_steps"], hub.counters["clock_drifts"])
 
 
-def drift(seeds: range) -> None:
+def drift(seeds: range, jitter_s: float) -> None:
     """A change of rate of 200 ppm, either way."""
     for seed in seeds:
-        found = follow(seed, Change(rate=2e-4 if seed % 2 else -2e-4), 75.0, 1.0)
+        found = follow(seed, Change(rate=2e-4 if seed % 2 else -2e-4), 75.0, 1.0, jitter_s)
+        even = follow(seed, Change(), 75.0, 1.0, jitter_s)
+        usual = max((e for at, e in even.aged if at > 0.0), default=float("nan"))
         before = max((e for at, e in found.errors if at <= 0.0), default=float("nan"))
         worst = max((e for at, e in found.errors if at > 0.0), default=float("nan"))
         settled = max((e for at, e in found.errors if at > 20.0), default=float("nan"))
@@ -194,7 +210,7 @@ def drift(seeds: range) -> None:
         print(
             f"drift of 200 ppm, session {seed}: {told}, {found.drifts} alarms of drift, {found.steps} of steps; map "
             f"{before:.2f} ms off before, {worst:.2f} ms at worst after, {settled:.2f} ms from 20 s on (asked 1 ms); "
-            f"{between:.2f} ms at worst between two maps",
+            f"{between:.2f} ms at worst between two maps, {usual:.2f} if nothing drifts",
             flush=True,
         )
 
@@ -214,15 +230,115 @@ def step(seeds: range) -> None:
         )
 
 
+def steady(seeds: range) -> None:
+    """Clocks that change nothing, behind links that hold frames up."""
+    for seed in seeds:
+        scatter_s = float(np.random.default_rng([seed, 22]).uniform(5e-3, 30e-3))
+        told, plain = (follow(seed, Change(), 60.0, 1.0, scatter_s, heard) for heard in (True, False))
+        worst = [max((e for _, e in found.aged), default=float("nan")) for found in (told, plain)]
+        rms = [float(np.sqrt(np.mean([e**2 for _, e in found.aged]))) for found in (told, plain)]
+        print(
+            f"steady, frames {1e3 * scatter_s:.0f} ms late, session {seed}: {told.drifts} alarms of drift, "
+            f"{told.steps} of steps; map {rms[0]:.3f} ms off (rms; {worst[0]:.3f} at worst), "
+            f"{rms[1]:.3f} ({worst[1]:.3f}) without arrivals",
+            flush=True,
+        )
+
+
+Link = Callable[[np.random.Generator, Floats], Floats]
+"""How late frames of true times (n,) [s] arrive [s]."""
+
+
+def _jitter(mean_s: float) -> Link:
+    return lambda rng, true: 2e-3 + rng.exponential(mean_s, len(true))
+
+
+def _wandering(tau_s: float, spread_s: float) -> Link:
+    """Delays that come and go within tau_s, as those of a busy machine do."""
+
+    def late(rng: np.random.Generator, true: Floats) -> Floats:
+        keeps = float(np.exp(-1.0 / tau_s))
+        steps = spread_s * np.sqrt(1.0 - keeps**2) * rng.normal(size=int(true[-1]) + 2)
+        level = lfilter([1.0], [1.0, -keeps], steps)
+        return np.asarray(5e-3 + np.interp(true, np.arange(len(level)), level) + rng.exponential(3e-4, len(true)))
+
+    return late
+
+
+def _routes(rng: np.random.Generator, true: Floats) -> Floats:
+    """Every 20 s or so the way is another one, up to a millisecond longer."""
+    at = np.sort(rng.uniform(0.0, true[-1], rng.poisson(true[-1] / 20.0)))
+    level = np.append(0.0, rng.uniform(0.0, 1e-3, len(at)))
+    return np.asarray(2e-3 + level[np.searchsorted(at, true)] + rng.exponential(3e-4, len(true)))
+
+
+def _loads(rng: np.random.Generator, true: Floats) -> Floats:
+    """Every 30 s or so a load begins within 0.5 to 5 s, which makes frames a millisecond late, and ends again."""
+    late = 2e-3 + rng.exponential(3e-4, len(true))
+    for at in rng.uniform(0.0, true[-1], rng.poisson(true[-1] / 30.0)):
+        rise, stay = rng.uniform(0.5, 5.0), rng.uniform(1.0, 20.0)
+        shape = np.interp(true, at + np.array([0.0, rise, rise + stay, 2.0 * rise + stay]), [0.0, 1.0, 1.0, 0.0])
+        late = late + rng.exponential(1e-3) * shape
+    return np.asarray(late)
+
+
+LINKS: dict[str, Link] = {
+    "0.3 ms of jitter": _jitter(3e-4),
+    "1 ms": _jitter(1e-3),
+    "5 ms": _jitter(5e-3),
+    "15 ms": _jitter(1.5e-2),
+    "30 ms": _jitter(3e-2),
+    "wandering by 0.1 ms within 10 s": _wandering(10.0, 1e-4),
+    "wandering by 1 ms within a minute": _wandering(60.0, 1e-3),
+    "wandering by 1 ms within 3 s": _wandering(3.0, 1e-3),
+    "routes that change": _routes,
+    "loads that come and go": _loads,
+}
+
+
+def links(seeds: range) -> None:
+    """The watch alone: ten minutes without a change and one drift of 200 ppm for each seed."""
+    for name, link in LINKS.items():
+        false, told = 0, list[float]()
+        for seed in seeds:
+            false += len(_alarms(link, seed, 600.0, 0.0))
+            begins = CHANGES_AT_S + float(np.random.default_rng([seed, 23]).uniform(0.0, 1.0))
+            alarms = _alarms(link, seed, begins + 30.0, 2e-4 if seed % 2 else -2e-4, begins)
+            right = [at - begins for at in alarms if at > begins]
+            false += len(alarms) - len(right)
+            told += right[:1]
+        when = f"after {np.median(told):.1f} s (at most {max(told):.1f})" if told else "never"
+        print(
+            f"{name:34} {false} false alarms in {len(seeds) / 6:.1f} h; 200 ppm told in {len(told)} of {len(seeds)}, "
+            + when,
+            flush=True,
+        )
+
+
+def _alarms(link: Link, seed: int, seconds: float, rate: float, begins: float = 0.0) -> list[float]:
+    """True times of the alarms of one camera's clock, 30 fps, up to 200 ppm off from the beginning."""
+    rng, watch, alarms = np.random.default_rng([seed, 24]), ClockWatch(), list[float]()
+    true = np.arange(round(30.0 * seconds)) / 30.0
+    shown = true * (1.0 + rng.uniform(-2e-4, 2e-4)) + rate * np.maximum(0.0, true - begins)
+    arrival = np.maximum.accumulate(true + link(rng, true))
+    for frame in range(len(true)):
+        _, event = watch.handle("", "", frame, frame, round(shown[frame] * NANOSECONDS), float(arrival[frame]))
+        if event is not None:
+            alarms.append(float(true[frame]))
+    return alarms
+
+
 def main() -> None:
     """Print the rows that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sessions", type=int, default=8)
     parser.add_argument("--start", type=int, default=0, help="first seed")
-    parser.add_argument("--only", default="window,drift,step")
+    parser.add_argument("--only", default="window,drift,step,steady,links")
+    parser.add_argument("--jitter-ms", type=float, default=1e3 * _SCATTER_S, help="of the drifts' arrivals (mean)")
     options = parser.parse_args()
     seeds = range(options.start, options.start + options.sessions)
-    for name, run in (("window", window), ("drift", drift), ("step", step)):
+    drifts = partial(drift, jitter_s=1e-3 * options.jitter_ms)
+    for name, run in (("window", window), ("drift", drifts), ("step", step), ("steady", steady), ("links", links)):
         if name in options.only.split(","):
             run(seeds)
 

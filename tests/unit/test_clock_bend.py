@@ -24,6 +24,10 @@ def shown(true: float) -> float:
     return EPOCH_S + true + 2e-4 * max(true - 30.0, 0.0)
 
 
+def shown_at(true: np.ndarray) -> np.ndarray:
+    return np.array([shown(float(t)) for t in true])
+
+
 def test_a_bend_begins_where_the_old_line_was_left() -> None:
     bend = Bend.of(DRIFT)
     assert bend.at_s == pytest.approx(EPOCH_S + 30.0, abs=1e-6)
@@ -43,6 +47,19 @@ def test_only_rows_between_the_bend_and_its_alarm_are_straightened() -> None:
     np.testing.assert_allclose(Bend.of(DRIFT).straightened(times) - EPOCH_S, true, atol=5e-6)
     later = np.array([EPOCH_S + 35.0])  # put right as it came
     np.testing.assert_array_equal(Bend.of(DRIFT).straightened(later), later)
+
+
+def test_what_was_put_by_the_first_guess_is_put_right_by_the_last() -> None:
+    """Frames from before and after the alarm, and the one with which it was told, all on the old clock's line."""
+    first = replace(DRIFT, step_s=6e-4, rate=1.6e-4)
+    amended = Bend.of(first).amended(DRIFT)
+    assert amended.amended(None) == amended
+    true = np.array([20.0, 31.0, 34.4])
+    np.testing.assert_allclose(amended.straightened(shown_at(true)) - EPOCH_S, true, atol=5e-6)
+    later = shown_at(np.array([34.4992, 40.0, 60.0]))
+    put = np.array([amended.on_old_clock(round(time * 1e9)) * 1e-9 for time in later])
+    assert np.abs(put - EPOCH_S - [34.4992, 40.0, 60.0]).max() > 2e-4
+    np.testing.assert_allclose(amended.straightened(put) - EPOCH_S, [34.4992, 40.0, 60.0], atol=5e-6)
 
 
 def test_a_bend_serves_until_its_new_epoch_does_and_a_step_ends_it() -> None:
