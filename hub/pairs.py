@@ -57,6 +57,7 @@ def solve_pairs(
     todo = list(itertools.combinations(names, 2))
     many = len(names) > _FEW and not prepared.shared_clock
     pairs: dict[tuple[str, str], PairSolution] = {}
+    plain: dict[tuple[str, str], PairSolution] = {}
     told = _ToldClocks()
     sort = len(todo) > 1 and not prepared.shared_clock
     for done, (a, b) in enumerate(_most_promising_first(prepared, todo, tell) if sort else todo):
@@ -65,7 +66,9 @@ def solve_pairs(
         answer = _solve(prepared, (a, b), known, near=near)
         # Where the others' clocks are right, a pair that sees much must agree; if not, it is heard for itself.
         if near is not None and not answer.solved and (not many or _sees_much(answer)):
-            answer = _solve(prepared, (a, b), known)
+            answer, near = _solve(prepared, (a, b), known), None
+        if near is None:
+            plain[a, b] = answer
         if claims and not answer.solved and not prepared.shared_clock:
             answer, warning = _chosen_by_claims(prepared, answer, known, claims)
             prepared = replace(prepared, warnings=prepared.warnings + warning)
@@ -73,7 +76,7 @@ def solve_pairs(
         told.hear(answer)
     pairs = {both: pairs[both] for both in todo}  # in the rig's order
     if thorough and not prepared.shared_clock:
-        prepared = _tie_at_other_rates(prepared, pairs, known, tell)
+        prepared = _tie_at_other_rates(prepared, pairs, plain, known, tell)
     return prepared, list(pairs.values())
 
 
@@ -165,6 +168,7 @@ def _solve(
     thorough: bool = False,
     near: float | None = None,
     settings: PairSettings | None = None,
+    plain: PairSolution | None = None,
 ) -> PairSolution:
     a, b = (prepared.camera(name).tracks for name in names)
     if prepared.shared_clock:
@@ -174,16 +178,29 @@ def _solve(
         given = relative_pose(known.cameras[names[0]].pose, known.cameras[names[1]].pose)
     calibrated = all(name in prepared.cameras for name in names)
     return solve_pair(
-        smooth_only(a), smooth_only(b), names, settings, given, calibrated=calibrated, thorough=thorough, near=near
+        smooth_only(a),
+        smooth_only(b),
+        names,
+        settings,
+        given,
+        calibrated=calibrated,
+        thorough=thorough,
+        near=near,
+        plain=plain,
     )
 
 
 def _tie_at_other_rates(
-    prepared: Prepared, pairs: dict[tuple[str, str], PairSolution], known: Known | None, tell: Progress
+    prepared: Prepared,
+    pairs: dict[tuple[str, str], PairSolution],
+    plain: dict[tuple[str, str], PairSolution],
+    known: Known | None,
+    tell: Progress,
 ) -> Prepared:
     """Tie what is not tied to the largest group at rates far from 1; ``pairs`` are replaced in place.
 
-    A group of several that is tied by one pair is paced as a whole, and its other pairs are solved again.
+    A group of several that is tied by one pair is paced as a whole, and its other pairs are solved again. plain: what
+    searches through all lags said, which are not made again.
     """
     names, tried = prepared.names, set[tuple[str, str]]()
     while True:
@@ -196,7 +213,7 @@ def _tie_at_other_rates(
                 continue
             tried.add((a, b))
             tell(f"pair {a}–{b} at other frame rates", 0.57)
-            answer = _solve(prepared, (a, b), known, thorough=True)
+            answer = _solve(prepared, (a, b), known, thorough=True, plain=plain.get((a, b)))
             if answer.solved and answer.fit is not None:
                 found = answer, answer.fit
                 break
@@ -210,10 +227,12 @@ def _tie_at_other_rates(
         prepared = prepared.paced(group, factor)
         pairs[answer.a, answer.b] = answer
         for (a, b), pair in pairs.items():
+            if a in group or b in group:
+                plain.pop((a, b), None)
             if (a in group) == (b in group) or pair is answer:
                 pairs[a, b] = _paced(pair, *(factor if name in group else 1.0 for name in (a, b)))
             else:
-                pairs[a, b] = _solve(prepared, (a, b), known)
+                pairs[a, b] = plain[a, b] = _solve(prepared, (a, b), known)
 
 
 def _paced(pair: PairSolution, factor_a: float, factor_b: float) -> PairSolution:

@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hub.timing import two_view
-from hub.timing.refine import PointPairs
+from hub.timing.refine import PointPairs, Refined
 from hub.timing.tracks import SmoothTrack
 from hub.timing.two_view import Geometry, RelativePose
 from protocols.geometry.types import Bools, Floats, Ints
 
 _PAUSE_INTERVALS = 5.0
+_GROSS = 3.0  # sigma beyond which a residual tells no correlation
+_TOLD = 2.0  # sigma by which a correlation must stand out
 _STEPS = (0.01, 0.0125, 0.016, 0.02, 0.025, 0.033, 0.05)
 
 
@@ -64,6 +66,12 @@ class PairSettings:
     """… and how many of them there must be."""
     accept_log10_gap: float = -2.0
     """log10 of the chance that the next best lag is so much worse; either of the two will do."""
+    alone_support: float = 5.0
+    """Seconds of agreeing motion from which an alignment at the noise is believed that stands alone: …"""
+    alone_strength: float = 3.0
+    """… its strength (`verdict.strength`), and …"""
+    alone_ratio: float = 0.4
+    """… the next best one's over it."""
     distinct_alignments: float = 0.3
     """Seconds between lags whose misfits are independent."""
     flat_ratio: float = 3.0
@@ -76,13 +84,17 @@ class PairSettings:
     worse_than_noise: float = 1.4
     """… this many times where the best one leaves no more than the noise, …"""
     clearly_likelier: float = 3.0
-    """… or if chance makes it this many powers of ten more often."""
+    """… or if chance makes it this many powers of ten more often; …"""
+    likelier_than_usual: float = 2.0
+    """… so many are enough where chance makes one like it in every search."""
     near_window: float = 0.3
     """How far the lag may be from what other cameras tell, where they do [s]."""
     exact: float = 1.3
     """What an alignment may leave over the tracks' own noise for the noise to explain it."""
     largest_lag_std: float = 4e-3
-    """Least certainty [s] of the lag and …"""
+    """Least certainty [s] of the lag, …"""
+    largest_slow_lag_std: float = 7e-3
+    """… up to this where the point moves by less than a pixel in that time, and …"""
     largest_turn_std: float = 0.1
     """… of the relative rotation [rad] that is worth an answer; …"""
     sure_turn_std: float = 0.25
@@ -102,7 +114,8 @@ class PairFit:
     flat_px: what one plane would leave [px]. misfit: mean squared distance over the settings' noise of the
     smoothed samples that agree. own_px: noise of the noisier camera's tracks. log10_chance: of one unrelated
     stretch of such length fitting as well, None where the recordings are too short to tell. log10_gap: of the
-    next best lag leaving so much more by chance. lag_std [s], turn_std [rad]: of the last refinement.
+    next best lag leaving so much more by chance. cycles: bandwidth times seconds of agreeing motion. lag_std [s],
+    turn_std [rad]: of the last refinement, by noise alone.
     """
 
     rate: float
@@ -121,6 +134,7 @@ class PairFit:
     own_px: float = float("nan")
     log10_chance: float | None = None
     log10_gap: float = 0.0
+    cycles: float = 0.0
     lag_std: float = float("nan")
     turn_std: float = float("nan")
 
@@ -220,6 +234,22 @@ class Samples:
         if there.all():
             return PointPairs(self.points, b, speed, lever)
         return PointPairs(self.points[there], b[there], speed[there], lever[there])
+
+    def together(self, found: Refined) -> float:
+        """How many residuals in a row count as one: 1 + 2 sum of their correlations, as far as these stand out."""
+        rate = 1.0 / found.slowness
+        a, b = self.at(rate, self.centre - rate * found.middle)
+        there = np.isfinite(b[:, 0])
+        off = two_view.sampson(found.geometry.matrix, a[there], b[there], 1.0 / self.a[0].focal, 1.0 / self.b[0].focal)
+        limit = _GROSS * float(np.median(np.abs(off))) / 0.6745
+        off = np.clip(off, -limit, limit)
+        variance, total = float(np.mean(off**2)), 1.0
+        for lag in range(1, len(off) // 4 if variance > 0.0 else 0):
+            correlation = float(np.mean(off[lag:] * off[:-lag])) / variance
+            if correlation < _TOLD / np.sqrt(len(off)):
+                break
+            total += 2.0 * correlation
+        return total
 
     def judge(self, cost: float, rate: float, offset: float, geometry: Geometry) -> PairFit:
         """Absolute figures of an alignment, over the samples where both move."""

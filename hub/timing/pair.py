@@ -24,6 +24,8 @@ from hub.timing.verdict import at_noise, distinct, doubts, hopeless, judge, need
 from protocols.geometry.types import Floats
 
 _LEAST_SAMPLES = 12
+_RATE_TOLD = 5.0  # std, residuals that are alike counted as one
+_USUAL_RATE = 2e-4  # std of a clock's rate, where the motion does not tell it
 _AT_NOISE = 0.8  # mean robust cost of an alignment whose rows are as noisy as the settings say: about 0.75
 _NEAR_CANDIDATES = 3
 _NO_FIT = "no alignment of the two tracks agrees with any geometry"
@@ -67,6 +69,7 @@ def solve_pair(
     calibrated: bool = True,
     thorough: bool = False,
     near: float | None = None,
+    plain: PairSolution | None = None,
 ) -> PairSolution:
     """Find lag, rate and geometry of two cameras from the labels that both saw.
 
@@ -75,14 +78,15 @@ def solve_pair(
     tracks' normalised coordinates are those of any nominal lens and the answer is a fundamental matrix.
     thorough: whether to go on where that finds nothing: clocks up to 5000 ppm off, those of wrongly told
     frame rates, and tracks that follow something else now and then; tens of times as dear. near: ``t_a - t_b``
-    in the middle of the common time, where other cameras tell it: then only lags about it are looked at.
+    in the middle of the common time, where other cameras tell it: then only lags about it are looked at. plain: the
+    refusal of the same tracks without ``thorough`` and ``near``, if it is at hand: then it is not sought again.
     """
     s = settings or PairSettings()
     labels = [label for label in tracks_a if label in tracks_b]
     if not labels:
         return PairSolution(*names, "no label that both cameras saw")
     search = _Search([tracks_a[k] for k in labels], [tracks_b[k] for k in labels], s, known, calibrated)
-    first = search.at_rate(names, 1.0, None if near is None else (near, s.near_window))
+    first = search.again(plain) or search.at_rate(names, 1.0, None if near is None else (near, s.near_window))
     if first.solved and near is None and first.fit is not None and first.fit.support < s.hardly and search.jumps():
         # A few seconds of a torn track agree with much; the lag at which its pieces agree for longer is likelier.
         pieces = search.in_pieces(names)
@@ -129,6 +133,13 @@ class _Search:
                 yield 1.0 + k * slip
                 yield 1.0 - k * slip
         yield from _LABELLED_RATES
+
+    def again(self, plain: PairSolution | None) -> PairSolution | None:
+        """The refusal of the search at rate 1 that was made before, as if it were made now."""
+        if plain is None or plain.solved:
+            return None
+        self.tried += 1
+        return plain
 
     def at_rate(self, names: tuple[str, str], rate: float, near: tuple[float, float] | None = None) -> PairSolution:
         """Answer with b's clock taken to run ``rate`` times as fast: one scan, its candidates, the verdict.
@@ -372,6 +383,21 @@ class _Search:
         if found is None:
             return answer
         covariance = np.linalg.pinv(found.normal, hermitian=True)
+        together = samples.together(found)
+        if abs(found.slowness - 1.0) < _RATE_TOLD * np.sqrt(together * covariance[-1, -1]):
+            # The motion does not tell the rate: then it is what clocks usually have.
+            wide = np.sqrt(together)
+            usual = refine(
+                samples,
+                found.geometry,
+                found.middle,
+                1.0,
+                Noise(noise.sigma_a * wide, noise.sigma_b * wide, _USUAL_RATE),
+                fixed_geometry=self.known is not None,
+                narrowest=WIDE,
+            )
+            if usual is not None:
+                found, covariance = usual, np.linalg.pinv(usual.normal, hermitian=True) / together
         rate = 1.0 / found.slowness
         last = samples.judge(found.cost, rate, samples.centre - rate * found.middle, found.geometry)
         last = replace(
@@ -382,7 +408,9 @@ class _Search:
             if isinstance(found.geometry, RelativePose) and self.known is None
             else 0.0,
         )
-        if last.lag_std > s.largest_lag_std:
+        speed = float(np.nanmedian(np.linalg.norm(samples.of_b((samples.time - last.offset) / rate)[1], axis=1)))
+        a_pixel = 1.0 / max(speed * self.b[0].focal, 1e-9)
+        if last.lag_std > min(max(s.largest_lag_std, a_pixel), s.largest_slow_lag_std):
             return replace(
                 answer, status=f"the motion tells the lag only to {1e3 * last.lag_std:.0f} ms (std)", fit=last
             )
@@ -427,13 +455,14 @@ class _Chances:
         seconds, cycles = fit.moving_overlap, self.bandwidth * fit.moving_overlap
         chosen = self._chance(seconds, fit.lag)
         if chosen is None:
-            return fit
+            return replace(fit, cycles=self.bandwidth * fit.support)
         # The next best: any lag that leaves at least half as much in common.
         index = int(np.argmin(np.abs(self.scan.offset - fit.lag)))
         others = (self.scan.support > 0.5 * self.scan.support[index]) & (np.abs(self.scan.offset - fit.lag) > OWN_LAGS)
         following = float(self.scan.cost[others].min(initial=np.inf))
         return replace(
             fit,
+            cycles=self.bandwidth * fit.support,
             log10_chance=chosen.log10_probability(fit.misfit, fit.inliers, cycles),
             log10_gap=chosen.log10_gap(fit.misfit / max(fit.inliers, 1e-9), following, cycles)
             if np.isfinite(following)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from hub.timing.alignment import PairFit, PairSettings, PairSolution, evidence
+from hub.timing.significance import COST_FLOOR
+from hub.timing.two_view import RelativePose
 
 _NEARLY_ALL = 0.9
+_LOOSE = 9.0  # of squared noise: wrong alignments in which nearly all rows agree leave less
 
 
 def judge(names: tuple[str, str], fits: list[PairFit], searched: float, s: PairSettings) -> PairSolution:
@@ -17,13 +20,15 @@ def judge(names: tuple[str, str], fits: list[PairFit], searched: float, s: PairS
     best = fits[0]
     others = tuple(fits[1:4])
     rivals = [fit for fit in fits[1:] if rival_of(fit, best, s)]
-    second = max((evidence(fit) / max(evidence(best), 1e-12) for fit in rivals), default=0.0)
+    grave = [fit for fit in rivals if not made_by_chance(fit, best, searched, s)]
+    second = max((evidence(fit) / max(evidence(best), 1e-12) for fit in grave), default=0.0)
     by_chance = None if best.log10_chance is None else best.log10_chance + np.log10(searched)
     # Regular motion fits nearly as well a period later. That is settled by the noise where there is enough of
     # it and nothing else comes near what the tracks' own noise leaves.
     settled = not rivals and best.support >= s.unchecked_support and best.sigma_px <= s.exact * best.own_px
     doubt = doubts(best, s)
     apart = not rivals and best.log10_gap < s.accept_log10_gap
+    alone = stands_alone(best, fits[1:], s)
     if doubt:
         reason = doubt
     elif best.inliers < needed_inliers(best, s):
@@ -32,13 +37,13 @@ def judge(names: tuple[str, str], fits: list[PairFit], searched: float, s: PairS
         reason = (
             f"the recordings overlap too little ({best.moving_overlap:.1f} s of motion) to tell one lag from another"
         )
-    elif by_chance is not None and by_chance > s.accept_log10_chance and not (settled or apart):
+    elif by_chance is not None and by_chance > s.accept_log10_chance and not (settled or apart or alone):
         reason = (
             f"other lags fit nearly as well (one of them would by chance in {100 * min(1.0, 10.0**by_chance):.0f} % "
             "of cases): too little or too regular common motion, or two different things"
         )
-    elif second > s.accept_ratio:
-        rival = max(rivals, key=evidence)
+    elif second > s.accept_ratio and not alone:
+        rival = max(grave, key=evidence)
         reason = f"two alignments are about as good ({best.offset:.2f} s and {rival.offset:.2f} s)"
     else:
         return PairSolution(*names, "ok", best, others)
@@ -76,6 +81,40 @@ def rival_of(fit: PairFit, best: PairFit, s: PairSettings) -> bool:
     return fit.log10_chance < best.log10_chance + s.clearly_likelier
 
 
+def made_by_chance(fit: PairFit, best: PairFit, searched: float, s: PairSettings) -> bool:
+    """Whether chance makes one like this rival in any search, and the best one far more rarely.
+
+    Where nothing corresponds, as many alignments as were looked at hold one or more like that: it speaks for nothing.
+    One as good as the best for longer is none of these: chance, told from parts of a motion that repeats itself, does
+    not decide there.
+    """
+    if fit.log10_chance is None or best.log10_chance is None or fit.support > best.support:
+        return False
+    usual = fit.log10_chance + np.log10(searched) >= 0.0
+    return bool(usual and fit.log10_chance > best.log10_chance + s.likelier_than_usual)
+
+
+def stands_alone(best: PairFit, others: list[PairFit], s: PairSettings) -> bool:
+    """Whether an alignment leaves no more than the noise, over cycles enough, and no other comes near it.
+
+    How unlikely that is by chance cannot be told from unrelated stretches where the motion is slow: any seven numbers
+    fit few cycles of it. But then some of the many other lags fit as well, and here none does.
+    """
+    if best.inliers < _NEARLY_ALL or best.support < s.alone_support or best.sigma_px > s.exact * best.own_px:
+        return False
+    if not isinstance(best.geometry, RelativePose):
+        return False  # without lenses two numbers more fit more of anything
+    own = strength(best)
+    next_best = max((strength(fit) for fit in others if fit.front > _NEARLY_ALL), default=0.0)
+    return own >= s.alone_strength and next_best <= s.alone_ratio * own
+
+
+def strength(fit: PairFit) -> float:
+    """Cycles of agreeing motion, times the logarithm of how much less they leave than wrong ones that agree do."""
+    share = (fit.misfit + COST_FLOOR) / _LOOSE
+    return fit.cycles * fit.inliers * fit.front * -float(np.log(min(share, 1.0)))
+
+
 def needed_inliers(fit: PairFit, s: PairSettings) -> float:
     """The share of the common motion that must agree: the less motion there is, the more of it."""
     short = float(np.clip((s.plenty - fit.support) / (s.plenty - s.hardly), 0.0, 1.0))
@@ -85,16 +124,13 @@ def needed_inliers(fit: PairFit, s: PairSettings) -> float:
 def distinct(fits: list[PairFit], s: PairSettings) -> list[PairFit]:
     """Best first, alignments that are the same within 0.1 s once.
 
-    The best is the one that chance explains least; where the recordings are too short to tell, the one with
-    most evidence.
+    The best is the strongest of those against which nothing speaks by itself, and in which enough agrees: most lags
+    with much in common fit some of it, and would come before the right one of a short overlap.
     """
-    told = all(fit.log10_chance is not None for fit in fits)
 
-    def merit(fit: PairFit) -> tuple[float, float]:
-        if not told:
-            return (evidence(fit), 0.0)
-        agreeing = fit.inliers * fit.front * (fit.support >= s.accept_support)
-        return (-(fit.log10_chance or 0.0) * agreeing, evidence(fit))
+    def merit(fit: PairFit) -> tuple[bool, float, float]:
+        fair = not doubts(fit, s) and fit.inliers >= needed_inliers(fit, s)
+        return (fair, strength(fit), evidence(fit))
 
     ordered = sorted(fits, key=merit, reverse=True)
     out: list[PairFit] = []

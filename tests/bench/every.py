@@ -43,6 +43,7 @@ BENCHES = {
         ("--sessions", "4", "--seconds", "120", "--only", "five,twenty"),
         data=True,
     ),
+    "real_life": Bench("sessions as people bring them, one trouble a row", ("--sessions", "1")),
     "video_folder": Bench(
         "a folder of videos, with and without measured lenses",
         ("--seconds", "15", "--cameras", "4", "--size", "640x360"),

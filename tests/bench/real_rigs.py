@@ -23,9 +23,16 @@ from pathlib import Path
 
 import numpy as np
 
+from hub.calibrate import calibrate
 from protocols.clocks import TimeMap
 from protocols.geometry.types import Floats
-from protocols.session.calibration import CameraCalibration, read_calibration, write_calibration, write_trajectory
+from protocols.session.calibration import (
+    CameraCalibration,
+    Known,
+    read_calibration,
+    write_calibration,
+    write_trajectory,
+)
 from protocols.session.observations import Observations, read_observations
 from protocols.session.rig import read_rig
 from tests.bench import board_rotation, scoring
@@ -103,8 +110,6 @@ def _run_command(session: Path, observations: str, out: Path) -> None:
 
 
 def _run_here(session: Path, observations: str, out: Path) -> None:
-    from hub.calibrate import calibrate
-
     rig = read_rig(session / "rig.toml")
     result = calibrate(rig, read_observations(session / observations, rig.cameras))
     write_calibration(out / "calibration.toml", result, rig)
@@ -257,9 +262,23 @@ def webcams(session: Path) -> bool:
         )
     if missing:
         print(f"  refused: {', '.join(missing)}")
-    for line in _board_lags(session, offsets):
+    for line in (_with_given_poses(session), *_board_lags(session, offsets)):
         print(f"  {line}")
     return good
+
+
+def _with_given_poses(session: Path) -> str:
+    """Offsets [ms] that the pictures tell where the given poses are held and only clocks and paths are sought."""
+    rig = read_rig(session / "rig.toml")
+    seen = read_observations(session / "observations.csv", rig.cameras)
+    _, given = read_calibration(session / "truth_calibration.toml")
+    found = calibrate(rig, seen, known=Known(given, "metric"))
+    told = []
+    for name, camera in found.cameras.items():
+        middle = float(np.median(np.concatenate([track.time for track in seen.of_camera(name)])))
+        offset = camera.time_map.clock_rate * middle + camera.time_map.time_offset - middle
+        told.append(f"{name} {_MS * offset:+.1f} ms, {camera.rms_px:.2f} px")
+    return f"with the given poses held: {'; '.join(told)}"
 
 
 def _board_lags(session: Path, offsets: dict[str, float]) -> list[str]:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
+import numpy as np
 import pytest
 
+import hub.pairs
 from hub.pairs import _ToldClocks, solve_pairs
 from hub.prepare import Prepared, prepare
-from hub.timing.pair import solve_pair
+from hub.timing.pair import PairSolution, _Search, solve_pair
 from hub.timing.promise import promise
 from hub.timing.tracks import smooth_only
 from tests.rigs import Session, simulate
@@ -64,3 +67,33 @@ def test_many_cameras_are_answered_in_the_rigs_order() -> None:
     _, pairs = solve_pairs(prepared, lambda text, share: None)
     assert [(pair.a, pair.b) for pair in pairs] == list(itertools.combinations(prepared.names, 2))
     assert sum(pair.solved for pair in pairs) >= 9
+
+
+def test_a_search_through_all_lags_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thorough search goes on from the refusal of the plain one, and says what it would say without it."""
+    prepared = prepared_of(simulate(9, 2, 12.0, strangers=[1]))
+    rates: list[float] = []
+    at_rate, solve = _Search.at_rate, hub.pairs._solve
+
+    def counted(
+        self: _Search, names: tuple[str, str], rate: float, near: tuple[float, float] | None = None
+    ) -> PairSolution:
+        rates.append(rate)
+        return at_rate(self, names, rate, near)
+
+    def anew(*given: Any, plain: PairSolution | None = None, **more: Any) -> PairSolution:
+        return solve(*given, **more)
+
+    monkeypatch.setattr(_Search, "at_rate", counted)
+    _, (once,) = solve_pairs(prepared, lambda text, share: None, thorough=True)
+    assert not once.solved
+    assert len(rates) > 5
+    assert rates.count(1.0) == 1
+    monkeypatch.setattr(hub.pairs, "_solve", anew)
+    _, (again,) = solve_pairs(prepared, lambda text, share: None, thorough=True)
+    assert rates.count(1.0) == 3
+    assert again.status == once.status
+    assert once.fit is not None
+    assert again.fit is not None
+    np.testing.assert_array_equal(again.fit.geometry.matrix, once.fit.geometry.matrix)
+    assert (again.fit.offset, again.fit.rate) == (once.fit.offset, once.fit.rate)

@@ -80,7 +80,7 @@ def hardly_a_row(_: pytest.MonkeyPatch) -> str:
 
 
 def vague_lag(_: pytest.MonkeyPatch) -> str:
-    return pair_told(PairSettings(largest_lag_std=1e-9))
+    return pair_told(PairSettings(largest_lag_std=1e-9, largest_slow_lag_std=1e-9))
 
 
 def vague_rotation(_: pytest.MonkeyPatch) -> str:

@@ -104,6 +104,20 @@ def test_what_fits_as_well_for_longer_is_a_rival_whatever_chance_says() -> None:
     assert judge(("a", "b"), [GOOD, replace(longer, support=14.0)], 20.0, PairSettings()).solved
 
 
+def test_what_chance_makes_in_every_search_is_no_rival() -> None:
+    """Three seconds in common, and an alignment of half as much that most unrelated stretches beat."""
+    best = replace(GOOD, support=2.9, moving_overlap=2.9, inliers=1.0, log10_chance=-3.2)
+    usual = replace(best, offset=8.0, support=1.6, moving_overlap=1.6, log10_chance=-0.25)
+    assert judge(("a", "b"), [best, usual], 15.0, PairSettings()).solved
+    refused = [
+        judge(("a", "b"), [best, replace(usual, log10_chance=-1.5)], 15.0, PairSettings()),  # chance makes few like it
+        judge(("a", "b"), [best, usual], 1.5, PairSettings()),  # and few were looked at
+        judge(("a", "b"), [replace(best, log10_chance=-2.6), replace(usual, log10_chance=-0.7)], 15.0, PairSettings()),
+        judge(("a", "b"), [best, replace(usual, support=3.0, moving_overlap=3.0)], 15.0, PairSettings()),
+    ]
+    assert [answer.status[:14] for answer in refused] == 4 * ["two alignments"]
+
+
 def test_every_kind_of_refusal_stands_in_the_code_and_in_the_faq() -> None:
     code = "\n".join(path.read_text(encoding="utf-8") for path in ROOT.rglob("*.py"))
     table = "\n".join(
