@@ -150,7 +150,7 @@ class MarkerDetector:
         top = max((first - _BESIDE) // _STEP, 0)
         near = coarse[top : (end + _BESIDE) // _STEP + 1]
         if near.any():
-            near = cv2.dilate(near, _NEAR)
+            near = np.asarray(cv2.dilate(near, _NEAR), dtype=np.uint8)
         free = near[np.arange(first, end) // _STEP - top].repeat(_STEP, axis=1)[:, : image.shape[1]] == 0
         for left, upper, width, height in boxes:
             margin = _BESIDE + (width + height) // 4

@@ -28,7 +28,7 @@ _PIXEL_STD = 6.0  # of a colour about the mixture of its two ends, by noise and 
 _SHADE_STD = 0.04  # relative: how much shading and texture brighten or darken either end along a ray
 _SHADE_RIDGE = 2.5
 _CURVED_RIDGE = 2.5
-_LARGE = 14.0  # px of radius from which a ball tells its shading that well; a smaller one less
+_LARGE = 13.0  # px of radius from which a ball tells its shading that well; a smaller one less
 _INNER_BAND, _INNER_RIDGE = 1.0, 2.0  # px inside of the rim where the ball's model is put right, and px² of ridge
 _OUTER_BAND = 3.0  # px beyond the rim from which the background's colour is taken
 _AS_KNOWN = 8.0  # 8-bit steps by which a background may have changed since it was seen without the ball
@@ -137,7 +137,7 @@ def _rims(
     pure &= radius > 0.0
     if pure.sum() < _FEWEST:
         return None, half, half
-    told = min(float(rim.mean()) / _LARGE, 1.0) ** 2  # how well so large a ball tells its own shading
+    told = min(float(rim.mean()) / _LARGE, 1.0) ** 3  # how well so large a ball tells its own shading
     front = _shaded(colour, radius / rim[:, None], pure, _CURVED_RIDGE / told**2)
     just_inside = pure & (along >= -half[:, None] - _INNER_BAND) & (along <= -half[:, None])
     front = front + told**4 * _stray(colour - front, just_inside * np.maximum(radius, 0.0) * _STEP * _ANGLE[1])
