@@ -19,10 +19,12 @@ from hub.paper_poses import all_sized, place_by_paper
 from hub.poses import covariance as cov
 from hub.poses import readout
 from hub.poses.adjust import adjust, noise, residual_norms
+from hub.poses.frame_times import settle
 from hub.poses.graph import ClockGraph, ClockGuess, average_clocks, components
 from hub.poses.initialise import Scaffold, agreement, grow, place_known
 from hub.poses.motion import motion_prior
 from hub.poses.problem import Freedom, Problem, State
+from hub.poses.sigma import together
 from hub.prepare import NO_INTRINSICS, Prepared, prepare
 from hub.publish import focal_stds, lone_pair_report, publish
 from hub.timing.pair import PairSolution
@@ -30,6 +32,7 @@ from hub.timing.paper_pairs import paper_pair
 from hub.timing.tracks import smooth_only
 from hub.timing.two_view import fundamental_from
 from protocols.errors import Refused
+from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, Known
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
@@ -39,6 +42,7 @@ _LEAST_ROWS = 30
 _LARGEST_TURN_STD = 0.035  # rad
 _LARGEST_CLOCK_STD = 5e-3  # s
 _LENS_ROUNDS = 3
+_LEAST_ALIKE = 2.0  # rows that count as one, from which what is known beforehand is weighed against them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -304,7 +308,7 @@ def solve_known(prepared: Prepared, pairs: list[PairSolution], known: Known, tel
     poses = {name: known.cameras[name].pose for name in graph.clocks}
     scaffold = place_known(cameras, graph, prepared.rows, prepared.labels, poses, not prepared.shared_clock)
     problem, state, _ = adjust(scaffold.problem, scaffold.state)
-    solution = replace_solution(scaffold, problem, state)
+    solution = replace_solution(scaffold, *settle(problem, state))
     return Solution(solution, tuple(pairs), _ordered(refused, prepared), inside, "joint", known=known)
 
 
@@ -354,11 +358,12 @@ def _adjust_all(scaffold: Scaffold, tell: Progress) -> Scaffold:
     """The final adjustment, with the lens freed where the data clearly ask for it."""
     tell("adjusting", 0.75)
     problem, state, _ = adjust(scaffold.problem, scaffold.state, progress=lambda text: tell(text, 0.75))
+    problem, state = settle(problem, state, lambda text: tell(text, 0.8))
     tell("adjusting the lenses", 0.85)
     freed = replace(problem, freedom=replace(problem.freedom, lens=True))
     freed_problem, freed_state, _ = adjust(freed, state, rounds=3, progress=lambda text: tell(text, 0.85))
     if _prefers(freed_problem, freed_state, problem, state):
-        problem, state = freed_problem, freed_state
+        problem, state = _weighed(freed_problem, freed_state)
     if problem.freedom.clock and readout.worth_freeing(problem, state, motion_prior(problem, state)):
         tell("adjusting the readouts", 0.9)
         read_problem, read_state, _ = adjust(readout.freed(problem), state, rounds=2)
@@ -372,23 +377,41 @@ def replace_solution(scaffold: Scaffold, problem: Problem, state: State) -> Scaf
     return Scaffold(scaffold.names, scaffold.labels, problem, state)
 
 
+def _weighed(problem: Problem, state: State) -> tuple[Problem, State]:
+    """Adjusted again with what is known of lenses and clocks beforehand weighed against rows that err alike.
+
+    The adjustment counts every row for one. Where many tell as little as one, the priors are to count that much more
+    against them: as they do in the covariance.
+    """
+    alike = float(np.median([together(problem, state, camera) for camera in range(len(state.cameras))]))
+    if alike < _LEAST_ALIKE:
+        return problem, state
+    free, less = problem.freedom, 1.0 / np.sqrt(alike)
+    strict = replace(free, focal_std=free.focal_std * less, k1_std=free.k1_std * less, rate_std=free.rate_std * less)
+    weighed, state, _ = adjust(replace(problem, freedom=strict), state, rounds=2)
+    return replace(weighed, freedom=free), state
+
+
 def _prefers(freed: Problem, freed_state: State, fixed: Problem, fixed_state: State, each: int = 2) -> bool:
     """Whether ``each`` parameters a camera (focal length and k1) are worth it (Bayesian information criterion).
 
-    The robust likelihood of all rows under each answer's own noise decides.
+    The robust likelihood of all rows under each answer's own noise decides; rows that err alike count as one.
     """
-    rows = sum(len(part.time) for part in fixed.rows)
-    gain = _deviance(fixed, fixed_state) - _deviance(freed, freed_state)
-    return bool(gain > each * len(fixed_state.cameras) * np.log(max(rows, 2)))
+    cameras = range(len(fixed_state.cameras))
+    alike = np.array([together(freed, freed_state, camera) for camera in cameras])
+    rows = sum(len(part.time) / alike[part.camera] for part in fixed.rows)
+    gain = float(((_deviances(fixed, fixed_state) - _deviances(freed, freed_state)) / alike).sum())
+    return bool(gain > each * len(cameras) * np.log(max(rows, 2)))
 
 
-def _deviance(problem: Problem, state: State) -> float:
-    total = 0.0
+def _deviances(problem: Problem, state: State) -> Floats:
+    """(cameras,) twice the negative logarithm of the likelihood of each camera's rows."""
+    total = np.zeros(len(state.cameras))
     for part in problem.rows:
         norms = residual_norms(part, state.cameras[part.camera], state.trajectories[part.label])
         norms = norms[np.isfinite(norms)]
         sigma = float(state.sigma[part.camera])
-        total += float(np.minimum((norms / sigma) ** 2, 25.0).sum()) + 4.0 * len(norms) * np.log(sigma)
+        total[part.camera] += float(np.minimum((norms / sigma) ** 2, 25.0).sum()) + 4.0 * len(norms) * np.log(sigma)
     return total
 
 

@@ -71,7 +71,7 @@ class Prepared:
             scaled = replace(camera, tracks=_scaled(camera.tracks, factor))
             (cameras if name in cameras else lensless)[name] = scaled
             if name in rows:
-                rows[name] = [replace(part, time=part.time * factor) for part in rows[name]]
+                rows[name] = [replace(part, time=part.time * factor, stamp=part.stamps * factor) for part in rows[name]]
             paces[name] = self.pace(name) * factor
         return replace(self, cameras=cameras, lensless=lensless, rows=rows, paces=paces)
 
@@ -126,7 +126,7 @@ def prepare(rig: Rig, observations: Observations) -> Prepared:
                 continue
             smooth[track.label] = cleaned
             use = np.ones(len(track), dtype=np.bool_)
-            mine.append(Rows(-1, labels.index(track.label), time - epoch, pixels, use))
+            mine.append(Rows(-1, labels.index(track.label), time - epoch, pixels, use, stamp=track.time - epoch))
         if not smooth:
             few = f"too few connected observations ({sum(len(track) for track in tracks)} rows)"
             refused[name] = f"{NO_INTRINSICS}; and {few}" if unknown else few

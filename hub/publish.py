@@ -116,7 +116,8 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
         + aside
         + gauge.warnings
         + _lenses_told(cameras)
-        + _readouts_told(cameras),
+        + _readouts_told(cameras)
+        + _jitter_told(names, state, paces),
         residuals={name: _residual_rows(problem, state, i, epochs[i], paces[i]) for i, name in enumerate(names)},
     )
 
@@ -152,7 +153,10 @@ def _reordered(problem: Problem, state: State, order: list[int]) -> tuple[Proble
         guessed=tuple(problem.lens_prior(i) for i in order),
         timed=tuple(problem.timed[i] for i in order) if problem.timed else (),
     )
-    return moved, replace(state, cameras=tuple(state.cameras[i] for i in order), sigma=state.sigma[order])
+    jitter = None if state.jitter is None else state.jitter[order]
+    return moved, replace(
+        state, cameras=tuple(state.cameras[i] for i in order), sigma=state.sigma[order], jitter=jitter
+    )
 
 
 def focal_stds(problem: Problem, state: State, covariance: cov.Covariance | None = None) -> Floats:
@@ -191,8 +195,26 @@ def _readouts_told(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
     )
 
 
+def _jitter_told(names: list[str], state: State, paces: list[float]) -> tuple[str, ...]:
+    """One sentence for each camera whose stamps jitter."""
+    stds = np.zeros(len(names)) if state.jitter is None else state.jitter / np.array(paces)
+    return tuple(
+        f"{name}: its stamps jitter by {1e3 * std:.2g} ms (std): each frame's own time was found from what it shows"
+        for name, std in zip(names, stds, strict=True)
+        if std > 0.0
+    )
+
+
 def _map_std(problem: Problem, state: State, covariance: cov.Covariance, camera: int, reference: int) -> float:
-    return cov.time_map_std(covariance, state, camera, reference) if problem.freedom.clock else 0.0
+    if not problem.freedom.clock or camera == reference:
+        return 0.0
+    variance = cov.time_map_std(covariance, state, camera, reference) ** 2
+    if state.jitter is not None:
+        # The map is that of the mean stamp: as well known as the mean of so many that jitter.
+        for one in (camera, reference):
+            stamps = [rows.stamps[rows.use] for rows in problem.rows if rows.camera == one]
+            variance += float(state.jitter[one]) ** 2 / max(len(np.unique(np.concatenate(stamps))), 1)
+    return float(np.sqrt(variance))
 
 
 def _rms(problem: Problem, state: State, camera: int) -> float:
@@ -212,7 +234,7 @@ def _residual_rows(problem: Problem, state: State, camera: int, epoch: float, pa
         if rows.camera == camera:
             predicted = predict(rows, state.cameras[camera], state.trajectories[rows.label])
             good = rows.use & np.isfinite(predicted).all(axis=1)
-            shown = rows.time[good] / pace + epoch
+            shown = rows.stamps[good] / pace + epoch
             parts.append(np.column_stack([shown, rows.pixels[good], (rows.pixels - predicted)[good]]))
     return np.concatenate(parts) if parts else np.zeros((0, 5))
 

@@ -62,7 +62,8 @@ class Rows:
     """Observations of one label by one camera.
 
     camera, label: indices. time: (n,) on the camera's clock less its epoch [s]. pixels: (n, 2) distorted.
-    use: (n,) rows that count.
+    use: (n,) rows that count. stamp: (n,) what the frames' stamps said, where ``time`` is not that: a told readout or a
+    frame's own time (`frame_times`) has moved it.
     """
 
     camera: int
@@ -70,6 +71,12 @@ class Rows:
     time: Floats
     pixels: Floats
     use: Bools
+    stamp: Floats | None = None
+
+    @property
+    def stamps(self) -> Floats:
+        """Stamps (n,) of the rows' frames [s]: one a frame."""
+        return self.time if self.stamp is None else self.stamp
 
     def using(self, use: Bools) -> Rows:
         """The same rows with other ones counting."""
@@ -90,12 +97,17 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Everything that the adjustment moves. sigma: (cameras,) noise of one pixel coordinate. steps: the way here."""
+    """Everything that the adjustment moves.
+
+    sigma: (cameras,) noise of one pixel coordinate. steps: the way here. jitter: (cameras,) std [s] of the cameras'
+    stamps where the frames' own times were found (`frame_times`); None = they were not looked for, or none jitter.
+    """
 
     cameras: tuple[CameraState, ...]
     trajectories: tuple[Trajectory, ...]
     sigma: Floats
     steps: tuple[AdjustmentStep, ...] = ()
+    jitter: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)

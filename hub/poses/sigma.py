@@ -78,33 +78,61 @@ def _absorbed(problem: Problem, state: State, found: Covariance, rows: Rows) -> 
 
 
 def together(problem: Problem, state: State, camera: int) -> float:
-    """How many residuals in a row count as one: 1 + 2 sum of their correlations, as far as these stand out."""
-    found = 1.0
+    """How many of a camera's residuals count as one: those in a row of a label, times those of a frame's labels.
+
+    1 + 2 sum of the correlations from frame to frame, and 1 + (labels - 1) times that within a frame, as far as these
+    stand out.
+    """
+    parts: list[tuple[Floats, Floats]] = []
     for rows in problem.rows:
         if rows.camera != camera or np.count_nonzero(rows.use) < 8:
             continue
         off = (predict(rows, state.cameras[camera], state.trajectories[rows.label]) - rows.pixels)[rows.use]
-        time = rows.time[rows.use]
         good = np.isfinite(off).all(axis=1)
-        found = max(found, _in_a_row(time[good], off[good]))
-    return found
+        parts.append((rows.stamps[rows.use][good], off[good]))
+    frames = _in_a_frame(parts)
+    return frames * _in_a_row(parts, frames)
 
 
-def _in_a_row(time: Floats, off: Floats) -> float:
-    order = np.argsort(time, kind="stable")
-    time, off = time[order], off[order]
-    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+def _in_a_frame(parts: list[tuple[Floats, Floats]]) -> float:
+    """parts: stamps (n,) and residuals (n, 2), one entry a label."""
+    if len(parts) < 2:
+        return 1.0
+    off = np.concatenate([part[1] for part in parts])
+    stamps, frame = np.unique(np.concatenate([part[0] for part in parts]), return_inverse=True)
+    shown = np.bincount(frame, minlength=len(stamps))
+    others = shown - 1.0
+    pairs = float((shown * others).sum()) / 2.0
     variance = float(np.mean(off**2))
+    if pairs < _LEAST_PAIRS or variance <= 0.0:
+        return 1.0
+    sums = np.stack([np.bincount(frame, column, len(stamps)) for column in off.T])
+    correlation = (float((sums**2).sum()) - float((off**2).sum())) / (4.0 * pairs * variance)
+    if correlation < _TOLD / np.sqrt(2.0 * pairs):
+        return 1.0
+    return 1.0 + float((shown * others).sum() / shown.sum()) * correlation
+
+
+def _in_a_row(parts: list[tuple[Floats, Floats]], frames: float = 1.0) -> float:
+    """parts: as above, in any order. frames: how many labels of a frame count as one: so few are their pairs."""
+    parts = [(time[order], off[order]) for time, off in parts for order in [np.argsort(time, kind="stable")]]
+    steps = np.concatenate([np.diff(time) for time, _ in parts]) if parts else np.zeros(0)
+    step = float(np.median(steps)) if len(steps) else 0.0
+    variance = float(np.mean(np.concatenate([off for _, off in parts]) ** 2)) if parts else 0.0
     if step <= 0.0 or variance <= 0.0:
         return 1.0
     total = 1.0
     for lag in range(1, round(_LONGEST_S / step) + 1):
-        near = np.abs(time[lag:] - time[:-lag] - lag * step) < 0.5 * step if lag < len(time) else np.zeros(0, np.bool_)
-        pairs = int(np.count_nonzero(near))
+        product, pairs = 0.0, 0
+        for time, off in parts:
+            if lag < len(time):
+                near = np.abs(time[lag:] - time[:-lag] - lag * step) < 0.5 * step
+                product += float(np.sum(off[lag:][near] * off[:-lag][near]))
+                pairs += int(np.count_nonzero(near))
         if pairs < _LEAST_PAIRS:
             break
-        correlation = float(np.mean(off[lag:][near] * off[:-lag][near])) / variance
-        if correlation < _TOLD / np.sqrt(2.0 * pairs):
+        correlation = 0.5 * product / pairs / variance
+        if correlation < _TOLD * np.sqrt(frames / (2.0 * pairs)):
             break
         total += 2.0 * correlation
     return min(total, _MOST_TOGETHER)

@@ -46,7 +46,7 @@ def test_residuals_in_a_row_count_as_the_closed_form_says(correlation: float) ->
     off: Floats = np.zeros((count, 2))
     for i in range(1, count):
         off[i] = correlation * off[i - 1] + fresh[i]
-    found = _in_a_row(np.arange(count) / 30.0, off)
+    found = _in_a_row([(np.arange(count) / 30.0, off)])
     assert found == pytest.approx((1.0 + correlation) / (1.0 - correlation), rel=0.15)
 
 
@@ -55,8 +55,8 @@ def test_lost_frames_and_the_order_of_rows_change_nothing() -> None:
     off = np.cumsum(rng.normal(size=(6000, 2)), axis=0)
     off -= np.stack([np.convolve(column, np.ones(31) / 31, "same") for column in off.T], axis=1)
     time, keep = np.arange(6000) / 30.0, np.sort(rng.permutation(6000)[:4500])
-    whole = _in_a_row(time, off)
+    whole = _in_a_row([(time, off)])
     assert whole > 3.0
-    assert _in_a_row(time[keep], off[keep]) == pytest.approx(whole, rel=0.15)
+    assert _in_a_row([(time[keep], off[keep])]) == pytest.approx(whole, rel=0.15)
     mixed = rng.permutation(6000)
-    assert _in_a_row(time[mixed], off[mixed]) == whole
+    assert _in_a_row([(time[mixed], off[mixed])]) == whole
