@@ -361,7 +361,7 @@ def _adjust_all(scaffold: Scaffold, tell: Progress) -> Scaffold:
     problem, state = settle(problem, state, lambda text: tell(text, 0.8))
     tell("adjusting the lenses", 0.85)
     freed = replace(problem, freedom=replace(problem.freedom, lens=True))
-    freed_problem, freed_state, _ = adjust(freed, state, rounds=3, progress=lambda text: tell(text, 0.85))
+    freed_problem, freed_state, _ = adjust(freed, state, rounds=2, progress=lambda text: tell(text, 0.85))
     if _prefers(freed_problem, freed_state, problem, state):
         problem, state = _weighed(freed_problem, freed_state)
     if problem.freedom.clock and readout.worth_freeing(problem, state, motion_prior(problem, state)):
@@ -388,7 +388,7 @@ def _weighed(problem: Problem, state: State) -> tuple[Problem, State]:
         return problem, state
     free, less = problem.freedom, 1.0 / np.sqrt(alike)
     strict = replace(free, focal_std=free.focal_std * less, k1_std=free.k1_std * less, rate_std=free.rate_std * less)
-    weighed, state, _ = adjust(replace(problem, freedom=strict), state, rounds=2)
+    weighed, state, _ = adjust(replace(problem, freedom=strict), state, rounds=1)
     return replace(weighed, freedom=free), state
 
 

@@ -148,7 +148,7 @@ def path_std(cov: Covariance, state: State, label: int, time: Floats) -> Floats:
                 values = cov.blocks[block, inside + 3 * a + axis, inside + 3 * b + axis]
                 out[:, axis] += weights[:, a] * weights[:, b] * values
         carried = sum(weights[:, a, None] * cov.carried[first + 3 * a + axis] for a in range(SUPPORT))
-        out[:, axis] += np.einsum("ni,ij,nj->n", carried, cov.free, carried)
+        out[:, axis] += ((carried @ cov.free) * carried).sum(axis=1)
     return one_std(np.sqrt(np.maximum(out, 0.0)))
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtri
 
 from hub.points import PointBasis
 from hub.poses.adjust import adjust, linearise
@@ -142,7 +142,7 @@ def _jitter(frames: _Frames, sigma: float) -> float:
     weight = 2.0 / (1.0 / told[good][1:] + 1.0 / told[good][:-1])
     along = 0.5 * float((weight * np.diff(alone[good]) ** 2).sum())
     across = 0.5 * float((weight * np.diff(side[good]) ** 2).sum())
-    enough = max(_LEAST_RATIO, float(stats.f.ppf(1.0 - _DOUBT, len(weight), len(weight))))
+    enough = max(_LEAST_RATIO, float(fdtri(len(weight), len(weight), 1.0 - _DOUBT)))
     if along < enough * across:
         return 0.0
     return min(float(np.sqrt((along - across) / weight.sum())), _LARGEST)

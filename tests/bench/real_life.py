@@ -44,11 +44,11 @@ class Trouble:
 
     hover: share of the time in which the marker stands. gaps: times a camera loses it for 5 to 20 s. glimpse: mean
     seconds [s] for which it is seen at a time, 0 = always. jitter: how far [share of an interval] a phone's frame
-    intervals wander about their mean; times are true. focal, centre_px, k1: std of what is told of a lens less what is
-    true (log, px, 1). every: only each n-th frame has a label. outliers: share of false detections, half of them in
-    one place for a while. numbers: cameras with random frame numbers. stagger: cameras whose times are no clock's.
-    chain: whether a camera sees together with the two before it and the two after it only. readout_s: longest readout
-    of a rolling shutter.
+    intervals wander about their mean; times are true. stamps: std [s] by which the stamp of a frame is off. focal,
+    centre_px, k1: std of what is told of a lens less what is true (log, px, 1). every: only each n-th frame has a
+    label. outliers: share of false detections, half of them in one place for a while. numbers: cameras with random
+    frame numbers. stagger: cameras whose times are no clock's. chain: whether a camera sees together with the two
+    before it and the two after it only. readout_s: longest readout of a rolling shutter.
     """
 
     cameras: int = 4
@@ -59,6 +59,7 @@ class Trouble:
     gaps: int = 0
     glimpse: float = 0.0
     jitter: float = 0.0
+    stamps: float = 0.0
     focal: float = 0.0
     centre_px: float = 0.0
     k1: float = 0.0
@@ -129,6 +130,8 @@ def session(seed: int, trouble: Trouble) -> rigs.Session:
         sticky = np.repeat(rng.random(len(true) // 20 + 1) < 0.5 * t.outliers, 20)[: len(true)]
         pixels[sticky] = where[sticky] + rng.normal(0, t.noise, (int(sticky.sum()), 2))
         shown = epoch + drift * true
+        if t.stamps > 0.0:  # frames keep their order
+            shown = np.sort(shown + rng.normal(0, t.stamps, len(shown)))
         if i >= t.cameras - t.stagger:
             shown = np.sort(shown + np.cumsum(rng.normal(0, 0.05, len(shown))))
         if i >= t.cameras - t.stagger - t.numbers and i < t.cameras - t.stagger:
@@ -237,6 +240,8 @@ ROWS: dict[str, Make] = {
     "gaps of 5 to 20 s": _always(replace(_CARRIED, gaps=3, seconds=90.0)),
     "seen for 3 s at a time": _always(replace(_CARRIED, glimpse=3.0)),
     "variable frame rate": _always(replace(_CARRIED, jitter=0.15)),
+    "stamps that jitter by 10 ms": _always(replace(_CARRIED, stamps=0.01)),
+    "stamps that jitter by 30 ms": _always(replace(_CARRIED, stamps=0.03)),
     "lenses: focal length 1.5 %, centre 8 px, k1 0.015": _always(replace(_CARRIED, focal=0.015, centre_px=8, k1=0.015)),
     "false detections, 15 %": _always(replace(_CARRIED, outliers=0.15)),
     "labels on every fourth frame": _always(replace(_CARRIED, every=4)),
