@@ -64,7 +64,7 @@ def settle(problem: Problem, state: State, progress: Callable[[str], None] | Non
     if any(isinstance(path.basis, PointBasis) for path in state.trajectories) or not problem.freedom.clock:
         return problem, state
     cameras = range(len(state.cameras))
-    found, fitted, last = problem, state, np.zeros(0)
+    found, fitted = problem, state
     jitter = np.zeros(len(cameras))
     for turn in range(_MOST_ROUNDS):
         parts = [_frames(problem, found, fitted, camera) for camera in cameras]
@@ -72,10 +72,10 @@ def settle(problem: Problem, state: State, progress: Callable[[str], None] | Non
         if not jitter.any():
             return problem, state
         shifts = [_shifts(part, float(fitted.sigma[i]), float(jitter[i])) for i, part in enumerate(parts)]
-        found, fitted, _ = adjust(_shifted(problem, parts, shifts), fitted, rounds=2, iterations=9)
-        now = np.concatenate(shifts)
-        moved = float(np.sqrt(np.mean((now - last) ** 2))) if len(now) == len(last) else np.inf
-        last = now
+        shifted = _shifted(problem, parts, shifts)
+        steps = [after.time - before.time for after, before in zip(shifted.rows, found.rows, strict=True)]
+        moved = float(np.sqrt(np.mean(np.concatenate(steps) ** 2)))
+        found, fitted, _ = adjust(shifted, fitted, rounds=2, iterations=9)
         if progress is not None:
             progress(f"times of frames {turn + 1}: {float(np.median(fitted.sigma)):.2f} px")
         if moved < _SETTLED * float(jitter.max()):
@@ -139,6 +139,8 @@ def _jitter(frames: _Frames, sigma: float) -> float:
     fast = told >= np.median(told[good])
     usual = _ROBUST * float(np.median(np.abs(np.diff(alone[fast])))) / np.sqrt(2.0)
     good &= _believed(alone, told, sigma, usual)
+    if np.count_nonzero(good) < _LEAST_FRAMES:
+        return 0.0
     weight = 2.0 / (1.0 / told[good][1:] + 1.0 / told[good][:-1])
     along = 0.5 * float((weight * np.diff(alone[good]) ** 2).sum())
     across = 0.5 * float((weight * np.diff(side[good]) ** 2).sum())
@@ -155,10 +157,10 @@ def _believed(alone: Floats, told: Floats, sigma: float, jitter: float) -> Bools
 
 def _shifts(frames: _Frames, sigma: float, jitter: float) -> Floats:
     """Each frame's time less its stamp (m,) [s]: its labels' word against the jitter's, mean and trend taken out."""
-    if jitter == 0.0:
-        return np.zeros(len(frames.stamp))
     alone, told, side = _alone(frames, sigma)
     good = (told > 0.0) & _believed(alone, told, sigma, jitter)
+    if jitter == 0.0 or not good.any():
+        return np.zeros(len(frames.stamp))
     # What labels of a frame have in common across their motion, they have along it too: no row is better than that.
     noise = max(sigma**2, float((told * side**2)[good].mean()))
     weight = np.where(good, told / (noise + told * jitter**2), 0.0)
