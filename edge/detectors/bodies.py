@@ -27,7 +27,7 @@ _AREA = sum(2.0 * half * (low - high) for half, high, low in _BARS)
 _WORK_HEIGHT = 64.0  # px: larger people are looked for in a smaller picture
 # Log-likelihood ratios of body to background, against that of a silhouette's pixel.
 _EMPTY, _SHADOW = -0.45, -0.08
-_NEW, _KEPT = 0.55, 0.28  # gain of a template, of its area, that makes it worth its place
+_NEW, _KEPT = 0.45, 0.28  # gain of a template, of its area, that makes it worth its place
 _COUNTS = (2.5, 1.0, 1.0)  # a head is small, but says most about where somebody stands
 _BOXES = np.array([*_BARS, (0.07, -0.1, -0.02), (0.1, 0.02, 0.12)]).T[:, :, None]
 """The bars, and what must be empty: above the head (of the height from the head down), below the feet (from them)."""
@@ -37,8 +37,11 @@ _COLOUR, _LOOKS = 45.0, 1.0  # 8-bit steps by which clothes differ from themselv
 _ROUNDS = 3  # of seeking those whom nobody expected
 _REACH = 0.14  # of the height: how far somebody may be from where it is expected
 _PULL = 3.0  # of its area, by the square of that distance over the height
-_SHORT, _LONG = 0.9, 1.12  # of the usual height at a place, that one who is followed may have
-_LOW, _HIGH, _BROAD, _BULK, _HEAD, _SLENDER = 0.85, 1.17, 0.62, 0.28, 0.22, 0.42
+_SHORT, _LONG = 0.8, 1.2  # of the usual height at a place, that somebody may have
+_STRETCHED = np.array([0.95, 1.0, 1.05])  # tried of the height that somebody has
+_COMING = np.array([0.88, 1.0, 1.1])  # tried of somebody whom nobody expected
+_STIFF = 8.0  # of its area, by the square of the logarithm of the height over what is expected
+_LOW, _HIGH, _BROAD, _BULK, _HEAD, _SLENDER = 0.85, 1.17, 0.62, 0.28, 0.22, 0.34
 """Of one whole silhouette: height, of the usual; breadth, area over height, breadth of the head, and
 breadth up to which no more is asked, of the height."""
 _MOST = 12  # people in one silhouette
@@ -74,7 +77,8 @@ class Body:
 class _Placed:
     """A template: its middle u, foot and height [px of the working picture].
 
-    stature: its height, of the usual one there. expected: which expectation it is; home: where that was.
+    stature: its height, of the usual one there; of: what that is expected to be.
+    expected: which expectation it is; home: where that was.
     """
 
     u: float
@@ -84,6 +88,7 @@ class _Placed:
     expected: int = -1
     home: tuple[float, float] | None = None
     gain: float = 0.0
+    of: float = 1.0
 
     @property
     def top(self) -> float:
@@ -97,12 +102,13 @@ def explain(
     expected: list[Box],
     image: Image | None = None,
     clothes: Sequence[Floats | None] = (),
+    statures: Sequence[float] = (),
 ) -> list[Body]:
     """People in a clean silhouette picture (H, W) 0/255.
 
     shadow: (H, W) what is only darker than the background: somebody may stand there in dark clothes, or a shadow lie.
     expected: boxes [px] where some should be; clothes: their torsos' mean colours (3,), as far as known, in ``image``
-    (H, W, 3).
+    (H, W, 3). statures: their heights, of what is usual, as far as known.
     """
     if not stature.known:
         return _by_shape(figure, expected)
@@ -132,21 +138,30 @@ def explain(
         scene = _Cluster(weight[rows, columns], filled[rows, columns], (columns.start, rows.start), scales, stature)
         if colours is not None:
             scene.dress(colours[rows, columns], {index: clothes[index] for index in mine})
-        placed = scene.explain([(index, expected[index]) for index in mine])
+        told = len(statures) == len(expected)
+        placed = scene.explain([(index, expected[index], statures[index] if told else 1.0) for index in mine])
         bodies += scene.bodies(placed, figure)
     return bodies
 
 
-def lone_people(figure: Image) -> list[tuple[float, float, float]]:
-    """Foot points u, v and heights [px] of silhouettes that have the shape of one whole person."""
+def lone_people(figure: Image, *, strict: bool = True) -> list[tuple[float, float, float]]:
+    """Foot points u, v and heights [px] of silhouettes that have the shape of one whole person.
+
+    Not strict: that are as slim; somebody who begins to walk, and the place where he stood, are one broader one.
+    """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(figure, connectivity=8)
     found = []
     piece = _pieces(np.asarray(stats))
     for one in range(1, count):
         x, y, w, h = (int(value) for value in stats[one, :4])
-        if h < _LEAST_HEIGHT or _is_cut((x, y, w, h), figure.shape) or not 1.8 * w < h < 4.5 * w or piece[one]:
+        if (
+            h < _LEAST_HEIGHT
+            or _is_cut((x, y, w, h), figure.shape)
+            or not (1.8 if strict else 1.2) * w < h < 4.5 * w
+            or piece[one]
+        ):
             continue
-        if _shaped(np.asarray(labels[y : y + h, x : x + w] == one, dtype=np.bool_)):
+        if not strict or _shaped(np.asarray(labels[y : y + h, x : x + w] == one, dtype=np.bool_)):
             found.append((x + 0.5 * w, float(y + h), float(h)))
     return found
 
@@ -311,14 +326,13 @@ class _Cluster:
         a, b, c, d = a - left, b - left, c - top, d - top
         return np.asarray(_LOOKS * (sums[d, b] - sums[c, b] - sums[d, a] + sums[c, a]), dtype=np.float64)
 
-    def explain(self, expected: list[tuple[int, Box]]) -> list[_Placed]:
-        """The templates that explain the silhouettes, nearest last expectations first."""
+    def explain(self, expected: list[tuple[int, Box, float]]) -> list[_Placed]:
+        """The templates that explain the silhouettes, nearest last expectations first: index, box, stature."""
         placed: list[_Placed] = []
-        for index, (x, y, w, h) in sorted(expected, key=lambda one: -(one[1][1] + one[1][3])):
-            u, foot, tall = self._inward(x + 0.5 * w, y + h, h)
+        for index, (x, y, w, h), stature in sorted(expected, key=lambda one: -(one[1][1] + one[1][3])):
+            u, foot, _ = self._inward(x + 0.5 * w, y + h, h)
             usual = float(self._heights(np.array([u]), np.array([foot]))[0])
-            stature = float(np.clip(tall / usual, _SHORT, _LONG))
-            one = _Placed(u, foot, stature * usual, stature, index, (u, foot))
+            one = _Placed(u, foot, stature * usual, stature, index, (u, foot), of=stature)
             self._settle(one)
             self._cover(one, 1)
             placed.append(one)
@@ -464,14 +478,19 @@ class _Cluster:
         """Move a template to the best place near, drawn to where it is expected."""
         reach = max(_REACH * one.tall, 2.0)
         steps = np.linspace(-reach, reach, 9)
-        u, foot = (values.ravel() for values in np.meshgrid(one.u + steps, one.foot + steps))
-        tall = one.stature * self._heights(u, foot)
+        u, foot, stature = (
+            values.ravel() for values in np.meshgrid(one.u + steps, one.foot + steps, one.stature * _STRETCHED)
+        )
+        stature = np.clip(stature, _SHORT, _LONG)
+        tall = stature * self._heights(u, foot)
         gains = self._gains(u, foot, tall) + self._dressed(one, u, foot, tall)
         home = one.home or (one.u, one.foot)
         pull = _PULL if one.home is not None else 0.3
-        away = ((u - home[0]) ** 2 + (foot - home[1]) ** 2) / one.tall**2
-        best = int(np.argmax(gains - pull * away * _AREA * one.tall**2))
+        away = pull * ((u - home[0]) ** 2 + (foot - home[1]) ** 2) / one.tall**2
+        away += _STIFF * np.log(stature / one.of) ** 2
+        best = int(np.argmax(gains - away * _AREA * one.tall**2))
         one.u, one.foot, one.tall, one.gain = float(u[best]), float(foot[best]), float(tall[best]), float(gains[best])
+        one.stature = float(stature[best])
 
     def _descend(self, placed: list[_Placed], sweeps: int) -> None:
         for _ in range(sweeps):
@@ -483,12 +502,15 @@ class _Cluster:
     def _best_new(self, u: Floats, foot: Floats, tall: Floats) -> _Placed | None:
         if not len(u):
             return None
-        gains = self._gains(u, foot, tall)
-        worth = gains / (_AREA * tall**2)
-        best = int(np.argmax(worth))
-        if worth[best] < _NEW:
+        gains = np.stack([self._gains(u, foot, stature * tall) for stature in _COMING])
+        worth = gains / (_AREA * np.square(_COMING[:, None] * tall)) - _STIFF * np.log(_COMING[:, None]) ** 2
+        size, best = np.unravel_index(int(np.argmax(worth)), worth.shape)
+        if worth[size, best] < _NEW:
             return None
-        return _Placed(float(u[best]), float(foot[best]), float(tall[best]), gain=float(gains[best]))
+        stature = float(_COMING[size])
+        return _Placed(
+            float(u[best]), float(foot[best]), stature * float(tall[best]), stature, gain=float(gains[size, best])
+        )
 
     def _cover(self, one: _Placed, by: int) -> None:
         for half, high, low in _BARS:

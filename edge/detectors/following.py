@@ -14,6 +14,7 @@ _SURE = 3  # sightings after which somebody is believed
 _FORGET_S = 1.2
 _GETS_ON = 0.35  # of the way that is gone, as the crow flies
 _TENTATIVE_S = 0.25
+_MEASURED, _DOUBT = 20, 2.0  # sightings of a height that count; what is usual counts as so many
 
 
 @dataclass(slots=True)
@@ -37,11 +38,19 @@ class Follower:
     way: float = 0.0
     missed_since: float | None = None
     colour: Floats | None = None
+    measured: int = 0
+    stature: float = 1.0
 
     @property
     def sure(self) -> bool:
         """Seen often enough to be believed."""
         return self.hits >= _SURE
+
+    def measure(self, stature: float) -> None:
+        """Its height, of the usual one where it stands, seen once more."""
+        self.measured += 1
+        share = 1.0 / (min(self.measured, _MEASURED) + _DOUBT)
+        self.stature *= float(np.clip(stature / self.stature, 0.7, 1.4)) ** share
 
     def expected(self, time: float) -> Box:
         """Its box [px] at a time [s]."""

@@ -1,4 +1,4 @@
-"""What is not background: a model of every pixel's values, light that changes, shadows, ghosts and jolts.
+"""What is not background: a model of every pixel's values, light that changes, ghosts and jolts.
 
 The model is OpenCV's mixture of Gaussians (MOG2) or its k nearest neighbours (KNN). It is asked with every frame and
 taught with every few, from a picture in which what is being followed is replaced by what is behind it: so somebody who
@@ -11,12 +11,13 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from edge.detectors.shadows import Shadows
 from protocols.geometry.types import Bools, Floats
 
 Image = npt.NDArray[np.uint8]
@@ -29,7 +30,7 @@ _BEGIN_S = 1.0  # in which a new model learns fast, and after which it begins ag
 _REVIEWS_S = (_BEGIN_S, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)  # when that is done, each time better
 _PAUSE_S = 2.0  # a longer time between two pictures is a pause, and tells nothing of their rate
 _RENEWAL = 0.05  # share of the latest step in the period
-_REVIEWED = 24  # pictures that a review looks at
+_REVIEWED = 32  # pictures that a review looks at
 _CLOSEST = 0.34  # of the pictures that show a place's background, at least
 _PASSING = 40  # 8-bit steps
 _JOLT = 0.4  # of the picture being foreground at once: the camera was pushed, or the light went on
@@ -37,13 +38,6 @@ _SUBSAMPLE = 8
 _GAIN = (0.3, 3.3)
 _EVEN_FIELD = 0.08  # a gain this far from 1 is not the same everywhere
 _DIM_STEP = 11  # 8-bit steps, times the gain: a dim picture's noise is raised with it
-_SHADOW = (0.42, 0.95)  # light that a shadow leaves
-_SHADOW_TEXTURE = 7.0  # 8-bit steps that are noise
-_SHADOW_CHROMA = 9.0  # 8-bit steps by which a shadow changes colours
-_SHADOW_PIXEL = 14.0  # the same of one pixel, with its noise
-_NEAR, _WINDOW = 5, 9  # pixels of half the picture: in which a shadow must show the texture of what it falls on
-_SHOWN, _HIDDEN = 0.4, 2.5  # share of the texture that a shadow shows at least; standard deviations
-_LEAST_NOISE = 2.0  # 8-bit steps
 _GHOST_STEP = 22  # 8-bit steps
 _BESIDE, _LEAST_RIM = 0.04, 10  # of the height: how far beside a rim is looked; pixels of it
 _FLUSHED_S, _CALM_S = 16.0, 0.4  # time in which those who were here at first are sought; in which nothing changed
@@ -89,6 +83,7 @@ class Foreground:
             self._model: cv2.BackgroundSubtractor = mixture
         else:
             self._model = cv2.createBackgroundSubtractorKNN(500, 300.0, False)
+        self._shadows = Shadows()
         self._seen = 0
         self._age = 0.0  # s since the first picture
         self._since = 0
@@ -103,6 +98,11 @@ class Foreground:
         self._stride = 1
         self._lately: deque[tuple[float, Image]] = deque()  # the pictures of the last moment, and when they were
         self._flushed_at = 0.0
+
+    @property
+    def young(self) -> bool:
+        """Whether the background may still show who was here at first."""
+        return bool(self._reviews)
 
     def prime(self, pictures: Sequence[Image]) -> None:
         """Learn from pictures spread over a longer time, so that what was here and there for a moment is not in it."""
@@ -184,7 +184,7 @@ class Foreground:
             figure = self._flushed(even, figure)
         else:
             self._lately.clear()
-        shadow = np.zeros_like(figure) if learning else self._shadow(even, figure)
+        shadow = np.zeros_like(figure) if learning else self._shadows.find(even, self._background, figure)
         self._teach(even, figure, protected, learning)
         young = len(self._reviews) == len(_REVIEWS_S)
         if self._reviews:
@@ -262,43 +262,6 @@ class Foreground:
             return figure
         return without_like(figure, even, self._ghosts, self._ghostly)
 
-    def _shadow(self, even: Image, figure: Image) -> Image:
-        """Where the background shows through, but darker: same colour, same texture."""
-        assert self._background is not None
-        shadow = np.zeros_like(figure)
-        x, y, w, h = cv2.boundingRect(figure)
-        if w < 4 or h < 4:
-            return shadow
-        # Half the resolution does: what is asked is asked of a neighbourhood anyhow.
-        part = slice(y, y + h), slice(x, x + w)
-        half = (w + 1) // 2, (h + 1) // 2
-        now = cv2.resize(even[part], half, interpolation=cv2.INTER_AREA)
-        then = cv2.resize(self._background[part], half, interpolation=cv2.INTER_AREA)
-        bright_now = cv2.cvtColor(now, cv2.COLOR_BGR2GRAY).astype(np.float32)
-        bright_then = cv2.cvtColor(then, cv2.COLOR_BGR2GRAY).astype(np.float32)
-        left = (cv2.blur(bright_now, (3, 3)) + 2.0) / (cv2.blur(bright_then, (3, 3)) + 2.0)
-        dark = cv2.inRange(left, _SHADOW[0], _SHADOW[1])
-        if not cv2.countNonZero(dark):
-            return shadow
-        # What is left after the background was dimmed by the local light must be noise, in brightness and in colour.
-        dimmed = cv2.multiply(then, cv2.merge([left] * 3), dtype=cv2.CV_8U)
-        texture = cv2.blur(cv2.absdiff(bright_now, bright_then * left), (3, 3))
-        colour = cv2.blur(cv2.absdiff(now, dimmed), (3, 3))
-        same = cv2.inRange(texture, -1.0, _SHADOW_TEXTURE)
-        grey = cv2.inRange(colour, (0, 0, 0), (_SHADOW_CHROMA,) * 3)
-        all_three = cv2.bitwise_and(dark, cv2.bitwise_and(same, grey))
-        raised = np.asarray(cv2.resize(figure[part], half, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
-        seems = np.asarray(all_three, dtype=np.uint8)
-        light = np.asarray(left, dtype=np.float32)
-        hidden = _hides_texture(bright_now, bright_then, light, seems, raised == 0)
-        sure = cv2.subtract(seems, hidden)
-        # At the rim of a body the neighbourhood is half the body's: there every pixel speaks for itself.
-        alike = cv2.subtract(cv2.inRange(cv2.absdiff(now, dimmed), (0, 0, 0), (_SHADOW_PIXEL,) * 3), hidden)
-        rim = cv2.bitwise_and(cv2.dilate(sure, np.ones((3, 3), np.uint8)), cv2.bitwise_and(alike, dark))
-        full = cv2.resize(cv2.bitwise_or(sure, rim), (w, h), interpolation=cv2.INTER_NEAREST)
-        shadow[part] = cv2.bitwise_and(full, figure[part])
-        return shadow
-
     def _teach(self, even: Image, figure: Image, protected: Sequence[Box], learning: bool) -> None:
         assert self._background is not None
         assert self._slow is not None
@@ -365,36 +328,6 @@ def _comparisons(count: int) -> list[tuple[int, int]]:
             gap //= 2
         run *= 2
     return pairs
-
-
-def _hides_texture(
-    now: npt.NDArray[np.float32],
-    then: npt.NDArray[np.float32],
-    left: npt.NDArray[np.float32],
-    candidate: Image,
-    quiet: Bools,
-) -> Image:
-    """Where what seems a shadow does not show the background's texture: trousers of the floor's colour.
-
-    now, then: (h, w) brightness and the background's; left: share of its light; candidate: 255 where a shadow may lie;
-    quiet: where nothing stands. A shadow's picture is the background's times ``left``, cloth has nothing of it:
-    over a window their correlation, sum(n t) / sum(t t), is 1 or 0, where n is the brightness and t the background's
-    times ``left``, both less their means nearby: of a shadow's soft rim, which has slopes of its own, little is left.
-    Where a film was compressed a shadow shows less: _SHOWN. It must be seen to show less than that, beyond the noise.
-    """
-    inside: npt.NDArray[np.float32] = (candidate > 0).astype(np.float32)
-
-    def total(values: npt.NDArray[Any], size: int) -> npt.NDArray[np.float32]:
-        return np.asarray(cv2.boxFilter(values, cv2.CV_32F, (size, size), normalize=False), dtype=np.float32)
-
-    near = np.maximum(total(inside, _NEAR), np.float32(1.0))
-    fine_now = (now - total(now * inside, _NEAR) / near) * inside
-    fine_then = left * (then - total(then * inside, _NEAR) / near) * inside
-    noise = 1.48 * float(np.median(np.abs(now[quiet] - then[quiet]))) if quiet.any() else 3.0
-    texture = np.maximum(total(fine_then * fine_then, _WINDOW), np.float32(1e-3))
-    shown = total(fine_then * fine_now, _WINDOW) / texture
-    surely = (_SHOWN - shown) * np.sqrt(texture) > _HIDDEN * max(noise, _LEAST_NOISE)
-    return np.asarray(np.where(surely & (shown < 0.4 * _SHOWN), 255, 0), dtype=np.uint8)
 
 
 def _slow_field(usable: Bools, left: Floats, size: tuple[int, int]) -> npt.NDArray[np.float32]:

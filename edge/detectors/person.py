@@ -32,6 +32,7 @@ _U_STD, _V_STD = 0.024, 0.105  # of the representative point, of the size, as re
 _FLOOR_STD = 0.6  # px
 _LEAST_TOLD = 12.0  # px: who is expected smaller tells no height
 _VAGUE = 0.12  # of the size: std of a place that is expected, above which it tells nothing
+_BETWEEN = 0.12  # of the height: gaps across that are closed where they seem a shadow
 _BELOW = 0.62  # of the height: the foot below the representative point that is expected
 _COMES_S, _COMES, _ALIKE = (0.2, 1.0), (0.12, 1.0), 0.15
 """Who walks: seconds, way in heights, logarithm of the height between two sightings of him alone."""
@@ -115,7 +116,7 @@ class PersonDetector:
         if layers.fresh:
             self._following.clear()
             return []
-        figure = _clean(layers.figure, self._typical())
+        figure = clean(layers.figure, layers.shadow, self._typical())
         self._learn_from(predictions)
         found = self._explain(small, layers, figure, now)
         detections = [self._report(small, figure, one) for one in found if self._worth_telling(one)]
@@ -159,7 +160,7 @@ class PersonDetector:
             if tall < _LEAST_TOLD or not math.sqrt(max(a, c)) < _VAGUE * one.size:
                 continue
             foot = (one.v + 0.5) * self._shrink + _BELOW * tall
-            self._stature.told((one.u + 0.5) * self._shrink, foot, tall)
+            self._stature.told((one.u + 0.5) * self._shrink, foot, tall, one.target)
 
     def _typical(self) -> float:
         heights = [one.box[3] for one in self._following.all if one.sure]
@@ -170,19 +171,38 @@ class PersonDetector:
         following = self._following
         followers = list(following.all)
         boxes = [one.expected(now) for one in followers]
-        moving = [box for box, one in zip(boxes, followers, strict=True) if one.sure and one.moved]
+        moving = [(box, one.name) for box, one in zip(boxes, followers, strict=True) if one.sure and one.moved]
         lone = [(now, *one) for one in lone_people(figure)] if self._learns else []
         for _, u, v, tall in lone:
             # What has not moved may be the place that somebody has left.
-            if any(_stands(box, u, v, tall) for box in moving) or self._comes(now, u, v, tall):
-                self._stature.learn(u, v, tall)
+            who = [name for box, name in moving if _stands(box, u, v, tall)]
+            if who or self._comes(now, u, v, tall):
+                self._stature.learn(u, v, tall, who[0] if who else "")
+        if self._learns and self._foreground.young:
+            guesses = lone_people(figure, strict=False)
+            tallest = max((one[2] for one in guesses), default=0.0)
+            for u, v, tall in guesses:
+                if tall > 0.5 * tallest:  # others may be pieces
+                    self._stature.guess(u, v, tall)
         self._lone = [one for one in self._lone if now - one[0] < _COMES_S[1]] + lone
-        bodies = explain(figure, layers.shadow, self._stature, boxes, image, [one.colour for one in followers])
+        bodies = explain(
+            figure,
+            layers.shadow,
+            self._stature,
+            boxes,
+            image,
+            [one.colour for one in followers],
+            [one.stature for one in followers],
+        )
         colours = [_torso(image, figure, body) for body in bodies]
         given = [followers[body.expected] if body.expected >= 0 else None for body in bodies]
         owners = following.assign([body.box for body in bodies], colours, now, given)
         found = []
         for body, owner, colour in zip(bodies, owners, colours, strict=True):
+            if body.alone and not body.cut and self._stature.known:
+                x, y, w, h = body.box
+                usual = float(self._stature.at(np.array(x + 0.5 * w), np.array(y + h)))
+                owner.measure(h / usual)
             if owner.time < now or owner.hits == 1:
                 if owner.time < now:
                     trust = 0.9 if body.alone and not body.cut else 0.6 if body.seen > 0.6 else 0.35
@@ -282,9 +302,17 @@ def _stands(box: tuple[float, float, float, float], u: float, v: float, tall: fl
     return near and 0.6 * h < tall < 1.6 * h
 
 
-def _clean(figure: Image, typical: float) -> Image:
-    """Without specks, and with a body's parts joined (a belt of the wall's colour cuts nobody in two)."""
+def clean(figure: Image, shadow: Image, typical: float) -> Image:
+    """A silhouette picture (H, W) 0/255 without specks, and with a body's parts joined.
+
+    typical: height [px] of people. A belt of the wall's colour cuts nobody in two.
+
+    What seems a shadow between two parts of a body side by side is of the body.
+    """
     calm = cv2.medianBlur(figure, 3)
+    wide = int(np.clip(_BETWEEN * typical, 3, 41)) | 1
+    across = cv2.morphologyEx(calm, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_RECT, (wide, 1)))
+    calm = cv2.bitwise_or(calm, cv2.bitwise_and(across, shadow))
     tall = int(np.clip(0.1 * typical, 3, 15)) | 1
     joined = cv2.morphologyEx(calm, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_RECT, (3, tall)))
     return np.asarray(joined, dtype=np.uint8)

@@ -11,30 +11,37 @@ from protocols.geometry.types import Floats
 _BANDS, _KEPT = 16, 60  # of the picture's rows; sightings in each
 _LEAST, _ENOUGH = 8, 40  # sightings before it is believed; before nobody else is asked
 _EVERY, _SELDOM = 8, 60  # new sightings after which it is fitted again, at first and later
-_SLOPE = 0.55  # px of height a row of the foot, of cameras at usual heights
-_SLOPES = 0.1, 1.4
-_SLOPE_STD = 0.45  # of its logarithm
-_NARROW = 0.5  # of half the picture's height: feet in so few rows tell little of the others
-_DRAWS = 150
-_SPREAD = 0.06  # of people's heights
+_GUESS, _GUESSES = 0.5, 12.0  # as how many sightings a guess counts, and all of them at the most
+_USUAL = np.array([0.3, np.log(0.8), np.log(0.6), 0.0])
+"""Tilt [rad], logarithms of focal length over the picture's width and of a person's height over the camera's, roll."""
+_STD = np.array([0.3, 0.3, 0.5, 0.06])
+_TILTS, _FOCALS, _RATIOS = np.linspace(-0.15, 1.2, 28), np.log([0.5, 0.65, 0.85, 1.1, 1.5]), np.linspace(-3.2, 0.2, 69)
+_SPREAD = 0.08  # of people's heights, and of how they are seen
 _TALLER = 0.3
+_OWN = 2.0  # sightings of somebody after which half of what he differs by is his own height
+_NEAREST = 0.01  # sine of the least angle below the horizon at which somebody may stand
 _ASTRAY = 0.75, 1.33  # what is told may be off by so much; what was seen beyond is something else
+
+
+_Sightings = list[deque[tuple[float, float, float, str]]]
 
 
 class Stature:
     """The height [px] of a person whose foot is at a pixel of a picture of width, height px.
 
-    On flat ground it is linear in the foot's place for a level camera; a squared term serves wide and steep ones.
+    Of a pinhole camera above flat ground: its tilt, focal length, roll and height over people's are what is learnt,
+    and where little has been seen they are what is usual. After Hoiem et al. (2008), with tilt and roll. Whoever is
+    named has a height of his own, so that it does not matter who was seen where.
     """
 
     def __init__(self, width: int, height: int) -> None:
         self.size = width, height
-        self._scale = np.array([0.5 * width, 0.5 * height])
         # By rows, so that somebody who stays where he is does not push out all others.
-        self._seen: list[deque[tuple[float, float, float]]] = [deque(maxlen=_KEPT) for _ in range(_BANDS)]
-        self._told: list[deque[tuple[float, float, float]]] = [deque(maxlen=_KEPT) for _ in range(_BANDS)]
+        self._seen: _Sightings = [deque(maxlen=_KEPT) for _ in range(_BANDS)]
+        self._told: _Sightings = [deque(maxlen=_KEPT) for _ in range(_BANDS)]
+        self._guessed: _Sightings = [deque(maxlen=_KEPT) for _ in range(_BANDS)]
         self._new, self._wait = 0, _EVERY
-        self._weights: Floats | None = None
+        self._view: Floats | None = None  # as _USUAL
         self._range = (0.0, 0.0)
         self.typical = 0.25 * height
         """Median height [px] of those who have been seen."""
@@ -42,19 +49,24 @@ class Stature:
     @property
     def known(self) -> bool:
         """Whether enough has been seen to tell."""
-        return self._weights is not None
+        return self._view is not None
 
-    def learn(self, u: float, v: float, height: float) -> None:
-        """One person who seems to stand alone: foot point and height [px]."""
-        self._keep(self._seen, u, v, height)
+    def learn(self, u: float, v: float, height: float, who: str = "") -> None:
+        """One person who seems to stand alone: foot point and height [px]. who: a name; "" = not known."""
+        self._keep(self._seen, u, v, height, who)
 
-    def told(self, u: float, v: float, height: float) -> None:
+    def guess(self, u: float, v: float, height: float) -> None:
+        """What may be one person, or the place that one has left: it counts a little until enough have been seen."""
+        if sum(map(len, self._seen)) < _ENOUGH:
+            self._keep(self._guessed, u, v, height, "")
+
+    def told(self, u: float, v: float, height: float, who: str = "") -> None:
         """What the tracking expects of somebody: it counts until enough have been seen here."""
-        self._keep(self._told, u, v, height)
+        self._keep(self._told, u, v, height, who)
 
-    def _keep(self, where: list[deque[tuple[float, float, float]]], u: float, v: float, height: float) -> None:
+    def _keep(self, where: _Sightings, u: float, v: float, height: float, who: str) -> None:
         band = int(np.clip(v / self.size[1] * _BANDS, 0, _BANDS - 1))
-        where[band].append((u, v, height))
+        where[band].append((u, v, height, who))
         self._new += 1
         if self._new >= self._wait:
             self._new = 0
@@ -66,51 +78,95 @@ class Stature:
         seen, told = sum(map(len, self._seen)), sum(map(len, self._told))
         if told >= _LEAST and seen < _ENOUGH:
             self._fit(self._told)
-        elif seen >= _LEAST:
+        elif seen >= _ENOUGH:
             self._fit(self._seen)
+        elif seen + _GUESS * sum(map(len, self._guessed)) >= _LEAST:
+            self._fit(self._seen, self._guessed)
 
     def at(self, u: Floats, v: Floats) -> Floats:
         """Heights [px] at foot points; call it only once it is ``known``."""
-        assert self._weights is not None
-        return np.clip(self._terms(u, v) @ self._weights, *self._range)
+        assert self._view is not None
+        return np.clip(self._heights(self._view, np.asarray(u), np.asarray(v)), *self._range)
 
-    def _terms(self, u: Floats, v: Floats) -> Floats:
-        x, y = u / self._scale[0] - 1.0, v / self._scale[1] - 1.0
-        return np.stack([np.ones_like(y), y, x, y * y, x * y], axis=-1)
+    def _heights(self, view: Floats, u: Floats, v: Floats) -> Floats:
+        """Of the foot's ray d, up (both in the camera's axes) and q = -up d: the head is at d + ratio q up."""
+        focal = np.exp(view[1]) * self.size[0]
+        x, y = (u - 0.5 * self.size[0]) / focal, (v - 0.5 * self.size[1]) / focal
+        up = _up(view[0], view[3])
+        below = np.maximum(-(up[0] * x + up[1] * y + up[2]), _NEAREST) * np.exp(view[2])
+        head = (y + below * up[1]) / np.maximum(1.0 + below * up[2], 0.1)
+        return np.asarray(np.maximum(focal * (y - head), 1.0), dtype=np.float64)
 
-    def _fit(self, sightings: list[deque[tuple[float, float, float]]]) -> None:
-        seen = np.array([one for band in sightings for one in band])
-        terms = self._terms(seen[:, 0], seen[:, 1])
-        found = _consensus(terms[:, 1], seen[:, 2], self._scale[1])
-        offset = np.array([found[0], found[1], 0.0, 0.0, 0.0])
-        # Toward the line that most agree on where little has been seen; the higher terms more so.
-        ridge = np.diag([0.02, 0.02, 0.3, 1.0, 1.0])
-        weights = offset
-        for _ in range(6):
-            error = (seen[:, 2] - terms @ weights) / (_SPREAD * np.maximum(terms @ weights, 8.0))
+    def _fit(self, sightings: _Sightings, guesses: _Sightings | None = None) -> None:
+        every = [one for band in sightings for one in band]
+        guessed = [one for band in guesses or () for one in band]
+        counts = np.ones(len(every) + len(guessed))
+        counts[len(every) :] = min(_GUESS, _GUESSES / max(len(guessed), 1))
+        every += guessed
+        u, v, height = np.array([one[:3] for one in every]).T
+        # Of each person one is taller or shorter than usual by something of his own: (people, n) who each sighting is.
+        who = np.array([one[3] for one in every])
+        owners = (who == np.unique(who[who != ""])[:, None]).astype(np.float64)
+        taller = np.zeros(len(every))
+        counts = counts * np.sqrt(height / height.max())  # pieces of people are short
+        view = self._consensus(v, height, counts)
+        steps = 1e-4 * np.eye(4)
+        for _ in range(8):
+            expected = self._heights(view, u, v)
+            error = (np.log(height / expected) - taller) / _SPREAD
             # Two behind each other and what is left of a shadow make silhouettes taller; the short are not taken.
-            weight = np.where(error > 0, _TALLER, 1.0) / (1.0 + error**2) ** 2
-            normal = terms.T @ (terms * weight[:, None]) + ridge
-            weights = offset + np.linalg.solve(normal, terms.T @ (weight * (seen[:, 2] - terms @ offset)))
-        agree = np.abs(seen[:, 2] - terms @ weights) < 2.5 * _SPREAD * np.maximum(terms @ weights, 8.0)
-        if agree.sum() < 0.5 * _LEAST:
+            weight = counts * np.where(error > 0, _TALLER, 1.0) / (1.0 + error**2) ** 2
+            slope = np.stack(
+                [np.log(self._heights(view + step, u, v) / expected) / (1e-4 * _SPREAD) for step in steps], axis=1
+            )
+            normal = slope.T @ (slope * weight[:, None]) + np.diag(1.0 / _STD**2)
+            right = slope.T @ (weight * error) - (view - _USUAL) / _STD**2
+            view = view + np.clip(np.linalg.solve(normal, right), -0.3, 0.3)
+            share = owners @ (weight * (error * _SPREAD + taller)) / (owners @ weight + _OWN)
+            taller = share @ owners
+        expected = self._heights(view, u, v)
+        agree = np.abs(np.log(height / expected) - taller) < 2.0 * _SPREAD
+        if counts[agree].sum() < 0.5 * _LEAST:
             return
         if sightings is self._told:
-            weights = weights * self._scale_by_sight(weights)
-        self._weights = weights
-        low, high = np.percentile(seen[agree, 2], [5, 95])
-        wide = np.ptp(terms[agree, 1]) > _NARROW
-        self._range = (0.75 * float(low), 1.6 * float(high)) if wide else (0.5 * float(low), 2.2 * float(high))
-        self.typical = float(np.median(seen[agree, 2]))
+            view = view + np.array([0.0, 0.0, np.log(self._scale_by_sight(view)), 0.0])
+        self._view = view
+        low, high = np.percentile(height[agree], [5, 95])
+        self._range = (0.4 * float(low), 2.5 * float(high))
+        self.typical = float(np.median(height[agree]))
 
-    def _scale_by_sight(self, weights: Floats) -> float:
+    def _consensus(self, v: Floats, height: Floats, counts: Floats) -> Floats:
+        """The view (4,) without roll that most sightings (n,) agree with, what is unusual agreeing less.
+
+        counts: (n,) as how many each counts.
+        """
+        best, found = -np.inf, _USUAL
+        for log_focal in _FOCALS:
+            focal = np.exp(log_focal) * self.size[0]
+            y = (v - 0.5 * self.size[1]) / focal
+            head = y - height / focal
+            up = _up(_TILTS, 0.0)
+            # For each tilt, the ratio that each sighting tells.
+            below = -(up[1][:, None] * y + up[2][:, None])
+            ratio = (head - y) / np.where(below > _NEAREST, below * (up[1][:, None] - head * up[2][:, None]), np.inf)
+            log_ratio = np.log(np.maximum(ratio, 1e-6))
+            error = (log_ratio[:, :, None] - _RATIOS) / _SPREAD
+            agreed = np.einsum("n,tnr->tr", counts, np.exp(-0.5 * np.square(np.where(error > 0, 1.5, 1.0) * error)))
+            unlikely = np.square((_TILTS - _USUAL[0]) / _STD[0])[:, None] + np.square((_RATIOS - _USUAL[2]) / _STD[2])
+            score = agreed - 0.5 * (unlikely + ((log_focal - _USUAL[1]) / _STD[1]) ** 2)
+            tilt, at = np.unravel_index(int(np.argmax(score)), score.shape)
+            if score[tilt, at] > best:
+                best = float(score[tilt, at])
+                found = np.array([_TILTS[tilt], log_focal, _RATIOS[at], 0.0])
+        return found
+
+    def _scale_by_sight(self, view: Floats) -> float:
         """How much taller people are seen than told: what is told was measured with templates of what was told before.
 
         Nothing else would hold heights that follow from each other.
         """
-        seen = np.array([one for band in self._seen for one in band]).reshape(-1, 3)
-        line = self._terms(seen[:, 0], seen[:, 1]) @ weights
-        ratio = seen[:, 2] / np.maximum(line, 1.0)
+        seen = np.array([one[:3] for band in self._seen for one in band]).reshape(-1, 3)
+        ratio = seen[:, 2] / np.maximum(self._heights(view, seen[:, 0], seen[:, 1]), 1.0)
         ratio = ratio[(ratio > _ASTRAY[0]) & (ratio < _ASTRAY[1])]
         if len(ratio) < _LEAST:
             return 1.0
@@ -120,24 +176,7 @@ class Stature:
         return float(tried[np.argmax(agreed)])
 
 
-def _consensus(y: Floats, height: Floats, half: float) -> Floats:
-    """The line (2,) height = a + b y that most sightings (n,), (n,) lie on, the taller counting more.
-
-    half: rows [px] of a unit of y. Where the feet are in few rows, the slope that cameras usually have.
-    """
-    rng = np.random.default_rng(len(y))
-    first, second = rng.integers(0, len(y), (2, _DRAWS))
-    run = y[second] - y[first]
-    usable = np.abs(run) > 0.04
-    slope = np.where(usable, (height[second] - height[first]) / np.where(usable, run, 1.0), 0.0) / half
-    usual = _SLOPE * np.exp(_SLOPE_STD * np.linspace(-1.5, 1.5, _DRAWS))
-    slope = np.where((slope > _SLOPES[0]) & (slope < _SLOPES[1]), slope, usual)
-    unlikely = (np.log(slope / _SLOPE) / _SLOPE_STD) ** 2
-    slope = slope * half
-    start = height[first] - slope * y[first]
-    line = start[:, None] + slope[:, None] * y
-    error = (height - line) / (_SPREAD * np.maximum(line, 8.0))
-    # What is left of somebody where the background has his colours is short.
-    agreed = np.exp(-0.5 * (error * np.where(error > 0, 1.5, 1.0)) ** 2) * np.sqrt(height / height.max())
-    best = int(np.argmax(agreed.sum(axis=1) - 0.5 * unlikely))
-    return np.array([start[best], slope[best]])
+def _up(tilt: Floats | float, roll: Floats | float) -> tuple[Floats, Floats, Floats]:
+    """The world's up in the axes (right, down, forward) of a camera that looks down by ``tilt`` and leans."""
+    cosine = np.cos(tilt)
+    return cosine * np.sin(roll), -cosine * np.cos(roll), -np.sin(tilt)

@@ -119,7 +119,7 @@ class VehicleDetector:
         small = self._smaller(image)
         if self._given is None or self._moving:
             self._look_for_motion(small)
-        figure = self._figure(small)
+        figure = self._figure(small, now)
         if figure is None:
             self._following.clear()
             return []
@@ -165,7 +165,7 @@ class VehicleDetector:
             self._moving = False
             self._foreground = Foreground(self._model, self._fps)
 
-    def _figure(self, image: Image) -> Image | None:
+    def _figure(self, image: Image, now: float) -> Image | None:
         """Silhouettes (H, W) 0/255; None while nothing can be told."""
         if self._moving:
             raw = self._carried.residual(image)
@@ -174,7 +174,8 @@ class VehicleDetector:
                 self._carried.residual(image)  # in case the camera turns out to move
             else:
                 self._carried.forget()
-            layers = self._foreground.look(image, [one.box for one in self._following.all if one.sure and one.moved])
+            followed = [one.box for one in self._following.all if one.sure and one.moved]
+            layers = self._foreground.look(image, followed, now)
             raw = None if layers.fresh else layers.figure
         if raw is None:
             return None

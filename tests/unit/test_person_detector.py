@@ -16,7 +16,8 @@ from edge.detectors.base import Detection, Prediction
 from edge.detectors.bodies import explain, lone_people
 from edge.detectors.foreground import Foreground, is_ghost, places_left, usual, without_like
 from edge.detectors.matching import match_predictions
-from edge.detectors.person import PersonDetector, silhouette_features
+from edge.detectors.person import PersonDetector, clean, silhouette_features
+from edge.detectors.shadows import Shadows
 from edge.detectors.stature import Stature
 from edge.detectors.vehicle import VehicleDetector
 from tests.people_boxes import judge
@@ -407,3 +408,123 @@ def test_who_counts_is_judged_as_pedestrian_benchmarks_do() -> None:
     counts = np.array([True, True, False, False])
     found = [np.array([1.0, 1, 10, 30]), np.array([100.0, 2, 10, 30]), np.array([200.0, 0, 10, 30])]
     assert judge(boxes, counts, found)[:3] == (1, 1, 1)
+
+
+def test_nothing_darker_than_the_places_shadows_is_a_shadow_once_they_are_known() -> None:
+    """Grey trousers before a plain floor are darker than shadows are here; what is as dark as they still is one."""
+    rng = np.random.default_rng(2)
+    floor = np.full((240, 320), 140.0)
+    floor[:, :200] += cv2.GaussianBlur(rng.normal(0.0, 60.0, (240, 200)), (0, 0), 1.5)
+
+    def seen(light: float, left: int) -> tuple[Image, Image]:
+        picture, figure = floor.copy(), np.zeros((240, 320), np.uint8)
+        picture[60:200, left : left + 80] *= light
+        figure[60:200, left : left + 80] = 255
+        noise = rng.normal(0.0, 2.0, (240, 320, 3))
+        return np.clip(picture[..., None] + noise, 0, 255).astype(np.uint8), figure
+
+    background, shadows = seen(1.0, 0)[0], Shadows()
+
+    def share(light: float, left: int) -> float:
+        picture, figure = seen(light, left)
+        return float((shadows.find(picture, background, figure)[70:190, left + 10 : left + 70] > 0).mean())
+
+    assert share(0.5, 230) > 0.9
+    for index in range(6):
+        assert share(0.7, 10 + 15 * index) > 0.8
+    assert shadows.darkest == pytest.approx(0.67, abs=0.03)
+    assert share(0.5, 230) < 0.1
+    assert share(0.72, 230) > 0.9
+
+
+def test_what_seems_a_shadow_within_a_body_is_of_the_body_and_beside_it_is_not() -> None:
+    whole = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    put_person(whole, 100.0, 200.0, 120.0, (255, 255, 255))
+    figure = np.where(whole.any(axis=2), np.uint8(255), np.uint8(0)).astype(np.uint8)
+    shadow = np.zeros_like(figure)
+    shadow[110:140, 95:105] = figure[110:140, 95:105]
+    figure[110:140, 95:105] = 0
+    shadow[185:200, 115:180] = 255
+    joined = clean(figure, shadow, 120.0)
+    assert (joined[112:138, 95:105] > 0).all()
+    assert not (joined[185:200, 120:180] > 0).any()
+    assert not (clean(figure, np.zeros_like(figure), 120.0)[122:128, 98:102] > 0).any()
+
+
+def pole(v: npt.ArrayLike, tilt: float = 0.35, focal: float = 420.0, ratio: float = 0.7) -> npt.NDArray[np.float64]:
+    """Heights [px] of people whose feet are in rows v of the middle of a 640 x 480 picture, by the pinhole's angles."""
+    below = np.arctan((np.asarray(v, dtype=np.float64) - 240.0) / focal) + tilt
+    head = np.arctan((1.0 - ratio) * np.tan(below))
+    return np.asarray(focal * (np.tan(below - tilt) - np.tan(head - tilt)), dtype=np.float64)
+
+
+def test_heights_of_a_place_follow_from_those_of_another() -> None:
+    rng = np.random.default_rng(0)
+    stature = Stature(640, 480)
+    for v in rng.uniform(280.0, 380.0, 60):
+        stature.learn(rng.uniform(250.0, 390.0), v, float(pole(v)) * rng.normal(1.0, 0.02))
+    v = np.array([230.0, 250.0, 300.0, 350.0, 420.0])
+    assert stature.at(np.full(5, 320.0), v) == pytest.approx(pole(v), rel=0.1)
+
+
+def test_it_does_not_matter_to_heights_who_was_seen_where() -> None:
+    """Somebody tall walks about the near half, somebody short about the far one: named, they tilt the place less."""
+
+    def astray(*, named: bool) -> float:
+        rng, stature = np.random.default_rng(1), Stature(640, 480)
+        for low, high, taller, who in ((330.0, 440.0, 1.12, "p0"), (240.0, 350.0, 0.88, "p1")):
+            for v in rng.uniform(low, high, 60):
+                stature.learn(320.0, v, taller * float(pole(v)) * rng.normal(1.0, 0.02), who if named else "")
+        v = np.array([240.0, 440.0])
+        far, near = np.log(stature.at(np.full(2, 320.0), v) / pole(v))
+        return float(near - far)
+
+    assert astray(named=True) < 0.6 * astray(named=False)
+
+
+def test_guesses_of_heights_count_until_enough_have_been_seen() -> None:
+    rng, stature = np.random.default_rng(2), Stature(640, 480)
+    for index, v in enumerate(rng.uniform(280.0, 420.0, 40)):
+        assert stature.known == (index >= 16)
+        stature.guess(320.0, v, 0.9 * float(pole(v)))
+    v = np.array([300.0, 400.0])
+    assert stature.at(np.full(2, 320.0), v) == pytest.approx(0.9 * pole(v), rel=0.04)
+    for v in rng.uniform(280.0, 420.0, 48):
+        stature.learn(320.0, v, float(pole(v)))
+    v = np.array([300.0, 400.0])
+    assert stature.at(np.full(2, 320.0), v) == pytest.approx(pole(v), rel=0.01)
+
+
+def test_a_short_one_beside_a_tall_one_has_a_short_ones_box() -> None:
+    """Both are one silhouette; nobody is expected, or both are, whose heights were measured when they were alone."""
+    stature = Stature(WIDTH, HEIGHT)
+    for index in range(60):
+        stature.learn(20.0 + 4 * index, 100.0 + index, 60.0)
+    drawn = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    put_person(drawn, 100.0, 150.0, 66.0, (255, 255, 255))
+    put_person(drawn, 116.0, 150.0, 48.0, (255, 255, 255))
+    figure = np.where(drawn.any(axis=2), np.uint8(255), np.uint8(0)).astype(np.uint8)
+    nothing = np.zeros_like(figure)
+    usual = float(stature.at(np.array([108.0]), np.array([150.0]))[0])
+    expected = [(89.0, 85.0, 22.0, 60.0), (105.0, 85.0, 22.0, 60.0)]
+    for bodies in (
+        explain(figure, nothing, stature, []),
+        explain(figure, nothing, stature, expected, statures=[66.0 / usual, 48.0 / usual]),
+    ):
+        tall, short = (body.box[3] for body in sorted(bodies, key=lambda body: body.box[0]))
+        assert tall == pytest.approx(66.0, abs=4.0)
+        assert short == pytest.approx(48.0, abs=3.0)
+
+
+def test_a_vehicle_s_background_is_learnt_by_the_pictures_times() -> None:
+    """25 pictures a second were told, 5 come: after the first second, that is 5 of them, cars are told."""
+    rng, detector = np.random.default_rng(5), VehicleDetector("mog2", 25.0, moving=False)
+    first = None
+    for index in range(40):
+        picture = street()
+        if index >= 3:
+            car(picture, 20.0 + 6.0 * index, 120.0)
+        if detector.detect(noisy(picture, rng), index / 5.0) and first is None:
+            first = index
+    assert first is not None
+    assert first < 20
