@@ -61,6 +61,9 @@ class DemoSettings:
 class Fleet:
     """The demo's processes, started together and stopped in order."""
 
+    _world_s = 0.0
+    """True time of the world when its cameras are switched on [s]."""
+
     def __init__(self, settings: DemoSettings) -> None:
         self.settings = settings
         self.out = settings.out.resolve()
@@ -161,7 +164,7 @@ class Fleet:
             "scene": self.settings.scene,
             "seed": self.settings.seed,
             "cameras": self.settings.cameras,
-            "start_unix_s": time.time(),
+            "start_unix_s": time.time() - self._world_s,
         }
         tables: dict[str, dict[str, object]] = {
             "recorder": {"id": "recorder", "site": self._site, "out": str(self.out / LOG), "bus": bus},

@@ -26,6 +26,8 @@ COLOUR_STD = 28.0
 _COLOUR_MOST = 12.0
 _HINT = 2.0
 """What the camera's own matching counts."""
+_TEMPER = 8.0
+"""Costs by which a pairing is e times less likely: 2 if what frames tell were independent; errors last for a second."""
 _WIDTH = 0.2
 _LENGTH = 0.6
 """Where silhouettes touch: shares of the sum of two lengths, across and along the body."""
@@ -80,6 +82,23 @@ def assign(total: Floats) -> tuple[Ints, Ints]:
     rows, columns = linear_sum_assignment(np.where(np.isfinite(total), total, _MOST))
     good = np.isfinite(total[rows, columns])
     return rows[good].astype(np.int64), columns[good].astype(np.int64)
+
+
+def ambiguity(total: Floats, row: Ints, column: Ints) -> Floats:
+    """How probable it is of matched pairs (k,) that the detection is another target's: 0 to 1/2.
+
+    Others either exchange their own with it or, where they have none, take it. total: (n, m) costs, inf = cannot be.
+    """
+    if not len(row):
+        return np.zeros(0)
+    own = total[row, column]
+    crossed = total[np.ix_(row, column)]
+    np.fill_diagonal(crossed, np.inf)
+    more = (crossed + crossed.T - own[:, None] - own[None, :]).min(axis=1)
+    idle = np.setdiff1d(np.arange(len(total)), row)
+    if len(idle):
+        more = np.minimum(more, total[np.ix_(idle, column)].min(axis=0) - own)
+    return np.asarray(1.0 / (1.0 + np.exp(np.clip(more / _TEMPER, 0.0, 60.0))))
 
 
 def rows_used(value: Floats, expected: Expected, distance: Floats, covariance: Floats) -> Bools:

@@ -13,7 +13,7 @@ import numpy as np
 from hub.tracking.body import BODIES
 from hub.tracking.camera import Frame, TrackingCamera
 from hub.tracking.kalman import LOG_SIZE, POSITION, SIZE, VELOCITY
-from hub.tracking.measure import POINT, expect
+from hub.tracking.measure import FOOT, HEAD, PARTS, POINT, doubt, expect, heavy
 from protocols.clocks import NANOSECONDS
 from protocols.geometry.types import Floats, Ints
 
@@ -166,14 +166,22 @@ def fit(
             forward = np.eye(SIZE)
             forward[POSITION, VELOCITY] = elapsed * np.eye(3)
             expected = expect(feature.camera, (forward @ mean)[None], kind, up)
-            used = np.isfinite(feature.value) & np.isfinite(expected.value[0])
-            slope = expected.slope[0][used] @ forward
-            weight = np.linalg.inv((feature.noise + expected.body_noise[0])[np.ix_(used, used)])
-            off = (feature.value - expected.value[0])[used]
-            hessian = hessian + slope.T @ weight @ slope
-            gradient = gradient + slope.T @ weight @ off
-            misfits.append(float(off @ weight @ off) if used[0] else np.inf)  # inf: behind the camera
-            counts.append(max(int(used.sum()), 1))
+            off = feature.value - expected.value[0]
+            slope = expected.slope[0] @ forward
+            noise = feature.noise + expected.body_noise[0]
+            misfit, count = 0.0 if np.isfinite(off[POINT]).all() else np.inf, 0  # inf: behind the camera
+            for rows in PARTS:
+                if not np.isfinite(off[rows]).all():
+                    continue
+                weight = np.linalg.inv(noise[rows, rows])
+                squared = off[rows] @ weight @ off[rows]
+                if rows is HEAD or rows is FOOT:
+                    weight, squared = weight / doubt(squared), heavy(squared)
+                hessian = hessian + slope[rows].T @ weight @ slope[rows]
+                gradient = gradient + slope[rows].T @ weight @ off[rows]
+                misfit, count = misfit + float(squared), count + len(weight)
+            misfits.append(misfit)
+            counts.append(max(count, 1))
         if step < _STEPS:
             mean = mean + np.linalg.solve(hessian, gradient)
     chi2 = sum(misfits) + float((information * (mean - prior) ** 2)[VELOCITY.start :].sum())

@@ -17,9 +17,12 @@ from protocols.geometry.types import Bools, Floats, Ints
 
 ROWS = 7
 POINT, HEAD, FOOT, SEEN_SIZE = slice(0, 2), slice(2, 4), slice(4, 6), 6
+PARTS = (POINT, HEAD, FOOT, slice(SEEN_SIZE, ROWS))
 _SIZE_STD = 0.08
 """Of the logarithm of a size seen: sizes of silhouettes breathe."""
 _LEAST_DEPTH = 1e-3
+_HEAVY = 4.0
+"""Degrees of freedom of Student's t that heads and feet keep: a silhouette that is cut or joined errs far."""
 
 _UPRIGHT = np.array([body.upright for body in BODIES])
 _ABOVE = np.array([body.point_above for body in BODIES])
@@ -102,6 +105,20 @@ def _expect_size(value: Floats, slope: Floats, mean: Floats, depth: Floats, upri
         chained = (by_difference @ (slope[:, HEAD] - slope[:, FOOT]))[:, 0]
         value[:, SEEN_SIZE] = np.where(tall, 0.5 * np.log(np.where(tall, length2, 1.0)), value[:, SEEN_SIZE])
         slope[:, SEEN_SIZE] = np.where(tall[:, None], chained, slope[:, SEEN_SIZE])
+
+
+def doubt(squared: Floats) -> Floats:
+    """How many times larger the variance of a head or foot is, by its squared Mahalanobis distance (...), NaN = 1.
+
+    The weight of Student's t in iterated least squares, never above 1 (Lange, Little and Taylor 1989).
+    """
+    return np.maximum(np.nan_to_num((_HEAVY + squared) / (_HEAVY + 2.0), nan=1.0), 1.0)
+
+
+def heavy(squared: Floats) -> Floats:
+    """The misfit that ``doubt`` minimises, where a Gaussian's is the squared Mahalanobis distance (...) itself."""
+    beyond = 2.0 + (_HEAVY + 2.0) * np.log(doubt(squared))
+    return np.where(squared > 2.0, beyond, squared)
 
 
 def measured(frame: Frame, detection: Ints) -> tuple[Floats, Floats]:

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hub.tracking import kalman
-from hub.tracking.associate import assign, costs, overlaps, rows_used
+from hub.tracking.associate import ambiguity, assign, costs, overlaps, rows_used
 from hub.tracking.body import BODIES
 from hub.tracking.camera import Frame, TrackingCamera
 from hub.tracking.discovery import Found, Scale, features_of, hypothesis
 from hub.tracking.identity import recall, remember
 from hub.tracking.kalman import LOG_SIZE, POSITION
-from hub.tracking.measure import POINT, Expected, expect, measured
+from hub.tracking.measure import FOOT, HEAD, POINT, Expected, doubt, expect, measured
 from hub.tracking.targets import State, Targets
 from protocols.clocks import NANOSECONDS
 from protocols.geometry.types import Bools, Floats, Ints
@@ -22,6 +22,8 @@ _WINDOW_NS = 250_000_000
 """Features so much older than a frame do not found a target with it."""
 _CROWD = 0.08
 """Noise that is added to the points of silhouettes that touch [sizes]."""
+_LEAST_TRUST = 0.1
+"""Share of its weight that a detection keeps which is as well another target's."""
 _MOST_FOUNDED = 4
 _MOST_TENTATIVE = 64
 _FASTEST, _SLOWEST = 0.35, 0.04
@@ -34,7 +36,7 @@ _SAME = 0.3
 """Shares of the size: a hypothesis so near a target is that target; two targets half as near are one."""
 _BODY, _BESIDE_S = 0.18, 1.0
 """Share of the height that bodies which touch are apart at the least; how long two may seem nearer [s]."""
-_FLOOR_REACH, _FLOOR_SURE, _FLOOR_MEMORY = 0.35, 200.0, 5000.0
+_FLOOR_REACH, _FLOOR_SURE, _FLOOR_MEMORY = 0.25, 200.0, 5000.0
 _GROWTH = 1e-4
 _AT_ONCE_NS = 500_000_000
 _RESTLESS = np.array([body.restlessness for body in BODIES])
@@ -108,10 +110,13 @@ def _matched(
             total[:, column] = np.inf
             some, those = assign(total)
             row, column = np.concatenate([row, some]), np.concatenate([column, those])
+        known = np.where(targets.confirmed[:, None], found.total, np.inf)
+        known[row, column] = found.total[row, column]
+        doubtful = ambiguity(known, row, column)
         left = np.ones(len(frame), dtype=np.bool_)
         left[column] = False
         free = np.flatnonzero(left)
-        targets = _updated(targets, frame, value, noise, expected, found.distance, row, column, camera)
+        targets = _updated(targets, frame, value, noise, expected, found.distance, row, column, doubtful, camera)
     hit = np.zeros(len(targets), dtype=np.bool_)
     hit[row] = True
     return _counted(targets, hit, seen & ~hidden), free
@@ -126,16 +131,21 @@ def _updated(
     distance: Floats,
     row: Ints,
     column: Ints,
+    doubtful: Floats,
     camera: int,
 ) -> Targets:
     if not len(row):
         return targets
     order = np.argsort(row, kind="stable")
-    row, column = row[order], column[order]
+    row, column, doubtful = row[order], column[order], doubtful[order]
     some = Expected(expected.value[row], expected.slope[row], expected.body_noise[row], expected.depth[row])
     used = rows_used(value[column], some, distance[row, column], targets.covariance[row])
     off = np.where(used, value[column] - some.value, 0.0)
     total = np.where(np.isfinite(noise[column]), noise[column], 0.0) + some.body_noise
+    for part, rows in ((1, HEAD), (2, FOOT)):
+        total[:, rows, rows] *= doubt(distance[row, column, part])[:, None, None]
+    # What may be another's moves nobody: where two cross, cameras that tell them apart lead.
+    total /= np.maximum(1.0 - 2.0 * doubtful, _LEAST_TRUST)[:, None, None] ** 2
     mean, covariance = kalman.update(targets.mean[row], targets.covariance[row], off, some.slope, total, used)
     means, covariances = targets.mean.copy(), targets.covariance.copy()
     means[row], covariances[row] = mean, covariance
@@ -270,12 +280,24 @@ def _sorted_out(state: State, world: World) -> State:
     drop = ~known & (weak | (unseen > _TENTATIVE_S))
     drop |= known & (unseen > world.coast_s)
     drop |= known & (unseen > _UNSEEN_S) & ((targets.support < _CONFIRMED_SUPPORT) | (spread > broad))
+    drop |= _off_floor(state, world)
     drop |= _doubled(targets, size) | (targets.beside_s > _BESIDE_S)
     drop |= ~np.isfinite(targets.mean).all(axis=1)
     if not drop.any():
         return state
     state = remember(state, known & drop & np.isfinite(targets.mean).all(axis=1), world.remember_s, world.most_gone)
     return replace(state, targets=state.targets.kept(~drop))
+
+
+def _off_floor(state: State, world: World) -> Bools:
+    """Which upright targets stand where no floor is, and no third camera says so: two see one person each."""
+    targets, now = state.targets, state.time_ns
+    if world.up is None or now is None or state.floor_weight < _FLOOR_SURE:
+        return np.zeros(len(targets), dtype=np.bool_)
+    size = np.exp(targets.mean[:, LOG_SIZE])
+    foot = targets.mean[:, POSITION] @ world.up - 0.5 * size
+    few = (targets.seen_by > now - _AT_ONCE_NS).sum(axis=1) < 3
+    return np.asarray(_UPRIGHT[targets.kind] & few & ~(np.abs(foot - state.floor) < _FLOOR_REACH * size))
 
 
 def _beside(targets: Targets, elapsed: float, world: World) -> Targets:

@@ -79,6 +79,8 @@ def test_a_log_through_the_hub_follows_everybody_with_equal_bytes(log: Path, kno
     assert comparison.on_floor.mota > 0.85, "0.4 s of eight pass before anybody is confirmed"
     assert comparison.on_floor.switches == 0
     assert comparison.on_floor.error < 0.10
+    assert comparison.on_floor.truths - comparison.begun.truths == 50 * comparison.people, "5 s, ten times a second"
+    assert comparison.begun.mota > comparison.on_floor.mota
     assert len(rows) > 100
     heads = [m.message for m in LogReader(tmp_path / "one.mcap").messages([PREDICTION])]
     assert any(target.face for message in heads for camera in message.cameras for target in camera.targets)  # type: ignore[attr-defined]

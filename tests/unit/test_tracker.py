@@ -111,7 +111,9 @@ def test_people_are_found_and_nobody_else(traffic: Traffic) -> None:
     tracker = follow(tracker_of(cameras_of(traffic.scene, "cam0")), list(traffic.messages()))
     assert people_found(traffic, tracker).max() < 0.3
     heights = np.exp(tracker.targets.mean[tracker.targets.confirmed, 6])
-    assert np.abs(np.sort(heights) - np.sort(traffic.scene.heights)).max() < 0.08
+    # Who walks is some 4 cm less tall than who stands.
+    walking = traffic.scene.heads(np.linspace(0.0, 7.0, 70))[:, :, 2].mean(axis=0)
+    assert np.abs(np.sort(heights) - np.sort(walking)).max() < 0.06
 
 
 def test_one_camera_alone_founds_nobody(traffic: Traffic) -> None:
