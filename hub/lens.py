@@ -18,7 +18,7 @@ from hub.poses.initialise import Camera
 from hub.poses.problem import LensPrior, Rows
 from hub.prepare import Prepared
 from hub.timing import two_view
-from hub.timing.alignment import PairFit
+from hub.timing.alignment import PairFit, PairSettings
 from hub.timing.pair import PairSolution, solve_pair
 from hub.timing.tracks import SmoothTrack, smooth_only, smooth_track
 from protocols.geometry.camera import Intrinsics
@@ -181,7 +181,7 @@ def _with_pose(pair: PairSolution, prepared: Prepared, guessed: Mapping[str, Cam
     if any(name in prepared.lensless and name not in guessed for name in (pair.a, pair.b)):
         return pair
     a, b = (smooth_only(camera.tracks) for camera in both)
-    answer = solve_pair(a, b, (pair.a, pair.b), calibrated=True, near=pair.fit.lag)
+    answer = solve_pair(a, b, (pair.a, pair.b), PairSettings(firm=False), calibrated=True, near=pair.fit.lag)
     if answer.solved:
         return answer
     # A focal length a few percent off leaves too much for a calibrated pair: the adjustment decides.

@@ -35,6 +35,7 @@ FAR_FROM_ONE = 0.01
 _FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
 _SAME_RATIO = 0.01
 _FEW = 8  # cameras whose pairs are all looked at closely
+_SEVERAL = 3  # cameras that tell of each other
 _MUCH = 8.0  # s of common motion
 _WIDEST_CLAIM = 0.5  # s on either side: a claim as vague as that chooses nothing
 
@@ -177,6 +178,8 @@ def _solve(
     if known is not None and all(name in known.cameras for name in names):
         given = relative_pose(known.cameras[names[0]].pose, known.cameras[names[1]].pose)
     calibrated = all(name in prepared.cameras for name in names)
+    # With more cameras the adjustment frees lenses itself and judges each clock: a vague lag is a start.
+    settings = replace(settings or PairSettings(), firm=len(prepared.names) < _SEVERAL)
     return solve_pair(
         smooth_only(a),
         smooth_only(b),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -37,7 +38,7 @@ class PairSettings:
     few: int = 160
     """Point pairs in the choice among the starts of a candidate."""
     samples: int = 500
-    """Point pairs in the refinement of a candidate."""
+    """Point pairs in the refinement of a candidate, and in the look at how firm the answer's lag is."""
     all_samples: int = 6000
     """Point pairs in the last refinement of the alignment that is answered."""
     largest_sigma_px: float = 6.0
@@ -70,8 +71,9 @@ class PairSettings:
     """Seconds of agreeing motion from which an alignment at the noise is believed that stands alone: …"""
     alone_strength: float = 3.0
     """… its strength (`verdict.strength`), and …"""
-    alone_ratio: float = 0.4
-    """… the next best one's over it."""
+    alone_margin: float = 2.3
+    """… by how much it exceeds the next best one's: half the logarithm of the odds, 100 to 1. (That one must not come
+    near it in evidence either: a motion that repeats itself makes two that are strong alike.)"""
     distinct_alignments: float = 0.3
     """Seconds between lags whose misfits are independent."""
     flat_ratio: float = 3.0
@@ -95,6 +97,16 @@ class PairSettings:
     """Least certainty [s] of the lag, …"""
     largest_slow_lag_std: float = 7e-3
     """… up to this where the point moves by less than a pixel in that time, and …"""
+    firm: bool = True
+    """Whether the answer must stand by itself, and not only begin an adjustment of more cameras, which judges it: …"""
+    largest_doubt: float = 20e-3 / 2.576
+    """… largest std [s] of the lag, lenses and shutters included: 20 ms, a wrong answer, come to one in a hundred; …"""
+    largest_brief_doubt: float = 20e-3 / 3.0
+    """… the same of less than ``brief`` in common, in which errors have longer tails than a Gaussian's; …"""
+    brief: float = 30.0
+    """… [s]; …"""
+    largest_swing: float = 20e-3
+    """… seconds by which it may move when a fifth of what it rests on is left out."""
     largest_turn_std: float = 0.1
     """… of the relative rotation [rad] that is worth an answer; …"""
     sure_turn_std: float = 0.25
@@ -115,7 +127,8 @@ class PairFit:
     smoothed samples that agree. own_px: noise of the noisier camera's tracks. log10_chance: of one unrelated
     stretch of such length fitting as well, None where the recordings are too short to tell. log10_gap: of the
     next best lag leaving so much more by chance. cycles: bandwidth times seconds of agreeing motion. lag_std [s],
-    turn_std [rad]: of the last refinement, by noise alone.
+    turn_std [rad]: of the last refinement, by noise alone. lag_doubt [s]: std of the lag with lenses and shutters not
+    exactly as told.
     """
 
     rate: float
@@ -137,6 +150,7 @@ class PairFit:
     cycles: float = 0.0
     lag_std: float = float("nan")
     turn_std: float = float("nan")
+    lag_doubt: float = float("nan")
 
     @property
     def pose(self) -> RelativePose:
@@ -203,6 +217,15 @@ class Samples:
         self.label, self.time, self.points = self.label[near], self.time[near], self.points[near]
         self._count()
 
+    def thinned(self, most: int) -> Samples:
+        """At most so many of these samples, spread over their rows."""
+        out = copy(self)
+        rows = np.unique(np.linspace(0, self.count - 1, min(most, self.count)).round().astype(np.int64))
+        out.label, out.time, out.points = self.label[rows], self.time[rows], self.points[rows]
+        out.seconds_a_sample = self.seconds_a_sample * self.count / max(len(rows), 1)
+        out._count()
+        return out
+
     def _count(self) -> None:
         self.count = len(self.time)
         self.centre = float(np.median(self.time)) if self.count else 0.0
@@ -236,20 +259,12 @@ class Samples:
         return PointPairs(self.points[there], b[there], speed[there], lever[there])
 
     def together(self, found: Refined) -> float:
-        """How many residuals in a row count as one: 1 + 2 sum of their correlations, as far as these stand out."""
+        """How many residuals in a row count as one."""
         rate = 1.0 / found.slowness
         a, b = self.at(rate, self.centre - rate * found.middle)
         there = np.isfinite(b[:, 0])
         off = two_view.sampson(found.geometry.matrix, a[there], b[there], 1.0 / self.a[0].focal, 1.0 / self.b[0].focal)
-        limit = _GROSS * float(np.median(np.abs(off))) / 0.6745
-        off = np.clip(off, -limit, limit)
-        variance, total = float(np.mean(off**2)), 1.0
-        for lag in range(1, len(off) // 4 if variance > 0.0 else 0):
-            correlation = float(np.mean(off[lag:] * off[:-lag])) / variance
-            if correlation < _TOLD / np.sqrt(len(off)):
-                break
-            total += 2.0 * correlation
-        return total
+        return 2.0 * float(correlated(off).sum()) - 1.0
 
     def judge(self, cost: float, rate: float, offset: float, geometry: Geometry) -> PairFit:
         """Absolute figures of an alignment, over the samples where both move."""
@@ -296,6 +311,20 @@ class Samples:
             misfit=float((smoothed[close] ** 2).mean()) if close.any() else np.inf,
             flat_px=_flat_px(a[moving][close] * focal_a, b[moving][close] * focal_b),
         )
+
+
+def correlated(off: Floats) -> Floats:
+    """Correlations (k,) of residuals (n,) so many rows apart, 0 first, as far as they stand out."""
+    limit = _GROSS * float(np.median(np.abs(off))) / 0.6745
+    off = np.clip(off, -limit, limit)
+    variance = max(float(np.mean(off**2)), 1e-300)
+    out = [1.0]
+    for lag in range(1, len(off) // 4):
+        correlation = float(np.mean(off[lag:] * off[:-lag])) / variance
+        if correlation < _TOLD / np.sqrt(len(off)):
+            break
+        out.append(correlation)
+    return np.array(out)
 
 
 def _interval(time: Floats) -> float:

@@ -14,8 +14,9 @@ import numpy as np
 
 from hub.timing import two_view
 from hub.timing.alignment import PairFit, PairSettings, PairSolution, Samples, evidence, grid_step
+from hub.timing.finish import NEAR_PX, finish
 from hub.timing.pieces import scan_pieces
-from hub.timing.refine import WIDE, Noise, Refined, refine
+from hub.timing.refine import Noise, Refined, refine
 from hub.timing.scan import PairMoments, Scan, busiest, candidates, grid_tracks, scan_lags
 from hub.timing.significance import OWN_LAGS, Chance, bandwidth, chance
 from hub.timing.tracks import SmoothTrack
@@ -24,8 +25,6 @@ from hub.timing.verdict import at_noise, distinct, doubts, hopeless, judge, need
 from protocols.geometry.types import Floats
 
 _LEAST_SAMPLES = 12
-_RATE_TOLD = 5.0  # std, residuals that are alike counted as one
-_USUAL_RATE = 2e-4  # std of a clock's rate, where the motion does not tell it
 _AT_NOISE = 0.8  # mean robust cost of an alignment whose rows are as noisy as the settings say: about 0.75
 _NEAR_CANDIDATES = 3
 _NO_FIT = "no alignment of the two tracks agrees with any geometry"
@@ -36,7 +35,6 @@ _PROMISING = 12.0  # … for what comes this near the noise: a wrong minimum of 
 _MOST_DRIFTS = 8  # of either sign
 _MOST_PIECES = 45.0  # s of a that the scan in pieces looks at
 _PIECES_STEP = 0.033  # s: the scan in pieces is rough, and dear
-_NEAR_PX = 10.0  # what may belong to the geometry of the scan in pieces
 _MOSTLY_ONE = 0.85  # of a track's rows: with fewer on one path there may be another
 _OTHER_LAGS = 0.5  # s from the best: what is no part of it
 _LEAST_OTHER_LAGS = 3.0  # s
@@ -180,7 +178,7 @@ class _Search:
                 ordered = distinct(fits + again, s)
                 answer = judge(names, ordered, self._searched(scan, ordered[0].lag), s)
         if answer.solved and answer.fit is not None:
-            answer = self._finish(answer, answer.fit, b)
+            answer = finish(answer, answer.fit, self.a, b, s, fixed=self.known is not None)
         if rate != 1.0 and answer.fit is not None:
             answer = replace(answer, fit=replace(answer.fit, rate=answer.fit.rate * rate))
         return answer
@@ -230,7 +228,7 @@ class _Search:
             )
         if reason:
             return PairSolution(*names, reason, fit)
-        return self._finish(PairSolution(*names, "ok", fit), fit, self.b, pieces=True)
+        return finish(PairSolution(*names, "ok", fit), fit, self.a, self.b, s, pieces=True)
 
     def _repeats(self, b: Sequence[SmoothTrack], moments: PairMoments, scan: Scan, best: PairFit) -> Iterator[PairFit]:
         """Alignments at other lags that begin with the best one's own geometry.
@@ -278,7 +276,7 @@ class _Search:
         s, a = self.s, self.a
         few = Samples(a, b, offset, s, s.samples if pieces else s.few)
         if pieces and isinstance(start, np.ndarray):
-            few.keep_near(start, 1.0, offset, _NEAR_PX)
+            few.keep_near(start, 1.0, offset, NEAR_PX)
         if few.count < _LEAST_SAMPLES:
             return None
         scale = float(np.sqrt(max(cost, 1.0)))
@@ -312,7 +310,7 @@ class _Search:
         offset = few.centre - rate * best.middle
         samples = Samples(a, b, offset, s, s.samples)
         if pieces:
-            samples.keep_near(best.geometry.matrix, rate, offset, _NEAR_PX)
+            samples.keep_near(best.geometry.matrix, rate, offset, NEAR_PX)
         if samples.count < _LEAST_SAMPLES:
             return None
         if samples.count > few.count:
@@ -357,68 +355,6 @@ class _Search:
         for seed in range(_SEEDS):
             for geometry in two_view.five_point(here_a, here_b, threshold, seed):
                 yield geometry, floor
-
-    def _finish(
-        self, answer: PairSolution, fit: PairFit, b: Sequence[SmoothTrack], *, pieces: bool = False
-    ) -> PairSolution:
-        """The answer with all samples, the tracks' own noise and hardly any robustness left, and its stds."""
-        s, a = self.s, self.a
-        samples = Samples(a, b, fit.offset, s, s.all_samples)
-        if pieces:
-            samples.keep_near(fit.geometry.matrix, fit.rate, fit.offset, _NEAR_PX)
-        own = [max(float(np.median([t.sigma for t in one])), 0.1 / one[0].focal) for one in (a, b)]
-        misfit = max(1.0, fit.sigma_px / (0.5 * (own[0] * a[0].focal + own[1] * b[0].focal)))
-        noise = Noise(own[0] * misfit, own[1] * misfit, s.rate_std)
-        slowness = 1.0 / fit.rate
-        found = refine(
-            samples,
-            fit.geometry,
-            slowness * (samples.centre - fit.offset),
-            1.0,
-            noise,
-            slowness=slowness,
-            fixed_geometry=self.known is not None,
-            narrowest=WIDE,
-        )
-        if found is None:
-            return answer
-        covariance = np.linalg.pinv(found.normal, hermitian=True)
-        together = samples.together(found)
-        if abs(found.slowness - 1.0) < _RATE_TOLD * np.sqrt(together * covariance[-1, -1]):
-            # The motion does not tell the rate: then it is what clocks usually have.
-            wide = np.sqrt(together)
-            usual = refine(
-                samples,
-                found.geometry,
-                found.middle,
-                1.0,
-                Noise(noise.sigma_a * wide, noise.sigma_b * wide, _USUAL_RATE),
-                fixed_geometry=self.known is not None,
-                narrowest=WIDE,
-            )
-            if usual is not None:
-                found, covariance = usual, np.linalg.pinv(usual.normal, hermitian=True) / together
-        rate = 1.0 / found.slowness
-        last = samples.judge(found.cost, rate, samples.centre - rate * found.middle, found.geometry)
-        last = replace(
-            last,
-            log10_chance=fit.log10_chance,
-            lag_std=float(np.sqrt(max(covariance[-2, -2], 0.0))),
-            turn_std=float(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0)))
-            if isinstance(found.geometry, RelativePose) and self.known is None
-            else 0.0,
-        )
-        speed = float(np.nanmedian(np.linalg.norm(samples.of_b((samples.time - last.offset) / rate)[1], axis=1)))
-        a_pixel = 1.0 / max(speed * self.b[0].focal, 1e-9)
-        if last.lag_std > min(max(s.largest_lag_std, a_pixel), s.largest_slow_lag_std):
-            return replace(
-                answer, status=f"the motion tells the lag only to {1e3 * last.lag_std:.0f} ms (std)", fit=last
-            )
-        sure = fit.log10_chance is not None and fit.log10_chance < s.sure_log10_chance
-        if last.turn_std > (s.sure_turn_std if sure else s.largest_turn_std):
-            reason = f"the motion tells the relative rotation only to {np.rad2deg(last.turn_std):.1f}° (std)"
-            return replace(answer, status=reason, fit=last)
-        return replace(answer, fit=last)
 
 
 class _Chances:

@@ -106,7 +106,8 @@ def stands_alone(best: PairFit, others: list[PairFit], s: PairSettings) -> bool:
         return False  # without lenses two numbers more fit more of anything
     own = strength(best)
     next_best = max((strength(fit) for fit in others if fit.front > _NEARLY_ALL), default=0.0)
-    return own >= s.alone_strength and next_best <= s.alone_ratio * own
+    apart = own - next_best >= s.alone_margin and next_best <= s.accept_ratio * own
+    return own >= s.alone_strength and apart
 
 
 def strength(fit: PairFit) -> float:
@@ -135,7 +136,7 @@ def distinct(fits: list[PairFit], s: PairSettings) -> list[PairFit]:
     ordered = sorted(fits, key=merit, reverse=True)
     out: list[PairFit] = []
     for fit in ordered:
-        if all(abs(fit.offset - other.offset) > 0.1 for other in out):
+        if all(abs(fit.lag - other.lag) > 0.1 for other in out):
             out.append(fit)
     return out
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hub.prepare import prepare
-from hub.timing import pair
+from hub.timing import finish, pair
 from hub.timing.alignment import PairFit, PairSettings, Samples
 from hub.timing.refine import WIDE, Noise, refine
 from hub.timing.tracks import SmoothTrack
@@ -43,6 +43,7 @@ JUNK = replace(SLOW, offset=-30.0, support=11.0, moving_overlap=12.0, misfit=6.0
 def test_what_leaves_no_more_than_the_noise_and_stands_alone_is_believed() -> None:
     assert judge(NAMES, [SLOW], 200.0, PairSettings()).solved
     assert judge(NAMES, [SLOW, SHORT, replace(JUNK, rate=1.0)], 200.0, PairSettings()).solved
+    assert judge(NAMES, [SLOW, replace(SHORT, cycles=0.62)], 200.0, PairSettings()).solved  # 1 in 100 as likely
 
 
 @pytest.mark.parametrize(
@@ -51,6 +52,8 @@ def test_what_leaves_no_more_than_the_noise_and_stands_alone_is_believed() -> No
         [SLOW, replace(SHORT, support=5.0, moving_overlap=5.0, cycles=0.8)],  # another one fits as well for long
         [replace(SLOW, support=4.5, cycles=1.0)],  # hardly any motion
         [replace(SLOW, cycles=0.7)],  # hardly any cycle of it
+        [replace(SLOW, cycles=0.9), replace(SHORT, cycles=0.4)],  # a little stronger than the next, of little
+        [replace(SLOW, cycles=8.0), replace(SHORT, cycles=4.5)],  # or of much that repeats itself
         [replace(SLOW, misfit=1.0)],  # more than the noise
         [replace(SLOW, sigma_px=0.6)],
         [replace(SLOW, geometry=Uncalibrated(np.eye(3), np.eye(3), 0.7))],  # without lenses more of anything fits
@@ -79,9 +82,9 @@ def test_a_rate_that_the_motion_does_not_tell_is_a_clocks(monkeypatch: pytest.Mo
     free: list[float] = []
     for seed in (11, 12, 13, 14):
         _, a, b = _tracks(seed, 10.0, 1.0, 0.3)
-        for usual, found in ((pair._USUAL_RATE, held), (1.0, free)):
+        for usual, found in ((finish._USUAL_RATE, held), (1.0, free)):
             with monkeypatch.context() as patch:
-                patch.setattr(pair, "_USUAL_RATE", usual)
+                patch.setattr(finish, "_USUAL_RATE", usual)
                 fit = pair.solve_pair({"": a}, {"": b}, NAMES).fit
             assert fit is not None
             found.append(1e6 * abs(fit.rate - 1.0))

@@ -130,7 +130,8 @@ def test_every_kind_of_refusal_stands_in_the_code_and_in_the_faq() -> None:
 
 def test_no_verdict_of_a_pair_is_left_out() -> None:
     """Every sentence with which a pair is refused is one of the kinds above."""
-    text = "".join((ROOT / "timing" / name).read_text(encoding="utf-8") for name in ("pair.py", "verdict.py"))
+    files = [ROOT / "timing" / name for name in ("pair.py", "finish.py", "verdict.py")]
+    text = "".join(path.read_text(encoding="utf-8") for path in files)
     reasons = re.findall(r'(?:PairSolution\(\*names, |reason = \(?\s*|status=|return )f?"([a-z][^"]{20,})"', text)
     assert len(reasons) > 12
     for reason in reasons:
