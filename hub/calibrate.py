@@ -42,7 +42,6 @@ _LEAST_ROWS = 30
 _LARGEST_TURN_STD = 0.035  # rad
 _LARGEST_CLOCK_STD = 5e-3  # s
 _LENS_ROUNDS = 3
-_LEAST_ALIKE = 2.0  # rows that count as one, from which what is known beforehand is weighed against them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -363,7 +362,7 @@ def _adjust_all(scaffold: Scaffold, tell: Progress) -> Scaffold:
     freed = replace(problem, freedom=replace(problem.freedom, lens=True))
     freed_problem, freed_state, _ = adjust(freed, state, rounds=2, progress=lambda text: tell(text, 0.85))
     if _prefers(freed_problem, freed_state, problem, state):
-        problem, state = _weighed(freed_problem, freed_state)
+        problem, state = freed_problem, freed_state
     if problem.freedom.clock and readout.worth_freeing(problem, state, motion_prior(problem, state)):
         tell("adjusting the readouts", 0.9)
         read_problem, read_state, _ = adjust(readout.freed(problem), state, rounds=2)
@@ -375,21 +374,6 @@ def _adjust_all(scaffold: Scaffold, tell: Progress) -> Scaffold:
 def replace_solution(scaffold: Scaffold, problem: Problem, state: State) -> Scaffold:
     """The scaffold with another problem and state."""
     return Scaffold(scaffold.names, scaffold.labels, problem, state)
-
-
-def _weighed(problem: Problem, state: State) -> tuple[Problem, State]:
-    """Adjusted again with what is known of lenses and clocks beforehand weighed against rows that err alike.
-
-    The adjustment counts every row for one. Where many tell as little as one, the priors are to count that much more
-    against them: as they do in the covariance.
-    """
-    alike = float(np.median([together(problem, state, camera) for camera in range(len(state.cameras))]))
-    if alike < _LEAST_ALIKE:
-        return problem, state
-    free, less = problem.freedom, 1.0 / np.sqrt(alike)
-    strict = replace(free, focal_std=free.focal_std * less, k1_std=free.k1_std * less, rate_std=free.rate_std * less)
-    weighed, state, _ = adjust(replace(problem, freedom=strict), state, rounds=1)
-    return replace(weighed, freedom=free), state
 
 
 def _prefers(freed: Problem, freed_state: State, fixed: Problem, fixed_state: State, each: int = 2) -> bool:
