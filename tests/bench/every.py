@@ -43,6 +43,7 @@ BENCHES = {
         ("--sessions", "4", "--seconds", "120", "--only", "five,twenty"),
         data=True,
     ),
+    "drone_pairs": Bench("two cameras that share 20 s of a drone, simulated", ("--sessions", "20")),
     "real_life": Bench("sessions as people bring them, one trouble a row", ("--sessions", "1")),
     "video_folder": Bench(
         "a folder of videos, with and without measured lenses",
