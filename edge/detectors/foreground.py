@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from edge.detectors.album import Album, usual
 from edge.detectors.shadows import Shadows
 from protocols.geometry.types import Bools, Floats
 
@@ -27,11 +28,11 @@ ModelName = Literal["mog2", "knn"]
 _TEACH_S = 0.4  # the model learns this often
 _MEMORY_S = 30.0  # and forgets over that time
 _BEGIN_S = 1.0  # in which a new model learns fast, and after which it begins again from what was there most of the time
-_REVIEWS_S = (_BEGIN_S, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)  # when that is done, each time better
+_REVIEWS_S = (_BEGIN_S, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0, 24.0)  # when that is done, each time better
 _PAUSE_S = 2.0  # a longer time between two pictures is a pause, and tells nothing of their rate
 _RENEWAL = 0.05  # share of the latest step in the period
-_REVIEWED = 32  # pictures that a review looks at
-_CLOSEST = 0.34  # of the pictures that show a place's background, at least
+_LESSONS = 8  # pictures of a review that the model is taught
+_TAUGHT, _RATES = 0.8, (0.03, 0.2)  # as how much all pictures count together; limits of one
 _PASSING = 40  # 8-bit steps
 _JOLT = 0.4  # of the picture being foreground at once: the camera was pushed, or the light went on
 _SUBSAMPLE = 8
@@ -93,9 +94,8 @@ class Foreground:
         self._ghostly: Image | None = None  # 255 where a ghost stands
         self._background: Image | None = None
         self._slow: npt.NDArray[np.float32] | None = None  # the background, in parts of a step
-        self._album: list[Image] = []
+        self._album = Album()
         self._reviews = list(_REVIEWS_S)
-        self._stride = 1
         self._lately: deque[tuple[float, Image]] = deque()  # the pictures of the last moment, and when they were
         self._flushed_at = 0.0
 
@@ -107,17 +107,20 @@ class Foreground:
     def prime(self, pictures: Sequence[Image]) -> None:
         """Learn from pictures spread over a longer time, so that what was here and there for a moment is not in it."""
         self._begin()
-        if not pictures:
-            return
-        middle = usual(pictures)
+        if pictures:
+            self._learn(pictures, usual(pictures))
+            self._seen, self._age = 10**6, math.inf
+            self._reviews = []
+
+    def _learn(self, pictures: Sequence[Image], middle: Image) -> None:
+        """Teach a new model with pictures of which ``middle`` is the background."""
         self._model.apply(middle, learningRate=1.0)
+        rate = float(np.clip(_TAUGHT / len(pictures), *_RATES))
         for picture in pictures:
             # Whatever differs much from what is usual is passing.
             alike = cv2.inRange(cv2.absdiff(picture, middle), (0, 0, 0), (_PASSING,) * 3)
-            self._model.apply(cv2.copyTo(picture, alike, middle.copy()), learningRate=0.03)
+            self._model.apply(cv2.copyTo(picture, alike, middle.copy()), learningRate=rate)
         self._set_background(middle)
-        self._seen, self._age = 10**6, math.inf
-        self._reviews = []
 
     def _set_background(self, picture: Image) -> None:
         self._background = picture
@@ -125,19 +128,17 @@ class Foreground:
 
     def _review(self, even: Image) -> None:
         """A young model's picture has everybody in it who was there at first: keep some pictures, and start over."""
-        if self._seen % self._stride == 0:
-            self._album.append(even.copy())
-        if len(self._album) > _REVIEWED:
-            # Evenly over all the time since the beginning.
-            self._album, self._stride = self._album[::2], 2 * self._stride
+        self._album.add(even, self._period)
         if self._age < self._reviews[0]:
             return
-        album, stride, left, seen, age = self._album, self._stride, self._reviews[1:], self._seen, self._age
-        lately, flushed_at = self._lately, self._flushed_at
-        self.prime(album)
-        self._seen, self._age, self._reviews, self._stride = seen, age, left, stride
+        album, left, seen, age = self._album, self._reviews[1:], self._seen, self._age
+        lately, flushed_at, shadows = self._lately, self._flushed_at, self._shadows
+        self._begin()
+        self._shadows = shadows
+        self._learn(album.pictures[:: max(len(album) // _LESSONS, 1)], album.background())
+        self._seen, self._age, self._reviews = seen, age, left
         self._lately, self._flushed_at = lately, flushed_at
-        self._album = album if left else []
+        self._album = album if left else Album()
 
     def look(self, image: Image, protected: Sequence[Box] = (), time_s: float | None = None) -> Layers:
         """Split a picture (H, W, 3) BGR. protected: x, y, w, h [px] of what must not be learnt.
@@ -205,7 +206,8 @@ class Foreground:
             return figure
         self._flushed_at = self._age
         calm = cv2.inRange(cv2.absdiff(even, self._lately[0][1]), (0, 0, 0), (_GHOST_STEP,) * 3)
-        left = cv2.bitwise_and(cv2.bitwise_and(places_left(even, self._background, figure), figure), calm)
+        places = cv2.bitwise_and(places_left(even, self._background, figure), figure)
+        left = np.asarray(cv2.bitwise_and(places, calm), dtype=np.uint8)
         if not cv2.countNonZero(left):
             return figure
         if self._ghosts is None or self._ghostly is None:
@@ -213,7 +215,7 @@ class Foreground:
         self._ghosts = np.asarray(cv2.copyTo(even, left, self._ghosts), dtype=np.uint8)
         self._ghostly = np.asarray(cv2.bitwise_or(self._ghostly, left), dtype=np.uint8)
         # The next review must not bring them back.
-        self._album = [np.asarray(cv2.copyTo(even, left, picture), dtype=np.uint8) for picture in self._album]
+        self._album.paint(even, left)
         return np.asarray(cv2.subtract(figure, left), dtype=np.uint8)
 
     def haunt(self, image: Image, box: Box) -> None:
@@ -289,45 +291,6 @@ def without_like(figure: Image, now: Image, then: Image, where: Image) -> Image:
     step = _GHOST_STEP - 1
     like = cv2.inRange(cv2.absdiff(now, then), (0, 0, 0), (step, step, step))
     return np.asarray(cv2.bitwise_and(figure, cv2.bitwise_not(cv2.bitwise_and(like, where))), dtype=np.uint8)
-
-
-def usual(pictures: Sequence[Image]) -> Image:
-    """What is behind it all in pictures (n of (H, W, 3)): of each value the middle of the closest third.
-
-    Unlike the median it holds where something passes for more than half of the time, as what passes differs.
-    """
-    count, shape = len(pictures), pictures[0].shape
-    share = max(round(_CLOSEST * count), 1)
-    values = [np.ascontiguousarray(picture).reshape(shape[0], -1) for picture in pictures]
-    for low, high in _comparisons(count):
-        one, other = values[low], values[high]
-        values[low], values[high] = np.asarray(cv2.min(one, other)), np.asarray(cv2.max(one, other))
-    found = values[share // 2].copy()
-    least = cv2.subtract(values[share - 1], values[0])
-    for start in range(1, count - share + 1):
-        width = cv2.subtract(values[start + share - 1], values[start])
-        cv2.copyTo(values[start + share // 2], cv2.compare(width, least, cv2.CMP_LT), found)
-        least = cv2.min(least, width)
-    return found.reshape(shape)
-
-
-def _comparisons(count: int) -> list[tuple[int, int]]:
-    """Pairs (low, high) of places that, put in order one after the other, sort so many values.
-
-    Batcher's odd-even merge sort: whole pictures are compared at once, which numpy's sort along them is slower than.
-    """
-    pairs = []
-    run = 1
-    while run < count:
-        gap = run
-        while gap >= 1:
-            for begin in range(gap % run, count - gap, 2 * gap):
-                for low in range(begin, begin + min(gap, count - begin - gap)):
-                    if low // (2 * run) == (low + gap) // (2 * run):
-                        pairs.append((low, low + gap))
-            gap //= 2
-        run *= 2
-    return pairs
 
 
 def _slow_field(usable: Bools, left: Floats, size: tuple[int, int]) -> npt.NDArray[np.float32]:
