@@ -17,10 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.detectors.base import Detection, Prediction
-from edge.detectors.bodies import Body, explain, lone_people
+from edge.detectors.bodies import explain
 from edge.detectors.following import Follower, Following
 from edge.detectors.foreground import Foreground, Layers, ModelName, is_ghost
 from edge.detectors.matching import match_predictions
+from edge.detectors.silhouettes import Body, LonePeople
 from edge.detectors.stature import Stature
 from protocols.geometry.types import Floats
 
@@ -42,6 +43,7 @@ _COMES_S, _COMES, _ALIKE = (0.2, 1.0), (0.12, 1.0), 0.15
 class _Found:
     body: Body
     follower: Follower
+    colour: Floats | None
 
 
 class PersonDetector:
@@ -172,14 +174,15 @@ class PersonDetector:
         followers = list(following.all)
         boxes = [one.expected(now) for one in followers]
         moving = [(box, one.name) for box, one in zip(boxes, followers, strict=True) if one.sure and one.moved]
-        lone = [(now, *one) for one in lone_people(figure)] if self._learns else []
+        alone = LonePeople(figure) if self._learns else None
+        lone = [(now, *one) for one in alone.find()] if alone else []
         for _, u, v, tall in lone:
             # What has not moved may be the place that somebody has left.
             who = [name for box, name in moving if _stands(box, u, v, tall)]
             if who or self._comes(now, u, v, tall):
                 self._stature.learn(u, v, tall, who[0] if who else "")
-        if self._learns and self._foreground.young:
-            guesses = lone_people(figure, strict=False)
+        if alone and self._foreground.young:
+            guesses = alone.find(strict=False)
             tallest = max((one[2] for one in guesses), default=0.0)
             for u, v, tall in guesses:
                 if tall > 0.5 * tallest:  # others may be pieces
@@ -207,7 +210,7 @@ class PersonDetector:
                 if owner.time < now:
                     trust = 0.9 if body.alone and not body.cut else 0.6 if body.seen > 0.6 else 0.35
                     owner.see(body.box, now, colour if body.seen > 0.6 else None, trust)
-                found.append(_Found(body, owner))
+                found.append(_Found(body, owner, colour))
             if not owner.moved and owner.hits % _ASKED == 0:
                 owner.ghost = is_ghost(image, layers.background, body.box, figure)
                 if owner.ghost and now - owner.born > _GHOST_AFTER_S:
@@ -234,7 +237,7 @@ class PersonDetector:
         v_std = math.hypot(_V_STD * size, _FLOOR_STD)
         if not body.alone:
             u_std, v_std = 1.5 * u_std, 1.4 * v_std
-        colour = follower.colour
+        colour = one.colour  # this picture's: who was taken for another must not wear his clothes from then on
         score = 0.95 if body.alone else 0.4 + 0.5 * min(body.fill, 1.0) * body.seen
         if not (follower.sure and follower.moved):
             score *= 0.5
@@ -286,13 +289,18 @@ def silhouette_features(figure: Image, box: tuple[float, float, float, float]) -
     peak = float(distance.max())
     rows, columns = np.nonzero(distance >= peak - 0.25)
     middle = left + float(columns.mean()), top + float(rows.mean())
-    rows_all, columns_all = np.nonzero(part)
-    rows_all = rows_all + top
-    upper = rows_all <= y + 0.1 * h
-    lower = rows_all >= y + 0.7 * h
-    head_u = left + float(columns_all[upper].mean()) if upper.any() else middle[0]
-    foot_u = left + float(columns_all[lower].mean()) if lower.any() else middle[0]
+    upper, lower = math.floor(y + 0.1 * h) + 1 - top, math.ceil(y + 0.7 * h) - top
+    head_u, foot_u = _middle(part[: max(upper, 0)]), _middle(part[max(lower, 0) :])
+    head_u = middle[0] if head_u is None else left + head_u
+    foot_u = middle[0] if foot_u is None else left + foot_u
     return Features(middle, (head_u, y - 0.5), (foot_u, y + h - 0.5))
+
+
+def _middle(part: Image) -> float | None:
+    """The mean column of a silhouette (h, w); None of none."""
+    counts = np.count_nonzero(part, axis=0)
+    total = int(counts.sum())
+    return float(counts @ np.arange(len(counts))) / total if total else None
 
 
 def _stands(box: tuple[float, float, float, float], u: float, v: float, tall: float) -> bool:

@@ -51,8 +51,11 @@ class Shadows:
         x, y, w, h = cv2.boundingRect(figure)
         if w < 4 or h < 4:
             return shadow
-        # Half the resolution does: what is asked is asked of a neighbourhood anyhow.
-        part = slice(y, y + h), slice(x, x + w)
+        # Half the resolution does: what is asked is asked of a neighbourhood anyhow. From even pixels on: that is fast.
+        bottom, right = min(y + h + (y + h) % 2, figure.shape[0]), min(x + w + (x + w) % 2, figure.shape[1])
+        x, y = x - x % 2, y - y % 2
+        w, h = right - x, bottom - y
+        part = slice(y, bottom), slice(x, right)
         half = (w + 1) // 2, (h + 1) // 2
         now = cv2.resize(image[part], half, interpolation=cv2.INTER_AREA)
         then = cv2.resize(background[part], half, interpolation=cv2.INTER_AREA)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -18,6 +19,11 @@ _STD = np.array([0.3, 0.3, 0.5, 0.06])
 _TILTS, _FOCALS, _RATIOS = np.linspace(-0.15, 1.2, 28), np.log([0.5, 0.65, 0.85, 1.1, 1.5]), np.linspace(-3.2, 0.2, 69)
 _SPREAD = 0.08  # of people's heights, and of how they are seen
 _TALLER = 0.3
+_STEP = 0.02
+_FINE = np.arange(_RATIOS[0] - 5.0 * _SPREAD, _RATIOS[-1] + 5.0 * _SPREAD, _STEP)
+_ERROR = (_FINE[:, None] - _RATIOS) / _SPREAD
+_AGREED = np.exp(-0.5 * np.square(np.where(_ERROR > 0, 1.5, 1.0) * _ERROR))
+"""How much a sighting that tells one of the ratios _FINE (k,) agrees with each of _RATIOS (n,): (k, n)."""
 _OWN = 2.0  # sightings of somebody after which half of what he differs by is his own height
 _NEAREST = 0.01  # sine of the least angle below the horizon at which somebody may stand
 _ASTRAY = 0.75, 1.33  # what is told may be off by so much; what was seen beyond is something else
@@ -86,14 +92,16 @@ class Stature:
     def at(self, u: Floats, v: Floats) -> Floats:
         """Heights [px] at foot points; call it only once it is ``known``."""
         assert self._view is not None
-        return np.clip(self._heights(self._view, np.asarray(u), np.asarray(v)), *self._range)
+        heights = self._heights(self._view, np.asarray(u), np.asarray(v))
+        return np.asarray(np.minimum(np.maximum(heights, self._range[0]), self._range[1]), dtype=np.float64)
 
     def _heights(self, view: Floats, u: Floats, v: Floats) -> Floats:
         """Of the foot's ray d, up (both in the camera's axes) and q = -up d: the head is at d + ratio q up."""
-        focal = np.exp(view[1]) * self.size[0]
+        tilt, log_focal, log_ratio, roll = view.tolist()  # few people are asked for at once
+        focal = math.exp(log_focal) * self.size[0]
         x, y = (u - 0.5 * self.size[0]) / focal, (v - 0.5 * self.size[1]) / focal
-        up = _up(view[0], view[3])
-        below = np.maximum(-(up[0] * x + up[1] * y + up[2]), _NEAREST) * np.exp(view[2])
+        up = _up(tilt, roll)
+        below = np.maximum(-(up[0] * x + up[1] * y + up[2]), _NEAREST) * math.exp(log_ratio)
         head = (y + below * up[1]) / np.maximum(1.0 + below * up[2], 0.1)
         return np.asarray(np.maximum(focal * (y - head), 1.0), dtype=np.float64)
 
@@ -141,6 +149,7 @@ class Stature:
         counts: (n,) as how many each counts.
         """
         best, found = -np.inf, _USUAL
+        rows = len(_FINE) * np.arange(len(_TILTS))[:, None]
         for log_focal in _FOCALS:
             focal = np.exp(log_focal) * self.size[0]
             y = (v - 0.5 * self.size[1]) / focal
@@ -150,8 +159,10 @@ class Stature:
             below = -(up[1][:, None] * y + up[2][:, None])
             ratio = (head - y) / np.where(below > _NEAREST, below * (up[1][:, None] - head * up[2][:, None]), np.inf)
             log_ratio = np.log(np.maximum(ratio, 1e-6))
-            error = (log_ratio[:, :, None] - _RATIOS) / _SPREAD
-            agreed = np.einsum("n,tnr->tr", counts, np.exp(-0.5 * np.square(np.where(error > 0, 1.5, 1.0) * error)))
+            # Counted by what they tell, as there may be a thousand.
+            at = np.rint((log_ratio - _FINE[0]) / _STEP).clip(0, len(_FINE) - 1).astype(np.intp)
+            told = np.bincount((at + rows).ravel(), np.broadcast_to(counts, at.shape).ravel(), rows.size * len(_FINE))
+            agreed = told.reshape(rows.size, -1) @ _AGREED
             unlikely = np.square((_TILTS - _USUAL[0]) / _STD[0])[:, None] + np.square((_RATIOS - _USUAL[2]) / _STD[2])
             score = agreed - 0.5 * (unlikely + ((log_focal - _USUAL[1]) / _STD[1]) ** 2)
             tilt, at = np.unravel_index(int(np.argmax(score)), score.shape)

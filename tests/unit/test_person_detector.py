@@ -13,11 +13,12 @@ import pytest
 from deploy.cli import run
 from edge import scenes
 from edge.detectors.base import Detection, Prediction
-from edge.detectors.bodies import explain, lone_people
+from edge.detectors.bodies import explain
 from edge.detectors.foreground import Foreground, is_ghost, places_left, usual, without_like
 from edge.detectors.matching import match_predictions
 from edge.detectors.person import PersonDetector, clean, silhouette_features
 from edge.detectors.shadows import Shadows
+from edge.detectors.silhouettes import LonePeople
 from edge.detectors.stature import Stature
 from edge.detectors.vehicle import VehicleDetector
 from tests.people_boxes import judge
@@ -364,7 +365,7 @@ def test_pieces_of_somebody_tell_no_height() -> None:
     put_person(figure, 100.0, 150.0, 90.0, (255, 255, 255))
     put_person(figure, 104.0, 176.0, 20.0, (255, 255, 255))
     put_person(figure, 220.0, 176.0, 80.0, (255, 255, 255))
-    found = lone_people(np.where(figure.any(axis=2), np.uint8(255), np.uint8(0)).astype(np.uint8))
+    found = LonePeople(np.where(figure.any(axis=2), np.uint8(255), np.uint8(0)).astype(np.uint8)).find()
     assert sorted(round(tall) for _, _, tall in found) == pytest.approx([80, 90], abs=2)
     stature = Stature(WIDTH, HEIGHT)
     for index in range(30):

@@ -1,0 +1,167 @@
+"""Sums that are kept, skipped or batched for speed are those that plain arithmetic gives."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from edge.detectors import crowd
+from edge.detectors.bodies import _smaller, explain
+from edge.detectors.person import silhouette_features
+from edge.detectors.silhouettes import LonePeople, _alone
+from edge.detectors.stature import Stature
+from edge.detectors.templates import BARS, Scene, Template
+from protocols.geometry.types import Floats
+
+WIDTH, HEIGHT = 320, 240
+
+
+def place() -> Stature:
+    stature = Stature(WIDTH, HEIGHT)
+    for index in range(60):
+        stature.learn(20.0 + 4 * index, 100.0 + index, 60.0)
+    return stature
+
+
+def scene_of(rng: np.random.Generator) -> Scene:
+    """A part of 90x110 px at the left border of the picture, of which a body stands before an empty wall."""
+    filled = np.zeros((110, 90), np.float32)
+    filled[20:95, 25:55] = rng.random((75, 30)) > 0.15
+    weight = (filled - 0.45 * (1.0 - filled)).astype(np.float32)
+    scene = Scene(weight, filled, (0, 60), (1.0, 1.0), place())
+    scene.dress(rng.integers(0, 255, (110, 90, 3), dtype=np.uint8), {0: np.array([120.0, 130.0, 140.0])})
+    return scene
+
+
+def plain_gain(scene: Scene, one: Template, free: Floats) -> float:
+    """By the definition: bars, less what goes on above and below; ``free``: weight that nobody covers."""
+
+    def held(half: float, high: float, low: float, base: float) -> float:
+        total = 0.0
+        for row in range(round(base + high * one.tall), round(base + low * one.tall)):
+            for column in range(round(one.u - half * one.tall), round(one.u + half * one.tall)):
+                inside = 0 <= row < free.shape[0] and 0 <= column < free.shape[1]
+                # Beyond the part is empty wall, beyond the picture nothing.
+                seen = 0 <= column + scene.origin[0] < WIDTH and 0 <= row + scene.origin[1] < HEIGHT
+                total += free[row, column] if inside else -0.45 if seen else 0.0
+        return total
+
+    bars = [held(*bar, one.top) for bar in BARS]
+    beyond = max(held(0.07, -0.1, -0.02, one.top), 0.0) + max(held(0.1, 0.02, 0.12, one.foot), 0.0)
+    return 2.5 * bars[0] + bars[1] + bars[2] - beyond
+
+
+def test_gains_are_those_of_the_definition_also_beyond_the_part_and_the_picture() -> None:
+    scene = scene_of(np.random.default_rng(0))
+    tried = [
+        Template(40.0, 96.0, 70.0),
+        Template(3.3, 99.2, 61.0),
+        Template(86.0, 60.7, 80.0),
+        Template(50.4, 178.0, 66.0),
+    ]
+    for one in tried:
+        places = scene.places(np.array([one.u]), np.array([one.foot]), np.array([one.tall]))
+        assert scene.gains(places)[0] == pytest.approx(
+            plain_gain(scene, one, scene.weight.astype(np.float64)), rel=1e-5, abs=1e-3
+        )
+
+
+def test_what_each_explains_alone_is_what_it_explains_when_it_is_taken_away() -> None:
+    scene = scene_of(np.random.default_rng(1))
+    placed = [Template(35.0, 95.0, 72.0, expected=0), Template(46.0, 97.0, 76.0), Template(30.0, 92.0, 60.0)]
+    for one in placed:
+        scene.cover(one)
+    own = scene.own_gains(placed)
+    for one, gain in zip(placed, own, strict=True):
+        scene.uncover(one)
+        places = scene.places(np.array([one.u]), np.array([one.foot]), np.array([one.tall]))
+        assert gain == pytest.approx(scene.gains(places, one.expected)[0], abs=1e-3)
+        scene.cover(one)
+    for one in placed:
+        scene.uncover(one)
+    np.testing.assert_array_equal(scene.unexplained(), np.maximum(scene.weight, 0.0))
+
+
+def test_the_best_new_one_is_the_best_of_all_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = scene_of(np.random.default_rng(2))
+    first = Template(30.0, 95.0, 72.0)
+    for covered in (False, True):
+        if covered:
+            scene.cover(first)
+        grid = crowd._Grid(scene)
+        found = grid.best_new()
+        with monkeypatch.context() as patch:
+            patch.setattr(crowd, "_LEAST", -np.inf)  # nothing is left out
+            best = grid.best_new()
+        assert found is not None
+        assert found == best
+
+
+def test_who_stood_still_is_sought_again_once_a_neighbour_has_moved() -> None:
+    scene = scene_of(np.random.default_rng(3))
+    one = Template(40.0, 95.0, 74.0)
+    for _ in range(20):
+        crowd._settle(scene, one)
+        if one.still is not None:
+            break
+    assert one.still is not None
+    rests = one.u, one.foot
+    crowd._settle(scene, one)
+    assert (one.u, one.foot) == rests
+    other = Template(one.u + 4.0, one.foot, one.tall)
+    scene.cover(other)
+    crowd._settle(scene, one)
+    assert (one.u, one.foot) != rests
+
+
+def test_only_what_is_near_silhouettes_is_made_smaller_and_that_alike() -> None:
+    rng = np.random.default_rng(4)
+    picture = np.zeros((480, 641), np.uint8)
+    picture[200:330, 170:260] = 255
+    size = round(641 * 19 / 32), 285
+    small = _smaller(picture, cv2.boundingRect(picture), 20, size)
+    assert small.shape == (285, size[0])
+    whole = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.int64)
+    assert np.abs(small - whole).mean() < 0.1
+    picture[200:330, 170:260] = np.where(rng.random((130, 90)) > 0.5, 255, 0)
+    even = np.ascontiguousarray(picture[:, :640])
+    exact = cv2.resize(even, (380, 285), interpolation=cv2.INTER_AREA)
+    np.testing.assert_allclose(_smaller(even, cv2.boundingRect(even), 20, (380, 285)), exact, atol=1)
+    assert not _smaller(np.zeros_like(even), (0, 0, 0, 0), 20, (380, 285)).any()
+
+
+def test_who_stands_in_a_frame_or_beside_specks_is_still_alone() -> None:
+    figure = np.zeros((HEIGHT, WIDTH), np.uint8)
+    for half, high, low in BARS:
+        figure[100 + round(60 * high) : 100 + round(60 * low), 160 - round(60 * half) : 160 + round(60 * half)] = 255
+    alone = LonePeople(figure).find()
+    assert alone == [(160.0, 160.0, 60.0)]
+    figure[90:91, 100:220] = figure[170:171, 100:220] = figure[90:171, 100] = figure[90:171, 219] = 255
+    figure[102, 153] = 255  # in his box, not of him
+    assert alone[0] in LonePeople(figure).find()
+    assert LonePeople(np.zeros_like(figure)).find() == []
+
+
+def test_another_silhouette_in_the_box_of_one_is_not_of_it() -> None:
+    part = np.zeros((9, 7), np.uint8)
+    part[:, 0] = part[8] = 255
+    corner = part.copy()
+    corner[:5, 4:] = 255
+    np.testing.assert_array_equal(_alone(corner), part > 0)
+
+
+def test_head_and_foot_are_the_middles_of_the_upper_and_lower_part() -> None:
+    figure = np.zeros((HEIGHT, WIDTH), np.uint8)
+    figure[100:112, 150:158] = 255
+    figure[112:160, 145:165] = 255
+    figure[140:160, 150:170] = 255
+    found = silhouette_features(figure, (145.0, 100.0, 25.0, 60.0))
+    rows, columns = np.nonzero(figure)
+    assert found.head == pytest.approx((columns[rows <= 106].mean(), 99.5))
+    assert found.foot == pytest.approx((columns[rows >= 142].mean(), 159.5))
+
+
+def test_nobody_in_an_empty_picture() -> None:
+    nothing = np.zeros((HEIGHT, WIDTH), np.uint8)
+    assert explain(nothing, nothing, place(), [(100.0, 50.0, 20.0, 60.0)], statures=[1.0]) == []
