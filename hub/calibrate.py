@@ -8,14 +8,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hub.clock_claims import Claim
-from hub.distributed import PlacedByNodes
 from hub.lens import LARGEST_STD, refocused, self_calibrated
 from hub.pairs import Progress, rate_warnings, solve_pairs, timing_told
-from hub.paper_poses import all_sized, place_by_paper
 from hub.poses import covariance as cov
 from hub.poses import readout
 from hub.poses.adjust import adjust, noise, residual_norms
@@ -36,6 +35,9 @@ from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, Known
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
+
+if TYPE_CHECKING:
+    from hub.distributed import PlacedByNodes
 
 _LEAST_AGREEMENT = 0.5  # share of a camera's rows that must fit the common path
 _LEAST_ROWS = 30
@@ -83,7 +85,11 @@ def calibrate(
     if known is not None:
         rig = with_known_lenses(rig, known)
     prepared = prepare(rig, observations)
-    by_sizes = solver == "paper" and known is None and all_sized(prepared, observations)
+    by_sizes = False
+    if solver == "paper" and known is None:
+        from hub.paper_poses import all_sized  # the other solvers are spared the nodes
+
+        by_sizes = all_sized(prepared, observations)
     if by_sizes and prepared.shared_clock:
         pairs = []  # nothing to find
     elif solver == "paper" and known is None:
@@ -101,6 +107,8 @@ def calibrate(
         elif solver == "paper":
             solution = solve_paper(prepared, pairs, tell, observations if by_sizes else None)
         elif solver == "distributed":
+            from hub.distributed import PlacedByNodes
+
             solution = solve_network(prepared, pairs, tell, PlacedByNodes(rig, prepared, observations, tell, seed))
         else:
             solution = solve_with_guesses(rig, prepared, pairs, tell)
@@ -286,6 +294,8 @@ def solve_paper(
     if sized is None:
         scaffold, unplaced = grow(prepared.cameras, graph, prepared.rows, prepared.labels, freedom=None)
     else:
+        from hub.paper_poses import place_by_paper
+
         scaffold, unplaced = place_by_paper(prepared, sized, graph)
     if prepared.shared_clock:
         freedom = replace(scaffold.problem.freedom, clock=False)

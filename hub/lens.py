@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from hub.poses.initialise import Camera
 from hub.poses.problem import LensPrior, Rows
@@ -105,6 +104,8 @@ def first_focals(
         values = np.linalg.svd(scaled, compute_uv=False)
         unequal = (values[:, 0] - values[:, 1]) / (values[:, 0] + values[:, 1])
         return np.concatenate([_robust(unequal / _EQUAL), (log_focal - mean) / std])
+
+    from scipy.optimize import least_squares  # a tenth of a second, which rigs of measured lenses are spared
 
     found = [least_squares(residual, mean + np.minimum(std, 1.0) * 2.0 * shift) for shift in _SCALES]
     best = min(found, key=lambda one: float(one.cost))

@@ -20,6 +20,7 @@ import numpy as np
 from hub.clock_claims import CAMERA_DELAY, Claim
 from hub.poses.graph import components
 from hub.prepare import Prepared
+from hub.timing.kept import Kept
 from hub.timing.pair import PairFit, PairSettings, PairSolution, evidence, solve_pair
 from hub.timing.promise import promise
 from hub.timing.shared import solve_shared_pair
@@ -59,15 +60,15 @@ def solve_pairs(
     many = len(names) > _FEW and not prepared.shared_clock
     pairs: dict[tuple[str, str], PairSolution] = {}
     plain: dict[tuple[str, str], PairSolution] = {}
-    told = _ToldClocks()
+    told, kept = _ToldClocks(), Kept()
     sort = len(todo) > 1 and not prepared.shared_clock
-    for done, (a, b) in enumerate(_most_promising_first(prepared, todo, tell) if sort else todo):
+    for done, (a, b) in enumerate(_most_promising_first(prepared, todo, tell, kept) if sort else todo):
         tell(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
         near = None if prepared.shared_clock else told.lag(prepared, a, b)
-        answer = _solve(prepared, (a, b), known, near=near)
+        answer = _solve(prepared, (a, b), known, near=near, kept=kept)
         # Where the others' clocks are right, a pair that sees much must agree; if not, it is heard for itself.
         if near is not None and not answer.solved and (not many or _sees_much(answer)):
-            answer, near = _solve(prepared, (a, b), known), None
+            answer, near = _solve(prepared, (a, b), known, kept=kept), None
         if near is None:
             plain[a, b] = answer
         if claims and not answer.solved and not prepared.shared_clock:
@@ -118,12 +119,15 @@ def _sees_much(answer: PairSolution) -> bool:
     return answer.fit is not None and answer.fit.moving_overlap > _MUCH
 
 
-def _most_promising_first(prepared: Prepared, todo: list[tuple[str, str]], tell: Progress) -> list[tuple[str, str]]:
+def _most_promising_first(
+    prepared: Prepared, todo: list[tuple[str, str]], tell: Progress, kept: Kept
+) -> list[tuple[str, str]]:
     """The pairs, those first that a coarse scan of all lags likes best: once cameras are tied, the rest is cheap."""
     likes = {}
     for a, b in todo:
         tell(f"coarse look at {a}–{b}", 0.05)
-        likes[a, b] = promise(smooth_only(prepared.camera(a).tracks), smooth_only(prepared.camera(b).tracks))
+        tracks_a, tracks_b = (smooth_only(prepared.camera(name).tracks) for name in (a, b))
+        likes[a, b] = promise(tracks_a, tracks_b, kept=kept)
     return sorted(todo, key=lambda pair: -likes[pair])
 
 
@@ -170,6 +174,7 @@ def _solve(
     near: float | None = None,
     settings: PairSettings | None = None,
     plain: PairSolution | None = None,
+    kept: Kept | None = None,
 ) -> PairSolution:
     a, b = (prepared.camera(name).tracks for name in names)
     if prepared.shared_clock:
@@ -190,6 +195,7 @@ def _solve(
         thorough=thorough,
         near=near,
         plain=plain,
+        kept=kept,
     )
 
 

@@ -63,7 +63,8 @@ class SplineBasis:
     @property
     def offsets(self) -> Ints:
         """(s,) index of each stretch's first control point."""
-        return np.asarray(np.r_[0, np.cumsum(self.intervals + 3)[:-1]].astype(np.int64))
+        each = self.intervals + 3
+        return np.asarray(np.cumsum(each) - each)
 
     def locate(self, time: Floats, beyond: float = 0.0) -> tuple[Ints, Floats, Bools, Floats]:
         """First control point (n,), place in the knot interval (n,) in [0, 1], inside a stretch (n,), width (n,).
@@ -71,16 +72,18 @@ class SplineBasis:
         beyond: knot intervals by which the polynomials at a stretch's ends go on; there the place is outside [0, 1].
         """
         known = np.isfinite(time)
-        time = np.where(known, time, self.starts[0])
+        if not known.all():
+            time = np.where(known, time, self.starts[0])
         stretch = np.searchsorted(self.starts - beyond * self.widths, time, side="right") - 1
         inside = known & (stretch >= 0)
-        stretch = np.maximum(stretch, 0)
+        np.maximum(stretch, 0, out=stretch)
         width = self.widths[stretch]
         place = (time - self.starts[stretch]) / width
         count = self.intervals[stretch]
         inside &= place <= count + beyond + 1e-9
-        interval = np.clip(np.floor(place), 0, count - 1).astype(np.int64)
-        return self.offsets[stretch] + interval, place - interval, inside, width
+        interval = np.clip(place, 0.0, count - 1.0).astype(np.int64)
+        place -= interval
+        return self.offsets[stretch] + interval, place, inside, width
 
     def weights(self, time: Floats, derivative: int = 0) -> tuple[Ints, Floats, Bools]:
         """First control point (n,), the 4 weights (n, 4), and whether inside a stretch (n,).
@@ -104,18 +107,16 @@ class SplineBasis:
     def evaluate(self, control: Floats, time: Floats, derivative: int = 0) -> Floats:
         """Values (n, d) at ``time`` of the spline with ``control`` (size, d); NaN outside the stretches."""
         index, weights, inside = self.weights(time, derivative)
-        values = np.zeros((len(time), control.shape[1]))
-        for k in range(SUPPORT):
-            values += weights[:, k, None] * control[index + k]
-        values[~inside] = np.nan
+        values = combined(control, index, weights)
+        if not inside.all():
+            values[~inside] = np.nan
         return values
 
     def evaluate_both(self, control: Floats, time: Floats) -> tuple[Floats, Floats]:
         """Values and first derivatives, (n, d) each, at ``time``; NaN outside the stretches."""
         index, u, inside, width = self.locate(time)
-        rows = control[index[:, None] + np.arange(SUPPORT)]
-        values = np.einsum("nk,nkd->nd", basis_weights(u), rows)
-        slopes = np.einsum("nk,nkd->nd", basis_weights(u, 1), rows) / width[:, None]
+        values = combined(control, index, basis_weights(u))
+        slopes = combined(control, index, basis_weights(u, 1)) / width[:, None]
         if not inside.all():
             values[~inside] = np.nan
             slopes[~inside] = np.nan
@@ -136,13 +137,35 @@ def basis_weights(u: Floats, derivative: int = 0) -> Floats:
     """The four cubic B-spline weights (n, 4), or a derivative by u, at u in [0, 1] of a knot interval."""
     u = np.asarray(u, dtype=np.float64)
     v = 1.0 - u
+    out = np.empty((SUPPORT, *u.shape))
     if derivative == 0:
-        columns = [v**3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3]
+        square = u * u
+        cube = square * u
+        out[0] = v * v * v
+        out[1] = 3 * cube - 6 * square + 4
+        out[2] = -3 * cube + 3 * square + 3 * u + 1
+        out[3] = cube
     elif derivative == 1:
-        columns = [-3 * v**2, 9 * u**2 - 12 * u, -9 * u**2 + 6 * u + 3, 3 * u**2]
+        square = u * u
+        out[0] = -3 * v * v
+        out[1] = 9 * square - 12 * u
+        out[2] = -9 * square + 6 * u + 3
+        out[3] = 3 * square
     else:
-        columns = [6 * v, 18 * u - 12, -18 * u + 6, 6 * u]
-    return np.stack(columns, axis=-1) / 6.0
+        out[0], out[1], out[2], out[3] = 6 * v, 18 * u - 12, -18 * u + 6, 6 * u
+    out /= 6.0
+    return np.moveaxis(out, 0, -1)
+
+
+def combined(control: Floats, index: Ints, weights: Floats) -> Floats:
+    """Sums (n, d) of four control points from ``index`` (n,) on, of ``control`` (size, d), with ``weights`` (n, 4)."""
+    out = np.empty((control.shape[1], len(index)))
+    # Coordinate by coordinate: numpy is slow along axes of two or three.
+    for values, column in zip(out, np.ascontiguousarray(control.T), strict=True):
+        np.multiply(weights[:, 0], column[index], out=values)
+        for k in range(1, SUPPORT):
+            values += weights[:, k] * column[k:][index]
+    return out.T
 
 
 def normal_bands(index: Ints, weights: Floats, row_weight: Floats, size: int) -> Floats:

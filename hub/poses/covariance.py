@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.special import erf
 
-from hub.poses.adjust import build_system
 from hub.poses.linear import BAND, eliminate
 from hub.poses.motion import MotionPrior
 from hub.poses.problem import CAMERA_PARAMETERS, OFFSET, RATE, Problem, State
+from hub.poses.system import build_system
 from hub.splines import SUPPORT
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
@@ -141,13 +142,18 @@ def path_std(cov: Covariance, state: State, label: int, time: Floats) -> Floats:
     index, weights, _ = state.trajectories[label].basis.weights(time)
     first = base + 3 * index
     block, inside = first // BAND, first % BAND
+    columns = index[:, None] + np.arange(SUPPORT)
+    pointers = SUPPORT * np.arange(len(time) + 1)
+    shape = (len(time), state.trajectories[label].basis.size)
+    spread = csr_array((weights.ravel(), columns.ravel(), pointers), shape=shape)
     out = np.zeros((len(time), 3))
     for axis in range(3):
         for a in range(SUPPORT):
             for b in range(SUPPORT):
                 values = cov.blocks[block, inside + 3 * a + axis, inside + 3 * b + axis]
                 out[:, axis] += weights[:, a] * weights[:, b] * values
-        carried = sum(weights[:, a, None] * cov.carried[first + 3 * a + axis] for a in range(SUPPORT))
+        mine = cov.carried[base + axis : base + 3 * state.trajectories[label].basis.size : 3]
+        carried = spread @ mine
         out[:, axis] += ((carried @ cov.free) * carried).sum(axis=1)
     return one_std(np.sqrt(np.maximum(out, 0.0)))
 

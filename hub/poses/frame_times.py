@@ -16,8 +16,9 @@ import numpy as np
 from scipy.special import fdtri
 
 from hub.points import PointBasis
-from hub.poses.adjust import adjust, linearise
+from hub.poses.adjust import adjust
 from hub.poses.problem import OFFSET, Problem, State
+from hub.poses.residuals import linearise
 from protocols.geometry.types import Bools, Floats, Ints
 
 _LEAST_FRAMES = 25

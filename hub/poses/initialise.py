@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from hub.points import PointBasis, SampledTrack, common_instants
-from hub.poses.adjust import adjust, residual_norms
+from hub.poses.adjust import adjust, mark_inliers, residual_norms
 from hub.poses.graph import ClockGraph
 from hub.poses.problem import CameraState, Freedom, LensPrior, Problem, Rows, State, Trajectory
 from hub.splines import SplineBasis, fit_spline, stretches
@@ -30,6 +30,7 @@ _PNP_POINTS = 400
 _PNP_PX = 8.0
 _LEAST_PNP = 12
 _FRAMES_A_KNOT = 1.5
+_MANY_ROWS, _ROWS_A_KNOT = 20_000, 2.0  # of more, a first adjustment takes a share; of one camera no fewer than …
 _SMALL, _GROWN = 6, 1.33  # cameras; growth
 _GRID = 0.05  # s between triangulated points
 _STRETCH_GAP = 1.0  # s: the path is cut where nobody saw the point for longer
@@ -172,8 +173,26 @@ def settle(
     if not used:
         raise Refused("no part of the path is seen by two cameras from directions that differ enough")
     if freedom is not None:
-        problem, state, _ = adjust(problem, state, iterations=12, rounds=2, roughly=True)
+        few = _thinned(problem, state)
+        adjusted, state, _ = adjust(few, state, iterations=12, rounds=2, roughly=True)
+        problem = adjusted if few is problem else mark_inliers(problem, state)
     return Scaffold(names, [labels[label] for label in used], problem, state)
+
+
+def _thinned(problem: Problem, state: State) -> Problem:
+    """Rows enough for a start: of very many a share, but a few of a camera to every knot interval of the path."""
+    share = sum(len(rows.time) for rows in problem.rows) / _MANY_ROWS
+    if share < 2.0 or any(isinstance(path.basis, PointBasis) for path in state.trajectories):
+        return problem
+    out = []
+    for rows in problem.rows:
+        interval = float(np.median(np.diff(rows.time))) * state.cameras[rows.camera].rate if len(rows.time) > 1 else 1.0
+        a_knot = state.trajectories[rows.label].basis.spacing / interval
+        every = max(1, int(min(a_knot / _ROWS_A_KNOT, share)))
+        stamp = None if rows.stamp is None else rows.stamp[::every]
+        few = replace(rows, time=rows.time[::every], pixels=rows.pixels[::every], use=rows.use[::every], stamp=stamp)
+        out.append(few)
+    return replace(problem, rows=tuple(out))
 
 
 def path_spacing(cameras: list[Camera], label: str) -> float:

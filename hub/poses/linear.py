@@ -37,47 +37,78 @@ class BorderedSystem:
     gradient_cameras: Floats
 
 
-def add_path_blocks(band: Floats, index: Ints, weights: Floats, blocks: Floats) -> None:
-    """Add sum over rows of (w wᵀ) ⊗ block to the band; index (n,), weights (n, 4), blocks (n, 3, 3) symmetric."""
-    size = band.shape[1]
-    for a in range(SUPPORT):
-        for b in range(a, SUPPORT):
-            product = weights[:, a] * weights[:, b]
+class PathBlocks:
+    """Sums over rows into the band and the border of one label's path; size: its control points.
+
+    A row touches four control points. Sums over rows are products with a sparse matrix of their weights; the band is
+    put together once, from sums for each first control point.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self._sums: Floats = np.zeros((size + SUPPORT, len(_PAIRS), 6))
+
+    def add(self, index: Ints, weights: Floats, upper: Floats) -> None:
+        """Add (w wᵀ) ⊗ block of every row; index (n,), weights (n, 4), upper (6, n): 00, 01, 02, 11, 12, 22 of it."""
+        products = np.empty((len(index), len(_PAIRS)))
+        for p, (a, b) in enumerate(_PAIRS):
+            products[:, p] = weights[:, a] * weights[:, b]
+        columns = len(_PAIRS) * index[:, None] + np.arange(len(_PAIRS))
+        summed = _summed(products, columns, np.ascontiguousarray(upper.T), self._sums.shape[0] * len(_PAIRS))
+        self._sums += summed.reshape(self._sums.shape)
+
+    def spread(self, index: Ints, weights: Floats, values: Floats) -> Floats:
+        """Sum over rows of w ⊗ value: (3 size, p) of values (3, p, n)."""
+        return border_block(index, weights, values, 3 * self.size)
+
+    def band(self) -> Floats:
+        """The band (12, 3 size) of all that was added."""
+        out = np.zeros((BAND, 3 * self.size))
+        for p, (a, b) in enumerate(_PAIRS):
             for i in range(3):
-                for j in range(3):
-                    distance = 3 * (b - a) + j - i
-                    if distance < 0 or (a == b and j < i):
-                        continue
-                    column = 3 * (index + b) + j
-                    values = np.bincount(column, product * blocks[:, i, j], minlength=size)
-                    band[BAND - 1 - distance] += values
+                for j in range(i if a == b else 0, 3):
+                    values = self._sums[: self.size - b, p, _UPPER[i][j]]
+                    out[BAND - 1 - 3 * (b - a) - j + i, 3 * b + j :: 3] += values
+        return out
 
 
-def path_gradient(index: Ints, weights: Floats, values: Floats, size: int) -> Floats:
-    """Sum over rows of w ⊗ value: (3 n,) of values (m, 3)."""
-    out = np.zeros(size)
-    for a in range(SUPPORT):
-        for i in range(3):
-            out += np.bincount(3 * (index + a) + i, weights[:, a] * values[:, i], minlength=size)
-    return out
+_PAIRS = tuple((a, b) for a in range(SUPPORT) for b in range(a, SUPPORT))
+_UPPER = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 
 
-def border_block(index: Ints, weights: Floats, blocks: Floats, size: int) -> Floats:
-    """Sum over rows of w ⊗ block: (3 n, p) of blocks (m, 3, p)."""
-    rows, _, width = blocks.shape
-    columns = (index[:, None] + np.arange(SUPPORT)).ravel()
-    shape = (rows, size // 3 + SUPPORT)
-    spread = csr_array((weights.ravel(), columns, SUPPORT * np.arange(rows + 1)), shape=shape)
-    return np.asarray((spread.T @ blocks.reshape(rows, -1)).reshape(-1, width)[:size])
+def border_block(index: Ints, weights: Floats, values: Floats, size: int) -> Floats:
+    """Sum over rows of w ⊗ value: (size, p) of values (3, p, n); size: three times the control points."""
+    width = values.shape[1]
+    columns = index[:, None] + np.arange(SUPPORT)
+    rows_first = np.ascontiguousarray(values.transpose(2, 0, 1)).reshape(-1, 3 * width)
+    return _summed(weights, columns, rows_first, size // 3 + SUPPORT).reshape(-1, width)[:size]
+
+
+def _summed(weights: Floats, columns: Ints, values: Floats, size: int) -> Floats:
+    """Sums (size, p) over rows of weights (n, k) at columns (n, k) times values (n, p)."""
+    rows, each = weights.shape
+    spread = csr_array((weights.ravel(), columns.ravel(), each * np.arange(rows + 1)), shape=(rows, size))
+    return np.asarray(spread.T @ values)
 
 
 def third_difference_band(basis: SplineBasis | PointBasis, weight: Floats) -> Floats:
     """Band of the motion prior sum weight_i |third difference_i|² over knot intervals; weight (m,)."""
     band = np.zeros((BAND, 3 * basis.size))
     index = basis.interval_starts()
-    rows = np.tile(THIRD_DIFFERENCE, (len(index), 1))
-    add_path_blocks(band, index, rows, weight[:, None, None] * np.eye(3))
+    for a, b in _PAIRS:
+        for j in range(3):
+            # no interval begins where another does
+            band[BAND - 1 - 3 * (b - a), 3 * (index + b) + j] += THIRD_DIFFERENCE[a] * THIRD_DIFFERENCE[b] * weight
     return band
+
+
+def third_difference_gradient(basis: SplineBasis | PointBasis, pulls: Floats) -> Floats:
+    """(3 n,): what pulls (m, 3) on the third differences are to the control points."""
+    out = np.zeros((basis.size, 3))
+    index = basis.interval_starts()
+    for k, coefficient in enumerate(THIRD_DIFFERENCE):
+        out[index + k] += coefficient * pulls
+    return out.ravel()
 
 
 THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hub.poses.linear import THIRD_DIFFERENCE, path_gradient, third_difference_band, third_differences
+from hub.poses.linear import third_difference_band, third_difference_gradient, third_differences
 from hub.poses.problem import Problem, State, Trajectory
 from hub.splines import SUPPORT
 from protocols.geometry.types import Bools, Floats
@@ -81,9 +81,7 @@ def motion_terms(path: Trajectory, weight: Floats, scale: ScalePull | None) -> t
     band = third_difference_band(path.basis, weight)
     differences = third_differences(path.basis, path.control)
     pulls = weight[:, None] * differences
-    index = path.basis.interval_starts()
-    rows = np.tile(THIRD_DIFFERENCE, (len(index), 1))
-    gradient = path_gradient(index, rows, pulls, 3 * path.basis.size)
+    gradient = third_difference_gradient(path.basis, pulls)
     value = float((pulls * differences).sum())
     if scale is not None:
         gradient -= scale.pull.ravel()

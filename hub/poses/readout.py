@@ -12,11 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from hub.poses.adjust import build_system, gauge_tangent
+from hub.poses.adjust import gauge_tangent
 from hub.poses.linear import cho_solve_path, eliminate
 from hub.poses.motion import MotionPrior
 from hub.poses.problem import CAMERA_PARAMETERS, READOUT, Problem, State
 from hub.poses.sigma import together
+from hub.poses.system import build_system
 from protocols.geometry.types import Bools, Floats
 from protocols.session.rig import LONGEST_READOUT
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import cho_solve_banded
 
-from hub.poses.adjust import build_system, moved
+from hub.poses.adjust import moved
 from hub.poses.covariance import held_rows
 from hub.poses.gauge import ReferenceTerms, reference_terms
 from hub.poses.linear import eliminate
 from hub.poses.motion import MotionPrior
 from hub.poses.problem import Problem, State
+from hub.poses.system import build_system
 from protocols.geometry.types import Floats
 from protocols.session.rig import Rig
 

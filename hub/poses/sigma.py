@@ -11,11 +11,11 @@ from dataclasses import replace
 import numpy as np
 
 from hub.points import PointBasis
-from hub.poses.adjust import linearise, predict
 from hub.poses.covariance import Covariance, covariance
 from hub.poses.linear import BAND
 from hub.poses.motion import MotionPrior
 from hub.poses.problem import CAMERA_PARAMETERS, Problem, Rows, State
+from hub.poses.residuals import linearise, predict
 from hub.splines import SUPPORT
 from protocols.geometry.types import Floats
 

@@ -333,11 +333,14 @@ def _interval(time: Floats) -> float:
     return float(steps[steps <= _PAUSE_INTERVALS * np.median(steps)].mean())
 
 
-def grid_step(a: Sequence[SmoothTrack], b: Sequence[SmoothTrack], s: PairSettings) -> float:
-    """Step of the scan [s] in which the faster motion of the two goes a few pixels."""
-    fast = max(
-        float(np.quantile(np.linalg.norm(track.at(track.time, 1), axis=1), 0.9)) * track.focal for track in (*a, *b)
-    )
+def fast_motion(track: SmoothTrack) -> float:
+    """Speed in the image [px/s] that a tenth of a track's rows exceed."""
+    speed = track.at(track.time, 1)
+    return float(np.quantile(np.sqrt(speed[:, 0] ** 2 + speed[:, 1] ** 2), 0.9)) * track.focal
+
+
+def grid_step(fast: float, s: PairSettings) -> float:
+    """Step of the scan [s] in which the faster motion of the two, of ``fast`` px/s, goes a few pixels."""
     wanted = s.step_px / max(fast, 1e-9)
     fitting = [step for step in _STEPS if s.finest_step <= step <= min(s.coarsest_step, wanted)]
     return max(fitting, default=s.finest_step)

@@ -15,10 +15,11 @@ import numpy as np
 from hub.timing import two_view
 from hub.timing.alignment import PairFit, PairSettings, PairSolution, Samples, evidence, grid_step
 from hub.timing.finish import NEAR_PX, finish
+from hub.timing.kept import Kept
 from hub.timing.pieces import scan_pieces
 from hub.timing.refine import Noise, Refined, refine
 from hub.timing.scan import PairMoments, Scan, busiest, candidates, grid_tracks, scan_lags
-from hub.timing.significance import OWN_LAGS, Chance, bandwidth, chance
+from hub.timing.significance import OWN_LAGS, Chance, chance
 from hub.timing.tracks import SmoothTrack
 from hub.timing.two_view import Geometry, RelativePose, Uncalibrated
 from hub.timing.verdict import at_noise, distinct, doubts, hopeless, judge, needed_inliers, sound
@@ -68,6 +69,7 @@ def solve_pair(
     thorough: bool = False,
     near: float | None = None,
     plain: PairSolution | None = None,
+    kept: Kept | None = None,
 ) -> PairSolution:
     """Find lag, rate and geometry of two cameras from the labels that both saw.
 
@@ -77,13 +79,14 @@ def solve_pair(
     thorough: whether to go on where that finds nothing: clocks up to 5000 ppm off, those of wrongly told
     frame rates, and tracks that follow something else now and then; tens of times as dear. near: ``t_a - t_b``
     in the middle of the common time, where other cameras tell it: then only lags about it are looked at. plain: the
-    refusal of the same tracks without ``thorough`` and ``near``, if it is at hand: then it is not sought again.
+    refusal of the same tracks without ``thorough`` and ``near``, if it is at hand: then it is not sought again. kept:
+    what other pairs of these cameras asked already.
     """
     s = settings or PairSettings()
     labels = [label for label in tracks_a if label in tracks_b]
     if not labels:
         return PairSolution(*names, "no label that both cameras saw")
-    search = _Search([tracks_a[k] for k in labels], [tracks_b[k] for k in labels], s, known, calibrated)
+    search = _Search([tracks_a[k] for k in labels], [tracks_b[k] for k in labels], s, known, calibrated, kept)
     first = search.again(plain) or search.at_rate(names, 1.0, None if near is None else (near, s.near_window))
     if first.solved and near is None and first.fit is not None and first.fit.support < s.hardly and search.jumps():
         # A few seconds of a torn track agree with much; the lag at which its pieces agree for longer is likelier.
@@ -113,12 +116,13 @@ class _Search:
         s: PairSettings,
         known: RelativePose | None,
         calibrated: bool,
+        kept: Kept | None = None,
     ) -> None:
         self.a, self.b, self.s, self.known, self.calibrated = a, b, s, known, calibrated
-        self.step = grid_step(a, b, s)
-        self.grid_a = grid_tracks(a, self.step, s.sigma_px)
+        self.kept = kept = kept or Kept()
+        self.step = grid_step(max(kept.fast_motion(track) for track in (*a, *b)), s)
         self.tried = 0
-        self.bandwidth = min(max(bandwidth(track) for track in one) for one in (a, b))
+        self.bandwidth = min(max(kept.bandwidth(track) for track in one) for one in (a, b))
         self.span = min(max(t.basis.end for t in one) - min(t.basis.begin for t in one) for one in (a, b))
 
     def rates(self) -> Iterator[float]:
@@ -146,9 +150,13 @@ class _Search:
         """
         s, self.tried = self.s, self.tried + 1
         b = list(self.b) if rate == 1.0 else [track.scaled(rate) for track in self.b]
-        moments = PairMoments(self.grid_a, grid_tracks(b, self.step, s.sigma_px))
+        grid_a = self.kept.grid(self.a, self.step, s.sigma_px)
+        grid_b = self.kept.grid(b, self.step, s.sigma_px) if rate == 1.0 else grid_tracks(b, self.step, s.sigma_px)
+        moments = PairMoments(grid_a, grid_b)
         if float(moments.support.max(initial=0.0)) < s.least_support:
             return PairSolution(*names, "the point hardly moves while both could have seen it")
+        if near is not None and float(moments.support[moments.near(*near)].max(initial=0.0)) < s.least_support:
+            return PairSolution(*names, _NO_FIT_NEAR)
         scan = scan_lags(moments, s.least_support, None if self.known is None else self.known.essential.T, near)
         chances = _Chances(moments, scan, self.known, self.bandwidth)
         fits: list[PairFit] = []

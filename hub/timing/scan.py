@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
 from hub.timing.tracks import SmoothTrack
@@ -21,10 +22,10 @@ PAIR_OF = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """Which of the six monomials is the product of two homogeneous coordinates."""
 _OF_A, _OF_B = (PAIR_OF[np.ix_(index, index)] for index in np.divmod(np.arange(9), 3))
 """(9, 9): which of the monomials of a, and of b, an entry of ``(s_a ⊗ s_b)(s_a ⊗ s_b)ᵀ`` is the product of."""
-_PLANE_A = np.kron(np.diag([1.0, 1.0, 0.0]), np.ones((3, 3)))[:8, :8, None]
-_PLANE_B = np.kron(np.ones((3, 3)), np.diag([1.0, 1.0, 0.0]))[:8, :8, None]
-"""(8, 8, 1): where noise in a's coordinates, and in b's, enters the normalisation."""
-_ITERATIONS = 10
+_SIDE = np.array([0, 1, 3, 4, 6, 7])
+"""Entries of ``s_a ⊗ s_b`` that hold one of b's two coordinates, which have noise."""
+_ITERATIONS = 6
+_PARALLEL = 1e-10  # part of a vector that is not along the other, squared, below which it tells nothing
 _COMPARED = 400
 _SLOW_PX = 20.0  # px/s: image speed at which a moment counts half
 _CHUNK = 4096  # lags per batch of eigenvalue problems
@@ -98,27 +99,57 @@ class Scan:
 
 
 class PairMoments:
-    """The 36 cross-correlations of two grid tracks, from which the moments of any lag are read."""
+    """The 36 cross-correlations of two grid tracks, from which the moments of any lag are read.
+
+    Which lags have enough in common is known at once; the rest is made for the lags that are asked for first.
+    """
 
     def __init__(self, a: GridTrack, b: GridTrack) -> None:
         self.a, self.b = a, b
         n_a, n_b = a.weight.shape[1], b.weight.shape[1]
-        length = next_fast_len(n_a + n_b, real=True)
-        spectra_a, spectra_b = rfft(monomials(a), length), rfft(monomials(b), length)
-        # c[lag] = sum_n a[n] b[n + lag], for lag = -(n_a - 1) … n_b - 1
-        product = np.zeros((len(_PAIRS), len(_PAIRS), length // 2 + 1), dtype=np.complex128)
-        for of_a, of_b in zip(spectra_a, spectra_b, strict=True):
-            product += np.conj(of_a)[:, None, :] * of_b[None, :, :]
-        correlation = np.asarray(irfft(product, length), dtype=np.float64)
+        self._length = next_fast_len(n_a + n_b, real=True)
         self.lags: Ints = np.arange(-(n_a - 1), n_b, dtype=np.int64)
-        self.moments: Floats = correlation[:, :, self.lags % length]
         self.offset: Floats = np.asarray(a.begin - b.begin - self.lags * a.step, dtype=np.float64)
-        self.support: Floats = np.asarray(np.maximum(self.moments[5, 5], 0.0) * a.step, dtype=np.float64)
+        self._weight = self._correlation(np.conj(rfft(a.weight, self._length)), rfft(b.weight, self._length))
+        common = self._weight[self.lags % self._length]
+        self.support: Floats = np.asarray(np.maximum(common, 0.0) * a.step, dtype=np.float64)
+        self._column = np.full(len(self.lags), -1, dtype=np.int64)
+        self._moments = np.zeros((len(_PAIRS), len(_PAIRS), 0))
+
+    def _correlation(self, of_a: NDArray[np.complex128], of_b: NDArray[np.complex128]) -> Floats:
+        """c[lag] = sum_n a[n] b[n + lag], all labels together; negative lags from the end."""
+        product = of_a[0] * of_b[0]
+        for k in range(1, len(of_a)):
+            product += of_a[k] * of_b[k]
+        return np.asarray(irfft(product, self._length, overwrite_x=True), dtype=np.float64)
+
+    def near(self, offset: float, window: float) -> Bools:
+        """Lags (n,) within ``window`` of ``offset`` [s]."""
+        return np.asarray(np.abs(self.offset - offset) <= window)
+
+    def sums(self, which: Ints) -> Floats:
+        """(6, 6, m) sums of the monomials' products at chosen lags."""
+        missing = which[self._column[which] < 0]
+        if len(missing):
+            place = self.lags[missing] % self._length
+            made = np.empty((len(_PAIRS), len(_PAIRS), len(missing)))
+            spectra_a = np.conj(rfft(monomials(self.a), self._length))
+            spectra_b = rfft(monomials(self.b), self._length)
+            for i in range(len(_PAIRS)):
+                for j in range(len(_PAIRS)):
+                    last = i == j == len(_PAIRS) - 1
+                    whole = self._weight if last else self._correlation(spectra_a[:, i], spectra_b[:, j])
+                    made[i, j] = whole[place]
+            self._column[missing] = self._moments.shape[2] + np.arange(len(missing))
+            self._moments = np.concatenate([self._moments, made], axis=2) if self._moments.size else made
+        if len(which) == self._moments.shape[2] and bool((self._column[which] == np.arange(len(which))).all()):
+            return self._moments
+        return self._moments[:, :, self._column[which]]
 
     def matrices(self, which: Ints) -> tuple[Floats, Floats]:
         """Moment matrices (m, 9, 9) and Taubin's normalisation (m, 9, 9) of chosen lags, per sample."""
-        total = np.maximum(self.moments[5, 5, which], 1e-9)
-        c = np.moveaxis(self.moments[:, :, which] / total, -1, 0)
+        sums = self.sums(which)
+        c = np.moveaxis(sums / np.maximum(sums[5, 5], 1e-9), -1, 0)
         full = c[:, PAIR_OF][:, :, :, PAIR_OF]  # (m, i, j, k, l): sum a_i a_j b_k b_l
         moment = full.transpose(0, 1, 3, 2, 4).reshape(-1, 9, 9)
         return moment, normalisation(full, self.a.sigma, self.b.sigma)
@@ -126,9 +157,10 @@ class PairMoments:
     def costs(self, which: Ints) -> Floats:
         """Smallest generalised eigenvalue (m,) at chosen lags: squared distance over noise."""
         out = np.full(len(which), np.inf)
+        sums = self.sums(which)
         for begin in range(0, len(which), _CHUNK):
-            part = which[begin : begin + _CHUNK]
-            out[begin : begin + _CHUNK] = eigen_costs(self.moments[:, :, part], self.a.sigma, self.b.sigma)
+            part = slice(begin, begin + _CHUNK)
+            out[part] = eigen_costs(sums[:, :, part], self.a.sigma, self.b.sigma)
         return out
 
     def costs_of(self, which: Ints, matrix: Floats) -> Floats:
@@ -140,7 +172,7 @@ class PairMoments:
         of_a, of_b = np.zeros(len(_PAIRS)), np.zeros(len(_PAIRS))
         np.add.at(of_b, PAIR_OF, self.a.sigma**2 * theta.T @ plane @ theta)
         np.add.at(of_a, PAIR_OF, self.b.sigma**2 * theta @ plane @ theta.T)
-        chosen = self.moments[:, :, which]
+        chosen = self.sums(which)
         noise = of_b @ chosen[5] + of_a @ chosen[:, 5]
         total = np.maximum(chosen[5, 5], 1e-9)
         left = np.tensordot(misfit, chosen, 2)
@@ -174,33 +206,75 @@ def eigen_costs(moments: Floats, sigma_a: float, sigma_b: float) -> Floats:
     next one is nearly as small, which says the same: no geometry stands out at that lag.
     """
     scaled = moments / np.maximum(moments[5, 5], 1e-9)
-    # The constant term is free: eliminate it, since its row of the normalisation is zero.
-    moment = scaled[_OF_A, _OF_B]
-    reduced = moment[:8, :8] - moment[:8, 8:] * moment[8:, :8] / moment[8:, 8:]
-    norm = sigma_a**2 * _PLANE_A * scaled[5][_OF_B[:8, :8]] + sigma_b**2 * _PLANE_B * scaled[:, 5][_OF_A[:8, :8]]
-    factor, pivots = _factors(reduced)
-    vector = np.repeat(np.cos(1.7 * np.arange(1.0, 9.0) ** 2)[:, None], moments.shape[2], axis=1)
-    image = np.einsum("pqm,qm->pm", norm, vector)
-    value = np.zeros(moments.shape[2])
+    factor, pivots = _factors(_reduced(scaled))
+    noise_a, noise_b = (sigma_b**2 * scaled[:, 5])[PAIR_OF], (sigma_a**2 * scaled[5])[PAIR_OF]
+    start = np.repeat(np.cos(1.7 * np.arange(1.0, 9.0) ** 2)[:, None], moments.shape[2], axis=1)
+    image = _normalised(noise_a, noise_b, start)
+    vector, by_moment = start, image
     for _ in range(_ITERATIONS):
+        by_moment = image
         vector = _solved(factor, pivots, image)
-        energy = (vector * image).sum(axis=0)
-        image = np.einsum("pqm,qm->pm", norm, vector)
-        length = np.maximum((vector * image).sum(axis=0), 1e-300)
-        value = energy / length
-        image /= np.sqrt(length)
-    return np.asarray(np.maximum(value, 0.0))
+        image = _normalised(noise_a, noise_b, vector)
+        over = 1.0 / np.sqrt(np.maximum((vector * image).sum(axis=0), 1e-300))
+        vector *= over
+        image *= over
+        by_moment = by_moment * over
+    # The last two vectors together are worth as many iterations again.
+    last = _solved(factor, pivots, image)
+    return np.maximum(_least_of_two(vector, last, by_moment, image, _normalised(noise_a, noise_b, last)), 0.0)
 
 
-def _factors(matrices: Floats) -> tuple[Floats, Floats]:
-    """L (n, n, m), below its diagonal, and D (n, m) of symmetric ``L D Lᵀ`` (n, n, m)."""
-    work = matrices.copy()
-    least = 1e-13 * np.maximum(np.einsum("ppm->m", matrices), 1e-300)
+def _reduced(scaled: Floats) -> Floats:
+    """Moment matrices (8, 8, m), their lower halves only, of scaled moments (6, 6, m), constant term eliminated.
+
+    That term is free: its row of the normalisation is zero.
+    """
+    out = np.empty((8, 8, scaled.shape[2]))
+    border = scaled[_OF_A[:8, 8], _OF_B[:8, 8]]
+    share = border / scaled[5, 5]
+    for p in range(8):
+        np.multiply(border[: p + 1], -share[p], out=out[p, : p + 1])
+        for q in range(p + 1):
+            out[p, q] += scaled[_OF_A[p, q], _OF_B[p, q]]
+    return out
+
+
+def _normalised(noise_a: Floats, noise_b: Floats, vector: Floats) -> Floats:
+    """Taubin's normalisation, by the noise that a's and b's monomials (3, 3, m) carry, of vectors (8, m)."""
+    out = np.empty_like(vector)
+    np.einsum("jlm,ilm->ijm", noise_b, vector[:6].reshape(2, 3, -1), out=out[:6].reshape(2, 3, -1))
+    out[6:] = 0.0
+    out[_SIDE] += np.einsum("ikm,kjm->ijm", noise_a, vector[_SIDE].reshape(3, 2, -1)).reshape(6, -1)
+    return out
+
+
+def _least_of_two(y: Floats, z: Floats, moment_y: Floats, norm_y: Floats, norm_z: Floats) -> Floats:
+    """Smallest generalised eigenvalues (m,) over the spans of y and z (n, m), of which z is one iteration on.
+
+    moment_y, norm_y, norm_z: the moments' and the normalisation's products with them; y's length under that is 1.
+    """
+    moment_yz, moment_z = np.ones(y.shape[1]), (z * norm_y).sum(axis=0)
+    length, along = np.maximum((z * norm_z).sum(axis=0), 1e-300), (y * norm_z).sum(axis=0)
+    value, share = moment_z / length, along / length
+    rest = np.maximum(1.0 - along * share, 0.0)
+    apart = rest > _PARALLEL
+    safe = np.where(apart, rest, 1.0)
+    across = (moment_yz - share * moment_z) ** 2 / (length * safe)
+    other = ((y * moment_y).sum(axis=0) - 2.0 * share * moment_yz + share**2 * moment_z) / safe
+    half = 0.5 * (other - value)
+    lower = across / np.maximum(half + np.sqrt(half**2 + across), 1e-300)
+    return np.asarray(np.where(apart, value - lower, value))
+
+
+def _factors(work: Floats) -> tuple[Floats, Floats]:
+    """L (n, n, m), below its diagonal, and D (n, m) of symmetric ``L D Lᵀ`` (n, n, m), in place of its lower half."""
+    least = 1e-13 * np.maximum(np.einsum("ppm->m", work), 1e-300)
     for k in range(len(work)):
-        work[k, k] = np.maximum(work[k, k], least)
+        np.maximum(work[k, k], least, out=work[k, k])
+        column = work[k + 1 :, k].copy()
         work[k + 1 :, k] /= work[k, k]
-        row = work[k, k + 1 :].copy()
-        work[k + 1 :, k + 1 :] -= work[k + 1 :, k, None] * row
+        for i in range(k + 1, len(work)):
+            work[i, k + 1 : i + 1] -= work[i, k] * column[: i - k]
     return work, np.einsum("ppm->pm", work)
 
 
@@ -228,8 +302,10 @@ def in_grid(matrix: Floats, a: GridTrack, b: GridTrack) -> Floats:
 def monomials(track: GridTrack) -> Floats:
     """(labels, 6, n): weight times the six products of the homogeneous coordinates."""
     x, y = track.points[:, :, 0], track.points[:, :, 1]
-    s = (x, y, np.ones_like(x))
-    return np.stack([track.weight * s[i] * s[j] for i, j in _PAIRS], axis=1)
+    out = np.empty((len(x), len(_PAIRS), x.shape[1]))
+    out[:, 2], out[:, 4], out[:, 5] = track.weight * x, track.weight * y, track.weight
+    out[:, 0], out[:, 1], out[:, 3] = out[:, 2] * x, out[:, 2] * y, out[:, 4] * y
+    return out
 
 
 def scan_lags(
@@ -245,7 +321,7 @@ def scan_lags(
     if near is not None:
         thinned = np.zeros_like(looked_at)
         thinned[:: max(1, len(thinned) // _COMPARED)] = True
-        looked_at &= thinned | (np.abs(moments.offset - near[0]) <= near[1])
+        looked_at &= thinned | moments.near(*near)
     which = np.flatnonzero(looked_at)
     if len(which):
         cost[which] = moments.costs(which) if known is None else moments.costs_of(which, known)

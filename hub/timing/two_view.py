@@ -155,6 +155,10 @@ def decompose(essential: Floats, a: Floats, b: Floats) -> RelativePose:
     return max(options, key=lambda option: int(in_front(option, a, b).sum()))
 
 
+_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+"""Which of the upper six entries of a symmetric matrix each of its nine is."""
+
+
 def homography_residual(a: Floats, b: Floats) -> float:
     """Robust distance (sigma of one coordinate, units of a and b, which are alike) that the best homography leaves.
 
@@ -166,33 +170,33 @@ def homography_residual(a: Floats, b: Floats) -> float:
     if len(a) < 8:
         return float("nan")
     scale_a, scale_b = conditioner(a), conditioner(b)
-    ha, hb = homogeneous(a) @ scale_a.T, homogeneous(b) @ scale_b.T
-    weight = np.ones(len(a))
-    distance = np.zeros(len(a))
+    # Coordinate by coordinate, rows last: numpy is slow along axes of two or three.
+    ha, (x, y, _) = scale_a @ homogeneous(a).T, scale_b @ homogeneous(b).T
+    outer = ha[[0, 0, 0, 1, 1, 2]] * ha[[0, 1, 2, 1, 2, 2]]
+    of_b = np.stack([np.ones_like(x), -x, -y, x * x + y * y], axis=1)
+    weight, none = np.ones(len(a)), np.zeros((3, 3))
     for _ in range(4):
-        rows = np.concatenate(
-            [
-                np.hstack([ha, np.zeros_like(ha), -hb[:, :1] * ha]) * weight[:, None],
-                np.hstack([np.zeros_like(ha), ha, -hb[:, 1:2] * ha]) * weight[:, None],
-            ]
-        )
-        homography = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, 3)
-        moved = ha @ homography.T
-        depth = np.where(np.abs(moved[:, 2]) > 1e-12, moved[:, 2], 1e-12)
-        distance = np.linalg.norm(moved[:, :2] / depth[:, None] - hb[:, :2], axis=1)
+        # The normal matrix of the rows (ha, 0, -x ha) and (0, ha, -y ha).
+        plain, by_x, by_y, by_both = (outer @ (of_b * np.square(weight)[:, None])).T[:, _SYMMETRIC]
+        normal = np.block([[plain, none, by_x], [none, plain, by_y], [by_x, by_y, by_both]])
+        homography = np.linalg.eigh(normal)[1][:, 0].reshape(3, 3)
+        moved = homography @ ha
+        depth = np.where(np.abs(moved[2]) > 1e-12, moved[2], 1e-12)
+        image = moved[:2] / depth
+        distance = np.hypot(image[0] - x, image[1] - y)
         # The algebraic error grows with the depth; divided out, rows count by distance in the image.
         weight = 1.0 / np.abs(depth) / (1.0 + (distance / max(3.0 * float(np.median(distance)), 1e-12)) ** 2)
         weight /= weight.max()
-    # The map's derivative at each point, in units of b over units of a.
-    image = (moved[:, :2] / depth[:, None])[:, :, None]
-    slope = (homography[None, :2, :2] - image * homography[None, 2:, :2]) / depth[:, None, None]
+    # The map's derivative (2, 2, n) at each point, in units of b over units of a.
+    slope = (homography[:2, :2, None] - image[:, None] * homography[2, :2, None]) / depth
     slope *= float(scale_a[0, 0] / scale_b[0, 0])
-    error = image[:, :, 0] - hb[:, :2]
+    error = image - np.stack([x, y])
     # In closed form: for points near the map's horizon 1 + J J^T is singular to within rounding.
-    determinant = 1.0 + np.square(slope).sum(axis=(1, 2)) + np.square(np.linalg.det(slope))
+    area = slope[0, 0] * slope[1, 1] - slope[0, 1] * slope[1, 0]
+    determinant = 1.0 + np.square(slope).sum(axis=(0, 1)) + np.square(area)
     # J^T applied to the error turned by a right angle: the adjugate of J J^T.
-    along = np.einsum("nji,nj->ni", slope, np.stack([error[:, 1], -error[:, 0]], axis=1))
-    squared = 2.0 * (np.square(error).sum(axis=1) + np.square(along).sum(axis=1)) / determinant
+    along = slope[0] * error[1] - slope[1] * error[0]
+    squared = 2.0 * (np.square(error).sum(axis=0) + np.square(along).sum(axis=0)) / determinant
     return float(np.median(np.sqrt(np.maximum(squared, 0.0)))) / 1.1774 / float(scale_b[0, 0])
 
 

@@ -293,7 +293,7 @@ def test_border_blocks_take_rows_in_any_order() -> None:
     rng = np.random.default_rng(0)
     index, weights = rng.integers(0, 20, 50), rng.random((50, 4))
     blocks = rng.normal(size=(50, 3, 5))
-    out = linear.border_block(index, weights, blocks, 3 * 24)
+    out = linear.border_block(index, weights, blocks.transpose(1, 2, 0), 3 * 24)
     expected = np.zeros((24, 3, 5))
     for n in range(50):
         for k in range(4):

@@ -11,6 +11,7 @@ import pytest
 import hub.pairs
 from hub.pairs import _ToldClocks, solve_pairs
 from hub.prepare import Prepared, prepare
+from hub.timing.kept import Kept
 from hub.timing.pair import PairSolution, _Search, solve_pair
 from hub.timing.promise import promise
 from hub.timing.tracks import smooth_only
@@ -97,3 +98,26 @@ def test_a_search_through_all_lags_is_made_once(monkeypatch: pytest.MonkeyPatch)
     assert again.fit is not None
     np.testing.assert_array_equal(again.fit.geometry.matrix, once.fit.geometry.matrix)
     assert (again.fit.offset, again.fit.rate) == (once.fit.offset, once.fit.rate)
+
+
+def test_what_is_kept_is_of_that_very_track() -> None:
+    prepared = prepared_of(simulate(3, 2, 20.0))
+    (track,) = smooth_only(prepared.camera("cam0").tracks).values()
+    kept = Kept()
+    grid = kept.grid([track], 0.05, 0.5)
+    assert kept.grid([track], 0.05, 0.5) is grid
+    assert kept.grid([track], 0.05, 1.0).sigma == pytest.approx(2.0 * grid.sigma)
+    assert kept.grid([track], 0.02, 0.5).step == 0.02
+    slower = track.scaled(2.0)
+    assert kept.bandwidth(slower) == pytest.approx(0.5 * kept.bandwidth(track))
+    assert kept.fast_motion(slower) == pytest.approx(0.5 * kept.fast_motion(track))
+    assert kept.grid([slower], 0.05, 0.5).points.shape[1] == pytest.approx(2 * grid.points.shape[1], abs=3)
+
+
+def test_nothing_is_looked_for_near_a_lag_that_leaves_nothing_in_common(monkeypatch: pytest.MonkeyPatch) -> None:
+    prepared = prepared_of(simulate(3, 2, 20.0))
+    tracks = [smooth_only(prepared.camera(name).tracks) for name in ("cam0", "cam1")]
+    monkeypatch.setattr("hub.timing.pair.scan_lags", None)  # not to be called
+    answer = solve_pair(tracks[0], tracks[1], ("cam0", "cam1"), near=100.0)
+    assert not answer.solved
+    assert "other lags were not looked at" in answer.status

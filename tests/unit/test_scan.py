@@ -63,6 +63,15 @@ def test_the_fft_moments_are_direct_sums(n_a: int, n_b: int) -> None:
         np.testing.assert_allclose(matrix[0] * direct[8, 8], direct, atol=1e-9)
 
 
+def test_moments_are_the_same_in_whatever_order_they_are_asked_for() -> None:
+    a, b = random_grid(7, 40), random_grid(8, 30)
+    whole, parts = PairMoments(a, b), PairMoments(a, b)
+    every = np.arange(len(whole.lags))
+    expected = whole.sums(every)
+    for which in (np.array([30, 4]), np.array([4, 5, 60, 30]), every[::-1], every):
+        np.testing.assert_array_equal(parts.sums(which), expected[:, :, which])
+
+
 def test_the_offset_of_a_lag_is_the_time_between_the_samples() -> None:
     a, b = random_grid(3, 30), random_grid(4, 30)
     moments = PairMoments(a, b)
