@@ -22,12 +22,16 @@ _MOST = 45.0
 """Cost of leaving a detection alone: that of a fit at the gate by a target known to some 10 px."""
 _PART_SHARE, _PART_MOST = 0.5, 12.0
 COLOUR_STD = 28.0
-"""Of one channel between cameras: light and white balance differ."""
+"""Of one channel between cameras, at the most: light and white balance differ. How far is learnt (`alikeness`)."""
+_LEAST_COLOUR_STD, _TAILS = 14.0, 2.0
+"""At the least, and how much wider than its std a colour's error is taken: parts of others come into it."""
+_SURE, _LEARNT = 0.05, 0.002
+"""Pairings more doubtful than this teach nothing; weight of one that does."""
 _COLOUR_MOST = 12.0
 _HINT = 2.0
 """What the camera's own matching counts."""
-_TEMPER = 8.0
-"""Costs by which a pairing is e times less likely: 2 if what frames tell were independent; errors last for a second."""
+_TEMPER = 4.0
+"""Costs by which a pairing is e times less likely: 2 if what frames tell were independent; errors last for a while."""
 _WIDTH = 0.2
 _LENGTH = 0.6
 """Where silhouettes touch: shares of the sum of two lengths, across and along the body."""
@@ -45,9 +49,18 @@ class Costs:
 
 
 def costs(
-    frame: Frame, value: Floats, noise: Floats, targets: Targets, expected: Expected, names: tuple[str, ...]
+    frame: Frame,
+    value: Floats,
+    noise: Floats,
+    targets: Targets,
+    expected: Expected,
+    names: tuple[str, ...],
+    colour_std: float = COLOUR_STD,
 ) -> Costs:
-    """How ill each detection fits each target. value, noise: (m, 7), (m, 7, 7) of the frame. names: of the targets."""
+    """How ill each detection fits each target.
+
+    value, noise: (m, 7), (m, 7, 7) of the frame. names: of the targets. colour_std: of a channel.
+    """
     n, m = len(targets), len(frame)
     distance = np.full((n, m, 3), np.nan)
     spread = np.zeros((n, m))
@@ -65,13 +78,22 @@ def costs(
                 spread = np.log(determinant / frame.per[None, :] ** 4)
     parts = np.minimum(np.nan_to_num(distance[:, :, 1:], nan=_PART_MOST / 3.0), _PART_MOST).sum(axis=2)
     with np.errstate(invalid="ignore"):
-        shade = ((frame.colour[None] - targets.colour[:, None]) ** 2).sum(axis=2) / COLOUR_STD**2
+        shade = ((frame.colour[None] - targets.colour[:, None]) ** 2).sum(axis=2) / colour_std**2
     shade = np.minimum(np.nan_to_num(shade, nan=_COLOUR_MOST / 4.0), _COLOUR_MOST)
     total = distance[:, :, 0] + spread + _PART_SHARE * parts + shade
     if any(frame.target):
         total = total - _HINT * (np.array(names)[:, None] == np.array(frame.target)[None, :])
     good = (distance[:, :, 0] < POINT_GATE) & (targets.kind[:, None] == frame.kind[None, :]) & (total < _MOST)
     return Costs(np.where(good, total, np.inf), distance)
+
+
+def either(one: Costs, other: Costs, odds: Floats) -> Costs:
+    """Costs if one of two hypotheses of each target holds. odds: (n,) of the second against the first."""
+    with np.errstate(divide="ignore"):
+        less = 2.0 * np.log(odds)[:, None]
+    better = other.total - less < one.total
+    total = -2.0 * np.logaddexp(-0.5 * one.total, 0.5 * (less - other.total))
+    return Costs(np.asarray(total), np.where(better[:, :, None], other.distance, one.distance))
 
 
 def assign(total: Floats) -> tuple[Ints, Ints]:
@@ -99,6 +121,22 @@ def ambiguity(total: Floats, row: Ints, column: Ints) -> Floats:
     if len(idle):
         more = np.minimum(more, total[np.ix_(idle, column)].min(axis=0) - own)
     return np.asarray(1.0 / (1.0 + np.exp(np.clip(more / _TEMPER, 0.0, 60.0))))
+
+
+def alikeness(before: float, told: Floats, known: Floats, doubtful: Floats) -> float:
+    """The variance of one channel between what is told and what is known, renewed by a frame's pairings.
+
+    told, known: (k, 3) colours, NaN where none is. doubtful: (k,) as `ambiguity` says.
+    """
+    off = np.minimum(((told - known) ** 2).mean(axis=1), COLOUR_STD**2)
+    for one in off[(doubtful < _SURE) & np.isfinite(off)].tolist():
+        before += _LEARNT * (one - before)
+    return before
+
+
+def colour_std(variance: float) -> float:
+    """The std of a channel with which detections are told apart."""
+    return float(np.clip(_TAILS * np.sqrt(variance), _LEAST_COLOUR_STD, COLOUR_STD))
 
 
 def rows_used(value: Floats, expected: Expected, distance: Floats, covariance: Floats) -> Bools:

@@ -54,6 +54,23 @@ def update(
     return moved, 0.5 * (new + new.transpose(0, 2, 1))
 
 
+def misfit(covariance: Floats, innovation: Floats, slope: Floats, noise: Floats, used: Bools) -> Floats:
+    """-2 log likelihood (n,) of one measurement each, without the constant of its rows; arguments as in `update`."""
+    innovation, slope, noise = masked(innovation, slope, noise, used)
+    spread = slope @ covariance @ slope.transpose(0, 2, 1) + noise
+    solved = np.linalg.solve(spread, innovation[:, :, None])[:, :, 0]
+    return np.asarray((innovation * solved).sum(axis=1) + np.linalg.slogdet(spread)[1])
+
+
+def merged(one: tuple[Floats, Floats], other: tuple[Floats, Floats], share: Floats) -> tuple[Floats, Floats]:
+    """The Gaussian with mean and covariance of a mixture of two. share: (n,) of the second."""
+    off = other[0] - one[0]
+    mean = one[0] + share[:, None] * off
+    across = (share * (1.0 - share))[:, None, None] * off[:, :, None] * off[:, None, :]
+    part = share[:, None, None]
+    return mean, (1.0 - part) * one[1] + part * other[1] + across
+
+
 def masked(innovation: Floats, slope: Floats, noise: Floats, used: Bools) -> tuple[Floats, Floats, Floats]:
     """The same measurement with the rows that don't count made void: no innovation, no slope, unit noise."""
     off = ~used

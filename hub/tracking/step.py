@@ -7,11 +7,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hub.tracking import kalman
-from hub.tracking.associate import ambiguity, assign, costs, overlaps, rows_used
+from hub.tracking.associate import alikeness, ambiguity, assign, colour_std, costs, either, overlaps, rows_used
 from hub.tracking.body import BODIES
 from hub.tracking.camera import Frame, TrackingCamera
 from hub.tracking.discovery import Found, Scale, features_of, hypothesis
 from hub.tracking.identity import recall, remember
+from hub.tracking.jumps import Turned, jumped, jumpy, weighed
 from hub.tracking.kalman import LOG_SIZE, POSITION
 from hub.tracking.measure import FOOT, HEAD, POINT, Expected, doubt, expect, measured
 from hub.tracking.targets import State, Targets
@@ -62,14 +63,14 @@ def step(state: State, frame: Frame, cameras: dict[str, TrackingCamera], world: 
     """The state after one frame; frames must come in the order of their keys."""
     state = state.with_camera(frame.camera.name)
     elapsed = 0.0 if state.time_ns is None else (frame.reference_ns - state.time_ns) / NANOSECONDS
-    targets = moved(state.targets, elapsed, world)
+    state = replace(state, targets=moved(state.targets, elapsed, world))
     value, noise = measured(frame, np.arange(len(frame)))
-    targets, free = _matched(targets, frame, value, noise, state.cameras.index(frame.camera.name), world)
+    state, free = _matched(state, frame, value, noise, world)
     pool = {name: features for name, features in state.pool.items() if name in cameras}
     fresh = {name: time for name, time in state.fresh.items() if name in cameras}
     pool[frame.camera.name] = features_of(frame, value, noise, free)
     fresh[frame.camera.name] = frame.reference_ns
-    state = replace(state, time_ns=frame.reference_ns, targets=targets, fresh=fresh, pool=pool)
+    state = replace(state, time_ns=frame.reference_ns, fresh=fresh, pool=pool)
     state = _discovered(state, frame, cameras, world)
     state = replace(_with_floor(state, world), targets=_beside(state.targets, elapsed, world))
     return _sorted_out(state, world)
@@ -86,13 +87,11 @@ def moved(targets: Targets, elapsed: float, world: World) -> Targets:
     return replace(targets, mean=mean, covariance=covariance)
 
 
-def _matched(
-    targets: Targets, frame: Frame, value: Floats, noise: Floats, camera: int, world: World
-) -> tuple[Targets, Ints]:
+def _matched(state: State, frame: Frame, value: Floats, noise: Floats, world: World) -> tuple[State, Ints]:
     """Targets updated by the frame's detections, and the detections that fit none of them."""
-    free = np.arange(len(frame))
+    targets, variance, free = state.targets, state.colour_variance, np.arange(len(frame))
     if not len(targets):
-        return targets, free
+        return state, free
     expected = expect(frame.camera, targets.mean, targets.kind, world.up)
     crowded, hidden = overlaps(frame.camera, expected, targets)
     if crowded.any():
@@ -103,7 +102,12 @@ def _matched(
     row, column = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     if len(frame):
         names = tuple(label_of(int(k), int(n)) if n else "" for k, n in zip(targets.kind, targets.number, strict=True))
-        found = costs(frame, value, noise, targets, expected, names)
+        found = costs(frame, value, noise, targets, expected, names, colour_std(variance))
+        turned = None
+        if jumpy(targets).any():
+            turned = jumped(targets, frame.reference_ns, world.scale.metre)
+            loose = replace(targets, covariance=turned.covariance)
+            found = either(found, costs(frame, value, noise, loose, expected, names, colour_std(variance)), turned.odds)
         # What is confirmed chooses first: a wrong pairing must not take a detection from it.
         for group in (targets.confirmed, ~targets.confirmed):
             total = np.where(group[:, None], found.total, np.inf)
@@ -116,14 +120,21 @@ def _matched(
         left = np.ones(len(frame), dtype=np.bool_)
         left[column] = False
         free = np.flatnonzero(left)
-        targets = _updated(targets, frame, value, noise, expected, found.distance, row, column, doubtful, camera)
+        sure = targets.confirmed[row]
+        told, known_as = frame.colour[column[sure]], targets.colour[row[sure]]
+        variance = alikeness(variance, told, known_as, doubtful[sure])
+        camera = state.cameras.index(frame.camera.name)
+        targets = _updated(
+            targets, turned, frame, value, noise, expected, found.distance, row, column, doubtful, camera
+        )
     hit = np.zeros(len(targets), dtype=np.bool_)
     hit[row] = True
-    return _counted(targets, hit, seen & ~hidden), free
+    return replace(state, targets=_counted(targets, hit, seen & ~hidden), colour_variance=variance), free
 
 
 def _updated(
     targets: Targets,
+    turned: Turned | None,
     frame: Frame,
     value: Floats,
     noise: Floats,
@@ -146,7 +157,12 @@ def _updated(
         total[:, rows, rows] *= doubt(distance[row, column, part])[:, None, None]
     # What may be another's moves nobody: where two cross, cameras that tell them apart lead.
     total /= np.maximum(1.0 - 2.0 * doubtful, _LEAST_TRUST)[:, None, None] ** 2
-    mean, covariance = kalman.update(targets.mean[row], targets.covariance[row], off, some.slope, total, used)
+    mean, covariance = targets.mean[row], targets.covariance[row]
+    if turned is None:
+        mean, covariance = kalman.update(mean, covariance, off, some.slope, total, used)
+    else:
+        loose, odds = turned.covariance[row], turned.odds[row]
+        mean, covariance = weighed(mean, covariance, loose, odds, off, some.slope, total, used)
     means, covariances = targets.mean.copy(), targets.covariance.copy()
     means[row], covariances[row] = mean, covariance
     colour, count = targets.colour.copy(), targets.colour_count.copy()

@@ -98,7 +98,8 @@ class State:
 
     time_ns: of the last frame. pool: by camera, its last frame's features that no target explains. gone: lost
     targets, oldest first. ended: (number, kind, mean) of targets lost at this frame. floor: heights of the feet of
-    confirmed upright targets, running mean and weight.
+    confirmed upright targets, running mean and weight. colour_variance: of one channel, between what cameras tell of a
+    target and what is known of it.
     """
 
     time_ns: int | None
@@ -111,6 +112,7 @@ class State:
     next_number: int = 1
     floor: float = 0.0
     floor_weight: float = 0.0
+    colour_variance: float = 400.0
 
     @classmethod
     def empty(cls) -> State:

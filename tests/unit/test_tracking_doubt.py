@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hub.tracking.associate import ambiguity
+from hub.tracking.associate import COLOUR_STD, alikeness, ambiguity, colour_std
 from hub.tracking.camera import TrackingCamera, frame_of
 from hub.tracking.measure import doubt, heavy
 from hub.tracking.step import World, step
@@ -134,3 +134,24 @@ def test_the_weight_of_a_far_head_is_the_slope_of_what_it_costs() -> None:
     slope = (heavy(squared + 1e-6) - heavy(squared - 1e-6)) / 2e-6
     assert np.allclose(slope, 1.0 / doubt(squared), rtol=1e-6)
     assert doubt(np.array([np.nan])) == 1.0
+
+
+def learnt_colour_std(off: float, doubtful: float) -> float:
+    """After 3000 pairings of which each channel is told ``off`` too high or too low."""
+    rng = np.random.default_rng(7)
+    variance = State.empty().colour_variance
+    for _ in range(1000):
+        known = rng.uniform(20.0, 230.0, (3, 3))
+        told = known + off * rng.choice([-1.0, 1.0], (3, 3))
+        told[rng.integers(3)] = np.nan
+        variance = alikeness(variance, told, known, np.full(3, doubtful))
+    return colour_std(variance)
+
+
+def test_how_alike_cameras_see_colours_is_learnt() -> None:
+    """Where they agree, a small difference tells people apart; where light differs, it does not."""
+    strict, usual, loose = (learnt_colour_std(off, 0.0) for off in (3.0, 10.0, 40.0))
+    assert strict == 14.0
+    assert 18.0 < usual < 22.0
+    assert loose == COLOUR_STD
+    assert learnt_colour_std(3.0, 0.4) == COLOUR_STD, "pairings that may be wrong teach nothing"
