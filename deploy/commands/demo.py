@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def demo(
     *,
-    seconds: float = 30.0,
+    seconds: float | None = None,
     cameras: int | None = None,
     scene: Literal["marker", "people", "town"] = "marker",
     out: Path = Path("demo-out"),
@@ -41,7 +41,7 @@ def demo(
     Parameters
     ----------
     seconds
-        How long to film.
+        How long to film; without it 30, or 60 for people.
     cameras
         How many cameras, 2 to 20; without it 3, or 5 for people.
     scene
@@ -59,6 +59,8 @@ def demo(
     """
     if cameras is None:
         cameras = 5 if scene == "people" else 3
+    if seconds is None:
+        seconds = 60.0 if scene == "people" else 30.0  # what is promised of people is so of a minute
     if seed < 0:
         raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
     if not 2 <= cameras <= 20:

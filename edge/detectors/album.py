@@ -24,7 +24,9 @@ class Album:
     """Pictures of the first time before a camera, evenly over it, each with what moved where."""
 
     def __init__(self) -> None:
+        # In cells (h, w, _CELL, _CELL, 3), as whole cells are chosen.
         self._pictures: list[Image] = []
+        self._shape: tuple[int, ...] = ()
         self._motion: list[Motion] = []
         self._number: list[int] = []
         self._stride = 1
@@ -34,10 +36,9 @@ class Album:
     def __len__(self) -> int:
         return len(self._pictures)
 
-    @property
-    def pictures(self) -> list[Image]:
-        """Those that are kept, (H, W, 3) each."""
-        return self._pictures
+    def some(self, count: int) -> list[Image]:
+        """About so many of those that are kept, (H, W, 3) each, evenly over the time."""
+        return [_joined(one, self._shape) for one in self._pictures[:: max(len(self) // count, 1)]]
 
     def add(self, picture: Image, period: float) -> None:
         """One more picture (H, W, 3), ``period`` [s] after the last."""
@@ -51,7 +52,8 @@ class Album:
             index = self._number.index(self._seen - lag)
             self._motion[index] = np.maximum(self._motion[index], change)
         if self._seen % self._stride == 0:
-            self._pictures.append(picture.copy())
+            self._shape = picture.shape
+            self._pictures.append(_cells(picture))
             self._motion.append(change)
             self._number.append(self._seen)
         self._seen += 1
@@ -61,7 +63,10 @@ class Album:
 
     def paint(self, picture: Image, where: Image) -> None:
         """Take over parts of a picture (H, W, 3) where ``where`` (H, W) is 255: there it shows the background."""
-        self._pictures = [np.asarray(cv2.copyTo(picture, where, one), dtype=np.uint8) for one in self._pictures]
+        shown, there = _cells(picture), _cells(where)[..., None] > 0
+        row, column = np.nonzero(there.any(axis=(2, 3, 4)))
+        for one in self._pictures:
+            one[row, column] = np.where(there[row, column], shown[row, column], one[row, column])
 
     def background(self) -> Image:
         """What is behind it all (H, W, 3): of each place the pictures in which least moved there.
@@ -76,15 +81,31 @@ class Album:
         order = np.argsort(_spread(count)).astype(np.float32) / (count + 1)
         share = min(max(round(_CALMEST * count), 3), count)
         calm = np.argsort(steps + order[:, None, None], axis=0, kind="stable")[:share]
-        height, width = self._pictures[0].shape[:2]
-        every = np.repeat(np.repeat(calm, _CELL, axis=1), _CELL, axis=2)[:, :height, :width]
+        row, column = np.indices(calm.shape[1:])
+        size = calm.shape[1] * _CELL
         stack = np.array(self._pictures)
-        row, column = np.arange(height)[:, None], np.arange(width)[None]
-        values = [stack[one, row, column] for one in every]
+        values = [stack[one, row, column].reshape(size, -1) for one in calm]
         for low, high in comparisons(share):
             one, other = values[low], values[high]
             values[low], values[high] = np.asarray(cv2.min(one, other)), np.asarray(cv2.max(one, other))
-        return np.asarray(values[min(int(_BRIGHT * share), share - 1)], dtype=np.uint8)
+        found = values[min(int(_BRIGHT * share), share - 1)]
+        return _joined(found.astype(np.uint8).reshape(stack.shape[1:]), self._shape)
+
+
+def _cells(picture: Image) -> Image:
+    """A picture (H, W) or (H, W, 3) in cells (h, w, _CELL, _CELL) or (h, w, _CELL, _CELL, 3), its border repeated."""
+    (height, width), deep = picture.shape[:2], picture.shape[2:]
+    down, across = -height % _CELL, -width % _CELL
+    whole = cv2.copyMakeBorder(picture, 0, down, 0, across, cv2.BORDER_REPLICATE) if down or across else picture
+    split = whole.reshape((height + down) // _CELL, _CELL, (width + across) // _CELL, _CELL, *deep)
+    return np.ascontiguousarray(split.swapaxes(1, 2), dtype=np.uint8)
+
+
+def _joined(cells: Image, shape: tuple[int, ...]) -> Image:
+    """The picture (H, W, 3) of cells (h, w, _CELL, _CELL, 3)."""
+    h, w = cells.shape[:2]
+    whole = cells.swapaxes(1, 2).reshape(h * _CELL, w * _CELL, 3)
+    return np.ascontiguousarray(whole[: shape[0], : shape[1]])
 
 
 def _change(one: Image, other: Image, shape: tuple[int, ...]) -> Motion:

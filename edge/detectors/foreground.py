@@ -27,8 +27,9 @@ ModelName = Literal["mog2", "knn"]
 
 _TEACH_S = 0.4  # the model learns this often
 _MEMORY_S = 30.0  # and forgets over that time
-_BEGIN_S = 1.0  # in which a new model learns fast, and after which it begins again from what was there most of the time
-_REVIEWS_S = (_BEGIN_S, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0, 24.0)  # when that is done, each time better
+_BEGIN_S = 0.7  # in which a new model learns fast, and after which it begins again from what stood still
+_REVIEWS_S = (_BEGIN_S, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0, 24.0)
+"""When that is done, each time better."""
 _PAUSE_S = 2.0  # a longer time between two pictures is a pause, and tells nothing of their rate
 _RENEWAL = 0.05  # share of the latest step in the period
 _LESSONS = 8  # pictures of a review that the model is taught
@@ -135,7 +136,7 @@ class Foreground:
         lately, flushed_at, shadows = self._lately, self._flushed_at, self._shadows
         self._begin()
         self._shadows = shadows
-        self._learn(album.pictures[:: max(len(album) // _LESSONS, 1)], album.background())
+        self._learn(album.some(_LESSONS), album.background())
         self._seen, self._age, self._reviews = seen, age, left
         self._lately, self._flushed_at = lately, flushed_at
         self._album = album if left else Album()
