@@ -25,8 +25,6 @@ _BREADTH = 0.36  # of a person's box, of the height
 _FARTHEST = 0.33  # of the height: from somebody's middle to a pixel of his
 _LONE, _GROUPED = 0.1, 0.17  # of the height: half of the least breadth
 _TRIM = 0.3
-_STEPS = 32  # px after which pixels of the working picture begin where pixels of the picture do
-_AROUND = 0.2  # of the usual height: how far what is near silhouettes is looked at
 _PATTERN = 5.0  # working px
 
 
@@ -47,13 +45,14 @@ def explain(
     """
     if not stature.known:
         return by_shape(figure, expected)
-    scale = min(1.0, max(round(_STEPS * WORK_HEIGHT / stature.typical), 1) / _STEPS)
+    scale = min(1.0, WORK_HEIGHT / stature.typical)
     size = max(round(figure.shape[1] * scale), 1), max(round(figure.shape[0] * scale), 1)
     scales = size[0] / figure.shape[1], size[1] / figure.shape[0]
     small, dim = figure, shadow
     if scale < 1.0:
-        box, margin = cv2.boundingRect(figure), math.ceil(_AROUND * stature.typical)
-        small, dim = (_smaller(one, box, margin, size) for one in (figure, shadow))
+        small, dim = (
+            np.asarray(cv2.resize(one, size, interpolation=cv2.INTER_AREA), dtype=np.uint8) for one in (figure, shadow)
+        )
     bodies: list[Body] = []
     for rows, columns, mine in clusters(small, stature, scales, expected):
         one = whole(figure, (rows, columns), scales, stature) if len(mine) < 2 else None
@@ -75,26 +74,6 @@ def explain(
         placed = place(scene, [(index, expected[index], statures[index] if told else 1.0) for index in mine])
         bodies += _bodies(scene, placed, figure.shape)
     return bodies
-
-
-def _smaller(picture: Image, box: Sequence[int], margin: int, size: tuple[int, int]) -> Image:
-    """A picture (H, W) in the size (w, h), as far as it is in a box x, y, w, h with a margin [px]; 0 elsewhere."""
-    small = np.zeros((size[1], size[0]), np.uint8)
-    (height, width), (x, y, w, h) = picture.shape, box
-    # Where these steps begin, pixels of both pictures begin.
-    left, right = _steps(x - margin, x + w + margin, width)
-    top, bottom = _steps(y - margin, y + h + margin, height)
-    fx, fy = size[0] / width, size[1] / height
-    rows, columns = slice(round(top * fy), round(bottom * fy)), slice(round(left * fx), round(right * fx))
-    part = small[rows, columns]
-    if part.size:
-        part[:] = cv2.resize(picture[top:bottom, left:right], part.shape[::-1], interpolation=cv2.INTER_AREA)
-    return small
-
-
-def _steps(first: int, end: int, most: int) -> tuple[int, int]:
-    """First and end of what holds these and begins and ends with a step, or the picture's border."""
-    return max(first // _STEPS, 0) * _STEPS, min(-(-end // _STEPS) * _STEPS, most)
 
 
 def _blurred(image: Image, part: tuple[slice, slice], scales: tuple[float, float]) -> Image:

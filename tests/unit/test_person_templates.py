@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
 from edge.detectors import crowd
-from edge.detectors.bodies import _smaller, explain
+from edge.detectors.bodies import explain
 from edge.detectors.person import silhouette_features
 from edge.detectors.silhouettes import LonePeople, _alone
 from edge.detectors.stature import Stature
@@ -113,22 +112,6 @@ def test_who_stood_still_is_sought_again_once_a_neighbour_has_moved() -> None:
     scene.cover(other)
     crowd._settle(scene, one)
     assert (one.u, one.foot) != rests
-
-
-def test_only_what_is_near_silhouettes_is_made_smaller_and_that_alike() -> None:
-    rng = np.random.default_rng(4)
-    picture = np.zeros((480, 641), np.uint8)
-    picture[200:330, 170:260] = 255
-    size = round(641 * 19 / 32), 285
-    small = _smaller(picture, cv2.boundingRect(picture), 20, size)
-    assert small.shape == (285, size[0])
-    whole = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.int64)
-    assert np.abs(small - whole).mean() < 0.1
-    picture[200:330, 170:260] = np.where(rng.random((130, 90)) > 0.5, 255, 0)
-    even = np.ascontiguousarray(picture[:, :640])
-    exact = cv2.resize(even, (380, 285), interpolation=cv2.INTER_AREA)
-    np.testing.assert_allclose(_smaller(even, cv2.boundingRect(even), 20, (380, 285)), exact, atol=1)
-    assert not _smaller(np.zeros_like(even), (0, 0, 0, 0), 20, (380, 285)).any()
 
 
 def test_who_stands_in_a_frame_or_beside_specks_is_still_alone() -> None:
