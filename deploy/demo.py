@@ -11,10 +11,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 
 import tomli_w
 
+from deploy.signals import interrupt_on_signals
 from protocols.bus.base import Bus
 from protocols.bus.router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
@@ -78,8 +78,7 @@ class Fleet:
         configs = self._write_configs()
         live = Live()
         # Ended from outside, the demo must take its agents along: as after Ctrl-C, ``finally`` does it.
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, _interrupt)
+        interrupted = interrupt_on_signals()
         bus_config = BusConfig(mode="client", connect=(self._endpoint,))
         with Router(self._endpoint), open_bus(self._site, bus_config, timeout_s=10.0) as bus:
             observations, calibrations = bus.subscribe(OBSERVATION), bus.subscribe(CALIBRATION)
@@ -95,6 +94,8 @@ class Fleet:
                 first: float | None = None
                 while first is None or time.monotonic() - first < self.settings.seconds:
                     observations.wait(0.2)
+                    if interrupted.is_set():
+                        raise KeyboardInterrupt
                     for received in observations.drain():
                         assert isinstance(received.message, pb.Observation)
                         name = received.message.camera
@@ -230,10 +231,6 @@ class Fleet:
     def _last_line(self, name: str) -> str:
         lines = (self.out / "logs" / f"{name}.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
         return lines[-1] if lines else "it said nothing"
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
 
 
 def _status(message: pb.Calibration) -> str:

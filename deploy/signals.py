@@ -21,3 +21,19 @@ def stop_on_signals() -> threading.Event:
     signal.signal(signal.SIGTERM, handle)
     signal.signal(signal.SIGINT, handle)
     return stop
+
+
+def interrupt_on_signals() -> threading.Event:
+    """An event that SIGTERM, SIGHUP and SIGINT set as they raise KeyboardInterrupt; whoever waits long looks at it.
+
+    What is raised while an object is being deleted is lost, and with it the only word that the process should end.
+    """
+    told = threading.Event()
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        told.set()
+        raise KeyboardInterrupt
+
+    for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+        signal.signal(number, handle)
+    return told

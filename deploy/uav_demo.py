@@ -12,12 +12,12 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tomli_w
 
+from deploy.signals import interrupt_on_signals
 from deploy.uav_config import FlightConfig
 from deploy.uav_demo_outcome import LOG, REPORT, Outcome, as_json, compare, compare_geo
 from protocols.bus.router import Router, free_endpoint
@@ -72,8 +72,7 @@ def run_town(
     endpoint, port = free_endpoint(), _free_port()
     progress = Progress()
     show(progress)
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, _interrupt)
+    interrupted = interrupt_on_signals()
     world = patrol(seed, seconds + _SPARE_S)
     epoch = time.time()
     processes = _Processes(out, _configs(out, endpoint, port, seconds, seed, epoch))
@@ -93,6 +92,8 @@ def run_town(
             while (elapsed := time.monotonic() - began) < seconds:
                 heard = station.counts.get(_GEO, 0)
                 station.poll(0.05)
+                if interrupted.is_set():
+                    raise KeyboardInterrupt
                 if station.told is not None and station.told.geo is not None and station.counts.get(_GEO, 0) > heard:
                     told_geo.append((time.time() - epoch, *station.told.geo))
                 for received in targets.drain():
@@ -292,7 +293,3 @@ def _free_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
