@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from hub.tracking.body import BODIES
 from hub.tracking.camera import Frame, TrackingCamera
 from hub.tracking.kalman import LOG_SIZE
 from hub.tracking.measure import FOOT, HEAD, POINT, SEEN_SIZE, Expected
@@ -30,11 +31,14 @@ _SURE, _LEARNT = 0.05, 0.002
 _COLOUR_MOST = 12.0
 _HINT = 2.0
 """What the camera's own matching counts."""
+_STRANGER = 30.0
+"""Cost at which a person's detection may as well be that of somebody who is not followed yet."""
 _TEMPER = 4.0
 """Costs by which a pairing is e times less likely: 2 if what frames tell were independent; errors last for a while."""
 _WIDTH = 0.2
 _LENGTH = 0.6
 """Where silhouettes touch: shares of the sum of two lengths, across and along the body."""
+_UPRIGHT = np.array([body.upright for body in BODIES])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,10 +110,19 @@ def assign(total: Floats) -> tuple[Ints, Ints]:
     return rows[good].astype(np.int64), columns[good].astype(np.int64)
 
 
-def ambiguity(total: Floats, row: Ints, column: Ints) -> Floats:
-    """How probable it is of matched pairs (k,) that the detection is another target's: 0 to 1/2.
+def strangers(kind: Ints) -> Floats:
+    """What it costs (k,) to take a detection for that of nobody who is followed. kind: (k,) of the targets.
 
-    Others either exchange their own with it or, where they have none, take it. total: (n, m) costs, inf = cannot be.
+    People come in numbers and look alike; a marker is seldom another's.
+    """
+    return np.where(_UPRIGHT[kind], _STRANGER, np.inf)
+
+
+def ambiguity(total: Floats, row: Ints, column: Ints, stranger: Floats) -> Floats:
+    """How probable it is of matched pairs (k,) that the detection is another's: 0 to 1/2.
+
+    Other targets either exchange their own with it or, where they have none, take it; or it is a stranger's, whom no
+    target follows. total: (n, m) costs, inf = cannot be. stranger: (k,) as `strangers` says.
     """
     if not len(row):
         return np.zeros(0)
@@ -120,6 +133,7 @@ def ambiguity(total: Floats, row: Ints, column: Ints) -> Floats:
     idle = np.setdiff1d(np.arange(len(total)), row)
     if len(idle):
         more = np.minimum(more, total[np.ix_(idle, column)].min(axis=0) - own)
+    more = np.minimum(more, stranger - own)
     return np.asarray(1.0 / (1.0 + np.exp(np.clip(more / _TEMPER, 0.0, 60.0))))
 
 

@@ -6,7 +6,7 @@ coordinates; 6 the logarithm of the size seen, normalised.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,22 +37,35 @@ class Expected:
 
     value: (n, 7), NaN in rows that a target has not (head and foot of what does not stand upright). slope: (n, 7, 7).
     body_noise: (n, 7, 7), of where on the body the points lie and of when the camera fired. depth: (n,), along the
-    axis. centre: (n, 2), of the body's centre.
+    axis. part_std: (n, 3) stds of point, head and foot on the body, in shares of the size; part_noise: (n, 3, 2, 2)
+    what a std of 1 would give.
     """
 
     value: Floats
     slope: Floats
     body_noise: Floats
     depth: Floats
+    part_std: Floats
+    part_noise: Floats
+
+    def blurred(self, extra: Floats) -> Expected:
+        """The same where others stand in the way: (n,) shares of the size that are added to the points' stds."""
+        noise = self.body_noise.copy()
+        more = ((self.part_std + extra[:, None]) ** 2 - self.part_std**2)[:, :, None, None] * self.part_noise
+        for part, rows in enumerate((POINT, HEAD, FOOT)):
+            noise[:, rows, rows] += more[:, part]
+        noise[:, SEEN_SIZE, SEEN_SIZE] = (_SIZE_STD + extra) ** 2
+        return replace(self, body_noise=noise)
+
+    def kept(self, which: Ints) -> Expected:
+        """Only of some targets."""
+        return Expected(*(getattr(self, name)[which] for name in self.__slots__))
 
 
-def expect(
-    camera: TrackingCamera, mean: Floats, kind: Ints, up: Floats | None, inflation: Floats | None = None
-) -> Expected:
+def expect(camera: TrackingCamera, mean: Floats, kind: Ints, up: Floats | None) -> Expected:
     """What ``camera`` should see of targets (n, 7) of ``kind`` (n,) at this moment.
 
-    up: (3,) unit vector of the world, None = not known: then nothing is known to stand upright. inflation: (n,) shares
-    of the size that are added to the points' noise, where others stand in the way.
+    up: (3,) unit vector of the world, None = not known: then nothing is known to stand upright.
     """
     n = len(mean)
     rotation = camera.pose.rotation
@@ -60,35 +73,31 @@ def expect(
     upright = _UPRIGHT[kind] & (up is not None)
     axis = rotation @ up if up is not None else np.zeros(3)
     centre = (mean[:, POSITION] - camera.pose.position) @ rotation.T
-    value = np.full((n, ROWS), np.nan)
-    slope = np.zeros((n, ROWS, SIZE))
-    noise = np.zeros((n, ROWS, ROWS))
     depth = centre[:, 2]
-    extra = np.zeros(n) if inflation is None else inflation
     velocity = mean[:, VELOCITY] @ rotation.T
-    shares = (np.where(upright, _ABOVE[kind], 0.0), np.full(n, 0.5), np.full(n, -0.5))
-    stds = (_POINT_NOISE[kind], _HEAD_NOISE[kind], _FOOT_NOISE[kind])
-    for rows, share, std in zip((POINT, HEAD, FOOT), shares, stds, strict=True):
-        where = centre + (share * size)[:, None] * axis
-        z = where[:, 2]
-        good = (z > _LEAST_DEPTH * size) & np.isfinite(z)
-        if rows is not POINT:
-            good &= upright
-        safe = np.where(good, z, 1.0)
-        seen = where[:, :2] / safe[:, None]
-        by_camera = np.zeros((n, 2, 3))  # derivative by the place in camera axes
-        by_camera[:, 0, 0] = by_camera[:, 1, 1] = 1.0 / safe
-        by_camera[:, :, 2] = -seen / safe[:, None]
-        value[:, rows] = np.where(good[:, None], seen, np.nan)
-        slope[:, rows, POSITION] = by_camera @ rotation
-        slope[:, rows, LOG_SIZE] = (by_camera @ axis) * (share * size)[:, None]
-        place = ((std + extra) * size) ** 2
-        moving = (by_camera @ velocity[:, :, None])[:, :, 0] * camera.time_std
-        noise[:, rows, rows] = place[:, None, None] * (by_camera @ by_camera.transpose(0, 2, 1))
-        noise[:, rows, rows] += moving[:, :, None] * moving[:, None, :]
+    # The three points of every target at once: (n, 3, ...) of point, head, foot.
+    along = size[:, None] * np.stack([np.where(upright, _ABOVE[kind], 0.0), np.full(n, 0.5), np.full(n, -0.5)], axis=1)
+    where = centre[:, None] + along[:, :, None] * axis
+    good = (where[:, :, 2] > _LEAST_DEPTH * size[:, None]) & np.isfinite(where[:, :, 2])
+    good[:, 1:] &= upright[:, None]
+    safe = np.where(good, where[:, :, 2], 1.0)
+    seen = where[:, :, :2] / safe[:, :, None]
+    by_camera = np.zeros((n, 3, 2, 3))  # derivative by the place in camera axes
+    by_camera[:, :, 0, 0] = by_camera[:, :, 1, 1] = 1.0 / safe
+    by_camera[:, :, :, 2] = -seen / safe[:, :, None]
+    value, slope, noise = np.full((n, ROWS), np.nan), np.zeros((n, ROWS, SIZE)), np.zeros((n, ROWS, ROWS))
+    value[:, :SEEN_SIZE] = np.where(good[:, :, None], seen, np.nan).reshape(n, 6)
+    slope[:, :SEEN_SIZE, POSITION] = (by_camera @ rotation).reshape(n, 6, 3)
+    slope[:, :SEEN_SIZE, LOG_SIZE] = ((by_camera @ axis) * along[:, :, None]).reshape(n, 6)
+    std = np.stack([_POINT_NOISE[kind], _HEAD_NOISE[kind], _FOOT_NOISE[kind]], axis=1)
+    unit = (size**2)[:, None, None, None] * (by_camera @ by_camera.swapaxes(2, 3))
+    moving = (by_camera @ velocity[:, None, :, None])[..., 0] * camera.time_std
+    both = (std**2)[:, :, None, None] * unit + moving[:, :, :, None] * moving[:, :, None, :]
+    for part, rows in enumerate((POINT, HEAD, FOOT)):
+        noise[:, rows, rows] = both[:, part]
     _expect_size(value, slope, mean, depth, upright, rotation)
-    noise[:, SEEN_SIZE, SEEN_SIZE] = (_SIZE_STD + extra) ** 2
-    return Expected(value, slope, noise, depth)
+    noise[:, SEEN_SIZE, SEEN_SIZE] = _SIZE_STD**2
+    return Expected(value, slope, noise, depth, std, unit)
 
 
 def _expect_size(value: Floats, slope: Floats, mean: Floats, depth: Floats, upright: Bools, rotation: Floats) -> None:

@@ -7,7 +7,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hub.tracking import kalman
-from hub.tracking.associate import alikeness, ambiguity, assign, colour_std, costs, either, overlaps, rows_used
+from hub.tracking.associate import (
+    alikeness,
+    ambiguity,
+    assign,
+    colour_std,
+    costs,
+    either,
+    overlaps,
+    rows_used,
+    strangers,
+)
 from hub.tracking.body import BODIES
 from hub.tracking.camera import Frame, TrackingCamera
 from hub.tracking.discovery import Found, Scale, features_of, hypothesis
@@ -95,9 +105,7 @@ def _matched(state: State, frame: Frame, value: Floats, noise: Floats, world: Wo
     expected = expect(frame.camera, targets.mean, targets.kind, world.up)
     crowded, hidden = overlaps(frame.camera, expected, targets)
     if crowded.any():
-        expected = expect(
-            frame.camera, targets.mean, targets.kind, world.up, np.where(hidden, 2.0, 1.0) * crowded * _CROWD
-        )
+        expected = expected.blurred(np.where(hidden, 2.0, 1.0) * crowded * _CROWD)
     seen = frame.camera.sees(expected.value[:, POINT], expected.depth)
     row, column = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     if len(frame):
@@ -116,7 +124,7 @@ def _matched(state: State, frame: Frame, value: Floats, noise: Floats, world: Wo
             row, column = np.concatenate([row, some]), np.concatenate([column, those])
         known = np.where(targets.confirmed[:, None], found.total, np.inf)
         known[row, column] = found.total[row, column]
-        doubtful = ambiguity(known, row, column)
+        doubtful = ambiguity(known, row, column, strangers(targets.kind[row]))
         left = np.ones(len(frame), dtype=np.bool_)
         left[column] = False
         free = np.flatnonzero(left)
@@ -149,7 +157,7 @@ def _updated(
         return targets
     order = np.argsort(row, kind="stable")
     row, column, doubtful = row[order], column[order], doubtful[order]
-    some = Expected(expected.value[row], expected.slope[row], expected.body_noise[row], expected.depth[row])
+    some = expected.kept(row)
     used = rows_used(value[column], some, distance[row, column], targets.covariance[row])
     off = np.where(used, value[column] - some.value, 0.0)
     total = np.where(np.isfinite(noise[column]), noise[column], 0.0) + some.body_noise

@@ -7,7 +7,7 @@ import numpy as np
 from hub.tracking.body import BODIES
 from hub.tracking.camera import TrackingCamera
 from hub.tracking.kalman import LOG_SIZE, POSITION, VELOCITY
-from hub.tracking.measure import FOOT, HEAD, POINT, expect
+from hub.tracking.measure import POINT, expect
 from hub.tracking.step import World, label_of
 from hub.tracking.targets import Gone, Targets
 from protocols.clocks import NANOSECONDS
@@ -29,6 +29,7 @@ def track_messages(
 ) -> list[pb.Track]:
     """Confirmed and coasting targets at a reference time, then those that were lost (``gone``)."""
     out: list[pb.Track] = []
+    angles = headings(targets.mean, world)
     for i in np.flatnonzero(targets.confirmed).tolist():
         mean, covariance, body = targets.mean[i], targets.covariance[i], BODIES[int(targets.kind[i])]
         unseen = max(time_ns - int(targets.seen_ns[i]), 0) / NANOSECONDS
@@ -46,9 +47,8 @@ def track_messages(
             cameras=int((targets.seen_by[i] > time_ns - _LATELY_NS).sum()),
             unseen_s=unseen,
         )
-        angle = heading(mean, world)
-        if angle is not None:
-            message.heading = angle
+        if np.isfinite(angles[i]):
+            message.heading = float(angles[i])
         if body.upright:
             size = float(np.exp(mean[LOG_SIZE]))
             message.height = size
@@ -82,30 +82,34 @@ def prediction_message(
     """What every camera should see of the confirmed targets at a reference time."""
     message = pb.Prediction(schema_version=SCHEMA_VERSION, sequence=sequence, reference_time_ns=time_ns)
     known = targets.kept(targets.confirmed)
+    ahead = _ahead(known.mean, world)
     for name, camera in cameras.items():
         part = message.cameras.add(camera=name, boot_id=boots.get(name, ""), device_time_ns=camera.device_ns(time_ns))
         if len(known):
-            _predict(part, known, camera, world)
+            _predict(part, known, ahead, camera, world)
     return message
 
 
-def _predict(part: pb.CameraPrediction, targets: Targets, camera: TrackingCamera, world: World) -> None:
+def _predict(part: pb.CameraPrediction, targets: Targets, ahead: Floats, camera: TrackingCamera, world: World) -> None:
     expected = expect(camera, targets.mean, targets.kind, world.up)
-    point = expected.value[:, POINT]
-    seen = camera.sees(point, expected.depth)
+    seen = camera.sees(expected.value[:, POINT], expected.depth)
     if not seen.any():
         return
+    point, slope = expected.value[:, POINT], expected.slope[:, POINT]
     lens = camera.intrinsics
-    pixels, bend = lens.project_normalised(point), lens.pixel_jacobian(point)
-    slope = expected.slope[:, POINT]
+    pixels, heads, feet = lens.project_normalised(expected.value[:, :6].reshape(-1, 2)).reshape(-1, 3, 2).swapaxes(0, 1)
+    bend = lens.pixel_jacobian(point)
     spread = slope @ targets.covariance @ slope.transpose(0, 2, 1) + expected.body_noise[:, POINT, POINT]
     spread = bend @ spread @ bend.transpose(0, 2, 1) + camera.noise_px**2 * np.eye(2)
     # Per second of the reference clock; a camera's own differs by parts in ten thousand.
     speed = (bend @ slope[:, :, POSITION] @ targets.mean[:, VELOCITY, None])[:, :, 0]
-    heads, feet = lens.project_normalised(expected.value[:, HEAD]), lens.project_normalised(expected.value[:, FOOT])
-    for i in np.flatnonzero(seen & np.isfinite(pixels).all(axis=1)).tolist():
-        if np.abs(pixels[i]).max() > _FARTHEST_PX:
-            continue
+    ends = np.hstack([heads, feet])
+    with np.errstate(invalid="ignore"):
+        whole = np.asarray((np.abs(ends) < _FARTHEST_PX).all(axis=1))
+        seen &= (np.abs(pixels) <= _FARTHEST_PX).all(axis=1)
+    size, face = np.linalg.norm(heads - feet, axis=1), face_regions(heads, feet)
+    views = facing(targets.mean, ahead, camera, world)
+    for i in np.flatnonzero(seen).tolist():
         target = part.targets.add(
             target=label_of(int(targets.kind[i]), int(targets.number[i])),
             kind=BODIES[int(targets.kind[i])].kind,
@@ -116,62 +120,63 @@ def _predict(part: pb.CameraPrediction, targets: Targets, camera: TrackingCamera
             covariance=[spread[i, 0, 0], 0.5 * (spread[i, 0, 1] + spread[i, 1, 0]), spread[i, 1, 1]],
         )
         _paint(target, targets.colour[i])
-        ends = np.concatenate([heads[i], feet[i]])
-        if np.isfinite(ends).all() and np.abs(ends).max() < _FARTHEST_PX:
+        if whole[i]:
             target.head.extend(heads[i].tolist())
             target.foot.extend(feet[i].tolist())
-            target.size = float(np.linalg.norm(heads[i] - feet[i]))
-            target.face.extend(face_region(heads[i], feet[i]))
-            target.view = facing(targets.mean[i], camera, world)
+            target.size = float(size[i])
+            target.face.extend(face[i].tolist())
+            target.view = views[i]
 
 
-def face_region(head: Floats, foot: Floats) -> list[float]:
-    """The box x, y, w, h [px] of head and face of somebody whose head's top and foot are at these pixels."""
-    tall = float(np.linalg.norm(head - foot))
+def face_regions(head: Floats, foot: Floats) -> Floats:
+    """Boxes (n, 4) x, y, w, h [px] of head and face of people whose heads' tops and feet are at pixels (n, 2)."""
+    tall = np.linalg.norm(head - foot, axis=1, keepdims=True)
     middle = head + (foot - head) * (0.5 * _HEAD_HEIGHT)
     # Of a head that leans in the image, the upright box around it.
-    lean = np.abs(head - foot) / max(tall, 1e-9)
-    width = tall * float(_HEAD_WIDTH * lean[1] + _HEAD_HEIGHT * lean[0])
-    height = tall * float(_HEAD_HEIGHT * lean[1] + _HEAD_WIDTH * lean[0])
-    return [float(middle[0]) - 0.5 * width, float(middle[1]) - 0.5 * height, width, height]
+    lean = np.abs(head - foot) / np.maximum(tall, 1e-9)
+    size = tall * (_HEAD_WIDTH * lean[:, ::-1] + _HEAD_HEIGHT * lean)
+    return np.hstack([middle - 0.5 * size, size])
 
 
-def facing(mean: Floats, camera: TrackingCamera, world: World) -> str:
-    """What a camera sees of the head of somebody who looks where he goes: front, back, his left or right side.
+def facing(mean: Floats, ahead: Floats, camera: TrackingCamera, world: World) -> list[str]:
+    """What a camera sees of the heads of people who look where they go: front, back, their left or right side.
 
-    "" where he stands still, or nobody knows up.
+    mean: (n, 7). ahead: (n, 3) as `_ahead` says; "" where it is NaN.
     """
-    if world.up is None or heading(mean, world) is None:
-        return ""
-    ahead = mean[VELOCITY] - world.up * (world.up @ mean[VELOCITY])
-    ahead = ahead / np.linalg.norm(ahead)
-    to_camera = camera.pose.position - mean[POSITION]
-    forward, left = float(to_camera @ ahead), float(to_camera @ np.cross(world.up, ahead))
-    if abs(forward) >= abs(left):
-        return "front" if forward > 0.0 else "back"
-    return "left" if left > 0.0 else "right"
+    if world.up is None:
+        return [""] * len(mean)
+    to_camera = camera.pose.position - mean[:, POSITION]
+    forward, left = (to_camera * ahead).sum(axis=1), (np.cross(world.up, ahead) * to_camera).sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        side = np.where(left > 0.0, "left", "right")
+        view = np.where(np.abs(forward) >= np.abs(left), np.where(forward > 0.0, "front", "back"), side)
+    return [str(one) for one in np.where(np.isfinite(forward), view, "")]
 
 
-def heading(mean: Floats, world: World) -> float | None:
-    """Direction of the motion [rad] about up, from the world's first axis; None where it stands or up is not known.
+def _ahead(mean: Floats, world: World) -> Floats:
+    """Unit vectors (n, 3) across up along the motion; NaN where somebody stands or up is not known."""
+    if world.up is None:
+        return np.full((len(mean), 3), np.nan)
+    along = mean[:, VELOCITY] - np.outer(mean[:, VELOCITY] @ world.up, world.up)
+    speed = np.linalg.norm(along, axis=1, keepdims=True)
+    return np.asarray(along / np.where(speed < _WALKS_M_S * world.scale.metre, np.nan, speed))
+
+
+def headings(mean: Floats, world: World) -> Floats:
+    """Directions of the motion (n,) [rad] about up, from the world's first axis; NaN as in `_ahead`.
 
     Where the first axis is up, from the second.
     """
     if world.up is None:
-        return None
-    first = np.array([1.0, 0.0, 0.0])
-    if abs(world.up[0]) > 0.9:
-        first = np.array([0.0, 1.0, 0.0])
+        return np.full(len(mean), np.nan)
+    first = np.array([0.0, 1.0, 0.0] if abs(world.up[0]) > 0.9 else [1.0, 0.0, 0.0])
     first = first - world.up * (world.up @ first)
     first /= np.linalg.norm(first)
-    second = np.cross(world.up, first)
-    x, y = float(mean[VELOCITY] @ first), float(mean[VELOCITY] @ second)
-    if np.hypot(x, y) < _WALKS_M_S * world.scale.metre:
-        return None
-    return float(np.arctan2(y, x))
+    ahead = _ahead(mean, world)
+    return np.asarray(np.arctan2(ahead @ np.cross(world.up, first), ahead @ first))
 
 
 def _paint(message: pb.Track | pb.PredictedTarget, colour: Floats) -> None:
     if np.isfinite(colour).all():
-        red, green, blue = (round(float(np.clip(value, 0, 255))) for value in colour)
+        red, green, blue = (round(min(max(value, 0.0), 255.0)) for value in colour.tolist())
         message.colour.red, message.colour.green, message.colour.blue = red, green, blue

@@ -138,6 +138,19 @@ class Tracker:
                 self._done -= old
         return self.state
 
+    def passed(self, after_ns: int, every_ns: int) -> list[State]:
+        """The states between ``after_ns`` and the present one, at least ``every_ns`` apart; none older than the lag.
+
+        A hub that was held up can tell them afterwards.
+        """
+        out: list[State] = []
+        for state in self._states[: max(self._done - 1, 0)]:
+            time_ns = state.time_ns or 0
+            if time_ns >= after_ns + every_ns and (self.time_ns or 0) - time_ns >= every_ns:
+                out.append(state)
+                after_ns = time_ns
+        return out
+
     def at(self, reference_ns: int) -> Targets:
         """The targets at another time, about that of the newest frame; nothing is learnt or forgotten by it."""
         if self.time_ns is None:

@@ -95,14 +95,37 @@ def test_who_leaves_the_floor_for_two_cameras_only_is_nobody() -> None:
 
 def test_a_pairing_is_as_doubtful_as_the_next_best_is_near() -> None:
     rows, columns = np.array([0, 1]), np.array([0, 1])
-    clear = ambiguity(np.array([[4.0, 200.0], [200.0, 4.0]]), rows, columns)
+    nobody = np.full(2, np.inf)
+    clear = ambiguity(np.array([[4.0, 200.0], [200.0, 4.0]]), rows, columns, nobody)
     assert clear.max() < 1e-6
-    even = ambiguity(np.array([[4.0, 5.0], [6.0, 7.0]]), rows, columns)
+    even = ambiguity(np.array([[4.0, 5.0], [6.0, 7.0]]), rows, columns, nobody)
     assert np.allclose(even, 0.5)
-    alone = ambiguity(np.array([[4.0], [np.inf]]), rows[:1], columns[:1])
+    alone = ambiguity(np.array([[4.0], [np.inf]]), rows[:1], columns[:1], nobody[:1])
     assert alone.max() < 1e-6
-    either = ambiguity(np.array([[4.0], [4.0]]), rows[:1], columns[:1])
+    either = ambiguity(np.array([[4.0], [4.0]]), rows[:1], columns[:1], nobody[:1])
     assert np.allclose(either, 0.5), "who has no detection may own this one"
+    strange = ambiguity(np.array([[4.0, np.inf], [np.inf, 40.0]]), rows, columns, np.full(2, 40.0))
+    assert strange[0] < 1e-3
+    assert np.allclose(strange[1], 0.5), "what fits ill may be somebody's who is not followed"
+
+
+def test_a_stranger_does_not_lead_anybody_away() -> None:
+    """Who passes half a metre aside in other clothes, and is not followed yet, draws no target along."""
+    cameras = ring(3)
+    camera = cameras["cam0"]
+    before = standing(cameras, 0.0, 3)
+    loose = np.diag([0.04, 0.04, 0.01, 0.1, 0.1, 0.1, 0.002])[None]
+    before = replace(before, targets=replace(before.targets, covariance=loose))
+    mean = before.targets.mean[0, :3]
+    moved = []
+    for aside, colour in ((0.15, (90, 120, 60)), (0.5, (160, 60, 140))):
+        message = person(camera, mean + aside * camera.pose.rotation[0], NANOSECONDS + 1, 1)
+        red, green, blue = colour
+        message.detections[0].colour.CopyFrom(pb.Colour(red=red, green=green, blue=blue))
+        after = step(before, frame_of(camera, message), cameras, World(up=UP)).targets
+        moved.append(float(np.linalg.norm(after.mean[0, :2] - mean[:2])))
+    assert moved[0] > 0.1, "his own detection does"
+    assert moved[1] < 0.15
 
 
 def test_what_may_be_anothers_moves_nobody() -> None:
