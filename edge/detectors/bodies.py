@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.detectors.crowd import place
-from edge.detectors.silhouettes import WORK_HEIGHT, Body, by_shape, clusters, is_cut, whole
+from edge.detectors.silhouettes import WORK_HEIGHT, Body, bulk, by_shape, clusters, is_cut, whole
 from edge.detectors.stature import Stature
 from edge.detectors.templates import EMPTY, Box, Scene, Template, mask
 from protocols.geometry.types import Bools, Floats
@@ -128,6 +128,8 @@ def _body(
 ) -> Body:
     left, right = one.u - 0.5 * _BREADTH * one.tall, one.u + 0.5 * _BREADTH * one.tall
     top, bottom = one.top, one.top + one.tall
+    if alone or seen > 0.6:
+        own = bulk(np.where(own, 255, 0).astype(np.uint8), one.tall) > 0
     full = np.flatnonzero(np.count_nonzero(own, axis=0) >= max(0.04 * one.tall, 1))
     if len(full) and seen > 0.6:
         least = _LONE if alone else _GROUPED

@@ -26,6 +26,7 @@ _COMING = np.array([0.88, 1.0, 1.1])  # tried of somebody whom nobody expected
 _STIFF = 8.0  # of its area, by the square of the logarithm of the height over what is expected
 _MOST = 12  # people in one silhouette
 _MERGE, _SPLIT = 0.45, 0.26  # distance of two who may be one, of the height; what one may explain less, of its area
+_DOUBTED, _BESIDE = 0.7, 0.6  # gain, of its area, up to which it is asked whether he is needed; of the height: how near
 _BETWEEN = np.linspace(0.0, 1.0, 7)
 _STATURES = np.array([0.92, 1.0, 1.08, 1.16, 1.25, 1.35])
 _HEAD_COUNTS = 1.5  # pixels of a head count more than others by so much
@@ -48,9 +49,11 @@ def place(scene: Scene, expected: list[tuple[int, Box, float]]) -> list[Template
     grid = _Grid(scene)
     # Who is expected and not there must not keep others out; of those who come some are not worth their place once
     # all have settled, and what they covered is free again.
-    for _ in range(_ROUNDS):
+    for turn in range(_ROUNDS):
         before = len(placed)
         placed = _merged(scene, _worthy(scene, placed))
+        if turn == 0:
+            placed = _needed(scene, placed)
         gone = before - len(placed)
         came = 0
         while len(placed) < _MOST:
@@ -80,6 +83,57 @@ def _worthy(scene: Scene, placed: list[Template]) -> list[Template]:
             scene.uncover(one)
             kept = [each for each in kept if each is not one]
     return kept
+
+
+def _needed(scene: Scene, placed: list[Template]) -> list[Template]:
+    """Without whoever is worth his place only as long as his neighbours stay where he has pushed them.
+
+    Two side by side who are broader than templates are else three.
+    """
+    if len(placed) < 2:
+        return placed
+    gains = scene.own_gains(placed)
+    for index in np.argsort(gains):
+        one = placed[index]
+        if gains[index] > _DOUBTED * AREA * one.tall**2:
+            break
+        beside = [each for each in placed if each is not one and _are_beside(each, one)]
+        if not beside:
+            continue
+        before = _explained(scene, [*beside, one])
+        moved = [replace(each) for each in beside]
+        _exchange(scene, [*beside, one], moved)
+        _descend(scene, moved, 1)
+        if before - _explained(scene, moved) < _KEPT * AREA * one.tall**2:
+            gone = {id(one), *map(id, beside)}
+            return _needed(scene, [each for each in placed if id(each) not in gone] + moved)
+        _exchange(scene, moved, [*beside, one])
+    return placed
+
+
+def _are_beside(one: Template, other: Template) -> bool:
+    rows = min(one.foot, other.foot) > max(one.top, other.top)
+    return rows and abs(one.u - other.u) < _BESIDE * other.tall
+
+
+def _exchange(scene: Scene, these: list[Template], those: list[Template]) -> None:
+    """Let those cover a scene in place of these."""
+    for one in these:
+        scene.uncover(one)
+    for one in those:
+        scene.cover(one)
+
+
+def _explained(scene: Scene, some: list[Template]) -> float:
+    """What some of those who cover a scene explain together beyond the others, the nearest first."""
+    for one in some:
+        scene.uncover(one)
+    total = 0.0
+    for one in sorted(some, key=lambda each: -each.foot):
+        places = scene.places(np.array([one.u]), np.array([one.foot]), np.array([one.tall]))
+        total += float(scene.gains(places, one.expected)[0])
+        scene.cover(one)
+    return total
 
 
 def _merged(scene: Scene, placed: list[Template]) -> list[Template]:

@@ -22,6 +22,7 @@ _PIECE, _PIECE_BESIDE, _PIECE_ALONG = 0.6, 0.15, 0.6
 """Of the height of a silhouette: how tall a piece of it may be, and how far it may be from it, across and along."""
 _LIKE = 0.7  # share of template and silhouette that one who stands alone has in common
 _SLIM, _STOUT = 1.15, 7.0  # height to breadth of one who stands alone, where nothing is known of the place
+_THIN, _SPECK = 0.05, 0.02  # of the height: what is lower is no limb; of its square: what has less area is none
 _LEAST_HEIGHT = 12.0  # px
 
 
@@ -169,6 +170,25 @@ def clusters(
     return parts
 
 
+def bulk(mask: Image, tall: float) -> Image:
+    """The largest silhouette of a mask (h, w) 0/255, what is above or below it, and others as large as a limb.
+
+    Without what is thin, as a wire or barrier tape that sways, and without the specks of a shadow's rim: each would
+    make the body's box broader. tall: height [px] of the body.
+    """
+    firm = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((max(round(_THIN * tall), 2), 1), np.uint8))
+    count, labels, stats, middles = cv2.connectedComponentsWithStats(firm, connectivity=8)
+    if count <= 1:
+        return mask
+    if count == 2:
+        return np.asarray(firm, dtype=np.uint8)
+    area = stats[:, cv2.CC_STAT_AREA]
+    left, _, wide = stats[1 + int(area[1:].argmax()), :3]
+    kept = (middles[:, 0] >= left) & (middles[:, 0] < left + wide) | (area > _SPECK * tall**2)
+    kept[0] = False
+    return np.where(kept[labels], 255, 0).astype(np.uint8)
+
+
 def whole(figure: Image, part: tuple[slice, slice], scales: tuple[float, float], stature: Stature) -> Body | None:
     """The silhouette in a part of the working picture as one person, if it is as tall and as slim as one there.
 
@@ -177,6 +197,7 @@ def whole(figure: Image, part: tuple[slice, slice], scales: tuple[float, float],
     (fx, fy), (rows, columns) = scales, part
     left, top = int(columns.start / fx), int(rows.start / fy)
     mask = figure[top : int(rows.stop / fy) + 1, left : int(columns.stop / fx) + 1]
+    mask = bulk(mask, (rows.stop - rows.start) / fy)
     x, y, w, h = cv2.boundingRect(mask)
     box = float(left + x), float(top + y), float(w), float(h)
     if h < _LEAST_HEIGHT or is_cut(box, figure.shape):

@@ -8,7 +8,7 @@ import pytest
 from edge.detectors import crowd
 from edge.detectors.bodies import explain
 from edge.detectors.person import silhouette_features
-from edge.detectors.silhouettes import LonePeople, _alone
+from edge.detectors.silhouettes import Image, LonePeople, _alone
 from edge.detectors.stature import Stature
 from edge.detectors.templates import BARS, Scene, Template
 from protocols.geometry.types import Floats
@@ -148,3 +148,36 @@ def test_head_and_foot_are_the_middles_of_the_upper_and_lower_part() -> None:
 def test_nobody_in_an_empty_picture() -> None:
     nothing = np.zeros((HEIGHT, WIDTH), np.uint8)
     assert explain(nothing, nothing, place(), [(100.0, 50.0, 20.0, 60.0)], statures=[1.0]) == []
+
+
+def drawn(*bodies: tuple[int, float]) -> Image:
+    """Silhouettes 60 px tall of people at the middles u whose feet are at 160, so many times as broad as templates."""
+    figure = np.zeros((HEIGHT, WIDTH), np.uint8)
+    for u, broad in bodies:
+        for half, high, low in BARS:
+            wide = round(60 * broad * half)
+            figure[100 + round(60 * high) : 100 + round(60 * low), u - wide : u + wide] = 255
+    return figure
+
+
+@pytest.mark.parametrize("expected", [[], [(152.0, 100.0, 16.0, 60.0)], [(130.0, 100.0, 20.0, 60.0)] * 2])
+def test_tape_that_sways_and_specks_of_a_shadow_make_nobody_broader(expected: list[tuple[float, ...]]) -> None:
+    figure = drawn((160, 1.0))
+    figure[118:120, 145:177] = 255
+    figure[156:160, 172:176] = figure[150:153, 145:149] = 255
+    found = explain(figure, np.zeros_like(figure), place(), expected, statures=[1.0] * len(expected))  # type: ignore[arg-type]
+    assert [one.box for one in found] == [pytest.approx((152.0, 100.0, 16.0, 60.0), abs=1.5)]
+
+
+def test_two_broad_ones_side_by_side_are_two_though_a_third_was_expected_between() -> None:
+    figure = drawn((149, 1.4), (171, 1.4))
+    boxes = [(u - 8.0, 100.0, 16.0, 60.0) for u in (146.0, 160.0, 174.0)]
+    found = explain(figure, np.zeros_like(figure), place(), boxes, statures=[1.0] * 3)
+    middles = sorted(one.box[0] + 0.5 * one.box[2] for one in found)
+    assert middles == pytest.approx([149.0, 171.0], abs=2.5)
+
+
+def test_who_stands_between_two_is_still_somebody() -> None:
+    figure = drawn((145, 1.0), (160, 1.0), (175, 1.0))
+    boxes = [(u - 8.0, 100.0, 16.0, 60.0) for u in (145.0, 160.0, 175.0)]
+    assert len(explain(figure, np.zeros_like(figure), place(), boxes, statures=[1.0] * 3)) == 3
