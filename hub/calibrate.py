@@ -42,7 +42,9 @@ if TYPE_CHECKING:
 _LEAST_AGREEMENT = 0.5  # share of a camera's rows that must fit the common path
 _LEAST_ROWS = 30
 _LARGEST_TURN_STD = 0.035  # rad
-_LARGEST_CLOCK_STD = 5e-3  # s
+_LARGEST_CLOCK_STD = 20e-3 / 3.0  # s: 20 ms, a wrong answer, are three of them
+_FARTHEST_FROM_PAIR = 20e-3  # s
+_APART = "the path tells its clock"
 _LENS_ROUNDS = 3
 
 
@@ -115,7 +117,9 @@ def calibrate(
         tell("covariances", 0.95)
         return publish(rig, solution)
     except Refused as refusal:
-        refusal.pairs = tuple(lone_pair_report(pair, prepared) for pair in pairs)
+        apart = {name: reason for name, reason in refusal.cameras.items() if reason.startswith(_APART)}
+        left = [replace(pair, status=apart[pair.b]) if pair.b in apart else pair for pair in pairs]
+        refusal.pairs = tuple(lone_pair_report(pair, prepared) for pair in left)
         refusal.warnings = prepared.warnings
         raise
 
@@ -231,6 +235,8 @@ def solve_network(
             if not reason:
                 worst, reason = _loosest(scaffold)
             if not reason:
+                worst, reason = _apart_from_pair(scaffold, graph)
+            if not reason:
                 break
             refused[worst] = reason
         remaining = [name for name in scaffold.names if name != worst]
@@ -262,12 +268,10 @@ def _loosest(scaffold: Scaffold) -> tuple[str, str]:
     turns = cov.turn_stds(found, state)
     clocks = np.zeros_like(turns)
     if problem.freedom.clock:
-        clocks = np.array(
-            [[cov.time_map_std(found, state, i, j) for j in range(len(turns))] for i in range(len(turns))]
-        )
+        clocks = cov.common_clock_stds(found, problem, state)
     for between, limit, unit, text in (
         (turns, _LARGEST_TURN_STD, np.rad2deg(1.0), "the common motion tells its orientation only to {:.1f}° (std)"),
-        (clocks, _LARGEST_CLOCK_STD, 1e3, "the common motion tells its clock only to {:.1f} ms (std, mid-recording)"),
+        (clocks, _LARGEST_CLOCK_STD, 1e3, "the common motion tells its clock only to {:.1f} ms (std, mid-overlap)"),
     ):
         np.fill_diagonal(between, np.inf)
         best = between.min(axis=1)
@@ -275,6 +279,24 @@ def _loosest(scaffold: Scaffold) -> tuple[str, str]:
         loosest = int(len(best) - 1 - np.argmax(best[::-1]))
         if best[loosest] > limit:
             return scaffold.names[loosest], text.format(unit * best[loosest])
+    return "", ""
+
+
+def _apart_from_pair(scaffold: Scaffold, graph: ClockGraph) -> tuple[str, str]:
+    """The later camera of a pair by itself whose lag the adjustment did not leave where it was, and by how much.
+
+    Epipolar lines and the path are two ways to the lag that lean on other things: where they differ, one of them is
+    wrong. Of three cameras and more a pair's lag is a beginning only.
+    """
+    for pair in graph.agreeing:
+        if pair.fit is None or not np.isfinite(pair.fit.lag_doubt):
+            continue
+        a, b = (scaffold.state.cameras[scaffold.names.index(name)] for name in (pair.a, pair.b))
+        at_a = np.array([pair.fit.middle])
+        at_b = (at_a - pair.fit.offset) / pair.fit.rate
+        apart = float(abs(a.reference_time(at_a) - b.reference_time(at_b))[0])
+        if apart > _FARTHEST_FROM_PAIR:
+            return pair.b, f"{_APART} {1e3 * apart:.0f} ms apart from what epipolar lines tell"
     return "", ""
 
 

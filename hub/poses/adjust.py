@@ -236,7 +236,7 @@ def _minimise(
             state, now, cost, system = trial, there, there.cost, None
             steps.append(AdjustmentStep(stage, pixels * float(np.sqrt(max(cost, 0.0) / counting))))
             damping = max(damping / 10.0, 1e-12)
-            if gain < least_gain * abs(cost):  # below 0 where the prior's pull on the scale outweighs the rows
+            if gain < least_gain * cost:
                 break
         else:
             damping = max(damping * 10.0, 1e-8)

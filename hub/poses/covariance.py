@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,6 +127,36 @@ def time_map_std(cov: Covariance, state: State, camera: int, reference: int) -> 
     row[reference * CAMERA_PARAMETERS + OFFSET] -= 1.0
     row[reference * CAMERA_PARAMETERS + RATE] -= at - base.centre
     return float(np.sqrt(max(float(row @ cov.cameras @ row), 0.0)) / base.rate)
+
+
+def common_clock_stds(cov: Covariance, problem: Problem, state: State) -> Floats:
+    """Std [s] (cameras, cameras) of how the clocks of two cameras lie to each other, in the middle of what both saw.
+
+    That is where their lag is used; beyond it, it is as vague as the rates make it. Of cameras that saw nothing at the
+    same time: in the middle of the gap. Diagonal 0.
+    """
+    spans = _observed_spans(problem, state)
+    count = len(state.cameras)
+    out = np.zeros((count, count))
+    for i, j in itertools.combinations(range(count), 2):
+        middle = 0.5 * (max(spans[i, 0], spans[j, 0]) + min(spans[i, 1], spans[j, 1]))
+        row = np.zeros(len(cov.cameras))
+        for camera, sign in ((i, 1.0), (j, -1.0)):
+            now = state.cameras[camera]
+            row[camera * CAMERA_PARAMETERS + OFFSET] = sign
+            row[camera * CAMERA_PARAMETERS + RATE] = sign * (middle - now.offset) / now.rate
+        out[i, j] = out[j, i] = np.sqrt(max(float(row @ cov.cameras @ row), 0.0))
+    return out
+
+
+def _observed_spans(problem: Problem, state: State) -> Floats:
+    """First and last internal reference time (cameras, 2) of each camera's rows."""
+    out = np.tile([np.inf, -np.inf], (len(state.cameras), 1))
+    for part in problem.rows:
+        if len(part.time):
+            times = state.cameras[part.camera].reference_time(part.time)
+            out[part.camera] = min(out[part.camera, 0], times.min()), max(out[part.camera, 1], times.max())
+    return out
 
 
 def position_std(cov: Covariance, camera: int) -> Floats:

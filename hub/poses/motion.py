@@ -16,19 +16,23 @@ from protocols.geometry.types import Bools, Floats
 class MotionPrior:
     """Weights (m,) of the squared third differences, one array a label.
 
-    scales: by label, what keeps the prior from making the path smaller; () = nothing does.
+    sizes: by label, what keeps the prior from making the path smaller; () = nothing does.
     """
 
     weights: tuple[Floats, ...]
-    scales: tuple[ScalePull, ...] = ()
+    sizes: tuple[Size | None, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ScalePull:
-    """A pull (size, 3) on the control points, and what it costs at the path for which it was made."""
+class Size:
+    """How large a path was when the strength of its prior was told.
 
-    pull: Floats
-    level: float
+    both: (m,) knot intervals that two cameras see. held: (size,) control points of these. scatter: of those.
+    """
+
+    both: Bools
+    held: Bools
+    scatter: float
 
 
 def motion_prior(problem: Problem, state: State, first: bool = False) -> MotionPrior:
@@ -36,7 +40,8 @@ def motion_prior(problem: Problem, state: State, first: bool = False) -> MotionP
 
     first: before the path can be trusted, only a whisper that closes holes.
     """
-    weights, scales = [], []
+    weights: list[Floats] = []
+    sizes: list[Size | None] = []
     for label, path in enumerate(state.trajectories):
         size = path.basis.size
         count = len(path.basis.interval_starts())
@@ -52,38 +57,41 @@ def motion_prior(problem: Problem, state: State, first: bool = False) -> MotionP
         scale = float(np.median(np.ptp(path.control, axis=0))) or 1.0
         variance = max(variance, (1e-6 * scale) ** 2)
         weights.append(np.full(count, (1e-3 if first else 1.0) / variance))
-        scales.append(_scale_pull(path, both, weights[-1], differences))
-    return MotionPrior(tuple(weights), () if first else tuple(scales))
+        sizes.append(None if first else _size(path, both))
+    return MotionPrior(tuple(weights), tuple(sizes))
 
 
-def _scale_pull(path: Trajectory, both: Bools, weight: Floats, differences: Floats) -> ScalePull:
-    """What takes the prior's say on the path's scale from it.
+def _size(path: Trajectory, both: Bools) -> Size | None:
+    """The size that the prior's strength follows; None for a path of which two cameras see hardly anything.
 
     A smaller path has smaller third differences, so that a prior of fixed strength prefers it, and a rig whose baseline
-    is held gives way by turning its cameras: with two of them by half a std. The strength is the path's own, and would
-    follow its size: sum w d² S0 / S, S the scatter of the control points, of which this is the derivative at S = S0.
-    both: (m,) knot intervals that two cameras see; elsewhere nothing would hold the path against it.
+    is held gives way by turning its cameras: with two of them by half a std. So where two cameras see the path its cost
+    is sum w d² S0 / S, with S the scatter of its control points, S0 that when w was told: the same for any size.
     """
+    if both.sum() < 4:
+        return None
     held = np.zeros(path.basis.size, dtype=np.bool_)
     held[(path.basis.interval_starts()[both, None] + np.arange(SUPPORT)).ravel()] = True
-    pull = np.zeros_like(path.control)
-    if both.sum() < 4:
-        return ScalePull(pull, 0.0)
-    about = path.control[held] - path.control[held].mean(axis=0)
-    level, scatter = float((weight[both, None] * differences[both] ** 2).sum()), float((about**2).sum())
-    if scatter > 0.0:
-        pull[held] = level / scatter * about
-    return ScalePull(pull, level)
+    scatter = float((_about(path.control[held]) ** 2).sum())
+    return Size(both, held, scatter) if scatter > 0.0 else None
 
 
-def motion_terms(path: Trajectory, weight: Floats, scale: ScalePull | None) -> tuple[Floats, Floats, float]:
+def _about(control: Floats) -> Floats:
+    return np.asarray(control - control.mean(axis=0))
+
+
+def motion_terms(path: Trajectory, weight: Floats, size: Size | None) -> tuple[Floats, Floats, float]:
     """Band, gradient (3 n,) and value of the prior's cost at a path."""
-    band = third_difference_band(path.basis, weight)
     differences = third_differences(path.basis, path.control)
+    if size is None:
+        pulls = weight[:, None] * differences
+        gradient = third_difference_gradient(path.basis, pulls)
+        return third_difference_band(path.basis, weight), gradient, float((pulls * differences).sum())
+    about = _about(path.control[size.held])
+    scatter = max(float((about**2).sum()), 1e-12 * size.scatter)
+    weight = np.where(size.both, size.scatter / scatter, 1.0) * weight
     pulls = weight[:, None] * differences
     gradient = third_difference_gradient(path.basis, pulls)
-    value = float((pulls * differences).sum())
-    if scale is not None:
-        gradient -= scale.pull.ravel()
-        value += 2.0 * (scale.level - float((path.control * scale.pull).sum()))
-    return band, gradient, value
+    level = float((pulls[size.both] * differences[size.both]).sum())
+    gradient.reshape(-1, 3)[size.held] -= level / scatter * about
+    return third_difference_band(path.basis, weight), gradient, float((pulls * differences).sum())

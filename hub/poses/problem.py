@@ -138,7 +138,8 @@ class Freedom:
 
     pose, clock, lens: whether poses, time maps, and focal length with k1 are estimated.
     readout: whether rolling-shutter readouts are. focal_std: prior std of log focal length. k1_std: prior std of k1.
-    rate_std: prior std of a rate. readout_std: prior std [s] of a readout about 0.
+    rate_std: prior std of a rate about 1: crystals err by 50 ppm, what is told of frame rates by 1000.
+    readout_std: prior std [s] of a readout about 0.
     """
 
     pose: bool = True
@@ -147,7 +148,7 @@ class Freedom:
     readout: bool = False
     focal_std: float = 0.01
     k1_std: float = 0.02
-    rate_std: float = 5e-3
+    rate_std: float = 1e-3
     readout_std: float = 0.02
 
 

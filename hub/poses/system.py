@@ -45,7 +45,7 @@ class Weighed:
 def weighed(problem: Problem, state: State, prior: MotionPrior, robust: bool) -> Weighed:
     """Residuals and the cost: what of `assemble` is cheap."""
     cost = sum(
-        motion_terms(path, prior.weights[label], prior.scales[label] if prior.scales else None)[2]
+        motion_terms(path, prior.weights[label], prior.sizes[label] if prior.sizes else None)[2]
         for label, path in enumerate(state.trajectories)
     )
     cost += sum((value / std) ** 2 for _, value, std in _camera_priors(problem, state))
@@ -106,7 +106,7 @@ def assemble(problem: Problem, state: State, prior: MotionPrior, seen: Weighed) 
             system.gradient_cameras[mine] += own[:-1, -1]
     for label, path in enumerate(state.trajectories):
         part = slice(bases[label], bases[label + 1])
-        band, gradient, _ = motion_terms(path, prior.weights[label], prior.scales[label] if prior.scales else None)
+        band, gradient, _ = motion_terms(path, prior.weights[label], prior.sizes[label] if prior.sizes else None)
         system.band[:, part] = band + blocks[label].band()
         system.gradient_path[part] += gradient
     place = {int(column): i for i, column in enumerate(columns)}

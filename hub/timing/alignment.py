@@ -99,12 +99,8 @@ class PairSettings:
     """… up to this where the point moves by less than a pixel in that time, and …"""
     firm: bool = True
     """Whether the answer must stand by itself, and not only begin an adjustment of more cameras, which judges it: …"""
-    largest_doubt: float = 20e-3 / 2.576
-    """… largest std [s] of the lag, lenses and shutters included: 20 ms, a wrong answer, come to one in a hundred; …"""
-    largest_brief_doubt: float = 20e-3 / 3.0
-    """… the same of less than ``brief`` in common, in which errors have longer tails than a Gaussian's; …"""
-    brief: float = 30.0
-    """… [s]; …"""
+    largest_doubt: float = 10e-3
+    """… largest std [s] of the lag, lenses and shutters included: the path, which tells it again, must then agree; …"""
     largest_swing: float = 20e-3
     """… seconds by which it may move when a fifth of what it rests on is left out."""
     largest_turn_std: float = 0.1

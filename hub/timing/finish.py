@@ -111,8 +111,7 @@ def _firm(
     lean = leaning(few, at_centre(found, samples.centre, few), sigma, rate_std, s.largest_lag_std)
     rate = 1.0 / lean.slowness
     fit = replace(fit, rate=rate, offset=few.centre - rate * lean.middle, lag_doubt=lean.std)
-    brief = float(np.ptp(few.time)) < s.brief
-    if lean.std > (s.largest_brief_doubt if brief else s.largest_doubt):
+    if lean.std > s.largest_doubt:
         told = f"{1e3 * lean.std:.0f} ms (std)"
         reason = f"the motion tells the lag only to {told}, with lenses and shutters not exactly as told"
         return replace(answer, status=reason, fit=fit)

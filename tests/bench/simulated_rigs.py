@@ -14,7 +14,7 @@ import argparse
 import itertools
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -24,8 +24,7 @@ import numpy as np  # noqa: E402
 
 from hub.calibrate import calibrate  # noqa: E402
 from hub.prepare import prepare  # noqa: E402
-from hub.timing.pair import solve_pair  # noqa: E402
-from hub.timing.tracks import SmoothTrack, smooth_track  # noqa: E402
+from hub.timing.tracks import SmoothTrack  # noqa: E402
 from protocols.clocks import TimeMap  # noqa: E402
 from protocols.errors import Refused  # noqa: E402
 from protocols.geometry.camera import Intrinsics  # noqa: E402
@@ -163,26 +162,25 @@ class _Seen:
 def cut(data: Path) -> None:
     """Pairs of the drone flights with little in common."""
     for seconds, asked in ((60.0, 97), (20.0, 60)):
-        count, solved, wrong = 0, 0, 0
+        errors = []
         for flight in ("drone1", "drone2"):
             rig = read_rig(data / flight / "rig.toml")
             observations = read_observations(data / flight / "observations.csv", rig.cameras)
             cameras = _all_seen(rig, observations)
-            for a, b in itertools.combinations(cameras.values(), 2):
-                span_a, span_b = (one.reference(one.track.time[[0, -1]]) for one in (a, b))
+            for (one, a), (other, b) in itertools.combinations(cameras.items(), 2):
+                span_a, span_b = (seen.reference(seen.track.time[[0, -1]]) for seen in (a, b))
                 begin, end = max(span_a[0], span_b[0]), min(span_a[1], span_b[1])
                 for first in np.arange(begin, end - seconds, seconds):
                     last = first + seconds
-                    if min(one.moving(first, last) for one in (a, b)) < seconds / 3:
+                    if min(seen.moving(first, last) for seen in (a, b)) < seconds / 3:
                         continue
-                    count += 1
-                    error = _solve_cut(a, b, first, last)
-                    if error is not None:
-                        solved += error <= _WRONG_S
-                        wrong += error > _WRONG_S
+                    errors.append(_solve_cut(rig, observations, {one: a, other: b}, first, last))
+        told = [error for error in errors if error is not None]
+        wrong = sum(error > _WRONG_S for error in told)
+        worst = ", ".join(f"{1e3 * error:.1f}" for error in sorted(told)[-3:])
         print(
-            f"drone pairs with {seconds:.0f} s in common: {100 * solved / count:.0f} % of {count} solved "
-            f"(asked {asked}), {wrong} wrong"
+            f"drone pairs with {seconds:.0f} s in common: {100 * (len(told) - wrong) / len(errors):.0f} % of "
+            f"{len(errors)} solved (asked {asked}), {wrong} wrong; worst {worst} ms"
         )
 
 
@@ -198,21 +196,27 @@ def _all_seen(rig: Rig, observations: Observations) -> dict[str, _Seen]:
     return out
 
 
-def _solve_cut(a: _Seen, b: _Seen, first: float, last: float) -> float | None:
-    """Error [s] of the lag in mid-overlap, or None where it was refused."""
-    tracks = []
-    for one, keep in ((a, a.reference(a.track.time) <= last), (b, b.reference(b.track.time) >= first)):
-        normalised = one.lens.unproject(one.track.pixels[keep])
-        tracks.append(smooth_track(one.track.time[keep], normalised, one.lens.focal))
-    left, right = tracks
-    if left is None or right is None:
-        return None
-    found = solve_pair({"": left}, {"": right}, ("a", "b"))
-    if not found.solved or found.fit is None:
+def _solve_cut(rig: Rig, observations: Observations, seen: dict[str, _Seen], first: float, last: float) -> float | None:
+    """Error [s] of the lag in mid-overlap as `calibrate` tells it of two cameras alone, or None where it refuses."""
+    tracks = {}
+    for (name, camera), ended in zip(seen.items(), (True, False), strict=True):
+        for track in observations.of_camera(name):
+            reference = camera.reference(track.time)
+            rows = np.flatnonzero(reference <= last if ended else reference >= first)
+            tracks[name, track.label] = replace(
+                track, frame=track.frame[rows], time=track.time[rows], pixels=track.pixels[rows], size=track.size[rows]
+            )
+    pair = replace(rig, cameras={name: rig.cameras[name] for name in seen})
+    try:
+        found = calibrate(pair, replace(observations, tracks=tracks))
+    except Refused:
         return None
     middle = 0.5 * (first + last)
-    shown_a, shown_b = ((middle - one.clock.time_offset) / one.clock.clock_rate for one in (a, b))
-    return abs(found.fit.rate * (shown_b - right.epoch) + found.fit.offset + left.epoch - shown_a)
+    told = []
+    for name, camera in seen.items():
+        shown = (middle - camera.clock.time_offset) / camera.clock.clock_rate
+        told.append(found.cameras[name].time_map.clock_rate * shown + found.cameras[name].time_map.time_offset)
+    return abs(told[0] - told[1])
 
 
 def main() -> None:

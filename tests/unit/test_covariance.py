@@ -11,7 +11,7 @@ from hub.calibrate import calibrate
 from hub.poses import covariance as cov
 from hub.poses.adjust import adjust
 from hub.poses.motion import MotionPrior
-from hub.poses.problem import CAMERA_PARAMETERS, CameraState, Problem, Rows, State, Trajectory
+from hub.poses.problem import CAMERA_PARAMETERS, OFFSET, RATE, CameraState, Problem, Rows, State, Trajectory
 from hub.splines import SplineBasis, fit_spline
 from protocols.geometry.types import Floats
 from tests.rigs import random_lens, random_path, random_poses, simulate
@@ -151,3 +151,26 @@ def test_the_path_is_less_sure_at_its_ends(solved: tuple[Problem, State, MotionP
     stds = cov.path_std(found, state, 0, np.array([0.02, 3.0, 5.98]))
     assert stds[1] < stds[0]
     assert stds[1] < stds[2]
+
+
+def test_clocks_are_judged_where_both_cameras_saw(solved: tuple[Problem, State, MotionPrior]) -> None:
+    """Spans 0 to 10 s and 8 to 30 s: at 9 s, however vague their rates make the lag elsewhere. By hand."""
+    problem, state, _ = solved
+    spans = ((0.0, 10.0), (8.0, 30.0), (40.0, 50.0))
+    cameras = tuple(
+        replace(camera, rate=1.0, offset=sum(span) / 2, centre=0.0)
+        for camera, span in zip(state.cameras, spans, strict=True)
+    )
+    rows = tuple(
+        replace(part, time=np.linspace(span[0], span[1], 150) - sum(span) / 2)
+        for part, span in zip(problem.rows, spans, strict=True)
+    )
+    variance = np.zeros(3 * CAMERA_PARAMETERS)
+    variance[OFFSET::CAMERA_PARAMETERS] = [0.0, 1e-6, 4e-6]
+    variance[RATE::CAMERA_PARAMETERS] = [1e-8, 4e-8, 0.0]
+    found = cov.Covariance(np.diag(variance), np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0, 0)))
+    stds = cov.common_clock_stds(found, replace(problem, rows=rows), replace(state, cameras=cameras))
+    assert stds[0, 1] == pytest.approx(np.sqrt(1e-6 + 4.0**2 * 1e-8 + 10.0**2 * 4e-8))
+    assert stds[0, 2] == pytest.approx(np.sqrt(4e-6 + 20.0**2 * 1e-8))  # nothing in common: mid-gap
+    np.testing.assert_array_equal(stds, stds.T)
+    assert not np.diag(stds).any()

@@ -107,7 +107,7 @@ def test_a_part_that_disagrees_is_told_by_leaving_it_out() -> None:
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        (PairSettings(largest_doubt=1e-9, largest_brief_doubt=1e-9), "lenses and shutters"),
+        (PairSettings(largest_doubt=1e-9), "lenses and shutters"),
         (PairSettings(largest_lag_std=1e-9, largest_swing=1e-9), "without a fifth"),
     ],
 )
@@ -124,7 +124,7 @@ def test_a_lag_that_leans_too_much_is_refused(settings: PairSettings, told: str)
 
 def test_what_only_begins_an_adjustment_need_not_be_firm() -> None:
     _, (a, b) = slow(0, 0.0)
-    answer = solved(a, b, PairSettings(firm=False, largest_doubt=1e-9, largest_brief_doubt=1e-9))
+    answer = solved(a, b, PairSettings(firm=False, largest_doubt=1e-9))
     assert answer.solved
     assert answer.fit is not None
     assert np.isnan(answer.fit.lag_doubt)

@@ -37,7 +37,7 @@ def two_cameras(seed: int, until: float = SECONDS, noise: float = 0.5) -> tuple[
 
 
 def value(path: Trajectory, prior: MotionPrior, control: Floats) -> float:
-    return motion_terms(replace(path, control=control), prior.weights[0], prior.scales[0])[2]
+    return motion_terms(replace(path, control=control), prior.weights[0], prior.sizes[0])[2]
 
 
 def test_its_gradient_is_half_the_difference_of_its_value() -> None:
@@ -45,7 +45,7 @@ def test_its_gradient_is_half_the_difference_of_its_value() -> None:
     path, prior = state.trajectories[0], motion_prior(problem, state)
     rng = np.random.default_rng(2)
     along = rng.normal(size=path.control.shape)
-    gradient = motion_terms(path, prior.weights[0], prior.scales[0])[1]
+    gradient = motion_terms(path, prior.weights[0], prior.sizes[0])[1]
     ahead, behind = (value(path, prior, path.control + sign * 1e-5 * along) for sign in (1, -1))
     assert gradient @ along.ravel() == pytest.approx((ahead - behind) / 4e-5, rel=1e-6)
 
@@ -62,9 +62,21 @@ def test_it_does_not_care_for_the_paths_size() -> None:
     assert gradient @ (path.control - centre).ravel() == pytest.approx(at, rel=1e-6)
 
 
+@pytest.mark.parametrize("times", [-1e3, -10.0, -1.0, 1.0, 10.0, 1e3])
+def test_no_path_gains_more_than_what_the_prior_cost(times: float) -> None:
+    """An even acceleration has no third differences: with a pull that has no end, rows that hardly hold a path's depth
+    (two cameras close together) lost to it."""
+    problem, state = two_cameras(5)
+    path, prior = state.trajectories[0], motion_prior(problem, state)
+    bent = np.linspace(-1.0, 1.0, len(path.control))[:, None] ** 2 * np.array([0.0, 0.0, 1.0])
+    assert value(path, prior, path.control + times * bent) >= 0.0
+
+
 def test_nothing_pulls_where_only_one_camera_sees() -> None:
     problem, state = two_cameras(4, until=6.0)
-    pull = motion_prior(problem, state).scales[0].pull
+    path, prior = state.trajectories[0], motion_prior(problem, state)
+    terms = (motion_terms(path, prior.weights[0], size)[1] for size in (None, prior.sizes[0]))
+    pull = np.subtract(*terms).reshape(-1, 3)
     assert np.abs(pull[4:20]).max(axis=1).min() > 0.0
     assert not pull[-20:].any()
 

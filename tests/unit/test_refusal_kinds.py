@@ -97,6 +97,13 @@ def vague_clock(patch: pytest.MonkeyPatch) -> str:
     return told_of(rigs.simulate(1, 2, SECONDS, late=0.5))
 
 
+def two_clocks(patch: pytest.MonkeyPatch) -> str:
+    patch.setattr(calibrating, "_FARTHEST_FROM_PAIR", 1e-9)
+    told = told_of(rigs.simulate(1, 2, SECONDS, late=0.5))
+    assert told.splitlines()[-1].startswith("the path tells its clock")  # nor is the pair's lag told
+    return told
+
+
 def vague_lens(patch: pytest.MonkeyPatch) -> str:
     patch.setattr(calibrating, "LARGEST_STD", -1.0)
     return told_of(rigs.simulate(1, 2, SECONDS, late=0.5))
@@ -192,6 +199,7 @@ KINDS: dict[str, Scene] = {
     "the motion tells the relative rotation only to": vague_rotation,
     "tells its orientation only to": vague_orientation,
     "tells its clock only to": vague_clock,
+    "apart from what epipolar lines tell": two_clocks,
     "tells its focal length only to": vague_lens,
     "the tracks jump": torn,
     "fit the path that the others see": another_path,

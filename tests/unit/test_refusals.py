@@ -64,6 +64,7 @@ TOLD = {
     "the motion tells the relative rotation only to": "rotation only to",
     "tells its orientation only to": "orientation",
     "tells its clock only to": "clock only to",
+    "apart from what epipolar lines tell": "apart from what epipolar lines tell",
     "tells its focal length only to": "focal length only to",
     "the tracks jump": "the tracks jump",
     "fit the path that the others see": "fit the path that the others see",
