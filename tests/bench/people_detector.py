@@ -1,6 +1,7 @@
 """The person detector on rendered rooms whose truth is known, beside the plain background model.
 
     python -m tests.bench.people_detector [--seeds 3] [--first-seed 700] [--seconds 30] [--people 5]
+    python -m tests.bench.people_detector --labels LABELS.csv --detections PEOPLE.csv
 
 Precision and recall at an overlap (intersection over union) of 0.5, as pedestrian benchmarks judge: people of whom less
 than half is in view and people whom the picture's border cuts neither count nor harm. Files: looked through twice, as
@@ -8,12 +9,17 @@ than half is in view and people whom the picture's border cuts neither count nor
 Noise 4, shadows on. CPU milliseconds a frame. Seeds from 700 on are not looked at while anything is adjusted.
 Also the squared error of the representative point over its covariance, across and down, of who stands alone and of who
 is among others, against that point of the true silhouette's part in view.
+
+The second form judges what `syncline detect person FILM --out PEOPLE.csv` found in a film of your own, in the frames
+that LABELS.csv has boxes for: frame,x,y,w,h,ignore (1 = neither counts nor harms).
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -101,13 +107,46 @@ def plain(pictures: list[Image], fps: float) -> tuple[list[list[Floats]], float]
     return found, 1e3 * (time.process_time() - begun) / len(pictures)
 
 
+def read_boxes(file: Path, prefix: str = "") -> dict[int, tuple[Floats, Bools]]:
+    """By frame, boxes (n, 4) x, y, w, h of a table, and which count (n,)."""
+    rows: dict[int, list[list[float]]] = {}
+    with file.open(encoding="utf-8", newline="") as lines:
+        for row in csv.DictReader(lines):
+            box = [float(row[prefix + side]) for side in "xywh"]
+            rows.setdefault(int(row["frame"]), []).append([*box, float(row.get("ignore") or 0)])
+    out = {}
+    for frame, boxes in rows.items():
+        table = np.array(boxes)
+        out[frame] = (table[:, :4], table[:, 4] == 0.0)
+    return out
+
+
+def judge_film(labels: Path, detections: Path) -> int:
+    """What was found in a film against its labels; prints it, and returns the exit status."""
+    true, found = read_boxes(labels), read_boxes(detections, "box_")
+    total: list[tuple[int, int, int, float]] = []
+    for frame, (boxes, counts) in true.items():
+        shown = list(found[frame][0]) if frame in found else []
+        total.append(judge(boxes, counts, shown))
+    right, wrong, missed = (sum(int(one[part]) for one in total) for part in range(3))
+    precision, recall = right / max(right + wrong, 1), right / max(right + missed, 1)
+    print(f"{len(true)} frames, {right + missed} people: precision {precision:.3f}, recall {recall:.3f}")
+    return int(min(precision, recall) < _BAR)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first-seed", type=int, default=700)
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--people", type=int, default=5)
+    parser.add_argument("--labels", type=Path, help="boxes of people in some frames of a film")
+    parser.add_argument("--detections", type=Path, help="what `syncline detect person` found in it")
     options = parser.parse_args()
+    if (options.labels is None) != (options.detections is None):
+        parser.error("--labels and --detections belong together")
+    if options.labels is not None:
+        return judge_film(options.labels, options.detections)
     cv2.setNumThreads(1)
     ways = {"file": from_file, "live": live, "MOG2 alone": plain}
     rows: dict[str, list[tuple[int, int, int, float, float]]] = {name: [] for name in ways}
