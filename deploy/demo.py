@@ -14,7 +14,7 @@ from pathlib import Path
 
 import tomli_w
 
-from deploy.signals import interrupt_on_signals
+from deploy.signals import Interruption, interrupt_on_signals
 from protocols.bus.base import Bus
 from protocols.bus.router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
@@ -69,6 +69,7 @@ class Fleet:
         self.out = settings.out.resolve()
         self.names = [f"cam{i}" for i in range(settings.cameras)]
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._interrupted = Interruption()
         self._endpoint = free_endpoint()
         self._site = "demo"
 
@@ -78,7 +79,7 @@ class Fleet:
         configs = self._write_configs()
         live = Live()
         # Ended from outside, the demo must take its agents along: as after Ctrl-C, ``finally`` does it.
-        interrupted = interrupt_on_signals()
+        self._interrupted = interrupt_on_signals()
         bus_config = BusConfig(mode="client", connect=(self._endpoint,))
         with Router(self._endpoint), open_bus(self._site, bus_config, timeout_s=10.0) as bus:
             observations, calibrations = bus.subscribe(OBSERVATION), bus.subscribe(CALIBRATION)
@@ -94,7 +95,7 @@ class Fleet:
                 first: float | None = None
                 while first is None or time.monotonic() - first < self.settings.seconds:
                     observations.wait(0.2)
-                    if interrupted.is_set():
+                    if self._interrupted.is_set():
                         raise KeyboardInterrupt
                     for received in observations.drain():
                         assert isinstance(received.message, pb.Observation)
@@ -202,7 +203,7 @@ class Fleet:
         raise Refused(f"the view did not start: {self._last_line('view')}")
 
     def _run(self, name: str, arguments: list[str]) -> None:
-        with (self.out / "logs" / f"{name}.txt").open("wb") as log:
+        with (self.out / "logs" / f"{name}.txt").open("wb") as log, self._interrupted.held():
             self._processes[name] = subprocess.Popen(
                 [sys.executable, "-m", "deploy", *arguments],
                 stdout=log,

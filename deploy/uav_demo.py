@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tomli_w
 
-from deploy.signals import interrupt_on_signals
+from deploy.signals import Interruption, interrupt_on_signals
 from deploy.uav_config import FlightConfig
 from deploy.uav_demo_outcome import LOG, REPORT, Outcome, as_json, compare, compare_geo
 from protocols.bus.router import Router, free_endpoint
@@ -75,7 +75,7 @@ def run_town(
     interrupted = interrupt_on_signals()
     world = patrol(seed, seconds + _SPARE_S)
     epoch = time.time()
-    processes = _Processes(out, _configs(out, endpoint, port, seconds, seed, epoch))
+    processes = _Processes(out, _configs(out, endpoint, port, seconds, seed, epoch), interrupted)
     with Router(endpoint), open_bus("demo", BusConfig(mode="client", connect=(endpoint,)), timeout_s=10.0) as bus:
         targets = bus.subscribe(TARGET)
         station = Station(f"udpout:127.0.0.1:{port}")
@@ -187,9 +187,10 @@ def _line(station: Station) -> str:
 class _Processes:
     """The agents, each from its configuration file."""
 
-    def __init__(self, out: Path, configs: dict[str, Path]) -> None:
+    def __init__(self, out: Path, configs: dict[str, Path], interrupted: Interruption) -> None:
         self.folder = out / "logs"
         self._configs = configs
+        self._interrupted = interrupted
         self._running: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(self, name: str, role: str) -> None:
@@ -207,7 +208,7 @@ class _Processes:
         raise Refused(f"the view did not start: {self._last_line('view')}")
 
     def _run(self, name: str, words: list[str]) -> None:
-        with (self.folder / f"{name}.txt").open("wb") as log:
+        with (self.folder / f"{name}.txt").open("wb") as log, self._interrupted.held():
             self._running[name] = subprocess.Popen(
                 [sys.executable, "-m", "deploy", *words],
                 stdout=log,
