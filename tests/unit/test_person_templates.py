@@ -175,9 +175,3 @@ def test_two_broad_ones_side_by_side_are_two_though_a_third_was_expected_between
     found = explain(figure, np.zeros_like(figure), place(), boxes, statures=[1.0] * 3)
     middles = sorted(one.box[0] + 0.5 * one.box[2] for one in found)
     assert middles == pytest.approx([149.0, 171.0], abs=2.5)
-
-
-def test_who_stands_between_two_is_still_somebody() -> None:
-    figure = drawn((145, 1.0), (160, 1.0), (175, 1.0))
-    boxes = [(u - 8.0, 100.0, 16.0, 60.0) for u in (145.0, 160.0, 175.0)]
-    assert len(explain(figure, np.zeros_like(figure), place(), boxes, statures=[1.0] * 3)) == 3
