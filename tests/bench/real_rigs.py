@@ -36,6 +36,7 @@ from protocols.session.calibration import (
 from protocols.session.observations import Observations, read_observations
 from protocols.session.rig import read_rig
 from tests.bench import board_rotation, scoring
+from tests.bench.resection import Resection, resect
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEFAULT_DATA = REPOSITORY.parent / "shared" / "data"
@@ -187,7 +188,7 @@ def _seen_times(run: Run, seen: Observations) -> list[Floats]:
 
 def _lags(run: Run, seen: Observations, fit: scoring.Alignment, table: Floats) -> Lags:
     """Lags against each camera's own resection on the truth, which uses nothing of the others."""
-    found: dict[str, scoring.Resection] = {}
+    found: dict[str, Resection] = {}
     lines = []
     for name, camera in run.cameras.items():
         clock = camera.time_map
@@ -195,7 +196,7 @@ def _lags(run: Run, seen: Observations, fit: scoring.Alignment, table: Floats) -
         track = seen.of_camera(name)[0]
         lens = camera.intrinsics
         try:
-            found[name] = scoring.resect(lens, track.time, track.pixels, start, table[:, 0], table[:, 1:])
+            found[name] = resect(lens, track.time, track.pixels, start, table[:, 0], table[:, 1:])
         except ValueError as error:
             lines.append(f"{name}: {error}")
     spans = dict(zip(run.cameras, _seen_times(run, seen), strict=True))
@@ -210,7 +211,11 @@ def _lags(run: Run, seen: Observations, fit: scoring.Alignment, table: Floats) -
     median, worst = float(np.median(sizes)), float(sizes.max())
     told = ", ".join(f"{a}–{b} {value:+.1f}" for (a, b), value in differences.items())
     lines.append(f"lags against resection on the truth: median {median:.1f} ms, worst {worst:.1f} ms ({told})")
-    told = ", ".join(f"{name} {part.median_px:.2f} px, focal × {part.focal_scale:.4f}" for name, part in found.items())
+    told = "; ".join(
+        f"{name} {part.median_px:.2f} px, focal × {part.focal_scale:.4f}, time ± {_MS * part.time_std:.1f} ms, errors "
+        f"{part.errors.white_px:.2f} px white, {part.errors.lasting_px:.2f} px lasting {part.errors.seconds:.1f} s"
+        for name, part in found.items()
+    )
     return Lags((*lines, f"resection: {told}"), worst)
 
 

@@ -9,14 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import minimize
 
 from protocols.clocks import TimeMap
 from protocols.geometry import so3
-from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose, Similarity, fit_similarity
 from protocols.geometry.types import Bools, Floats
 
@@ -185,57 +182,6 @@ def nearest(times: Floats, grid: Floats) -> Floats:
     after = np.clip(np.searchsorted(times, grid), 0, len(times) - 1)
     before = np.maximum(after - 1, 0)
     return np.minimum(np.abs(times[after] - grid), np.abs(times[before] - grid))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Resection:
-    """One camera fitted to the truth by itself. time_map: truth's clock from the camera's; median_px: residual."""
-
-    time_map: TimeMap
-    pose: Pose
-    focal_scale: float
-    median_px: float
-
-
-def resect(
-    lens: Intrinsics, time: Floats, pixels: Floats, start: TimeMap, truth_time: Floats, truth: Floats
-) -> Resection:
-    """Pose, focal length and time map of one camera against the truth's path, robustly.
-
-    time: (n,) camera times; pixels: (n, 2); start: a first guess of truth time from camera time, good to
-    about half a second. Nothing else of the answer that is being judged goes in.
-    """
-    path = CubicSpline(truth_time, truth)
-    middle = float(np.median(time))
-    seen = start.clock_rate * time + start.time_offset
-    inside = (seen > truth_time[0] + 2) & (seen < truth_time[-1] - 2)
-    time, pixels, seen = time[inside], pixels[inside], seen[inside]
-    found, rotation, translation, _ = cv2.solvePnPRansac(
-        path(seen), pixels, lens.matrix, lens.distortions, reprojectionError=12.0, iterationsCount=500
-    )
-    if not found:
-        raise ValueError("no pose fits the truth")
-
-    def residual(parameters: Floats) -> Floats:
-        turn, shift = so3.exp(parameters[:3]), parameters[3:6]
-        rate = start.clock_rate + 1e-3 * parameters[7]
-        at = start.clock_rate * middle + start.time_offset + parameters[6] + rate * (time - middle)
-        matrix = lens.matrix.copy()
-        matrix[:2, :2] *= 1.0 + 0.01 * parameters[8]
-        points = path(at) @ turn.T + shift
-        points[:, 2] = np.maximum(points[:, 2], 1e-3)
-        bent = Intrinsics(lens.width, lens.height, matrix, lens.distortions, lens.fisheye)
-        return np.asarray((bent.project(points) - pixels).ravel())
-
-    first = np.r_[rotation.ravel(), translation.ravel(), 0.0, 0.0, 0.0]
-    fit = least_squares(residual, first, loss="soft_l1", f_scale=5.0, x_scale="jac", max_nfev=60)
-    fit = least_squares(residual, fit.x, loss="soft_l1", f_scale=1.0, x_scale="jac", max_nfev=100)
-    rate = start.clock_rate + 1e-3 * float(fit.x[7])
-    offset = start.clock_rate * middle + start.time_offset + float(fit.x[6]) - rate * middle
-    turn = so3.exp(fit.x[:3])
-    norms = np.linalg.norm(residual(fit.x).reshape(-1, 2), axis=1)
-    pose = Pose(turn, np.asarray(-turn.T @ fit.x[3:6]))
-    return Resection(TimeMap(rate, offset), pose, 1.0 + 0.01 * float(fit.x[8]), float(np.median(norms)))
 
 
 def lag_difference(a: TimeMap, b: TimeMap, true_a: TimeMap, true_b: TimeMap, reference_time: float) -> float:

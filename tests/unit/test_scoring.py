@@ -7,11 +7,9 @@ import pytest
 
 from protocols.clocks import TimeMap
 from protocols.geometry import so3
-from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose, Similarity
 from protocols.geometry.types import Floats
 from tests.bench import scoring
-from tests.unit.solved_session import looking_at
 
 MOVE = Similarity(0.31, so3.exp(np.array([0.4, -1.1, 0.7])), np.array([3.0, -2.0, 0.5]))
 RATE, OFFSET = 1.0 + 7e-4, -41.3
@@ -83,24 +81,6 @@ def test_coverage_is_the_share_of_time_two_cameras_saw() -> None:
     assert scoring.coverage(whole[whole < 7.0], [a, b]) == pytest.approx(0.5, abs=0.01)
     assert scoring.coverage(np.zeros(0), [a, b]) == 0.0
     assert scoring.coverage(whole, [a]) == 0.0
-
-
-def test_a_camera_is_resected_with_its_clock_and_focal_length() -> None:
-    lens = Intrinsics(1920, 1080, np.array([[1500.0, 0, 960], [0, 1500.0, 540], [0, 0, 1]]))
-    told = Intrinsics(1920, 1080, np.array([[1470.0, 0, 960], [0, 1470.0, 540], [0, 0, 1]]))
-    pose = looking_at(np.array([25.0, -20.0, 2.0]), np.array([0.0, 0.0, 3.0]))
-    clock = TimeMap(1 + 3e-4, 12.5)
-    time = np.arange(40.0, 120.0, 1 / 25)
-    pixels = lens.project(pose.camera_from_world(path(clock.clock_rate * time + clock.time_offset)))
-    pixels += np.random.default_rng(3).normal(0, 0.5, pixels.shape)
-    pixels[::40] += 80.0  # false detections
-    found = scoring.resect(told, time, pixels, TimeMap(1.0, 12.3), *truth())
-    middle = 80.0
-    exact = clock.clock_rate * middle + clock.time_offset
-    assert found.time_map.clock_rate * middle + found.time_map.time_offset == pytest.approx(exact, abs=1e-3)
-    assert found.focal_scale == pytest.approx(1500 / 1470, abs=2e-3)
-    np.testing.assert_allclose(found.pose.position, pose.position, atol=0.1)
-    assert found.median_px < 0.8
 
 
 def test_lags_are_compared_at_one_instant() -> None:
