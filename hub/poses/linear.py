@@ -91,14 +91,19 @@ def _summed(weights: Floats, columns: Ints, values: Floats, size: int) -> Floats
     return np.asarray(spread.T @ values)
 
 
-def third_difference_band(basis: SplineBasis | PointBasis, weight: Floats) -> Floats:
-    """Band of the motion prior sum weight_i |third difference_i|² over knot intervals; weight (m,)."""
+def third_difference_band(basis: SplineBasis | PointBasis, weight: Floats, metric: Floats) -> Floats:
+    """Band of the motion prior sum weight_i dᵢᵀ metric dᵢ over knot intervals with third differences dᵢ.
+
+    weight: (m,). metric: (3, 3), symmetric.
+    """
     band = np.zeros((BAND, 3 * basis.size))
     index = basis.interval_starts()
     for a, b in _PAIRS:
-        for j in range(3):
-            # no interval begins where another does
-            band[BAND - 1 - 3 * (b - a), 3 * (index + b) + j] += THIRD_DIFFERENCE[a] * THIRD_DIFFERENCE[b] * weight
+        for i in range(3):
+            for j in range(i if a == b else 0, 3):
+                # no interval begins where another does
+                values = THIRD_DIFFERENCE[a] * THIRD_DIFFERENCE[b] * metric[i, j] * weight
+                band[BAND - 1 - 3 * (b - a) - j + i, 3 * (index + b) + j] += values
     return band
 
 

@@ -11,12 +11,15 @@ from hub.poses.problem import Problem, State, Trajectory
 from hub.splines import SUPPORT
 from protocols.geometry.types import Bools, Floats
 
+_FLATTEST = 1e-3 / 3.0
+"""Least share of a path's scatter in any direction: a path in a plane has none across it."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionPrior:
     """Weights (m,) of the squared third differences, one array a label.
 
-    sizes: by label, what keeps the prior from making the path smaller; () = nothing does.
+    sizes: by label, what keeps the prior from making the path smaller or flatter; () = nothing does.
     """
 
     weights: tuple[Floats, ...]
@@ -25,14 +28,16 @@ class MotionPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Size:
-    """How large a path was when the strength of its prior was told.
+    """How large a path was, and in which directions, when the strength of its prior was told.
 
-    both: (m,) knot intervals that two cameras see. held: (size,) control points of these. scatter: of those.
+    both: (m,) knot intervals that two cameras see. held: (size,) control points of these. floor: added to the diagonal
+    of their scatter. scale: of the metric ``scale * scatter⁻¹``, in which the prior is what it was told to be.
     """
 
     both: Bools
     held: Bools
-    scatter: float
+    floor: float
+    scale: float
 
 
 def motion_prior(problem: Problem, state: State, first: bool = False) -> MotionPrior:
@@ -57,27 +62,40 @@ def motion_prior(problem: Problem, state: State, first: bool = False) -> MotionP
         scale = float(np.median(np.ptp(path.control, axis=0))) or 1.0
         variance = max(variance, (1e-6 * scale) ** 2)
         weights.append(np.full(count, (1e-3 if first else 1.0) / variance))
-        sizes.append(None if first else _size(path, both))
+        sizes.append(None if first else _size(path, both, weights[-1]))
     return MotionPrior(tuple(weights), tuple(sizes))
 
 
-def _size(path: Trajectory, both: Bools) -> Size | None:
+def _size(path: Trajectory, both: Bools, weight: Floats) -> Size | None:
     """The size that the prior's strength follows; None for a path of which two cameras see hardly anything.
 
-    A smaller path has smaller third differences, so that a prior of fixed strength prefers it, and a rig whose baseline
-    is held gives way by turning its cameras: with two of them by half a std. So where two cameras see the path its cost
-    is sum w d² S0 / S, with S the scatter of its control points, S0 that when w was told: the same for any size.
+    A smaller path has smaller third differences, and so has one that is flatter: a prior of fixed strength prefers
+    both, and cameras give way, by turning and, where lenses are free, by zooming (with errors that last for seconds by
+    metres). So where two cameras see the path its third differences d count in the metric of the scatter S of its
+    control points: sum w dᵀ S⁻¹ d is the same for every affine picture of a path.
     """
     if both.sum() < 4:
         return None
     held = np.zeros(path.basis.size, dtype=np.bool_)
     held[(path.basis.interval_starts()[both, None] + np.arange(SUPPORT)).ravel()] = True
-    scatter = float((_about(path.control[held]) ** 2).sum())
-    return Size(both, held, scatter) if scatter > 0.0 else None
+    scatter = _scatter(path.control[held], 0.0)
+    floor = _FLATTEST * float(np.trace(scatter))
+    if not floor > 0.0:
+        return None
+    differences = third_differences(path.basis, path.control)[both]
+    inverse = np.linalg.inv(_scatter(path.control[held], floor))
+    plain = float((weight[both, None] * differences**2).sum())
+    metric = float((weight[both, None] * (differences @ inverse) * differences).sum())
+    return Size(both, held, floor, plain / metric) if metric > 0.0 else None
 
 
 def _about(control: Floats) -> Floats:
     return np.asarray(control - control.mean(axis=0))
+
+
+def _scatter(control: Floats, floor: float) -> Floats:
+    about = _about(control)
+    return np.asarray(about.T @ about / len(about) + floor * np.eye(3))
 
 
 def motion_terms(path: Trajectory, weight: Floats, size: Size | None) -> tuple[Floats, Floats, float]:
@@ -86,12 +104,14 @@ def motion_terms(path: Trajectory, weight: Floats, size: Size | None) -> tuple[F
     if size is None:
         pulls = weight[:, None] * differences
         gradient = third_difference_gradient(path.basis, pulls)
-        return third_difference_band(path.basis, weight), gradient, float((pulls * differences).sum())
-    about = _about(path.control[size.held])
-    scatter = max(float((about**2).sum()), 1e-12 * size.scatter)
-    weight = np.where(size.both, size.scatter / scatter, 1.0) * weight
-    pulls = weight[:, None] * differences
+        return third_difference_band(path.basis, weight, np.eye(3)), gradient, float((pulls * differences).sum())
+    held = path.control[size.held]
+    inverse = np.linalg.inv(_scatter(held, size.floor))
+    metric: Floats = np.asarray(size.scale * inverse)
+    inside, outside = np.where(size.both, weight, 0.0), np.where(size.both, 0.0, weight)
+    pulls = inside[:, None] * (differences @ metric) + outside[:, None] * differences
     gradient = third_difference_gradient(path.basis, pulls)
-    level = float((pulls[size.both] * differences[size.both]).sum())
-    gradient.reshape(-1, 3)[size.held] -= level / scatter * about
-    return third_difference_band(path.basis, weight), gradient, float((pulls * differences).sum())
+    level = (inside[:, None] * differences).T @ differences
+    gradient.reshape(-1, 3)[size.held] -= size.scale / len(held) * _about(held) @ inverse @ level @ inverse
+    band = third_difference_band(path.basis, inside, metric) + third_difference_band(path.basis, outside, np.eye(3))
+    return band, gradient, float((pulls * differences).sum())

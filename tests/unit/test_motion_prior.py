@@ -62,6 +62,20 @@ def test_it_does_not_care_for_the_paths_size() -> None:
     assert gradient @ (path.control - centre).ravel() == pytest.approx(at, rel=1e-6)
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_it_does_not_care_whether_the_path_is_flatter_or_askew(seed: int) -> None:
+    """Rows that err for seconds hold a rig loosely: a prior that prefers flat paths bent it by metres."""
+    problem, state = two_cameras(3)
+    path, prior = state.trajectories[0], motion_prior(problem, state)
+    centre = path.control.mean(axis=0)
+    size = prior.sizes[0]
+    assert size is not None
+    seen = MotionPrior((np.where(size.both, prior.weights[0], 0.0),), prior.sizes)
+    picture = np.eye(3) + 0.3 * np.random.default_rng(seed).normal(size=(3, 3))
+    at, other = (value(path, seen, centre + (path.control - centre) @ one) for one in (np.eye(3), picture))
+    assert other == pytest.approx(at, rel=0.02)  # but for what keeps a flat path from having no size at all
+
+
 @pytest.mark.parametrize("times", [-1e3, -10.0, -1.0, 1.0, 10.0, 1e3])
 def test_no_path_gains_more_than_what_the_prior_cost(times: float) -> None:
     """An even acceleration has no third differences: with a pull that has no end, rows that hardly hold a path's depth
