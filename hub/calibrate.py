@@ -21,6 +21,7 @@ from hub.poses.adjust import adjust, noise, residual_norms
 from hub.poses.frame_times import settle
 from hub.poses.graph import ClockGraph, ClockGuess, average_clocks, components
 from hub.poses.initialise import Scaffold, agreement, grow, place_known
+from hub.poses.lasting import with_lasting_errors
 from hub.poses.motion import motion_prior
 from hub.poses.problem import Freedom, Problem, State
 from hub.poses.sigma import together
@@ -41,9 +42,9 @@ if TYPE_CHECKING:
 
 _LEAST_AGREEMENT = 0.5  # share of a camera's rows that must fit the common path
 _LEAST_ROWS = 30
-_LARGEST_TURN_STD = 0.035  # rad
-_LARGEST_CLOCK_STD = 20e-3 / 3.0  # s: 20 ms, a wrong answer, are three of them
-_FARTHEST_FROM_PAIR = 20e-3  # s
+_LARGEST_TURN_STD = 0.05  # rad
+_LARGEST_CLOCK_STD = 10e-3  # s: a frame is more than three of them
+_FARTHEST_FROM_PAIR = 30e-3  # s
 _APART = "the path tells its clock"
 _LENS_ROUNDS = 3
 
@@ -265,7 +266,7 @@ def _loosest(scaffold: Scaffold) -> tuple[str, str]:
     """The camera that is least tied to any other, and what is too uncertain about it; "" for nothing."""
     problem, state = scaffold.problem, scaffold.state
     found = cov.covariance(problem, state, motion_prior(problem, state))
-    turns = cov.turn_stds(found, state)
+    turns = cov.turn_stds(found.cameras, state)
     clocks = np.zeros_like(turns)
     if problem.freedom.clock:
         clocks = cov.common_clock_stds(found, problem, state)
@@ -400,6 +401,8 @@ def _adjust_all(scaffold: Scaffold, tell: Progress) -> Scaffold:
         read_problem, read_state, _ = adjust(readout.freed(problem), state, rounds=2)
         if readout.plausible(read_state) and _prefers(read_problem, read_state, problem, state, 1):
             problem, state = read_problem, read_state
+    tell("errors that last", 0.92)
+    problem, state = with_lasting_errors(problem, state)
     return replace_solution(scaffold, problem, state)
 
 

@@ -150,18 +150,22 @@ def _reordered(problem: Problem, state: State, order: list[int]) -> tuple[Proble
         nominal=tuple(problem.nominal[i] for i in order),
         clock_reference=place[problem.clock_reference],
         anchors=(place[problem.anchors[0]], place[problem.anchors[1]]),
-        guessed=tuple(problem.lens_prior(i) for i in order),
+        guessed=tuple(problem.guessed[i] for i in order) if problem.guessed else (),
         timed=tuple(problem.timed[i] for i in order) if problem.timed else (),
+        loose=tuple(problem.loose[i] for i in order) if problem.loose else (),
     )
-    jitter = None if state.jitter is None else state.jitter[order]
     return moved, replace(
-        state, cameras=tuple(state.cameras[i] for i in order), sigma=state.sigma[order], jitter=jitter
+        state,
+        cameras=tuple(state.cameras[i] for i in order),
+        sigma=state.sigma[order],
+        jitter=None if state.jitter is None else state.jitter[order],
+        coloured=None if state.coloured is None else state.coloured.of(order),
     )
 
 
 def focal_stds(problem: Problem, state: State, covariance: cov.Covariance | None = None) -> Floats:
     """(cameras,) relative stds of the focal lengths that the path told; 0 where the lens was given."""
-    guessed = [problem.lens_prior(i) is not None for i in range(len(state.cameras))]
+    guessed = [bool(problem.guessed) and problem.guessed[i] is not None for i in range(len(state.cameras))]
     if not any(guessed):
         return np.zeros(len(guessed))
     found = covariance or cov.covariance(problem, state, motion_prior(problem, state))

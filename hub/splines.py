@@ -66,6 +66,12 @@ class SplineBasis:
         each = self.intervals + 3
         return np.asarray(np.cumsum(each) - each)
 
+    @property
+    def middles(self) -> Floats:
+        """(size,) times about which the control points act [s]."""
+        stretches = zip(self.starts, self.widths, self.intervals, strict=True)
+        return np.concatenate([start + width * (np.arange(count + 3) - 1.0) for start, width, count in stretches])
+
     def locate(self, time: Floats, beyond: float = 0.0) -> tuple[Ints, Floats, Bools, Floats]:
         """First control point (n,), place in the knot interval (n,) in [0, 1], inside a stretch (n,), width (n,).
 

@@ -66,8 +66,11 @@ def covariance(problem: Problem, state: State, prior: MotionPrior, references: F
     return Covariance(full, parts.carried, free, _inverse_blocks(system.band))
 
 
-def turn_stds(covariance: Covariance, state: State) -> Floats:
-    """(n, n) largest std [rad] of the rotation between two cameras in any direction; no gauge enters."""
+def turn_stds(cameras: Floats, state: State) -> Floats:
+    """(n, n) largest std [rad] of the rotation between two cameras in any direction; no gauge enters.
+
+    cameras: (18 n, 18 n) covariance of their parameters.
+    """
     count = len(state.cameras)
     out = np.zeros((count, count))
     for i in range(count):
@@ -75,13 +78,8 @@ def turn_stds(covariance: Covariance, state: State) -> Floats:
             at = np.r_[i * CAMERA_PARAMETERS : i * CAMERA_PARAMETERS + 3]
             to = np.r_[j * CAMERA_PARAMETERS : j * CAMERA_PARAMETERS + 3]
             relative = state.cameras[i].pose.rotation @ state.cameras[j].pose.rotation.T
-            cross = covariance.cameras[np.ix_(at, to)] @ relative.T
-            between = (
-                covariance.cameras[np.ix_(at, at)]
-                + relative @ covariance.cameras[np.ix_(to, to)] @ relative.T
-                - cross
-                - cross.T
-            )
+            cross = cameras[np.ix_(at, to)] @ relative.T
+            between = cameras[np.ix_(at, at)] + relative @ cameras[np.ix_(to, to)] @ relative.T - cross - cross.T
             out[i, j] = out[j, i] = float(np.sqrt(max(np.linalg.eigvalsh(between)[-1], 0.0)))
     return out
 

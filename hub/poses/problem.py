@@ -96,11 +96,25 @@ class Trajectory:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Coloured:
+    """Noise of one image axis by camera. white, lasting: (cameras,) std [px]. seconds: (cameras,) time constant."""
+
+    white: Floats
+    lasting: Floats
+    seconds: Floats
+
+    def of(self, cameras: list[int]) -> Coloured:
+        """The same of some cameras, in this order."""
+        return Coloured(self.white[cameras], self.lasting[cameras], self.seconds[cameras])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class State:
     """Everything that the adjustment moves.
 
     sigma: (cameras,) noise of one pixel coordinate. steps: the way here. jitter: (cameras,) std [s] of the cameras'
     stamps where the frames' own times were found (`frame_times`); None = they were not looked for, or none jitter.
+    coloured: noise by which errors that last were counted (`generalised`); None = rows err by themselves.
     """
 
     cameras: tuple[CameraState, ...]
@@ -108,6 +122,7 @@ class State:
     sigma: Floats
     steps: tuple[AdjustmentStep, ...] = ()
     jitter: Floats | None = None
+    coloured: Coloured | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +174,8 @@ class Problem:
     rows: all observations. nominal: intrinsics as given (priors of the lens). clock_reference: index of the camera
     whose clock is the internal time. anchors: two cameras whose pose and distance fix the gauge. freedom: what may
     move. guessed: by camera, priors of lenses that were not measured, None = given; () = all are. timed: by camera,
-    whether its readout was told, so that its rows' times count it already; () = none was.
+    whether its readout was told, so that its rows' times count it already; () = none was. loose: by camera, by how much
+    lenses that are given may be off where they are estimated all the same; () = they are not.
     """
 
     rows: tuple[Rows, ...]
@@ -169,10 +185,12 @@ class Problem:
     freedom: Freedom = field(default_factory=Freedom)
     guessed: tuple[LensPrior | None, ...] = ()
     timed: tuple[bool, ...] = ()
+    loose: tuple[LensPrior, ...] = ()
 
     def lens_prior(self, camera: int) -> LensPrior | None:
-        """The prior of a lens that was not measured; None = the lens is given."""
-        return self.guessed[camera] if self.guessed else None
+        """The prior of a lens that is estimated whole; None = at most its focal length and k1 are."""
+        guess = self.guessed[camera] if self.guessed else None
+        return self.loose[camera] if guess is None and self.loose else guess
 
     def free_columns(self) -> Ints:
         """Indices of the free camera parameters in the stacked vector of CAMERA_PARAMETERS each."""

@@ -8,6 +8,7 @@ from scipy.linalg import cho_solve_banded
 from hub.poses.adjust import moved
 from hub.poses.covariance import held_rows
 from hub.poses.gauge import ReferenceTerms, reference_terms
+from hub.poses.generalised import fit
 from hub.poses.linear import eliminate
 from hub.poses.motion import MotionPrior
 from hub.poses.problem import Problem, State
@@ -25,6 +26,14 @@ def adjust_to_references(rig: Rig, names: list[str], problem: Problem, state: St
     state: the optimum of what was seen, moved into the rig's world. Gauss-Newton with step halving; the gauge
     directions that the references leave open stay where they are.
     """
+    if state.coloured is not None:
+        return fit(
+            problem,
+            state,
+            prior,
+            state.coloured,
+            lambda at: reference_terms(rig, names, [camera.pose for camera in at.cameras]),
+        ).state
     terms = reference_terms(rig, names, [camera.pose for camera in state.cameras])
     system, seen = build_system(problem, state, prior, robust=False)
     columns = problem.free_columns()

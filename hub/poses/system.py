@@ -48,7 +48,7 @@ def weighed(problem: Problem, state: State, prior: MotionPrior, robust: bool) ->
         motion_terms(path, prior.weights[label], prior.sizes[label] if prior.sizes else None)[2]
         for label, path in enumerate(state.trajectories)
     )
-    cost += sum((value / std) ** 2 for _, value, std in _camera_priors(problem, state))
+    cost += sum((value / std) ** 2 for _, value, std in camera_priors(problem, state))
     # A point behind the camera or off the path costs what a gross outlier does, and pulls nothing.
     gross = WIDTH**2 * np.log1p((100.0 / WIDTH) ** 2) if robust else 100.0**2
     looks, weights = [], []
@@ -110,14 +110,14 @@ def assemble(problem: Problem, state: State, prior: MotionPrior, seen: Weighed) 
         system.band[:, part] = band + blocks[label].band()
         system.gradient_path[part] += gradient
     place = {int(column): i for i, column in enumerate(columns)}
-    for column, value, std in _camera_priors(problem, state):
+    for column, value, std in camera_priors(problem, state):
         if column in place:
             system.corner[place[column], place[column]] += 1.0 / std**2
             system.gradient_cameras[place[column]] += value / std**2
     return system
 
 
-def _camera_priors(problem: Problem, state: State) -> list[tuple[int, float, float]]:
+def camera_priors(problem: Problem, state: State) -> list[tuple[int, float, float]]:
     """Column, difference and std of every prior on rates, readouts and lenses."""
     freedom, out = problem.freedom, list[tuple[int, float, float]]()
     for camera, (now, nominal) in enumerate(zip(state.cameras, problem.nominal, strict=True)):

@@ -95,13 +95,13 @@ class PairSettings:
     """What an alignment may leave over the tracks' own noise for the noise to explain it."""
     largest_lag_std: float = 4e-3
     """Least certainty [s] of the lag, …"""
-    largest_slow_lag_std: float = 7e-3
+    largest_slow_lag_std: float = 10e-3
     """… up to this where the point moves by less than a pixel in that time, and …"""
     firm: bool = True
     """Whether the answer must stand by itself, and not only begin an adjustment of more cameras, which judges it: …"""
     largest_doubt: float = 10e-3
     """… largest std [s] of the lag, lenses and shutters included: the path, which tells it again, must then agree; …"""
-    largest_swing: float = 20e-3
+    largest_swing: float = 30e-3
     """… seconds by which it may move when a fifth of what it rests on is left out."""
     largest_turn_std: float = 0.1
     """… of the relative rotation [rad] that is worth an answer; …"""

@@ -83,3 +83,26 @@ def test_a_camera_bumped_since_the_survey_is_told_and_does_not_bend_the_others()
     assert [told for told in found.warnings if "cam2 was set aside" in told]
     assert not found.refused
     assert errors(session, found).max() < 4.0 * _STD
+
+
+def test_errors_that_last_leave_references_what_they_are() -> None:
+    """Generalised least squares weighs them too: cameras surveyed to 2 mm stay there, others go where errors lead."""
+    session = rigs.simulate(5, 4, 40.0, noise=0.4, late=1.0, drops=0.0)
+    rng = np.random.default_rng(6)
+    pixels = session.pixels.copy()
+    for name in session.rig.cameras:
+        mine = np.flatnonzero([one == name for one in session.camera])
+        steps = rng.normal(0.0, 1.2, (len(mine), 2))
+        for i in range(1, len(mine)):
+            steps[i] = 0.98 * steps[i - 1] + np.sqrt(1.0 - 0.98**2) * steps[i]
+        pixels[mine] += steps
+    session = replace(session, pixels=pixels)
+    std = 0.002
+    sure = surveyed(session, 7, std, told=std)
+    untold = {name: replace(camera, position_std=None) for name, camera in sure.rig.cameras.items()}
+    found = calibrate(sure.rig, session.observations())
+    loose = calibrate(replace(sure.rig, cameras=untold), session.observations())
+    assert any(step.stage == "lasting errors" for step in found.convergence)
+    rms = [float(np.sqrt(np.mean(errors(session, one) ** 2))) for one in (found, loose)]
+    assert rms[0] < 1.5 * np.sqrt(3.0) * std
+    assert rms[1] > 2.0 * rms[0]

@@ -1,0 +1,286 @@
+"""The adjustment by generalised least squares: errors that last for seconds are parameters, held by what they are.
+
+Ordinary least squares takes a thousand rows that err alike for a thousand separate ones, and bends clocks and lenses to
+suit. Here each camera, label and image axis has an error that lasts, a line between knots under the prior of its
+Gauss-Markov process (`coloured`), and only what is left counts as each row's own. Paths and lasting errors, in the
+order of time, are one banded system; poses, clocks and lenses are its border.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.sparse import block_diag, coo_array, csr_array, diags_array, vstack
+
+from hub.points import PointBasis
+from hub.poses.adjust import gauge_tangent, moved
+from hub.poses.coloured import Markov
+from hub.poses.covariance import held_rows
+from hub.poses.gauge import ReferenceTerms
+from hub.poses.motion import MotionPrior, motion_terms
+from hub.poses.problem import CAMERA_PARAMETERS, Coloured, Problem, Rows, State
+from hub.poses.residuals import derivatives, look
+from hub.poses.system import camera_priors
+from hub.splines import SUPPORT
+from protocols.geometry.types import Floats, Ints
+
+_KNOTS = 8.0  # of a lasting error, in a time constant
+_MOST_KNOTS = 15_000
+_STEPS = 40
+_HALVINGS = 5
+_GROSS = 100.0**2
+_DONE = 1e-6  # gain as a share of the cost
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """The optimum. cost: minus twice the logarithm of the likelihood and of the priors, but for constants.
+
+    free: (p, p) covariance of the free columns of the camera parameters, none across the gauge.
+    """
+
+    state: State
+    cost: float
+    free: Floats
+
+    def covariance_of(self, problem: Problem) -> Floats:
+        """(18 n, 18 n) covariance of all camera parameters, zero where one was held."""
+        columns = problem.free_columns()
+        width = len(self.state.cameras) * CAMERA_PARAMETERS
+        full = np.zeros((width, width))
+        full[np.ix_(columns, columns)] = self.free
+        return full
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """Used rows (n,) of one camera and label, and the knots (m,) of their lasting error.
+
+    knots: on the camera's clock [s]. between: (n, m) the share of each knot in a row's error. precision: (2, m) upper
+    band of the process. factor: Cholesky band of that and the rows. over: information of a row's own noise [1/px²].
+    """
+
+    rows: Rows
+    knots: Floats
+    between: csr_array
+    precision: Floats
+    factor: Floats
+    over: float
+
+
+def fit(
+    problem: Problem,
+    state: State,
+    prior: MotionPrior,
+    noise: Coloured,
+    references: Callable[[State], ReferenceTerms] | None = None,
+) -> Fit:
+    """Gauss-Newton from a state that is nearly there, over the rows in use; halved where the cost would rise.
+
+    references: what surveyed places say at a state; without it the gauge is held (`adjust.gauge_tangent`). Raises
+    LinAlgError where the rows do not tell a path.
+    """
+    parts = _parts(problem, noise)
+    cost = _cost(problem, state, prior, parts, references)
+    for _ in range(_STEPS):
+        path, cameras, _ = _step(problem, state, prior, parts, references)
+        shrink, there, trial = 1.0, np.inf, state
+        for _ in range(_HALVINGS):
+            trial = moved(problem, state, shrink * path, shrink * cameras)
+            there = _cost(problem, trial, prior, parts, references)
+            if there < cost:
+                break
+            shrink *= 0.5
+        if not there < cost:
+            break
+        gain, state, cost = cost - there, trial, there
+        if gain < _DONE * cost:
+            break
+    return Fit(state, cost, _step(problem, state, prior, parts, references)[2])
+
+
+def cost_at(problem: Problem, state: State, prior: MotionPrior, noise: Coloured) -> float:
+    """What `fit` makes small, at a state: lasting errors are the likeliest there; nothing is said of references."""
+    return _cost(problem, state, prior, _parts(problem, noise), None)
+
+
+def _parts(problem: Problem, noise: Coloured) -> list[_Part]:
+    used = [rows for rows in problem.rows if np.count_nonzero(rows.use) > 1]
+    spans = [float(np.ptp(rows.time[rows.use])) for rows in used]
+    wanted = [_KNOTS * span / float(noise.seconds[rows.camera]) for rows, span in zip(used, spans, strict=True)]
+    finer = min(1.0, _MOST_KNOTS / max(sum(wanted), 1.0))
+    return [
+        _part(rows, max(2, int(np.ceil(finer * count)) + 1), noise) for rows, count in zip(used, wanted, strict=True)
+    ]
+
+
+def _part(rows: Rows, count: int, noise: Coloured) -> _Part:
+    time = rows.time[rows.use]
+    knots = np.linspace(float(time.min()), float(time.max()) + 1e-6, count)
+    place = np.clip(np.searchsorted(knots, time, side="right") - 1, 0, count - 2)
+    share = (time - knots[place]) / (knots[1] - knots[0])
+    between = csr_array(
+        (
+            np.column_stack([1.0 - share, share]).ravel(),
+            np.column_stack([place, place + 1]).ravel(),
+            2 * np.arange(len(time) + 1),
+        ),
+        shape=(len(time), count),
+    )
+    # Between two knots the process strays from the line.
+    width, lasting = float(knots[1] - knots[0]), float(noise.lasting[rows.camera])
+    strays = lasting**2 * min(width / (3.0 * float(noise.seconds[rows.camera])), 1.0)
+    over = 1.0 / (float(noise.white[rows.camera]) ** 2 + strays)
+    precision = Markov.over(knots, float(noise.seconds[rows.camera])).precision() / lasting**2
+    gram = between.T @ between
+    both = precision.copy()
+    both[1] += over * gram.diagonal()
+    both[0, 1:] += over * gram.diagonal(1)
+    return _Part(rows, knots, between, precision, cholesky_banded(both, check_finite=False), over)
+
+
+def _cost(
+    problem: Problem,
+    state: State,
+    prior: MotionPrior,
+    parts: list[_Part],
+    references: Callable[[State], ReferenceTerms] | None,
+) -> float:
+    """The cost at a state, its lasting errors the likeliest there; a row off the path costs what a gross error does."""
+    total = sum(_motion(state, prior, label)[2] for label in range(len(state.trajectories)))
+    total += sum((value / std) ** 2 for _, value, std in camera_priors(problem, state))
+    if references is not None:
+        total += references(state).cost
+    for part in parts:
+        seen = look(part.rows, state.cameras[part.rows.camera], state.trajectories[part.rows.label])
+        total += _GROSS * float(np.count_nonzero(~seen.valid))
+        residual = np.where(seen.valid, seen.residual, 0.0)
+        pulls = part.over * (part.between.T @ residual.T)
+        likeliest = cho_solve_banded((part.factor, False), pulls, check_finite=False)
+        total += part.over * float((residual**2).sum()) - float((pulls * likeliest).sum())
+    return float(total)
+
+
+def _motion(state: State, prior: MotionPrior, label: int) -> tuple[Floats, Floats, float]:
+    return motion_terms(state.trajectories[label], prior.weights[label], prior.sizes[label] if prior.sizes else None)
+
+
+def _step(
+    problem: Problem,
+    state: State,
+    prior: MotionPrior,
+    parts: list[_Part],
+    references: Callable[[State], ReferenceTerms] | None,
+) -> tuple[Floats, Floats, Floats]:
+    """Steps of the paths (3 n,) and the free camera parameters (p,), and the covariance (p, p) of these."""
+    columns = problem.free_columns()
+    bases = np.r_[0, np.cumsum([3 * path.basis.size for path in state.trajectories])]
+    motion = [_motion(state, prior, label) for label in range(len(state.trajectories))]
+    lasting = int(bases[-1])
+    inner, outer, residuals, weights = [], [], [], []
+    size = lasting + 2 * sum(len(part.knots) for part in parts)
+    for part in parts:
+        rows, camera, path = part.rows, state.cameras[part.rows.camera], state.trajectories[part.rows.label]
+        seen = look(rows, camera, path)
+        mine = np.flatnonzero(columns // CAMERA_PARAMETERS == rows.camera)
+        by = derivatives(seen, camera, path, (columns[mine] % CAMERA_PARAMETERS).tolist())
+        at = bases[rows.label] + 3 * seen.index[:, None] + np.arange(3 * SUPPORT)
+        for axis in range(2):
+            by_path = seen.weights[:, :, None] * by[axis, :3].T[:, None, :]
+            inner.append(_wide(np.asarray(by_path).reshape(len(at), -1), at, part.between, lasting, size))
+            outer.append(_rows_of(by[axis, 3:].T, np.broadcast_to(mine, (len(at), len(mine))), len(columns)))
+            residuals.append(seen.residual[axis])
+            weights.append(np.where(seen.valid, part.over, 0.0))
+            lasting += len(part.knots)
+    left, right = vstack(inner, format="csr"), vstack(outer, format="csr")
+    weight, residual = np.concatenate(weights), np.concatenate(residuals)
+    weighted = (diags_array(weight) @ left).tocsr()
+    priors = [_symmetric(band) for band, _, _ in motion]
+    priors += [_symmetric(part.precision) for part in parts for _ in range(2)]
+    normal = (left.T @ weighted + block_diag(priors, format="csr")).tocoo()
+    border = (weighted.T @ right).toarray()
+    corner = (right.T @ (diags_array(weight) @ right)).toarray()
+    gradient = weighted.T @ residual
+    gradient[: bases[-1]] += np.concatenate([one[1] for one in motion])
+    pull = right.T @ (weight * residual)
+    place = {int(column): i for i, column in enumerate(columns)}
+    for column, value, std in camera_priors(problem, state):
+        if column in place:
+            corner[place[column], place[column]] += 1.0 / std**2
+            pull[place[column]] += value / std**2
+    tangent = gauge_tangent(problem, state)
+    if references is not None:
+        told = references(state)
+        corner += told.information[np.ix_(columns, columns)]
+        pull += told.gradient[columns]
+        held = held_rows([camera.pose for camera in state.cameras], told.information)[:, columns]
+        tangent = np.linalg.svd(held)[2][len(held) :].T if len(held) else None
+    carried = _solved(normal, _in_time(state, parts), np.column_stack([border, gradient]))
+    reduced, right_side = corner - border.T @ carried[:, :-1], border.T @ carried[:, -1] - pull
+    free = np.eye(len(columns)) if tangent is None else tangent
+    covariance = free @ np.linalg.inv(free.T @ reduced @ free) @ free.T if len(columns) else reduced
+    cameras = covariance @ right_side
+    return -(carried[:, -1] + carried[:, :-1] @ cameras)[: bases[-1]], cameras, covariance
+
+
+def _wide(by_path: Floats, at: Ints, between: csr_array, first: int, size: int) -> csr_array:
+    """Rows (n, size): derivatives (n, 12) by the path at columns (n, 12), and by a lasting error from ``first`` on."""
+    knots = between.indices.reshape(-1, 2) + first
+    values = np.concatenate([by_path, between.data.reshape(-1, 2)], axis=1)
+    return _rows_of(values, np.concatenate([at, knots], axis=1), size)
+
+
+def _rows_of(values: Floats, columns: Ints, size: int) -> csr_array:
+    """A sparse matrix (n, size) of values (n, k) in columns (n, k)."""
+    count, each = values.shape
+    return csr_array((values.ravel(), columns.ravel(), each * np.arange(count + 1)), shape=(count, size))
+
+
+def _symmetric(upper: Floats) -> csr_array:
+    """The symmetric matrix (n, n) of an upper band (k, n)."""
+    bands = len(upper)
+    offsets = range(bands - 1, -1, -1)
+    above = [upper[bands - 1 - offset, offset:] for offset in offsets]
+    return diags_array(
+        [*above, *(values for values, offset in zip(above, offsets, strict=True) if offset)],
+        offsets=[*offsets, *(-offset for offset in offsets if offset)],
+        format="csr",
+    )
+
+
+def _in_time(state: State, parts: list[_Part]) -> Ints:
+    """Places (n,) of all unknowns in an order in which those of a label and a time stand together."""
+    labels, times = [], []
+    for label, path in enumerate(state.trajectories):
+        if isinstance(path.basis, PointBasis):
+            raise TypeError("separate points have no errors that last")
+        times.append(np.repeat(path.basis.middles, 3))
+        labels.append(np.full(len(times[-1]), label))
+    for part in parts:
+        for _ in range(2):
+            times.append(state.cameras[part.rows.camera].reference_time(part.knots))
+            labels.append(np.full(len(part.knots), part.rows.label))
+    place = np.empty(sum(map(len, times)), dtype=np.int64)
+    place[np.lexsort((np.concatenate(times), np.concatenate(labels)))] = np.arange(len(place))
+    return place
+
+
+def _solved(normal: coo_array, place: Ints, right: Floats) -> Floats:
+    """The solution (n, k) of a symmetric system that is banded once its unknowns are at ``place`` (n,)."""
+    row, column = place[normal.row], place[normal.col]
+    upper = row <= column
+    row, column, values = row[upper], column[upper], normal.data[upper]
+    bands = int((column - row).max(initial=0)) + 1
+    band = np.zeros((bands, len(place)))
+    band[bands - 1 - (column - row), column] = values
+    band[-1] += 1e-12 * float(band[-1].max(initial=1.0))
+    factor = cholesky_banded(band, overwrite_ab=True, check_finite=False)
+    ordered = np.empty_like(right, order="F")
+    ordered[place] = right
+    return np.asarray(cho_solve_banded((factor, False), ordered, overwrite_b=True, check_finite=False)[place])
+
+
+__all__ = ["Fit", "cost_at", "fit"]

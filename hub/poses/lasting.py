@@ -1,0 +1,132 @@
+"""Errors that last for seconds: found where they are, and then counted for what they are.
+
+Where residuals are alike from frame to frame, the adjustment is made again by generalised least squares
+(`generalised`), and the lenses, whose errors look just like that, are estimated whole under priors of what a given
+lens may be off by. Both or neither: with rows taken as separate a freed lens takes up what a detector errs by; and with
+the lens as told the lasting errors take up the lens.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hub.points import PointBasis
+from hub.poses.adjust import noise
+from hub.poses.coloured import coloured
+from hub.poses.covariance import turn_stds
+from hub.poses.generalised import Fit, fit
+from hub.poses.motion import motion_prior
+from hub.poses.problem import (
+    ASPECT,
+    CAMERA_PARAMETERS,
+    CENTRE,
+    FOCAL,
+    K1,
+    K2,
+    K3,
+    P1,
+    Coloured,
+    LensPrior,
+    Problem,
+    State,
+)
+from hub.poses.sigma import together
+from hub.poses.system import camera_priors
+from protocols.geometry.camera import Intrinsics
+from protocols.session.calibration import AdjustmentStep
+
+_LEAST_ALIKE = 4.0
+"""Residuals that must count as one before they are looked at for errors that last."""
+_LARGEST_TURN_STD = 0.0175
+"""Std [rad] of a camera's orientation beyond which too little is told for errors to be told from the path."""
+_LENS = (FOCAL, CENTRE, CENTRE + 1, K1, K2, K3, ASPECT, P1, P1 + 1)
+
+
+def tolerance(lens: Intrinsics) -> LensPrior:
+    """What a lens that somebody measured may be off by in the field: a zoom's play, a crop, a stabiliser."""
+    return LensPrior(
+        focal=lens.focal,
+        focal_std=0.01,
+        centre=(float(lens.matrix[0, 2]), float(lens.matrix[1, 2])),
+        centre_std=lens.width / 240.0,
+        k1=float(lens.distortions[0]),
+        k1_std=0.012,
+        k2=float(lens.distortions[1]),
+        k2_std=0.02,
+        k3_std=0.005,
+        tangential_std=1e-3,
+        aspect_std=1e-3,
+    )
+
+
+def with_lasting_errors(problem: Problem, state: State) -> tuple[Problem, State]:
+    """The adjustment made again where errors last; both unchanged where none do, or where frames' times were found.
+
+    problem, state: adjusted.
+    """
+    unfit = state.jitter is not None or not problem.freedom.clock or not problem.freedom.pose
+    if unfit or any(isinstance(path.basis, PointBasis) for path in state.trajectories):
+        return problem, state
+    cameras = range(len(state.cameras))
+    if max(together(problem, state, camera) for camera in cameras) < _LEAST_ALIKE:
+        return problem, state
+    told = replace(problem, freedom=replace(problem.freedom, lens=False))
+    loose = replace(told, loose=tuple(tolerance(lens) for lens in problem.nominal))
+    try:
+        found, best, kinds = _fitted(loose, state)
+        if as_told(loose, best):
+            found, best, kinds = _fitted(told, _with_told_lenses(told, state))
+    except np.linalg.LinAlgError:
+        return problem, state
+    if _loosest_turn(found, best) > _LARGEST_TURN_STD:
+        return problem, state
+    after = replace(best.state, sigma=noise(found, best.state), coloured=kinds)
+    step = AdjustmentStep("lasting errors", float(np.sqrt(np.mean(after.sigma**2))))
+    return found, replace(after, steps=(*after.steps, step))
+
+
+def _fitted(problem: Problem, state: State) -> tuple[Problem, Fit, Coloured]:
+    kinds = coloured(problem, state)
+    return problem, fit(problem, state, motion_prior(problem, state), kinds), kinds
+
+
+def _with_told_lenses(problem: Problem, state: State) -> State:
+    cameras = (
+        camera if problem.lens_prior(i) is not None else replace(camera, intrinsics=problem.nominal[i])
+        for i, camera in enumerate(state.cameras)
+    )
+    return replace(state, cameras=tuple(cameras))
+
+
+def _loosest_turn(problem: Problem, best: Fit) -> float:
+    """Std [rad] of the rotation of the camera that is least tied to any other."""
+    stds = turn_stds(best.covariance_of(problem), best.state)
+    np.fill_diagonal(stds, np.inf)
+    return float(stds.min(axis=1).max())
+
+
+def as_told(problem: Problem, best: Fit) -> bool:
+    """Whether lenses exactly as told are likelier than ones that are off by about their tolerance.
+
+    problem: with loose lenses. The ratio of the two likelihoods is that of the densities of "off by nothing" before
+    and after the rows were seen (Savage and Dickey), with both taken as Gaussian.
+    """
+    columns = problem.free_columns()
+    terms = {
+        column: (value, std)
+        for column, value, std in camera_priors(problem, best.state)
+        if column % CAMERA_PARAMETERS in _LENS
+        and not (problem.guessed and problem.guessed[column // CAMERA_PARAMETERS] is not None)
+    }
+    if not terms:
+        return False  # nobody told any of them
+    mine = np.array([i for i, column in enumerate(columns) if int(column) in terms], dtype=np.int64)
+    off, std = np.array([terms[int(columns[i])] for i in mine]).T
+    after = best.free[np.ix_(mine, mine)]
+    surprise = float(off @ np.linalg.solve(after, off))
+    return bool(surprise + np.linalg.slogdet(after)[1] < 2.0 * np.log(std).sum())
+
+
+__all__ = ["as_told", "tolerance", "with_lasting_errors"]
