@@ -29,7 +29,7 @@ from tests import rigs  # noqa: E402
 
 WRONG_S = 0.02
 SIZE = (1920, 1080)
-_FPS = (25.0, 29.97, 30.0, 50.0, 59.94)
+FPS = (25.0, 29.97, 30.0, 50.0, 59.94)
 _MOVING_PX = 20.0  # px/s
 _EXTENT = 10.0  # m, of the flight
 
@@ -66,8 +66,8 @@ def stretch(seed: int, seconds: float) -> Stretch | None:
         away = rng.uniform(35.0, 70.0)
         place = np.array([away * np.cos(bearing), away * np.sin(bearing), rng.uniform(-12.0, -6.0)])
         pose = rigs.looking_at(place, rng.normal(0.0, 1.5, 3), float(rng.normal(0.0, 0.03)))
-        true, told = _lenses(rng)
-        rate, drift, epoch = float(rng.choice(_FPS)), 1.0 + 1e-6 * rng.uniform(-100.0, 100.0), rng.uniform(0.0, 1e3)
+        true, told = lenses(rng)
+        rate, drift, epoch = float(rng.choice(FPS)), 1.0 + 1e-6 * rng.uniform(-100.0, 100.0), rng.uniform(0.0, 1e3)
         time = begin + rng.uniform(0.0, 1.0 / rate) + np.arange(int((end - begin) * rate)) / rate
         readout = rng.uniform(-0.025, 0.025)
         pixels = true.project(pose.camera_from_world(path.at(time)))
@@ -92,7 +92,7 @@ def stretch(seed: int, seconds: float) -> Stretch | None:
     return Stretch(Rig(cameras), Observations(tracks), middles[0], middles[1])
 
 
-def _lenses(rng: np.random.Generator) -> tuple[Intrinsics, Intrinsics]:
+def lenses(rng: np.random.Generator) -> tuple[Intrinsics, Intrinsics]:
     """A long lens as it is and as it is told."""
     focal, centre = rng.uniform(1450.0, 1950.0), 0.5 * np.array(SIZE) + rng.normal(0.0, 8.0, 2)
     k1 = rng.uniform(-0.1, 0.05)

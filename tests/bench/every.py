@@ -44,6 +44,9 @@ BENCHES = {
         data=True,
     ),
     "drone_pairs": Bench("two cameras that share 20 s of a drone, simulated", ("--sessions", "20")),
+    "lasting_errors": Bench(
+        "four cameras of a drone, labels' errors last for seconds", ("--sessions", "3"), ("--compare",)
+    ),
     "real_life": Bench("sessions as people bring them, one trouble a row", ("--sessions", "1")),
     "video_folder": Bench(
         "a folder of videos, with and without measured lenses",
