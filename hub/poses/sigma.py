@@ -46,7 +46,7 @@ def honest(problem: Problem, state: State, prior: MotionPrior) -> State:
         numbers[rows.camera] += 2.0 * float(np.count_nonzero(rows.use))
         absorbed[rows.camera] += _absorbed(problem, state, found, rows)
     for camera in range(len(state.cameras)):
-        alike[camera] = together(problem, state, camera)
+        alike[camera] = max(together(problem, state, camera), modelled(problem, state, camera))
     left = np.maximum(1.0 - absorbed / np.maximum(numbers, 1.0), _LEAST_LEFT)
     return replace(state, sigma=state.sigma * np.sqrt(alike / left))
 
@@ -75,6 +75,19 @@ def _absorbed(problem: Problem, state: State, found: Covariance, rows: Rows) -> 
         shift[:, :, mine] += line.by_camera[:, :, columns[mine] % CAMERA_PARAMETERS]
         trace += float(np.einsum("npi,ij,npj->", shift, found.free, shift, optimize=True))
     return trace / float(state.sigma[rows.camera]) ** 2 * len(used) / len(pick)
+
+
+def modelled(problem: Problem, state: State, camera: int) -> float:
+    """How many residuals count as one by the noise that was found; 1 where none was."""
+    if state.coloured is None:
+        return 1.0
+    times = [np.sort(rows.time[rows.use]) for rows in problem.rows if rows.camera == camera and rows.use.sum() > 1]
+    if not times:
+        return 1.0
+    white, lasting = float(state.coloured.white[camera]) ** 2, float(state.coloured.lasting[camera]) ** 2
+    step = float(np.median(np.concatenate([np.diff(time) for time in times])))
+    kept = float(np.exp(-step / state.coloured.seconds[camera]))
+    return 1.0 + 2.0 * lasting / (white + lasting) * kept / max(1.0 - kept, 1e-6)
 
 
 def together(problem: Problem, state: State, camera: int) -> float:

@@ -15,6 +15,7 @@ from hub.poses.generalised import Fit, cost_at, fit
 from hub.poses.lasting import as_told, tolerance, with_lasting_errors
 from hub.poses.motion import MotionPrior, motion_prior
 from hub.poses.problem import CAMERA_PARAMETERS, FOCAL, CameraState, Coloured, Problem, Rows, State, Trajectory
+from hub.poses.sigma import honest, modelled
 from hub.splines import SplineBasis, fit_spline
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
@@ -50,7 +51,7 @@ def rig(seed: int, lasting_px: float = LASTING, told: float = 1.0) -> tuple[Prob
     path = Trajectory(basis, fit_spline(basis, grid, random_path(rng).at(grid), np.ones(len(grid))))
     rows = []
     for i, camera in enumerate(cameras):
-        time = (np.arange(int(RATE * SECONDS)) + rng.uniform()) / RATE
+        time: Floats = np.asarray((np.arange(int(RATE * SECONDS)) + rng.uniform()) / RATE, dtype=np.float64)
         seen = camera.intrinsics.project(camera.pose.camera_from_world(path.at(camera.reference_time(time))))
         seen = seen + rng.normal(0.0, WHITE, seen.shape) + markov(rng, time, lasting_px, SLOW)
         rows.append(Rows(i, 0, time, seen, np.ones(len(time), dtype=bool)))
@@ -203,3 +204,17 @@ def test_gross_errors_are_no_lasting_ones() -> None:
     assert found.lasting == pytest.approx(np.full(CAMERAS, 0.5), rel=0.4)
     norms = residual_norms(rows[0], truth.cameras[0], truth.trajectories[0])
     assert norms.max() > 150.0
+
+
+def test_stds_count_rows_that_are_alike_as_one() -> None:
+    """As many as make the variance of the rows' mean what it is; and what is published goes by it."""
+    problem, truth = rig(11)
+    state = replace(truth, coloured=kinds())
+    time = problem.rows[0].time
+    of_mean = float(dense(time, WHITE, LASTING, SLOW).mean())
+    alike = of_mean * len(time) / (WHITE**2 + LASTING**2)
+    assert modelled(problem, state, 0) == pytest.approx(alike, rel=0.05)
+    assert modelled(problem, truth, 0) == 1.0
+    prior = motion_prior(problem, truth)
+    long = replace(state, coloured=replace(kinds(), seconds=np.full(CAMERAS, 20.0)))
+    assert (honest(problem, long, prior).sigma > 1.5 * honest(problem, truth, prior).sigma).all()
