@@ -70,6 +70,7 @@ _STAGES = {
     "robust": "all rows, robust",
     "fitting rows": "the rows that fit",
     "free lenses": "lenses freed",
+    "lasting errors": "errors that last",
 }
 
 
@@ -105,7 +106,8 @@ def adjustment(steps: tuple[AdjustmentStep, ...]) -> str:
             middle = (x(index - 1) + x(index)) / 2
             ends = f'x1="{at(middle)}" y1="{at(top)}" x2="{at(middle)}" y2="{at(bottom)}"'
             parts.append(f'<line class="grid" {ends} stroke-dasharray="4 4"/>')
-        parts.append(text(x(index), top - 10, _STAGES.get(step.stage, step.stage), "tick"))
+        side = "end" if index == len(steps) - 1 else "start"  # a last step's name would leave the page
+        parts.append(text(x(index), top - 10, _STAGES.get(step.stage, step.stage), "tick", side))
     for index in range(1, len(steps) + 1):
         # A round starts with the state that the one before left, weighed anew: no line leads there.
         if (
