@@ -116,6 +116,7 @@ def publish(rig: Rig, solution: Solution) -> Calibration:
         + aside
         + gauge.warnings
         + _lenses_told(cameras)
+        + _lenses_loose(names, problem, state)
         + _readouts_told(cameras)
         + _jitter_told(names, state, paces),
         residuals={name: _residual_rows(problem, state, i, epochs[i], paces[i]) for i, name in enumerate(names)},
@@ -181,6 +182,17 @@ def _lenses_told(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
         for name, camera in cameras.items()
         if camera.focal_std > 0.0
     )
+
+
+def _lenses_loose(names: list[str], problem: Problem, state: State) -> tuple[str, ...]:
+    """One sentence for all lenses that were told and came out a little different."""
+    if not problem.loose:
+        return ()
+    told = ", ".join(
+        f"{name} {100 * (camera.intrinsics.focal / lens.focal - 1):+.1f} %"
+        for name, camera, lens in zip(names, state.cameras, problem.nominal, strict=True)
+    )
+    return (f"lenses are about as told, not exactly: focal lengths by what was seen {told} (tolerance 1 %)",)
 
 
 def _readout(rig: Rig, name: str, found: float) -> float:

@@ -53,7 +53,10 @@ class Markov:
 
 
 def coloured(problem: Problem, state: State) -> Coloured:
-    """The noise of every camera, from the residuals of the rows in use."""
+    """The noise of every camera, from the residuals of the rows in use.
+
+    Of a camera with fewer than 50 of them: all white. Labels with fewer than 8 are not looked at.
+    """
     count = len(state.cameras)
     out = Coloured(state.sigma.copy(), np.full(count, _LEAST_PX), np.ones(count))
     for camera in range(count):

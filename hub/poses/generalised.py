@@ -9,7 +9,7 @@ order of time, are one banded system; poses, clocks and lenses are its border.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
@@ -27,8 +27,10 @@ from hub.poses.system import camera_priors
 from hub.splines import SUPPORT
 from protocols.geometry.types import Floats, Ints
 
-_KNOTS = 8.0  # of a lasting error, in a time constant
+_KNOTS, _FEWEST_KNOTS = 8.0, 2.0  # of a lasting error, in a time constant
+_LONGEST = 5.0  # s between two of them: what a row ties together must stand close together in the band
 _MOST_KNOTS = 15_000
+_MOST_ROWS = 150_000
 _STEPS = 40
 _HALVINGS = 5
 _GROSS = 100.0**2
@@ -80,9 +82,11 @@ def fit(
 ) -> Fit:
     """Gauss-Newton from a state that is nearly there, over the rows in use; halved where the cost would rise.
 
-    references: what surveyed places say at a state; without it the gauge is held (`adjust.gauge_tangent`). Raises
-    LinAlgError where the rows do not tell a path.
+    references: what surveyed places say at a state; without it the gauge is held (`adjust.gauge_tangent`). Rows that
+    are off the path at ``state``, and a camera's only row of a label, are left out; after ten steps it ends wherever it
+    is. Raises LinAlgError where the rows do not tell a path.
     """
+    problem = _on_the_path(problem, state)
     parts = _parts(problem, noise)
     cost = _cost(problem, state, prior, parts, references)
     for _ in range(_STEPS):
@@ -107,14 +111,39 @@ def cost_at(problem: Problem, state: State, prior: MotionPrior, noise: Coloured)
     return _cost(problem, state, prior, _parts(problem, noise), None)
 
 
+def within_reach(problem: Problem, noise: Coloured) -> bool:
+    """Whether there is room for knots so close that the lasting errors are lines between them, and for the rows."""
+    used = _used(problem)
+    rows = sum(int(np.count_nonzero(part.use)) for part in used)
+    return rows <= _MOST_ROWS and _FEWEST_KNOTS * sum(_constants(part, noise) for part in used) <= _MOST_KNOTS
+
+
+def _used(problem: Problem) -> list[Rows]:
+    return [rows for rows in problem.rows if np.count_nonzero(rows.use) > 1]
+
+
+def _constants(rows: Rows, noise: Coloured) -> float:
+    """Time constants of the lasting error from the first row to the last."""
+    return float(np.ptp(rows.time[rows.use])) / float(noise.seconds[rows.camera])
+
+
+def _on_the_path(problem: Problem, state: State) -> Problem:
+    out = []
+    for rows in problem.rows:
+        use = rows.use.copy()
+        use[use] = look(rows, state.cameras[rows.camera], state.trajectories[rows.label]).valid
+        out.append(rows.using(use))
+    return replace(problem, rows=tuple(out))
+
+
 def _parts(problem: Problem, noise: Coloured) -> list[_Part]:
-    used = [rows for rows in problem.rows if np.count_nonzero(rows.use) > 1]
-    spans = [float(np.ptp(rows.time[rows.use])) for rows in used]
-    wanted = [_KNOTS * span / float(noise.seconds[rows.camera]) for rows, span in zip(used, spans, strict=True)]
-    finer = min(1.0, _MOST_KNOTS / max(sum(wanted), 1.0))
-    return [
-        _part(rows, max(2, int(np.ceil(finer * count)) + 1), noise) for rows, count in zip(used, wanted, strict=True)
-    ]
+    used = _used(problem)
+    each = min(_KNOTS, _MOST_KNOTS / max(sum(_constants(rows, noise) for rows in used), 1.0))
+    out = []
+    for rows in used:
+        span = float(np.ptp(rows.time[rows.use]))
+        out.append(_part(rows, 1 + max(1, int(np.ceil(max(each * _constants(rows, noise), span / _LONGEST)))), noise))
+    return out
 
 
 def _part(rows: Rows, count: int, noise: Coloured) -> _Part:
@@ -283,4 +312,4 @@ def _solved(normal: coo_array, place: Ints, right: Floats) -> Floats:
     return np.asarray(cho_solve_banded((factor, False), ordered, overwrite_b=True, check_finite=False)[place])
 
 
-__all__ = ["Fit", "cost_at", "fit"]
+__all__ = ["Fit", "cost_at", "fit", "within_reach"]

@@ -16,7 +16,7 @@ from hub.points import PointBasis
 from hub.poses.adjust import noise
 from hub.poses.coloured import coloured
 from hub.poses.covariance import turn_stds
-from hub.poses.generalised import Fit, fit
+from hub.poses.generalised import Fit, fit, within_reach
 from hub.poses.motion import motion_prior
 from hub.poses.problem import (
     ASPECT,
@@ -27,7 +27,6 @@ from hub.poses.problem import (
     K2,
     K3,
     P1,
-    Coloured,
     LensPrior,
     Problem,
     State,
@@ -62,9 +61,11 @@ def tolerance(lens: Intrinsics) -> LensPrior:
 
 
 def with_lasting_errors(problem: Problem, state: State) -> tuple[Problem, State]:
-    """The adjustment made again where errors last; both unchanged where none do, or where frames' times were found.
+    """The adjustment made again where errors last; else both as they are.
 
-    problem, state: adjusted.
+    problem, state: adjusted. Both stay too where poses are given, where clocks are shared or frames' own times were
+    found, where a recording is too long for it (`generalised.within_reach`), and where it would leave a camera's
+    orientation looser than 1°.
     """
     unfit = state.jitter is not None or not problem.freedom.clock or not problem.freedom.pose
     if unfit or any(isinstance(path.basis, PointBasis) for path in state.trajectories):
@@ -72,24 +73,27 @@ def with_lasting_errors(problem: Problem, state: State) -> tuple[Problem, State]
     cameras = range(len(state.cameras))
     if max(together(problem, state, camera) for camera in cameras) < _LEAST_ALIKE:
         return problem, state
+    kinds = coloured(problem, state)
+    if not within_reach(problem, kinds):
+        return problem, state
     told = replace(problem, freedom=replace(problem.freedom, lens=False))
-    loose = replace(told, loose=tuple(tolerance(lens) for lens in problem.nominal))
+    found = replace(told, loose=tuple(tolerance(lens) for lens in problem.nominal))
     try:
-        found, best, kinds = _fitted(loose, state)
-        if as_told(loose, best):
-            found, best, kinds = _fitted(told, _with_told_lenses(told, state))
+        best = fit(found, state, motion_prior(found, state), kinds)
+        if as_told(found, best):
+            # The state may have been adjusted with other lenses: its residuals tell of these too.
+            found, start = told, _with_told_lenses(told, state)
+            best = fit(told, start, motion_prior(told, start), kinds)
+            kinds = coloured(told, best.state)
+            best = fit(told, best.state, motion_prior(told, best.state), kinds)
+        loosest = _loosest_turn(found, best)
     except np.linalg.LinAlgError:
         return problem, state
-    if _loosest_turn(found, best) > _LARGEST_TURN_STD:
+    if not (np.isfinite(best.cost) and loosest <= _LARGEST_TURN_STD):
         return problem, state
     after = replace(best.state, sigma=noise(found, best.state), coloured=kinds)
     step = AdjustmentStep("lasting errors", float(np.sqrt(np.mean(after.sigma**2))))
     return found, replace(after, steps=(*after.steps, step))
-
-
-def _fitted(problem: Problem, state: State) -> tuple[Problem, Fit, Coloured]:
-    kinds = coloured(problem, state)
-    return problem, fit(problem, state, motion_prior(problem, state), kinds), kinds
 
 
 def _with_told_lenses(problem: Problem, state: State) -> State:

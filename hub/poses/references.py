@@ -24,17 +24,14 @@ def adjust_to_references(rig: Rig, names: list[str], problem: Problem, state: St
     """The state in the rig's world that fits both what was seen and the references, each by its std.
 
     state: the optimum of what was seen, moved into the rig's world. Gauss-Newton with step halving; the gauge
-    directions that the references leave open stay where they are.
+    directions that the references leave open stay where they are. Where errors last, rows go by `State.coloured`.
     """
     if state.coloured is not None:
-        return fit(
-            problem,
-            state,
-            prior,
-            state.coloured,
-            lambda at: reference_terms(rig, names, [camera.pose for camera in at.cameras]),
-        ).state
-    terms = reference_terms(rig, names, [camera.pose for camera in state.cameras])
+        try:
+            return fit(problem, state, prior, state.coloured, lambda at: _terms(rig, names, at)).state
+        except np.linalg.LinAlgError:
+            return state
+    terms = _terms(rig, names, state)
     system, seen = build_system(problem, state, prior, robust=False)
     columns = problem.free_columns()
     for _ in range(_STEPS):
@@ -45,7 +42,7 @@ def adjust_to_references(rig: Rig, names: list[str], problem: Problem, state: St
         shrink, better = 1.0, False
         while shrink > 1e-3 and not better:
             trial = moved(problem, state, shrink * (-path - parts.carried @ step), shrink * step)
-            trial_terms = reference_terms(rig, names, [camera.pose for camera in trial.cameras])
+            trial_terms = _terms(rig, names, trial)
             trial_system, trial_seen = build_system(problem, trial, prior, robust=False)
             better = trial_seen + trial_terms.cost < seen + terms.cost
             shrink *= 0.5
@@ -56,6 +53,10 @@ def adjust_to_references(rig: Rig, names: list[str], problem: Problem, state: St
         if gain < _DONE * (seen + terms.cost):
             break
     return state
+
+
+def _terms(rig: Rig, names: list[str], state: State) -> ReferenceTerms:
+    return reference_terms(rig, names, [camera.pose for camera in state.cameras])
 
 
 def _step(

@@ -81,8 +81,8 @@ def modelled(problem: Problem, state: State, camera: int) -> float:
     """How many residuals count as one by the noise that was found; 1 where none was."""
     if state.coloured is None:
         return 1.0
-    times = [np.sort(rows.time[rows.use]) for rows in problem.rows if rows.camera == camera and rows.use.sum() > 1]
-    if not times:
+    times = [np.unique(rows.time[rows.use]) for rows in problem.rows if rows.camera == camera]
+    if not any(len(time) > 1 for time in times):
         return 1.0
     white, lasting = float(state.coloured.white[camera]) ** 2, float(state.coloured.lasting[camera]) ** 2
     step = float(np.median(np.concatenate([np.diff(time) for time in times])))

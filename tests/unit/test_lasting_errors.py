@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 from hub.poses import lasting
 from hub.poses.adjust import adjust, moved, residual_norms
 from hub.poses.coloured import Markov, coloured, likeliest
-from hub.poses.generalised import Fit, cost_at, fit
+from hub.poses.generalised import Fit, cost_at, fit, within_reach
 from hub.poses.lasting import as_told, tolerance, with_lasting_errors
 from hub.poses.motion import MotionPrior, motion_prior
 from hub.poses.problem import CAMERA_PARAMETERS, FOCAL, CameraState, Coloured, Problem, Rows, State, Trajectory
@@ -218,3 +218,43 @@ def test_stds_count_rows_that_are_alike_as_one() -> None:
     prior = motion_prior(problem, truth)
     long = replace(state, coloured=replace(kinds(), seconds=np.full(CAMERAS, 20.0)))
     assert (honest(problem, long, prior).sigma > 1.5 * honest(problem, truth, prior).sigma).all()
+
+
+def test_told_lenses_have_their_own_noise_whatever_lenses_came_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lenses that the plain adjustment had freed by 3 % leave residuals that are no lasting errors."""
+    problem, truth = rig(12, lasting_px=1.0)
+    freed = replace(problem, freedom=replace(problem.freedom, lens=True, focal_std=1.0))
+    start = replace(
+        truth,
+        cameras=tuple(replace(one, intrinsics=zoomed(one.intrinsics, 1.03)) for one in truth.cameras),
+    )
+    freed, state, _ = adjust(freed, start, rounds=1, iterations=3)
+    monkeypatch.setattr(lasting, "as_told", lambda *_: True)
+    found, after = with_lasting_errors(freed, state)
+    assert not found.loose
+    plain, fitted, _ = adjust(problem, truth, rounds=1, iterations=10)
+    expected = with_lasting_errors(plain, fitted)[1].coloured
+    assert after.coloured is not None
+    assert expected is not None
+    assert after.coloured.lasting == pytest.approx(expected.lasting, rel=0.1)
+
+
+def test_a_recording_that_is_too_long_for_its_knots_is_left_alone() -> None:
+    problem, _ = rig(13)
+    assert within_reach(problem, kinds())
+    hours = tuple(replace(rows, time=240.0 * rows.time) for rows in problem.rows)
+    assert not within_reach(replace(problem, rows=hours), replace(kinds(), seconds=np.full(CAMERAS, 0.5)))
+
+
+def test_times_told_twice_are_one() -> None:
+    problem, truth = rig(14)
+    state = replace(truth, coloured=kinds())
+    twice = np.repeat(np.arange(len(problem.rows[0].time)), 2)
+    rows = replace(
+        problem.rows[0],
+        time=problem.rows[0].time[twice],
+        pixels=problem.rows[0].pixels[twice],
+        use=np.ones(len(twice), bool),
+    )
+    doubled = replace(problem, rows=(rows, *problem.rows[1:]))
+    assert modelled(doubled, state, 0) == pytest.approx(modelled(problem, state, 0), rel=1e-6)
