@@ -20,7 +20,7 @@ from hub.poses.adjust import gauge_tangent, moved
 from hub.poses.coloured import Markov
 from hub.poses.covariance import held_rows
 from hub.poses.gauge import ReferenceTerms
-from hub.poses.motion import MotionPrior, motion_terms
+from hub.poses.motion import MotionPrior, motion_cost, motion_terms
 from hub.poses.problem import CAMERA_PARAMETERS, Coloured, Problem, Rows, State
 from hub.poses.residuals import derivatives, look
 from hub.poses.system import camera_priors
@@ -179,7 +179,10 @@ def _cost(
     references: Callable[[State], ReferenceTerms] | None,
 ) -> float:
     """The cost at a state, its lasting errors the likeliest there; a row off the path costs what a gross error does."""
-    total = sum(_motion(state, prior, label)[2] for label in range(len(state.trajectories)))
+    total = sum(
+        motion_cost(path, prior.weights[label], prior.sizes[label] if prior.sizes else None)
+        for label, path in enumerate(state.trajectories)
+    )
     total += sum((value / std) ** 2 for _, value, std in camera_priors(problem, state))
     if references is not None:
         total += references(state).cost

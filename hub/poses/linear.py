@@ -96,14 +96,16 @@ def third_difference_band(basis: SplineBasis | PointBasis, weight: Floats, metri
 
     weight: (m,). metric: (3, 3), symmetric.
     """
-    band = np.zeros((BAND, 3 * basis.size))
     index = basis.interval_starts()
+    sums = np.zeros((SUPPORT, basis.size))  # by distance of two control points, at the later one
     for a, b in _PAIRS:
-        for i in range(3):
-            for j in range(i if a == b else 0, 3):
-                # no interval begins where another does
-                values = THIRD_DIFFERENCE[a] * THIRD_DIFFERENCE[b] * metric[i, j] * weight
-                band[BAND - 1 - 3 * (b - a) - j + i, 3 * (index + b) + j] += values
+        # no interval begins where another does
+        sums[b - a, index + b] += THIRD_DIFFERENCE[a] * THIRD_DIFFERENCE[b] * weight
+    band = np.zeros((BAND, 3 * basis.size))
+    for distance in range(SUPPORT):
+        for i, j in np.ndindex(3, 3):
+            if metric[i, j] != 0.0 and (distance or j >= i):
+                band[BAND - 1 - 3 * distance - j + i, 3 * distance + j :: 3] = metric[i, j] * sums[distance, distance:]
     return band
 
 

@@ -98,20 +98,33 @@ def _scatter(control: Floats, floor: float) -> Floats:
     return np.asarray(about.T @ about / len(about) + floor * np.eye(3))
 
 
+def motion_cost(path: Trajectory, weight: Floats, size: Size | None) -> float:
+    """Value of the prior's cost at a path."""
+    differences = third_differences(path.basis, path.control)
+    return float((_pulls(path, differences, weight, size)[0] * differences).sum())
+
+
 def motion_terms(path: Trajectory, weight: Floats, size: Size | None) -> tuple[Floats, Floats, float]:
     """Band, gradient (3 n,) and value of the prior's cost at a path."""
     differences = third_differences(path.basis, path.control)
+    pulls, inverse = _pulls(path, differences, weight, size)
+    gradient, value = third_difference_gradient(path.basis, pulls), float((pulls * differences).sum())
     if size is None:
-        pulls = weight[:, None] * differences
-        gradient = third_difference_gradient(path.basis, pulls)
-        return third_difference_band(path.basis, weight, np.eye(3)), gradient, float((pulls * differences).sum())
+        return third_difference_band(path.basis, weight, np.eye(3)), gradient, value
     held = path.control[size.held]
-    inverse = np.linalg.inv(_scatter(held, size.floor))
-    metric: Floats = np.asarray(size.scale * inverse)
     inside, outside = np.where(size.both, weight, 0.0), np.where(size.both, 0.0, weight)
-    pulls = inside[:, None] * (differences @ metric) + outside[:, None] * differences
-    gradient = third_difference_gradient(path.basis, pulls)
     level = (inside[:, None] * differences).T @ differences
     gradient.reshape(-1, 3)[size.held] -= size.scale / len(held) * _about(held) @ inverse @ level @ inverse
-    band = third_difference_band(path.basis, inside, metric) + third_difference_band(path.basis, outside, np.eye(3))
-    return band, gradient, float((pulls * differences).sum())
+    band = third_difference_band(path.basis, inside, np.asarray(size.scale * inverse))
+    if outside.any():
+        band += third_difference_band(path.basis, outside, np.eye(3))
+    return band, gradient, value
+
+
+def _pulls(path: Trajectory, differences: Floats, weight: Floats, size: Size | None) -> tuple[Floats, Floats]:
+    """Half the cost's derivative (m, 3) by the third differences, the metric held; the scatter's inverse (3, 3)."""
+    if size is None:
+        return weight[:, None] * differences, np.eye(3)
+    inverse: Floats = np.asarray(np.linalg.inv(_scatter(path.control[size.held], size.floor)), dtype=np.float64)
+    pulls = np.where(size.both[:, None], differences @ (size.scale * inverse), differences)
+    return weight[:, None] * pulls, inverse

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hub.poses.linear import BorderedSystem, PathBlocks
-from hub.poses.motion import MotionPrior, motion_terms
+from hub.poses.motion import MotionPrior, motion_cost, motion_terms
 from hub.poses.problem import (
     ASPECT,
     CAMERA_PARAMETERS,
@@ -45,7 +45,7 @@ class Weighed:
 def weighed(problem: Problem, state: State, prior: MotionPrior, robust: bool) -> Weighed:
     """Residuals and the cost: what of `assemble` is cheap."""
     cost = sum(
-        motion_terms(path, prior.weights[label], prior.sizes[label] if prior.sizes else None)[2]
+        motion_cost(path, prior.weights[label], prior.sizes[label] if prior.sizes else None)
         for label, path in enumerate(state.trajectories)
     )
     cost += sum((value / std) ** 2 for _, value, std in camera_priors(problem, state))
