@@ -34,7 +34,7 @@ _MOST_ROWS = 150_000
 _STEPS = 40
 _HALVINGS = 5
 _GROSS = 100.0**2
-_DONE = 1e-6  # gain as a share of the cost
+_DONE = 1e-5  # gain as a share of the cost
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,7 +90,7 @@ def fit(
     parts = _parts(problem, noise)
     cost = _cost(problem, state, prior, parts, references)
     for _ in range(_STEPS):
-        path, cameras, _ = _step(problem, state, prior, parts, references)
+        path, cameras, free = _step(problem, state, prior, parts, references)
         shrink, there, trial = 1.0, np.inf, state
         for _ in range(_HALVINGS):
             trial = moved(problem, state, shrink * path, shrink * cameras)
@@ -103,7 +103,7 @@ def fit(
         gain, state, cost = cost - there, trial, there
         if gain < _DONE * cost:
             break
-    return Fit(state, cost, _step(problem, state, prior, parts, references)[2])
+    return Fit(state, cost, free)  # a last step away, where it hardly differs
 
 
 def cost_at(problem: Problem, state: State, prior: MotionPrior, noise: Coloured) -> float:
