@@ -83,8 +83,8 @@ def fit(
     """Gauss-Newton from a state that is nearly there, over the rows in use; halved where the cost would rise.
 
     references: what surveyed places say at a state; without it the gauge is held (`adjust.gauge_tangent`). Rows that
-    are off the path at ``state``, and a camera's only row of a label, are left out; after ten steps it ends wherever it
-    is. Raises LinAlgError where the rows do not tell a path.
+    are off the path at ``state``, and a camera's only row of a label, are left out; after forty steps it ends wherever
+    it is. Raises LinAlgError where the rows do not tell a path.
     """
     problem = _on_the_path(problem, state)
     parts = _parts(problem, noise)

@@ -2,8 +2,8 @@
 
 Where residuals are alike from frame to frame, the adjustment is made again by generalised least squares
 (`generalised`), and the lenses, whose errors look just like that, are estimated whole under priors of what a given
-lens may be off by. Both or neither: with rows taken as separate a freed lens takes up what a detector errs by; and with
-the lens as told the lasting errors take up the lens.
+lens may be off by. With rows taken as separate a freed lens takes up what a detector errs by; with lasting errors and
+two numbers of each lens free, these two take up the rest of the lens.
 """
 
 from __future__ import annotations
