@@ -7,7 +7,7 @@ control points lie in one vector, so that every normal matrix is banded.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import solveh_banded
@@ -30,6 +30,12 @@ class SplineBasis:
     intervals: Ints
     widths: Floats
     """(s,) knot interval of each stretch [s]: ``spacing``, or a little less where a stretch is filled exactly."""
+    offsets: Ints = field(init=False)
+    """(s,) index of each stretch's first control point."""
+
+    def __post_init__(self) -> None:
+        each = self.intervals + 3
+        object.__setattr__(self, "offsets", np.cumsum(each) - each)
 
     @classmethod
     def over(cls, begins: Floats, ends: Floats, spacing: float) -> SplineBasis:
@@ -59,12 +65,6 @@ class SplineBasis:
     def end(self) -> float:
         """Last time of the last stretch [s]."""
         return float(self.starts[-1] + self.intervals[-1] * self.widths[-1])
-
-    @property
-    def offsets(self) -> Ints:
-        """(s,) index of each stretch's first control point."""
-        each = self.intervals + 3
-        return np.asarray(np.cumsum(each) - each)
 
     @property
     def middles(self) -> Floats:
@@ -141,9 +141,8 @@ class SplineBasis:
 
 def basis_weights(u: Floats, derivative: int = 0) -> Floats:
     """The four cubic B-spline weights (n, 4), or a derivative by u, at u in [0, 1] of a knot interval."""
-    u = np.asarray(u, dtype=np.float64)
     v = 1.0 - u
-    out = np.empty((SUPPORT, *u.shape))
+    out = np.empty((SUPPORT, len(u)))
     if derivative == 0:
         square = u * u
         cube = square * u
@@ -160,7 +159,7 @@ def basis_weights(u: Floats, derivative: int = 0) -> Floats:
     else:
         out[0], out[1], out[2], out[3] = 6 * v, 18 * u - 12, -18 * u + 6, 6 * u
     out /= 6.0
-    return np.moveaxis(out, 0, -1)
+    return out.T
 
 
 def combined(control: Floats, index: Ints, weights: Floats) -> Floats:
@@ -168,9 +167,9 @@ def combined(control: Floats, index: Ints, weights: Floats) -> Floats:
     out = np.empty((control.shape[1], len(index)))
     # Coordinate by coordinate: numpy is slow along axes of two or three.
     for values, column in zip(out, np.ascontiguousarray(control.T), strict=True):
-        np.multiply(weights[:, 0], column[index], out=values)
+        np.multiply(weights[:, 0], column.take(index), out=values)
         for k in range(1, SUPPORT):
-            values += weights[:, k] * column[k:][index]
+            values += weights[:, k] * column[k:].take(index)
     return out.T
 
 

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from deploy.heap import keep_heap
 from deploy.outputs import write_outputs, write_refusal
 from deploy.progress import progress_bar
 from deploy.sessions import load_session
@@ -78,6 +79,7 @@ def calibrate(
     if from_known is not None:
         known, rig = _known(from_known, rig)
     command = shlex.join(["syncline", *sys.argv[1:]])
+    keep_heap()
     from hub.calibrate import calibrate as solve
 
     began = time.process_time()

@@ -13,13 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.sparse import block_diag, coo_array, csr_array, diags_array, vstack
+from scipy.sparse import csr_array
 
 from hub.points import PointBasis
 from hub.poses.adjust import gauge_tangent, moved
 from hub.poses.coloured import Markov
 from hub.poses.covariance import held_rows
 from hub.poses.gauge import ReferenceTerms
+from hub.poses.linear import PathBlocks, summed
 from hub.poses.motion import MotionPrior, motion_cost, motion_terms
 from hub.poses.problem import CAMERA_PARAMETERS, Coloured, Problem, Rows, State
 from hub.poses.residuals import derivatives, look
@@ -61,12 +62,15 @@ class Fit:
 class _Part:
     """Used rows (n,) of one camera and label, and the knots (m,) of their lasting error.
 
-    knots: on the camera's clock [s]. between: (n, m) the share of each knot in a row's error. precision: (2, m) upper
-    band of the process. factor: Cholesky band of that and the rows. over: information of a row's own noise [1/px²].
+    knots: on the camera's clock [s]. place: (n,) the knot before each row. shares: (n, 2) of it and of the next one in
+    a row's error. between: (n, m) the same as a matrix. precision: (2, m) upper band of the process. factor: Cholesky
+    band of that and the rows. over: information of a row's own noise [1/px²].
     """
 
     rows: Rows
     knots: Floats
+    place: Ints
+    shares: Floats
     between: csr_array
     precision: Floats
     factor: Floats
@@ -151,24 +155,27 @@ def _part(rows: Rows, count: int, noise: Coloured) -> _Part:
     knots = np.linspace(float(time.min()), float(time.max()) + 1e-6, count)
     place = np.clip(np.searchsorted(knots, time, side="right") - 1, 0, count - 2)
     share = (time - knots[place]) / (knots[1] - knots[0])
+    shares = np.column_stack([1.0 - share, share])
+    pointers = 2 * np.arange(len(time) + 1)
     between = csr_array(
-        (
-            np.column_stack([1.0 - share, share]).ravel(),
-            np.column_stack([place, place + 1]).ravel(),
-            2 * np.arange(len(time) + 1),
-        ),
-        shape=(len(time), count),
+        (shares.ravel(), np.column_stack([place, place + 1]).ravel(), pointers), shape=(len(time), count)
     )
     # Between two knots the process strays from the line.
     width, lasting = float(knots[1] - knots[0]), float(noise.lasting[rows.camera])
     strays = lasting**2 * min(width / (3.0 * float(noise.seconds[rows.camera])), 1.0)
     over = 1.0 / (float(noise.white[rows.camera]) ** 2 + strays)
     precision = Markov.over(knots, float(noise.seconds[rows.camera])).precision() / lasting**2
-    gram = between.T @ between
-    both = precision.copy()
-    both[1] += over * gram.diagonal()
-    both[0, 1:] += over * gram.diagonal(1)
-    return _Part(rows, knots, between, precision, cholesky_banded(both, check_finite=False), over)
+    both = precision + _gram(place, shares, np.full(len(time), over), count)
+    return _Part(rows, knots, place, shares, between, precision, cholesky_banded(both, check_finite=False), over)
+
+
+def _gram(place: Ints, shares: Floats, weight: Floats, count: int) -> Floats:
+    """Upper band (2, m) of what rows say of the knots that they lie between."""
+    out = np.zeros((2, count))
+    before, after = shares.T
+    out[1] = np.bincount(place, weight * before**2, count) + np.bincount(place + 1, weight * after**2, count)
+    out[0] = np.bincount(place + 1, weight * before * after, count)
+    return out
 
 
 def _cost(
@@ -211,33 +218,35 @@ def _step(
     columns = problem.free_columns()
     bases = np.r_[0, np.cumsum([3 * path.basis.size for path in state.trajectories])]
     motion = [_motion(state, prior, label) for label in range(len(state.trajectories))]
-    lasting = int(bases[-1])
-    inner, outer, residuals, weights = [], [], [], []
+    paths, lasting = int(bases[-1]), int(bases[-1])
     size = lasting + 2 * sum(len(part.knots) for part in parts)
+    border, gradient = np.zeros((size, len(columns)), order="F"), np.zeros(size)
+    corner, pull = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
+    blocks, entries = PathBlocks(paths // 3), Entries()
     for part in parts:
         rows, camera, path = part.rows, state.cameras[part.rows.camera], state.trajectories[part.rows.label]
         seen = look(rows, camera, path)
+        index = seen.index + bases[rows.label] // 3
         mine = np.flatnonzero(columns // CAMERA_PARAMETERS == rows.camera)
-        by = derivatives(seen, camera, path, (columns[mine] % CAMERA_PARAMETERS).tolist())
-        at = bases[rows.label] + 3 * seen.index[:, None] + np.arange(3 * SUPPORT)
+        by = derivatives(seen, camera, (columns[mine] % CAMERA_PARAMETERS).tolist())
+        terms = np.concatenate([by, seen.residual[:, None]], axis=1)
+        weight = np.where(seen.valid, part.over, 0.0)
+        weighted = terms * weight
+        spread, own = blocks.add_rows(index, seen.weights, terms, weighted)
+        border[:paths, mine] += spread[:, :-1]
+        gradient[:paths] += spread[:, -1]
+        corner[np.ix_(mine, mine)] += own[:-1, :-1]
+        pull[mine] += own[:-1, -1]
+        gram = part.precision + _gram(part.place, part.shares, weight, len(part.knots))
         for axis in range(2):
-            by_path = seen.weights[:, :, None] * by[axis, :3].T[:, None, :]
-            inner.append(_wide(np.asarray(by_path).reshape(len(at), -1), at, part.between, lasting, size))
-            outer.append(_rows_of(by[axis, 3:].T, np.broadcast_to(mine, (len(at), len(mine))), len(columns)))
-            residuals.append(seen.residual[axis])
-            weights.append(np.where(seen.valid, part.over, 0.0))
+            at = slice(lasting, lasting + len(part.knots))
+            knots = part.between.T @ np.ascontiguousarray(weighted[axis, 3:].T)
+            border[at, mine], gradient[at] = knots[:, :-1], knots[:, -1]
+            entries.add_band(gram, lasting)
+            entries.add_between(index, seen.weights, part.place + lasting, part.shares, weighted[axis, :3])
             lasting += len(part.knots)
-    left, right = vstack(inner, format="csr"), vstack(outer, format="csr")
-    weight, residual = np.concatenate(weights), np.concatenate(residuals)
-    weighted = (diags_array(weight) @ left).tocsr()
-    priors = [_symmetric(band) for band, _, _ in motion]
-    priors += [_symmetric(part.precision) for part in parts for _ in range(2)]
-    normal = (left.T @ weighted + block_diag(priors, format="csr")).tocoo()
-    border = (weighted.T @ right).toarray()
-    corner = (right.T @ (diags_array(weight) @ right)).toarray()
-    gradient = weighted.T @ residual
-    gradient[: bases[-1]] += np.concatenate([one[1] for one in motion])
-    pull = right.T @ (weight * residual)
+    gradient[:paths] += np.concatenate([one[1] for one in motion])
+    entries.add_band(blocks.band() + np.concatenate([one[0] for one in motion], axis=1), 0)
     place = {int(column): i for i, column in enumerate(columns)}
     for column, value, std in camera_priors(problem, state):
         if column in place:
@@ -250,37 +259,49 @@ def _step(
         pull += told.gradient[columns]
         held = held_rows([camera.pose for camera in state.cameras], told.information)[:, columns]
         tangent = np.linalg.svd(held)[2][len(held) :].T if len(held) else None
-    carried = _solved(normal, _in_time(state, parts), np.column_stack([border, gradient]))
+    carried = _solved(entries, _in_time(state, parts), np.column_stack([border, gradient]))
     reduced, right_side = corner - border.T @ carried[:, :-1], border.T @ carried[:, -1] - pull
     free = np.eye(len(columns)) if tangent is None else tangent
     covariance = free @ np.linalg.inv(free.T @ reduced @ free) @ free.T if len(columns) else reduced
     cameras = covariance @ right_side
-    return -(carried[:, -1] + carried[:, :-1] @ cameras)[: bases[-1]], cameras, covariance
+    return -(carried[:, -1] + carried[:, :-1] @ cameras)[:paths], cameras, covariance
 
 
-def _wide(by_path: Floats, at: Ints, between: csr_array, first: int, size: int) -> csr_array:
-    """Rows (n, size): derivatives (n, 12) by the path at columns (n, 12), and by a lasting error from ``first`` on."""
-    knots = between.indices.reshape(-1, 2) + first
-    values = np.concatenate([by_path, between.data.reshape(-1, 2)], axis=1)
-    return _rows_of(values, np.concatenate([at, knots], axis=1), size)
+class Entries:
+    """Entries of a symmetric sparse matrix, those of one half: of one place there may be several, which add up."""
 
+    def __init__(self) -> None:
+        self._parts: list[tuple[Ints, Ints, Floats]] = []
 
-def _rows_of(values: Floats, columns: Ints, size: int) -> csr_array:
-    """A sparse matrix (n, size) of values (n, k) in columns (n, k)."""
-    count, each = values.shape
-    return csr_array((values.ravel(), columns.ravel(), each * np.arange(count + 1)), shape=(count, size))
+    def add_band(self, upper: Floats, first: int) -> None:
+        """A block on the diagonal from ``first`` on, told by its upper band (k, m), 0 where there is no row."""
+        row, column = np.nonzero(upper)
+        self._parts.append((first + column - (len(upper) - 1 - row), first + column, upper[row, column]))
 
+    def add_between(self, index: Ints, weights: Floats, place: Ints, shares: Floats, values: Floats) -> None:
+        """What rows tie together: the control points at ``index`` (n,) by ``weights`` (n, 4), of three coordinates by
+        ``values`` (3, n), and the two unknowns from ``place`` (n,) on by ``shares`` (n, 2).
+        """
+        # Rows of one knot interval of the path and one of the lasting error are summed first.
+        span = int(place.max()) + 1
+        cells, cell = np.unique(index * span + place, return_inverse=True)
+        products = (weights[:, :, None] * shares[:, None, :]).reshape(len(index), -1)
+        each = products.shape[1]
+        sums = summed(products, each * cell[:, None] + np.arange(each), values.T, each * len(cells))
+        control = 3 * (cells // span)[:, None] + 3 * np.arange(SUPPORT)
+        shape = (len(cells), SUPPORT, 2, 3)
+        row = np.broadcast_to(control[:, :, None, None] + np.arange(3), shape)
+        column = np.broadcast_to((cells % span)[:, None, None, None] + np.arange(2)[:, None], shape)
+        self._parts.append((row.ravel(), column.ravel(), sums.ravel()))
 
-def _symmetric(upper: Floats) -> csr_array:
-    """The symmetric matrix (n, n) of an upper band (k, n)."""
-    bands = len(upper)
-    offsets = range(bands - 1, -1, -1)
-    above = [upper[bands - 1 - offset, offset:] for offset in offsets]
-    return diags_array(
-        [*above, *(values for values, offset in zip(above, offsets, strict=True) if offset)],
-        offsets=[*offsets, *(-offset for offset in offsets if offset)],
-        format="csr",
-    )
+    def band(self, place: Ints) -> Floats:
+        """The upper band (k, n), as LAPACK has it, of the matrix whose unknowns are at ``place`` (n,)."""
+        row, column = (place[np.concatenate([part[i] for part in self._parts])] for i in range(2))
+        low, high = np.minimum(row, column), np.maximum(row, column)
+        bands = int((high - low).max(initial=0)) + 1
+        flat = bands * high + bands - 1 - (high - low)
+        values = np.bincount(flat, np.concatenate([part[2] for part in self._parts]), bands * len(place))
+        return np.asarray(values, dtype=np.float64).reshape(len(place), bands).T
 
 
 def _in_time(state: State, parts: list[_Part]) -> Ints:
@@ -300,14 +321,9 @@ def _in_time(state: State, parts: list[_Part]) -> Ints:
     return place
 
 
-def _solved(normal: coo_array, place: Ints, right: Floats) -> Floats:
+def _solved(normal: Entries, place: Ints, right: Floats) -> Floats:
     """The solution (n, k) of a symmetric system that is banded once its unknowns are at ``place`` (n,)."""
-    row, column = place[normal.row], place[normal.col]
-    upper = row <= column
-    row, column, values = row[upper], column[upper], normal.data[upper]
-    bands = int((column - row).max(initial=0)) + 1
-    band = np.zeros((bands, len(place)))
-    band[bands - 1 - (column - row), column] = values
+    band = normal.band(place)
     band[-1] += 1e-12 * float(band[-1].max(initial=1.0))
     factor = cholesky_banded(band, overwrite_ab=True, check_finite=False)
     ordered = np.empty_like(right, order="F")
@@ -315,4 +331,4 @@ def _solved(normal: coo_array, place: Ints, right: Floats) -> Floats:
     return np.asarray(cho_solve_banded((factor, False), ordered, overwrite_b=True, check_finite=False)[place])
 
 
-__all__ = ["Fit", "cost_at", "fit", "within_reach"]
+__all__ = ["Entries", "Fit", "cost_at", "fit", "within_reach"]

@@ -255,28 +255,29 @@ def linear_triangulation(seeing: list[tuple[CameraState, Track]], time: Floats) 
 
     Least squares over the distances to the rays, which needs no start and no depth.
     """
-    matrix, right = np.zeros((len(time), 3, 3)), np.zeros((len(time), 3))
+    # Sums over the cameras of P = 1 - r rᵀ, r a ray, and of P times the camera's position; coordinate by coordinate.
+    sums, target = np.zeros((3, 3, len(time))), np.zeros((3, len(time)))
     count = np.zeros(len(time), dtype=np.int64)
     rays = []
     for state, track in seeing:
-        seen = track.at(state.camera_time(time))
-        there = np.asarray(np.isfinite(seen).all(axis=1))
-        local = np.column_stack([np.where(there[:, None], seen, 0.0), np.ones(len(time))])
-        ray = local @ state.pose.rotation
-        ray /= np.linalg.norm(ray, axis=1)[:, None]
-        across = (np.eye(3) - ray[:, :, None] * ray[:, None, :]) * there[:, None, None]
-        matrix += across
-        right += across @ state.pose.position
+        seen = track.at(state.camera_time(time)).T
+        there = np.asarray(np.isfinite(seen).all(axis=0))
+        ray = state.pose.rotation.T @ np.stack([*np.where(there, seen, 0.0), np.ones(len(time))])
+        ray *= there / np.sqrt((ray**2).sum(axis=0))
+        position = state.pose.position[:, None]
+        sums -= ray[:, None] * ray
+        sums[range(3), range(3)] += there
+        target += there * position - ray * (ray * position).sum(axis=0)
         count += there
-        rays.append((state, ray, there))
+        rays.append((position, ray))
+    matrix, right = np.ascontiguousarray(sums.transpose(2, 0, 1)), target.T
     eigenvalues = np.linalg.eigvalsh(matrix)
     # Smallest eigenvalue of two rays at angle t: 1 - cos t.
     good = (count >= 2) & (eigenvalues[:, 0] > 1.0 - np.cos(_LEAST_PARALLAX))
     points = np.zeros((len(time), 3))
     points[good] = np.linalg.solve(matrix[good], right[good][:, :, None])[:, :, 0]
-    for state, ray, there in rays:
-        ahead = ((points - state.pose.position) * ray).sum(axis=1) > 0
-        good &= ahead | ~there
+    for position, ray in rays:  # a ray of length 0 is none
+        good &= (((points.T - position) * ray).sum(axis=0) > 0) | ~ray.any(axis=0)
     return points, good
 
 

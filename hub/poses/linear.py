@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.sparse import csr_array
+from scipy.linalg.lapack import dtbtrs
+from scipy.sparse import csc_array
 
 from hub.points import PointBasis
 from hub.splines import SUPPORT, SplineBasis
@@ -54,8 +55,20 @@ class PathBlocks:
         for p, (a, b) in enumerate(_PAIRS):
             products[:, p] = weights[:, a] * weights[:, b]
         columns = len(_PAIRS) * index[:, None] + np.arange(len(_PAIRS))
-        summed = _summed(products, columns, np.ascontiguousarray(upper.T), self._sums.shape[0] * len(_PAIRS))
-        self._sums += summed.reshape(self._sums.shape)
+        sums = summed(products, columns, np.ascontiguousarray(upper.T), self._sums.shape[0] * len(_PAIRS))
+        self._sums += sums.reshape(self._sums.shape)
+
+    def add_rows(self, index: Ints, weights: Floats, terms: Floats, weighted: Floats) -> tuple[Floats, Floats]:
+        """Add rows' normal matrix; returns what else is in it: (3 size, p) with the path, and (p, p) without.
+
+        terms: (2, 3 + p, n) derivatives of both image axes by the point and by p others, or what stands in their place;
+        weighted: the same times the rows' weights. index (n,), weights (n, 4): control points of each row's point.
+        """
+        # The point's three rows, by the point's and the others' columns.
+        products = weighted[0, :3, None] * terms[0] + weighted[1, :3, None] * terms[1]
+        self.add(index, weights, products[_ROWS, _COLUMNS])
+        spread = self.spread(index, weights, products[:, 3:])
+        return spread, weighted[0, 3:] @ terms[0, 3:].T + weighted[1, 3:] @ terms[1, 3:].T
 
     def spread(self, index: Ints, weights: Floats, values: Floats) -> Floats:
         """Sum over rows of w ⊗ value: (3 size, p) of values (3, p, n)."""
@@ -74,6 +87,7 @@ class PathBlocks:
 
 _PAIRS = tuple((a, b) for a in range(SUPPORT) for b in range(a, SUPPORT))
 _UPPER = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
+_ROWS, _COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
 
 
 def border_block(index: Ints, weights: Floats, values: Floats, size: int) -> Floats:
@@ -81,14 +95,14 @@ def border_block(index: Ints, weights: Floats, values: Floats, size: int) -> Flo
     width = values.shape[1]
     columns = index[:, None] + np.arange(SUPPORT)
     rows_first = np.ascontiguousarray(values.transpose(2, 0, 1)).reshape(-1, 3 * width)
-    return _summed(weights, columns, rows_first, size // 3 + SUPPORT).reshape(-1, width)[:size]
+    return summed(weights, columns, rows_first, size // 3 + SUPPORT).reshape(-1, width)[:size]
 
 
-def _summed(weights: Floats, columns: Ints, values: Floats, size: int) -> Floats:
+def summed(weights: Floats, columns: Ints, values: Floats, size: int) -> Floats:
     """Sums (size, p) over rows of weights (n, k) at columns (n, k) times values (n, p)."""
     rows, each = weights.shape
-    spread = csr_array((weights.ravel(), columns.ravel(), each * np.arange(rows + 1)), shape=(rows, size))
-    return np.asarray(spread.T @ values)
+    spread = csc_array((weights.ravel(), columns.ravel(), each * np.arange(rows + 1)), shape=(size, rows))
+    return np.asarray(spread @ values)
 
 
 def third_difference_band(basis: SplineBasis | PointBasis, weight: Floats, metric: Floats) -> Floats:
@@ -96,16 +110,18 @@ def third_difference_band(basis: SplineBasis | PointBasis, weight: Floats, metri
 
     weight: (m,). metric: (3, 3), symmetric.
     """
-    index = basis.interval_starts()
-    sums = np.zeros((SUPPORT, basis.size))  # by distance of two control points, at the later one
+    size = basis.size
+    begun = np.zeros(size)  # weight of the interval that begins at a control point
+    begun[basis.interval_starts()] = weight
+    sums = np.zeros((SUPPORT, size))  # by distance of two control points, at the later one
     for a, b in _PAIRS:
-        # no interval begins where another does
-        sums[b - a, index + b] += THIRD_DIFFERENCE[a] * THIRD_DIFFERENCE[b] * weight
-    band = np.zeros((BAND, 3 * basis.size))
+        sums[b - a, b:] += THIRD_DIFFERENCE[a] * THIRD_DIFFERENCE[b] * begun[: size - b]
+    band = np.zeros((BAND, 3 * size))
     for distance in range(SUPPORT):
-        for i, j in np.ndindex(3, 3):
-            if metric[i, j] != 0.0 and (distance or j >= i):
-                band[BAND - 1 - 3 * distance - j + i, 3 * distance + j :: 3] = metric[i, j] * sums[distance, distance:]
+        for j in range(3):
+            top = BAND - 1 - 3 * distance - j
+            above = metric[: 3 if distance else j + 1, j, None]
+            band[top : top + len(above), 3 * distance + j :: 3] = above * sums[distance, distance:]
     return band
 
 
@@ -141,9 +157,7 @@ class Elimination:
 
 def eliminate(system: BorderedSystem, damping: float = 0.0) -> Elimination:
     """Factor A (damped on its diagonal) and form the Schur complement. Raises LinAlgError if not definite."""
-    band = system.band.copy()
-    band[-1] += damping * band[-1] + 1e-12 * float(band[-1].max(initial=1.0))
-    factor = cholesky_banded(band, check_finite=False)
+    factor = _factored(system.band, damping)
     carried = cho_solve_banded((factor, False), system.border, check_finite=False)
     reduced = system.corner - system.border.T @ carried
     return Elimination(factor, np.asarray(carried), np.asarray(0.5 * (reduced + reduced.T)))
@@ -159,14 +173,24 @@ def solve(system: BorderedSystem, damping: float, tangent: Floats | None) -> tup
 
     tangent: (p, q) orthonormal directions that the cameras may move in (the gauge is held); None = all.
     """
-    parts = eliminate(system, damping)
-    path = cho_solve_path(parts, system.gradient_path)
-    right = -(system.gradient_cameras - system.border.T @ path)
-    matrix = parts.reduced + damping * np.diag(np.diag(system.corner)) + 1e-12 * np.eye(len(right))
-    if len(right) == 0:
-        return -np.asarray(path), right
+    factor = _factored(system.band, damping)
+    # Half of what `eliminate` does is enough: with A = Uᵀ U and H = U⁻ᵀ [B g], Hᵀ H holds Bᵀ A⁻¹ B and Bᵀ A⁻¹ g.
+    half = np.empty((factor.shape[1], len(system.gradient_cameras) + 1), order="F")
+    half[:, :-1], half[:, -1] = system.border, system.gradient_path
+    half, _ = dtbtrs(factor, half, trans="T", overwrite_b=True)  # fails where a diagonal is 0, as the factor's never is
+    gram = half.T @ half
+    right = gram[:-1, -1] - system.gradient_cameras
+    matrix = system.corner - gram[:-1, :-1] + damping * np.diag(np.diag(system.corner)) + 1e-12 * np.eye(len(right))
     if tangent is None:
         cameras = np.linalg.solve(matrix, right)
     else:
         cameras = tangent @ np.linalg.solve(tangent.T @ matrix @ tangent, tangent.T @ right)
-    return np.asarray(-path - parts.carried @ cameras), np.asarray(cameras)
+    path = cho_solve_banded((factor, False), system.gradient_path + system.border @ cameras, check_finite=False)
+    return -np.asarray(path), np.asarray(cameras)
+
+
+def _factored(band: Floats, damping: float) -> Floats:
+    """Cholesky band of A, damped on its diagonal. Raises LinAlgError if not definite."""
+    band = band.copy()
+    band[-1] += damping * band[-1] + 1e-12 * float(band[-1].max(initial=1.0))
+    return np.asarray(cholesky_banded(band, check_finite=False))

@@ -7,7 +7,8 @@ transposed views, rows first.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 
@@ -50,24 +51,40 @@ class Linearised:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
-    """Used rows of one camera and label at a state, without derivatives.
+    """Used rows of one camera at a state, without derivatives.
 
     residual: (2, n) [px]. valid: (n,) whether the path is known and in front; elsewhere numbers are finite and mean
-    nothing. time: (n,) on the camera's clock, its readout counted. index, weights, slopes: place in the spline.
-    local: (3, n) in camera axes. flat: (2, n) undistorted. distorting: (n, 2, 2) derivative of distorted by
-    undistorted coordinates, where it came with the residuals.
+    nothing. time: (n,) on the camera's clock, its readout counted. index, weights, slopes: place in ``control``
+    (size, 3), the path's or all paths' control points. local: (3, n) in camera axes. flat: (2, n) undistorted.
+    distorting: (n, 2, 2) derivative of distorted by undistorted coordinates, where it came with the residuals.
     """
 
     residual: Floats
     valid: Bools
     time: Floats
     pixels: Floats
+    control: Floats
     index: Ints
     weights: Floats
     slopes: Floats
     local: Floats
     flat: Floats
     distorting: Floats | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stacked:
+    """The paths of all labels, one after the other. firsts: by label its first of the ``control`` points (size, 3)."""
+
+    paths: tuple[Trajectory, ...]
+    firsts: tuple[int, ...]
+    control: Floats
+
+    @classmethod
+    def of(cls, paths: tuple[Trajectory, ...]) -> Stacked:
+        """All paths of a state."""
+        firsts = accumulate((path.basis.size for path in paths), initial=0)
+        return cls(paths, tuple(firsts)[:-1], np.concatenate([np.zeros((0, 3)), *(path.control for path in paths)]))
 
 
 def predict(rows: Rows, camera: CameraState, path: Trajectory) -> Floats:
@@ -83,12 +100,27 @@ def residual_norms(rows: Rows, camera: CameraState, path: Trajectory) -> Floats:
 
 
 def look(rows: Rows, camera: CameraState, path: Trajectory) -> Look:
-    """Residuals of the used rows, and what derivatives need."""
-    used = slice(None) if rows.use.all() else rows.use
-    pixels = rows.pixels[used]
-    time = camera.shot(rows.time[used], pixels)
-    index, weights, slopes, inside = path.basis.weights_both(camera.reference_time(time), _BEYOND)
-    local = camera.pose.rotation @ (combined(path.control, index, weights).T - camera.pose.position[:, None])
+    """Residuals of the used rows of one label, and what derivatives need."""
+    return look_together((replace(rows, label=0),), camera, Stacked((path,), (0,), path.control))
+
+
+def look_together(parts: Sequence[Rows], camera: CameraState, paths: Stacked) -> Look:
+    """The used rows of several labels of one camera, one label after the other.
+
+    Some thirty rows a label are what a board gives: numpy takes as long for these as for all labels' at once.
+    """
+    pixels = np.concatenate([part.pixels[part.use] for part in parts])
+    time = camera.shot(np.concatenate([part.time[part.use] for part in parts]), pixels)
+    reference = camera.reference_time(time)
+    ends = np.cumsum([np.count_nonzero(part.use) for part in parts])
+    places = [
+        paths.paths[part.label].basis.weights_both(mine, _BEYOND)
+        for part, mine in zip(parts, np.split(reference, ends[:-1]), strict=True)
+    ]
+    index = np.concatenate([place[0] + paths.firsts[part.label] for place, part in zip(places, parts, strict=True)])
+    weights, slopes = (np.concatenate([place[i] for place in places]) for i in (1, 2))
+    inside = np.concatenate([place[3] for place in places])
+    local = camera.pose.rotation @ (combined(paths.control, index, weights).T - camera.pose.position[:, None])
     z = local[2]
     valid = inside & (z > 1e-9)
     flat = np.where(valid, local[:2] / np.where(valid, z, 1.0), 0.0)
@@ -106,10 +138,11 @@ def look(rows: Rows, camera: CameraState, path: Trajectory) -> Look:
         projected = np.where(valid, projected, lens.matrix[:2, 2:])
         if distorting is not None:
             distorting[~valid] = np.eye(2)
-    return Look(projected - pixels.T, valid, time, pixels, index, weights, slopes, local, flat, distorting)
+    residual = projected - pixels.T
+    return Look(residual, valid, time, pixels, paths.control, index, weights, slopes, local, flat, distorting)
 
 
-def derivatives(seen: Look, camera: CameraState, path: Trajectory, columns: Sequence[int]) -> Floats:
+def derivatives(seen: Look, camera: CameraState, columns: Sequence[int]) -> Floats:
     """Derivatives (2, 3 + columns, n) of the residuals by the point and by those parameters of the camera."""
     out = np.empty((2, 3 + len(columns), len(seen.time)))
     lens, flat, local = camera.intrinsics, seen.flat, seen.local
@@ -133,7 +166,7 @@ def derivatives(seen: Look, camera: CameraState, path: Trajectory, columns: Sequ
             np.negative(by_point[:, column - 3], out=values)
         elif column in (OFFSET, RATE, READOUT):
             if along is None:
-                velocity = combined(path.control, seen.index, seen.slopes).T
+                velocity = combined(seen.control, seen.index, seen.slopes).T
                 along = (by_point * velocity).sum(axis=1)
             lever: Floats | float = 1.0
             if column == RATE:
@@ -175,5 +208,5 @@ def _by_lens(seen: Look, lens: Intrinsics, column: int, radius2: Floats) -> Floa
 def linearise(rows: Rows, camera: CameraState, path: Trajectory, columns: int = CAMERA_PARAMETERS) -> Linearised:
     """Residuals of the used rows and their derivatives by the point (n, 2, 3) and the camera (n, 2, columns)."""
     seen = look(rows, camera, path)
-    slopes = derivatives(seen, camera, path, range(columns)).transpose(2, 0, 1)
+    slopes = derivatives(seen, camera, range(columns)).transpose(2, 0, 1)
     return Linearised(seen.residual.T, slopes[:, :, :3], slopes[:, :, 3:], seen.index, seen.weights, seen.valid)

@@ -128,10 +128,10 @@ def _in_a_frame(parts: list[tuple[Floats, Floats]]) -> float:
 
 def _in_a_row(parts: list[tuple[Floats, Floats]], frames: float = 1.0) -> float:
     """parts: as above, in any order. frames: how many labels of a frame count as one: so few are their pairs."""
-    parts = [(time[order], off[order]) for time, off in parts for order in [np.argsort(time, kind="stable")]]
+    parts = [(time[order], off[order].T.copy()) for time, off in parts for order in [np.argsort(time, kind="stable")]]
     steps = np.concatenate([np.diff(time) for time, _ in parts]) if parts else np.zeros(0)
     step = float(np.median(steps)) if len(steps) else 0.0
-    variance = float(np.mean(np.concatenate([off for _, off in parts]) ** 2)) if parts else 0.0
+    variance = float(np.mean(np.concatenate([off for _, off in parts], axis=1) ** 2)) if parts else 0.0
     if step <= 0.0 or variance <= 0.0:
         return 1.0
     total = 1.0
@@ -140,7 +140,7 @@ def _in_a_row(parts: list[tuple[Floats, Floats]], frames: float = 1.0) -> float:
         for time, off in parts:
             if lag < len(time):
                 near = np.abs(time[lag:] - time[:-lag] - lag * step) < 0.5 * step
-                product += float(np.sum(off[lag:][near] * off[:-lag][near]))
+                product += float(((off[:, lag:] * off[:, :-lag]) @ near).sum())
                 pairs += int(np.count_nonzero(near))
         if pairs < _LEAST_PAIRS:
             break

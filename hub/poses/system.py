@@ -21,22 +21,22 @@ from hub.poses.problem import (
     READOUT,
     LensPrior,
     Problem,
+    Rows,
     State,
 )
-from hub.poses.residuals import Look, derivatives, look
+from hub.poses.residuals import Look, Stacked, derivatives, look_together
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
 WIDTH = 4.0
 """Cauchy width in sigma of the 2-D residual: nearly efficient for Gaussian noise."""
-_POINT_ROWS = [0, 0, 0, 1, 1, 2]
-_POINT_COLUMNS = [0, 1, 2, 1, 2, 2]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weighed:
-    """The rows at a state, what each weighs, and the cost of all and of the priors."""
+    """The rows at a state by camera, what each weighs, and the cost of all and of the priors."""
 
+    cameras: tuple[int, ...]
     looks: tuple[Look, ...]
     weights: tuple[Floats, ...]
     cost: float
@@ -51,10 +51,14 @@ def weighed(problem: Problem, state: State, prior: MotionPrior, robust: bool) ->
     cost += sum((value / std) ** 2 for _, value, std in camera_priors(problem, state))
     # A point behind the camera or off the path costs what a gross outlier does, and pulls nothing.
     gross = WIDTH**2 * np.log1p((100.0 / WIDTH) ** 2) if robust else 100.0**2
-    looks, weights = [], []
+    by_camera: dict[int, list[Rows]] = {}
     for rows in problem.rows:
-        seen = look(rows, state.cameras[rows.camera], state.trajectories[rows.label])
-        over = 1.0 / state.sigma[rows.camera] ** 2
+        by_camera.setdefault(rows.camera, []).append(rows)
+    paths = Stacked.of(state.trajectories)
+    looks, weights = [], []
+    for camera, parts in by_camera.items():
+        seen = look_together(parts, state.cameras[camera], paths)
+        over = 1.0 / state.sigma[camera] ** 2
         squared = (seen.residual[0] ** 2 + seen.residual[1] ** 2) * over
         if robust:
             ratio = squared / WIDTH**2
@@ -65,7 +69,7 @@ def weighed(problem: Problem, state: State, prior: MotionPrior, robust: bool) ->
             losses = squared
         cost += float(np.where(seen.valid, losses, gross).sum())
         looks.append(seen)
-    return Weighed(tuple(looks), tuple(weights), float(cost))
+    return Weighed(tuple(by_camera), tuple(looks), tuple(weights), float(cost))
 
 
 def build_system(problem: Problem, state: State, prior: MotionPrior, robust: bool) -> tuple[BorderedSystem, float]:
@@ -86,28 +90,23 @@ def assemble(problem: Problem, state: State, prior: MotionPrior, seen: Weighed) 
         np.zeros(bases[-1]),
         np.zeros(len(columns)),
     )
-    blocks = [PathBlocks(path.basis.size) for path in state.trajectories]
-    for rows, one, weight in zip(problem.rows, seen.looks, seen.weights, strict=True):
-        mine = np.flatnonzero(columns // CAMERA_PARAMETERS == rows.camera)
-        camera, path = state.cameras[rows.camera], state.trajectories[rows.label]
-        by = derivatives(one, camera, path, (columns[mine] % CAMERA_PARAMETERS).tolist())
+    blocks = PathBlocks(bases[-1] // 3)
+    for which, one, weight in zip(seen.cameras, seen.looks, seen.weights, strict=True):
+        mine = np.flatnonzero(columns // CAMERA_PARAMETERS == which)
+        by = derivatives(one, state.cameras[which], (columns[mine] % CAMERA_PARAMETERS).tolist())
         terms = np.concatenate([by, one.residual[:, None]], axis=1)
         weighted = terms * weight
-        # Rows of the normal matrix: the point's three, by the point's, the camera's and the residual's columns.
-        products = weighted[0, :3, None] * terms[0] + weighted[1, :3, None] * terms[1]
-        blocks[rows.label].add(one.index, one.weights, products[_POINT_ROWS, _POINT_COLUMNS])
-        spread = blocks[rows.label].spread(one.index, one.weights, products[:, 3:])
-        part = slice(bases[rows.label], bases[rows.label + 1])
-        system.gradient_path[part] += spread[:, -1]
+        spread, own = blocks.add_rows(one.index, one.weights, terms, weighted)
+        system.gradient_path += spread[:, -1]
         if len(mine):
-            system.border[part, mine[0] : mine[-1] + 1] += spread[:, :-1]
-            own = weighted[0, 3:] @ terms[0, 3:].T + weighted[1, 3:] @ terms[1, 3:].T
-            system.corner[np.ix_(mine, mine)] += own[:-1, :-1]
-            system.gradient_cameras[mine] += own[:-1, -1]
+            system.border[:, mine[0] : mine[-1] + 1] = spread[:, :-1]
+            system.corner[np.ix_(mine, mine)] = own[:-1, :-1]
+            system.gradient_cameras[mine] = own[:-1, -1]
+    system.band += blocks.band()
     for label, path in enumerate(state.trajectories):
         part = slice(bases[label], bases[label + 1])
         band, gradient, _ = motion_terms(path, prior.weights[label], prior.sizes[label] if prior.sizes else None)
-        system.band[:, part] = band + blocks[label].band()
+        system.band[:, part] += band
         system.gradient_path[part] += gradient
     place = {int(column): i for i, column in enumerate(columns)}
     for column, value, std in camera_priors(problem, state):

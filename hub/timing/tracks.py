@@ -186,17 +186,20 @@ def _neighbour_score(time: Floats, points: Floats, good: Bools, one_sided: bool)
     t, x = time[rows], points[rows]
     before = np.searchsorted(rows, np.arange(len(time))) - 1
     after = before + 1 + good
-    lines = [(before - i, after + j) for i in range(_NEIGHBOURS) for j in range(_NEIGHBOURS)]
+    places = np.stack([before - i for i in range(_NEIGHBOURS)] + [after + j for j in range(_NEIGHBOURS)])
+    there = (places >= 0) & (places < len(rows))
+    t_near, x_near, y_near = (column.take(places, mode="clip") for column in (t, *np.ascontiguousarray(x.T)))
+    lines = [(i, _NEIGHBOURS + j) for i in range(_NEIGHBOURS) for j in range(_NEIGHBOURS)]
     if one_sided:
-        lines += [(before - j, before - i) for j in range(1, _NEIGHBOURS) for i in range(j)]
-        lines += [(after + i, after + j) for j in range(1, _NEIGHBOURS) for i in range(j)]
-    residuals = np.full((len(lines), len(time)), np.inf)
-    for k, (first, second) in enumerate(lines):
-        here = np.flatnonzero((first >= 0) & (second < len(rows)))
-        low, high = first[here], second[here]
-        share = (time[here] - t[low]) / (t[high] - t[low])
-        off = points[here] - x[low] - share[:, None] * (x[high] - x[low])
-        residuals[k, here] = np.hypot(off[:, 0], off[:, 1])
+        lines += [(j, i) for j in range(1, _NEIGHBOURS) for i in range(j)]
+        lines += [(_NEIGHBOURS + i, _NEIGHBOURS + j) for j in range(1, _NEIGHBOURS) for i in range(j)]
+    residuals = np.empty((len(lines), len(time)))
+    with np.errstate(divide="ignore", invalid="ignore"):  # where one of the two is not there
+        for k, (low, high) in enumerate(lines):
+            share = (time - t_near[low]) / (t_near[high] - t_near[low])
+            across = points[:, 0] - x_near[low] - share * (x_near[high] - x_near[low])
+            down = points[:, 1] - y_near[low] - share * (y_near[high] - y_near[low])
+            residuals[k] = np.where(there[low] & there[high], np.hypot(across, down), np.inf)
     residuals.sort(axis=0)
     known = np.isfinite(residuals).sum(axis=0)
     pick = np.maximum(0, np.ceil(_NEIGHBOUR_QUANTILE * known).astype(np.int64) - 1)

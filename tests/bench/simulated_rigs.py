@@ -23,6 +23,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import numpy as np  # noqa: E402
 
+from deploy.heap import keep_heap  # noqa: E402
 from hub.calibrate import calibrate  # noqa: E402
 from hub.prepare import prepare  # noqa: E402
 from hub.timing.tracks import SmoothTrack  # noqa: E402
@@ -231,6 +232,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=DEFAULT_DATA)
     parser.add_argument("--only", default="five,twenty,cut")
     options = parser.parse_args()
+    keep_heap()  # as the command does
     wanted = options.only.split(",")
     if "five" in wanted:
         five(options.sessions, options.first)

@@ -34,3 +34,29 @@ def test_what_a_solver_frees_goes_back_to_the_system() -> None:
     if grown("steady") == "cannot":
         pytest.skip("no glibc")
     assert float(grown("steady")) < 2.0
+
+
+FAULTS = """
+import resource, sys
+from deploy.heap import keep_heap
+if sys.argv[1] == "kept" and not keep_heap():
+    print("cannot"); sys.exit()
+import numpy as np
+def work():
+    parts = [np.ones(60_000) for _ in range(20)]  # 480 kB each, as a solver's
+    return sum(part.sum() for part in parts)
+work()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(20):
+    work()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc only")
+def test_what_a_command_frees_is_at_hand_again() -> None:
+    done = subprocess.run([sys.executable, "-c", FAULTS, "kept"], capture_output=True, text=True, check=True)
+    if done.stdout.strip() == "cannot":
+        pytest.skip("no glibc")
+    pages = 20 * 20 * 480_000 / 4096
+    assert float(done.stdout) < 0.05 * pages

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 from hub.poses import lasting
 from hub.poses.adjust import adjust, moved, residual_norms
 from hub.poses.coloured import Markov, coloured, likeliest
-from hub.poses.generalised import Fit, cost_at, fit, within_reach
+from hub.poses.generalised import Entries, Fit, cost_at, fit, within_reach
 from hub.poses.lasting import as_told, tolerance, with_lasting_errors
 from hub.poses.motion import MotionPrior, motion_prior
 from hub.poses.problem import CAMERA_PARAMETERS, FOCAL, CameraState, Coloured, Problem, Rows, State, Trajectory
@@ -74,6 +74,34 @@ def test_the_precision_of_the_process_is_the_inverse_of_its_covariance() -> None
     band = Markov.over(time, SLOW).precision()
     found = np.diag(band[1]) + np.diag(band[0, 1:], 1) + np.diag(band[0, 1:], -1)
     assert found @ dense(time, 0.0, 1.0, SLOW) == pytest.approx(np.eye(len(time)), abs=1e-8)
+
+
+def test_what_rows_tie_together_comes_out_banded_in_any_order() -> None:
+    rng = np.random.default_rng(1)
+    controls, knots, count = 9, 5, 40
+    index, place = rng.integers(0, controls - 3, count), rng.integers(0, knots - 1, count)
+    weights, shares, values = rng.random((count, 4)), rng.random((count, 2)), rng.normal(size=(3, count))
+    upper = np.stack([np.r_[0.0, rng.normal(size=knots - 1)], rng.normal(size=knots)])
+    size = 3 * controls + knots
+    entries = Entries()
+    entries.add_band(upper, 3 * controls)
+    entries.add_between(index, weights, 3 * controls + place, shares, values)
+    expected = np.zeros((size, size))
+    at = 3 * controls + np.arange(knots)
+    expected[at, at], expected[at[:-1], at[1:]] = upper[1], upper[0, 1:]
+    for n in range(count):
+        for k, knot in np.ndindex(4, 2):
+            for axis in range(3):
+                value = weights[n, k] * shares[n, knot] * values[axis, n]
+                expected[3 * (index[n] + k) + axis, 3 * controls + place[n] + knot] += value
+    expected += np.triu(expected, 1).T
+    order = rng.permutation(size)
+    band = entries.band(order)
+    placed = np.zeros_like(expected)
+    placed[np.ix_(order, order)] = expected
+    for distance in range(size):
+        found = band[len(band) - 1 - distance, distance:] if distance < len(band) else np.zeros(size - distance)
+        assert found == pytest.approx(np.diag(placed, distance), abs=1e-12)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
