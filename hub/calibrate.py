@@ -44,7 +44,7 @@ _LEAST_AGREEMENT = 0.5  # share of a camera's rows that must fit the common path
 _LEAST_ROWS = 30
 _LARGEST_TURN_STD = 0.05  # rad
 _LARGEST_CLOCK_STD = 10e-3  # s: a frame is more than three of them
-_FARTHEST_FROM_PAIR = 30e-3  # s
+_FARTHEST_FROM_PAIR = 20e-3  # s
 _APART = "the path tells its clock"
 _LENS_ROUNDS = 3
 
@@ -214,14 +214,18 @@ def solve_network(
     refused = dict(prepared.refused)
     freedom = Freedom(clock=not prepared.shared_clock)
     graph = _connect(prepared, list(prepared.cameras), pairs, refused)
+    held = replace(freedom, rate_std=_rate_std(graph, freedom.rate_std))
     while True:
         if nodes is not None:
             scaffold, unplaced = nodes(graph)
         else:
             scaffold, unplaced = grow(
-                prepared.cameras, graph, prepared.rows, prepared.labels, lambda text: tell(text, 0.6), freedom
+                prepared.cameras, graph, prepared.rows, prepared.labels, lambda text: tell(text, 0.6), held
             )
             scaffold = _adjust_all(scaffold, tell)
+            # What the rate was held by is no knowledge of it: stds are by what is known of clocks.
+            free = replace(scaffold.problem.freedom, rate_std=freedom.rate_std)
+            scaffold.problem = replace(scaffold.problem, freedom=free)
         refused |= unplaced
         bad = [name for name in scaffold.names if not _fits(scaffold, name)]
         # A lens that was guessed may be what is wrong with all the others.
@@ -251,6 +255,15 @@ def solve_network(
     if nodes is not None:
         solver, warnings = "distributed", warnings + nodes.warnings
     return Solution(scaffold, tuple(pairs), _ordered(refused, prepared), prepared, solver, warnings)
+
+
+def _rate_std(graph: ClockGraph, usual: float) -> float:
+    """Prior std of rates: narrow where two cameras have only each other and epipolar lines did not tell the rate.
+
+    The path would not tell it either, and a rate thousands of ppm off carries the lag away with it.
+    """
+    told = [pair.fit.rate_std for pair in graph.agreeing if pair.fit is not None and np.isfinite(pair.fit.lag_doubt)]
+    return min([usual, *told])
 
 
 def _vaguest_lens(scaffold: Scaffold) -> tuple[str, str]:

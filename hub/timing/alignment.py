@@ -74,6 +74,8 @@ class PairSettings:
     alone_margin: float = 2.3
     """… by how much it exceeds the next best one's: half the logarithm of the odds, 100 to 1. (That one must not come
     near it in evidence either: a motion that repeats itself makes two that are strong alike.)"""
+    apart_ratio: float = 0.6
+    """Strength of the next best alignment over that of one whose lag is told firmly, beyond which it is in doubt."""
     distinct_alignments: float = 0.3
     """Seconds between lags whose misfits are independent."""
     flat_ratio: float = 3.0
@@ -101,8 +103,12 @@ class PairSettings:
     """Whether the answer must stand by itself, and not only begin an adjustment of more cameras, which judges it: …"""
     largest_doubt: float = 10e-3
     """… largest std [s] of the lag, lenses and shutters included: the path, which tells it again, must then agree; …"""
+    largest_flat_doubt: float = 7e-3
+    """… where a plane explains the motion nearly as well, so much; …"""
     largest_swing: float = 30e-3
     """… seconds by which it may move when a fifth of what it rests on is left out."""
+    largest_turn_apart: float = 0.5
+    """Angle [rad] between rotations that fit alike, beyond which a pair by itself has none; …"""
     largest_turn_std: float = 0.1
     """… of the relative rotation [rad] that is worth an answer; …"""
     sure_turn_std: float = 0.25
@@ -124,7 +130,7 @@ class PairFit:
     stretch of such length fitting as well, None where the recordings are too short to tell. log10_gap: of the
     next best lag leaving so much more by chance. cycles: bandwidth times seconds of agreeing motion. lag_std [s],
     turn_std [rad]: of the last refinement, by noise alone. lag_doubt [s]: std of the lag with lenses and shutters not
-    exactly as told.
+    exactly as told. rate_std: of what the rate was taken for beforehand, narrow where the motion does not tell it.
     """
 
     rate: float
@@ -147,6 +153,7 @@ class PairFit:
     lag_std: float = float("nan")
     turn_std: float = float("nan")
     lag_doubt: float = float("nan")
+    rate_std: float = float("nan")
 
     @property
     def pose(self) -> RelativePose:

@@ -22,7 +22,18 @@ from hub.timing.scan import PairMoments, Scan, busiest, candidates, grid_tracks,
 from hub.timing.significance import OWN_LAGS, Chance, chance
 from hub.timing.tracks import SmoothTrack
 from hub.timing.two_view import Geometry, RelativePose, Uncalibrated
-from hub.timing.verdict import at_noise, distinct, doubts, hopeless, judge, needed_inliers, sound
+from hub.timing.verdict import (
+    at_noise,
+    distinct,
+    doubts,
+    flat,
+    hopeless,
+    judge,
+    needed_inliers,
+    sound,
+    stands_apart,
+    strength,
+)
 from protocols.geometry.types import Floats
 
 _LEAST_SAMPLES = 12
@@ -178,18 +189,35 @@ class _Search:
                 good = (evidence(fit), cost)
         if not fits:
             return PairSolution(*names, _NO_FIT if near is None else _NO_FIT_NEAR)
-        ordered = distinct(fits, s)
-        answer = judge(names, ordered, 1.0 if near is not None else self._searched(scan, ordered[0].lag), s)
-        if answer.solved and near is None:
-            again = [chances.of(fit) for fit in self._repeats(b, moments, scan, ordered[0])]
+        answer = self._judged(names, fits, b, None if near is not None else scan)
+        if answer.solved and answer.fit is not None and near is None:
+            again = [chances.of(fit) for fit in self._repeats(b, moments, scan, answer.fit)]
             if again:
-                ordered = distinct(fits + again, s)
-                answer = judge(names, ordered, self._searched(scan, ordered[0].lag), s)
+                answer = self._judged(names, fits + again, b, scan)
         if answer.solved and answer.fit is not None:
             answer = finish(answer, answer.fit, self.a, b, s, fixed=self.known is not None)
         if rate != 1.0 and answer.fit is not None:
             answer = replace(answer, fit=replace(answer.fit, rate=answer.fit.rate * rate))
         return answer
+
+    def _judged(
+        self, names: tuple[str, str], fits: list[PairFit], b: Sequence[SmoothTrack], scan: Scan | None
+    ) -> PairSolution:
+        """What is said of the best of ``fits``. scan: of all lags, None where they were not looked at."""
+        s = self.s
+        ordered = distinct(fits, s)
+        answer = judge(names, ordered, 1.0 if scan is None else self._searched(scan, ordered[0].lag), s)
+        if answer.solved or scan is None or self.tried > 1:
+            return answer
+        best = max(ordered, key=strength)
+        if not stands_apart(best, ordered, s):
+            return answer
+        # Where nothing corresponds, what fits all the same bends to the lag: the motion does not tell that firmly.
+        most = s.largest_flat_doubt if flat(best, s) else s.largest_doubt
+        apart = PairSolution(*names, "ok", best, tuple(fit for fit in ordered if fit is not best)[:3])
+        wanted = replace(s, firm=True, largest_doubt=most)
+        firm = finish(apart, best, self.a, b, wanted, fixed=self.known is not None)
+        return apart if firm.solved else answer
 
     def jumps(self) -> bool:
         """Whether a track jumps, so that it may be made of several things; geometry that is given needs no pieces."""

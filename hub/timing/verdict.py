@@ -52,6 +52,13 @@ def judge(names: tuple[str, str], fits: list[PairFit], searched: float, s: PairS
 
 def doubts(fit: PairFit, s: PairSettings) -> str:
     """What speaks against an alignment taken by itself; "" for nothing."""
+    if faults(fit, s) or not flat(fit, s):
+        return faults(fit, s)
+    return "the motion lies in one plane (or the cameras stand in one place), which leaves the geometry open"
+
+
+def faults(fit: PairFit, s: PairSettings) -> str:
+    """What speaks against an alignment taken by itself, flatness left aside; "" for nothing."""
     if fit.support < s.accept_support:
         return f"only {fit.support:.1f} s of motion agree (of {fit.moving_overlap:.1f} s)"
     if fit.sigma_px > s.largest_sigma_px:
@@ -60,9 +67,12 @@ def doubts(fit: PairFit, s: PairSettings) -> str:
         return f"the best alignment needs a clock that is {1e6 * abs(fit.rate - 1.0):.0f} ppm off"
     if fit.front < s.accept_in_front:
         return "the best geometry puts points behind a camera"
-    if fit.flat_px < s.flat_ratio * max(fit.sigma_px, s.sigma_px):
-        return "the motion lies in one plane (or the cameras stand in one place), which leaves the geometry open"
     return ""
+
+
+def flat(fit: PairFit, s: PairSettings) -> bool:
+    """Whether a plane explains the motion nearly as well, so that several geometries may."""
+    return fit.flat_px < s.flat_ratio * max(fit.sigma_px, s.sigma_px)
 
 
 def rival_of(fit: PairFit, best: PairFit, s: PairSettings) -> bool:
@@ -108,6 +118,22 @@ def stands_alone(best: PairFit, others: list[PairFit], s: PairSettings) -> bool:
     next_best = max((strength(fit) for fit in others if fit.front > _NEARLY_ALL), default=0.0)
     apart = own - next_best >= s.alone_margin and next_best <= s.accept_ratio * own
     return own >= s.alone_strength and apart
+
+
+def stands_apart(best: PairFit, fits: list[PairFit], s: PairSettings) -> bool:
+    """Whether nothing speaks against an alignment by itself, and no other comes near its strength.
+
+    fits: with or without it. What lenses that are not exactly as told leave over the tracks' noise is no matter here,
+    and neither is a plane that leaves more than it does. By itself that proves nothing: unrelated tracks have a
+    strongest alignment too. But it hardly ever tells its lag firmly.
+    """
+    if not isinstance(best.geometry, RelativePose) or best.support < s.alone_support:
+        return False
+    if best.inliers < _NEARLY_ALL or faults(best, s) or best.flat_px < s.flat_ratio * best.sigma_px:
+        return False
+    own = strength(best)
+    next_best = max((strength(fit) for fit in fits if fit is not best and fit.front > _NEARLY_ALL), default=0.0)
+    return own >= s.alone_strength and own - next_best >= s.alone_margin and next_best <= s.apart_ratio * own
 
 
 def strength(fit: PairFit) -> float:

@@ -21,6 +21,7 @@ import numpy as np  # noqa: E402
 from hub.calibrate import calibrate  # noqa: E402
 from hub.timing.tracks import smooth_track  # noqa: E402
 from protocols.errors import Refused  # noqa: E402
+from protocols.geometry import so3  # noqa: E402
 from protocols.geometry.camera import Intrinsics  # noqa: E402
 from protocols.geometry.types import Floats  # noqa: E402
 from protocols.session.observations import Observations, Track  # noqa: E402
@@ -36,12 +37,16 @@ _EXTENT = 10.0  # m, of the flight
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stretch:
-    """A session of cameras a and b; the times [s] on their clocks of one instant in the middle of what they share."""
+    """A session of cameras a and b.
+
+    at_a, at_b: times [s] on their clocks of one instant in the middle of what they share. turn: (3, 3) b from a.
+    """
 
     rig: Rig
     observations: Observations
     at_a: float
     at_b: float
+    turn: Floats
 
 
 def flight(rng: np.random.Generator) -> rigs.Path:
@@ -61,7 +66,7 @@ def stretch(seed: int, seconds: float) -> Stretch | None:
     path, first = flight(rng), float(rng.uniform(0.0, 2.0 * np.pi))
     bearings = (first, first + np.deg2rad(rng.uniform(25.0, 110.0)))
     spans = ((0.0, before + seconds), (before, before + seconds + after))
-    cameras, tracks, middles = {}, {}, []
+    cameras, tracks, middles, turns = {}, {}, [], []
     for name, bearing, (begin, end) in zip("ab", bearings, spans, strict=True):
         away = rng.uniform(35.0, 70.0)
         place = np.array([away * np.cos(bearing), away * np.sin(bearing), rng.uniform(-12.0, -6.0)])
@@ -89,7 +94,8 @@ def stretch(seed: int, seconds: float) -> Stretch | None:
         cameras[name] = RigCamera(name, SIZE, fps=rate, intrinsics=told)
         tracks[name, "marker"] = Track(name, "marker", np.flatnonzero(seen), shown, rows, np.full(len(rows), np.nan))
         middles.append(float(epoch + drift * (before + 0.5 * seconds)))
-    return Stretch(Rig(cameras), Observations(tracks), middles[0], middles[1])
+        turns.append(pose.rotation)
+    return Stretch(Rig(cameras), Observations(tracks), *middles, so3.nearest(turns[1] @ turns[0].T))
 
 
 def lenses(rng: np.random.Generator) -> tuple[Intrinsics, Intrinsics]:
@@ -121,7 +127,7 @@ def main() -> None:
     parser.add_argument("--sessions", type=int, default=60)
     parser.add_argument("--start", type=int, default=7000, help="first seed")
     options = parser.parse_args()
-    count, errors = 0, []
+    count, errors, turns = 0, [], []
     for seed in range(options.start, options.start + options.sessions):
         pair = stretch(seed, options.seconds)
         if pair is None:
@@ -131,6 +137,8 @@ def main() -> None:
             found = calibrate(pair.rig, pair.observations)
         except Refused:
             continue
+        one, other = (found.cameras[name].pose.rotation for name in "ab")
+        turns.append(np.degrees(so3.angle_between(other @ one.T, pair.turn)))
         a, b = (found.cameras[name].time_map for name in "ab")
         errors.append(a.clock_rate * pair.at_a + a.time_offset - b.clock_rate * pair.at_b - b.time_offset)
     off = 1e3 * np.abs(np.array(errors))
@@ -141,7 +149,8 @@ def main() -> None:
         f"{np.count_nonzero(off > 1e3 * FAR_S)} of them over {1e3 * FAR_S:.0f} ms"
     )
     if len(off):
-        print(f"error {np.median(off):.1f} ms median, {np.sort(off)[-3:].round(1).tolist()} worst")
+        print(f"lag {np.median(off):.1f} ms median, {np.sort(off)[-3:].round(1).tolist()} worst")
+        print(f"rotation {np.median(turns):.1f}° median, {np.sort(turns)[-3:].round(1).tolist()} worst")
 
 
 if __name__ == "__main__":

@@ -62,6 +62,7 @@ TOLD = {
     "needs a clock that is": "needs a clock that is",
     "the motion tells the lag only to": "tells the lag only to",
     "the motion tells the relative rotation only to": "rotation only to",
+    "apart fit the motion alike": "rotations fit the motion alike",
     "tells its orientation only to": "orientation",
     "tells its clock only to": "clock only to",
     "apart from what epipolar lines tell": "apart from what epipolar lines tell",
