@@ -9,7 +9,7 @@ from hub.timing.kept import Kept
 from hub.timing.scan import PairMoments, ranked, scan_lags
 from hub.timing.tracks import SmoothTrack
 
-_COARSER = 4.0  # than the step of the scan proper
+_COARSER = 8.0  # than the step of the scan proper
 
 
 def promise(

@@ -1,15 +1,17 @@
 """Two cameras far from a drone that share a short stretch, with lenses and shutters told a little wrong.
 
-    python -m tests.bench.drone_pairs [--seconds 20] [--sessions 60] [--start 7000]
+    python -m tests.bench.drone_pairs [--seconds 20] [--sessions 60] [--start 7000] [--strangers]
 
 Each camera filmed 30 to 90 s more than the stretch, before or after it. Asked of every answer: its lag within 20 ms in
 the middle of the stretch. Labels err alike for half a second, focal lengths by up to 2 %, centres by 8 px, k1 by 0.012;
 shutters roll for up to 25 ms either way. Stretches in which a camera sees less than a third of motion do not count.
+--strangers: a of each stretch with b of the next one, which watched another flight; none may be accepted.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 from dataclasses import dataclass
 
@@ -95,7 +97,8 @@ def stretch(seed: int, seconds: float) -> Stretch | None:
         tracks[name, "marker"] = Track(name, "marker", np.flatnonzero(seen), shown, rows, np.full(len(rows), np.nan))
         middles.append(float(epoch + drift * (before + 0.5 * seconds)))
         turns.append(pose.rotation)
-    return Stretch(Rig(cameras), Observations(tracks), *middles, so3.nearest(turns[1] @ turns[0].T))
+    turn = so3.nearest(turns[1] @ turns[0].T)
+    return Stretch(Rig(cameras), Observations(tracks), middles[0], middles[1], turn)
 
 
 def lenses(rng: np.random.Generator) -> tuple[Intrinsics, Intrinsics]:
@@ -121,14 +124,34 @@ def _noise(rng: np.random.Generator, count: int, rate: float) -> Floats:
     return np.asarray(rng.normal(0.0, 0.25, (count, 2)) + 0.3 * np.stack(alike, axis=1))
 
 
+def strangers(stretches: list[Stretch]) -> int:
+    """How many pairs are accepted of cameras that watched different flights."""
+    accepted = 0
+    for one, other in itertools.pairwise(stretches):
+        tracks = [track for part, name in ((one, "a"), (other, "b")) for track in part.observations.of_camera(name)]
+        rig = Rig({"a": one.rig.cameras["a"], "b": other.rig.cameras["b"]})
+        try:
+            calibrate(rig, Observations({(track.camera, track.label): track for track in tracks}))
+        except Refused:
+            continue
+        accepted += 1
+    return accepted
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0, help="how much the two share")
     parser.add_argument("--sessions", type=int, default=60)
     parser.add_argument("--start", type=int, default=7000, help="first seed")
+    parser.add_argument("--strangers", action="store_true", help="pairs that watched different things instead")
     options = parser.parse_args()
+    seeds = range(options.start, options.start + options.sessions)
+    if options.strangers:
+        made = [part for seed in seeds if (part := stretch(seed, options.seconds)) is not None]
+        print(f"{len(made) - 1} pairs that watched different flights: {strangers(made)} accepted")
+        return
     count, errors, turns = 0, [], []
-    for seed in range(options.start, options.start + options.sessions):
+    for seed in seeds:
         pair = stretch(seed, options.seconds)
         if pair is None:
             continue
@@ -144,8 +167,8 @@ def main() -> None:
     off = 1e3 * np.abs(np.array(errors))
     wrong = off > 1e3 * WRONG_S
     print(
-        f"{count} pairs with {options.seconds:g} s in common, seeds {options.start} to "
-        f"{options.start + options.sessions - 1}: {np.count_nonzero(~wrong)} solved, {np.count_nonzero(wrong)} wrong, "
+        f"{count} pairs with {options.seconds:g} s in common, seeds {seeds[0]} to {seeds[-1]}: "
+        f"{np.count_nonzero(~wrong)} solved, {np.count_nonzero(wrong)} wrong, "
         f"{np.count_nonzero(off > 1e3 * FAR_S)} of them over {1e3 * FAR_S:.0f} ms"
     )
     if len(off):
