@@ -12,6 +12,7 @@ clocks may choose among them. It is asked last, so that it changes no answer tha
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
@@ -77,9 +78,19 @@ def solve_pairs(
         pairs[a, b] = answer
         told.hear(answer)
     pairs = {both: pairs[both] for both in todo}  # in the rig's order
+    if len(names) >= _SEVERAL and not prepared.shared_clock and known is None:
+        for both in _by_themselves(pairs):
+            tell(f"pair {both[0]}–{both[1]} by itself", 0.56)
+            pairs[both] = plain[both] = _solve(prepared, both, known, alone=True, kept=kept)
     if thorough and not prepared.shared_clock:
         prepared = _tie_at_other_rates(prepared, pairs, plain, known, tell)
     return prepared, list(pairs.values())
+
+
+def _by_themselves(pairs: Mapping[tuple[str, str], PairSolution]) -> list[tuple[str, str]]:
+    """The solved pairs whose cameras no other pair ties to anything: what they tell must stand by itself."""
+    ties = Counter(name for both, answer in pairs.items() if answer.solved for name in both)
+    return [both for both, answer in pairs.items() if answer.solved and max(ties[name] for name in both) == 1]
 
 
 def _chosen_by_claims(
@@ -175,6 +186,7 @@ def _solve(
     settings: PairSettings | None = None,
     plain: PairSolution | None = None,
     kept: Kept | None = None,
+    alone: bool = False,
 ) -> PairSolution:
     a, b = (prepared.camera(name).tracks for name in names)
     if prepared.shared_clock:
@@ -184,7 +196,7 @@ def _solve(
         given = relative_pose(known.cameras[names[0]].pose, known.cameras[names[1]].pose)
     calibrated = all(name in prepared.cameras for name in names)
     # With more cameras the adjustment frees lenses itself and judges each clock: a vague lag is a start.
-    settings = replace(settings or PairSettings(), firm=len(prepared.names) < _SEVERAL)
+    settings = replace(settings or PairSettings(), firm=alone or len(prepared.names) < _SEVERAL)
     return solve_pair(
         smooth_only(a),
         smooth_only(b),

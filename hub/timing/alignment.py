@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -105,6 +105,10 @@ class PairSettings:
     """… largest std [s] of the lag, lenses and shutters included: the path, which tells it again, must then agree; …"""
     largest_flat_doubt: float = 7e-3
     """… where a plane explains the motion nearly as well, so much; …"""
+    largest_short_doubt: float = 7e-3
+    """… where an alignment that stands apart has less motion than …"""
+    plenty_apart: float = 10.0
+    """… these seconds, so much; …"""
     largest_swing: float = 30e-3
     """… seconds by which it may move when a fifth of what it rests on is left out."""
     largest_turn_apart: float = 0.5
@@ -347,6 +351,14 @@ def grid_step(fast: float, s: PairSettings) -> float:
     wanted = s.step_px / max(fast, 1e-9)
     fitting = [step for step in _STEPS if s.finest_step <= step <= min(s.coarsest_step, wanted)]
     return max(fitting, default=s.finest_step)
+
+
+def turned_round(fit: PairFit) -> PairFit:
+    """The same alignment with the two cameras in the other order. Raises ValueError without lenses."""
+    turn = fit.pose.rotation.T
+    pose = RelativePose(turn, -turn @ fit.pose.direction)
+    middle = (fit.middle - fit.offset) / fit.rate
+    return replace(fit, rate=1.0 / fit.rate, offset=-fit.offset / fit.rate, geometry=pose, middle=middle)
 
 
 def evidence(fit: PairFit) -> float:

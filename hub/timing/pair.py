@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from hub.timing import two_view
-from hub.timing.alignment import PairFit, PairSettings, PairSolution, Samples, evidence, grid_step
+from hub.timing.alignment import PairFit, PairSettings, PairSolution, Samples, evidence, grid_step, turned_round
 from hub.timing.finish import NEAR_PX, finish
 from hub.timing.kept import Kept
 from hub.timing.pieces import scan_pieces
@@ -207,17 +207,32 @@ class _Search:
         s = self.s
         ordered = distinct(fits, s)
         answer = judge(names, ordered, 1.0 if scan is None else self._searched(scan, ordered[0].lag), s)
-        if answer.solved or scan is None or self.tried > 1:
+        if answer.solved or scan is None or self.tried > 1 or self.known is not None:
             return answer
         best = max(ordered, key=strength)
         if not stands_apart(best, ordered, s):
             return answer
-        # Where nothing corresponds, what fits all the same bends to the lag: the motion does not tell that firmly.
-        most = s.largest_flat_doubt if flat(best, s) else s.largest_doubt
         apart = PairSolution(*names, "ok", best, tuple(fit for fit in ordered if fit is not best)[:3])
+        return apart if self._told_firmly(apart, best, b) else answer
+
+    def _told_firmly(self, apart: PairSolution, best: PairFit, b: Sequence[SmoothTrack]) -> bool:
+        """Whether the motion tells the lag of ``best`` firmly, from either camera's side.
+
+        Where nothing corresponds, what fits all the same bends to the lag.
+        """
+        s = self.s
+        most = s.largest_doubt
+        if flat(best, s):
+            most = s.largest_flat_doubt
+        if best.support < s.plenty_apart:
+            most = min(most, s.largest_short_doubt)
         wanted = replace(s, firm=True, largest_doubt=most)
-        firm = finish(apart, best, self.a, b, wanted, fixed=self.known is not None)
-        return apart if firm.solved else answer
+        there = finish(apart, best, self.a, b, wanted)
+        if not there.solved or there.fit is None:
+            return False
+        back = turned_round(best)
+        other = finish(replace(apart, fit=back), back, b, self.a, wanted)
+        return other.solved and other.fit is not None and abs(there.fit.lag + other.fit.lag) < s.largest_swing
 
     def jumps(self) -> bool:
         """Whether a track jumps, so that it may be made of several things; geometry that is given needs no pieces."""

@@ -132,7 +132,7 @@ def stands_apart(best: PairFit, fits: list[PairFit], s: PairSettings) -> bool:
     if best.inliers < _NEARLY_ALL or faults(best, s) or best.flat_px < s.flat_ratio * best.sigma_px:
         return False
     own = strength(best)
-    next_best = max((strength(fit) for fit in fits if fit is not best and fit.front > _NEARLY_ALL), default=0.0)
+    next_best = max((strength(fit) for fit in fits if fit is not best), default=0.0)
     return own >= s.alone_strength and own - next_best >= s.alone_margin and next_best <= s.apart_ratio * own
 
 

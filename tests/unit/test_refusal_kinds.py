@@ -87,6 +87,10 @@ def vague_rotation(_: pytest.MonkeyPatch) -> str:
     return pair_told(PairSettings(largest_turn_std=1e-9, sure_turn_std=1e-9))
 
 
+def from_many_places(_: pytest.MonkeyPatch) -> str:
+    return pair_told(PairSettings(largest_turn_apart=-1.0))
+
+
 def vague_orientation(patch: pytest.MonkeyPatch) -> str:
     patch.setattr(calibrating, "_LARGEST_TURN_STD", 1e-9)
     return told_of(rigs.simulate(1, 2, SECONDS, late=0.5))
@@ -197,6 +201,7 @@ KINDS: dict[str, Scene] = {
     "no alignment of the two tracks agrees with any geometry": hardly_a_row,
     "the motion tells the lag only to": vague_lag,
     "the motion tells the relative rotation only to": vague_rotation,
+    "apart fit the motion alike": from_many_places,
     "tells its orientation only to": vague_orientation,
     "tells its clock only to": vague_clock,
     "apart from what epipolar lines tell": two_clocks,
