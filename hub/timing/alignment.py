@@ -115,6 +115,8 @@ class PairSettings:
     """Angle [rad] between rotations that fit alike, beyond which a pair by itself has none; …"""
     largest_turn_std: float = 0.1
     """… of the relative rotation [rad] that is worth an answer; …"""
+    firm_turn_std: float = 0.04
+    """… where an alignment is believed for standing apart, so little; …"""
     sure_turn_std: float = 0.25
     """… where the lag is beyond doubt, so much: epipolar lines can be right to a pixel with the pose open."""
     sure_log10_chance: float = -3.0

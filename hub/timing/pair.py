@@ -216,7 +216,7 @@ class _Search:
         return apart if self._told_firmly(apart, best, b) else answer
 
     def _told_firmly(self, apart: PairSolution, best: PairFit, b: Sequence[SmoothTrack]) -> bool:
-        """Whether the motion tells the lag of ``best`` firmly, from either camera's side.
+        """Whether the motion tells lag and rotation of ``best`` firmly, from either camera's side.
 
         Where nothing corresponds, what fits all the same bends to the lag.
         """
@@ -226,7 +226,7 @@ class _Search:
             most = s.largest_flat_doubt
         if best.support < s.plenty_apart:
             most = min(most, s.largest_short_doubt)
-        wanted = replace(s, firm=True, largest_doubt=most)
+        wanted = replace(s, firm=True, largest_doubt=most, largest_turn_std=s.firm_turn_std)
         there = finish(apart, best, self.a, b, wanted)
         if not there.solved or there.fit is None:
             return False

@@ -95,6 +95,20 @@ def test_lenses_a_little_off_keep_no_pair_from_its_answer(seed: int, monkeypatch
     assert "other lags fit" in pair.solve_pair(both["a"], both["b"], NAMES, SETTINGS).status
 
 
+@pytest.mark.parametrize("limit", ["largest_doubt", "firm_turn_std", "largest_swing"])
+def test_what_stands_apart_must_be_told_firmly(limit: str) -> None:
+    _, _, both = tracks(7065)
+    strict = replace(SETTINGS, **{limit: 0.0})
+    assert "other lags fit" in pair.solve_pair(both["a"], both["b"], NAMES, strict).status
+
+
+def test_what_rests_on_little_motion_must_be_told_more_firmly() -> None:
+    _, _, both = tracks(7131)
+    for seconds, solved in ((10.0, True), (100.0, False)):
+        strict = replace(SETTINGS, plenty_apart=seconds, largest_short_doubt=1e-3)
+        assert pair.solve_pair(both["a"], both["b"], NAMES, strict).solved == solved
+
+
 def test_unrelated_tracks_do_not_tell_their_best_lag_firmly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their strongest alignment stands apart too, and would be believed."""
     kinds: list[bool] = []
