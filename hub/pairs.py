@@ -80,6 +80,8 @@ def solve_pairs(
     pairs = {both: pairs[both] for both in todo}  # in the rig's order
     if len(names) >= _SEVERAL and not prepared.shared_clock and known is None:
         for both in _by_themselves(pairs):
+            if plain.get(both) is not pairs[both]:
+                continue  # chosen by what the machines claim: the search through all lags left it open
             tell(f"pair {both[0]}–{both[1]} by itself", 0.56)
             pairs[both] = plain[both] = _solve(prepared, both, known, alone=True, kept=kept)
     if thorough and not prepared.shared_clock:

@@ -82,13 +82,13 @@ def test_nothing_is_told_where_nothing_contradicts(hub: LiveHub, session: Sessio
     assert told(LiveHub(SETTINGS), *right) == [], "nothing is known yet"
 
 
-def regular_session(seed: int, period: float = 2.5) -> Session:
-    """Two cameras that watch a motion which repeats itself exactly: lags a period apart fit alike."""
+def regular_session(seed: int, period: float = 2.5, cameras: int = 2, strangers: tuple[int, ...] = ()) -> Session:
+    """Cameras that watch a motion which repeats itself exactly: lags a period apart fit alike."""
     rng = np.random.default_rng(seed)
     harmonic = np.arange(1.0, 4.0)[:, None] * np.ones((1, 3))
     amplitude = rng.uniform(0.4, 1.0, (3, 3)) / harmonic
     path = Path(harmonic / period, rng.uniform(0.0, 2.0 * np.pi, (3, 3)), 1.4 * amplitude / amplitude.sum(axis=0))
-    return simulate(seed, 2, 20, path=path, ppm=20.0)
+    return simulate(seed, cameras, 20, path=path, ppm=20.0, strangers=list(strangers))
 
 
 def hub_after(session: Session, *claims: pb.AgentStatus) -> LiveHub:
@@ -114,6 +114,14 @@ def test_of_lags_that_a_regular_motion_leaves_open_the_claimed_one_is_taken_and_
     assert abs(session.clock_error("cam1", "cam0", believed.cameras["cam1"].time_map)) < 2e-3, "the pictures' precision"
     (warning,) = [text for text in believed.warnings if "clocks claim" in text]
     assert warning.startswith("cam0–cam1: the motion alone leaves several lags open")
+
+
+def test_a_claim_chooses_beside_a_camera_that_sees_nothing_of_it_too() -> None:
+    session = regular_session(900, cameras=3, strangers=(2,))
+    believed = hub_after(session, claim(session, "cam0"), claim(session, "cam1")).calibration
+    assert believed is not None
+    assert list(believed.cameras) == ["cam0", "cam1"]
+    assert abs(session.clock_error("cam1", "cam0", believed.cameras["cam1"].time_map)) < 2e-3
 
 
 @pytest.mark.parametrize(
