@@ -18,7 +18,7 @@ from deploy.heap import trim
 from edge.detectors.base import Detector
 from edge.devices.base import Device
 from protocols.bus.base import Bus
-from protocols.errors import EXIT_DONE, InputError
+from protocols.core.errors import EXIT_DONE, InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.session.rig import Rig, RigCamera, read_rig
 

@@ -20,8 +20,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from protocols.errors import InputError, Refused
-from protocols.version import VERSION
+from protocols.core.errors import InputError, Refused
+from protocols.core.version import VERSION
 
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
@@ -51,12 +51,12 @@ BUDGET_MB = {"camera": 350.0, "uav": 350.0}
 _WARM = {
     "camera": "deploy.agents, deploy.detecting, deploy.notify, edge.camera_agent, edge.detectors.bright, "
     "edge.detectors.marker, edge.detectors.tag, edge.devices.logged, edge.devices.network, edge.devices.picamera, "
-    "edge.devices.usb, edge.devices.video, protocols.bus.zenoh_bus",
+    "edge.devices.usb, edge.devices.video, protocols.bus.transport.zenoh_bus",
     "uav": "deploy.uav, deploy.notify, edge.uav_agent, edge.mavlink.link, edge.uav.models.ground, edge.devices.video, "
-    "protocols.bus.zenoh_bus",
-    "hub": "deploy.agents, hub.agent, hub.calibrate, hub.nodes.host, hub.report, protocols.bus.zenoh_bus",
-    "recorder": "deploy.record, protocols.bus.zenoh_bus",
-    "router": "deploy.commands.router, protocols.bus.router",
+    "protocols.bus.transport.zenoh_bus",
+    "hub": "deploy.agents, hub.agent, hub.calibrate, hub.nodes.host, hub.report, protocols.bus.transport.zenoh_bus",
+    "recorder": "deploy.record, protocols.bus.transport.zenoh_bus",
+    "router": "deploy.commands.router, protocols.bus.router.zenoh_router",
 }
 _WHEELS = "wheels"
 _GLIBC = 28  # Debian 10 and later, as all our wheels ask for

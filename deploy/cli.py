@@ -20,8 +20,8 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 from cyclopts import App, CycloptsError  # noqa: E402
 from cyclopts.exceptions import UnknownCommandError  # noqa: E402
 
-from protocols.errors import EXIT_BUG, EXIT_DONE, EXIT_INPUT, SynclineError  # noqa: E402
-from protocols.version import VERSION  # noqa: E402
+from protocols.core.errors import EXIT_BUG, EXIT_DONE, EXIT_INPUT, SynclineError  # noqa: E402
+from protocols.core.version import VERSION  # noqa: E402
 
 # name, where it lives, one line for the overview
 COMMANDS: tuple[tuple[str, str, str], ...] = (

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 
-from protocols.catalogue import TOPICS
-from protocols.errors import InputError
-from protocols.gate import message_class
-from protocols.log.reader import Logged, LogReader
+from protocols.core.errors import InputError
+from protocols.log.read.reader import Logged, LogReader
+from protocols.topics import TOPICS
+from protocols.validation.codec import message_class
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

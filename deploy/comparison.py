@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from edge import scenes
-from protocols.clocks import ReferenceTime
+from protocols.core.clocks import ReferenceTime
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.session.calibration import read_calibration

@@ -10,8 +10,8 @@ from msgspec import Meta
 
 from deploy.config_file import Source, effective_toml, load
 from protocols.bus.settings import BusConfig
-from protocols.catalogue import valid_id
-from protocols.errors import InputError
+from protocols.core.errors import InputError
+from protocols.topics import valid_id
 
 __all__ = [
     "BusConfig",

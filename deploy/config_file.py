@@ -11,7 +11,7 @@ from typing import Any, TypeVar, get_args
 
 import msgspec
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 _Config = TypeVar("_Config", bound=msgspec.Struct)
 

@@ -16,13 +16,13 @@ import tomli_w
 
 from deploy.signals import Interruption, interrupt_on_signals
 from protocols.bus.base import Bus
-from protocols.bus.router import Router, free_endpoint
+from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import CALIBRATION, OBSERVATION
-from protocols.errors import InputError, Refused
-from protocols.files import check_folder
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.core.errors import InputError, Refused
+from protocols.core.files import check_folder
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import CALIBRATION, OBSERVATION
 
 LOG = "demo.mcap"
 _STARTING_S = 60.0

@@ -17,11 +17,11 @@ from deploy.simulated import camera_tables
 from edge import scenes
 from edge.scenes.people import PeopleScene
 from protocols.bus.base import Bus
-from protocols.catalogue import OBSERVATION, TRACK
-from protocols.clocks import NANOSECONDS
-from protocols.files import write_atomically
-from protocols.log.reader import LogReader
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.files import write_atomically
+from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import OBSERVATION, TRACK
 
 KNOWN = "known.toml"
 REACH_M = 0.5

@@ -14,7 +14,7 @@ import tomli_w
 from edge.detectors.base import Detection, Detector
 from edge.detectors.marker import MarkerDetector, MarkerModel, teach
 from edge.devices.film import Film
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.session.calibration import csv_cell
 from protocols.session.rig import read_toml

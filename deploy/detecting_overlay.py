@@ -11,7 +11,7 @@ import numpy as np
 from edge.detectors.base import Detection
 from edge.devices.base import Image
 from edge.devices.film import Film
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 _HUES = 12
 

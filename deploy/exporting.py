@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.formats import colmap, toml_rigs, trc, yaml_rigs
 from protocols.formats.cameras import Written, in_units
 from protocols.session.calibration import read_calibration
@@ -39,7 +39,7 @@ def path_files(source: Path, out: Path, units: str) -> dict[Path, str]:
 def export_log(log: Path, out: Path) -> tuple[int, int, tuple[str, ...]]:
     """A log as a session folder; returns cameras, observations, warnings. Raises InputError."""
     from deploy.importing import log_to_session
-    from protocols.log.as_session import session_from_log
+    from protocols.log.read.session import session_from_log
     from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
 
     for name in (RIG_FILE, OBSERVATIONS_FILE):

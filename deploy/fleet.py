@@ -17,12 +17,12 @@ from typing import Any
 
 from deploy.rig_folder import ROLES, Agent, RigFolder, client, prepare
 from protocols.bus.base import Bus
-from protocols.bus.router import Router, free_endpoint
+from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import LOOPBACK_ROUTER, BusConfig, is_loopback
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import CALIBRATION, STATUS
-from protocols.errors import InputError, Refused
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.core.errors import InputError, Refused
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import CALIBRATION, STATUS
 
 STATE = "fleet.json"
 COMMANDS = {"recorder": "record"}

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from deploy.config import HealthConfig
 from protocols.bus.base import Refusal
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.messages import syncline_pb2 as pb
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.formats import colmap, points, toml_rigs, yaml_rigs
 from protocols.formats.cameras import ForeignRig, rig_tables
 from protocols.geometry.types import Floats, Ints
@@ -118,8 +118,8 @@ def read_points(source: Source, times: points.Times, likelihood: float, camera: 
 
 def session_to_log(rig: Rig, observations: Observations, out: Path) -> int:
     """A session as a log; returns the number of messages. The log is whole or not there. Raises InputError."""
-    from protocols.catalogue import CAMERA_INFO, OBSERVATION, RIG_INFO
-    from protocols.log.writer import LogWriter
+    from protocols.log.write.writer import LogWriter
+    from protocols.topics import CAMERA_INFO, OBSERVATION, RIG_INFO
 
     if out.exists():
         raise InputError("this file exists already", file=out, remedy="choose another --out: logs are not replaced")

@@ -7,10 +7,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from protocols.catalogue import OBSERVATION
-from protocols.clocks import NANOSECONDS
-from protocols.log.reader import LogReader
+from protocols.core.clocks import NANOSECONDS
+from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import OBSERVATION
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

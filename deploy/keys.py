@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING, Any
 
 import tomli_w
 
-from protocols.bus.access import access_rules, certificate_name, tls_settings
+from protocols.bus.security.access import access_rules, certificate_name, tls_settings
 from protocols.bus.settings import BusConfig, TlsConfig
-from protocols.catalogue import valid_id
-from protocols.errors import InputError
-from protocols.files import write_atomically
+from protocols.core.errors import InputError
+from protocols.core.files import write_atomically
+from protocols.topics import valid_id
 
 if TYPE_CHECKING:
     from cryptography import x509

@@ -10,11 +10,11 @@ from typing import Any
 import msgspec
 
 from deploy import keys
-from protocols.bus.access import certificate_name
-from protocols.bus.router import Router, free_endpoint
-from protocols.bus.selftest import Finding, try_agents, try_stranger
+from protocols.bus.router.zenoh_router import Router, free_endpoint
+from protocols.bus.security.access import certificate_name
+from protocols.bus.security.selftest import Finding, try_agents, try_stranger
 from protocols.bus.settings import BusConfig, TlsConfig
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 
 def tls_of(folder: Path) -> TlsConfig:

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from hub.report import build_report
-from protocols.errors import InputError, Refused
-from protocols.files import write_together
+from protocols.core.errors import InputError, Refused
+from protocols.core.files import write_together
 from protocols.session.calibration import Calibration, calibration_text, trajectory_text
 from protocols.session.observations import Observations
 from protocols.session.result import refusal_document, result_document, result_text

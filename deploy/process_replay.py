@@ -6,12 +6,12 @@ import os
 from pathlib import Path
 
 from hub.live import KnownCalibration, LiveHub, LiveSettings
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, PREDICTION, RIG_INFO, TRACK
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
-from protocols.log.reader import LogReader
-from protocols.log.writer import LogWriter
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
+from protocols.log.read.reader import LogReader
+from protocols.log.write.writer import LogWriter
 from protocols.session.calibration import read_calibration
+from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, PREDICTION, RIG_INFO, TRACK
 
 _TOPICS = {topic.message: topic for topic in (CALIBRATION, TRACK, PREDICTION)}
 

@@ -23,8 +23,8 @@ from hub.live import LiveHub, LiveSettings
 from hub.view.planes import PicturePlanes
 from hub.view.server import ViewServer, run_view
 from hub.view.state import ViewState
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.errors import InputError
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.session.rig import Rig
 
@@ -192,7 +192,7 @@ class Quick:
 
     def _watch_alone(self, bus: MemoryBus, done: threading.Event, each: Callable[[ViewState], None]) -> None:
         """The same loop without a browser."""
-        from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION
+        from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION
 
         state = ViewState()
         subscriptions = [bus.subscribe(topic) for topic in (CAMERA_INFO, OBSERVATION, CALIBRATION)]

@@ -15,14 +15,14 @@ from pathlib import Path
 
 from deploy.config import RecorderConfig, effective_toml
 from protocols.bus.base import Bus, Received, Subscription
-from protocols.catalogue import PICTURE, STATUS, TOPICS
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
-from protocols.gate import SCHEMA_VERSION
-from protocols.log.rotation import RotatingWriter
-from protocols.log.writer import LogWriter
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
+from protocols.core.version import VERSION
+from protocols.log.write.rotation import RotatingWriter
+from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
-from protocols.version import VERSION
+from protocols.topics import PICTURE, STATUS, TOPICS
+from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "record"
 _TICK_S = 0.02

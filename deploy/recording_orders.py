@@ -12,12 +12,12 @@ import msgspec
 from deploy.config import RecorderConfig
 from deploy.record import ROLE, RecorderResult, run_recorder
 from protocols.bus.base import Bus
-from protocols.catalogue import STATUS
-from protocols.errors import InputError
-from protocols.gate import SCHEMA_VERSION
+from protocols.core.commands import Orders
+from protocols.core.errors import InputError
+from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
-from protocols.orders import Orders
-from protocols.version import VERSION
+from protocols.topics import STATUS
+from protocols.validation.codec import SCHEMA_VERSION
 
 _STATUS_S = 1.0
 _START, _STOP = "start_recording", "stop_recording"

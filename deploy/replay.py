@@ -11,11 +11,11 @@ from pathlib import Path
 from google.protobuf.message import Message
 
 from protocols.bus.base import Bus, Publisher
-from protocols.catalogue import Topic
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
-from protocols.log.reader import Logged, LogReader
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
+from protocols.log.read.reader import Logged, LogReader
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import Topic
 
 _LINGER_S = 0.5
 _BOOT_LENGTH = 50

@@ -15,11 +15,11 @@ import numpy as np
 from deploy.outputs import CALIBRATION, RESULT, TRAJECTORY
 from deploy.sessions import is_log, load_session
 from hub.report.convergence import Step
-from protocols import catalogue
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError, Refused
+from protocols import topics
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError, Refused
 from protocols.geometry.types import Floats
-from protocols.log.reader import LogReader
+from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import (
     AdjustmentStep,
@@ -121,7 +121,7 @@ def history_of(log: Path | None) -> tuple[Step, ...]:
         return ()
     steps: list[Step] = []
     first: int | None = None
-    for logged in LogReader(log).messages([catalogue.OBSERVATION, catalogue.CALIBRATION]):
+    for logged in LogReader(log).messages([topics.OBSERVATION, topics.CALIBRATION]):
         first = logged.log_time_ns if first is None else first
         message = logged.message
         if isinstance(message, pb.Calibration) and message.status == "solved":

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from hub.view.player import Recording
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
-from protocols.files import check_folder
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
+from protocols.core.files import check_folder
 from protocols.geometry import so3
-from protocols.log.small_pictures import Scale, scale_of
+from protocols.log.write.thumbnails import Scale, scale_of
 from protocols.messages import syncline_pb2 as pb
 
 _TIME = "recording"

@@ -22,7 +22,7 @@ from msgspec import Meta
 from deploy.config import CameraConfig, HubConfig, RecorderConfig, SimulatedConfig
 from deploy.config_file import effective_toml, load
 from protocols.bus.settings import BusConfig
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.session.rig import Rig, read_rig
 
 SHIPPED = Path(__file__).parent / "rigs"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
@@ -14,7 +14,7 @@ def load_session(path: Path, observations: Path | None = None) -> tuple[Rig, Obs
     if is_log(path):
         if observations is not None:
             raise InputError("--observations goes with a session folder", file=path, remedy="leave it out for a log")
-        from protocols.log.as_session import session_from_log
+        from protocols.log.read.session import session_from_log
 
         return session_from_log(path)
     from protocols.session.folder import read_folder

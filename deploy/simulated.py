@@ -11,8 +11,8 @@ import tomli_w
 from edge import scenes
 from edge.scenes.base import Scene
 from edge.scenes.session import SimulatedTracks, simulated_session
-from protocols.errors import InputError
-from protocols.files import write_atomically
+from protocols.core.errors import InputError
+from protocols.core.files import write_atomically
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
 from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks
 from protocols.session.rig import Rig, RigCamera

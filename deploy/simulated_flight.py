@@ -12,8 +12,8 @@ import tomli_w
 from edge.uav.tracker import Telemetry
 from edge.uav.world import scenarios
 from edge.uav.world.world import World
-from protocols.errors import InputError
-from protocols.files import write_together
+from protocols.core.errors import InputError
+from protocols.core.files import write_together
 from protocols.geometry import so3
 from protocols.session.folder import RIG_FILE
 

@@ -12,9 +12,9 @@ from deploy.simulated import TRUTH_CALIBRATION, TRUTH_TRAJECTORY, camera_tables
 from edge import scenes
 from edge.scenes.people import PeopleScene
 from edge.scenes.people_session import PeopleTrack, film_people, seen
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
-from protocols.files import write_atomically
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
+from protocols.core.files import write_atomically
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
 from protocols.session.observations import Observations, gather_tracks
 

@@ -24,7 +24,7 @@ def checked(settings: Any) -> None:
     """Raise InputError where the certificate is not this agent's; warn of one that ends soon, and of open doors."""
     tls = settings.bus.tls
     if tls is not None:
-        from protocols.bus.tls import check_files, check_owner, days_left
+        from protocols.bus.security.tls import check_files, check_owner, days_left
 
         check_files(tls)
         check_owner(tls, role_of(settings), settings.id)

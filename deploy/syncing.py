@@ -18,8 +18,8 @@ import numpy as np
 
 from edge.devices.base import Image
 from edge.devices.film import Film
-from protocols.clocks import CameraTime, TimeMap
-from protocols.errors import InputError, Refused
+from protocols.core.clocks import CameraTime, TimeMap
+from protocols.core.errors import InputError, Refused
 from protocols.geometry.types import Floats
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ import numpy as np
 from edge.devices.base import Frame
 from edge.devices.recording import IMAGE_SUFFIXES
 from edge.uav.tracker import Box, Estimate, Image, State, Telemetry, Tracker
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 from protocols.session.rig import RigCamera, read_rig
 

@@ -12,13 +12,13 @@ import numpy as np
 from edge.devices.base import DeviceInfo, Frame
 from edge.devices.recording import Recording
 from edge.uav.follower import decoded
-from protocols.catalogue import FLIGHT_IMAGE, UAV_INFO
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
-from protocols.log.reader import LogReader
+from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import FLIGHT_IMAGE, UAV_INFO
 
 _FPS = 30.0
 

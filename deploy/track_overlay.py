@@ -9,7 +9,7 @@ import numpy as np
 
 from deploy.track import Tracked
 from edge.uav.tracker import Image, State
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 
 _MARGIN = 0.5  # of the picture, on each side

@@ -12,7 +12,7 @@ import numpy as np
 
 from deploy.track import Tracked
 from edge.uav.tracker import State
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.types import Bools, Floats
 
 NEAR_PX = 20.0

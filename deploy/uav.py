@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 from deploy.uav_config import FlightConfig, UavConfig
 from edge.devices.base import Device
 from protocols.bus.base import Bus
-from protocols.errors import EXIT_DONE, InputError
+from protocols.core.errors import EXIT_DONE, InputError
+from protocols.core.version import VERSION
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from protocols.session.rig import read_rig
-from protocols.version import VERSION
 
 if TYPE_CHECKING:
     from edge.devices.aircraft import SimulatedAircraft

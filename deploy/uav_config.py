@@ -9,7 +9,7 @@ import msgspec
 from msgspec import Meta
 
 from deploy.config import OakConfig, Seconds, Seed, VideoConfig, _Agent, _check_id, _Strict
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 Degrees = Annotated[float, Meta(ge=-180.0, le=180.0)]
 SystemId = Annotated[int, Meta(ge=1, le=255)]

@@ -20,13 +20,13 @@ import tomli_w
 from deploy.signals import Interruption, interrupt_on_signals
 from deploy.uav_config import FlightConfig
 from deploy.uav_demo_outcome import LOG, REPORT, Outcome, as_json, compare, compare_geo
-from protocols.bus.router import Router, free_endpoint
+from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import TARGET
-from protocols.errors import InputError, Refused
-from protocols.files import check_folder, write_atomically
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.core.errors import InputError, Refused
+from protocols.core.files import check_folder, write_atomically
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import TARGET
 
 if TYPE_CHECKING:
     from edge.mavlink.station import Station

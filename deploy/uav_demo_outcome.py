@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from protocols.catalogue import STATUS, TARGET
-from protocols.clocks import NANOSECONDS
-from protocols.errors import Refused
-from protocols.log.reader import LogReader
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import Refused
+from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import STATUS, TARGET
 
 if TYPE_CHECKING:
     from edge.uav.world.world import World

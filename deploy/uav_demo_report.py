@@ -15,11 +15,11 @@ from deploy.uav_demo_outcome import Outcome, as_rows
 from hub.report.style import STYLE
 from hub.report.svg import at, drawing, esc, points, text
 from hub.report.tables import table
-from protocols.catalogue import FLIGHT_IMAGE, TARGET, TARGET_CLOUD
-from protocols.files import write_atomically
+from protocols.core.files import write_atomically
 from protocols.geometry.types import Floats
-from protocols.log.reader import LogReader
+from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import FLIGHT_IMAGE, TARGET, TARGET_CLOUD
 
 if TYPE_CHECKING:
     from edge.uav.world.world import World

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from protocols.catalogue import FLIGHT_IMAGE, ROAD_MAP, TARGET, TARGET_CLOUD, TARGET_COMMAND, TELEMETRY, UAV_INFO
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
-from protocols.log.reader import Logged, LogReader
-from protocols.log.writer import LogWriter
+from protocols.log.read.reader import Logged, LogReader
+from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import FLIGHT_IMAGE, ROAD_MAP, TARGET, TARGET_CLOUD, TARGET_COMMAND, TELEMETRY, UAV_INFO
 
 if TYPE_CHECKING:
     from edge.uav.follower import Follower

@@ -11,12 +11,12 @@ import numpy as np
 from deploy.track import TelemetryFile
 from deploy.track_log import open_pictures
 from edge.uav.tracker import Telemetry
-from protocols.catalogue import TELEMETRY
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import TELEMETRY
 
 SUFFIXES = (".tlog", ".mcap")
 _LOOKED_AT = 3600  # frames: two minutes are enough to find the offset
@@ -31,7 +31,7 @@ def read_own_clock(file: Path) -> TelemetryFile:
         log = read_tlog(file)
         return TelemetryFile(log.samples, log.left_out)
     from edge.uav.navigation import from_quaternion
-    from protocols.log.reader import LogReader
+    from protocols.log.read.reader import LogReader
 
     found: dict[str, list[Telemetry]] = {}
     left_out = 0

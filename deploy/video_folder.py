@@ -18,13 +18,13 @@ import tomli_w
 from deploy.detecting import MARKER_FILE, Found, detect_in, marker_detector, observations_text, read_marker
 from edge.detectors.marker import REVISION, MarkerModel
 from edge.devices.film import VIDEO_SUFFIXES, Film, has_pyav
-from protocols.errors import InputError
-from protocols.files import write_together
+from protocols.core.errors import InputError
+from protocols.core.files import write_together
+from protocols.core.version import VERSION
 from protocols.geometry.camera import Intrinsics
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, read_folder
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, read_rig, read_toml
-from protocols.version import VERSION
 
 Progress = Callable[[str, float], None]
 DetectorName = Literal["marker", "person", "vehicle"]

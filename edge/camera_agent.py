@@ -23,13 +23,13 @@ from edge.picture_watch import PictureWatch
 from edge.pictures import WIDTH, picture_message
 from edge.predictions import Predictions
 from protocols.bus.base import Bus
-from protocols.catalogue import CAMERA_INFO, OBSERVATION, PICTURE, PREDICTION, STATUS, Topic
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
-from protocols.gate import SCHEMA_VERSION
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
+from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import RigCamera
-from protocols.version import VERSION
+from protocols.topics import CAMERA_INFO, OBSERVATION, PICTURE, PREDICTION, STATUS, Topic
+from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "camera"
 _READ_TIMEOUT_S = 0.1  # how long a stop may wait for a silent camera

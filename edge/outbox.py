@@ -12,7 +12,7 @@ from typing import Self
 from google.protobuf.message import Message
 
 from protocols.bus.base import Bus, Publisher
-from protocols.catalogue import Topic
+from protocols.topics import Topic
 
 _FLUSH_S = 2.0
 _IDLE_S = 0.2

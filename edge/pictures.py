@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 
 from edge.devices.base import Frame
-from protocols.gate import SCHEMA_VERSION
 from protocols.messages import syncline_pb2 as pb
+from protocols.validation.codec import SCHEMA_VERSION
 
 WIDTH = 320
 """Of the small picture [px]: 8 kB as JPEG, so that fifty cameras fit a wireless link."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from edge.detectors.base import Prediction
 from protocols.bus.base import Subscription
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.messages import syncline_pb2 as pb
 
 _FRESH_S = 0.5  # an older prediction says nothing of this frame

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from edge.devices.base import Image
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 CLOCK_HZ = 90_000
 _PACKET_BYTES = 1400  # with IP's and UDP's headers within 1500

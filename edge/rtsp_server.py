@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 
 from edge.devices.base import Image
 from edge.rtp_encoder import RtpEncoder, is_rtcp
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 PATH = "/overlay"
 _MOST_VIEWERS = 4

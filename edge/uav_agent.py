@@ -29,7 +29,12 @@ from edge.uav.time_map import Aligner, CameraHostClock
 from edge.uav.tracker import Box, Estimate, State, Telemetry
 from edge.uav_told import line, show
 from protocols.bus.base import Bus
-from protocols.catalogue import (
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.version import VERSION
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Floats
+from protocols.messages import syncline_pb2 as pb
+from protocols.topics import (
     FLIGHT_IMAGE,
     PICTURE,
     ROAD_MAP,
@@ -40,12 +45,7 @@ from protocols.catalogue import (
     TELEMETRY,
     UAV_INFO,
 )
-from protocols.clocks import NANOSECONDS
-from protocols.gate import SCHEMA_VERSION
-from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
-from protocols.messages import syncline_pb2 as pb
-from protocols.version import VERSION
+from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "uav"
 _READ_S = 0.02

@@ -11,7 +11,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import TracebackType
 from typing import Self
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 PATH = "/stream.mjpg"
 _BOUNDARY = "frame"

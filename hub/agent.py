@@ -15,11 +15,11 @@ from hub.live import LiveHub
 from hub.nodes.host import ROLE as NODES
 from hub.nodes.host import NodeHost
 from protocols.bus.base import Bus, Publisher
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, NODE_STATE, OBSERVATION, PREDICTION, RIG_INFO, STATUS, TRACK
+from protocols.core.commands import Orders
+from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
-from protocols.orders import Orders
 from protocols.session.rig import Rig
-from protocols.version import VERSION
+from protocols.topics import CALIBRATION, CAMERA_INFO, NODE_STATE, OBSERVATION, PREDICTION, RIG_INFO, STATUS, TRACK
 
 ROLE = "hub"
 _TICK_S = 0.05

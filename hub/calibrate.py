@@ -31,7 +31,7 @@ from hub.timing.pair import PairSolution
 from hub.timing.paper_pairs import paper_pair
 from hub.timing.tracks import smooth_only
 from hub.timing.two_view import fundamental_from
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, Known
 from protocols.session.observations import Observations

@@ -13,7 +13,7 @@ import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from protocols.clocks import NANOSECONDS, CameraTime
+from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration
 

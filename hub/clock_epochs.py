@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from hub.timing.clock_watch import ClockEvent, ClockWatch
-from protocols.clocks import TimeMap
+from protocols.core.clocks import TimeMap
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration
 

@@ -24,14 +24,14 @@ from hub.poses.initialise import Scaffold, place_known
 from hub.poses.trust import trusted
 from hub.prepare import Prepared
 from hub.timing.tracks import SmoothTrack, Track
-from protocols.clocks import TimeMap
-from protocols.errors import Refused
+from protocols.core.clocks import TimeMap
+from protocols.core.errors import Refused
+from protocols.core.version import VERSION
 from protocols.geometry.pose import Pose, Similarity
 from protocols.geometry.types import Bools, Floats
 from protocols.session.calibration import Calibration, CameraCalibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
-from protocols.version import VERSION
 
 _EVERY_S = 0.1
 """Time between two updates of each node [s]."""

@@ -24,13 +24,13 @@ from hub.timing.clock_bend import Bends
 from hub.tracking.camera import tracked_kind
 from hub.tracking.live import LiveTracking
 from hub.tracking.walkers import Walkers
-from protocols.errors import InputError, Refused
+from protocols.core.errors import InputError, Refused
+from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder, rig_camera
 from protocols.session.calibration import Calibration, CameraCalibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
-from protocols.version import VERSION
 
 _WALKED_S = 40.0
 """Of tracklets: how much of people two cameras must have seen before calibrating by them is worth a try."""

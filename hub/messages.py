@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, TrajectoryTable
 

@@ -12,7 +12,7 @@ from hub.poses.graph import ClockGraph
 from hub.poses.initialise import Scaffold, settle
 from hub.poses.problem import CameraState
 from hub.prepare import Prepared
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations

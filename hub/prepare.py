@@ -11,8 +11,8 @@ from hub.points import sampled_track
 from hub.poses.initialise import Camera
 from hub.poses.problem import Rows
 from hub.timing.tracks import SmoothTrack, Track, smooth_track, without_jumps
-from protocols.geometry.ball import outline_to_centre
 from protocols.geometry.camera import Intrinsics
+from protocols.geometry.sphere_projection import outline_to_centre
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, RigCamera

@@ -20,11 +20,11 @@ from hub.poses.trust import trusted
 from hub.timing.pair import PairSolution
 from hub.timing.two_view import fundamental_from, relative_pose
 from hub.wand import measured_wands, scaled_by_wands
-from protocols.clocks import TimeMap
+from protocols.core.clocks import TimeMap
+from protocols.core.version import VERSION
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, CameraCalibration, PairReport, TrajectoryTable
 from protocols.session.rig import Rig
-from protocols.version import VERSION
 
 if TYPE_CHECKING:
     from hub.calibrate import Solution

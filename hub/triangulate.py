@@ -17,8 +17,8 @@ from hub.poses.graph import ClockGraph, ClockGuess
 from hub.poses.initialise import Scaffold, agreement, place_known
 from hub.prepare import Prepared, prepare
 from hub.publish import path_tables
-from protocols.clocks import CameraTime
-from protocols.errors import Refused
+from protocols.core.clocks import CameraTime
+from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
 from protocols.session.calibration import CameraCalibration, TrajectoryTable
 from protocols.session.observations import Observations

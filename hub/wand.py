@@ -8,7 +8,7 @@ import numpy as np
 
 from hub.poses.gauge import Gauge
 from hub.poses.problem import Problem, State
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry.pose import Similarity
 from protocols.geometry.types import Bools, Floats
 from protocols.session.rig import Rig

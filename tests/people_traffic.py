@@ -9,7 +9,7 @@ import numpy as np
 
 from edge.scenes.people import PeopleScene
 from hub.tracking.camera import TrackingCamera
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 

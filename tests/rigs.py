@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from protocols.clocks import CameraTime, ReferenceTime, TimeMap
+from protocols.core.clocks import CameraTime, ReferenceTime, TimeMap
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose

@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 from google.protobuf.message import Message
 
-from protocols.catalogue import (
+from protocols.messages import syncline_pb2 as pb
+from protocols.topics import (
     CALIBRATION,
     CAMERA_INFO,
     COMMAND,
@@ -27,7 +28,6 @@ from protocols.catalogue import (
     UAV_INFO,
     Topic,
 )
-from protocols.messages import syncline_pb2 as pb
 
 MATRIX = [600.0, 0.0, 319.5, 0.0, 600.0, 239.5, 0.0, 0.0, 1.0]
 

@@ -15,7 +15,7 @@ from cyclopts import Parameter
 from deploy.config import CameraConfig, HubConfig, RecorderConfig, effective_toml, load
 from deploy.signals import stop_on_signals
 from protocols.bus.settings import BusConfig
-from protocols.errors import EXIT_BUG, EXIT_DONE, EXIT_INPUT
+from protocols.core.errors import EXIT_BUG, EXIT_DONE, EXIT_INPUT
 
 if TYPE_CHECKING:
     from deploy.notify import Notifier
@@ -144,8 +144,8 @@ def _with_bus(settings: Any, start: Any) -> int:
     from deploy.notify import Notifier
     from deploy.supervised import checked, serve_health
     from protocols.bus.base import BusDead, BusStopped
-    from protocols.bus.guard import GuardedBus
-    from protocols.bus.zenoh_bus import open_bus
+    from protocols.bus.security.sender_identity import GuardedBus
+    from protocols.bus.transport.zenoh_bus import open_bus
 
     steady_heap(give_back=isinstance(settings, HubConfig | RecorderConfig))
     checked(settings)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from protocols.errors import EXIT_DONE
+from protocols.core.errors import EXIT_DONE
 
 
 def bundle(

@@ -15,8 +15,8 @@ from deploy.heap import keep_heap
 from deploy.outputs import write_outputs, write_refusal
 from deploy.progress import progress_bar
 from deploy.sessions import load_session
-from protocols.errors import EXIT_DONE, InputError, Refused
-from protocols.files import check_folder
+from protocols.core.errors import EXIT_DONE, InputError, Refused
+from protocols.core.files import check_folder
 from protocols.session.calibration import Known, read_calibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from protocols.errors import EXIT_DONE, EXIT_REFUSED, InputError
+from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
 
 if TYPE_CHECKING:
     from rich.live import Live as RichLive

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from deploy.progress import progress_bar
 from edge.detectors.base import Detection, Detector
-from protocols.errors import EXIT_DONE, InputError, Refused
+from protocols.core.errors import EXIT_DONE, InputError, Refused
 
 _REMEDIES = {
     "marker": "use a brightly coloured ball that is whole in the picture, or show it with --teach --target x,y,w,h",
@@ -122,7 +122,7 @@ def detect(
     from edge.detectors.marker import MarkerModel
     from edge.devices.base import check_size
     from edge.devices.film import Film
-    from protocols.files import write_together
+    from protocols.core.files import write_together
 
     film = Film(video, fps)
     name = video.stem if camera is None else camera

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from protocols.errors import EXIT_DONE, InputError
+from protocols.core.errors import EXIT_DONE, InputError
 
 
 def export(
@@ -51,7 +51,7 @@ def export(
     """
     from deploy import exporting
     from deploy.sessions import is_log
-    from protocols.files import check_folder, write_together
+    from protocols.core.files import check_folder, write_together
 
     log = is_log(source)
     if to is None and not log:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from protocols.errors import EXIT_DONE, InputError
+from protocols.core.errors import EXIT_DONE, InputError
 
 
 def import_(
@@ -81,7 +81,7 @@ def import_(
     if fps is not None and videos is not None:
         raise InputError("--fps and --videos each tell the frames' times", remedy="keep one")
     from deploy import importing
-    from protocols.files import write_atomically
+    from protocols.core.files import write_atomically
     from protocols.session.folder import read_folder, write_observations
 
     source = importing.recognise(list(sources), format)

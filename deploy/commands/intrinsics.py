@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from deploy.progress import progress_bar
-from protocols.errors import EXIT_DONE, InputError
+from protocols.core.errors import EXIT_DONE, InputError
 
 _TRIED = 250  # frames that are looked at, at the most
 _A_SECOND = 5.0  # … of each second
@@ -90,7 +90,7 @@ def intrinsics(
     from edge.lens.board import Charuco, Chessboard, View, views_of
     from edge.lens.models import UNKNOWN_STD, angle_across, find_model
     from edge.lens.solve import LensFit, coverage_map, lens_from_angle, solve_lens
-    from protocols.files import write_atomically
+    from protocols.core.files import write_atomically
 
     name = video.stem if camera is None else camera
     if not name or name != name.strip() or '"' in name or name == "metadata":

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from protocols.errors import EXIT_DONE, EXIT_REFUSED
+from protocols.core.errors import EXIT_DONE, EXIT_REFUSED
 
 Json = Annotated[bool, Parameter(negative="")]
 Many = Annotated[tuple[str, ...], Parameter(negative="")]

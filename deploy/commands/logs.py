@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from protocols.errors import EXIT_DONE, EXIT_REFUSED, InputError
+from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
 
 
 def info(path: Path, /, *, json: Annotated[bool, Parameter(negative="")] = False) -> int:
@@ -62,7 +62,7 @@ def recover(log: Path, /, *, out: Path, json: Annotated[bool, Parameter(negative
     json
         Print what was saved and lost as JSON.
     """
-    from protocols.log.recover import recover as make_whole
+    from protocols.log.read.recovery import recover as make_whole
 
     recovery = make_whole(log, out)
     if json:
@@ -187,8 +187,8 @@ def replay(
     from deploy.signals import stop_on_signals
     from protocols.bus.base import BusStopped
     from protocols.bus.settings import BusConfig
-    from protocols.bus.zenoh_bus import open_bus
-    from protocols.log.reader import LogReader
+    from protocols.bus.transport.zenoh_bus import open_bus
+    from protocols.log.read.reader import LogReader
 
     damage = LogReader(log).summary().reason  # told before, not after, an hour of replay
     if damage:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from protocols.errors import EXIT_DONE, InputError, Refused
+from protocols.core.errors import EXIT_DONE, InputError, Refused
 
 if TYPE_CHECKING:
     from edge.devices.base import Device
@@ -92,7 +92,7 @@ def quick(
     from deploy.outputs import remove_outputs, write_outputs, write_refusal
     from deploy.quick import Quick, QuickSettings, show_report
     from deploy.signals import stop_on_signals
-    from protocols.files import check_folder
+    from protocols.core.files import check_folder
     from protocols.session.rig import read_rig
 
     cv2.setNumThreads(1)

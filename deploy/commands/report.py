@@ -10,7 +10,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from protocols.errors import EXIT_DONE, InputError, Refused
+from protocols.core.errors import EXIT_DONE, InputError, Refused
 
 
 def report(
@@ -49,7 +49,7 @@ def report(
     from hub.report import build_report
     from hub.report.measures import usage
     from hub.report.verdict import judge, judge_refusal
-    from protocols.files import write_atomically
+    from protocols.core.files import write_atomically
 
     file = out or (source / "report.html" if (source / "result.json").is_file() else Path("report.html"))
     if file.suffix.lower() not in (".html", ".htm"):

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 
 from deploy.config import RouterConfig, effective_toml, load
 from deploy.signals import stop_on_signals
-from protocols.errors import EXIT_BUG, EXIT_DONE
+from protocols.core.errors import EXIT_BUG, EXIT_DONE
 
 if TYPE_CHECKING:
     from deploy.notify import Notifier
@@ -44,7 +44,7 @@ def router(config: Path, /, *, print_config: Annotated[bool, Parameter(negative=
     from deploy.health import Health
     from deploy.supervised import checked, serve_health
     from protocols.bus.base import BusDead
-    from protocols.bus.router import RulesChanged, run_router
+    from protocols.bus.router.zenoh_router import RulesChanged, run_router
 
     checked(settings)
     restarts = int(os.environ.get(_RESTARTS, "0"))

@@ -9,8 +9,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from protocols.errors import EXIT_DONE, InputError
-from protocols.files import check_folder
+from protocols.core.errors import EXIT_DONE, InputError
+from protocols.core.files import check_folder
 
 _SECONDS, _NOISE_PX = 60.0, 0.5
 _BODY_NOISE_PX = 2.0  # a head's top and a foot point are not as sharp as a ball

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from deploy.progress import progress_bar
-from protocols.errors import EXIT_DONE, InputError
+from protocols.core.errors import EXIT_DONE, InputError
 
 
 def sync(
@@ -48,7 +48,7 @@ def sync(
     seed
         Accepted as everywhere; nothing here is drawn at random.
     """
-    from protocols.files import check_folder, write_together
+    from protocols.core.files import check_folder, write_together
 
     check_folder(out)
     if fps is not None and not 0.1 <= fps <= 1000:

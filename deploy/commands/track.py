@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from deploy.progress import progress_bar
-from protocols.errors import EXIT_DONE, InputError
-from protocols.files import check_folder, write_together
+from protocols.core.errors import EXIT_DONE, InputError
+from protocols.core.files import check_folder, write_together
 
 
 def track(

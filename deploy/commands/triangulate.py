@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from deploy.progress import progress_bar
-from protocols.errors import EXIT_DONE, InputError
+from protocols.core.errors import EXIT_DONE, InputError
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
@@ -49,7 +49,7 @@ def triangulate(
     if out.is_dir():
         raise InputError("a folder of this name is in the way", file=out, remedy="give --out the name of a CSV file")
     from hub.triangulate import triangulate as solve
-    from protocols.files import write_atomically
+    from protocols.core.files import write_atomically
     from protocols.session.calibration import csv_cell, read_calibration
 
     rig, known = read_calibration(calibration)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from protocols.bus.settings import BusConfig
-from protocols.errors import EXIT_BUG, EXIT_DONE, InputError
+from protocols.core.errors import EXIT_BUG, EXIT_DONE, InputError
 
 if TYPE_CHECKING:
     from hub.view.server import ViewServer
@@ -100,7 +100,7 @@ def _live(settings: BusConfig, site: str, serve: Callable[[Any], ViewServer], br
     from deploy.signals import stop_on_signals
     from hub.view.server import run_view
     from protocols.bus.base import BusDead, BusStopped
-    from protocols.bus.zenoh_bus import open_bus
+    from protocols.bus.transport.zenoh_bus import open_bus
 
     stop = stop_on_signals()
     shown = _told(serve(None), browser, json)

@@ -12,7 +12,7 @@ import numpy as np
 from deploy.doctor.finding import Finding, missing, ok, skip, warn, wrong
 from edge.devices.base import Device
 from protocols.bus.settings import BusConfig, is_loopback, open_to_others
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 _SMALL, _LARGE = 1024, 1_000_000
 _EXPIRES_SOON_DAYS = 7.0
@@ -69,7 +69,7 @@ def certificates(bus: BusConfig, role: str, agent: str) -> Finding:
                 "make some with `syncline keys`: anybody in that network may say anything",
             )
         return skip("certificates", "none: everything stays on this machine")
-    from protocols.bus.tls import check_files, check_owner, days_left
+    from protocols.bus.security.tls import check_files, check_owner, days_left
 
     try:
         check_files(bus.tls)
@@ -98,7 +98,7 @@ def bus_path(bus: BusConfig, site: str, role: str, agent: str, patience_s: float
     try:
         if bus.tls is not None and role not in _HEARS_ALL:
             return _matched(config, site, agent, where)
-        from protocols.bus.probe import round_trip
+        from protocols.bus.router.probe import round_trip
 
         prefix = _own_prefix(site, role, agent) if bus.tls is not None else f"syncline/{site}/canary/doctor"
         small = round_trip(config, prefix, _SMALL)
@@ -128,8 +128,8 @@ def bus_path(bus: BusConfig, site: str, role: str, agent: str, patience_s: float
 
 
 def _matched(config: BusConfig, site: str, agent: str, where: str) -> Finding:
-    from protocols.bus.zenoh_bus import open_bus
-    from protocols.catalogue import OBSERVATION
+    from protocols.bus.transport.zenoh_bus import open_bus
+    from protocols.topics import OBSERVATION
 
     with open_bus(site, config, timeout_s=5.0) as bus:
         if bus.publisher(OBSERVATION, agent).wait_matched(3.0):
@@ -145,7 +145,7 @@ def _matched(config: BusConfig, site: str, agent: str, where: str) -> Finding:
 def rights(bus: BusConfig, site: str, role: str, agent: str, seconds: float = 2.5) -> Finding:
     """Whether the router holds this certificate to its own keys."""
     from protocols.bus.base import BusDead
-    from protocols.bus.probe import hears, round_trip
+    from protocols.bus.router.probe import hears, round_trip
 
     config = _as_client(bus)
     if bus.tls is None or config is None:

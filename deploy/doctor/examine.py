@@ -11,7 +11,7 @@ from deploy.doctor import machine
 from deploy.doctor.finding import Finding, missing, skip, wrong
 from deploy.install import units
 from deploy.rig_folder import role_of
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 
 def examine(file: Path | None, role: str | None = None) -> Iterator[Finding]:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from protocols.errors import EXIT_DONE, EXIT_INPUT, EXIT_REFUSED
+from protocols.core.errors import EXIT_DONE, EXIT_INPUT, EXIT_REFUSED
 
 Verdict = Literal["ok", "warn", "fail", "skip"]
 

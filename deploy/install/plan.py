@@ -17,7 +17,7 @@ import tomli_w
 
 from deploy.config_file import Source, load
 from deploy.install import units
-from protocols.errors import InputError, Refused
+from protocols.core.errors import InputError, Refused
 from protocols.session.rig import read_rig
 
 CONFIG, STATE, UNITS = "/etc/syncline", "/var/lib/syncline", "/etc/systemd/system"

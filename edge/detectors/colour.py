@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 
 _BITS = 5  # of each channel in the table: 32³ entries, which a board's cache holds

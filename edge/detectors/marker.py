@@ -22,9 +22,9 @@ from edge.detectors.base import Detection, Prediction
 from edge.detectors.colour import ColourModel, codes, taught
 from edge.detectors.outline import Outline, measure_outline
 from edge.detectors.scenery import Scenery
-from protocols.errors import InputError
-from protocols.geometry.ball import outline_to_centre
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
+from protocols.geometry.sphere_projection import outline_to_centre
 from protocols.geometry.types import Bools, Floats
 
 REVISION = 4

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.detectors.base import Detection, Prediction
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 
 DICTIONARIES = (

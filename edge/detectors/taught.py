@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from edge.detectors.base import Detection, Prediction
 from edge.detectors.marker import MarkerDetector, MarkerModel, teach
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
 _SPREAD = (26, 18, 18)  # of one colour in CIE L*a*b* (0..255): light and shade of a ball

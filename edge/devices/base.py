@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.detectors.base import Detection
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
 Image: TypeAlias = npt.NDArray[np.uint8]

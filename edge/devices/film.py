@@ -19,8 +19,8 @@ import numpy as np
 
 from edge.devices.base import Image
 from edge.devices.recording import FOLDER_FPS, IMAGE_SUFFIXES, Recording
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
 
 if TYPE_CHECKING:
     from av import VideoFrame

@@ -8,7 +8,7 @@ from edge.devices.aircraft import SimulatedAircraft
 from edge.devices.base import DeviceInfo, Frame, Image
 from edge.devices.pacing import Pace
 from edge.uav.world.world import World
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 
 _TRANSFER_S = 0.004
 

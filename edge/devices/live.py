@@ -15,8 +15,8 @@ import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame, check_size
 from edge.devices.returning import Connection, Gone, ReturningCamera, without_password
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
 ON_ARRIVAL = ("exposure", "time of capture: stamped on arrival", "dropped frames")

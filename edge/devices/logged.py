@@ -14,12 +14,12 @@ import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame, Image, check_size
 from edge.devices.pacing import Pace
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
-from protocols.log.pictures import PictureRun, picture_runs, pictures
-from protocols.log.reader import LogReader
-from protocols.log.small_pictures import Scale
+from protocols.log.read.images import PictureRun, picture_runs, pictures
+from protocols.log.read.reader import LogReader
+from protocols.log.write.thumbnails import Scale
 from protocols.messages import syncline_pb2 as pb
 
 

@@ -17,8 +17,8 @@ import numpy as np
 from edge.devices.base import Device, DeviceInfo, Frame, check_size
 from edge.devices.live import LiveCamera
 from edge.devices.returning import Connection, Gone, ReturningCamera, without_password
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
 _OPEN_S, _READ_S = 5.0, 3.0

@@ -20,7 +20,7 @@ import numpy as np
 from edge.devices.base import DeviceInfo, Frame, check_size
 from edge.devices.oak_network import Naming, boxes
 from edge.devices.returning import Connection, Gone, ReturningCamera
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
 _QUEUE = 4  # newest frames: what is older than that has been waited for in vain

@@ -17,7 +17,7 @@ import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame, check_size
 from edge.devices.returning import Connection, Gone, ReturningCamera
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
 _REMEDY = "check the ribbon cable (contacts, both ends), and that `rpicam-hello --list-cameras` shows it"

@@ -10,8 +10,8 @@ import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame, Image, check_size
 from edge.devices.pacing import Pace
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 from edge.devices.base import DeviceInfo, Frame
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
 
 _RETRY_S, _SLOWEST_RETRY_S = 0.5, 5.0
 _FIRST_FRAME_S = 10.0

@@ -9,7 +9,7 @@ import numpy as np
 from edge.devices.base import DeviceInfo, Frame
 from edge.devices.pacing import Pace
 from edge.scenes.base import Renderer, Scene, SimulatedClock
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 
 _TRANSFER_S = 0.004  # from the end of the exposure until the picture has come over the wire
 

@@ -23,8 +23,8 @@ import numpy as np
 from edge.devices.base import Device, DeviceInfo, Frame, Image, check_size
 from edge.devices.live import LiveCamera
 from edge.devices.returning import Connection, Gone, ReturningCamera
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
 _MONOTONIC, _CLOCKS = 0x2000, 0xE000  # V4L2_BUF_FLAG_TIMESTAMP_…

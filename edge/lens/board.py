@@ -10,7 +10,7 @@ import numpy as np
 
 from edge.devices.base import Image
 from edge.devices.film import Shot
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 
 LEAST_CORNERS = 8  # a view with fewer says less than its own pose asks

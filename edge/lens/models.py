@@ -14,7 +14,7 @@ import math
 import re
 from dataclasses import dataclass
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 
 @dataclass(frozen=True, slots=True)

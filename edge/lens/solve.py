@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from edge.lens.board import View
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Ints
 

@@ -20,7 +20,7 @@ from edge.mavlink.framing import Framer
 from edge.mavlink.signing import Signing
 from edge.mavlink.transport import Address, Transport
 from edge.uav.navigation import Origin, to_quaternion
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats
 
 _RATES = {

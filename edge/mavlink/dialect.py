@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 os.environ["MAVLINK20"] = "1"
 os.environ.setdefault("MAVLINK_DIALECT", "common")

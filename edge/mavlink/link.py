@@ -14,7 +14,7 @@ from edge.mavlink.dialect import mavlink
 from edge.mavlink.framing import Framer
 from edge.mavlink.signing import Signing
 from edge.mavlink.transport import Address, Transport, Url, open_transport
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 
 _USUAL_VEHICLE = 1
 _SENDERS = 8  # addresses whose bytes are looked at while nobody is locked

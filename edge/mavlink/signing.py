@@ -11,8 +11,8 @@ import hmac
 import json
 from pathlib import Path
 
-from protocols.errors import InputError
-from protocols.files import write_atomically
+from protocols.core.errors import InputError
+from protocols.core.files import write_atomically
 
 EPOCH_UNIX_S = 1_420_070_400
 TICKS = 100_000

@@ -10,7 +10,7 @@ from typing import Any
 from edge.mavlink.dialect import CAMERA, STATION, mavlink
 from edge.mavlink.link import Link
 from edge.mavlink.transport import parse
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 
 _KINDS = (
     "HEARTBEAT",

@@ -18,7 +18,7 @@ from edge.mavlink.link import is_autopilot
 from edge.mavlink.telemetry import Attitude, GlobalPosition, LocalPosition, report
 from edge.uav.navigation import Origin
 from edge.uav.tracker import Telemetry
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 
 _STAMP = 8

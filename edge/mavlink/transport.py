@@ -13,7 +13,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 Address = tuple[str, int]
 """Who sent bytes: host and port; ("", 0) where a link has only one other end."""

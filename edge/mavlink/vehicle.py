@@ -20,7 +20,7 @@ from edge.mavlink.telemetry import (
 )
 from edge.uav.navigation import Origin
 from edge.uav.vehicle_clock import VehicleClock
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats
 
 _TRIP_S = 0.5  # between questions about the time

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 if TYPE_CHECKING:
     from edge.scenes.base import Scene

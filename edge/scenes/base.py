@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from protocols.clocks import NANOSECONDS, TimeMap
-from protocols.errors import InputError
+from protocols.core.clocks import NANOSECONDS, TimeMap
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.scenes.people import PeopleScene
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Bools, Floats, Ints
 
 HIDDEN_PX = 3.0

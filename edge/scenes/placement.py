@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.scenes.base import SimulatedCamera, SimulatedClock
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose

@@ -8,7 +8,7 @@ import numpy as np
 
 from edge.scenes.base import SimulatedCamera
 from edge.scenes.marker import MarkerScene
-from protocols.clocks import NANOSECONDS, TimeMap
+from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry.types import Bools, Floats, Ints
 
 

@@ -19,12 +19,12 @@ from edge.uav import models
 from edge.uav.georeference import Georeference
 from edge.uav.navigation import Origin, from_quaternion
 from edge.uav.tracker import Box, Estimate, Image, State, Telemetry, Tracker
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
-from protocols.gate import SCHEMA_VERSION
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
+from protocols.validation.codec import SCHEMA_VERSION
 
 _REMEMBERED = 200  # samples of telemetry from before a target is chosen
 _CLOUD_EVERY, _ROAD_EVERY = 6, 15  # frames

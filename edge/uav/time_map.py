@@ -13,7 +13,7 @@ import numpy as np
 from edge.uav.alignment import Offset, find_offset
 from edge.uav.seen_turning import SeenTurning
 from edge.uav.tracker import Image, Telemetry
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 

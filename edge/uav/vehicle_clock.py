@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 
 _WINDOW_NS = 20 * NANOSECONDS
 _MEMORY = 512

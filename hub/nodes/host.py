@@ -20,7 +20,7 @@ from hub.nodes.messages import Notice, Reference, SharedObservation, StateMessag
 from hub.nodes.node import PoseNode
 from hub.nodes.pairing import GAP
 from hub.nodes.wire import edges_from_wire, edges_to_wire, name_of, number_of, state_from_wire, state_to_wire
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats

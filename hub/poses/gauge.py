@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hub.poses.problem import CAMERA_PARAMETERS, State
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, Similarity, fit_similarity
 from protocols.geometry.types import Floats

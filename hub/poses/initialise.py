@@ -18,7 +18,7 @@ from hub.poses.problem import CameraState, Freedom, LensPrior, Problem, Rows, St
 from hub.splines import SplineBasis, fit_spline, stretches
 from hub.timing.pair import PairSolution, evidence
 from hub.timing.tracks import Track
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose

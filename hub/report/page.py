@@ -8,11 +8,11 @@ from hub.report.measures import Usage
 from hub.report.style import STYLE
 from hub.report.svg import THIN, esc, number, short, whole
 from hub.report.verdict import UNIT_WORDS, Verdict, half_interval_ms, judge, judge_refusal
-from protocols.errors import Refused
+from protocols.core.errors import Refused
+from protocols.core.version import VERSION
 from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
-from protocols.version import VERSION
 
 # The page forbids itself to load anything: what it needs is in it.
 _POLICY = (

@@ -6,7 +6,7 @@ import numpy as np
 
 from hub.report.svg import THIN, at, drawing, esc, line, number, rect, text
 from hub.report.verdict import contradicts
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.session.calibration import Calibration, PairReport
 
 _MOST_LABELS = 15  # more lags than this would cover each other

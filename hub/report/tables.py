@@ -12,7 +12,7 @@ from hub.report.pair_graph import edge_kind
 from hub.report.remedies import remedy_for
 from hub.report.svg import THIN, esc, number, short, whole
 from hub.report.verdict import half_interval_ms
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration
 from protocols.session.rig import Rig

@@ -10,7 +10,7 @@ from hub.report import measures
 from hub.report.measures import Usage
 from hub.report.remedies import remedy_for
 from hub.report.svg import THIN, number, short
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.session.calibration import Calibration, CameraCalibration, PairReport
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig

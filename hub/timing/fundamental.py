@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hub.timing.fundamental import epipolar_lines, line_distances, maximum_likelihood
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry.types import Bools, Floats
 
 _TOLERANCE = 1e-6  # relative fall of E below which eq. 22 counts as "no longer falls"

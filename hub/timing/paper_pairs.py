@@ -8,7 +8,7 @@ from hub.timing import two_view
 from hub.timing.pair import PairSolution, judge_alignment
 from hub.timing.paper import alternate
 from hub.timing.tracks import SmoothTrack
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Ints
 from protocols.session.observations import Track

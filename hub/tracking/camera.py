@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hub.tracking.body import INDEX
-from protocols.clocks import NANOSECONDS, TimeMap
+from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats, Ints

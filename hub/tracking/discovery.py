@@ -14,7 +14,7 @@ from hub.tracking.body import BODIES
 from hub.tracking.camera import Frame, TrackingCamera
 from hub.tracking.kalman import LOG_SIZE, POSITION, SIZE, VELOCITY
 from hub.tracking.measure import FOOT, HEAD, PARTS, POINT, doubt, expect, heavy
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats, Ints
 
 _LEAST_SINE = 0.05

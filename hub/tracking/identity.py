@@ -10,7 +10,7 @@ from hub.tracking.body import BODIES
 from hub.tracking.discovery import Scale
 from hub.tracking.kalman import LOG_SIZE, POSITION, VELOCITY
 from hub.tracking.targets import Gone, State, Targets
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Bools, Floats
 
 _COLOUR_STD = 18.0

@@ -14,7 +14,7 @@ from hub.tracking import kalman
 from hub.tracking.body import BODIES
 from hub.tracking.kalman import POSITION, VELOCITY
 from hub.tracking.targets import Targets
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Bools, Floats
 
 _LONGEST_S = 0.3

@@ -17,7 +17,7 @@ from hub.tracking.targets import State
 from hub.tracking.telling import prediction_message, track_messages
 from hub.tracking.tracker import Tracker
 from hub.tracking.upright import UpFinder
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, Similarity, fit_similarity
 from protocols.geometry.types import Floats

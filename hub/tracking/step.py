@@ -26,7 +26,7 @@ from hub.tracking.jumps import Turned, jumped, jumpy, weighed
 from hub.tracking.kalman import LOG_SIZE, POSITION
 from hub.tracking.measure import FOOT, HEAD, POINT, Expected, doubt, expect, measured
 from hub.tracking.targets import State, Targets
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Bools, Floats, Ints
 
 _WINDOW_NS = 250_000_000

@@ -10,7 +10,7 @@ from hub.tracking.kalman import LOG_SIZE, POSITION, VELOCITY
 from hub.tracking.measure import POINT, expect
 from hub.tracking.step import World, label_of
 from hub.tracking.targets import Gone, Targets
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 

@@ -11,7 +11,7 @@ import numpy as np
 from hub.tracking.camera import Frame, TrackingCamera, frame_of
 from hub.tracking.step import World, moved, step
 from hub.tracking.targets import State, Targets
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.pose import Similarity
 from protocols.messages import syncline_pb2 as pb
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from hub.view.state import ViewState
-from protocols.clocks import TimeMap
+from protocols.core.clocks import TimeMap
+from protocols.core.version import VERSION
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import rig_camera
 from protocols.session.calibration import Calibration, CameraCalibration, calibration_text
 from protocols.session.rig import Rig
-from protocols.version import VERSION
 
 
 def calibration_file(state: ViewState) -> str:

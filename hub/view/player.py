@@ -12,7 +12,13 @@ from google.protobuf.message import Message
 
 from hub.messages import calibration_message, track_messages
 from hub.view.state import ViewState
-from protocols.catalogue import (
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
+from protocols.log.read.reader import LogReader
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.calibration import Calibration, read_calibration
+from protocols.session.trajectory import read_trajectory
+from protocols.topics import (
     CALIBRATION,
     CAMERA_INFO,
     FLIGHT_IMAGE,
@@ -25,12 +31,6 @@ from protocols.catalogue import (
     TRACK,
     UAV_INFO,
 )
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
-from protocols.log.reader import LogReader
-from protocols.messages import syncline_pb2 as pb
-from protocols.session.calibration import Calibration, read_calibration
-from protocols.session.trajectory import read_trajectory
 
 BEFORE_S = 20.0
 """A jump shows what was seen in the so many seconds before it; what is told once is known from the beginning."""

@@ -12,7 +12,7 @@ from hub.view.state import CameraState, CameraView, ViewState
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
-from protocols.log.small_pictures import jpeg_size
+from protocols.log.write.thumbnails import jpeg_size
 
 if TYPE_CHECKING:
     import viser

@@ -20,7 +20,10 @@ from hub.view.player import Player, Recording
 from hub.view.scene import Options, SceneDrawing
 from hub.view.state import ViewState
 from protocols.bus.base import Bus, Subscription
-from protocols.catalogue import (
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
+from protocols.messages import syncline_pb2 as pb
+from protocols.topics import (
     CALIBRATION,
     CAMERA_INFO,
     COMMAND,
@@ -33,10 +36,7 @@ from protocols.catalogue import (
     TRACK,
     UAV_INFO,
 )
-from protocols.clocks import NANOSECONDS
-from protocols.errors import InputError
-from protocols.gate import SCHEMA_VERSION
-from protocols.messages import syncline_pb2 as pb
+from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "view"
 _DRAW_S = 0.2

@@ -14,7 +14,7 @@ from google.protobuf.message import Message
 
 from hub.guidance import Guidance
 from hub.view.flights import FlightView
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats

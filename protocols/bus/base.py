@@ -10,7 +10,7 @@ from typing import Protocol, Self
 
 from google.protobuf.message import Message
 
-from protocols.catalogue import Topic
+from protocols.topics import Topic
 
 
 class BusDead(Exception):

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 LOOPBACK_ROUTER = "tcp/127.0.0.1:7447"
 """Where a router listens, and where others look for one, when nothing else is said."""

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from protocols.clocks import TimeMap
-from protocols.errors import InputError, Refused
+from protocols.core.clocks import TimeMap
+from protocols.core.errors import InputError, Refused
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats

@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.formats.cameras import (
     ForeignCamera,
     ForeignRig,

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.formats.cameras import check_name
 from protocols.geometry.types import Floats, Ints
 from protocols.session.observations import Observations, gather_tracks

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from protocols.clocks import TimeMap
-from protocols.errors import InputError
+from protocols.core.clocks import TimeMap
+from protocols.core.errors import InputError
 from protocols.formats.cameras import ForeignCamera, ForeignRig, Written, in_units, numbers
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from protocols.clocks import TimeMap
-from protocols.errors import InputError
+from protocols.core.clocks import TimeMap
+from protocols.core.errors import InputError
 from protocols.formats.cameras import (
     ForeignCamera,
     ForeignRig,

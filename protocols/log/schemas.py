@@ -9,7 +9,7 @@ from google.protobuf.descriptor import Descriptor, FileDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message
 
-from protocols.gate import message_class, parse_key
+from protocols.validation.codec import message_class, parse_key
 
 VIEW_PREFIX = "foxglove/"
 """Channels below it repeat what ours say in schemas that viewers know; readers of ours pass over them."""

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import Message
 
-from protocols.clocks import NANOSECONDS
-from protocols.errors import Refused
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from protocols.clocks import TimeMap
-from protocols.errors import InputError
-from protocols.files import write_atomically
+from protocols.core.clocks import TimeMap
+from protocols.core.errors import InputError
+from protocols.core.files import write_atomically
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose

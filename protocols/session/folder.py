@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from protocols.errors import InputError
-from protocols.files import write_atomically
+from protocols.core.errors import InputError
+from protocols.core.files import write_atomically
 from protocols.session.calibration import csv_cell
 from protocols.session.observations import Observations, read_observations
 from protocols.session.rig import Rig, read_rig

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.types import Floats, Ints
 
 REQUIRED = ("camera", "frame", "time", "u", "v")

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from protocols.files import write_atomically
+from protocols.core.files import write_atomically
+from protocols.core.version import VERSION
 from protocols.session.calibration import Calibration, PairReport, TrajectoryTable, calibration_tables
 from protocols.session.rig import Rig
-from protocols.version import VERSION
 
 TRAJECTORY_FILE = "trajectory.csv"
 

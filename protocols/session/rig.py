@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
@@ -35,7 +35,7 @@ class RigCamera:
     focal_std: relative std of the focal length where the lens is a guess (a data sheet's); 0 = it was measured.
     up: (3,) unit vector, away from the ground in the camera's own axes, as its accelerometer shows at rest.
     ball_outline: whether its rows are centres of balls' outlines of diameter ``size``, seen before the lens was known:
-    the projection of a ball's centre is elsewhere (``protocols/geometry/ball.py``).
+    the projection of a ball's centre is elsewhere (``protocols/geometry/sphere_projection.py``).
     readout: seconds from the first row of an image to its last (rolling shutter); None = not told.
     table: the camera's table as it stands in the file, with keys this version does not know.
     """

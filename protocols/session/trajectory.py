@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.session.calibration import TrajectoryTable
 from protocols.session.observations import DEFAULT_LABEL
 

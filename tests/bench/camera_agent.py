@@ -25,10 +25,10 @@ from edge.detectors.marker import MarkerDetector
 from edge.devices.base import DeviceInfo, Frame, Image
 from edge.devices.pacing import AsFastAsPossible
 from edge.devices.simulated import SimulatedDevice
-from protocols.bus.router import Router, free_endpoint
+from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import OBSERVATION
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.topics import OBSERVATION
 
 SIZE, FPS = (1280, 720), 30.0
 

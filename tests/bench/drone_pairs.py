@@ -22,7 +22,7 @@ import numpy as np  # noqa: E402
 
 from hub.calibrate import calibrate  # noqa: E402
 from hub.timing.tracks import smooth_track  # noqa: E402
-from protocols.errors import Refused  # noqa: E402
+from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry import so3  # noqa: E402
 from protocols.geometry.camera import Intrinsics  # noqa: E402
 from protocols.geometry.types import Floats  # noqa: E402

@@ -25,8 +25,8 @@ from scipy.signal import lfilter  # noqa: E402
 from hub.calibrate import calibrate  # noqa: E402
 from hub.poses.lasting import with_lasting_errors  # noqa: E402
 from hub.poses.problem import Problem, State  # noqa: E402
-from protocols.clocks import TimeMap  # noqa: E402
-from protocols.errors import Refused  # noqa: E402
+from protocols.core.clocks import TimeMap  # noqa: E402
+from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry.types import Floats  # noqa: E402
 from protocols.session.calibration import Calibration  # noqa: E402
 from protocols.session.observations import Observations, Track  # noqa: E402

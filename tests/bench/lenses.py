@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from hub.calibrate import calibrate
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from tests.rigs import simulate
 
 

@@ -29,8 +29,8 @@ from scipy.signal import lfilter  # noqa: E402
 from hub.calibrate import calibrate  # noqa: E402
 from hub.live import LiveHub, LiveSettings  # noqa: E402
 from hub.timing.clock_watch import ClockWatch  # noqa: E402
-from protocols.clocks import NANOSECONDS  # noqa: E402
-from protocols.errors import Refused  # noqa: E402
+from protocols.core.clocks import NANOSECONDS  # noqa: E402
+from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry.types import Floats  # noqa: E402
 from protocols.messages import syncline_pb2 as pb  # noqa: E402
 from tests import rigs  # noqa: E402

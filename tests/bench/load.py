@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from protocols.bus.guard import GuardedBus
-from protocols.bus.router import Router, free_endpoint
+from protocols.bus.router.zenoh_router import Router, free_endpoint
+from protocols.bus.security.sender_identity import GuardedBus
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import CAMERA_INFO, OBSERVATION
+from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import CAMERA_INFO, OBSERVATION
 
 _SESSIONS = 10
 

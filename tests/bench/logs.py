@@ -24,16 +24,16 @@ from typing import Any
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from protocols.bus.router import Router, free_endpoint
+from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import FLIGHT_IMAGE, OBSERVATION, STATUS
-from protocols.errors import Refused
-from protocols.gate import encode
-from protocols.log.reader import LogReader
-from protocols.log.recover import recover
-from protocols.log.writer import CHUNK_SIZE, LogWriter
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.core.errors import Refused
+from protocols.log.read.reader import LogReader
+from protocols.log.read.recovery import recover
+from protocols.log.write.writer import CHUNK_SIZE, LogWriter
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import FLIGHT_IMAGE, OBSERVATION, STATUS
+from protocols.validation.codec import encode
 from tests.integration.test_record_replay import RECORDER
 
 KEY = OBSERVATION.key_for("local", "cam0")

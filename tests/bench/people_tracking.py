@@ -27,10 +27,9 @@ from hub.tracking.step import World, label_of
 from hub.tracking.telling import prediction_message
 from hub.tracking.tracker import Tracker
 from hub.tracking.walkers import Walkers
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.catalogue import PREDICTION
-from protocols.clocks import NANOSECONDS, TimeMap
-from protocols.errors import Refused
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.core.clocks import NANOSECONDS, TimeMap
+from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import fit_similarity
@@ -38,6 +37,7 @@ from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration
 from protocols.session.rig import Rig, RigCamera
+from protocols.topics import PREDICTION
 from tests.people_traffic import Faults, Traffic, cameras_of, film
 from tests.rigs import looking_at
 

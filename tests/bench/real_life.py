@@ -22,8 +22,8 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import numpy as np  # noqa: E402
 
 from hub.calibrate import calibrate  # noqa: E402
-from protocols.clocks import TimeMap  # noqa: E402
-from protocols.errors import Refused  # noqa: E402
+from protocols.core.clocks import TimeMap  # noqa: E402
+from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry import so3  # noqa: E402
 from protocols.geometry.camera import Intrinsics  # noqa: E402
 from protocols.geometry.pose import Pose  # noqa: E402

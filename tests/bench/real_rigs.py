@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from hub.calibrate import calibrate
-from protocols.clocks import TimeMap
+from protocols.core.clocks import TimeMap
 from protocols.geometry.types import Floats
 from protocols.session.calibration import (
     CameraCalibration,

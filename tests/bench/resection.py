@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import least_squares, minimize
 
-from protocols.clocks import TimeMap
+from protocols.core.clocks import TimeMap
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from protocols.clocks import TimeMap
+from protocols.core.clocks import TimeMap
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, Similarity, fit_similarity
 from protocols.geometry.types import Bools, Floats

@@ -27,8 +27,8 @@ from deploy.heap import keep_heap  # noqa: E402
 from hub.calibrate import calibrate  # noqa: E402
 from hub.prepare import prepare  # noqa: E402
 from hub.timing.tracks import SmoothTrack  # noqa: E402
-from protocols.clocks import TimeMap  # noqa: E402
-from protocols.errors import Refused  # noqa: E402
+from protocols.core.clocks import TimeMap  # noqa: E402
+from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry.camera import Intrinsics  # noqa: E402
 from protocols.geometry.types import Floats  # noqa: E402
 from protocols.session.calibration import Calibration  # noqa: E402

@@ -19,11 +19,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from protocols.bus.router import Router, free_endpoint
+from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, PICTURE, TRACK
+from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, PICTURE, TRACK
 from tests.samples import MATRIX
 
 _SYNCLINE = (sys.executable, "-m", "deploy")

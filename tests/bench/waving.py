@@ -15,8 +15,8 @@ from deploy.simulated import observations_of, rig_of
 from edge import scenes
 from edge.scenes.session import simulated_session
 from hub.calibrate import calibrate
-from protocols.clocks import CameraTime
-from protocols.errors import Refused
+from protocols.core.clocks import CameraTime
+from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
 
 FIRST_SEED = 7000

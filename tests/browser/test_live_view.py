@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import CALIBRATION, STATUS
-from protocols.log.reader import LogReader
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import read_calibration
+from protocols.topics import CALIBRATION, STATUS
 from tests.browser.conftest import Tab
 from tests.samples import eventually
 

@@ -14,8 +14,8 @@ pytest.importorskip("viser")
 
 from hub.view.player import LogRecording
 from hub.view.server import ViewServer, run_replay, run_view
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, PICTURE, TARGET, UAV_INFO
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, PICTURE, TARGET, UAV_INFO
 from tests.browser.conftest import Tab
 from tests.integration.test_view_server import TOKEN, solved
 from tests.samples import camera_info, eventually, observation, picture, target_state, uav_info

@@ -17,11 +17,11 @@ from collections import defaultdict
 from typing import Any
 
 from protocols.bus.base import Bus
-from protocols.bus.guard import GuardedBus
+from protocols.bus.security.sender_identity import GuardedBus
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import OBSERVATION
+from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import OBSERVATION
 
 
 def _asked(timeout_s: float) -> str | None:

@@ -20,7 +20,7 @@ from typing import Any
 
 from google.protobuf.message import Message
 
-from protocols.gate import Rejected, admit, sender
+from protocols.validation.codec import Rejected, admit, sender
 from tests.samples import SAMPLES
 
 _EXTREME = (
@@ -173,7 +173,7 @@ def fuzz_config(count: int, seed: int) -> Counter[str]:
     from pathlib import Path
 
     from deploy.config import CameraConfig, load
-    from protocols.errors import InputError
+    from protocols.core.errors import InputError
 
     rng, counts = random.Random(f"{seed} config"), Counter[str]()
     valid = [

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from protocols.bus.router import free_endpoint
+from protocols.bus.router.zenoh_router import free_endpoint
 from tests.bench.load import resident_mb
 from tests.faults.processes import Process, router
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from deploy.bundle import BUDGET_MB, Bundle, Target, folder_size_mb, make_bundle
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 HERE = f"{sys.version_info.major}.{sys.version_info.minor}"
 CONFIG = {

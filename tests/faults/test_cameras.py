@@ -18,10 +18,10 @@ from edge.detectors.base import Detection
 from edge.devices.base import DeviceInfo, Frame
 from edge.devices.live import LiveCamera
 from hub.timing.clock_watch import ClockWatch
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.catalogue import OBSERVATION, STATUS
-from protocols.errors import InputError
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.core.errors import InputError
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import OBSERVATION, STATUS
 from tests.faults.matrix import measured
 
 PERIOD_S = 1 / 30

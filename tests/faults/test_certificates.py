@@ -16,13 +16,13 @@ import pytest
 from deploy import keys
 from deploy.cli import run
 from deploy.keys_check import check_site, tls_of
-from protocols.bus.access import access_rules
 from protocols.bus.base import Publisher
-from protocols.bus.router import Router, free_endpoint
+from protocols.bus.router.zenoh_router import Router, free_endpoint
+from protocols.bus.security.access import access_rules
+from protocols.bus.security.tls import why_refused
 from protocols.bus.settings import BusConfig, parts_of
-from protocols.bus.tls import why_refused
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import OBSERVATION
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.topics import OBSERVATION
 from tests.faults.matrix import measured
 from tests.faults.processes import ROOT, Process, wait_until
 from tests.integration.receiving import collect, sequences

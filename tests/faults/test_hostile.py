@@ -8,13 +8,13 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from protocols.bus.guard import GuardedBus
-from protocols.bus.router import Router, free_endpoint
-from protocols.bus.session import open_session
+from protocols.bus.router.zenoh_router import Router, free_endpoint
+from protocols.bus.security.sender_identity import GuardedBus
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import OBSERVATION
+from protocols.bus.transport.session import open_session
+from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import OBSERVATION
 from tests.faults.fuzz import fuzz_config, fuzz_gate, fuzz_mavlink
 from tests.faults.matrix import measured
 from tests.faults.processes import wait_until

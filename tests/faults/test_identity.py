@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from protocols.bus.guard import GuardedBus
-from protocols.bus.router import Router, free_endpoint
-from protocols.bus.session import open_session
+from protocols.bus.router.zenoh_router import Router, free_endpoint
+from protocols.bus.security.sender_identity import GuardedBus
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import ZenohBus, open_bus
-from protocols.catalogue import OBSERVATION, STATUS
+from protocols.bus.transport.session import open_session
+from protocols.bus.transport.zenoh_bus import ZenohBus, open_bus
+from protocols.topics import OBSERVATION, STATUS
 from tests.faults.matrix import measured
 from tests.faults.processes import Process, wait_until
 from tests.integration.receiving import collect, matched, sequences

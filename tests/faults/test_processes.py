@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from protocols.bus.router import Router, free_endpoint
-from protocols.bus.session import open_session
+from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import OBSERVATION
-from protocols.errors import InputError
+from protocols.bus.transport.session import open_session
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.core.errors import InputError
+from protocols.topics import OBSERVATION
 from tests.faults.matrix import measured
 from tests.faults.processes import Process, publisher, receiver, router, wait_until
 from tests.integration.receiving import collect, matched
@@ -208,7 +208,7 @@ def test_a_panic_in_the_transport_ends_the_agent_with_one_line(tmp_path: Path) -
     config.write_text(f'out = "log.mcap"\n[bus]\nmode = "client"\nconnect = ["{endpoint}"]\n', encoding="utf-8")
     code = (
         "import sys, zenoh.ext\n"
-        "from protocols.bus.zenoh_bus import ZenohPublisher\n"
+        "from protocols.bus.transport.zenoh_bus import ZenohPublisher\n"
         "panic = type('PanicException', (BaseException,), {})\n"
         "class Broken:\n"
         "    def put(self, payload): raise panic('unwrap on None')\n"

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from protocols.bus.router import free_endpoint
-from protocols.log.reader import LogReader
+from protocols.bus.router.zenoh_router import free_endpoint
+from protocols.log.read.reader import LogReader
 from tests.faults.matrix import measured
 from tests.faults.processes import Process, publisher, receiver, router, wait_until
 

@@ -18,9 +18,9 @@ from edge.uav.tracker import State
 from edge.uav.world.patrol import patrol
 from edge.uav.world.world import World
 from edge.uav_agent import TOPICS
-from protocols.errors import InputError
-from protocols.log.reader import LogReader
-from protocols.log.writer import LogWriter
+from protocols.core.errors import InputError
+from protocols.log.read.reader import LogReader
+from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from tests.uav_flights import Flight, mavlink
 

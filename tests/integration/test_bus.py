@@ -9,14 +9,14 @@ from contextlib import ExitStack
 import pytest
 
 from protocols.bus.base import AgentEvent, Bus, BusDead
-from protocols.bus.delivery import cache_size
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.bus.router import Router, free_endpoint
+from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, RIG_INFO, STATUS, Topic
-from protocols.errors import InputError
-from protocols.gate import Rejected
+from protocols.bus.transport.delivery import cache_size
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.core.errors import InputError
+from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, RIG_INFO, STATUS, Topic
+from protocols.validation.codec import Rejected
 from tests.integration.receiving import collect, matched, sequences
 from tests.samples import calibration, camera_info, eventually, observation, rig_info
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hub.calibrate import calibrate
-from protocols.errors import EXIT_REFUSED, Refused
+from protocols.core.errors import EXIT_REFUSED, Refused
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, fit_similarity
 from protocols.geometry.types import Floats

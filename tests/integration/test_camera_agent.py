@@ -20,11 +20,11 @@ from edge.devices.base import DeviceInfo, Frame
 from edge.devices.pacing import AsFastAsPossible
 from edge.devices.simulated import SimulatedDevice
 from protocols.bus.base import BusDead
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.catalogue import CAMERA_INFO, OBSERVATION, STATUS
-from protocols.errors import InputError
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.core.errors import InputError
 from protocols.geometry import so3
 from protocols.session.rig import RigCamera
+from protocols.topics import CAMERA_INFO, OBSERVATION, STATUS
 
 
 class ListedDevice:

@@ -9,10 +9,10 @@ import pytest
 
 from hub.agent import run_hub, status_message
 from hub.live import LiveHub, LiveSettings
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.catalogue import CAMERA_INFO, OBSERVATION, STATUS
-from protocols.clocks import CameraTime
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.core.clocks import CameraTime
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import CAMERA_INFO, OBSERVATION, STATUS
 from tests.integration.test_live_hub import SETTINGS, feed, messages
 from tests.rigs import Path, Session, simulate
 from tests.samples import eventually

@@ -15,12 +15,12 @@ from deploy.cli import run
 from deploy.process_replay import replay_through_hub
 from deploy.replay import replay
 from hub.live import LiveSettings
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, STATUS, TRACK, Topic
-from protocols.clocks import NANOSECONDS
-from protocols.log.reader import LogReader
-from protocols.log.writer import LogWriter
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.core.clocks import NANOSECONDS
+from protocols.log.read.reader import LogReader
+from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, STATUS, TRACK, Topic
 from tests.integration.test_live_hub import messages as session_messages
 from tests.rigs import simulate
 from tests.samples import calibration, camera_info, observation, status, track

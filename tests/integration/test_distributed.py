@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hub.calibrate import calibrate
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry.pose import fit_similarity
 from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations

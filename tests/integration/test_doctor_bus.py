@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 
 from deploy.doctor import agent
-from protocols.bus import probe
-from protocols.bus.router import Router, free_endpoint
-from protocols.bus.session import open_session
+from protocols.bus.router import probe
+from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig, TlsConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import OBSERVATION, STATUS
+from protocols.bus.transport.session import open_session
+from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import OBSERVATION, STATUS
 
 pytest.importorskip("cryptography", reason="the extra `keys` is not installed: access rules are not tested")
 from deploy.keys import issue, make_site

@@ -16,8 +16,8 @@ import pytest
 
 from deploy.cli import run
 from hub.calibrate import calibrate
-from protocols.errors import InputError
-from protocols.files import write_together
+from protocols.core.errors import InputError
+from protocols.core.files import write_together
 from protocols.session.folder import write_observations
 from protocols.session.observations import Observations
 from tests.rigs import Session, simulate

@@ -19,7 +19,7 @@ from hub.lens import LARGEST_STD, first_focals, prior_of
 from hub.timing.alignment import PairFit
 from hub.timing.pair import PairSolution
 from hub.timing.two_view import Uncalibrated, relative_pose
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.session.folder import read_folder, write_observations
 from protocols.session.rig import RigCamera, read_rig
 from tests.films import numbered, write_film

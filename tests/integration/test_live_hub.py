@@ -9,7 +9,7 @@ import pytest
 from google.protobuf.message import Message
 
 from hub.live import LiveHub, LiveSettings
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder
 from tests.rigs import Session, simulate

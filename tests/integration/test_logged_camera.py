@@ -20,11 +20,11 @@ from edge.devices.base import Frame
 from edge.devices.logged import LoggedCamera
 from edge.devices.pacing import AsFastAsPossible
 from edge.pictures import picture_message
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.catalogue import CAMERA_INFO, OBSERVATION, PICTURE
-from protocols.errors import InputError
-from protocols.log.writer import LogWriter
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.core.errors import InputError
+from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import CAMERA_INFO, OBSERVATION, PICTURE
 
 SCENE = scenes.get("marker", 0)
 LENS = SCENE.camera("cam0").intrinsics

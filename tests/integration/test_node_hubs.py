@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from protocols.bus.base import Bus, Publisher, Subscription
-from protocols.bus.router import Router, free_endpoint
+from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, NODE_STATE, OBSERVATION, STATUS
+from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.folder import write_rig
+from protocols.topics import CALIBRATION, CAMERA_INFO, NODE_STATE, OBSERVATION, STATUS
 from tests.bench.pose_worlds import World, cube, observe, section_4
 from tests.node_traffic import CENTRE, Stream, info, name
 from tests.samples import eventually

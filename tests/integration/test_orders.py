@@ -11,11 +11,11 @@ from deploy.config import RecorderConfig
 from deploy.recording_orders import record_as_asked, replace_out
 from hub.agent import run_hub
 from hub.live import LiveHub
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.catalogue import CAMERA_INFO, COMMAND, OBSERVATION, STATUS
-from protocols.log.reader import LogReader
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.core.commands import Orders
+from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
-from protocols.orders import Orders
+from protocols.topics import CAMERA_INFO, COMMAND, OBSERVATION, STATUS
 from tests.samples import camera_info, eventually, observation
 
 

@@ -15,15 +15,15 @@ from deploy.simulated import camera_tables
 from edge import scenes
 from hub.agent import run_hub
 from hub.live import KnownCalibration, LiveHub, LiveSettings
-from protocols.bus.router import Router, free_endpoint
+from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import CAMERA_INFO, OBSERVATION, PREDICTION, TRACK
-from protocols.clocks import NANOSECONDS
-from protocols.log.reader import LogReader
-from protocols.log.writer import LogWriter
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.core.clocks import NANOSECONDS
+from protocols.log.read.reader import LogReader
+from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import read_calibration
+from protocols.topics import CAMERA_INFO, OBSERVATION, PREDICTION, TRACK
 from tests.people_traffic import Traffic, film
 from tests.samples import eventually
 

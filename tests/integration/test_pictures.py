@@ -12,9 +12,9 @@ import pytest
 from edge.camera_agent import CameraAgent
 from edge.devices.base import DeviceInfo, Frame
 from edge.pictures import picture_message
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.catalogue import OBSERVATION, PICTURE
-from protocols.gate import encode
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.topics import OBSERVATION, PICTURE
+from protocols.validation.codec import encode
 from tests.integration.test_camera_agent import Given
 from tests.samples import eventually
 

@@ -13,7 +13,7 @@ import pytest
 from deploy.cli import run
 from edge import scenes
 from edge.detectors.taught import TaughtDetector, teach_at
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from tests.films import film_scene
 
 pytest.importorskip("viser")

@@ -22,15 +22,15 @@ from deploy.info import as_table, describe_log
 from deploy.record import RecorderResult, log_path, run_recorder
 from deploy.replay import replay
 from protocols.bus.base import AgentEvent, Bus, Received
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.bus.router import Router, free_endpoint
+from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import CAMERA_INFO, OBSERVATION, PICTURE, STATUS, TOPICS
-from protocols.errors import InputError
-from protocols.log.reader import Logged, LogReader
-from protocols.log.writer import LogWriter
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.core.errors import InputError
+from protocols.log.read.reader import Logged, LogReader
+from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import CAMERA_INFO, OBSERVATION, PICTURE, STATUS, TOPICS
 from tests.samples import SAMPLES, camera_info, eventually, observation
 
 SECOND = 1_000_000_000
@@ -315,7 +315,7 @@ from deploy.config import RecorderConfig
 from deploy.record import run_recorder
 from deploy.signals import stop_on_signals
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
+from protocols.bus.transport.zenoh_bus import open_bus
 stop = stop_on_signals()
 config = RecorderConfig(out=Path(sys.argv[2]), bus=BusConfig(mode="client", connect=(sys.argv[1],)))
 with open_bus(config.site, config.bus, stop=stop.is_set) as bus:

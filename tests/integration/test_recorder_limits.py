@@ -15,15 +15,15 @@ from deploy.cli import run
 from deploy.commands import agents
 from deploy.config import RecorderConfig
 from deploy.record import free_bytes, run_recorder
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.bus.router import Router, free_endpoint
+from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import OBSERVATION, STATUS
-from protocols.errors import InputError
-from protocols.log.reader import LogReader
-from protocols.log.recover import recover
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.core.errors import InputError
+from protocols.log.read.reader import LogReader
+from protocols.log.read.recovery import recover
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import OBSERVATION, STATUS
 from tests.integration.test_record_replay import RECORDER
 from tests.samples import eventually, observation
 

@@ -11,7 +11,7 @@ import pytest
 
 from deploy.cli import run
 from deploy.reporting import load_answer
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.session.calibration import Calibration
 
 SIZE_LIMIT = 6 * 1024 * 1024

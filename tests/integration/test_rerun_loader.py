@@ -20,11 +20,11 @@ from deploy.rerun_export import write_rrd
 from edge.devices.base import Frame
 from edge.pictures import picture_message
 from hub.view.player import LogRecording
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, PICTURE, TRACK
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
-from protocols.log.writer import LogWriter
+from protocols.log.write.writer import LogWriter
+from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, PICTURE, TRACK
 from tests.samples import calibration, camera_info, observation, track
 
 TIME_NS = 1_700_000_000_000_000_000

@@ -14,7 +14,7 @@ import pytest
 
 from edge.rtp_encoder import RtpEncoder
 from edge.rtsp_server import PATH, RtspServer
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from tests.samples import eventually
 
 av: Any = pytest.importorskip("av", reason="PyAV is not installed: nothing of RTSP is tested")

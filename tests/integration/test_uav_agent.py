@@ -23,8 +23,8 @@ from deploy.config import load
 from deploy.uav_config import FlightConfig, UavConfig
 from edge.mavlink.autopilot import ORIGIN
 from edge.uav.world.world import World
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.catalogue import TOPICS
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.topics import TOPICS
 from tests.samples import eventually
 
 M = mavutil.mavlink

@@ -14,8 +14,8 @@ import pytest
 
 from deploy.cli import run
 from hub.calibrate import calibrate
-from protocols.clocks import TimeMap
-from protocols.errors import Refused
+from protocols.core.clocks import TimeMap
+from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
 from protocols.session.folder import write_observations
 from tests.rigs import Session, simulate

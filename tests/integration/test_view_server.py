@@ -15,10 +15,10 @@ pytest.importorskip("viser")
 
 from deploy.cli import run
 from hub.view.server import ViewServer, run_view
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, COMMAND, OBSERVATION, STATUS, TRACK
-from protocols.errors import InputError
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.core.errors import InputError
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import CALIBRATION, CAMERA_INFO, COMMAND, OBSERVATION, STATUS, TRACK
 from tests.samples import MATRIX, camera_info, eventually, observation, status, track
 
 TOKEN = "a-long-secret-token"

@@ -11,15 +11,15 @@ import time
 import pytest
 import zenoh
 
-from protocols.bus.backfill import Question
 from protocols.bus.base import AgentEvent, Bus, BusDead, BusStopped, Received
-from protocols.bus.inbox import MOST_BYTES, Inbox
-from protocols.bus.router import Router, free_endpoint
+from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import ZenohSubscription, open_bus
-from protocols.catalogue import FLIGHT_IMAGE, OBSERVATION
-from protocols.errors import InputError
+from protocols.bus.transport.backfill import Question
+from protocols.bus.transport.inbox import MOST_BYTES, Inbox
+from protocols.bus.transport.zenoh_bus import ZenohSubscription, open_bus
+from protocols.core.errors import InputError
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import FLIGHT_IMAGE, OBSERVATION
 from tests.integration.receiving import collect, matched, sequences
 from tests.samples import eventually, observation
 
@@ -192,7 +192,7 @@ def test_an_outage_of_the_router_loses_nothing() -> None:
 AGENT = """
 import sys, time
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
+from protocols.bus.transport.zenoh_bus import open_bus
 with open_bus("local", BusConfig(mode="client", connect=(sys.argv[1],)), timeout_s=10.0) as bus:
     with bus.announce("camera", "cam0", "boot-1"):
         print("ready", flush=True)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hub.timing.paper import alternate, corresponding, overall_lag, search_start
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry.camera import Intrinsics
 from protocols.session.observations import Observations, Track
 from protocols.session.rig import Rig, RigCamera

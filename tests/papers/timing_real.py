@@ -27,7 +27,7 @@ from hub.timing.pair import solve_pair
 from hub.timing.paper import PaperResult, Turn, alternate, corresponding, point_lags
 from hub.timing.tracks import SmoothTrack, smooth_track
 from hub.timing.two_view import fundamental_from, relative_pose
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations, Track, read_observations

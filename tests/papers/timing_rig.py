@@ -15,7 +15,7 @@ import numpy as np
 
 from hub.timing.fundamental import epipolar_lines, line_distances, maximum_likelihood
 from hub.timing.paper import alternate
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 

@@ -11,10 +11,10 @@ from typing import Any
 
 from google.protobuf.json_format import MessageToDict
 
-from protocols.catalogue import NODE_STATE, TOPICS
-from protocols.gate import SCHEMA_VERSION
-from protocols.log.reader import LogReader
-from protocols.log.writer import LogWriter
+from protocols.log.read.reader import LogReader
+from protocols.log.write.writer import LogWriter
+from protocols.topics import NODE_STATE, TOPICS
+from protocols.validation.codec import SCHEMA_VERSION
 from tests.samples import SAMPLES
 
 LOGS = Path(__file__).parent / "logs"

@@ -23,10 +23,10 @@ from edge.uav.world.patrol import patrol
 from edge.uav.world.world import World
 from edge.uav_agent import TOPICS
 from hub.live import LiveSettings
-from protocols.catalogue import CAMERA_INFO, OBSERVATION, TARGET, TRACK, Topic
-from protocols.clocks import NANOSECONDS
-from protocols.log.reader import LogReader
-from protocols.log.writer import LogWriter
+from protocols.core.clocks import NANOSECONDS
+from protocols.log.read.reader import LogReader
+from protocols.log.write.writer import LogWriter
+from protocols.topics import CAMERA_INFO, OBSERVATION, TARGET, TRACK, Topic
 from tests.people_traffic import film
 from tests.uav_flights import Flight
 

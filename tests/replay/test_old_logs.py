@@ -8,13 +8,14 @@ from pathlib import Path
 import pytest
 
 from deploy.cli import run
-from protocols.catalogue import TRACK, Topic
-from protocols.errors import InputError
-from protocols.gate import SCHEMA_VERSION
-from protocols.log import migration, writer
-from protocols.log.reader import LogReader
-from protocols.log.writer import LogWriter
+from protocols.core.errors import InputError
+from protocols.log.read import migration
+from protocols.log.read.reader import LogReader
+from protocols.log.write import writer
+from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import TRACK, Topic
+from protocols.validation.codec import SCHEMA_VERSION
 from tests.replay.keep_log import LOGS, content
 from tests.samples import track
 

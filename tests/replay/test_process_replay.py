@@ -15,13 +15,13 @@ from rich.console import Console
 
 from deploy.compare import as_table, compare_logs
 from deploy.demo_people import score_log
-from protocols.catalogue import CALIBRATION, TARGET, TRACK
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
-from protocols.log.reader import LogReader
-from protocols.log.writer import LogWriter
+from protocols.log.read.reader import LogReader
+from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import read_calibration
+from protocols.topics import CALIBRATION, TARGET, TRACK
 from tests.replay import scenes
 
 # What other processors' arithmetic may change: of one machine's BLAS kernels against another's it was 4e-14.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from protocols.bus.backfill import AGAIN_S, GAP_PATIENCE_S, PATIENCE_S, Backfill, Question
+from protocols.bus.transport.backfill import AGAIN_S, GAP_PATIENCE_S, PATIENCE_S, Backfill, Question
 
 
 class Stage:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from hub.prepare import prepare
-from protocols.errors import InputError
-from protocols.geometry.ball import outline_to_centre
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
+from protocols.geometry.sphere_projection import outline_to_centre
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations
 from protocols.session.rig import read_rig

@@ -19,7 +19,7 @@ from edge.detectors.marker import MarkerDetector
 from edge.detectors.tag import TagDetector
 from edge.devices.base import Frame
 from edge.picture_watch import PictureWatch
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 BOARDS = sorted((Path(deploy.__file__).parent / "boards").glob("*.toml"))
 DRIVERS = {

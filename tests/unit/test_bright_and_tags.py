@@ -9,7 +9,7 @@ import pytest
 from edge.detectors.base import Detection
 from edge.detectors.bright import BrightDetector, BrightModel
 from edge.detectors.tag import TagDetector, TagModel
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 from tests.rendered_markers import add_look_alikes, add_spot, add_tag, dim_room, exposed, tag_image
 

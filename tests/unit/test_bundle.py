@@ -9,7 +9,7 @@ import pytest
 
 from deploy.bundle import BUDGET_MB, NEEDS, Target, _lock, _requirements, _script
 from deploy.cli import run
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 
 @pytest.mark.parametrize("role", sorted(NEEDS))

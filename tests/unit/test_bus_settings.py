@@ -10,11 +10,11 @@ import pytest
 
 from deploy.config import HubConfig, load
 from deploy.supervised import checked
-from protocols.bus.delivery import cache_size
-from protocols.bus.session import LEASE_MS, MAX_MESSAGE_SIZE, _settings
 from protocols.bus.settings import BusConfig, TlsConfig, is_loopback, open_to_others
-from protocols.catalogue import OBSERVATION, STATUS
-from protocols.errors import InputError
+from protocols.bus.transport.delivery import cache_size
+from protocols.bus.transport.session import LEASE_MS, MAX_MESSAGE_SIZE, _settings
+from protocols.core.errors import InputError
+from protocols.topics import OBSERVATION, STATUS
 
 
 def opened_with(config: BusConfig, key: str) -> Any:

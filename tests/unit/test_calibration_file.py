@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from protocols.clocks import TimeMap
-from protocols.errors import EXIT_INPUT, InputError
+from protocols.core.clocks import TimeMap
+from protocols.core.errors import EXIT_INPUT, InputError
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose

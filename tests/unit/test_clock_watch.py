@@ -9,7 +9,7 @@ import pytest
 
 from hub.clock_epochs import ClockEpochs
 from hub.timing.clock_watch import ClockEvent, ClockWatch
-from protocols.clocks import TimeMap
+from protocols.core.clocks import TimeMap
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, CameraCalibration
 from tests.rigs import random_lens, random_poses

@@ -9,7 +9,7 @@ import pytest
 
 from deploy.config import BusConfig, CameraConfig, HubConfig, RecorderConfig, effective_toml, load
 from protocols.bus.settings import LOOPBACK_ROUTER, is_loopback
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 
 def write(folder: Path, text: str) -> Path:

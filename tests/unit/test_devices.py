@@ -19,7 +19,7 @@ from edge.devices.simulated import SimulatedDevice
 from edge.devices.video import open_video
 from edge.scenes.base import Renderer
 from edge.scenes.marker import MarkerScene
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 
 class Blank(Renderer):

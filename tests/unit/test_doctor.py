@@ -20,7 +20,7 @@ from deploy.doctor.finding import Finding, exit_status, missing, ok, warn, wrong
 from edge.clock_quality import kernel_clock
 from edge.devices.base import DeviceInfo, Frame
 from protocols.bus.settings import BusConfig
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 ONE_LINE = 400
 

@@ -11,7 +11,7 @@ import pytest
 
 from edge.devices import film as film_module
 from edge.devices.film import Film
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from tests.films import number_in, numbered, write_film
 
 TIMES = np.cumsum(np.r_[0.0, np.random.default_rng(5).uniform(0.01, 0.08, 39)])

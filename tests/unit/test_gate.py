@@ -12,7 +12,8 @@ from google.protobuf.message import Message
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocols.catalogue import (
+from protocols.messages import syncline_pb2 as pb
+from protocols.topics import (
     CALIBRATION,
     CAMERA_INFO,
     FLIGHT_IMAGE,
@@ -28,8 +29,7 @@ from protocols.catalogue import (
     TRACK,
     Topic,
 )
-from protocols.gate import MAX_PAYLOAD, Reason, Rejected, admit, decode, encode, parse_key
-from protocols.messages import syncline_pb2 as pb
+from protocols.validation.codec import MAX_PAYLOAD, Reason, Rejected, admit, decode, encode, parse_key
 from tests.samples import SAMPLES, camera_info, observation, status
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hub.poses.gauge import fix_gauge
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, Similarity
 from protocols.geometry.types import Floats

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from protocols.bus.base import AgentEvent, Received
-from protocols.bus.guard import SILENT_S, Guard
-from protocols.catalogue import OBSERVATION
-from protocols.gate import Reason
+from protocols.bus.security.sender_identity import SILENT_S, Guard
+from protocols.topics import OBSERVATION
+from protocols.validation.codec import Reason
 from tests.samples import observation
 
 

@@ -12,8 +12,8 @@ import pytest
 from deploy.config import HealthConfig
 from deploy.health import LIVE_S, Health, HealthServer
 from protocols.bus.base import Refusal
-from protocols.gate import Reason
 from protocols.messages import syncline_pb2 as pb
+from protocols.validation.codec import Reason
 
 
 class Agent:

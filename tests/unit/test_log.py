@@ -14,13 +14,13 @@ from google.protobuf.message import Message
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from protocols.catalogue import CALIBRATION, OBSERVATION, STATUS, TOPICS, Topic
-from protocols.errors import InputError
-from protocols.gate import encode
-from protocols.log import writer as writer_module
-from protocols.log.frames import Damage, frames, open_log
-from protocols.log.reader import Logged, LogReader
-from protocols.log.writer import CHUNK_SIZE, LogWriter
+from protocols.core.errors import InputError
+from protocols.log.read.frames import Damage, frames, open_log
+from protocols.log.read.reader import Logged, LogReader
+from protocols.log.write import writer as writer_module
+from protocols.log.write.writer import CHUNK_SIZE, LogWriter
+from protocols.topics import CALIBRATION, OBSERVATION, STATUS, TOPICS, Topic
+from protocols.validation.codec import encode
 from tests.samples import SAMPLES, observation, status
 
 SECOND = 1_000_000_000

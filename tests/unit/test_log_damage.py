@@ -9,13 +9,13 @@ import pytest
 from mcap.reader import make_reader
 
 from deploy.cli import run
-from protocols.catalogue import OBSERVATION
-from protocols.errors import InputError, Refused
-from protocols.log import recover as recover_module
-from protocols.log.frames import Damage, Frame, frames, open_log
-from protocols.log.reader import Logged, LogReader
-from protocols.log.recover import recover
-from protocols.log.writer import LogWriter
+from protocols.core.errors import InputError, Refused
+from protocols.log.read import recovery as recover_module
+from protocols.log.read.frames import Damage, Frame, frames, open_log
+from protocols.log.read.reader import Logged, LogReader
+from protocols.log.read.recovery import recover
+from protocols.log.write.writer import LogWriter
+from protocols.topics import OBSERVATION
 from tests.samples import observation
 
 CHUNK, MESSAGE_INDEX, METADATA = 0x06, 0x07, 0x0C

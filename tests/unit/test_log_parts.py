@@ -8,13 +8,13 @@ import pytest
 
 from deploy.cli import run
 from deploy.sessions import load_session
-from protocols.catalogue import CAMERA_INFO, OBSERVATION
-from protocols.errors import InputError
-from protocols.log.parts import find_parts
-from protocols.log.reader import Logged, LogReader
-from protocols.log.recover import recover
-from protocols.log.rotation import RotatingWriter
-from protocols.log.writer import LogWriter
+from protocols.core.errors import InputError
+from protocols.log.read.parts import find_parts
+from protocols.log.read.reader import Logged, LogReader
+from protocols.log.read.recovery import recover
+from protocols.log.write.rotation import RotatingWriter
+from protocols.log.write.writer import LogWriter
+from protocols.topics import CAMERA_INFO, OBSERVATION
 from tests.samples import camera_info, observation
 
 SECOND = 1_000_000_000

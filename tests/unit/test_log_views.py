@@ -14,7 +14,15 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.reader import make_reader
 
 from deploy.info import describe_log
-from protocols.catalogue import (
+from protocols.geometry import so3
+from protocols.geometry.pose import Pose
+from protocols.log.read.reader import LogReader
+from protocols.log.schemas import VIEW_KINDS, schema_of
+from protocols.log.write.foxglove import quaternion
+from protocols.log.write.thumbnails import jpeg_size
+from protocols.log.write.writer import LogWriter
+from protocols.messages import syncline_pb2 as pb
+from protocols.topics import (
     CALIBRATION,
     CAMERA_INFO,
     FLIGHT_IMAGE,
@@ -25,14 +33,6 @@ from protocols.catalogue import (
     TRACK,
     UAV_INFO,
 )
-from protocols.geometry import so3
-from protocols.geometry.pose import Pose
-from protocols.log.reader import LogReader
-from protocols.log.schemas import VIEW_KINDS, schema_of
-from protocols.log.small_pictures import jpeg_size
-from protocols.log.views import quaternion
-from protocols.log.writer import LogWriter
-from protocols.messages import syncline_pb2 as pb
 from tests.samples import SAMPLES, calibration, camera_info, observation, picture, rig_info, track
 
 mcap_protobuf = pytest.importorskip("mcap_protobuf.decoder")

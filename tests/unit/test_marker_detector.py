@@ -12,7 +12,7 @@ from edge import scenes
 from edge.detectors.colour import ColourModel, codes
 from edge.detectors.marker import MarkerDetector, MarkerModel, teach
 from edge.scenes.marker import MarkerScene
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from tests.bench.marker_detector import Result, measure
 

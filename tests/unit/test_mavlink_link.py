@@ -16,7 +16,7 @@ from edge.mavlink.framing import Framer
 from edge.mavlink.link import Heard, Link
 from edge.mavlink.signing import EPOCH_UNIX_S, TICKS, Signing, read_key, ticks
 from edge.mavlink.transport import Pipe, parse
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 KEY = bytes(range(32))
 UNIX_S = 1_700_000_000.0

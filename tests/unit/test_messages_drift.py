@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorProto
 
-from protocols.catalogue import TOPICS
-from protocols.gate import message_class
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import TOPICS
+from protocols.validation.codec import message_class
 from tests.generate_messages import MESSAGES, generate
 
 

@@ -16,7 +16,7 @@ import pytest
 from edge.devices.base import Frame
 from edge.devices.live import LiveCamera
 from edge.devices.network import NetworkCamera, StreamClock, open_network
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from tests.rtsp_camera import RtspCamera
 
 pytest.importorskip("av", reason="the extra `video` is not installed: network streams are not tested")

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from edge.devices.oak import OakCamera, OakSettings, Stream, open_stream
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 dai = pytest.importorskip("depthai", reason="the extra `oak` is not installed: the OAK driver is not tested")
 

@@ -17,9 +17,9 @@ from edge.camera_agent import run_camera_agent
 from edge.devices.base import Frame
 from edge.devices.oak import OakCamera, OakSettings, Stream, open_archive, open_stream
 from edge.devices.oak_network import Box, Naming, boxes
-from protocols.bus.memory import MemoryBus, MemoryHub
-from protocols.catalogue import OBSERVATION
-from protocols.errors import InputError
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.core.errors import InputError
+from protocols.topics import OBSERVATION
 
 dai = pytest.importorskip("depthai", reason="the extra `oak` is not installed: the OAK driver is not tested")
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from protocols.errors import EXIT_INPUT, InputError
+from protocols.core.errors import EXIT_INPUT, InputError
 from protocols.session.observations import DEFAULT_LABEL, Observations, read_observations
 
 HEAD = "camera,frame,time,u,v\n"

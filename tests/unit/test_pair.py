@@ -8,7 +8,7 @@ import pytest
 from hub.calibrate import calibrate
 from hub.timing.pair import PairSolution, solve_pair
 from hub.timing.tracks import SmoothTrack, smooth_track
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry import so3
 from tests.bench.honesty import regular
 from tests.rigs import Path, Session, random_path, simulate

@@ -8,7 +8,7 @@ import pytest
 from edge import scenes
 from edge.scenes.people_rendering import PeopleRenderer
 from edge.scenes.people_session import film_people, seen
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 
 def test_the_same_seed_gives_the_same_world_and_another_gives_another() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hub.calibrate import calibrate
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.session.calibration import Calibration, read_calibration, write_calibration
 from protocols.session.rig import RigCamera, read_rig
 from tests import rigs

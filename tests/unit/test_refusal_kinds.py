@@ -15,7 +15,7 @@ from hub.timing.alignment import PairSettings
 from hub.timing.pair import _Search, solve_pair
 from hub.timing.tracks import SmoothTrack, smooth_track
 from hub.triangulate import triangulate
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from tests import rigs
 from tests.unit.test_refusals import TOLD, VERDICTS
 

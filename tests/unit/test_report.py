@@ -14,7 +14,7 @@ from hub.report.convergence import adjustment
 from hub.report.remedies import remedy_for
 from hub.report.svg import number, short, ticks
 from hub.report.verdict import judge, judge_refusal
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.session.calibration import AdjustmentStep, Calibration
 from protocols.session.observations import Observations
 from tests.unit.solved_session import REFUSED, solved_session

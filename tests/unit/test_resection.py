@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from protocols.clocks import TimeMap
+from protocols.core.clocks import TimeMap
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.session.calibration import calibration_tables
 from protocols.session.result import refusal_document, result_document, result_text, write_result
 from tests.unit.solved_session import solved_session

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocols.errors import EXIT_INPUT, InputError
+from protocols.core.errors import EXIT_INPUT, InputError
 from protocols.geometry import so3
 from protocols.session.rig import Rig, read_rig
 

@@ -14,7 +14,7 @@ from deploy.fleet import read_state
 from deploy.rig_folder import SHIPPED, find_rig, prepare, read_rig_folder
 from edge import scenes
 from edge.scenes.scaled import scaled, scaled_lens
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.session.rig import read_rig
 
 RIGS = sorted(path.name for path in SHIPPED.iterdir() if path.is_dir())

@@ -13,8 +13,8 @@ from edge import scenes
 from edge.scenes import rendering
 from edge.scenes.base import SimulatedClock
 from edge.scenes.session import simulated_session
-from protocols.clocks import CameraTime
-from protocols.errors import InputError
+from protocols.core.clocks import CameraTime
+from protocols.core.errors import InputError
 
 NAMES = scenes.NAMES
 

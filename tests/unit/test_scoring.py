@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from protocols.clocks import TimeMap
+from protocols.core.clocks import TimeMap
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, Similarity
 from protocols.geometry.types import Floats

@@ -15,7 +15,7 @@ from hub.tracking.live import LiveTracking
 from hub.tracking.step import World, step
 from hub.tracking.tracker import Tracker
 from hub.tracking.upright import UpFinder
-from protocols.clocks import NANOSECONDS, TimeMap
+from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose, Similarity

@@ -12,7 +12,7 @@ from hub.tracking.measure import doubt, heavy
 from hub.tracking.step import World, step
 from hub.tracking.targets import State, Targets
 from hub.tracking.tracker import Tracker
-from protocols.clocks import NANOSECONDS, TimeMap
+from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb

@@ -15,7 +15,7 @@ from hub.tracking.kalman import SIZE
 from hub.tracking.step import World
 from hub.tracking.targets import Targets
 from hub.tracking.tracker import Tracker
-from protocols.clocks import NANOSECONDS, TimeMap
+from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb

@@ -9,7 +9,7 @@ from google.protobuf.message import Message
 
 from edge import scenes
 from hub.tracking.live import LiveTracking
-from protocols.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration
 from tests.people_traffic import film

@@ -12,7 +12,7 @@ import pytest
 from edge.uav.models import get
 from edge.uav.tracker import Box, Estimate, State, Telemetry
 from edge.uav.world import scenarios
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 

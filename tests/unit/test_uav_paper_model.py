@@ -16,7 +16,7 @@ from edge.uav.paper.car import moved_car
 from edge.uav.paper.road_filter import RoadFilter, aligned, support
 from edge.uav.paper.white_lines import Edges, sections
 from edge.uav.tracker import Box, Image, State, Tracker
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 
 SIZE = (640, 480)

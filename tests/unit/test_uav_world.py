@@ -10,7 +10,7 @@ import pytest
 
 from edge.uav.world import cars, scenarios
 from edge.uav.world.world import World
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 

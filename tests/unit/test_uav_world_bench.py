@@ -17,7 +17,7 @@ from deploy.cli import run
 from edge.uav.tracker import Box, Estimate, Hypothesis, Image, State, Telemetry
 from edge.uav.world import scenarios
 from edge.uav.world.world import Truth, World
-from protocols.errors import EXIT_DONE
+from protocols.core.errors import EXIT_DONE
 from protocols.geometry.types import Floats
 from protocols.session.rig import read_rig
 from tests.bench import real_rigs, uav_aerial

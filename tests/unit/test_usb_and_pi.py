@@ -13,7 +13,7 @@ from edge.devices.base import Frame
 from edge.devices.live import LiveCamera
 from edge.devices.picamera import PiCamera, PiSettings
 from edge.devices.usb import UsbCamera, UsbSettings, V4l2Stream, open_usb
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 raw = pytest.importorskip("linuxpy.video.raw", reason="the extra `v4l2` is not installed: V4L2 is not tested")
 video = pytest.importorskip("linuxpy.video.device")

@@ -13,9 +13,9 @@ from hub.view.flights import FlightView
 from hub.view.player import LogRecording, Player
 from hub.view.scene import decoded
 from hub.view.state import ViewState
-from protocols.catalogue import FLIGHT_IMAGE, TARGET, UAV_INFO
-from protocols.log.writer import LogWriter
+from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import FLIGHT_IMAGE, TARGET, UAV_INFO
 from tests.samples import flight_image, observation, picture, road_map, target_cloud, target_state, uav_info
 
 SECOND = 1_000_000_000

@@ -16,12 +16,12 @@ from hub.view.player import CalibrationRecording, LogRecording, Player
 from hub.view.scene import standpoint
 from hub.view.server import answer_to, commands_for
 from hub.view.state import SILENT_S, ViewState
-from protocols.catalogue import CALIBRATION, CAMERA_INFO, OBSERVATION, TRACK
-from protocols.errors import InputError
-from protocols.gate import encode
-from protocols.log.writer import LogWriter
+from protocols.core.errors import InputError
+from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import read_calibration
+from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, TRACK
+from protocols.validation.codec import encode
 from tests.samples import calibration, camera_info, observation, picture, status, track
 
 SECOND = 1_000_000_000

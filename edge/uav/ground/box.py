@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from edge.uav.tracker import Box, Image
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 _SMALLEST_BOX = 4.0  # px
 _LEAST_INSIDE = 0.3  # share of the box

@@ -11,7 +11,7 @@ from edge.uav.ground.history import MotionFit
 from edge.uav.ground.light import Shade
 from edge.uav.ground.placing import Placing
 from edge.uav.tracker import Box
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 
 Picture = npt.NDArray[np.uint8]

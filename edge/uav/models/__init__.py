@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from edge.uav.tracker import Tracker
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 

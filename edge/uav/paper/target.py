@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.uav.tracker import Box, Image
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 
 _SMALLEST = 4.0  # px: below this a box holds too few pixels for a histogram
 _SEEN = 0.25  # of the box that has to lie in the image

@@ -16,7 +16,7 @@ from edge.uav.world.roads import LANE, STEP, Bend, Curve, Road, curve, drive, st
 from edge.uav.world.stage import view
 from edge.uav.world.town import build
 from edge.uav.world.world import World
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 
 NAME = "patrol"

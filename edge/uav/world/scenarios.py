@@ -18,7 +18,7 @@ from edge.uav.world.roads import LANE, Road
 from edge.uav.world.stage import Script, Stage, view
 from edge.uav.world.town import build
 from edge.uav.world.world import World, camera_poses
-from protocols.errors import InputError
+from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 
 _FIRST_LOOK = 33  # frames at the beginning in which no house or tree hides the target

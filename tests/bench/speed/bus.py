@@ -18,13 +18,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from protocols.bus.guard import GuardedBus
-from protocols.bus.router import free_endpoint
+from protocols.bus.router.zenoh_router import free_endpoint
+from protocols.bus.security.sender_identity import GuardedBus
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import OBSERVATION
-from protocols.gate import encode
+from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.messages import syncline_pb2 as pb
+from protocols.topics import OBSERVATION
+from protocols.validation.codec import encode
 from tests.bench.logs import KEY, messages
 from tests.bench.real_rigs import REPOSITORY
 from tests.bench.speed.rows import Limit, Row, Section

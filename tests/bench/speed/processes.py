@@ -10,10 +10,10 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
-from protocols.bus.router import Router, free_endpoint
+from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
-from protocols.bus.zenoh_bus import open_bus
-from protocols.catalogue import OBSERVATION, STATUS
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.topics import OBSERVATION, STATUS
 from tests.bench.load import resident_mb
 from tests.bench.real_rigs import REPOSITORY
 from tests.bench.speed.rows import Limit, Row, Section

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from protocols.catalogue import FLIGHT_IMAGE, OBSERVATION, Topic
-from protocols.gate import encode
 from protocols.log.schemas import schema_of
-from protocols.log.writer import LogWriter
+from protocols.log.write.writer import LogWriter
+from protocols.topics import FLIGHT_IMAGE, OBSERVATION, Topic
+from protocols.validation.codec import encode
 from tests.bench.logs import KEY, messages, pictures, raw_writer
 from tests.bench.speed.rows import Limit, Row, Section, interleaved
 

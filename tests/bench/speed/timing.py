@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from hub.timing.paper import alternate
 from hub.timing.two_view import RelativePose, decompose, homogeneous, sampson
-from protocols.errors import Refused
+from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
 from tests.bench import pair_timing
 from tests.bench.pair_trials import FOCAL, MATRIX, Regime, Trial, make, map_error

@@ -1,0 +1,155 @@
+"""A Zenoh router inside this process, so that a demo or a rig needs no other program."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import NoReturn, Self
+
+import msgspec
+
+from protocols.bus.router.canary import DEAD_AFTER_S, Canary
+from protocols.bus.settings import LOOPBACK_ROUTER, BusConfig, parts_of
+from protocols.bus.transport.session import close_session, open_session, zenoh_call
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.core.version import VERSION
+from protocols.messages import syncline_pb2 as pb
+from protocols.topics import STATUS
+from protocols.validation.codec import SCHEMA_VERSION
+
+ROLE = "router"
+_TICK_S = 0.1
+_STATUS_S = 1.0
+
+
+class RulesChanged(Exception):
+    """The router's access rules are new: it must be opened again to know them."""
+
+
+class Router:
+    """Relays between the clients that connect to it while the context is open.
+
+    listen: endpoints; more routers to join in connect. config: everything instead, also certificates and access
+    rules. Raises InputError if an address is taken.
+    """
+
+    def __init__(self, *listen: str, connect: tuple[str, ...] = (), config: BusConfig | None = None) -> None:
+        config = config or BusConfig(mode="router", listen=listen or (LOOPBACK_ROUTER,), connect=connect)
+        self.listen = config.endpoints()[1]
+        self._session = open_session(config)
+
+    def sessions(self) -> int:
+        """How many others are connected."""
+        with zenoh_call("info"):
+            return len(self._session.info.transports())
+
+    def close(self) -> None:
+        """Stop relaying."""
+        close_session(self._session)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def run_router(
+    config: BusConfig,
+    site: str,
+    agent: str,
+    stop: threading.Event,
+    *,
+    died: Callable[[str], NoReturn],
+    restarts: int = 0,
+    ready: Callable[[tuple[str, ...]], None] = lambda listen: None,
+    beat: Callable[[], None] = lambda: None,
+    seen: Callable[[pb.AgentStatus], None] = lambda status: None,
+) -> None:
+    """Relay until ``stop`` is set, with a canary through the router itself, and publish its status.
+
+    restarts: how often this router had to be started anew, for its status. ready: called with the endpoints once
+    messages pass; beat: in every round from then on; seen: with
+    every status. died: called when nothing has passed for 0.9 s although the process lives; it must replace the
+    process and not return, because closing a router in that state may hang. Raises RulesChanged: open it again.
+    """
+    boot = uuid.uuid4().hex
+    config = msgspec.structs.replace(config, listen=tuple(map(_with_port, config.endpoints()[1])))
+    router = Router(config=config)
+    inside = BusConfig(mode="client", connect=(own_endpoint(router.listen),), tls=config.tls)
+    written = _changed(config.access)
+    canary = Canary(inside, f"syncline/{site}/canary/{agent}")
+    with open_bus(site, inside, timeout_s=5.0) as bus, bus.announce(ROLE, agent, boot):
+        publisher = bus.publisher(STATUS, agent)
+        told, next_status = False, 0.0
+        while not stop.wait(_TICK_S):
+            silent = canary.silent_s()
+            if silent > DEAD_AFTER_S:
+                died(f"nothing has passed through this router for {silent:.1f} s, although it is alive")
+            if canary.heard and not told:
+                told = True
+                ready(router.listen)
+            if told:
+                beat()
+            if _changed(config.access) != written:
+                break
+            now = time.monotonic()
+            if now >= next_status:
+                next_status = now + _STATUS_S
+                status = pb.AgentStatus(
+                    schema_version=SCHEMA_VERSION,
+                    agent=agent,
+                    role=ROLE,
+                    boot_id=boot,
+                    state="running" if told else "starting",
+                    message=f"relays, {canary.delay_s * 1e3:.1f} ms",
+                    counters={"restarts": restarts, "canary": canary.heard},
+                    gauges={"canary_s": canary.delay_s, "sessions": router.sessions()},
+                    version=VERSION,
+                )
+                publisher.put(status)
+                seen(status)
+        publisher.close()
+    canary.close()
+    router.close()
+    if not stop.is_set():
+        raise RulesChanged
+
+
+def _changed(file: Path | None) -> int:
+    try:
+        return 0 if file is None else file.stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+def _with_port(endpoint: str) -> str:
+    """The endpoint with a free port for port 0: the canary must know where to go."""
+    _, host, port = parts_of(endpoint)
+    if port:
+        return endpoint
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+        probe.bind((host, 0))
+        return f"{endpoint.removesuffix(':0')}:{probe.getsockname()[1]}"
+
+
+def own_endpoint(listen: tuple[str, ...]) -> str:
+    """How this machine itself reaches a router that listens there."""
+    protocol, host, port = parts_of(listen[0])
+    if host in ("0.0.0.0", "::"):
+        host = "127.0.0.1"
+    return f"{protocol}/[{host}]:{port}" if ":" in host else f"{protocol}/{host}:{port}"
+
+
+def free_endpoint() -> str:
+    """A loopback endpoint that nobody listens on at this moment, for demos and tests."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

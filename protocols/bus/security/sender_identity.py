@@ -1,0 +1,254 @@
+"""Who is believed: one agent an id, one connection a run; refusals are counted by reason and source.
+
+Two processes with one id interleave without a word, and whoever knows a camera's key can speak on it. Without
+certificates nothing stops them at the router, so every receiver keeps these rules:
+
+* of two agents of one role and id the one that was there first is heard, until it is gone;
+* while an agent is alive, only its own runs (boot ids) are heard under its id;
+* a run speaks through the connection on which it was first heard, until that has been silent for a while.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Self
+
+from google.protobuf.message import Message
+
+from protocols.bus.base import AgentEvent, AgentWatch, Bus, Publisher, Received, Refusal, Subscription
+from protocols.messages import syncline_pb2 as pb
+from protocols.topics import STATUS, Topic
+from protocols.validation.rules import MAX_NUMBERS, Reason
+
+SILENT_S = 10.0
+"""After this another connection may speak for a run: a log that is replayed twice has the same boot ids."""
+_SOURCES = 4096
+_TOLD_SOURCES = 48
+_NAME = 64
+
+
+@dataclass(slots=True)
+class _Agent:
+    """One (role, id): boots alive, in the order of arrival, and every boot that was ever the first."""
+
+    alive: list[str] = field(default_factory=list)
+    heard: set[str] = field(default_factory=set)
+
+
+class Guard:
+    """The rules, without a bus. Roles of pose nodes and the like do not publish under an id of their own."""
+
+    def __init__(self) -> None:
+        self._agents: dict[tuple[str, str], _Agent] = {}
+        self._sources: dict[str, tuple[str, float]] = {}
+
+    def handle(self, event: AgentEvent) -> None:
+        """An agent came or went."""
+        agent = self._agents.setdefault((event.role, event.agent), _Agent())
+        if event.alive and event.boot_id not in agent.alive:
+            agent.alive.append(event.boot_id)
+        elif not event.alive and event.boot_id in agent.alive:
+            agent.alive.remove(event.boot_id)
+        if agent.alive:
+            agent.heard.add(agent.alive[0])
+
+    def refuse(self, received: Received, now: float) -> tuple[Reason, str] | None:
+        """Why a message is not believed; None if it is. now: any monotonic clock [s]."""
+        boot: str = getattr(received.message, "boot_id", "")
+        if not boot:
+            return None
+        agent = self._agents.get((_role(received), received.agent))
+        if agent is not None and agent.alive and boot not in agent.heard:
+            if boot in agent.alive:
+                return Reason.SECOND_AGENT, f"boot {boot[:12]} beside {agent.alive[0][:12]}"
+            return Reason.WRONG_SOURCE, f"boot {boot[:12]} is not that of the agent that is alive"
+        if not received.source:
+            return None
+        known = self._sources.get(boot)
+        if known is not None and known[0] != received.source and now - known[1] < SILENT_S:
+            return Reason.WRONG_SOURCE, f"boot {boot[:12]} speaks from {known[0]}, not from {received.source}"
+        if known is None and len(self._sources) >= _SOURCES:
+            self._sources = {b: s for b, s in self._sources.items() if now - s[1] < SILENT_S}
+        if known is not None or len(self._sources) < _SOURCES:
+            self._sources[boot] = (received.source, now)
+        return None
+
+    def alarms(self) -> list[str]:
+        """What an operator must see to: ids that are there twice."""
+        return [
+            f"{role} {name} runs {len(agent.alive)} times; only the first is heard"
+            for (role, name), agent in sorted(self._agents.items())
+            if len(agent.alive) > 1
+        ]
+
+
+def _role(received: Received) -> str:
+    if isinstance(received.message, pb.AgentStatus):
+        return received.message.role
+    return received.topic.key.partition("/")[0]
+
+
+class GuardedSubscription:
+    """See ``protocols.bus.base.Subscription``; what the guard refuses is counted like what the gate refuses."""
+
+    def __init__(self, bus: GuardedBus, inner: Subscription) -> None:
+        self._bus, self._inner = bus, inner
+        self._refused: Counter[str] = Counter()
+
+    def drain(self) -> list[Received]:
+        """Everything since the last call that is believed."""
+        self._bus.look()
+        believed = []
+        for received in self._inner.drain():
+            why = self._bus.guard.refuse(received, self._bus.now())
+            if why is None:
+                believed.append(received)
+                continue
+            reason, detail = why
+            self._refused[f"rejected.{reason.value}"] += 1
+            sequence = getattr(received.message, "sequence", None)
+            self._bus.note(Refusal(reason.value, received.agent, received.topic.name, detail, sequence))
+        for refusal in self._inner.refusals():
+            self._bus.note(refusal)
+        return believed
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for something to drain."""
+        return self._inner.wait(timeout_s)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """See the contract."""
+        counts = Counter(self._inner.counters)
+        counts.update(self._refused)
+        counts["received"] -= sum(self._refused.values())
+        return counts
+
+    def refusals(self) -> list[Refusal]:
+        """None: the bus has been told of them."""
+        return []
+
+    def close(self) -> None:
+        """Stop receiving."""
+        self._inner.close()
+
+
+class _StatusPublisher:
+    """Completes an agent's status with what its agent does not know, and shows it to ``seen``."""
+
+    def __init__(self, bus: GuardedBus, inner: Publisher) -> None:
+        self._bus, self._inner = bus, inner
+
+    def put(self, message: Message) -> None:
+        """Publish the status."""
+        if isinstance(message, pb.AgentStatus):
+            message = self._bus.completed(message)
+        self._inner.put(message)
+
+    def wait_matched(self, timeout_s: float) -> bool:
+        """Wait until somebody subscribes."""
+        return self._inner.wait_matched(timeout_s)
+
+    def close(self) -> None:
+        """Stop publishing."""
+        self._inner.close()
+
+
+class GuardedBus:
+    """A bus whose subscriptions believe only whom the guard believes. See ``protocols.bus.base.Bus``.
+
+    now: a monotonic clock [s]. seen: told of every status that this process publishes. refused: told of every
+    refusal, as far as they are kept for telling.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        now: Callable[[], float],
+        *,
+        seen: Callable[[pb.AgentStatus], None] = lambda status: None,
+        refused: Callable[[Refusal], None] = lambda refusal: None,
+    ) -> None:
+        self._bus = bus
+        self.now = now
+        self._seen, self._refused = seen, refused
+        self.guard = Guard()
+        self._watch: AgentWatch | None = None
+        self._by_source: Counter[tuple[str, str]] = Counter()
+
+    @property
+    def site(self) -> str:
+        """The site whose keys this bus uses."""
+        return self._bus.site
+
+    def publisher(self, topic: Topic, agent: str, *, rate_hz: float | None = None, block: bool = False) -> Publisher:
+        """Declare a publisher."""
+        publisher = self._bus.publisher(topic, agent, rate_hz=rate_hz, block=block)
+        return _StatusPublisher(self, publisher) if topic is STATUS else publisher
+
+    def subscribe(self, topic: Topic, agent: str = "*") -> Subscription:
+        """Subscribe to one agent or to all."""
+        if self._watch is None:
+            self._watch = self._bus.watch_agents()
+        return GuardedSubscription(self, self._bus.subscribe(topic, agent))
+
+    def announce(self, role: str, agent: str, boot_id: str) -> AbstractContextManager[None]:
+        """Be seen as alive while the context is open."""
+        return self._bus.announce(role, agent, boot_id)
+
+    def watch_agents(self) -> AgentWatch:
+        """Watch all agents of the site come and go."""
+        return self._bus.watch_agents()
+
+    def close(self) -> None:
+        """Close the bus."""
+        if self._watch is not None:
+            self._watch.close()
+        self._bus.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def look(self) -> None:
+        """Take note of who came and went."""
+        if self._watch is not None:
+            for event in self._watch.drain():
+                self.guard.handle(event)
+
+    def note(self, refusal: Refusal) -> None:
+        """Count one refusal by reason and source, and tell of it."""
+        source = refusal.agent or "unknown"
+        if (refusal.reason, source) not in self._by_source and len(self._by_source) >= _SOURCES:
+            source = "others"
+        self._by_source[refusal.reason, source] += 1
+        self._refused(refusal)
+
+    def refusals_by_source(self) -> dict[tuple[str, str], int]:
+        """Counts by (reason, agent id in the key)."""
+        return dict(self._by_source)
+
+    def completed(self, status: pb.AgentStatus) -> pb.AgentStatus:
+        """The status with refusals by source (``rejected.<reason>@<id>``) and alarms."""
+        self.look()
+        whole = pb.AgentStatus()
+        whole.CopyFrom(status)
+        for (reason, source), count in self._by_source.most_common(_TOLD_SOURCES):
+            if len(whole.counters) < MAX_NUMBERS:
+                whole.counters[f"rejected.{reason}@{source}"[:_NAME]] = count
+        alarms = self.guard.alarms()
+        if alarms:
+            whole.counters["alarms"] = len(alarms)
+            whole.message = "; ".join([*alarms, whole.message])[:1000]
+            if whole.state == "running":
+                whole.state = "degraded"
+        self._seen(whole)
+        return whole

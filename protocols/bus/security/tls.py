@@ -1,0 +1,152 @@
+"""Why a connection with certificates is refused, told before Zenoh is asked and after it has failed.
+
+Zenoh says only that it could not connect. The standard library's TLS makes the same handshake with the same
+files, and gives the reason.
+"""
+
+from __future__ import annotations
+
+import re
+import socket
+import ssl
+import stat
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from protocols.bus.security.access import owner_of
+from protocols.bus.settings import TlsConfig, parts_of
+from protocols.core.errors import InputError
+
+_PATIENCE_S = 0.6
+_PLAIN = "it speaks plain TCP, and this connection wants TLS: write tcp/, or give the router certificates"
+
+
+def check_files(tls: TlsConfig) -> None:
+    """Raise InputError where a file is missing, is no PEM, has expired, or where others may read the key."""
+    for what, file in (("ca", tls.ca), ("certificate", tls.certificate), ("key", tls.key)):
+        try:
+            text = file.read_text(encoding="ascii")
+        except OSError as error:
+            raise InputError(
+                f"bus.tls: {what} cannot be read: {error.strerror}", file=file, remedy="see `syncline keys issue`"
+            ) from None
+        except UnicodeDecodeError:
+            text = ""
+        if "-----BEGIN" not in text:
+            raise InputError(f"bus.tls: {what} is not a PEM file", file=file, remedy="see `syncline keys issue`")
+    if tls.key.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise InputError("bus.tls: others may read this key", file=tls.key, remedy=f"chmod 600 {tls.key}")
+    try:
+        ssl.create_default_context(cafile=tls.ca).load_cert_chain(tls.certificate, tls.key)
+    except (ssl.SSLError, ValueError) as error:
+        raise InputError(
+            f"bus.tls: certificate and key do not fit: {_told(error)}",
+            file=tls.certificate,
+            remedy="issue them again with `syncline keys issue`",
+        ) from None
+    left = days_left(tls.certificate)
+    if left <= 0.0:
+        raise InputError(
+            f"bus.tls: the certificate expired {-left:.1f} days ago",
+            file=tls.certificate,
+            remedy="renew it with `syncline keys issue`",
+        )
+
+
+def _decoded(certificate: Path) -> dict[str, Any]:
+    # The only reader of a certificate's fields in the standard library; a board need not have `cryptography`.
+    decode = getattr(ssl, "_ssl")._test_decode_cert  # noqa: B009 - not in the stubs
+    return dict(decode(str(certificate)))
+
+
+def days_left(certificate: Path) -> float:
+    """Days until a PEM certificate expires; negative once it has, or by how much it is not valid yet."""
+    fields = _decoded(certificate)
+    now = datetime.now(UTC).timestamp()
+    begins, ends = (ssl.cert_time_to_seconds(fields[name]) for name in ("notBefore", "notAfter"))
+    return min(ends - now, now - begins if now < begins else float("inf")) / 86_400.0
+
+
+def common_name(certificate: Path) -> str:
+    """The certificate's common name, ``<role>.<id>`` or ``<role>.<id>.<generation>`` where `syncline keys` made it."""
+    for pairs in _decoded(certificate).get("subject", ()):
+        for name, value in pairs:
+            if name == "commonName":
+                return str(value)
+    return ""
+
+
+def check_owner(tls: TlsConfig, role: str, agent: str) -> None:
+    """Raise InputError where the certificate is another agent's: the router would drop all it says, in silence."""
+    name = common_name(tls.certificate)
+    if owner_of(name) != f"{role}.{agent}":
+        raise InputError(
+            f"bus.tls: the certificate is {name!r}'s, this is {role} {agent!r}",
+            file=tls.certificate,
+            remedy=f"issue one with `syncline keys issue DIR --role {role} --id {agent}`, or correct id",
+        )
+
+
+def why_refused(endpoint: str, tls: TlsConfig | None, patience_s: float = _PATIENCE_S) -> str:
+    """Why a router that can be reached does not let this process in; "" where nothing can be told.
+
+    endpoint: as in ``connect``. Takes up to ``patience_s``.
+    """
+    protocol, host, port = parts_of(endpoint)
+    deadline = time.monotonic() + patience_s
+    try:
+        with socket.create_connection((host, port), timeout=patience_s) as raw:
+            if protocol == "tcp":
+                return _plain(raw, deadline)
+            assert tls is not None
+            context = ssl.create_default_context(cafile=tls.ca)
+            context.load_cert_chain(tls.certificate, tls.key)
+            with context.wrap_socket(raw, server_hostname=host) as secure:
+                # In TLS 1.3 the server's verdict on our certificate comes after the handshake.
+                secure.settimeout(max(0.05, min(0.3, deadline - time.monotonic())))
+                secure.recv(1)
+    except ssl.SSLCertVerificationError as error:
+        return f"the router's certificate is refused here: {error.verify_message}"
+    except ssl.SSLError as error:
+        return _alert(error)
+    except (OSError, ValueError):
+        return ""
+    return ""
+
+
+def _plain(raw: socket.socket, deadline: float) -> str:
+    """Whether what answers a plain connection in fact speaks TLS."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    raw.settimeout(max(0.05, deadline - time.monotonic()))
+    try:
+        context.wrap_socket(raw).close()
+    except ssl.SSLError as error:
+        if "ALERT" not in str(error.reason):
+            return ""
+    except (OSError, ValueError):
+        return ""
+    return "it wants certificates, and this connection is plain TCP: write tls/ for tcp/ and add [bus.tls]"
+
+
+def _alert(error: ssl.SSLError) -> str:
+    reason = str(error.reason or "")
+    told = {
+        "CERTIFICATE_REQUIRED": "it wants a certificate",
+        "CERTIFICATE_EXPIRED": "it says that this certificate has expired",
+        "UNKNOWN_CA": "it does not know who signed this certificate",
+        "BAD_CERTIFICATE": "it does not accept this certificate",
+        "CERTIFICATE_UNKNOWN": "it does not accept this certificate",
+        "DECRYPT_ERROR": "it does not accept who signed this certificate",
+        "HANDSHAKE_FAILURE": "it refuses the handshake",
+        "WRONG_VERSION_NUMBER": _PLAIN,
+        "RECORD_LAYER_FAILURE": _PLAIN,
+    }
+    return next((text for word, text in told.items() if word in reason), "" if not reason else _told(error))
+
+
+def _told(error: Exception) -> str:
+    text = str(getattr(error, "reason", None) or error)
+    return re.sub(r"\s+", " ", text.replace("_", " ").lower())[:120]

@@ -1,0 +1,1 @@
+"""The bus itself: Zenoh and in-process sessions, queues, loss recovery."""

@@ -1,0 +1,243 @@
+"""The bus inside one process: the same promises as over Zenoh, without sockets.
+
+A MemoryHub stands for the network; every MemoryBus made on it is one process's connection. Messages
+are encoded and decoded on the way, so nothing passes here that would not pass on the wire.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Self
+
+from google.protobuf.message import Message
+
+from protocols.bus.base import AgentEvent, BusDead, Received, Refusal
+from protocols.bus.transport.delivery import cache_size
+from protocols.bus.transport.inbox import Inbox, Roll, subscription_key
+from protocols.topics import Topic, liveliness_key, valid_id
+from protocols.validation.codec import encode, parse_key
+
+
+class MemoryHub:
+    """The network that several MemoryBus share.
+
+    clock_ns: stamps arrivals (Unix, ns); tests pass their own.
+    """
+
+    def __init__(self, clock_ns: Callable[[], int] = time.time_ns) -> None:
+        self.clock_ns = clock_ns
+        self.lock = threading.RLock()
+        self.changed = threading.Condition(self.lock)
+        self.publishers: list[MemoryPublisher] = []
+        self.subscriptions: list[MemorySubscription] = []
+        self.watches: list[MemoryWatch] = []
+        self.tokens: list[str] = []
+
+    def mark(self, key: str, alive: bool) -> None:
+        """Add or remove one liveliness token and tell the watches of its site."""
+        with self.lock:
+            if alive:
+                self.tokens.append(key)
+            elif key in self.tokens:
+                self.tokens.remove(key)
+            for watch in self.watches:
+                watch.mark(key, key in self.tokens)
+
+
+class MemoryPublisher:
+    """See ``protocols.bus.base.Publisher``."""
+
+    def __init__(self, hub: MemoryHub, topic: Topic, key: str, rate_hz: float | None) -> None:
+        self.key = key
+        self.cache: deque[bytes] = deque(maxlen=cache_size(topic, rate_hz))
+        self._hub = hub
+        self._message = topic.message
+        self._closed = False
+        with hub.lock:
+            hub.publishers.append(self)
+
+    def put(self, message: Message) -> None:
+        """Deliver to every matching subscription at once, and keep it for late ones."""
+        if message.DESCRIPTOR.name != self._message:
+            raise TypeError(f"{message.DESCRIPTOR.name} on a topic of {self._message}")
+        payload = encode(message)
+        with self._hub.lock:
+            if self._closed:
+                raise BusDead("the publisher is closed")
+            self.cache.append(payload)
+            for subscription in self._hub.subscriptions:
+                if subscription.matches(self.key):
+                    subscription.inbox.push(self.key, payload)
+
+    def wait_matched(self, timeout_s: float) -> bool:
+        """Wait for a subscription that matches."""
+        with self._hub.changed:
+            return self._hub.changed.wait_for(
+                lambda: any(subscription.matches(self.key) for subscription in self._hub.subscriptions),
+                timeout_s,
+            )
+
+    def close(self) -> None:
+        """Forget the cache."""
+        with self._hub.lock:
+            self._closed = True
+            if self in self._hub.publishers:
+                self._hub.publishers.remove(self)
+
+
+class MemorySubscription:
+    """See ``protocols.bus.base.Subscription``."""
+
+    def __init__(self, hub: MemoryHub, topic: Topic, site: str, agent: str) -> None:
+        subscription_key(topic, site, agent)  # refuses an id that Zenoh would refuse too
+        self._hub = hub
+        self._topic = topic
+        self._site = site
+        self._agent = agent
+        self.inbox = Inbox(topic, hub.clock_ns)
+        with hub.changed:
+            for publisher in hub.publishers:
+                if self.matches(publisher.key):
+                    for payload in publisher.cache:
+                        self.inbox.push(publisher.key, payload)
+            hub.subscriptions.append(self)
+            hub.changed.notify_all()
+
+    def matches(self, key: str) -> bool:
+        """Whether messages of this key come here."""
+        address = parse_key(key)
+        return (
+            address is not None
+            and address.topic is self._topic
+            and address.site == self._site
+            and self._agent in ("*", address.agent)
+        )
+
+    def drain(self) -> list[Received]:
+        """Everything since the last call."""
+        return self.inbox.drain()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for something to drain."""
+        return self.inbox.wait(timeout_s)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """See the contract; ``lost`` stays 0, since memory loses nothing."""
+        return self.inbox.counters
+
+    def refusals(self) -> list[Refusal]:
+        """What was refused since the last call."""
+        return self.inbox.refusals()
+
+    def close(self) -> None:
+        """Stop receiving."""
+        with self._hub.lock:
+            if self in self._hub.subscriptions:
+                self._hub.subscriptions.remove(self)
+
+
+class MemoryWatch:
+    """See ``protocols.bus.base.AgentWatch``."""
+
+    def __init__(self, hub: MemoryHub, site: str) -> None:
+        self._hub = hub
+        self._prefix = f"syncline/{site}/alive/"
+        self._roll = Roll()
+        with hub.lock:
+            hub.watches.append(self)
+            for key in hub.tokens:
+                self.mark(key, True)
+
+    def mark(self, key: str, alive: bool) -> None:
+        """Take note of a token of this site."""
+        if key.startswith(self._prefix):
+            self._roll.mark(key, alive)
+
+    def drain(self) -> list[AgentEvent]:
+        """Changes since the last call."""
+        return self._roll.drain()
+
+    def close(self) -> None:
+        """Stop watching."""
+        with self._hub.lock:
+            if self in self._hub.watches:
+                self._hub.watches.remove(self)
+
+
+class MemoryBus:
+    """See ``protocols.bus.base.Bus``."""
+
+    def __init__(self, hub: MemoryHub, site: str = "local") -> None:
+        self._hub = hub
+        self._site = valid_id(site, "site")
+        self._declared: list[MemoryPublisher | MemorySubscription | MemoryWatch] = []
+        self._tokens: list[str] = []
+        self._closed = False
+
+    @property
+    def site(self) -> str:
+        """The site whose keys this bus uses."""
+        return self._site
+
+    def publisher(
+        self, topic: Topic, agent: str, *, rate_hz: float | None = None, block: bool = False
+    ) -> MemoryPublisher:
+        """Declare a publisher; ``block`` changes nothing here, since memory has no slow link."""
+        self._check_open()
+        publisher = MemoryPublisher(self._hub, topic, topic.key_for(self._site, agent), rate_hz)
+        self._declared.append(publisher)
+        return publisher
+
+    def subscribe(self, topic: Topic, agent: str = "*") -> MemorySubscription:
+        """Subscribe to one agent or to all."""
+        self._check_open()
+        subscription = MemorySubscription(self._hub, topic, self._site, agent)
+        self._declared.append(subscription)
+        return subscription
+
+    @contextmanager
+    def announce(self, role: str, agent: str, boot_id: str) -> Iterator[None]:
+        """Be seen as alive while the context is open, or until the bus is closed."""
+        self._check_open()
+        key = liveliness_key(self._site, role, agent, boot_id)
+        self._tokens.append(key)
+        self._hub.mark(key, True)
+        try:
+            yield
+        finally:
+            if key in self._tokens:
+                self._tokens.remove(key)
+                self._hub.mark(key, False)
+
+    def watch_agents(self) -> MemoryWatch:
+        """Watch all agents of the site come and go."""
+        self._check_open()
+        watch = MemoryWatch(self._hub, self._site)
+        self._declared.append(watch)
+        return watch
+
+    def close(self) -> None:
+        """What a process's end does: everything it declared is gone."""
+        self._closed = True
+        while self._declared:
+            self._declared.pop().close()
+        while self._tokens:
+            self._hub.mark(self._tokens.pop(), False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise BusDead("the bus is closed")

@@ -1,0 +1,344 @@
+"""The bus over Zenoh. See ``protocols.bus.base`` for the contract and the README for the reasons."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from types import TracebackType
+from typing import Any, Self, TypeAlias
+
+import zenoh
+import zenoh.ext
+import zenoh.handlers
+from google.protobuf.message import Message
+
+from protocols.bus.base import AgentEvent, BusDead, Received, Refusal
+from protocols.bus.settings import BusConfig
+from protocols.bus.transport.backfill import Backfill, Question
+from protocols.bus.transport.delivery import cache_size
+from protocols.bus.transport.inbox import Inbox, Roll, subscription_key
+from protocols.bus.transport.session import close_session, open_session, release, zenoh_call
+from protocols.topics import Delivery, Topic, liveliness_key, valid_id
+from protocols.validation.codec import Reason, Rejected, encode, parse_key
+
+HEARTBEAT_S = 0.5
+"""How soon a subscriber learns that the last message before a silence is missing."""
+_POLL_S = 0.005
+_FETCH_S = 2.0
+_GAP_S = 10.0
+_MOST_KEYS, _KEYS_AT_ONCE = 8192, 64
+
+_Source: TypeAlias = tuple[str, int]
+"""A publisher as Zenoh names it: session and entity."""
+
+
+class ZenohPublisher:
+    """See ``protocols.bus.base.Publisher``."""
+
+    def __init__(self, session: zenoh.Session, topic: Topic, key: str, cache: int, block: bool) -> None:
+        self._message = topic.message
+        self._session = session
+        self._key = key
+        self._matcher: Any = None  # its stub has the type of matching_status wrong
+        reliable = topic.delivery is Delivery.RELIABLE
+        congestion = zenoh.CongestionControl.BLOCK if block else zenoh.CongestionControl.DROP
+        with zenoh_call(f"declare {key}"):
+            self._publisher = zenoh.ext.declare_advanced_publisher(
+                session,
+                key,
+                encoding=zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(f"syncline.v1.{topic.message}"),
+                congestion_control=congestion,
+                priority=zenoh.Priority.DATA_LOW if topic.bulky else zenoh.Priority.DATA,
+                cache=zenoh.ext.CacheConfig(max_samples=cache),
+                # Also where nothing is recovered: it numbers the messages, which a plain publisher does not.
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(
+                    heartbeat=HEARTBEAT_S if reliable else None, sporadic_heartbeat=None
+                ),
+                publisher_detection=True,
+            )
+
+    def put(self, message: Message) -> None:
+        """Publish one message."""
+        if message.DESCRIPTOR.name != self._message:
+            raise TypeError(f"{message.DESCRIPTOR.name} on a topic of {self._message}")
+        payload = encode(message)
+        with zenoh_call(f"put {self._key}"):
+            self._publisher.put(payload)
+
+    def wait_matched(self, timeout_s: float) -> bool:
+        """Poll for a matching subscriber."""
+        deadline = time.monotonic() + timeout_s
+        with zenoh_call(f"match {self._key}"):
+            if self._matcher is None:
+                # An advanced publisher cannot tell; a plain one beside it can.
+                self._matcher = self._session.declare_publisher(self._key)
+            while not self._matcher.matching_status.matching:
+                if time.monotonic() >= deadline:
+                    return False
+                time.sleep(_POLL_S)
+        return True
+
+    def close(self) -> None:
+        """Undeclare; closing twice, or after the session, is no error."""
+        release(self._matcher, self._publisher)
+
+
+class _Keys:
+    """Declares the keys that messages arrive under.
+
+    Zenoh 1.10.2 remembers where a message goes for declared keys only. For all others it compares the key with every
+    one that it knows of, for each message: with 1,000 cameras that is 110 us of CPU, more than all the rest.
+    """
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._met: set[str] = set()
+        self._new: deque[str] = deque()
+        self._declared: list[zenoh.KeyExpr] = []
+
+    def meet(self, key: str) -> None:
+        """Take note of a message's key; from a callback, so nothing is declared here."""
+        if key not in self._met and len(self._met) < _MOST_KEYS:
+            self._met.add(key)
+            self._new.append(key)
+
+    def declare(self) -> None:
+        """Declare some of the new ones."""
+        for _ in range(min(len(self._new), _KEYS_AT_ONCE)):
+            key = self._new.popleft()
+            if parse_key(key) is None:  # it came through a wildcard: the gate refuses it
+                continue
+            with zenoh_call(f"declare {key}"):
+                self._declared.append(self._session.declare_keyexpr(key))
+
+    def close(self) -> None:
+        """Undeclare them; after the session this is no error."""
+        while self._declared:
+            with suppress(BusDead), zenoh_call("undeclare"):
+                self._session.undeclare(self._declared.pop())
+
+
+class ZenohSubscription:
+    """See ``protocols.bus.base.Subscription``."""
+
+    def __init__(self, session: zenoh.Session, topic: Topic, key: str, clock_ns: Callable[[], int]) -> None:
+        self._session = session
+        self._inbox = Inbox(topic, clock_ns)
+        self._reliable = topic.delivery is Delivery.RELIABLE
+        self._backfill: Backfill[_Source] = Backfill(self._push, self._ask, self._inbox.lose)
+        self._newest: dict[_Source, int] = {}
+        self._keys = _Keys(session)
+        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+        with zenoh_call(f"subscribe {key}"):
+            self._subscriber: zenoh.ext.AdvancedSubscriber[None] = zenoh.ext.declare_advanced_subscriber(
+                session,
+                key,
+                self._take,
+                # No max_samples: it would also cap what is recovered after an outage.
+                history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
+                recovery=recovery if self._reliable else None,
+            )
+
+    # All callbacks run on threads of Zenoh's: an exception there is printed and swallowed, and a slow
+    # one starves the whole session. So they only enqueue.
+    def _take(self, sample: zenoh.Sample) -> None:
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        source, key = sample.source_info, str(sample.key_expr)
+        if source is None:
+            self._inbox.refuse(Rejected(Reason.PLAIN_PUBLISHER, "not from an advanced publisher"), key)
+            return
+        self._keys.meet(key)
+        name = (str(source.source_id.zid), source.source_id.eid)
+        if self._reliable:
+            self._backfill.take(name, source.source_sn, key, sample.payload.to_bytes())
+        else:
+            self._count_gap(name, source.source_sn)
+            self._push(name, key, sample.payload.to_bytes())
+
+    def _count_gap(self, source: _Source, number: int) -> None:
+        """Of a topic that is not recovered: what never came is counted all the same."""
+        newest = self._newest.get(source)
+        if newest is None and len(self._newest) >= _MOST_KEYS:
+            self._newest.clear()
+        if newest is None or newest < number:
+            if newest is not None and number > newest + 1:
+                self._inbox.skip(number - newest - 1)
+            self._newest[source] = number
+
+    def _push(self, source: _Source, key: str, payload: bytes) -> None:
+        self._inbox.push(key, payload, source[0])
+
+    def _ask(self, question: Question[_Source]) -> None:
+        """Ask one publisher's cache; its answers come on a thread of Zenoh's."""
+        source, lock, served = question.source, threading.Lock(), False
+        still_open = 1 if question.witness is None else 2
+
+        def answer(reply: zenoh.Reply) -> None:
+            sample = reply.ok
+            if sample is not None and sample.source_info is not None:
+                number = sample.source_info.source_sn
+                self._backfill.answer(source, number, str(sample.key_expr), sample.payload.to_bytes())
+
+        def witnessed(reply: zenoh.Reply) -> None:
+            nonlocal served
+            served = served or reply.ok is not None
+
+        def done() -> None:
+            nonlocal still_open
+            with lock:
+                still_open -= 1
+                ended = still_open == 0
+            if ended:
+                self._backfill.finish(source, question.number, served)
+
+        def get(low: int, high: int, take: Callable[[zenoh.Reply], None]) -> None:
+            with zenoh_call(f"fetch {question.key}"):
+                self._session.get(
+                    f"{question.key}/@adv/pub/{source[0]}/{source[1]}/**?_sn={low}..{high}",
+                    zenoh.handlers.Callback(take, drop=done),
+                    consolidation=zenoh.ConsolidationMode.NONE,
+                    accept_replies=zenoh.ReplyKeyExpr.ANY,
+                    timeout=_FETCH_S if question.witness is None else _GAP_S,
+                )
+
+        try:
+            get(question.low, question.high, answer)
+            if question.witness is not None:
+                # After the other on the same way: where this one is answered, that one has been.
+                get(question.witness, question.witness, witnessed)
+        except BusDead:
+            self._backfill.finish(source, question.number, served=False)
+
+    def drain(self) -> list[Received]:
+        """Everything since the last call."""
+        self._keys.declare()
+        self._backfill.tend()
+        return self._inbox.drain()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for something to drain."""
+        return self._inbox.wait(timeout_s)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """See the contract."""
+        return self._inbox.counters
+
+    def refusals(self) -> list[Refusal]:
+        """What was refused since the last call."""
+        return self._inbox.refusals()
+
+    def close(self) -> None:
+        """Undeclare: a process with an open callback never exits."""
+        release(self._subscriber)
+        self._keys.close()
+
+
+class ZenohWatch:
+    """See ``protocols.bus.base.AgentWatch``."""
+
+    def __init__(self, session: zenoh.Session, site: str) -> None:
+        self._roll = Roll()
+        key = f"syncline/{site}/alive/**"
+        with zenoh_call(f"watch {key}"):
+            self._subscriber: zenoh.Subscriber[None] = session.liveliness().declare_subscriber(
+                key, self._take, history=True
+            )
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        self._roll.mark(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+    def drain(self) -> list[AgentEvent]:
+        """Changes since the last call."""
+        return self._roll.drain()
+
+    def close(self) -> None:
+        """Undeclare."""
+        release(self._subscriber)
+
+
+class ZenohBus:
+    """See ``protocols.bus.base.Bus``. Made by ``open_bus``."""
+
+    def __init__(self, session: zenoh.Session, site: str, clock_ns: Callable[[], int], outage_s: float) -> None:
+        self._session = session
+        self._site = valid_id(site, "site")
+        self._clock_ns = clock_ns
+        self._outage_s = outage_s
+        self._declared: list[ZenohPublisher | ZenohSubscription | ZenohWatch] = []
+
+    @property
+    def site(self) -> str:
+        """The site whose keys this bus uses."""
+        return self._site
+
+    def publisher(
+        self, topic: Topic, agent: str, *, rate_hz: float | None = None, block: bool = False
+    ) -> ZenohPublisher:
+        """Declare a publisher; see the contract."""
+        key = topic.key_for(self._site, agent)
+        publisher = ZenohPublisher(self._session, topic, key, cache_size(topic, rate_hz, self._outage_s), block)
+        self._declared.append(publisher)
+        return publisher
+
+    def subscribe(self, topic: Topic, agent: str = "*") -> ZenohSubscription:
+        """Subscribe to one agent or to all."""
+        key = subscription_key(topic, self._site, agent)
+        subscription = ZenohSubscription(self._session, topic, key, self._clock_ns)
+        self._declared.append(subscription)
+        return subscription
+
+    @contextmanager
+    def announce(self, role: str, agent: str, boot_id: str) -> Iterator[None]:
+        """Hold a liveliness token while the context is open."""
+        key = liveliness_key(self._site, role, agent, boot_id)
+        with zenoh_call(f"announce {key}"):
+            token = self._session.liveliness().declare_token(key)
+        try:
+            yield
+        finally:
+            release(token)
+
+    def watch_agents(self) -> ZenohWatch:
+        """Watch all agents of the site come and go."""
+        watch = ZenohWatch(self._session, self._site)
+        self._declared.append(watch)
+        return watch
+
+    def close(self) -> None:
+        """Undeclare everything and close the session."""
+        while self._declared:
+            self._declared.pop().close()
+        close_session(self._session)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def open_bus(
+    site: str,
+    config: BusConfig | None = None,
+    *,
+    stop: Callable[[], bool] | None = None,
+    timeout_s: float | None = None,
+    clock_ns: Callable[[], int] = time.time_ns,
+) -> ZenohBus:
+    """Connect to the others of ``site``.
+
+    stop: asked while a client waits for its router; True raises BusStopped.
+    timeout_s: how long a client waits for its router before InputError; None waits for ever.
+    clock_ns: stamps arrivals (Unix, ns).
+    Raises InputError, in one line, for a site or an endpoint that cannot be used.
+    """
+    valid_id(site, "site")
+    config = config or BusConfig()
+    return ZenohBus(open_session(config, stop=stop, timeout_s=timeout_s), site, clock_ns, config.outage_s)

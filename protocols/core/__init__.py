@@ -1,0 +1,1 @@
+"""Errors, atomic files, clocks, versions: what every other module stands on."""

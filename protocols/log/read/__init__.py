@@ -1,0 +1,1 @@
+"""Reading MCAP logs: whole, damaged, in parts, of earlier versions."""

@@ -1,0 +1,276 @@
+"""The frames of an MCAP file in file order, as far as they are whole.
+
+The library's readers stop at the first flaw with an exception that names something else, pass over a
+cut-off record, and do not check attachments. Here each record is taken whole or not at all, and a
+flaw is a sentence for a person.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Chunk
+from mcap.records import Metadata as MetadataRecord
+from mcap.stream_reader import get_chunk_data_stream
+
+from protocols.core.errors import InputError
+
+MAGIC = b"\x89MCAP0\r\n"
+MAX_CHUNK = 256 * 1024 * 1024
+"""Bytes, unpacked. More is no chunk that anybody wrote."""
+
+_HEAD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_CHUNK = struct.Struct("<QQQII")
+"""Start time, end time, unpacked size, checksum, length of the compression's name; then that name, u64 size, data."""
+_KNOWN = frozenset(int(opcode) for opcode in Opcode)
+_FIRST_PRIVATE_OPCODE = 0x80
+_LONGEST = 1 << 40
+"""Bytes. A longer record is a damaged length."""
+_LONGEST_METADATA = 1 << 24
+_SMALLEST_METADATA, _SMALLEST_ATTACHMENT = 8, 36
+_FOOTER_LENGTH = 20
+_WINDOW = 1 << 20
+# Chunk, attachment, metadata, message index, end of data or footer, shorter than 4 GiB: a cheap sieve for heads.
+_CANDIDATE = re.compile(rb"(?=[\x06\x09\x0c\x07\x0f\x02][\x00-\xff]{4}\x00{4})")
+
+
+class Frame(NamedTuple):
+    """One record: where it begins, its kind, its bytes."""
+
+    offset: int
+    opcode: int
+    content: bytes
+
+
+class RawMessage(NamedTuple):
+    """One message record, not yet decoded."""
+
+    channel: int
+    sequence: int
+    log_time_ns: int
+    publish_time_ns: int
+    payload: bytes
+
+
+@dataclass(slots=True)
+class Damage:
+    """What is wrong with a file: the first flaw as a sentence, how many there were, bytes passed over."""
+
+    text: str = ""
+    flaws: int = 0
+    skipped: int = 0
+    cut: bool = False
+    """Whether a file ends before its end."""
+    place: str = ""
+    """The file, where there are several."""
+
+    def found(self, text: str) -> None:
+        """Take note of a flaw."""
+        self.text = self.text or f"{self.place}{text}"
+        self.flaws += 1
+
+
+def open_log(path: Path) -> BinaryIO:
+    """Open an MCAP file and read its magic; InputError if it is none."""
+    try:
+        stream = path.open("rb")
+    except OSError as error:
+        raise InputError(
+            f"cannot read: {error.strerror or error}", file=path, remedy="check the name of the log"
+        ) from None
+    try:
+        magic = stream.read(len(MAGIC))
+    except OSError as error:
+        stream.close()
+        raise InputError(f"cannot read: {error.strerror or error}", file=path) from None
+    if magic != MAGIC:
+        stream.close()
+        what = "is empty" if not magic else "is not an MCAP log"
+        raise InputError(what, file=path, remedy="give a .mcap file that syncline recorded")
+    return stream
+
+
+def frames(stream: BinaryIO, damage: Damage, begin: int = len(MAGIC)) -> Iterator[Frame]:
+    """Every whole record from ``begin`` (default: after the magic) up to the footer; flaws go to ``damage``.
+
+    After a flaw the walk goes on at the next record that proves itself. The checksum of the data section is
+    verified where the file has one.
+    """
+    size = stream.seek(0, 2)
+    offset = stream.seek(begin)
+    head = stream.read(_HEAD.size)
+    crc = zlib.crc32(MAGIC)
+    unbroken = begin == len(MAGIC)
+    while True:
+        opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
+        end = offset + _HEAD.size + length
+        whole = _is_head(opcode, length) and end <= size
+        if whole:
+            block = stream.read(length + _HEAD.size)
+            content, following = block[:length], block[length:]
+            # A length that leads to no record is not its length, unless the inside says the same.
+            whole = _is_next(following) or _proves_itself(opcode, content)
+        if not whole:
+            found = resync(stream, offset + 1, size) if offset < size else None
+            damage.found(_flaw(offset, head, opcode, length, found))
+            if found is None:
+                damage.cut = True
+                return
+            damage.skipped += found - offset
+            offset, unbroken = stream.seek(found), False
+            head = stream.read(_HEAD.size)
+            continue
+        if opcode == Opcode.DATA_END and length >= 4:
+            (expected,) = struct.unpack_from("<I", content)
+            if unbroken and expected not in (0, crc):
+                damage.found("the checksum of the data does not match: some bytes have changed")
+        if opcode == Opcode.FOOTER and length == _FOOTER_LENGTH:
+            (expected,) = struct.unpack_from("<I", content, length - 4)
+            if unbroken and expected not in (0, zlib.crc32(head + content[:-4], crc)):
+                damage.found("the checksum of the index does not match: some bytes have changed")
+        crc = 0 if opcode == Opcode.DATA_END else zlib.crc32(content, zlib.crc32(head, crc))
+        yield Frame(offset, opcode, content)
+        if opcode == Opcode.FOOTER:
+            if following[: len(MAGIC)] != MAGIC:
+                damage.found("the end mark is missing")
+            return
+        offset, head = end, following
+
+
+def _flaw(offset: int, head: bytes, opcode: int, length: int, found: int | None) -> str:
+    """What is wrong at ``offset``; found: where the walk goes on."""
+    if found is not None:
+        return f"{found - offset} bytes from byte {offset} on are damaged and were left out"
+    if len(head) < _HEAD.size:
+        where = "" if not head else " in the middle of a record"
+        return f"ends at byte {offset}{where}, without a footer: its writer did not close it"
+    if _is_head(opcode, length):
+        return f"the record at byte {offset} is cut off: its writer did not close the file"
+    return f"byte {offset} begins no record, nor does any after it: the rest cannot be read"
+
+
+def _is_head(opcode: int, length: int) -> bool:
+    return (opcode in _KNOWN or opcode >= _FIRST_PRIVATE_OPCODE) and length < _LONGEST
+
+
+def _is_next(head: bytes) -> bool:
+    """Whether these bytes begin a record, or are the end of what was written."""
+    return len(head) < _HEAD.size or _is_head(*_HEAD.unpack(head))
+
+
+def _proves_itself(opcode: int, content: bytes) -> bool:
+    """Whether a record's inside fits its length so closely that chance is out of the question."""
+    if opcode == Opcode.CHUNK:
+        return chunk_is_in_shape(content)
+    if opcode == Opcode.ATTACHMENT:
+        return len(content) > _SMALLEST_ATTACHMENT and attachment_is_whole(content)
+    if opcode == Opcode.METADATA:
+        try:
+            MetadataRecord.read(ReadDataStream(BytesIO(content)))
+        except (McapError, ValueError, struct.error):
+            return False
+        return len(content) > _SMALLEST_METADATA
+    if opcode not in _KNOWN:
+        return False
+    if opcode == Opcode.MESSAGE_INDEX:
+        return len(content) >= 6 and int.from_bytes(content[2:6], "little") == len(content) - 6
+    return len(content) == {Opcode.FOOTER: _FOOTER_LENGTH, Opcode.DATA_END: 4}.get(Opcode(opcode), -1)
+
+
+def chunk_is_in_shape(content: bytes) -> bool:
+    """Whether the lengths inside a chunk add up; says nothing about its data."""
+    if len(content) < _CHUNK.size:
+        return False
+    name = int(_CHUNK.unpack_from(content)[4])
+    start = _CHUNK.size + name + 8
+    return (
+        name <= 4
+        and len(content) >= start
+        and int.from_bytes(content[start - 8 : start], "little") == (len(content) - start)
+    )
+
+
+def resync(stream: BinaryIO, start: int, size: int) -> int | None:
+    """The offset of the next record at or after ``start`` that proves itself; None if there is none."""
+    begin = start
+    while begin < size:
+        stream.seek(begin)
+        window = stream.read(_WINDOW + _HEAD.size)
+        for match in _CANDIDATE.finditer(window):
+            offset = begin + match.start()
+            opcode, length = _HEAD.unpack_from(window, match.start())
+            if length > size - offset - _HEAD.size:
+                continue
+            stream.seek(offset + _HEAD.size)
+            # A look at the first bytes spares reading megabytes for each chance likeness of a head.
+            if opcode == Opcode.CHUNK:
+                start_of_chunk = stream.read(_CHUNK.size + 12)
+                if not _begins_chunk(start_of_chunk, length):
+                    continue
+            elif opcode == Opcode.METADATA and length > _LONGEST_METADATA:
+                continue
+            stream.seek(offset + _HEAD.size)
+            if _proves_itself(opcode, stream.read(length)) and _is_next(stream.read(_HEAD.size)):
+                return offset
+        begin += _WINDOW
+    return None
+
+
+def _begins_chunk(start: bytes, length: int) -> bool:
+    if len(start) < _CHUNK.size + 8:
+        return False
+    name = int(_CHUNK.unpack_from(start)[4])
+    if name > 4:
+        return False
+    place = _CHUNK.size + name
+    return int.from_bytes(start[place : place + 8], "little") == length - place - 8
+
+
+def chunk_records(frame: Frame, damage: Damage) -> Iterator[tuple[int, bytes]]:
+    """(opcode, content) of the records in a chunk; none if its checksum does not match."""
+    try:
+        chunk: Chunk = Chunk.read(ReadDataStream(BytesIO(frame.content)))
+        if chunk.uncompressed_size > MAX_CHUNK:
+            raise ValueError("too big")
+        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+        data = stream.read(size)
+    except (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError):
+        damage.found(f"the chunk at byte {frame.offset} is damaged and was left out")
+        return
+    offset = 0
+    while offset + _HEAD.size <= len(data):
+        opcode, length = _HEAD.unpack_from(data, offset)
+        offset += _HEAD.size
+        if length > len(data) - offset:
+            damage.found(f"the chunk at byte {frame.offset} has a record that is cut off")
+            return
+        yield opcode, data[offset : offset + length]
+        offset += length
+
+
+def message_record(content: bytes) -> RawMessage | None:
+    """Parse a message record; None if it is too short to be one."""
+    if len(content) < _MESSAGE.size:
+        return None
+    channel, sequence, log_time_ns, publish_time_ns = _MESSAGE.unpack_from(content)
+    return RawMessage(channel, sequence, log_time_ns, publish_time_ns, content[_MESSAGE.size :])
+
+
+def attachment_is_whole(content: bytes) -> bool:
+    """Whether an attachment's own checksum matches (0: it has none)."""
+    if len(content) < 4:
+        return False
+    (expected,) = struct.unpack_from("<I", content, len(content) - 4)
+    return expected in (0, zlib.crc32(content[:-4]))

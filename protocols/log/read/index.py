@@ -1,0 +1,65 @@
+"""The closing index of an MCAP file, where it has a sound one: where to begin reading, without reading all before."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from io import BytesIO
+from typing import BinaryIO
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel
+
+from protocols.log.read.frames import MAGIC
+
+_HEAD = struct.Struct("<BQ")
+_FOOTER = struct.Struct("<BQQQI")
+_CHUNK_INDEX = struct.Struct("<QQQ")
+
+
+@dataclass(frozen=True, slots=True)
+class Index:
+    """chunks: (first and last log time [ns], offset) in file order; channels: keys by id."""
+
+    chunks: tuple[tuple[int, int, int], ...]
+    channels: dict[int, str]
+
+    def offset_of(self, start_ns: int) -> int | None:
+        """Where the first chunk with something at or after a log time begins; None if there is none."""
+        return next((offset for _, last, offset in self.chunks if last >= start_ns), None)
+
+
+def read_index(stream: BinaryIO) -> Index | None:
+    """The index of a file that was closed and whose index has its checksum; else None."""
+    size = stream.seek(0, 2)
+    tail = _FOOTER.size + len(MAGIC)
+    if size < tail + len(MAGIC):
+        return None
+    stream.seek(size - tail)
+    footer = stream.read(_FOOTER.size)
+    opcode, _, start, _, crc = _FOOTER.unpack(footer)
+    if opcode != Opcode.FOOTER or stream.read(len(MAGIC)) != MAGIC or not 0 < start < size - tail or not crc:
+        return None
+    stream.seek(start)
+    summary = stream.read(size - tail - start)
+    if zlib.crc32(footer[:-4], zlib.crc32(summary)) != crc:
+        return None
+    chunks: list[tuple[int, int, int]] = []
+    channels: dict[int, str] = {}
+    offset = 0
+    try:
+        while offset < len(summary):
+            opcode, length = _HEAD.unpack_from(summary, offset)
+            offset += _HEAD.size
+            if opcode == Opcode.CHUNK_INDEX:
+                chunks.append(_CHUNK_INDEX.unpack_from(summary, offset))
+            elif opcode == Opcode.CHANNEL:
+                channel = Channel.read(ReadDataStream(BytesIO(summary[offset : offset + length])))
+                channels[channel.id] = channel.topic
+            offset += length
+    except (McapError, ValueError, struct.error):
+        return None
+    return Index(tuple(chunks), channels)

@@ -1,0 +1,42 @@
+"""Reads logs of earlier versions: one small declared function from each version to the next.
+
+A released version's tiny log stays in tests/replay/logs, and a test reads it for ever. When SCHEMA_VERSION is
+raised, UPGRADES gets a function under the old number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from protocols.core.errors import InputError
+from protocols.log.write.writer import LOG_VERSION
+from protocols.topics import Topic
+from protocols.validation.codec import SCHEMA_VERSION
+
+Upgrade = Callable[[Topic, bytes], bytes]
+"""Gives a payload of one version as a payload of the next, its schema_version included."""
+
+UPGRADES: Mapping[int, Upgrade] = {}
+"""By the version that they start from."""
+
+
+def upgrades_for(path: Path, form: Mapping[str, str]) -> tuple[Upgrade, ...]:
+    """What turns this log's payloads into today's, in order. form: what the log says about itself.
+
+    Raises InputError for a log of a newer Syncline, which cannot be understood.
+    """
+    schema, layout = _number(form.get("schema")), _number(form.get("log"))
+    if schema > SCHEMA_VERSION or layout > LOG_VERSION:
+        raise InputError(
+            f"was written by Syncline {form.get('syncline', '?')} (log {layout}, schema {schema}); this one reads "
+            f"up to log {LOG_VERSION}, schema {SCHEMA_VERSION}",
+            file=path,
+            remedy="update Syncline",
+        )
+    return tuple(UPGRADES[version] for version in range(schema, SCHEMA_VERSION))
+
+
+def _number(text: str | None) -> int:
+    # Logs before this record existed are of version 1; a garbled figure is damage, which the messages themselves show.
+    return int(text) if text is not None and text.isdecimal() and text.isascii() and int(text) >= 1 else 1

@@ -1,0 +1,94 @@
+"""A log in several files: name-000.mcap, name-001.mcap, …; each is a whole log, together they are one."""
+
+from __future__ import annotations
+
+import re
+from io import BytesIO
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Metadata
+
+from protocols.core.errors import InputError
+from protocols.log.read.frames import Damage, frames, open_log
+from protocols.log.write.writer import FORMAT_RECORD, checked
+
+_PART = re.compile(r"(?P<stem>.+)-(?P<number>\d{3,6})\Z")
+
+
+class Parts(NamedTuple):
+    """The files of one log in order, and what is missing among them ("" if nothing)."""
+
+    paths: tuple[Path, ...]
+    missing: str
+
+
+def part_path(path: Path, number: int) -> Path:
+    """The name of one part of the log ``path``."""
+    return path.with_name(f"{path.stem}-{number:03d}{path.suffix}")
+
+
+def find_parts(path: Path) -> Parts:
+    """The log that ``path`` names: a folder that holds one, its first part, or one file alone. Raises InputError."""
+    if path.is_dir():
+        return _in_folder(path)
+    open_log(path).close()
+    found = _PART.match(path.stem)
+    if found is None or int(found["number"]) != 0:
+        return Parts((path,), "")
+    session = log_format(path).get("session")
+    if not session:
+        return Parts((path,), "")
+    numbered: dict[int, Path] = {}
+    for other in path.parent.glob("*.mcap"):
+        match = _PART.match(other.stem)
+        if match is not None and match["stem"] == found["stem"] and _belongs(other, session):
+            numbered[int(match["number"])] = other
+    absent = sorted(set(range(max(numbered) + 1)) - set(numbered))
+    names = ", ".join(part_path(path.with_name(f"{found['stem']}.mcap"), number).name for number in absent[:5])
+    missing = f"{len(absent)} of its parts are missing ({names})" if absent else ""
+    return Parts(tuple(numbered[number] for number in sorted(numbered)), missing)
+
+
+def log_format(path: Path) -> dict[str, str]:
+    """What a log says about its own form at its beginning; {} if it says nothing."""
+    with open_log(path) as stream:
+        for frame in frames(stream, Damage()):
+            if frame.opcode == Opcode.CHUNK:
+                break
+            if frame.opcode == Opcode.METADATA:
+                try:
+                    record = Metadata.read(ReadDataStream(BytesIO(frame.content)))
+                except (McapError, ValueError):
+                    continue
+                if record.name == FORMAT_RECORD and record.metadata == checked(record.metadata):
+                    return dict(record.metadata)
+    return {}
+
+
+def _belongs(path: Path, session: str) -> bool:
+    """Whether a file with a fitting name is of the session; one whose beginning is damaged is taken at its name."""
+    try:
+        return log_format(path).get("session", session) == session
+    except InputError:
+        return False
+
+
+def _in_folder(folder: Path) -> Parts:
+    files = sorted(folder.glob("*.mcap"))
+    if not files:
+        raise InputError("no .mcap log in this folder", file=folder, remedy="give the log itself")
+    stems = {found["stem"] if (found := _PART.match(file.stem)) else file.stem for file in files}
+    if len(stems) > 1:
+        names = ", ".join(sorted(stems)[:5])
+        raise InputError(f"{len(stems)} logs in this folder ({names})", file=folder, remedy="give one of them")
+    first = find_parts(files[0])
+    if len(first.paths) == len(files):
+        return first
+    if first.paths == (files[0],) and log_format(files[0]).get("part") not in (None, "0"):
+        lost = f"its first parts are missing (it begins with {files[0].name})"
+        return Parts(tuple(files), lost)
+    raise InputError(f"{len(files)} logs in this folder", file=folder, remedy="give one of them")

@@ -1,0 +1,342 @@
+"""Reads a log: the good part of a damaged one too, and says what is wrong with it."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self, TypeVar, cast
+
+from google.protobuf.message import Message
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment as AttachmentRecord
+from mcap.records import Channel
+from mcap.records import Metadata as MetadataRecord
+
+from protocols.core.errors import InputError
+from protocols.log.read.frames import (
+    Damage,
+    Frame,
+    RawMessage,
+    attachment_is_whole,
+    chunk_records,
+    frames,
+    message_record,
+    open_log,
+)
+from protocols.log.read.index import read_index
+from protocols.log.read.migration import upgrades_for
+from protocols.log.read.parts import find_parts, log_format
+from protocols.log.schemas import is_view
+from protocols.log.write.writer import CHANNEL_RECORD, channel_record
+from protocols.topics import BY_NAME, Topic
+from protocols.validation.codec import Address, Rejected, admit, parse_key
+
+_Record = TypeVar("_Record", AttachmentRecord, Channel, MetadataRecord)
+
+
+class Logged(NamedTuple):
+    """One message of a log, through the gate. log_time_ns: the recorder's clock (Unix, ns)."""
+
+    topic: Topic
+    agent: str
+    site: str
+    message: Message
+    log_time_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """One file stored in a log."""
+
+    name: str
+    media_type: str
+    data: bytes
+    log_time_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class TopicSummary:
+    """What a log holds of one key. address is None for a channel that is not of the catalogue."""
+
+    key: str
+    address: Address | None
+    count: int
+    first_ns: int
+    last_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class LogSummary:
+    """What a whole log holds, by key in the order of first appearance; times as in Logged, 0 if empty.
+
+    What only repeats it for viewers is left out.
+
+    damaged, reason: whether something is wrong with the file, and what comes first.
+    """
+
+    topics: tuple[TopicSummary, ...]
+    messages: int
+    first_ns: int
+    last_ns: int
+    damaged: bool
+    reason: str
+
+
+class RawLogged(NamedTuple):
+    """One message as it stands in a file: undecoded, under its channel's name; times in ns (Unix)."""
+
+    part: Path
+    key: str
+    raw: RawMessage
+
+
+class LogReader:
+    """Reads one log: a file, or the parts of one (their folder, or the first of them).
+
+    Raises InputError if it cannot be read, is no MCAP file at all, or is of a newer Syncline.
+
+    Every scan is in file order and verifies the checksums. A log that was not closed, is cut off or
+    has changed bytes gives what is whole; ``damage`` then says what is wrong.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self.paths, self._missing = find_parts(self.path)
+        self._damage = Damage()
+        self._counts: Counter[str] = Counter()
+        self._part = self.paths[0]
+        self.format = log_format(self._part)
+        """What the log says about its form: log, schema, syncline (versions); session and part if it has parts."""
+        self._upgrades = upgrades_for(self._part, self.format)
+
+    @property
+    def damage(self) -> str:
+        """What the last scan found wrong, as far as it came; "" if nothing."""
+        more = f" (and {self._damage.flaws - 1} more)" if self._damage.flaws > 1 else ""
+        return self._damage.text + more
+
+    @property
+    def skipped_bytes(self) -> int:
+        """Bytes that the last scan passed over because no record could be made out in them."""
+        return self._damage.skipped
+
+    @property
+    def cut(self) -> bool:
+        """Whether the last scan found a file to end before its end."""
+        return self._damage.cut
+
+    @property
+    def size(self) -> int:
+        """Bytes in all files."""
+        return sum(path.stat().st_size for path in self.paths)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Of the last ``messages()``: rejected.<reason>, and foreign for channels not of the catalogue."""
+        return dict(self._counts)
+
+    def messages(
+        self,
+        topics: Iterable[Topic | str] | None = None,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> Iterator[Logged]:
+        """The messages in file order.
+
+        topics: only these, by name or entry of the catalogue; start_ns, end_ns: log times, the end
+        excluded. With a start, what stands before it in a file with a sound index is neither read nor
+        verified. Raises InputError for a name that the catalogue does not have.
+        """
+        wanted = None if topics is None else {_topic(topic).name for topic in topics}
+        return self._messages(wanted, start_ns, end_ns)
+
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """The metadata records by name; the last one of a name counts."""
+        found: dict[str, dict[str, str]] = {}
+        for frame in self._frames():
+            if frame.opcode == Opcode.METADATA:
+                record = self._parse(MetadataRecord, frame)
+                if record is not None and not record.name.startswith("syncline."):
+                    found[record.name] = dict(record.metadata)
+        return found
+
+    def raw(self) -> Iterator[RawLogged]:
+        """Every whole message in file order, not through the gate, those for viewers too."""
+        for key, raw in self._raw_messages():
+            yield RawLogged(self._part, key, raw)
+
+    def attachments(self) -> list[Attachment]:
+        """The stored files in file order; one whose checksum does not match is left out, as damage."""
+        found: list[Attachment] = []
+        for frame in self._frames():
+            if frame.opcode != Opcode.ATTACHMENT:
+                continue
+            if not attachment_is_whole(frame.content):
+                self._damage.found(f"the attachment at byte {frame.offset} is damaged and was left out")
+                continue
+            record = self._parse(AttachmentRecord, frame)
+            if record is not None:
+                attachment = Attachment(record.name, record.media_type, record.data, record.log_time)
+                if attachment not in found:  # each part of a log repeats them
+                    found.append(attachment)
+        return found
+
+    def summary(self) -> LogSummary:
+        """Count everything; reads the whole file, but decodes no message."""
+        count: Counter[str] = Counter()
+        first: dict[str, int] = {}
+        last: dict[str, int] = {}
+        for key, raw in self._raw_messages():
+            if is_view(key):
+                continue
+            count[key] += 1
+            first[key] = min(first.get(key, raw.log_time_ns), raw.log_time_ns)
+            last[key] = max(last.get(key, raw.log_time_ns), raw.log_time_ns)
+        return LogSummary(
+            topics=tuple(TopicSummary(key, parse_key(key), count[key], first[key], last[key]) for key in count),
+            messages=count.total(),
+            first_ns=min(first.values(), default=0),
+            last_ns=max(last.values(), default=0),
+            damaged=bool(self._damage.flaws),
+            reason=self.damage,
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Nothing stays open between scans."""
+
+    def _messages(self, wanted: set[str] | None, start_ns: int | None, end_ns: int | None) -> Iterator[Logged]:
+        counts: Counter[str] = Counter()
+        self._counts = counts
+        for key, raw in self._raw_messages(start_ns):
+            if start_ns is not None and raw.log_time_ns < start_ns:
+                continue
+            if end_ns is not None and raw.log_time_ns >= end_ns:
+                continue
+            address = parse_key(key)
+            if address is None and is_view(key):
+                continue
+            if address is None:
+                counts["foreign"] += 1
+                continue
+            if wanted is not None and address.topic.name not in wanted:
+                continue
+            try:
+                payload = raw.payload
+                for upgrade in self._upgrades:
+                    payload = upgrade(address.topic, payload)
+                _, message = admit(key, payload)
+            except Rejected as error:
+                counts[f"rejected.{error.reason.value}"] += 1
+                continue
+            yield Logged(address.topic, address.agent, address.site, message, raw.log_time_ns)
+
+    def _raw_messages(self, start_ns: int | None = None) -> Iterator[tuple[str, RawMessage]]:
+        """(key, message) of every message whose channel is known."""
+        channels: dict[int, str] = {}
+        part, searched = None, False
+        for opcode, content, frame in self._records(start_ns):
+            if self._part != part:
+                channels, part, searched = {}, self._part, False
+            if opcode == Opcode.CHANNEL:
+                channel = self._parse(Channel, Frame(frame.offset, opcode, content))
+                if channel is not None:
+                    channels[channel.id] = channel.topic
+            elif opcode == Opcode.METADATA:
+                noted = _noted_channel(frame)
+                if noted is not None:
+                    channels.setdefault(*noted)
+            elif opcode == Opcode.MESSAGE:
+                raw = message_record(content)
+                if raw is not None and raw.channel not in channels and not searched:
+                    # The chunk that introduced the channel is damaged; the index at the end repeats it.
+                    searched = True
+                    channels = self._indexed_channels() | channels
+                if raw is None or raw.channel not in channels:
+                    self._damage.found(f"a message near byte {frame.offset} belongs to no known channel")
+                    continue
+                yield channels[raw.channel], raw
+
+    def _indexed_channels(self) -> dict[int, str]:
+        channels: dict[int, str] = {}
+        with open_log(self._part) as stream:
+            index = read_index(stream)
+            if index is not None:
+                return index.channels
+            for frame in frames(stream, Damage()):
+                if frame.opcode == Opcode.CHANNEL:
+                    channel = self._parse(Channel, frame)
+                    if channel is not None:
+                        channels[channel.id] = channel.topic
+        return channels
+
+    def _records(self, start_ns: int | None = None) -> Iterator[tuple[int, bytes, Frame]]:
+        """(opcode, content, the frame it stands in), with chunks opened."""
+        for frame in self._frames(start_ns):
+            if frame.opcode == Opcode.CHUNK:
+                for opcode, content in chunk_records(frame, self._damage):
+                    yield opcode, content, frame
+            else:
+                yield frame.opcode, frame.content, frame
+
+    def _frames(self, start_ns: int | None = None) -> Iterator[Frame]:
+        self._damage = damage = Damage()
+        if self._missing:
+            damage.found(self._missing)
+        for path in self.paths:
+            self._part = path
+            damage.place = f"{path.name}: " if len(self.paths) > 1 else ""
+            try:
+                with open_log(path) as stream:
+                    index = None if start_ns is None else read_index(stream)
+                    if index is None or start_ns is None:
+                        yield from frames(stream, damage)
+                        continue
+                    begin = index.offset_of(start_ns)
+                    if begin is not None:
+                        yield from frames(stream, damage, begin)
+            except InputError as error:
+                damage.found(error.what)
+            except OSError as error:
+                damage.found(f"the disk cannot read it to the end: {error.strerror or error}")
+
+    def _parse(self, kind: type[_Record], frame: Frame) -> _Record | None:
+        """One record as the library's class; None, and damage, if its inside is garbled."""
+        read: Callable[[ReadDataStream], _Record] = cast(Any, kind).read
+        try:
+            return read(ReadDataStream(BytesIO(frame.content)))
+        except (McapError, ValueError, struct.error):
+            self._damage.found(f"the record at byte {frame.offset} is garbled and was left out")
+            return None
+
+
+def _noted_channel(frame: Frame) -> tuple[int, str] | None:
+    """(id, key) of a note that names a channel outside its chunk; None for other metadata."""
+    try:
+        record = MetadataRecord.read(ReadDataStream(BytesIO(frame.content)))
+        if record.name != CHANNEL_RECORD:
+            return None
+        number, key = int(record.metadata["id"]), record.metadata["key"]
+    except (McapError, ValueError, struct.error, KeyError):
+        return None
+    return (number, key) if record.metadata == channel_record(number, key) else None
+
+
+def _topic(topic: Topic | str) -> Topic:
+    if isinstance(topic, Topic):
+        return topic
+    found = BY_NAME.get(topic)
+    if found is None:
+        raise InputError(f"there is no topic {topic!r}", remedy=f"use one of {', '.join(BY_NAME)}")
+    return found

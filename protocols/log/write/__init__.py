@@ -1,0 +1,1 @@
+"""Writing MCAP logs: crash-safe, rotated, with Foxglove channels."""

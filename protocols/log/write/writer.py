@@ -1,0 +1,270 @@
+"""Writes a live MCAP log that survives the death of its writer."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Any, NoReturn, Self, cast
+
+from google.protobuf.message import Message
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.writer import CompressionType, Writer
+
+from protocols.core.errors import InputError
+from protocols.core.version import VERSION
+from protocols.log.schemas import schema_of
+from protocols.topics import Topic
+from protocols.validation.codec import SCHEMA_VERSION, encode, parse_key
+
+if TYPE_CHECKING:
+    from protocols.log.write.foxglove import Views
+
+PROFILE = "syncline"
+LIBRARY = "syncline"
+CHUNK_SIZE = 60 * 1024
+"""Bytes after which a chunk is finished, so that one of small messages stays below 64 KiB.
+
+A chunk that was not finished is lost with its writer; 1 MiB of small messages is 12 s.
+"""
+LOG_VERSION = 1
+"""Counts changes of how a log is laid out that an old reader must know of."""
+FORMAT_RECORD = "syncline.format"
+CHANNEL_RECORD = "syncline.channel"
+
+
+class LogWriter:
+    """Writes messages of the catalogue to a new MCAP file. For use by one thread.
+
+    path: the file; its folders are made. An existing file is never overwritten (InputError).
+    metadata: written at the start, by name; readers get it back as it is.
+    part: of a log in several files: (session, number from 0).
+    views: also write what viewers show without set-up, in Foxglove's schemas.
+    schema: the version of the messages, where those of an old log are copied.
+    Any failure of the disk is InputError; what was written until then stays readable.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        metadata: Mapping[str, Mapping[str, str]] | None = None,
+        *,
+        part: tuple[str, int] | None = None,
+        views: bool = False,
+        schema: int = SCHEMA_VERSION,
+    ) -> None:
+        self.path = Path(path)
+        self._sequences: dict[int, int] = {}
+        self._channels: dict[str, int] = {}
+        self._keys: dict[tuple[str, str, str], str] = {}
+        self._schemas: dict[str, int] = {}
+        self._views: Views | None = None
+        if views:
+            from protocols.log.write.foxglove import Views
+
+            self._views = Views()
+        with self._disk():
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = _DirectFile(self.path)
+            _sync_folder(self.path.parent)
+        self._open = True
+        self._writer: Any = Writer(  # Any: half of its methods have no types
+            cast(IO[Any], self._file),
+            chunk_size=CHUNK_SIZE,
+            compression=CompressionType.ZSTD,
+            enable_crcs=True,
+            enable_data_crcs=True,
+        )
+        with self._disk():
+            self._writer.start(profile=PROFILE, library=LIBRARY)
+            self._writer.add_metadata(FORMAT_RECORD, _format(part, schema))
+            for name, values in (metadata or {}).items():
+                self._writer.add_metadata(name, dict(values))
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file so far."""
+        return self._file.tell()
+
+    def write(self, topic: Topic, agent: str, site: str, message: Message, log_time_ns: int) -> None:
+        """Append one message under the key it has on the bus.
+
+        log_time_ns: the recorder's clock (Unix, ns); the devices' own times stay in the message.
+        """
+        if message.DESCRIPTOR.name != topic.message:
+            raise TypeError(f"{message.DESCRIPTOR.name} on a topic of {topic.message}")
+        payload = encode(message)
+        name = (topic.name, agent, site)
+        key = self._keys.get(name)
+        if key is None:
+            key = self._keys[name] = topic.key_for(site, agent)
+        try:
+            self._put(key, payload, log_time_ns)
+            if self._views is not None:
+                for view in self._views.of(site, message, log_time_ns):
+                    self._put(view.key, view.message.SerializeToString(deterministic=True), log_time_ns)
+        except OSError as error:
+            self._failed(error)
+
+    def copy(self, key: str, payload: bytes, log_time_ns: int, publish_time_ns: int, sequence: int) -> None:
+        """Append a message of another log as it is. Its channel must be one of ours."""
+        try:
+            self._put(key, payload, log_time_ns, publish_time_ns, sequence)
+        except OSError as error:
+            self._failed(error)
+
+    def _put(
+        self,
+        key: str,
+        payload: bytes,
+        log_time_ns: int,
+        publish_time_ns: int | None = None,
+        sequence: int | None = None,
+    ) -> None:
+        channel = self._channels.get(key) or self._new_channel(key)
+        if sequence is None:
+            sequence = self._sequences.get(channel, 0)
+            self._sequences[channel] = sequence + 1
+        # By place: keywords cost a tenth of the rate.
+        self._writer.add_message(
+            channel,
+            log_time_ns,
+            payload,
+            log_time_ns if publish_time_ns is None else publish_time_ns,
+            sequence & 0xFFFFFFFF,
+        )
+
+    def attach(self, name: str, media_type: str, data: bytes, log_time_ns: int = 0) -> None:
+        """Store a whole file, e.g. a rig.toml, beside the messages."""
+        with self._disk():
+            self._writer.add_attachment(
+                create_time=0, log_time=log_time_ns, name=name, media_type=media_type, data=data
+            )
+
+    def sync(self) -> None:
+        """Finish the current chunk and bring everything to the disk; call it each second."""
+        with self._disk():
+            self._writer.flush()
+            self._file.sync()
+
+    def close(self) -> None:
+        """Write the index and bring everything to the disk. May be called twice."""
+        if not self._open:
+            return
+        with self._disk():
+            self._writer.finish()
+            self._file.sync()
+            self._shut()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _new_channel(self, key: str) -> int:
+        schema = schema_of(key)
+        if schema is None:
+            raise ValueError(f"{key!r} is no channel of ours")
+        if schema.name not in self._schemas:
+            self._schemas[schema.name] = self._writer.register_schema(
+                name=schema.name, encoding=SchemaEncoding.Protobuf, data=schema.data
+            )
+        address = parse_key(key)
+        channel: int = self._writer.register_channel(
+            topic=key,
+            message_encoding=MessageEncoding.Protobuf,
+            schema_id=self._schemas[schema.name],
+            metadata={} if address is None else {"topic": address.topic.name},
+        )
+        self._channels[key] = channel
+        # MCAP names a channel only inside the chunk that uses it first, and at the very end: one damaged chunk
+        # would make all that follow in an unclosed log nameless. This copy stands outside.
+        self._writer.add_metadata(CHANNEL_RECORD, channel_record(channel, key))
+        return channel
+
+    def _shut(self) -> None:
+        self._open = False
+        self._file.close()
+
+    @contextmanager
+    def _disk(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self._failed(error)
+
+    def _failed(self, error: OSError) -> NoReturn:
+        if isinstance(error, FileExistsError) and self.path.exists():
+            raise InputError("exists already", file=self.path, remedy="choose another name, or move it away") from None
+        # After a failed write the file may end in half a record, so nothing more is appended.
+        if getattr(self, "_open", False):
+            self._shut()
+        raise InputError(
+            f"cannot write: {error.strerror or error}",
+            file=self.path,
+            remedy="make room, or choose a place that can be written",
+        ) from None
+
+
+class _DirectFile:
+    """A new file without a buffer of its own, so that every finished chunk reaches the kernel.
+
+    Not an io.RawIOBase on purpose: the MCAP writer would put a buffer before one.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._raw = path.open("xb", buffering=0)
+        self._position = 0
+
+    def write(self, data: bytes) -> int:
+        left = memoryview(data)
+        while left:
+            written = self._raw.write(left)
+            left = left[written:]
+        self._position += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        return self._position
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def sync(self) -> None:
+        os.fsync(self._raw.fileno())
+
+    def close(self) -> None:
+        self._raw.close()
+
+
+def _sync_folder(folder: Path) -> None:
+    """Bring a new name to the disk: without it a power cut leaves synced data that no name leads to."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError:
+        pass  # some network file systems cannot; the data are synced all the same
+    finally:
+        os.close(handle)
+
+
+def channel_record(channel: int, key: str) -> dict[str, str]:
+    """What is noted of a channel outside its chunk."""
+    return checked({"id": str(channel), "key": key})
+
+
+def checked(values: Mapping[str, str]) -> dict[str, str]:
+    """Metadata with a checksum of its own, which MCAP does not give it; the same again for what has one already."""
+    plain = {name: value for name, value in values.items() if name != "crc"}
+    return {**plain, "crc": str(zlib.crc32(repr(sorted(plain.items())).encode()))}
+
+
+def _format(part: tuple[str, int] | None, schema: int) -> dict[str, str]:
+    values = {"log": str(LOG_VERSION), "schema": str(schema), "syncline": VERSION}
+    return checked(values if part is None else {**values, "session": part[0], "part": str(part[1])})

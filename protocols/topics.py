@@ -1,0 +1,122 @@
+"""The one catalogue of topics: key expression, message, rate, recorded?, queue, when it is stale.
+
+Publishing, subscribing, liveness, logging and replay all derive from this table, so that a topic is
+added in one place.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from enum import Enum
+
+from protocols.core.errors import InputError
+
+_ID = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}\Z")
+
+
+class Delivery(Enum):
+    """What happens to a message when the link or the receiver is slow or away."""
+
+    RELIABLE = "reliable"
+    """Cached by the publisher, recovered by the subscriber after an outage, in order."""
+    LATEST = "latest"
+    """Only the newest counts: late joiners get the last one, a slow reader skips."""
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One kind of message.
+
+    key: key expression below ``syncline/<site>/``, with ``{id}`` for the agent that publishes it.
+    message: name of the protobuf message in ``syncline.v1``.
+    rate_hz: nominal messages a second from one publisher (0 = on change).
+    recorded: whether the recorder writes it.
+    queue: messages that a subscriber holds before the oldest is dropped (and counted); 64 MiB is the other bound.
+    stale_after_s: silence after which a publisher that is alive counts as stale; 0 = never.
+    bulky: pictures: they wait in a lane of their own on every link, behind everything else.
+    """
+
+    name: str
+    key: str
+    message: str
+    rate_hz: float
+    recorded: bool
+    delivery: Delivery
+    queue: int
+    stale_after_s: float
+    bulky: bool = False
+
+    def key_for(self, site: str, agent: str) -> str:
+        """The concrete key of one publisher."""
+        return f"syncline/{valid_id(site, 'site')}/{self.key.format(id=valid_id(agent, 'id'))}"
+
+    def key_expression(self, site: str) -> str:
+        """Matches every publisher of this topic on a site."""
+        return f"syncline/{valid_id(site, 'site')}/{self.key.format(id='*')}"
+
+
+OBSERVATION = Topic("observation", "camera/{id}/observation", "Observation", 30.0, True, Delivery.RELIABLE, 65_536, 2.0)
+CAMERA_INFO = Topic("camera_info", "camera/{id}/info", "CameraInfo", 0.5, True, Delivery.LATEST, 256, 10.0)
+RIG_INFO = Topic("rig_info", "hub/{id}/rig", "RigInfo", 0.1, True, Delivery.LATEST, 16, 60.0)
+CALIBRATION = Topic("calibration", "hub/{id}/calibration", "Calibration", 0.5, True, Delivery.LATEST, 64, 0.0)
+TRACK = Topic("track", "hub/{id}/track", "Track", 30.0, True, Delivery.RELIABLE, 4096, 0.0)
+STATUS = Topic("status", "agent/{id}/status", "AgentStatus", 1.0, True, Delivery.LATEST, 1024, 5.0)
+NODE_STATE = Topic("node_state", "node/{id}/state", "NodeState", 10.0, True, Delivery.LATEST, 4096, 2.0)
+COMMAND = Topic("command", "view/{id}/command", "Command", 0.1, False, Delivery.RELIABLE, 64, 0.0)
+PREDICTION = Topic("prediction", "hub/{id}/prediction", "Prediction", 20.0, True, Delivery.LATEST, 16, 0.0)
+PICTURE = Topic("picture", "camera/{id}/picture", "Picture", 4.0, True, Delivery.LATEST, 512, 5.0, bulky=True)
+FLIGHT_IMAGE = Topic("flight_image", "uav/{id}/image", "FlightImage", 30.0, True, Delivery.LATEST, 512, 2.0, bulky=True)
+TELEMETRY = Topic("telemetry", "uav/{id}/telemetry", "VehicleTelemetry", 50.0, True, Delivery.RELIABLE, 8192, 2.0)
+TARGET_COMMAND = Topic("target_command", "uav/{id}/command", "TargetCommand", 0.1, True, Delivery.RELIABLE, 64, 0.0)
+TARGET = Topic("target", "uav/{id}/target", "TargetState", 30.0, True, Delivery.RELIABLE, 4096, 0.0)
+TARGET_CLOUD = Topic("target_cloud", "uav/{id}/cloud", "TargetCloud", 5.0, True, Delivery.LATEST, 16, 0.0)
+UAV_INFO = Topic("uav_info", "uav/{id}/info", "UavInfo", 0.5, True, Delivery.LATEST, 16, 10.0)
+ROAD_MAP = Topic("road_map", "uav/{id}/road", "RoadMap", 2.0, True, Delivery.LATEST, 16, 0.0)
+
+TOPICS: tuple[Topic, ...] = (
+    OBSERVATION,
+    CAMERA_INFO,
+    RIG_INFO,
+    CALIBRATION,
+    TRACK,
+    STATUS,
+    NODE_STATE,
+    COMMAND,
+    PICTURE,
+    PREDICTION,
+    FLIGHT_IMAGE,
+    TELEMETRY,
+    TARGET_COMMAND,
+    TARGET,
+    TARGET_CLOUD,
+    ROAD_MAP,
+    UAV_INFO,
+)
+BY_NAME: dict[str, Topic] = {topic.name: topic for topic in TOPICS}
+
+
+def liveliness_key(site: str, role: str, agent: str, boot_id: str) -> str:
+    """Key of an agent's liveliness token.
+
+    The boot id is part of it, so that two agents with one id show as two instead of interleaving
+    without a word.
+    """
+    return (
+        f"syncline/{valid_id(site, 'site')}/alive/{valid_id(role, 'role')}/{valid_id(agent, 'id')}/"
+        f"{valid_id(boot_id, 'boot id')}"
+    )
+
+
+def valid_id(text: str, what: str = "id") -> str:
+    """Return ``text`` if it may stand in a key; raise InputError otherwise.
+
+    A ``?`` or ``*`` in a declared key poisons a router's routing for good, so nothing else than this
+    alphabet ever reaches the bus.
+    """
+    if not _ID.match(text):
+        raise InputError(
+            f"{what} {text!r} is not usable",
+            remedy="use 1 to 63 lower-case letters, digits, '-' or '_', beginning with a letter or digit",
+        )
+    return text

@@ -1,0 +1,122 @@
+"""The gate: every payload from the bus or a log passes here, and nothing else does.
+
+``decode`` and ``admit`` return a message whose every field is usable, or raise Rejected with a
+reason that the caller counts. What is usable stands in ``gate_rules``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+from google.protobuf.message import DecodeError, Message
+
+from protocols.messages import syncline_pb2 as pb
+from protocols.topics import TOPICS, Topic
+from protocols.validation.rules import SCHEMA_VERSION, Reason, Rejected, check
+
+__all__ = [
+    "MAX_PAYLOAD",
+    "SCHEMA_VERSION",
+    "Address",
+    "Reason",
+    "Rejected",
+    "admit",
+    "decode",
+    "encode",
+    "message_class",
+    "parse_key",
+    "sender",
+]
+
+MAX_PAYLOAD = 1024 * 1024
+"""Bytes. An observation with the most detections that are allowed is about two thirds of it."""
+
+_ID = r"[a-z0-9][a-z0-9_-]{0,62}"
+_KEYS: tuple[tuple[Topic, re.Pattern[str]], ...] = tuple(
+    (topic, re.compile(rf"syncline/({_ID})/{re.escape(topic.key).replace(re.escape('{id}'), f'({_ID})')}\Z"))
+    for topic in TOPICS
+)
+FLIGHT = (
+    pb.FlightImage | pb.VehicleTelemetry | pb.TargetCommand | pb.TargetState | pb.TargetCloud | pb.RoadMap | pb.UavInfo
+)
+"""What a UAV agent says; all name it as their sender."""
+_CLASSES: Mapping[str, type[Message]] = {topic.message: getattr(pb, topic.message) for topic in TOPICS}
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """What a key says: the site, the kind of message, and the agent that publishes it."""
+
+    site: str
+    topic: Topic
+    agent: str
+
+
+@lru_cache(maxsize=8192)
+def parse_key(key: str) -> Address | None:
+    """The address in a key such as ``syncline/local/camera/cam0/observation``; None for other keys."""
+    for topic, pattern in _KEYS:
+        found = pattern.match(key)
+        if found:
+            return Address(found[1], topic, found[2])
+    return None
+
+
+def message_class(topic: Topic) -> type[Message]:
+    """The protobuf class of a topic's messages."""
+    return _CLASSES[topic.message]
+
+
+def sender(message: Message) -> str | None:
+    """The id that a message claims to come from; None for kinds that name no sender."""
+    if isinstance(message, pb.Observation | pb.CameraInfo | pb.NodeState | pb.Picture):
+        return message.camera
+    if isinstance(message, pb.Command):
+        return message.sender
+    if isinstance(message, pb.AgentStatus | FLIGHT):
+        return message.agent
+    return None
+
+
+def encode(message: Message) -> bytes:
+    """Serialise; equal messages give equal bytes (maps are sorted). Raises Rejected above MAX_PAYLOAD."""
+    payload = message.SerializeToString(deterministic=True)
+    if len(payload) > MAX_PAYLOAD:
+        raise Rejected(Reason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD}")
+    return payload
+
+
+def decode(topic: Topic, payload: bytes) -> Message:
+    """Parse and validate one payload of ``topic``; raises Rejected."""
+    if len(payload) > MAX_PAYLOAD:
+        raise Rejected(Reason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD}")
+    message = _CLASSES[topic.message]()
+    try:
+        message.ParseFromString(payload)
+    except DecodeError as error:
+        raise Rejected(Reason.GARBLED, str(error)) from None
+    try:
+        check(message)
+    except Rejected as error:
+        error.sequence = getattr(message, "sequence", None)
+        raise
+    return message
+
+
+def admit(key: str, payload: bytes) -> tuple[Address, Message]:
+    """Parse and validate what arrived under ``key``; raises Rejected.
+
+    A message whose own id differs from the id in its key is rejected: else an agent that may write
+    only below its own key could speak in another's name.
+    """
+    address = parse_key(key)
+    if address is None:
+        raise Rejected(Reason.UNKNOWN_KEY, key[:200])
+    message = decode(address.topic, payload)
+    claimed = sender(message)
+    if claimed is not None and claimed != address.agent:
+        raise Rejected(Reason.WRONG_SENDER, f"{claimed!r} under the key of {address.agent!r}")
+    return address, message
