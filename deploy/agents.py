@@ -31,7 +31,7 @@ def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event, beat: Ca
     import cv2
 
     from deploy.notify import Watched
-    from edge.camera_agent import run_camera_agent
+    from edge.agents.camera import run_camera_agent
 
     cv2.setNumThreads(1)  # one core a camera: several agents share a board
     known = _known_camera(config)
@@ -66,7 +66,7 @@ def _detector(config: CameraConfig, lens: Intrinsics | None, fps: float) -> Dete
             remedy="pip install scipy, or make the bundle with --extra scipy",
         )
     if config.detector == "marker":
-        from edge.detectors.marker import MarkerDetector, MarkerModel
+        from edge.detectors.marker.ball import MarkerDetector, MarkerModel
 
         marker = config.marker
         if marker.mode != "colour":
@@ -84,11 +84,11 @@ def _detector(config: CameraConfig, lens: Intrinsics | None, fps: float) -> Dete
         )
     moving = config.moving
     if config.detector == "person":
-        from edge.detectors.person import PersonDetector
+        from edge.detectors.people.person import PersonDetector
 
         # Cameras do not know each other's people: their labels must not look like the same points.
         return PersonDetector(moving.background, fps, prefix=f"{config.id[:48]}-p")
-    from edge.detectors.vehicle import VehicleDetector
+    from edge.detectors.moving.vehicle import VehicleDetector
 
     camera = {"auto": None, "fixed": False, "moving": True}[moving.camera]
     return VehicleDetector(moving.background, fps, prefix=f"{config.id[:48]}-t", moving=camera)
@@ -153,7 +153,7 @@ def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:
     if config.driver == "simulated":
         return _simulated(config)
     if config.driver == "oak":
-        from edge.devices.oak import OakCamera, OakSettings
+        from edge.devices.live.oak import OakCamera, OakSettings
 
         oak = config.oak or OakConfig()
         settings = OakSettings(
@@ -171,7 +171,7 @@ def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:
         )
         return OakCamera(settings, intrinsics=intrinsics)
     if config.driver == "usb":
-        from edge.devices.usb import UsbSettings, open_usb
+        from edge.devices.live.usb import UsbSettings, open_usb
 
         usb = config.usb or UsbConfig()
         place = f"/dev/video{usb.device}" if usb.device.isdigit() else str(usb.device)
@@ -180,26 +180,26 @@ def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:
             intrinsics=intrinsics,
         )
     if config.driver == "picamera2":
-        from edge.devices.picamera import PiCamera, PiSettings
+        from edge.devices.live.picamera import PiCamera, PiSettings
 
         pi = config.picamera2 or PiConfig()
         made = PiSettings(pi.camera, pi.size, pi.fps, pi.exposure_us, pi.gain, pi.readout_s)
         return PiCamera(made, intrinsics=intrinsics)
     if config.driver == "rtsp":
-        from edge.devices.network import open_network
+        from edge.devices.live.network import open_network
 
         assert config.rtsp is not None  # the configuration has seen to that
         url, transport = config.rtsp.url, config.rtsp.transport
         return open_network(url, transport=transport, fps=config.rtsp.fps, intrinsics=intrinsics)
-    from edge.devices.pacing import RealTime
+    from edge.devices.playback.playback_clock import RealTime
 
     if config.driver == "log":
-        from edge.devices.logged import LoggedCamera
+        from edge.devices.playback.log_playback import LoggedCamera
 
         assert config.log is not None  # the configuration has seen to that
         pace = None if config.log.fast else RealTime(time.time())
         return LoggedCamera(config.log.file, config.log.camera or config.id, pace=pace, intrinsics=intrinsics)
-    from edge.devices.video import open_video
+    from edge.devices.playback.open_video import open_video
 
     assert config.video is not None  # the configuration has seen to that
     return open_video(
@@ -213,9 +213,9 @@ def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:
 
 def _simulated(config: CameraConfig) -> Device:
     from edge import scenes
-    from edge.devices.pacing import RealTime
-    from edge.devices.simulated import SimulatedDevice
-    from edge.scenes.scaled import scaled
+    from edge.devices.playback.playback_clock import RealTime
+    from edge.devices.simulated.camera import SimulatedDevice
+    from edge.scenes.common.scaled import scaled
 
     world = config.simulated or SimulatedConfig()
     epoch = world.start_unix_s

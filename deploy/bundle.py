@@ -49,11 +49,12 @@ NEEDS: dict[str, tuple[str, ...]] = {
 BUDGET_MB = {"camera": 350.0, "uav": 350.0}
 """Installed, without an OAK board's depthai."""
 _WARM = {
-    "camera": "deploy.agents, deploy.detecting, deploy.notify, edge.camera_agent, edge.detectors.bright, "
-    "edge.detectors.marker, edge.detectors.tag, edge.devices.logged, edge.devices.network, edge.devices.picamera, "
-    "edge.devices.usb, edge.devices.video, protocols.bus.transport.zenoh_bus",
-    "uav": "deploy.uav, deploy.notify, edge.uav_agent, edge.mavlink.link, edge.uav.models.ground, edge.devices.video, "
-    "protocols.bus.transport.zenoh_bus",
+    "camera": "deploy.agents, deploy.detecting, deploy.notify, edge.agents.camera, "
+    "edge.detectors.marker.bright, edge.detectors.marker.ball, edge.detectors.marker.tag, "
+    "edge.devices.playback.log_playback, edge.devices.live.network, edge.devices.live.picamera, "
+    "edge.devices.live.usb, edge.devices.playback.open_video, protocols.bus.transport.zenoh_bus",
+    "uav": "deploy.uav, deploy.notify, edge.agents.uav, edge.mavlink.link.connection, "
+    "edge.uav.ground_tracker, edge.devices.playback.open_video, protocols.bus.transport.zenoh_bus",
     "hub": "deploy.agents, hub.agent, hub.calibrate, hub.nodes.host, hub.report, protocols.bus.transport.zenoh_bus",
     "recorder": "deploy.record, protocols.bus.transport.zenoh_bus",
     "router": "deploy.commands.router, protocols.bus.router.zenoh_router",

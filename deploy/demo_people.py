@@ -15,7 +15,7 @@ from deploy.demo import LOG, DemoSettings, Fleet, Live
 from deploy.people_scores import Moment, Scores, clear_mot
 from deploy.simulated import camera_tables
 from edge import scenes
-from edge.scenes.people import PeopleScene
+from edge.scenes.people.scene import PeopleScene
 from protocols.bus.base import Bus
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.files import write_atomically

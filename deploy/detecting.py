@@ -12,8 +12,8 @@ from typing import Literal
 import tomli_w
 
 from edge.detectors.base import Detection, Detector
-from edge.detectors.marker import MarkerDetector, MarkerModel, teach
-from edge.devices.film import Film
+from edge.detectors.marker.ball import MarkerDetector, MarkerModel, teach
+from edge.devices.playback.video_reader import Film
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.session.calibration import csv_cell
@@ -130,11 +130,11 @@ def other_marker(
 ) -> Detector:
     """The detector of a marker that is no coloured ball; see ``deploy.config.MarkerConfig``. Raises InputError."""
     if mode == "tag":
-        from edge.detectors.tag import TagDetector, TagModel
+        from edge.detectors.marker.tag import TagDetector, TagModel
 
         tags = TagModel(dictionary, "tag" if label == "marker" else label)
         return TagDetector(tags if min_size is None else replace(tags, min_size=min_size))
-    from edge.detectors.bright import BrightDetector, BrightModel
+    from edge.detectors.marker.bright import BrightDetector, BrightModel
 
     light = BrightModel(threshold, min_size or 0.0, label=label)
     return BrightDetector(light if max_size is None else replace(light, max_size=max_size))

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deploy.detecting import Found, detect_in
-from edge.detectors.foreground import ModelName
-from edge.detectors.person import PersonDetector
-from edge.detectors.vehicle import VehicleDetector
-from edge.devices.film import Film
+from edge.detectors.moving.foreground import ModelName
+from edge.detectors.moving.vehicle import VehicleDetector
+from edge.detectors.people.person import PersonDetector
+from edge.devices.playback.video_reader import Film
 
 if TYPE_CHECKING:
     from edge.detectors.base import Detection

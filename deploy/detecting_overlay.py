@@ -10,7 +10,7 @@ import numpy as np
 
 from edge.detectors.base import Detection
 from edge.devices.base import Image
-from edge.devices.film import Film
+from edge.devices.playback.video_reader import Film
 from protocols.core.errors import InputError
 
 _HUES = 12

@@ -185,7 +185,7 @@ def _kind_of(file: Path) -> str | None:
 
 def _stamps_of(camera: str, videos: Path) -> Floats:
     """Times (n,) [s] of the frames of a camera's video, in the order in which they are shown."""
-    from edge.devices.film import VIDEO_SUFFIXES, Film
+    from edge.devices.playback.video_reader import VIDEO_SUFFIXES, Film
 
     found = sorted(path for path in videos.glob(f"{camera}.*") if path.suffix.lower() in VIDEO_SUFFIXES)
     if not found:

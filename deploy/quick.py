@@ -12,9 +12,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from edge.camera_agent import CameraAgent
-from edge.detectors.marker import MarkerModel, teach
-from edge.detectors.taught import TaughtDetector, teach_at
+from edge.agents.camera import CameraAgent
+from edge.detectors.marker.ball import MarkerModel, teach
+from edge.detectors.marker.teach import TaughtDetector, teach_at
 from edge.devices.base import Device, DeviceInfo, Frame
 from edge.lens.solve import lens_from_angle
 from hub.agent import run_hub

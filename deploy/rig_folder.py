@@ -201,7 +201,7 @@ def _simulated_flight(config: Any, world: World, began: float) -> Any:
 def _simulated_rig(rig: RigFolder, cameras: Sequence[str]) -> dict[str, Any]:
     """rig.toml of the stand-in world: its lenses, and of the rig's distances those that it has."""
     from edge import scenes
-    from edge.scenes.scaled import scaled
+    from edge.scenes.common.scaled import scaled
 
     scene = scaled(scenes.get(rig.world.scene, rig.world.seed, max(len(cameras), 2)), rig.world.width, rig.world.fps)
     where = {name: scene.cameras[index] for index, name in enumerate(cameras)}

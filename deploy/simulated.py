@@ -9,8 +9,8 @@ import numpy as np
 import tomli_w
 
 from edge import scenes
-from edge.scenes.base import Scene
-from edge.scenes.session import SimulatedTracks, simulated_session
+from edge.scenes.common.base import Scene
+from edge.scenes.marker.session import SimulatedTracks, simulated_session
 from protocols.core.errors import InputError
 from protocols.core.files import write_atomically
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig

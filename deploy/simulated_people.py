@@ -10,8 +10,8 @@ import tomli_w
 
 from deploy.simulated import TRUTH_CALIBRATION, TRUTH_TRAJECTORY, camera_tables
 from edge import scenes
-from edge.scenes.people import PeopleScene
-from edge.scenes.people_session import PeopleTrack, film_people, seen
+from edge.scenes.people.scene import PeopleScene
+from edge.scenes.people.session import PeopleTrack, film_people, seen
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.files import write_atomically

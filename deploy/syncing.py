@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from edge.devices.base import Image
-from edge.devices.film import Film
+from edge.devices.playback.video_reader import Film
 from protocols.core.clocks import CameraTime, TimeMap
 from protocols.core.errors import InputError, Refused
 from protocols.geometry.types import Floats

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from edge.devices.base import Frame
-from edge.devices.recording import IMAGE_SUFFIXES
+from edge.devices.playback.video_file import IMAGE_SUFFIXES
 from edge.uav.tracker import Box, Estimate, Image, State, Telemetry, Tracker
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame
-from edge.devices.recording import Recording
-from edge.uav.follower import decoded
+from edge.devices.playback.video_file import Recording
+from edge.uav.estimator import decoded
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics

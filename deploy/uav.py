@@ -21,10 +21,10 @@ from protocols.geometry.types import Floats
 from protocols.session.rig import read_rig
 
 if TYPE_CHECKING:
-    from edge.devices.aircraft import SimulatedAircraft
-    from edge.mavlink.autopilot import Autopilot
-    from edge.mavlink.camera import CameraComponent, Select, Stop, Stream
-    from edge.mavlink.link import Link
+    from edge.devices.simulated.aircraft import SimulatedAircraft
+    from edge.mavlink.link.connection import Link
+    from edge.mavlink.roles.autopilot import Autopilot
+    from edge.mavlink.roles.camera import CameraComponent, Select, Stop, Stream
     from edge.uav.tracker import Estimate, Image
     from edge.uav.world.world import World
 
@@ -48,7 +48,7 @@ def start_uav(config: UavConfig, bus: Bus, stop: threading.Event, beat: Callable
 
     from deploy.notify import Watched
     from deploy.uav_video import Shown, serve_video
-    from edge.uav_agent import Looking, UavAgent
+    from edge.agents.uav import Looking, UavAgent
 
     cv2.setNumThreads(1)
     with ExitStack() as stack:
@@ -79,11 +79,11 @@ def start_uav(config: UavConfig, bus: Bus, stop: threading.Event, beat: Callable
 
 def make_link(config: UavConfig) -> Link:
     """The link that the configuration names, not yet open."""
-    from edge.mavlink import camera, telemetry
     from edge.mavlink.dialect import CAMERA
-    from edge.mavlink.link import Link
-    from edge.mavlink.signing import Signing, read_key
-    from edge.mavlink.transport import parse
+    from edge.mavlink.link.connection import Link
+    from edge.mavlink.link.signing import Signing, read_key
+    from edge.mavlink.link.transport import parse
+    from edge.mavlink.roles import camera, telemetry
 
     settings = config.mavlink
     signing = None
@@ -112,10 +112,10 @@ def make_agent(
     boot_id: str | None = None,
 ) -> object:
     """The agent around a device and a link. looking: a ``Looking``; now_ns: the host's monotonic clock."""
-    from edge.mavlink.camera import CameraComponent
-    from edge.mavlink.control import Control, Limits
-    from edge.mavlink.vehicle import Vehicle
-    from edge.uav_agent import Looking, UavAgent
+    from edge.agents.uav import Looking, UavAgent
+    from edge.mavlink.roles.camera import CameraComponent
+    from edge.mavlink.roles.guidance import Control, Limits
+    from edge.mavlink.roles.vehicle import Vehicle
 
     assert isinstance(looking, Looking)
     numbers = tuple(int(part) for part in VERSION.split(".")[:3])
@@ -161,7 +161,7 @@ def simulation(flight: FlightConfig, size: tuple[int, int] = (640, 480)) -> Simu
     """The world of a [simulated] table and its aircraft, at the world's time 0. Raises InputError."""
     import numpy as np
 
-    from edge.devices.aircraft import SimulatedAircraft
+    from edge.devices.simulated.aircraft import SimulatedAircraft
     from edge.uav.world.patrol import patrol
 
     world = patrol(flight.seed, flight.seconds, size)
@@ -188,9 +188,9 @@ def simulation(flight: FlightConfig, size: tuple[int, int] = (640, 480)) -> Simu
 @contextmanager
 def flying(flight: FlightConfig, site: Simulation, epoch_unix_s: float) -> Iterator[None]:
     """The autopilot of a simulation, on its UDP port, in a thread of its own."""
-    from edge.devices.pacing import RealTime
-    from edge.mavlink.autopilot import Autopilot, Faults
-    from edge.mavlink.transport import Udp, Url
+    from edge.devices.playback.playback_clock import RealTime
+    from edge.mavlink.link.transport import Udp, Url
+    from edge.mavlink.roles.autopilot import Autopilot, Faults
 
     host, _, port = flight.autopilot.rpartition(":")
     try:
@@ -226,8 +226,8 @@ def _camera(config: UavConfig) -> Iterator[tuple[Device, Intrinsics | None, Floa
     if config.driver == "simulated":
         import numpy as np
 
-        from edge.devices.flight_camera import FlightCamera
-        from edge.devices.pacing import RealTime
+        from edge.devices.playback.playback_clock import RealTime
+        from edge.devices.simulated.aircraft_camera import FlightCamera
 
         flight = config.simulated or FlightConfig()
         site = simulation(flight)
@@ -247,7 +247,7 @@ def _camera(config: UavConfig) -> Iterator[tuple[Device, Intrinsics | None, Floa
 
 def gimbal_mounting() -> Floats:
     """body_from_camera of a camera that looks along its gimbal's x axis."""
-    from edge.devices.aircraft import GIMBAL_FROM_CAMERA
+    from edge.devices.simulated.aircraft import GIMBAL_FROM_CAMERA
 
     return GIMBAL_FROM_CAMERA
 

@@ -35,7 +35,7 @@ class MavlinkConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     key_state: Path | None = None
 
     def __post_init__(self) -> None:
-        from edge.mavlink.transport import parse
+        from edge.mavlink.link.transport import parse
 
         try:
             parse(self.url)

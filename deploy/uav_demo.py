@@ -29,7 +29,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.topics import TARGET
 
 if TYPE_CHECKING:
-    from edge.mavlink.station import Station
+    from edge.mavlink.roles.station import Station
     from edge.uav.world.world import World
 
 RESULT = "result.json"
@@ -64,7 +64,7 @@ def run_town(
     view_port: of a live view beside it; None = none, 0 = any free one. viewed: is told the address to open.
     """
     from deploy.uav_demo_report import write_report
-    from edge.mavlink.station import Station
+    from edge.mavlink.roles.station import Station
     from edge.uav.world.patrol import patrol
 
     out = out.resolve()

@@ -107,7 +107,7 @@ def compare_geo(told: list[tuple[float, float, float, float]], world: World) -> 
 
     told: world time [s], latitude, longitude [degrees], accuracy [m].
     """
-    from edge.mavlink.autopilot import ORIGIN
+    from edge.mavlink.roles.autopilot import ORIGIN
 
     errors, accuracies = [], []
     for moment, latitude, longitude, accuracy in told:

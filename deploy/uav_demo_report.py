@@ -153,7 +153,7 @@ def _pictures(log: Path, states: Sequence[pb.TargetState], world: World) -> str:
 def _figure(message: pb.FlightImage, state: Any, clouds: Iterable[pb.TargetCloud], why: str) -> str:
     import cv2
 
-    from edge.uav.follower import decoded
+    from edge.uav.estimator import decoded
     from edge.uav.operator_view import draw
     from edge.uav.tracker import Estimate, State
 

@@ -17,7 +17,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.topics import FLIGHT_IMAGE, ROAD_MAP, TARGET, TARGET_CLOUD, TARGET_COMMAND, TELEMETRY, UAV_INFO
 
 if TYPE_CHECKING:
-    from edge.uav.follower import Follower
+    from edge.uav.estimator import Follower
 
 _INPUTS = (FLIGHT_IMAGE, TELEMETRY, TARGET_COMMAND)
 _OUTPUTS = {topic.message: topic for topic in (TARGET, TARGET_CLOUD, ROAD_MAP)}
@@ -80,7 +80,7 @@ def _infos(reader: LogReader) -> dict[tuple[str, str], pb.UavInfo]:
 
 
 def _follower(info: pb.UavInfo) -> Follower:
-    from edge.uav.follower import Follower
+    from edge.uav.estimator import Follower
 
     lens = None
     if info.matrix:

@@ -26,7 +26,7 @@ _AROUND_S = 3.0  # of samples kept before and after the video
 def read_own_clock(file: Path) -> TelemetryFile:
     """The samples of a .tlog or .mcap, on that file's own clock. Raises InputError."""
     if file.suffix.lower() == ".tlog":
-        from edge.mavlink.tlog import read_tlog
+        from edge.mavlink.link.tlog import read_tlog
 
         log = read_tlog(file)
         return TelemetryFile(log.samples, log.left_out)
@@ -63,8 +63,8 @@ def onto_video(
 
     No samples where the offset can't be told; then the line says why. tell: called with the index of each frame.
     """
-    from edge.uav.alignment import find_offset
-    from edge.uav.seen_turning import SeenTurning, usual_tilt
+    from edge.uav.timing.telemetry_offset import find_offset
+    from edge.uav.timing.visual_rotation import SeenTurning, usual_tilt
 
     samples = told.samples
     tilt = usual_tilt(samples, body_from_camera)

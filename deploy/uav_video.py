@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from deploy.uav_config import VideoOutConfig
 
 if TYPE_CHECKING:
-    from edge.mavlink.camera import Stream
+    from edge.mavlink.roles.camera import Stream
     from edge.uav.tracker import Estimate, Image
 
 
@@ -54,22 +54,22 @@ def serve_video(out: VideoOutConfig, size: tuple[int, int], fps: float, shown: S
 
     size: (width, height) [px]. Raises InputError where it cannot be served.
     """
-    from edge.mavlink.camera import Stream
+    from edge.mavlink.roles.camera import Stream
 
     host, _, text = out.listen.rpartition(":")
     host, port = host.strip("[]"), int(text)
     if out.stream == "rtsp":
-        from edge import rtsp_server
+        from edge.video import rtsp_server
 
         server = stack.enter_context(rtsp_server.RtspServer(host, port, shown.picture, size, fps, out.kbps))
         shown.tell = server.changed
         scheme, path, port = "rtsp", rtsp_server.PATH, server.port
     else:
-        from edge import video_server
+        from edge.video import mjpeg_server
 
-        pages = stack.enter_context(video_server.VideoServer(host, port, lambda: shown.jpeg(out.quality)))
+        pages = stack.enter_context(mjpeg_server.VideoServer(host, port, lambda: shown.jpeg(out.quality)))
         shown.tell = pages.changed
-        scheme, path, port = "http", video_server.PATH, pages.port
+        scheme, path, port = "http", mjpeg_server.PATH, pages.port
     shown_host = f"[{host}]" if ":" in host else host
     uri = out.uri or f"{scheme}://{shown_host}:{port}{path}"
     return Stream("rtsp" if uri.startswith("rtsp://") else "mjpeg", uri)

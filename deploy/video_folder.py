@@ -16,8 +16,8 @@ import cv2
 import tomli_w
 
 from deploy.detecting import MARKER_FILE, Found, detect_in, marker_detector, observations_text, read_marker
-from edge.detectors.marker import REVISION, MarkerModel
-from edge.devices.film import VIDEO_SUFFIXES, Film, has_pyav
+from edge.detectors.marker.ball import REVISION, MarkerModel
+from edge.devices.playback.video_reader import VIDEO_SUFFIXES, Film, has_pyav
 from protocols.core.errors import InputError
 from protocols.core.files import write_together
 from protocols.core.version import VERSION

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import tomli_w
 
 from edge import scenes
-from edge.scenes.marker import MarkerScene
+from edge.scenes.marker.scene import MarkerScene
 from protocols.geometry.types import Floats
 
 Image = npt.NDArray[np.uint8]

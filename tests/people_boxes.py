@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
-from edge.scenes.people import PeopleScene
+from edge.scenes.people.scene import PeopleScene
 from protocols.geometry.types import Bools, Floats
 
 _IN_VIEW = 0.5  # share of the silhouette that must be seen to count

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from edge.scenes.people import PeopleScene
+from edge.scenes.people.scene import PeopleScene
 from hub.tracking.camera import TrackingCamera
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats

@@ -18,18 +18,18 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from deploy.uav import gimbal_mounting, make_agent
 from deploy.uav_config import ControlConfig, FlightConfig, UavConfig
-from edge.devices.aircraft import Push, SimulatedAircraft
+from edge.agents.uav import Looking, UavAgent
 from edge.devices.base import Frame
-from edge.devices.flight_camera import FlightCamera
-from edge.devices.pacing import AsFastAsPossible
-from edge.mavlink import camera, telemetry
-from edge.mavlink.autopilot import Autopilot, Faults
+from edge.devices.playback.playback_clock import AsFastAsPossible
+from edge.devices.simulated.aircraft import Push, SimulatedAircraft
+from edge.devices.simulated.aircraft_camera import FlightCamera
 from edge.mavlink.dialect import CAMERA
-from edge.mavlink.link import Link
-from edge.mavlink.signing import Signing
-from edge.mavlink.transport import Address, Pipe
+from edge.mavlink.link.connection import Link
+from edge.mavlink.link.signing import Signing
+from edge.mavlink.link.transport import Address, Pipe
+from edge.mavlink.roles import camera, telemetry
+from edge.mavlink.roles.autopilot import Autopilot, Faults
 from edge.uav.world.world import Truth, World
-from edge.uav_agent import Looking, UavAgent
 
 STEP_S = 0.01
 TRANSFER_S = 0.02

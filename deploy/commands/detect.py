@@ -119,9 +119,9 @@ def detect(
         raise InputError("--teach, --marker and --colour each say what the marker looks like", remedy="keep one")
     from deploy import detecting
     from deploy.track import choose_camera, parse_target
-    from edge.detectors.marker import MarkerModel
+    from edge.detectors.marker.ball import MarkerModel
     from edge.devices.base import check_size
-    from edge.devices.film import Film
+    from edge.devices.playback.video_reader import Film
     from protocols.core.files import write_together
 
     film = Film(video, fps)

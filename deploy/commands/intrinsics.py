@@ -86,7 +86,7 @@ def intrinsics(
         raise InputError(what, remedy=f"give 5 to {widest:g} degrees")
     if model is not None and field_of_view is not None:
         raise InputError("--model and --field-of-view each tell the field of view", remedy="keep one")
-    from edge.devices.film import Film
+    from edge.devices.playback.video_reader import Film
     from edge.lens.board import Charuco, Chessboard, View, views_of
     from edge.lens.models import UNKNOWN_STD, angle_across, find_model
     from edge.lens.solve import LensFit, coverage_map, lens_from_angle, solve_lens

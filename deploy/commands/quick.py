@@ -142,7 +142,7 @@ def _box(text: str) -> tuple[float, float, float, float]:
 
 
 def _webcams(cameras: str) -> dict[str, Device]:
-    from edge.devices.video import open_video
+    from edge.devices.playback.open_video import open_video
 
     places = [place.strip() for place in cameras.split(",") if place.strip()]
     _enough(places, "--cameras")
@@ -153,7 +153,7 @@ def _webcams(cameras: str) -> dict[str, Device]:
 
 
 def _films(files: tuple[Path, ...]) -> dict[str, Device]:
-    from edge.devices.video import open_video
+    from edge.devices.playback.open_video import open_video
 
     _enough([str(file) for file in files], "--source")
     for file in files:
@@ -165,8 +165,8 @@ def _films(files: tuple[Path, ...]) -> dict[str, Device]:
 
 def _simulated(seed: int) -> dict[str, Device]:
     from edge import scenes
-    from edge.devices.pacing import RealTime
-    from edge.devices.simulated import SimulatedDevice
+    from edge.devices.playback.playback_clock import RealTime
+    from edge.devices.simulated.camera import SimulatedDevice
 
     pace = RealTime(time.time())
     scene = scenes.get("marker", seed, 2)

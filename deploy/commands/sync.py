@@ -59,7 +59,7 @@ def sync(
         raise InputError("--out is the folder of the videos", file=out, remedy="choose another --out")
     from deploy import syncing
     from deploy.video_folder import list_videos
-    from edge.devices.film import Film, has_pyav
+    from edge.devices.playback.video_reader import Film, has_pyav
     from protocols.session.calibration import csv_cell, read_calibration
 
     if not has_pyav():
@@ -133,7 +133,7 @@ def sync(
 
 
 def _troubles(film: object) -> list[str]:
-    from edge.devices.film import Film
+    from edge.devices.playback.video_reader import Film
 
     assert isinstance(film, Film)
     told = [f"{film.corrupt} frames could not be decoded and were skipped"] if film.corrupt else []

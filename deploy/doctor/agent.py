@@ -171,7 +171,7 @@ def mavlink(
 ) -> Finding:
     """A heartbeat of an autopilot.
 
-    link: an ``edge.mavlink.link.Link`` that lets HEARTBEAT in. hello: a message that is sent each second, for
+    link: an ``edge.mavlink.link`` connection that lets HEARTBEAT in. hello: a message that is sent each second, for
     autopilots that answer only who has called them; None = only listen.
     """
     began = now()

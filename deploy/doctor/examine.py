@@ -79,8 +79,8 @@ def _sight(config: Any, driver: str) -> Iterator[Finding]:
 def _vehicle(config: Any, patience_s: float = 3.0) -> Finding:
     try:
         from edge.mavlink.dialect import CAMERA, mavlink
-        from edge.mavlink.link import Link
-        from edge.mavlink.transport import parse
+        from edge.mavlink.link.connection import Link
+        from edge.mavlink.link.transport import parse
 
         url = parse(config.mavlink.url)
     except InputError as error:

@@ -17,7 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from deploy.doctor.finding import Finding, ok, skip, warn, wrong
-from edge.clock_quality import kernel_clock
+from edge.agents.clock_quality import kernel_clock
 
 PACKAGES: dict[str, tuple[str, ...]] = {
     "": ("numpy", "zenoh", "msgspec", "google.protobuf"),

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from edge.devices.base import Image
-from edge.devices.film import Shot
+from edge.devices.playback.video_reader import Shot
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 from protocols.core.errors import InputError
 
 if TYPE_CHECKING:
-    from edge.scenes.base import Scene
-    from edge.scenes.marker import MarkerScene
-    from edge.scenes.people import PeopleScene
+    from edge.scenes.common.base import Scene
+    from edge.scenes.marker.scene import MarkerScene
+    from edge.scenes.people.scene import PeopleScene
 
 NAMES = ("marker", "marker-outdoor")
 PEOPLE = "people"
@@ -25,7 +25,7 @@ def get(name: str, seed: int, cameras: int | None = None, mixed_fps: bool = Fals
     mixed_fps: whether the cameras of ``marker`` run at 30, 25, 29.97 and 50 fps instead of 30
     (``marker-outdoor`` always does). Raises InputError for an unknown name or too few cameras.
     """
-    from edge.scenes.marker import marker_field, marker_room
+    from edge.scenes.marker.scene import marker_field, marker_room
 
     if name not in NAMES:
         raise InputError(f"there is no scene {name!r}", remedy=f"use one of {', '.join((*NAMES, PEOPLE))}, or town")
@@ -44,7 +44,7 @@ def get_people(
     cameras: 2 or more, None = 5. people: 1 to 12, None = 5. mixed_fps: 10, 12.5, 9.99 and 15 fps instead of 10.
     Raises InputError.
     """
-    from edge.scenes.people import MOST_PEOPLE, people_room
+    from edge.scenes.people.scene import MOST_PEOPLE, people_room
 
     cameras, people = 5 if cameras is None else cameras, 5 if people is None else people
     if cameras < 2:

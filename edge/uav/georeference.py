@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from edge.uav.ground.telemetry import TelemetryClock
+from edge.uav.timing.telemetry_track import TelemetryClock
 from edge.uav.tracker import Estimate, Telemetry
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats

@@ -19,12 +19,12 @@ import cv2
 import numpy as np
 
 from edge import scenes
-from edge.camera_agent import run_camera_agent
+from edge.agents.camera import run_camera_agent
 from edge.detectors.base import Detection, Prediction
-from edge.detectors.marker import MarkerDetector
+from edge.detectors.marker.ball import MarkerDetector
 from edge.devices.base import DeviceInfo, Frame, Image
-from edge.devices.pacing import AsFastAsPossible
-from edge.devices.simulated import SimulatedDevice
+from edge.devices.playback.playback_clock import AsFastAsPossible
+from edge.devices.simulated.camera import SimulatedDevice
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus

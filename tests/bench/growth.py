@@ -141,7 +141,7 @@ def hub(quick: bool) -> list[Curve]:
 def particles(quick: bool) -> list[Curve]:
     """The tracker in the picture plane (`--model plain`), whose cloud has a fixed size."""
     from edge.uav import models
-    from edge.uav.models import plain
+    from edge.uav.baselines import plain_tracker
     from edge.uav.world import scenarios
 
     world = scenarios.get("exit-bend", 16, frames=30)
@@ -155,7 +155,7 @@ def particles(quick: bool) -> list[Curve]:
             for i in range(1, len(images)):
                 tracker.handle_frame(images[i], world.time(i))
 
-        with mock.patch.object(plain, "_PARTICLES", count):
+        with mock.patch.object(plain_tracker, "_PARTICLES", count):
             curve.add(count, 1e3 * _cpu(run) / (len(images) - 1))
     return [curve]
 
@@ -163,7 +163,7 @@ def particles(quick: bool) -> list[Curve]:
 def pixels(quick: bool) -> list[Curve]:
     """The marker detector against the picture's size."""
     from edge import scenes
-    from edge.detectors.marker import MarkerDetector
+    from edge.detectors.marker.ball import MarkerDetector
 
     renderer = scenes.get("marker", 0).renderer("cam0", np.random.default_rng(0))
     drawn = [renderer.render(moment) for moment in np.linspace(1.0, 30.0, 10)]

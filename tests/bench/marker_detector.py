@@ -24,11 +24,11 @@ import cv2
 import numpy as np
 
 from edge import scenes
-from edge.detectors.bright import BrightDetector
-from edge.detectors.marker import MarkerDetector
-from edge.detectors.tag import TagDetector
-from edge.scenes.marker import MarkerScene
-from edge.scenes.rendering import MarkerRenderer
+from edge.detectors.marker.ball import MarkerDetector
+from edge.detectors.marker.bright import BrightDetector
+from edge.detectors.marker.tag import TagDetector
+from edge.scenes.marker.renderer import MarkerRenderer
+from edge.scenes.marker.scene import MarkerScene
 from protocols.geometry.types import Floats
 from tests.films import write_film_of
 from tests.rendered_markers import Image, add_look_alikes, add_spot, add_tag, dim_room, exposed, tag_image

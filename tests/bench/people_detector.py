@@ -27,9 +27,9 @@ import numpy.typing as npt
 
 from edge import scenes
 from edge.detectors.base import Detection
-from edge.detectors.person import PersonDetector, silhouette_features
-from edge.scenes.people import PeopleScene
-from edge.scenes.people_rendering import PeopleRenderer
+from edge.detectors.people.person import PersonDetector, silhouette_features
+from edge.scenes.people.renderer import PeopleRenderer
+from edge.scenes.people.scene import PeopleScene
 from protocols.geometry.types import Bools, Floats
 from tests.people_boxes import judge, overlap, truth
 

@@ -19,8 +19,8 @@ import numpy as np
 
 from deploy.people_scores import Moment, Scores, clear_mot
 from edge import scenes
-from edge.predictions import Predictions
-from edge.scenes.people import PeopleScene
+from edge.agents.predictions import Predictions
+from edge.scenes.people.scene import PeopleScene
 from hub.calibrate import calibrate
 from hub.tracking.camera import TrackingCamera
 from hub.tracking.step import World, label_of
@@ -89,7 +89,7 @@ def rendered(scene: PeopleScene, seconds: float, seed: int, kept: float = 1.0) -
     The tracking's predictions come back to the detectors, as over the bus: from what had arrived ``TOLD_S`` before a
     frame was taken. kept: share of the frames that a busy machine comes to look at; which, chance decides.
     """
-    from edge.detectors.person import PersonDetector
+    from edge.detectors.people.person import PersonDetector
 
     reference = scene.cameras[0].name
     cameras, frames = [], []

@@ -21,12 +21,12 @@ import cv2
 import numpy as np
 
 from deploy.uav_config import ControlConfig
-from edge.devices.aircraft import Push
 from edge.devices.base import Frame
-from edge.mavlink.link import Heard
-from edge.mavlink.tlog import read_tlog
-from edge.uav.alignment import find_offset
-from edge.uav.seen_turning import SeenTurning, usual_tilt
+from edge.devices.simulated.aircraft import Push
+from edge.mavlink.link.connection import Heard
+from edge.mavlink.link.tlog import read_tlog
+from edge.uav.timing.telemetry_offset import find_offset
+from edge.uav.timing.visual_rotation import SeenTurning, usual_tilt
 from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA
 from edge.uav.world.patrol import patrol
 from protocols.geometry.camera import Intrinsics

@@ -34,8 +34,8 @@ import numpy as np
 import tomli_w
 
 from edge import scenes
-from edge.scenes.base import SimulatedCamera
-from edge.scenes.marker import MarkerScene
+from edge.scenes.common.base import SimulatedCamera
+from edge.scenes.marker.scene import MarkerScene
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import fit_similarity

@@ -13,7 +13,7 @@ import numpy as np
 
 from deploy.simulated import observations_of, rig_of
 from edge import scenes
-from edge.scenes.session import simulated_session
+from edge.scenes.marker.session import simulated_session
 from hub.calibrate import calibrate
 from protocols.core.clocks import CameraTime
 from protocols.core.errors import Refused

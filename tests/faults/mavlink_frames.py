@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 from edge.mavlink.dialect import mavlink
-from edge.mavlink.link import Heard, Link
-from edge.mavlink.signing import Signing, ticks
-from edge.mavlink.transport import Address
+from edge.mavlink.link.connection import Heard, Link
+from edge.mavlink.link.signing import Signing, ticks
+from edge.mavlink.link.transport import Address
 
 VEHICLE: Address = ("127.0.0.1", 14550)
 UNIX_S = 1_800_000_000.0

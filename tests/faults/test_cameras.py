@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
-from edge.camera_agent import run_camera_agent
+from edge.agents.camera import run_camera_agent
 from edge.detectors.base import Detection
 from edge.devices.base import DeviceInfo, Frame
-from edge.devices.live import LiveCamera
+from edge.devices.live.opencv_capture import LiveCamera
 from hub.timing.clock_watch import ClockWatch
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.errors import InputError

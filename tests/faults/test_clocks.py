@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edge import scenes
-from edge.scenes.session import simulated_session
+from edge.scenes.marker.session import simulated_session
 from hub.live import LiveHub, LiveSettings
 from protocols.messages import syncline_pb2 as pb
 from tests.faults.matrix import measured

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("pymavlink")
 
-from edge.mavlink.signing import Signing, ticks
+from edge.mavlink.link.signing import Signing, ticks
 from tests.faults.matrix import measured
 from tests.faults.mavlink_frames import UNIX_S, VEHICLE, Vehicle, Wire, link
 

@@ -13,11 +13,11 @@ from deploy.uav_config import ControlConfig
 from deploy.uav_demo_outcome import compare
 from deploy.uav_demo_report import write_report
 from deploy.uav_replay import replay_through_uav
-from edge.mavlink.autopilot import Faults
+from edge.agents.uav import TOPICS
+from edge.mavlink.roles.autopilot import Faults
 from edge.uav.tracker import State
 from edge.uav.world.patrol import patrol
 from edge.uav.world.world import World
-from edge.uav_agent import TOPICS
 from protocols.core.errors import InputError
 from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter

@@ -11,8 +11,8 @@ import numpy as np
 
 from deploy.simulated import observations_of, rig_of
 from edge import scenes
-from edge.scenes.marker import MarkerScene
-from edge.scenes.session import SimulatedTracks, simulated_session
+from edge.scenes.marker.scene import MarkerScene
+from edge.scenes.marker.session import SimulatedTracks, simulated_session
 from hub.calibrate import calibrate
 from protocols.geometry.pose import Pose, fit_similarity
 from protocols.geometry.types import Floats

@@ -13,12 +13,12 @@ import pytest
 
 from deploy.notify import Watched
 from edge import scenes
-from edge.camera_agent import CameraAgent, run_camera_agent
+from edge.agents.camera import CameraAgent, run_camera_agent
 from edge.detectors.base import Detection
-from edge.detectors.marker import MarkerDetector
+from edge.detectors.marker.ball import MarkerDetector
 from edge.devices.base import DeviceInfo, Frame
-from edge.devices.pacing import AsFastAsPossible
-from edge.devices.simulated import SimulatedDevice
+from edge.devices.playback.playback_clock import AsFastAsPossible
+from edge.devices.simulated.camera import SimulatedDevice
 from protocols.bus.base import BusDead
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.errors import InputError
@@ -208,7 +208,7 @@ def test_a_dead_bus_ends_the_agent(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_device_that_does_not_open_is_told_before_anything_is_announced() -> None:
     hub = MemoryHub()
     watch = MemoryBus(hub).watch_agents()
-    from edge.devices.recording import Recording
+    from edge.devices.playback.video_file import Recording
 
     with pytest.raises(InputError, match="does not exist"):
         run_camera_agent(Recording(Path("gone.mp4")), Given(), MemoryBus(hub), "cam0", threading.Event())

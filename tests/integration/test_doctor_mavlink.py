@@ -16,10 +16,10 @@ pytest.importorskip("pymavlink", reason="the extra `uav` is not installed: DOCTO
 from deploy.doctor import examine
 from deploy.doctor.finding import Finding
 from deploy.uav_config import MavlinkConfig, UavConfig
-from edge.devices.aircraft import SimulatedAircraft
-from edge.devices.pacing import RealTime
-from edge.mavlink.autopilot import Autopilot
-from edge.mavlink.transport import Udp, Url
+from edge.devices.playback.playback_clock import RealTime
+from edge.devices.simulated.aircraft import SimulatedAircraft
+from edge.mavlink.link.transport import Udp, Url
+from edge.mavlink.roles.autopilot import Autopilot
 
 
 def asked(url: str, patience_s: float = 0.5) -> Finding:

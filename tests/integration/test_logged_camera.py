@@ -15,11 +15,11 @@ import pytest
 from deploy.agents import start_camera
 from deploy.config import CameraConfig, LogConfig
 from edge import scenes
-from edge.detectors.marker import MarkerDetector
+from edge.agents.thumbnails import picture_message
+from edge.detectors.marker.ball import MarkerDetector
 from edge.devices.base import Frame
-from edge.devices.logged import LoggedCamera
-from edge.devices.pacing import AsFastAsPossible
-from edge.pictures import picture_message
+from edge.devices.playback.log_playback import LoggedCamera
+from edge.devices.playback.playback_clock import AsFastAsPossible
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.errors import InputError
 from protocols.log.write.writer import LogWriter

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from edge.camera_agent import CameraAgent
+from edge.agents.camera import CameraAgent
+from edge.agents.thumbnails import picture_message
 from edge.devices.base import DeviceInfo, Frame
-from edge.pictures import picture_message
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.topics import OBSERVATION, PICTURE
 from protocols.validation.codec import encode

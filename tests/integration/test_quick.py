@@ -12,7 +12,7 @@ import pytest
 
 from deploy.cli import run
 from edge import scenes
-from edge.detectors.taught import TaughtDetector, teach_at
+from edge.detectors.marker.teach import TaughtDetector, teach_at
 from protocols.core.errors import InputError
 from tests.films import film_scene
 

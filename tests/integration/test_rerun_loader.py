@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from deploy.rerun_export import write_rrd
+from edge.agents.thumbnails import picture_message
 from edge.devices.base import Frame
-from edge.pictures import picture_message
 from hub.view.player import LogRecording
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics

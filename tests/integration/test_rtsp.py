@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge.rtp_encoder import RtpEncoder
-from edge.rtsp_server import PATH, RtspServer
+from edge.video.rtp_encoder import RtpEncoder
+from edge.video.rtsp_server import PATH, RtspServer
 from protocols.core.errors import InputError
 from tests.samples import eventually
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edge import scenes
-from edge.scenes.marker import MarkerScene
+from edge.scenes.marker.scene import MarkerScene
 from hub.calibrate import calibrate
 from protocols.geometry import so3
 from protocols.session.calibration import Calibration

@@ -21,7 +21,7 @@ from pymavlink import mavutil
 from deploy import uav
 from deploy.config import load
 from deploy.uav_config import FlightConfig, UavConfig
-from edge.mavlink.autopilot import ORIGIN
+from edge.mavlink.roles.autopilot import ORIGIN
 from edge.uav.world.world import World
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.topics import TOPICS
@@ -113,7 +113,7 @@ BUILD = uav.simulation
 
 @pytest.fixture(autouse=True)
 def built_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    from edge.devices.aircraft import SimulatedAircraft
+    from edge.devices.simulated.aircraft import SimulatedAircraft
 
     def simulation(flight: FlightConfig, size: tuple[int, int] = (640, 480)) -> uav.Simulation:
         world = small_world(flight)

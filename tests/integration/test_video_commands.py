@@ -19,8 +19,8 @@ import pytest
 import tomli_w
 
 from deploy.cli import run
-from edge.devices.film import Film
-from edge.scenes.marker import MarkerScene
+from edge.devices.playback.video_reader import Film
+from edge.scenes.marker.scene import MarkerScene
 from protocols.geometry.types import Floats
 from tests.films import Image, film_scene, number_in, numbered, write_film
 

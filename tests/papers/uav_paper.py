@@ -16,9 +16,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edge.uav.models.paper import PaperTracker
-from edge.uav.models.plain import PlainTracker
-from edge.uav.paper import regions
+from edge.uav.baselines import regions
+from edge.uav.baselines.paper_tracker import PaperTracker
+from edge.uav.baselines.plain_tracker import PlainTracker
 from edge.uav.tracker import Estimate, Image, State, Tracker
 from edge.uav.world import scenarios
 from edge.uav.world.world import World

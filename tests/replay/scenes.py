@@ -17,11 +17,11 @@ from deploy.cli import run
 from deploy.process_replay import replay_through_hub
 from deploy.simulated import camera_tables
 from deploy.uav_replay import replay_through_uav
+from edge.agents.uav import TOPICS
 from edge.scenes import get_people
-from edge.scenes.people import PeopleScene
+from edge.scenes.people.scene import PeopleScene
 from edge.uav.world.patrol import patrol
 from edge.uav.world.world import World
-from edge.uav_agent import TOPICS
 from hub.live import LiveSettings
 from protocols.core.clocks import NANOSECONDS
 from protocols.log.read.reader import LogReader

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from edge.detectors.album import Album, comparisons
+from edge.detectors.moving.bootstrap import Album, comparisons
 
 Image = npt.NDArray[np.uint8]
 WIDTH, HEIGHT = 320, 96

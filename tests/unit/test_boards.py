@@ -14,11 +14,11 @@ from deploy.agents import make_device
 from deploy.commands.agents import camera
 from deploy.config import CameraConfig, effective_toml, load
 from edge import scenes
-from edge.detectors.bright import BrightDetector
-from edge.detectors.marker import MarkerDetector
-from edge.detectors.tag import TagDetector
+from edge.agents.image_health import PictureWatch
+from edge.detectors.marker.ball import MarkerDetector
+from edge.detectors.marker.bright import BrightDetector
+from edge.detectors.marker.tag import TagDetector
 from edge.devices.base import Frame
-from edge.picture_watch import PictureWatch
 from protocols.core.errors import InputError
 
 BOARDS = sorted((Path(deploy.__file__).parent / "boards").glob("*.toml"))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from edge.detectors.base import Detection
-from edge.detectors.bright import BrightDetector, BrightModel
-from edge.detectors.tag import TagDetector, TagModel
+from edge.detectors.marker.bright import BrightDetector, BrightModel
+from edge.detectors.marker.tag import TagDetector, TagModel
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 from tests.rendered_markers import add_look_alikes, add_spot, add_tag, dim_room, exposed, tag_image

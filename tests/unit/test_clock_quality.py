@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from edge.clock_quality import ClockQuality, ClockWatcher, chrony_error, clock_quality, kernel_clock, ptp_error
+from edge.agents.clock_quality import ClockQuality, ClockWatcher, chrony_error, clock_quality, kernel_clock, ptp_error
 
 TRACKING = (
     "C0A80A01,192.168.10.1,3,1763758812.084,0.000012345,-0.000004,0.000021,-12.3,0.001,0.02,0.0012,0.0003,64.5,Normal\n"

@@ -12,13 +12,13 @@ import pytest
 
 from edge import scenes
 from edge.devices.base import Frame
-from edge.devices.live import LiveCamera
-from edge.devices.pacing import AsFastAsPossible, RealTime
-from edge.devices.recording import Recording
-from edge.devices.simulated import SimulatedDevice
-from edge.devices.video import open_video
-from edge.scenes.base import Renderer
-from edge.scenes.marker import MarkerScene
+from edge.devices.live.opencv_capture import LiveCamera
+from edge.devices.playback.open_video import open_video
+from edge.devices.playback.playback_clock import AsFastAsPossible, RealTime
+from edge.devices.playback.video_file import Recording
+from edge.devices.simulated.camera import SimulatedDevice
+from edge.scenes.common.base import Renderer
+from edge.scenes.marker.scene import MarkerScene
 from protocols.core.errors import InputError
 
 

@@ -17,7 +17,7 @@ import pytest
 from deploy.cli import run
 from deploy.doctor import agent, examine, machine
 from deploy.doctor.finding import Finding, exit_status, missing, ok, warn, wrong
-from edge.clock_quality import kernel_clock
+from edge.agents.clock_quality import kernel_clock
 from edge.devices.base import DeviceInfo, Frame
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import InputError
@@ -262,7 +262,7 @@ import sys
 for name in sys.argv[2:]:
     sys.modules[name] = None
 from deploy.cli import run
-from edge.clock_quality import kernel_clock
+from edge.agents.clock_quality import kernel_clock
 sys.exit(run(["doctor", sys.argv[1], "--json"]))
 """
 

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from edge.devices import film as film_module
-from edge.devices.film import Film
+from edge.devices.playback import video_reader as film_module
+from edge.devices.playback.video_reader import Film
 from protocols.core.errors import InputError
 from tests.films import number_in, numbered, write_film
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from edge import scenes
-from edge.detectors.colour import ColourModel, codes
-from edge.detectors.marker import MarkerDetector, MarkerModel, teach
-from edge.scenes.marker import MarkerScene
+from edge.detectors.marker.ball import MarkerDetector, MarkerModel, teach
+from edge.detectors.marker.colour import ColourModel, codes
+from edge.scenes.marker.scene import MarkerScene
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from tests.bench.marker_detector import Result, measure

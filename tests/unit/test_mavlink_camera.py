@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge.mavlink.camera import CameraComponent, Select, Stop, Stream
 from edge.mavlink.dialect import mavlink
-from edge.mavlink.link import Link
-from edge.mavlink.transport import Pipe
+from edge.mavlink.link.connection import Link
+from edge.mavlink.link.transport import Pipe
+from edge.mavlink.roles.camera import CameraComponent, Select, Stop, Stream
 from protocols.geometry.camera import Intrinsics
 
 ACTIVE, ERROR, COASTING = 1, 2, 8

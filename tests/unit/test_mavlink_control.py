@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge.mavlink.control import Aim, Control, Limits
 from edge.mavlink.dialect import mavlink
-from edge.mavlink.link import Link
-from edge.mavlink.transport import Pipe
+from edge.mavlink.link.connection import Link
+from edge.mavlink.link.transport import Pipe
+from edge.mavlink.roles.guidance import Aim, Control, Limits
 from edge.uav.navigation import Origin
 
 ORIGIN = Origin(47.4, 8.5, 480.0)

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from edge.mavlink.dialect import mavlink
-from edge.mavlink.framing import Framer
-from edge.mavlink.link import Heard, Link
-from edge.mavlink.signing import EPOCH_UNIX_S, TICKS, Signing, read_key, ticks
-from edge.mavlink.transport import Pipe, parse
+from edge.mavlink.link.connection import Heard, Link
+from edge.mavlink.link.framing import Framer
+from edge.mavlink.link.signing import EPOCH_UNIX_S, TICKS, Signing, read_key, ticks
+from edge.mavlink.link.transport import Pipe, parse
 from protocols.core.errors import InputError
 
 KEY = bytes(range(32))

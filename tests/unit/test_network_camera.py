@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from edge.devices.base import Frame
-from edge.devices.live import LiveCamera
-from edge.devices.network import NetworkCamera, StreamClock, open_network
+from edge.devices.live.network import NetworkCamera, StreamClock, open_network
+from edge.devices.live.opencv_capture import LiveCamera
 from protocols.core.errors import InputError
 from tests.rtsp_camera import RtspCamera
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge.devices.oak import OakCamera, OakSettings, Stream, open_stream
+from edge.devices.live.oak import OakCamera, OakSettings, Stream, open_stream
 from protocols.core.errors import InputError
 
 dai = pytest.importorskip("depthai", reason="the extra `oak` is not installed: the OAK driver is not tested")

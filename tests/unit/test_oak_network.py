@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge.camera_agent import run_camera_agent
+from edge.agents.camera import run_camera_agent
 from edge.devices.base import Frame
-from edge.devices.oak import OakCamera, OakSettings, Stream, open_archive, open_stream
-from edge.devices.oak_network import Box, Naming, boxes
+from edge.devices.live.oak import OakCamera, OakSettings, Stream, open_archive, open_stream
+from edge.devices.live.oak_network import Box, Naming, boxes
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.errors import InputError
 from protocols.topics import OBSERVATION

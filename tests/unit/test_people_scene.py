@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from edge import scenes
-from edge.scenes.people_rendering import PeopleRenderer
-from edge.scenes.people_session import film_people, seen
+from edge.scenes.people.renderer import PeopleRenderer
+from edge.scenes.people.session import film_people, seen
 from protocols.core.errors import InputError
 
 

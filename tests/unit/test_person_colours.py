@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge.detectors.person import PersonDetector
+from edge.detectors.people.person import PersonDetector
 from tests.unit.test_person_detector import learnt, noisy, put_person, street
 
 RED, BLUE = (30, 30, 160), (160, 60, 30)

@@ -13,14 +13,14 @@ import pytest
 from deploy.cli import run
 from edge import scenes
 from edge.detectors.base import Detection, Prediction
-from edge.detectors.bodies import explain
-from edge.detectors.foreground import Foreground, is_ghost, places_left, usual, without_like
-from edge.detectors.matching import match_predictions
-from edge.detectors.person import PersonDetector, clean, silhouette_features
-from edge.detectors.shadows import Shadows
-from edge.detectors.silhouettes import LonePeople
-from edge.detectors.stature import Stature
-from edge.detectors.vehicle import VehicleDetector
+from edge.detectors.moving.foreground import Foreground, is_ghost, places_left, usual, without_like
+from edge.detectors.moving.gating import match_predictions
+from edge.detectors.moving.shadows import Shadows
+from edge.detectors.moving.vehicle import VehicleDetector
+from edge.detectors.people.height_model import Stature
+from edge.detectors.people.person import PersonDetector, clean, silhouette_features
+from edge.detectors.people.segmentation import explain
+from edge.detectors.people.silhouettes import LonePeople
 from tests.people_boxes import judge
 
 Image = npt.NDArray[np.uint8]

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge.detectors import crowd
-from edge.detectors.bodies import explain
-from edge.detectors.person import silhouette_features
-from edge.detectors.silhouettes import Image, LonePeople, _alone
-from edge.detectors.stature import Stature
-from edge.detectors.templates import BARS, Scene, Template
+from edge.detectors.people import occupancy
+from edge.detectors.people.height_model import Stature
+from edge.detectors.people.person import silhouette_features
+from edge.detectors.people.segmentation import explain
+from edge.detectors.people.silhouettes import Image, LonePeople, _alone
+from edge.detectors.people.templates import BARS, Scene, Template
 from protocols.geometry.types import Floats
 
 WIDTH, HEIGHT = 320, 240
@@ -88,10 +88,10 @@ def test_the_best_new_one_is_the_best_of_all_places(monkeypatch: pytest.MonkeyPa
     for covered in (False, True):
         if covered:
             scene.cover(first)
-        grid = crowd._Grid(scene)
+        grid = occupancy._Grid(scene)
         found = grid.best_new()
         with monkeypatch.context() as patch:
-            patch.setattr(crowd, "_LEAST", -np.inf)  # nothing is left out
+            patch.setattr(occupancy, "_LEAST", -np.inf)  # nothing is left out
             best = grid.best_new()
         assert found is not None
         assert found == best
@@ -101,16 +101,16 @@ def test_who_stood_still_is_sought_again_once_a_neighbour_has_moved() -> None:
     scene = scene_of(np.random.default_rng(3))
     one = Template(40.0, 95.0, 74.0)
     for _ in range(20):
-        crowd._settle(scene, one)
+        occupancy._settle(scene, one)
         if one.still is not None:
             break
     assert one.still is not None
     rests = one.u, one.foot
-    crowd._settle(scene, one)
+    occupancy._settle(scene, one)
     assert (one.u, one.foot) == rests
     other = Template(one.u + 4.0, one.foot, one.tall)
     scene.cover(other)
-    crowd._settle(scene, one)
+    occupancy._settle(scene, one)
     assert (one.u, one.foot) != rests
 
 

@@ -13,7 +13,7 @@ from deploy.config import CameraConfig, HubConfig, load
 from deploy.fleet import read_state
 from deploy.rig_folder import SHIPPED, find_rig, prepare, read_rig_folder
 from edge import scenes
-from edge.scenes.scaled import scaled, scaled_lens
+from edge.scenes.common.scaled import scaled, scaled_lens
 from protocols.core.errors import InputError
 from protocols.session.rig import read_rig
 

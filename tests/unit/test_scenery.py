@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from edge.detectors.marker import MarkerDetector
-from edge.detectors.scenery import Scenery, known_at
+from edge.detectors.marker.ball import MarkerDetector
+from edge.detectors.moving.static_background import Scenery, known_at
 from protocols.geometry.types import Bools, Floats
 
 _SIZE = (96, 128)

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge import scenes
-from edge.scenes import rendering
-from edge.scenes.base import SimulatedClock
-from edge.scenes.session import simulated_session
+from edge.scenes.common.base import SimulatedClock
+from edge.scenes.marker import renderer as rendering
+from edge.scenes.marker.session import simulated_session
 from protocols.core.clocks import CameraTime
 from protocols.core.errors import InputError
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge.detectors.vehicle import VehicleDetector
+from edge.detectors.moving.vehicle import VehicleDetector
 from edge.uav.world import scenarios
 from tests.bench import people_detector
 

@@ -7,10 +7,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from edge.uav.ground.camera import ImagePlane, inverse, transfer
 from edge.uav.ground.ego_motion import EgoMotion
+from edge.uav.ground.image_plane import ImagePlane, inverse, transfer
 from edge.uav.ground.plane_motion import ChainPlane, PosePlane
-from edge.uav.ground.telemetry import TelemetryClock
+from edge.uav.timing.telemetry_track import TelemetryClock
 from edge.uav.tracker import Telemetry
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics

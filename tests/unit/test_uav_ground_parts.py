@@ -10,21 +10,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge.uav.ground import cloud as clouds
-from edge.uav.ground.appearance import Appearance, Candidate, Patch, cut_patch
-from edge.uav.ground.camera import ImagePlane
-from edge.uav.ground.cloud import FREE
-from edge.uav.ground.evidence import judge
-from edge.uav.ground.footprint import corners, oriented
-from edge.uav.ground.habits import Driving
-from edge.uav.ground.history import MotionFit, Sightings
-from edge.uav.ground.light import Light, Shade
+from edge.uav.ground.frame_init import root_from_telemetry
+from edge.uav.ground.image_plane import ImagePlane
+from edge.uav.ground.photometric import Light, Shade
 from edge.uav.ground.road_map import CELL, RoadMap
-from edge.uav.ground.rooting import root_from_telemetry
-from edge.uav.ground.survey import plausible
-from edge.uav.ground.telemetry import TelemetryClock
-from edge.uav.ground.tracklets import Tracklet, Tracklets
-from edge.uav.ground.ways import Way, edges, trace
+from edge.uav.prediction import particle_set as clouds
+from edge.uav.prediction.driver_model import Driving
+from edge.uav.prediction.particle_set import FREE
+from edge.uav.prediction.paths import Way, edges, trace
+from edge.uav.target.appearance import Appearance, Candidate, Patch, cut_patch
+from edge.uav.target.footprint import corners, oriented
+from edge.uav.target.likelihood import judge
+from edge.uav.target.motion_history import MotionFit, Sightings
+from edge.uav.target.redetection import plausible
+from edge.uav.target.tracklets import Tracklet, Tracklets
+from edge.uav.timing.telemetry_track import TelemetryClock
 from edge.uav.tracker import Box, Telemetry
 from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA
 from protocols.geometry.camera import Intrinsics

@@ -8,17 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge.uav.ground import cloud as clouds
-from edge.uav.ground.appearance import Candidate
-from edge.uav.ground.cloud import Cloud
-from edge.uav.ground.evidence import judge
-from edge.uav.ground.history import MotionFit
 from edge.uav.ground.road_map import CELL, RoadMap
-from edge.uav.ground.tracklets import Tracklet, Tracklets
-from edge.uav.ground.ways import Way, edges, trace
+from edge.uav.prediction import particle_set as clouds
+from edge.uav.prediction.particle_set import Cloud
+from edge.uav.prediction.paths import Way, edges, trace
+from edge.uav.target.appearance import Candidate
+from edge.uav.target.likelihood import judge
+from edge.uav.target.motion_history import MotionFit
+from edge.uav.target.tracklets import Tracklet, Tracklets
 from edge.uav.world import cars
 from edge.uav.world.roads import LANE
-from edge.uav.world.stage import Stage, corner, view
+from edge.uav.world.scenario_builder import Stage, corner, view
 from protocols.geometry.types import Floats
 
 

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from edge.uav.models.paper import PaperTracker
-from edge.uav.models.plain import AppearanceJudge, PlainTracker
-from edge.uav.paper import histograms, regions, road
-from edge.uav.paper.background import BackgroundFilter, Motion, flow_of
-from edge.uav.paper.car import moved_car
-from edge.uav.paper.road_filter import RoadFilter, aligned, support
-from edge.uav.paper.white_lines import Edges, sections
+from edge.uav.baselines import histograms, regions, road
+from edge.uav.baselines.background import BackgroundFilter, Motion, flow_of
+from edge.uav.baselines.car import moved_car
+from edge.uav.baselines.paper_tracker import PaperTracker
+from edge.uav.baselines.plain_tracker import AppearanceJudge, PlainTracker
+from edge.uav.baselines.road_filter import RoadFilter, aligned, support
+from edge.uav.baselines.white_lines import Edges, sections
 from edge.uav.tracker import Box, Image, State, Tracker
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from edge.uav import particles as pf
+from edge.uav.prediction import particles as pf
 from protocols.geometry.types import Floats
 
 _LOGS = arrays(np.float64, st.integers(1, 60), elements=st.floats(-800.0, 800.0))

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from edge.devices.base import Frame
-from edge.devices.live import LiveCamera
-from edge.devices.picamera import PiCamera, PiSettings
-from edge.devices.usb import UsbCamera, UsbSettings, V4l2Stream, open_usb
+from edge.devices.live.opencv_capture import LiveCamera
+from edge.devices.live.picamera import PiCamera, PiSettings
+from edge.devices.live.usb import UsbCamera, UsbSettings, V4l2Stream, open_usb
 from protocols.core.errors import InputError
 
 raw = pytest.importorskip("linuxpy.video.raw", reason="the extra `v4l2` is not installed: V4L2 is not tested")

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.ground.camera import ImagePlane, inverse, transfer
+from edge.uav.ground.image_plane import ImagePlane, inverse, transfer
 from edge.uav.ground.plane_motion import ChainPlane, PlaneMotion, PosePlane
 from protocols.geometry import so3
 from protocols.geometry.types import Bools, Floats

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.ground.camera import ImagePlane, inverse, transfer
+from edge.uav.ground.image_plane import ImagePlane, inverse, transfer
 from protocols.geometry.types import Floats
 
 Picture = npt.NDArray[np.uint8]

@@ -8,12 +8,12 @@ import numpy as np
 
 from edge.uav.world import cars
 from edge.uav.world.flight import GRID_HZ, Flight, Shake, fly, grid_times, unrest
+from edge.uav.world.flight_planner import FPS, View, ease, ramp_seconds
 from edge.uav.world.ground import Area
-from edge.uav.world.journey import FPS, View, ease, ramp_seconds
 from edge.uav.world.noise import wander
 from edge.uav.world.rendering import Light
 from edge.uav.world.roads import LANE, STEP, Bend, Curve, Road, curve, drive, straight
-from edge.uav.world.stage import view
+from edge.uav.world.scenario_builder import view
 from edge.uav.world.town import build
 from edge.uav.world.world import World
 from protocols.core.errors import InputError

@@ -80,7 +80,7 @@ class Renderer:
         for car in moving:
             if np.abs(car.ground[frame] - middle).max() < radius:
                 cars.draw(image, matrix, car.ground[frame], float(car.course[frame]), car.colour)
-        self._town.solids.draw(image, matrix, camera)
+        self._town.occluders.draw(image, matrix, camera)
         return self._expose(image, frame, flat, noise)
 
     def _footprint(self, flat: Floats) -> tuple[Floats, float]:

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.uav.world import cars, exits, rides
+from edge.uav.world import cars, scenarios_exit, scenarios_in_view
 from edge.uav.world.flight import Flight
+from edge.uav.world.flight_planner import FPS, View
 from edge.uav.world.ground import Area
-from edge.uav.world.journey import FPS, View
 from edge.uav.world.noise import wander
 from edge.uav.world.rendering import Light
 from edge.uav.world.roads import LANE, Road
-from edge.uav.world.stage import Script, Stage, view
+from edge.uav.world.scenario_builder import Script, Stage, view
 from edge.uav.world.town import build
 from edge.uav.world.world import World, camera_poses
 from protocols.core.errors import InputError
@@ -34,21 +34,21 @@ class Scenario:
 
 
 SCENARIOS = {
-    "exit-straight": Scenario(exits.straight_road, 45, "out of the picture on a straight road"),
-    "exit-bend": Scenario(exits.bend, 60, "out of the picture round a bend"),
-    "turn-out-of-view": Scenario(exits.turn_out_of_view, 75, "turns off at a crossing while out of the picture"),
-    "yaw": Scenario(exits.yaw, 45, "out of the picture because the drone yaws"),
-    "distractors": Scenario(exits.distractors, 60, "out of the picture among cars of the same colour"),
-    "trees": Scenario(rides.trees, None, "under trees"),
-    "bridge": Scenario(rides.bridge, None, "under a bridge"),
-    "lighting": Scenario(rides.lighting, None, "the light changes"),
-    "off-road": Scenario(rides.off_road, None, "drives over grass"),
-    "partial": Scenario(rides.partial, 90, "cut in half by the picture's border"),
-    "cut": Scenario(rides.cut, None, "cut in half by the picture's border in the first frame"),
-    "climb": Scenario(rides.climb, None, "the drone climbs or sinks tenfold"),
-    "far": Scenario(rides.far, None, "10 px long, from high above"),
-    "paper-3.3": Scenario(rides.winding, None, "a winding road, a drone with a simple controller"),
-    "paper-4.4": Scenario(exits.town, 60, "crossings, buildings, many cars; the car turns, the drone does not"),
+    "exit-straight": Scenario(scenarios_exit.straight_road, 45, "out of the picture on a straight road"),
+    "exit-bend": Scenario(scenarios_exit.bend, 60, "out of the picture round a bend"),
+    "turn-out-of-view": Scenario(scenarios_exit.turn_out_of_view, 75, "turns off at a crossing while out of view"),
+    "yaw": Scenario(scenarios_exit.yaw, 45, "out of the picture because the drone yaws"),
+    "distractors": Scenario(scenarios_exit.distractors, 60, "out of view among cars of the same colour"),
+    "trees": Scenario(scenarios_in_view.trees, None, "under trees"),
+    "bridge": Scenario(scenarios_in_view.bridge, None, "under a bridge"),
+    "lighting": Scenario(scenarios_in_view.lighting, None, "the light changes"),
+    "off-road": Scenario(scenarios_in_view.off_road, None, "drives over grass"),
+    "partial": Scenario(scenarios_in_view.partial, 90, "cut in half by the picture's border"),
+    "cut": Scenario(scenarios_in_view.cut, None, "cut in half by the picture's border in the first frame"),
+    "climb": Scenario(scenarios_in_view.climb, None, "the drone climbs or sinks tenfold"),
+    "far": Scenario(scenarios_in_view.far, None, "10 px long, from high above"),
+    "paper-3.3": Scenario(scenarios_in_view.winding, None, "a winding road, a drone with a simple controller"),
+    "paper-4.4": Scenario(scenarios_exit.town, 60, "crossings, buildings, many cars; only the car turns"),
 }
 
 

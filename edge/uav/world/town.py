@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from edge.uav.world import solids
+from edge.uav.world import occluders
 from edge.uav.world.cars import COLOURS_BGR, Car
 from edge.uav.world.ground import Area, Ground, paint
+from edge.uav.world.occluders import Solid, Solids
 from edge.uav.world.roads import Curve, Road
-from edge.uav.world.solids import Solid, Solids
 from protocols.geometry.types import Floats
 
 _CELL = 1.0  # metres, of the map of distances
@@ -24,7 +24,7 @@ class Town:
     """All that stands still. parked: cars that never move (one frame each)."""
 
     ground: Ground
-    solids: Solids
+    occluders: Solids
     parked: tuple[Car, ...]
 
 
@@ -83,8 +83,8 @@ def _buildings(
     away: _Distance,
     clear: _Distance | None,
     special: Sequence[Solid],
-) -> list[solids.Building]:
-    out: list[solids.Building] = []
+) -> list[occluders.Building]:
+    out: list[occluders.Building] = []
     for _ in range(int(area.size / 110.0)):
         if len(out) >= area.size / 620.0:
             break
@@ -96,18 +96,18 @@ def _buildings(
             continue
         if any(np.linalg.norm(centre - other.centre) < reach + other.reach + 2.0 for other in (*out, *special)):
             continue
-        out.append(solids.building(rng, centre, _along(roads, centre), length, width, rng.uniform(3.0, 8.0)))
+        out.append(occluders.building(rng, centre, _along(roads, centre), length, width, rng.uniform(3.0, 8.0)))
     return out
 
 
 def _trees(
     rng: np.random.Generator,
     area: Area,
-    houses: Sequence[solids.Building],
+    houses: Sequence[occluders.Building],
     away: _Distance,
     clear: _Distance | None,
-) -> list[solids.Slab]:
-    out: list[solids.Slab] = []
+) -> list[occluders.Slab]:
+    out: list[occluders.Slab] = []
     for _ in range(int(area.size / 170.0)):
         centre = np.array([rng.uniform(*area.north), rng.uniform(*area.east)])
         radius = rng.uniform(1.4, 3.3)
@@ -115,7 +115,7 @@ def _trees(
             continue
         if any(np.linalg.norm(centre - house.centre) < 0.7 * house.reach + radius for house in houses):
             continue
-        out.append(solids.canopy(rng, centre, radius, rng.uniform(3.0, 5.5)))
+        out.append(occluders.canopy(rng, centre, radius, rng.uniform(3.0, 5.5)))
     return sorted(out, key=lambda tree: tree.height)
 
 
@@ -158,7 +158,7 @@ def _along(roads: Sequence[Road], point: Floats) -> float:
     return course
 
 
-def _yard(house: solids.Building) -> Floats:
+def _yard(house: occluders.Building) -> Floats:
     unit = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]])
     c, s = np.cos(house.roof.course), np.sin(house.roof.course)
     return np.asarray((unit * (house.half + 2.2)) @ np.array([[c, s], [-s, c]]) + house.centre)

@@ -141,7 +141,7 @@ class World:
         width, height = corner.max(axis=0) - corner.min(axis=0)
         points = cars.grid(ground, course)
         inside = _in_picture(self.lens, _project(matrix, points))
-        seen = inside & ~self.town.solids.hide(position, points) if inside.any() else inside
+        seen = inside & ~self.town.occluders.hide(position, points) if inside.any() else inside
         before, after = max(i - 1, 0), min(i + 1, self.length - 1)
         step = self.target.ground[after] - self.target.ground[before]
         return Truth(
@@ -233,7 +233,7 @@ class World:
                 continue
             points = cars.grid(ground, course)
             seen = _in_picture(self.lens, _project(matrix, points))
-            seen &= ~self.town.solids.hide(position, points)
+            seen &= ~self.town.occluders.hide(position, points)
             if seen.mean() > _NEARLY:
                 out.append(pixel)
         return np.array(out).reshape(-1, 2)

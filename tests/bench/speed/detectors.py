@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from edge import scenes
-from edge.detectors.marker import MarkerDetector
-from edge.detectors.tag import TagDetector
+from edge.detectors.marker.ball import MarkerDetector
+from edge.detectors.marker.tag import TagDetector
 from tests.bench import people_detector
 from tests.bench.speed.rows import Limit, Row, Section, interleaved
 from tests.rendered_markers import add_tag, dim_room, exposed, tag_image

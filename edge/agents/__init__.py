@@ -1,0 +1,1 @@
+"""The camera agent and the UAV agent: thin loops around devices, detectors and estimators."""

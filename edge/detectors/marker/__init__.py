@@ -1,0 +1,1 @@
+"""Marker detectors: coloured ball, point of light, fiducial tags."""

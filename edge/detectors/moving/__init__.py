@@ -1,0 +1,1 @@
+"""Detection of moving objects: background subtraction, shadows, gating, vehicles."""

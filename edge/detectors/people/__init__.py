@@ -1,0 +1,1 @@
+"""People detection from silhouettes: templates, occupancy, height model, segmentation."""

@@ -1,0 +1,1 @@
+"""Drivers of real cameras: USB, OAK, Raspberry Pi, network streams."""

@@ -1,0 +1,243 @@
+"""USB cameras (V4L2) with the kernel's own stamps, sequence numbers and exposure, through linuxpy.
+
+The kernel stamps a buffer on CLOCK_MONOTONIC when its first packet comes ("start of exposure", as uvcvideo calls it) or
+when it is complete, and numbers all frames, also those that nobody took. Without linuxpy the camera is read through
+OpenCV, which stamps on arrival.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+import cv2
+import numpy as np
+
+from edge.devices.base import Device, DeviceInfo, Frame, Image, check_size
+from edge.devices.live.opencv_capture import LiveCamera
+from edge.devices.live.reconnecting import Connection, Gone, ReturningCamera
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
+from protocols.geometry.camera import Intrinsics
+
+_MONOTONIC, _CLOCKS = 0x2000, 0xE000  # V4L2_BUF_FLAG_TIMESTAMP_…
+_START_OF_EXPOSURE, _MOMENTS = 0x10000, 0x70000  # V4L2_BUF_FLAG_TSTAMP_SRC_…; else the end of the frame
+_BAD = 0x40  # V4L2_BUF_FLAG_ERROR: the pixels are damaged
+_BUFFERS = 4
+_REMEDY = "check that it is plugged in, that no other program uses it, and that you may read /dev/video*"
+_EXPOSURE_UNIT_US = 100  # V4L2_CID_EXPOSURE_ABSOLUTE
+
+
+@dataclass(frozen=True, slots=True)
+class UsbSettings:
+    """One USB camera.
+
+    device: /dev/video…, or a stable name of udev's. size: (width, height) [px]; None = as it is set. fps: None = as it
+    is set. pixels: MJPG, YUYV or GREY. exposure_us: fixed; None = the camera chooses, and mid-exposure wanders with
+    the light. gain: the camera's own units; None = left alone. readout_s: first to last row; 0 = not known.
+    """
+
+    device: str = "/dev/video0"
+    size: tuple[int, int] | None = None
+    fps: float | None = None
+    pixels: str = "MJPG"
+    exposure_us: int | None = None
+    gain: int | None = None
+    readout_s: float = 0.0
+
+
+def open_usb(
+    settings: UsbSettings,
+    *,
+    intrinsics: Intrinsics | None = None,
+    there: Callable[[str], bool] = lambda name: find_spec(name) is not None,
+    now_ns: Callable[[], int] = time.monotonic_ns,
+) -> Device:
+    """The camera through linuxpy; without it through OpenCV, which stamps on arrival. It still has to be opened."""
+    if there("linuxpy"):
+        return UsbCamera(settings, intrinsics=intrinsics, now_ns=now_ns)
+    return LiveCamera(settings.device, fps=settings.fps, intrinsics=intrinsics, driver="usb", now_ns=now_ns)
+
+
+class UsbCamera(ReturningCamera):
+    """A V4L2 camera; see ``edge.devices.base.Device``. stream: makes the open stream; tests give another."""
+
+    def __init__(
+        self,
+        settings: UsbSettings,
+        *,
+        intrinsics: Intrinsics | None = None,
+        stream: Callable[[UsbSettings], Any] | None = None,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        name = f"camera {settings.device}"
+        make = stream or V4l2Stream
+
+        def connect() -> Connection:
+            try:
+                return UsbConnection(make(settings), settings, now_ns)
+            except OSError as error:
+                what = f"{name} does not answer: {error.strerror or error}"
+                raise InputError(what, remedy=_REMEDY) from None
+
+        def describe(connection: Connection, first: Frame) -> DeviceInfo:
+            assert isinstance(connection, UsbConnection)
+            height, width = first.image.shape[:2]
+            check_size(intrinsics, width, height, name)
+            unknown = connection.unknown
+            return DeviceInfo(
+                width, height, connection.fps, "usb", "monotonic", intrinsics, settings.readout_s, unknown=unknown
+            )
+
+        super().__init__(name, connect, describe, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
+
+
+class V4l2Stream:
+    """linuxpy's device and its memory-mapped buffers. Raises OSError where it does not answer."""
+
+    def __init__(self, settings: UsbSettings) -> None:
+        from linuxpy.video.device import Device as V4l2Device
+        from linuxpy.video.device import V4L2Error, VideoCapture
+
+        self._device = V4l2Device(os.path.realpath(settings.device))
+        try:
+            self._device.open()
+            self._capture = VideoCapture(self._device, size=_BUFFERS)
+            if settings.size is not None:
+                self._capture.set_format(*settings.size, settings.pixels)
+            if settings.fps is not None:
+                self._capture.set_fps(settings.fps)
+            with suppress(OSError, ZeroDivisionError):
+                self.fps = float(self._capture.get_fps())
+            self._fix(settings)
+            self._capture.open()
+        except V4L2Error as error:
+            self.close()
+            raise OSError(errno.EINVAL, str(error)) from None
+        except OSError:
+            self.close()
+            raise
+
+    fps = 0.0
+
+    def _fix(self, settings: UsbSettings) -> None:
+        """Fixed exposure and gain, as far as the camera has them."""
+        controls = self._device.controls
+        if settings.exposure_us is not None:
+            if "auto_exposure" not in controls or "exposure_time_absolute" not in controls:
+                raise OSError(errno.EINVAL, "it cannot fix its exposure; leave exposure_us out")
+            controls["auto_exposure"].value = 1  # V4L2_EXPOSURE_MANUAL
+            controls["exposure_time_absolute"].value = max(round(settings.exposure_us / _EXPOSURE_UNIT_US), 1)
+        if settings.gain is not None:
+            if "gain" not in controls:
+                raise OSError(errno.EINVAL, "it has no gain; leave gain out")
+            controls["gain"].value = settings.gain
+
+    def exposure_ns(self) -> int:
+        """Of the pictures now; 0 where the camera chooses it, as it may be another each time, or does not tell."""
+        controls = self._device.controls
+        if "auto_exposure" not in controls or "exposure_time_absolute" not in controls:
+            return 0
+        if int(controls["auto_exposure"].value) != 1:
+            return 0
+        return int(controls["exposure_time_absolute"].value) * _EXPOSURE_UNIT_US * 1000
+
+    def get(self, timeout_s: float) -> Any:
+        """linuxpy's frame; None where none came. Raises OSError where the camera is gone."""
+        ready, _, broken = select.select([self._device], [], [self._device], timeout_s)
+        if broken and not ready:
+            raise OSError(errno.ENODEV, "unplugged")
+        return self._capture.buffer.raw_read() if ready else None
+
+    def close(self) -> None:
+        """Stop, and release the buffers; also of a camera that is gone."""
+        for close in (getattr(getattr(self, "_capture", None), "close", None), self._device.close):
+            with suppress(OSError, ValueError, AttributeError):
+                if close is not None:
+                    close()
+
+
+class UsbConnection:
+    """The pictures of one open V4L2 stream, with mid-exposure times as far as they can be told."""
+
+    def __init__(self, stream: Any, settings: UsbSettings, now_ns: Callable[[], int]) -> None:
+        self._stream = stream
+        self._readout_ns = round(settings.readout_s * NANOSECONDS)
+        self._now_ns = now_ns
+        self._exposure_ns = int(stream.exposure_ns())
+        self.fps = float(settings.fps or stream.fps)
+        self._first: Any = None
+        self._arrival = False
+        self.damaged = 0
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """What this camera does not tell."""
+        told = [] if self._exposure_ns else ["exposure: the camera chooses it"]
+        if not self._readout_ns:
+            told.append("readout of a rolling shutter")
+        if self._arrival:
+            told.append("time of capture: stamped on arrival")
+        return tuple(told)
+
+    def take(self, timeout_s: float) -> Frame | None:
+        try:
+            frame = self._stream.get(timeout_s)
+        except OSError as error:
+            if error.errno in (errno.EAGAIN, errno.EINTR):
+                return None
+            raise Gone from None
+        if frame is None:
+            return None
+        flags = int(frame.buff.flags)
+        image = None if flags & _BAD else picture(frame)
+        if image is None:
+            self.damaged += 1  # its number is a gap
+            return None
+        return Frame(image, self._middle(frame, flags), int(frame.frame_nb), self._exposure_ns)
+
+    def close(self) -> None:
+        self._stream.close()
+
+    def _middle(self, frame: Any, flags: int) -> int:
+        """Mid-exposure of the middle row [ns]."""
+        stamp = frame.buff.timestamp
+        moment = int(stamp.secs) * NANOSECONDS + int(stamp.usecs) * 1000
+        self._arrival = flags & _CLOCKS != _MONOTONIC
+        if self._arrival:
+            return self._now_ns()
+        inwards = (self._exposure_ns + self._readout_ns) // 2
+        return moment + inwards if flags & _MOMENTS == _START_OF_EXPOSURE else moment - inwards
+
+
+def picture(frame: Any) -> Image | None:
+    """(H, W, 3) BGR of one of linuxpy's frames; None where it is damaged. Raises InputError for an unknown format."""
+    kind = frame.pixel_format.name
+    data = np.frombuffer(bytes(frame.data), dtype=np.uint8)
+    if kind in ("MJPEG", "JPEG"):
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+        return None if image is None else np.asarray(image, dtype=np.uint8)
+    depth = {"YUYV": 2, "UYVY": 2, "GREY": 1, "BGR24": 3, "RGB24": 3}.get(kind)
+    if depth is None:
+        raise InputError(f"the camera gives {kind} pixels", remedy='set pixels = "MJPG" or "YUYV" in [usb]')
+    shape = (frame.height, frame.width, depth)
+    if data.size < int(np.prod(shape)):
+        return None
+    raw = data[: int(np.prod(shape))].reshape(shape)
+    if kind == "BGR24":
+        return raw.copy()
+    code = {
+        "YUYV": cv2.COLOR_YUV2BGR_YUY2,
+        "UYVY": cv2.COLOR_YUV2BGR_UYVY,
+        "GREY": cv2.COLOR_GRAY2BGR,
+        "RGB24": cv2.COLOR_RGB2BGR,
+    }[kind]
+    return np.asarray(cv2.cvtColor(raw, code), dtype=np.uint8)

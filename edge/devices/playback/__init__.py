@@ -1,0 +1,1 @@
+"""Sources that play recordings: video files, image folders, logs."""

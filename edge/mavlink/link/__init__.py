@@ -1,0 +1,1 @@
+"""The MAVLink link: transports, framing, signing, receiving, telemetry logs."""

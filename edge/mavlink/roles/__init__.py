@@ -1,0 +1,1 @@
+"""The roles on a MAVLink network: camera component, autopilot, ground station, guidance."""

@@ -1,0 +1,1 @@
+"""What simulated scenes share: cameras, placement, background, sensor noise."""

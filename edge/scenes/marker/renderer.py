@@ -1,0 +1,128 @@
+"""Draws the marker of a simulated world into a camera's picture, at sub-pixel truth.
+
+The ball is drawn as what it is: each pixel's ray is tested against the sphere, so its outline is the exact ellipse
+that the lens makes of it, and the picture is the mean over the exposure, so a moving ball is smeared about the place
+where it was at mid-exposure.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from edge.scenes.common import background
+from edge.scenes.common.base import Renderer
+from edge.scenes.common.sensor import PEDESTAL, SensorNoise, dimmed, pixel_rays
+from protocols.geometry.types import Floats
+
+if TYPE_CHECKING:
+    from edge.scenes.marker.scene import MarkerScene
+
+BACKGROUND_STREAM = 2  # beside the streams of cameras (0) and path (1)
+_NOISE_STD = 3.0  # of a small sensor indoors, in 8-bit steps
+_MAX_STEPS = 16  # instants that an exposure is sampled at
+_BACKGROUND_WIDTH = 960  # px; wider pictures get a background of this width, enlarged
+_AMBIENT, _DIFFUSE, _GLINT = 0.62, 0.42, 0.35
+
+
+class MarkerRenderer(Renderer):
+    """Pictures of a marker scene from one camera.
+
+    noise_rng: sensor noise. noise_std: its std [8-bit steps]. The furniture comes from the scene's own seed, so that
+    all cameras see the same.
+    """
+
+    def __init__(
+        self,
+        scene: MarkerScene,
+        camera: str,
+        noise_rng: np.random.Generator,
+        noise_std: float = _NOISE_STD,
+    ) -> None:
+        self._scene = scene
+        self._camera = scene.camera(camera)
+        self._name = camera
+        lens = self._camera.intrinsics
+        self._background = self._draw_background(np.random.default_rng([scene.seed, BACKGROUND_STREAM]))
+        self._dimmed = dimmed(self._background)
+        self._noise = SensorNoise(lens.width, lens.height, noise_std, noise_rng)
+        self._light = self._camera.pose.rotation @ background.LIGHT_WORLD
+
+    def render(self, true_time: float) -> npt.NDArray[np.uint8]:
+        image = self._dimmed.copy()
+        self._draw_marker(image, true_time)
+        return self._noise.add(image)
+
+    def _draw_background(self, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
+        lens, pose = self._camera.intrinsics, self._camera.pose
+        shrink = max(1.0, lens.width / _BACKGROUND_WIDTH)
+        width, height = round(lens.width / shrink), round(lens.height / shrink)
+        u = (np.arange(width) + 0.5) * lens.width / width - 0.5
+        v = (np.arange(height) + 0.5) * lens.height / height - 0.5
+        rays = pixel_rays(lens, *np.meshgrid(u, v)) @ pose.rotation
+        if self._scene.room is None:
+            picture = background.field(rays, pose.position, rng)
+        else:
+            picture = background.room(rays, pose.position, *self._scene.room, rng)
+        if shrink > 1.0:
+            picture = np.asarray(
+                cv2.resize(picture, (lens.width, lens.height), interpolation=cv2.INTER_CUBIC), dtype=np.uint8
+            )
+        return picture
+
+    def _draw_marker(self, image: npt.NDArray[np.uint8], true_time: float) -> None:
+        camera, lens = self._camera, self._camera.intrinsics
+        ends = true_time + 0.5 * camera.exposure_s * np.array([-1.0, 0.0, 1.0])
+        pixels, diameter = self._scene.seen_by(self._name, ends)
+        if not np.isfinite(pixels).all():
+            return
+        smear = float(np.linalg.norm(pixels[2] - pixels[0]))
+        reach = 0.6 * float(diameter.max()) + 3.0
+        low = np.floor(pixels.min(axis=0) - reach).astype(int)
+        high = np.ceil(pixels.max(axis=0) + reach).astype(int) + 1
+        left, top = max(int(low[0]), 0), max(int(low[1]), 0)
+        right, bottom = min(int(high[0]), lens.width), min(int(high[1]), lens.height)
+        if right <= left or bottom <= top:
+            return
+        rays = pixel_rays(lens, *np.meshgrid(np.arange(left, right, dtype=float), np.arange(top, bottom, dtype=float)))
+        rays = np.where(np.isfinite(rays), rays, 0.0)
+        steps = int(np.clip(np.ceil(2.0 * smear), 1, _MAX_STEPS))
+        instants = true_time + camera.exposure_s * ((np.arange(steps) + 0.5) / steps - 0.5)
+        if camera.readout_s:  # the ball is where it was when its own row was read
+            row = np.clip(pixels[1, 1], 0, lens.height - 1)
+            instants = instants + camera.readout_s * (row / (lens.height - 1) - 0.5)
+        centres = camera.pose.camera_from_world(self._scene.marker_position(instants))
+        cover, light = self._ball(rays, centres)
+        patch = image[top:bottom, left:right].astype(np.float64) + PEDESTAL
+        bare = 1.0 - cover.mean(axis=0)[..., None]
+        patch = bare * patch + (cover[..., None] * light).mean(axis=0)
+        image[top:bottom, left:right] = np.clip(np.rint(patch - PEDESTAL), 0, 255)
+
+    def _ball(self, rays: Floats, centres: Floats) -> tuple[Floats, Floats]:
+        """Coverage (s, h, w) in 0..1 and colour (s, h, w, 3) of the ball.
+
+        rays: (h, w, 3) unit vectors, one a pixel. centres: (s, 3) of the ball at s instants; camera axes.
+        """
+        distance = np.linalg.norm(centres, axis=1)
+        towards = centres / distance[:, None]
+        cosine = np.clip(np.einsum("hwk,sk->shw", rays, towards), 0.05, 1.0)
+        sine_edge = (self._scene.marker_radius / distance)[:, None, None]
+        # Where a ray passes the centre, in units of the sphere's radius, across the line of sight.
+        across = (rays / cosine[..., None] - towards[:, None, None]) / sine_edge[..., None]
+        across *= cosine[..., None]  # sin instead of tan: exact at the outline
+        radius = np.linalg.norm(across, axis=-1)
+        # Pixels from the outline: the radius' own slope in the picture gives the scale.
+        slope = np.hypot(np.gradient(radius, axis=1), np.gradient(radius, axis=2)) if min(rays.shape[:2]) > 1 else 1.0
+        cover = np.clip(0.5 + (1.0 - radius) / np.maximum(slope, 1e-3), 0.0, 1.0)
+        inner = np.minimum(radius, 1.0)
+        normal = across * (inner / np.maximum(radius, 1e-9))[..., None]
+        normal = normal - np.sqrt(1.0 - inner * inner)[..., None] * towards[:, None, None]
+        facing = np.clip(normal @ self._light, 0.0, 1.0)
+        colour = np.array(self._scene.marker_bgr) * (_AMBIENT + _DIFFUSE * facing)[..., None]
+        half_way = self._light - towards
+        half_way /= np.linalg.norm(half_way, axis=1, keepdims=True)
+        glint = np.clip(np.einsum("shwk,sk->shw", normal, half_way), 0.0, 1.0) ** 40
+        return cover, np.minimum(colour + 255.0 * _GLINT * glint[..., None], 255.0)

@@ -1,0 +1,132 @@
+"""A recorded session of a simulated world without drawing a picture: what detectors would have reported."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge.scenes.common.base import SimulatedCamera
+from edge.scenes.marker.scene import MarkerScene
+from protocols.core.clocks import NANOSECONDS, TimeMap
+from protocols.geometry.types import Bools, Floats, Ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedTrack:
+    """What one camera reported of the marker; rows in order of time.
+
+    frame: (n,). time: (n,) [s] on the camera's own clock. pixels: (n, 2) distorted pixels. size: (n,) diameter [px].
+    Truth: true_time: (n,) [s] of the exposures; is_outlier: (n,) rows that show something else.
+    """
+
+    camera: str
+    frame: Ints
+    time: Floats
+    pixels: Floats
+    size: Floats
+    true_time: Floats
+    is_outlier: Bools
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedTracks:
+    """A session and its truth: the scene knows intrinsics, poses, clocks and the marker's path.
+
+    start, end: true times [s] within which frames were taken.
+    """
+
+    scene: MarkerScene
+    tracks: dict[str, SimulatedTrack]
+    start: float
+    end: float
+
+    @property
+    def cameras(self) -> tuple[SimulatedCamera, ...]:
+        """All cameras, also such as saw nothing."""
+        return self.scene.cameras
+
+    def true_time_map(self, camera: str, reference_camera: str) -> TimeMap:
+        """``t_reference = clock_rate * t_camera + time_offset`` in truth."""
+        return self.scene.true_time_map(camera, reference_camera)
+
+    def marker_position(self, camera: str, camera_time: Floats) -> Floats:
+        """Where the marker truly was, (n, 3) [m], at times (n,) [s] on a camera's clock."""
+        clock = self.scene.camera(camera).clock
+        return self.scene.marker_position((np.asarray(camera_time) - clock.epoch_ns / NANOSECONDS) / clock.rate)
+
+
+def simulated_session(
+    scene: MarkerScene,
+    duration_s: float,
+    seed: int,
+    *,
+    pixel_noise: float = 0.1,
+    size_noise: float = 0.01,
+    outlier_fraction: float = 0.0,
+    drop_fraction: float | None = None,
+    jitter_s: float | None = None,
+) -> SimulatedTracks:
+    """Film the marker for ``duration_s`` from true time 0; every camera starts when its ``start_s`` says.
+
+    pixel_noise: std of each coordinate [px]; 0.1 is what the shipped detector does. size_noise: relative std of the
+    diameter. outlier_fraction: share of rows that show a random place instead. drop_fraction, jitter_s:
+    for all cameras, instead of their own. The same arguments give the same session.
+    """
+    tracks = {}
+    for index, camera in enumerate(scene.cameras):
+        rng = np.random.default_rng([seed, index])
+        tracks[camera.name] = _film(
+            scene,
+            camera,
+            duration_s,
+            rng,
+            pixel_noise,
+            size_noise,
+            outlier_fraction,
+            camera.drop_fraction if drop_fraction is None else drop_fraction,
+            camera.jitter_s if jitter_s is None else jitter_s,
+        )
+    return SimulatedTracks(scene, tracks, 0.0, duration_s)
+
+
+def _film(
+    scene: MarkerScene,
+    camera: SimulatedCamera,
+    duration_s: float,
+    rng: np.random.Generator,
+    pixel_noise: float,
+    size_noise: float,
+    outlier_fraction: float,
+    drop_fraction: float,
+    jitter_s: float,
+) -> SimulatedTrack:
+    count = max(int((duration_s - camera.start_s) * camera.fps * camera.clock.rate), 0)
+    true_time = camera.capture_times(camera.start_s, 0, count, rng, jitter_s)
+    kept = rng.random(count) >= drop_fraction
+    pixels, size = scene.seen_by(camera.name, true_time)
+    pixels = pixels + rng.normal(0.0, pixel_noise, (count, 2))
+    size = size * (1.0 + rng.normal(0.0, size_noise, count))
+    # A ball that the image's border cuts is not reported.
+    limit = np.array([camera.intrinsics.width, camera.intrinsics.height]) - 1.0
+    reach = 0.5 * size[:, None]
+    with np.errstate(invalid="ignore"):
+        kept &= ((pixels >= reach) & (pixels <= limit - reach)).all(axis=1)
+    outlier = rng.random(count) < outlier_fraction
+    pixels = np.where(outlier[:, None], rng.uniform(0.0, 1.0, (count, 2)) * limit, pixels)
+    size = np.where(outlier, size * rng.uniform(0.5, 2.0, count), size)
+    stamp = rng.normal(0.0, camera.clock.stamp_noise_s, count)
+    time = np.array([camera.clock.device_time_ns(t) for t in true_time], dtype=np.int64)
+    seconds = (time + np.rint(stamp * NANOSECONDS).astype(np.int64)) / NANOSECONDS
+    return SimulatedTrack(
+        camera=camera.name,
+        frame=np.flatnonzero(kept).astype(np.int64),
+        time=seconds[kept],
+        pixels=pixels[kept],
+        size=size[kept],
+        true_time=true_time[kept],
+        is_outlier=outlier[kept],
+    )

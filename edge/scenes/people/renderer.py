@@ -1,0 +1,222 @@
+"""Draws walkers into a camera's picture: bodies of limbs with cloth on them, before a room, with their shadows.
+
+The farther is drawn first, so that people hide each other. A frame is sharp: at 8 ms a walking leg moves by a pixel.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from edge.scenes.common import background
+from edge.scenes.common.base import Renderer
+from edge.scenes.common.sensor import PEDESTAL, SensorNoise, dimmed, pixel_rays
+from edge.scenes.people.scene import RADII, Person, joint_radii
+from edge.scenes.people.walking import JOINTS
+from protocols.geometry.types import Floats
+
+if TYPE_CHECKING:
+    from edge.scenes.people.scene import PeopleScene
+
+Image = npt.NDArray[np.uint8]
+_BACKGROUND_STREAM = 2
+_NOISE_STD = 3.0
+_SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
+_SHADE = 0.62  # of the light is left in a shadow
+_SHRINK = 4  # shadows are drawn that much smaller
+_CLOTH = (96, 48)  # px of a body's texture
+_J = {name: index for index, name in enumerate(JOINTS)}
+_LIMBS = ("hip", "knee", "ankle", "toe"), ("shoulder", "elbow", "hand")
+
+
+class PeopleRenderer(Renderer):
+    """Pictures of a people scene from one camera.
+
+    noise_rng: sensor noise. noise_std: its std [8-bit steps]. shadows: whether people throw them.
+    """
+
+    def __init__(
+        self,
+        scene: PeopleScene,
+        camera: str,
+        noise_rng: np.random.Generator,
+        noise_std: float = _NOISE_STD,
+        shadows: bool = True,
+    ) -> None:
+        self._scene = scene
+        self._name = camera
+        self._camera = scene.camera(camera)
+        self._shadows = shadows
+        lens = self._camera.intrinsics
+        u, v = np.meshgrid(np.arange(lens.width, dtype=float), np.arange(lens.height, dtype=float))
+        rays = pixel_rays(lens, u, v) @ self._camera.pose.rotation
+        rng = np.random.default_rng([scene.seed, _BACKGROUND_STREAM])
+        self._dimmed = dimmed(background.room(rays, self._camera.pose.position, *scene.room, rng))
+        self._noise = SensorNoise(lens.width, lens.height, noise_std, noise_rng)
+        self._cloth = [_cloth(scene.seed, index, person.pattern) for index, person in enumerate(scene.people)]
+        self._reach = joint_radii(scene.heights)
+
+    def render(self, true_time: float) -> Image:
+        return self._noise.add(self._draw(true_time, None))
+
+    def render_with_owners(self, true_time: float) -> tuple[Image, Image]:
+        """The picture, and whose each pixel is (H, W): 0 nobody's, else the person's index + 1."""
+        owners = np.zeros(self._dimmed.shape[:2], np.uint8)
+        return self._noise.add(self._draw(true_time, owners)), owners
+
+    def _draw(self, true_time: float, owners: Image | None) -> Image:
+        joints = self._scene.joints(np.array([true_time]))[0]
+        pixels = self._scene.seen_by(self._name, joints)
+        depth = self._camera.pose.camera_from_world(joints.reshape(-1, 3))[:, 2].reshape(joints.shape[:2])
+        image = self._shaded(joints) if self._shadows else self._dimmed.copy()
+        for index in np.argsort(-depth[:, _J["pelvis"]]):
+            if np.isfinite(pixels[index]).all():
+                scale = self._camera.intrinsics.focal / depth[index]
+                self._draw_person(image, owners, int(index), pixels[index], depth[index], scale)
+        return image
+
+    def _shaded(self, joints: Floats) -> Image:
+        """The room with the soft shadows of bodies on its floor."""
+        lens = self._camera.intrinsics
+        light = background.LIGHT_WORLD
+        ground = joints - joints[..., 2:] / light[2] * light
+        near = np.concatenate([ground[..., :2], np.zeros((*ground.shape[:-1], 1))], axis=-1)
+        pixels = self._scene.seen_by(self._name, near)
+        depth = self._camera.pose.camera_from_world(near.reshape(-1, 3))[:, 2].reshape(near.shape[:2])
+        mask = np.zeros((lens.height // _SHRINK, lens.width // _SHRINK), np.uint8)
+        for index in range(len(joints)):
+            if not np.isfinite(pixels[index]).all():
+                continue
+            width = self._reach[index] * lens.focal / np.maximum(depth[index], 0.3) / _SHRINK
+            place = pixels[index] / _SHRINK
+            for one, other, thick in _bones():
+                _line(mask, place[one], place[other], 2.0 * thick * max(width[one], width[other]), 255)
+        if not mask.any():
+            return self._dimmed.copy()
+        soft = cv2.GaussianBlur(mask, (0, 0), 1.2)
+        share = 255 - cv2.resize(soft, (lens.width, lens.height), interpolation=cv2.INTER_LINEAR) * (1.0 - _SHADE)
+        rows = np.flatnonzero(soft.any(axis=1))
+        top, bottom = int(rows[0]) * _SHRINK, min((int(rows[-1]) + 2) * _SHRINK, lens.height)
+        image = self._dimmed.copy()
+        part = image[top:bottom]
+        lit = cv2.multiply(part, cv2.merge([share[top:bottom].astype(np.uint8)] * 3), scale=1.0 / 255.0)
+        # The pedestal has been taken off already, and it isn't the light's.
+        image[top:bottom] = cv2.subtract(lit, _missing(share[top:bottom].astype(np.uint8)))
+        return image
+
+    def _draw_person(
+        self, image: Image, owners: Image | None, index: int, pixels: Floats, depth: Floats, scale: Floats
+    ) -> None:
+        person = self._scene.people[index]
+        reach = self._reach[index] * scale
+        low = np.floor((pixels - reach[:, None]).min(axis=0) - 2).astype(int)
+        high = np.ceil((pixels + reach[:, None]).max(axis=0) + 3).astype(int)
+        left, top = max(int(low[0]), 0), max(int(low[1]), 0)
+        right, bottom = min(int(high[0]), image.shape[1]), min(int(high[1]), image.shape[0])
+        if right - left < 2 or bottom - top < 2:
+            return
+        crop = image[top:bottom, left:right]
+        colour, mask = crop.copy(), np.zeros(crop.shape[:2], np.uint8)
+        _body((colour, mask), pixels - (left, top), depth, scale, person)
+        size = int(high[0] - low[0]), int(high[1] - low[1])
+        cloth = cv2.resize(self._cloth[index], size, interpolation=cv2.INTER_LINEAR)
+        cloth = cloth[top - low[1] : bottom - low[1], left - low[0] : right - low[0]]
+        worn = cv2.multiply(colour, cloth, scale=1.0 / 128.0)
+        # Edges were mixed while they were drawn; inside them is cloth.
+        np.copyto(colour, worn, where=(mask > 250)[..., None])
+        crop[:] = colour
+        if owners is not None:
+            owners[top:bottom, left:right][mask > 127] = index + 1
+
+
+def _missing(share: npt.NDArray[np.uint8]) -> Image:
+    """What the pedestal, taken off in full, has taken too much from where less light falls."""
+    lost = np.rint(PEDESTAL * (1.0 - share.astype(np.float32) / 255.0)).astype(np.uint8)
+    return np.asarray(cv2.merge([lost] * 3), dtype=np.uint8)
+
+
+def _bones() -> list[tuple[int, int, float]]:
+    bones = [(_J["pelvis"], _J["neck"], 1.3), (_J["head"], _J["head"], 1.0)]
+    for side in "lr":
+        for chain in _LIMBS:
+            bones += [(_J[f"{a}_{side}"], _J[f"{b}_{side}"], 1.0) for a, b in pairwise(chain)]
+    return bones
+
+
+def _body(canvas: tuple[Image, Image], pixels: Floats, depth: Floats, scale: Floats, person: Person) -> None:
+    """Paint a body's parts, the farther arm and leg first."""
+    size = person.height * scale
+
+    def limb(one: str, other: str, share: float, colour: tuple[float, float, float]) -> None:
+        a, b = _J[one], _J[other]
+        width = 2.0 * share * 0.5 * (size[a] + size[b])
+        _line(canvas[0], pixels[a], pixels[b], width, _dim(colour))
+        _line(canvas[1], pixels[a], pixels[b], width, 255)
+
+    sides = sorted("lr", key=lambda side: -depth[_J[f"hip_{side}"]])
+    for side in sides:
+        far = 0.85 if side == sides[0] else 1.0
+        trousers, shoes = _times(person.trousers, far), _times(person.shoes, far)
+        if side == sides[0]:
+            _arm(limb, person, side, far)
+        limb(f"ankle_{side}", f"toe_{side}", 0.022, shoes)
+        limb(f"hip_{side}", f"knee_{side}", RADII["thigh"], trousers)
+        limb(f"knee_{side}", f"ankle_{side}", RADII["shank"], trousers)
+    hull = []
+    for name, share in (("shoulder_l", 0.045), ("shoulder_r", 0.045), ("pelvis", RADII["pelvis"])):
+        at, radius = pixels[_J[name]], share * size[_J[name]]
+        hull.append(at + radius * _CIRCLE)
+    points = np.concatenate(hull).astype(np.float32)
+    outline = np.rint(cv2.convexHull(points)[:, 0] * (1 << _SHIFT)).astype(np.int32)
+    for target, colour in ((canvas[0], _dim(person.top)), (canvas[1], 255)):
+        cv2.fillConvexPoly(target, outline, colour, cv2.LINE_AA, _SHIFT)
+    limb("neck", "head", RADII["neck"], person.skin)
+    limb("head", "head", RADII["head"], person.hair)
+    face = pixels[_J["head"]] + 0.015 * size[_J["head"]] * np.array([0.0, 1.0])
+    _line(canvas[0], face, face, 2.0 * 0.048 * size[_J["head"]], _dim(person.skin))
+    _arm(limb, person, sides[1], 1.0)
+
+
+def _arm(limb: object, person: Person, side: str, far: float) -> None:
+    assert callable(limb)
+    limb(f"shoulder_{side}", f"elbow_{side}", RADII["arm"] * 1.15, _times(person.top, 0.92 * far))
+    limb(f"elbow_{side}", f"hand_{side}", RADII["arm"], _times(person.top, 0.92 * far))
+    limb(f"hand_{side}", f"hand_{side}", RADII["arm"], person.skin)
+
+
+_CIRCLE = np.stack([np.cos(np.linspace(0, 2 * np.pi, 12)), np.sin(np.linspace(0, 2 * np.pi, 12))], axis=-1)
+
+
+def _line(target: Image, a: Floats, b: Floats, width: float, colour: object) -> None:
+    """A bar with round ends, to a sixteenth of a pixel (its width to whole ones)."""
+    ends = [tuple(int(value) for value in np.rint(np.clip(at, -2e4, 2e4) * (1 << _SHIFT))) for at in (a, b)]
+    cv2.line(target, ends[0], ends[1], colour, max(round(width), 1), cv2.LINE_AA, _SHIFT)  # type: ignore[call-overload]
+
+
+def _times(colour: tuple[float, float, float], share: float) -> tuple[float, float, float]:
+    return colour[0] * share, colour[1] * share, colour[2] * share
+
+
+def _dim(colour: tuple[float, float, float]) -> tuple[float, float, float]:
+    return max(colour[0] - PEDESTAL, 0.0), max(colour[1] - PEDESTAL, 0.0), max(colour[2] - PEDESTAL, 0.0)
+
+
+def _cloth(seed: int, index: int, pattern: str) -> Image:
+    """Folds, patterns and the light from one side, (96, 48, 3) about 128."""
+    rng = np.random.default_rng([seed, 7, index])
+    height, width = _CLOTH
+    folds = cv2.GaussianBlur(rng.normal(0.0, 1.0, _CLOTH), (0, 0), 2.5)
+    light = 1.0 + 0.12 * folds / folds.std()
+    light *= np.linspace(1.12, 0.82, width)[None]
+    down, across = np.mgrid[:height, :width]
+    upper = down < 0.5 * height
+    if pattern == "stripes":
+        light = np.where(upper & (down // 4 % 2 == 0), 0.72 * light, light)
+    elif pattern == "checks":
+        light = np.where(upper & ((down // 5 + across // 5) % 2 == 0), 0.78 * light, light)
+    grey = np.clip(np.rint(128.0 * light), 0, 255).astype(np.uint8)
+    return np.asarray(grey[..., None].repeat(3, axis=2), dtype=np.uint8)

@@ -1,0 +1,161 @@
+"""``people``: walkers in a furnished room, seen by cameras with clocks of their own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge.scenes.common.base import Renderer, Scene
+from edge.scenes.common.placement import Surroundings, cameras_around
+from edge.scenes.people.walking import CROWN, Paths, body, wander
+from protocols.geometry.types import Floats
+
+MOST_PEOPLE = 12
+ROOM = (5.0, 3.0)
+"""Half the side and the height [m] of the room."""
+_WALKED = 2.7  # half the side of the part that is walked [m]
+_CAMERAS = Surroundings(
+    distance=(4.1, 4.8),
+    height=(2.0, 2.75),
+    aim=0.2,
+    focal=(0.55, 0.75),
+    size=(640, 480),
+    exposure_s=0.008,
+    fps=(10.0,),
+    roll=0.06,
+)
+_MIXED = (10.0, 12.5, 9.99, 15.0)
+_STREAMS = {"cameras": 0, "people": 1}  # the background has 2
+RADII = {"head": 0.062, "neck": 0.032, "torso": 0.085, "pelvis": 0.075, "arm": 0.028, "thigh": 0.05, "shank": 0.036}
+"""Of the parts of a body, of its height."""
+
+
+@dataclass(frozen=True, slots=True)
+class Person:
+    """One walker. height: [m]. Colours in full light, BGR 0..255. pattern: of the top: plain, stripes or checks."""
+
+    name: str
+    height: float
+    skin: tuple[float, float, float]
+    hair: tuple[float, float, float]
+    top: tuple[float, float, float]
+    trousers: tuple[float, float, float]
+    shoes: tuple[float, float, float]
+    pattern: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PeopleScene(Scene):
+    """People who walk about a room and avoid each other.
+
+    people: (n) who they are. paths: where they are.
+    """
+
+    people: tuple[Person, ...]
+    paths: Paths
+    room: tuple[float, float]
+
+    @property
+    def heights(self) -> Floats:
+        """(n,) [m]."""
+        return np.array([person.height for person in self.people])
+
+    def joints(self, true_time: Floats) -> Floats:
+        """All joints (t, n, 19, 3) [m], see ``walking.JOINTS``, at true times (t,) [s]."""
+        return body(*self.paths.at(true_time), self.heights)
+
+    def heads(self, true_time: Floats) -> Floats:
+        """Tops of the heads (t, n, 3) [m]; a walking head bobs."""
+        return self.joints(true_time)[:, :, CROWN]
+
+    def feet(self, true_time: Floats) -> Floats:
+        """Points of the floor (t, n, 3) [m] below the bodies."""
+        place, _, _ = self.paths.at(true_time)
+        return np.concatenate([place, np.zeros((*place.shape[:2], 1))], axis=-1)
+
+    def centres(self, true_time: Floats) -> Floats:
+        """Middles (t, n, 3) [m] between head and foot."""
+        return 0.5 * (self.heads(true_time) + self.feet(true_time))
+
+    def headings(self, true_time: Floats) -> Floats:
+        """Where people face (t, n) [rad] from the x axis."""
+        return self.paths.at(true_time)[2]
+
+    def seen_by(self, camera: str, points: Floats) -> Floats:
+        """Distorted pixels (..., 2) of points (..., 3) [m]; NaN where they are behind the camera."""
+        simulated = self.camera(camera)
+        flat = simulated.pose.camera_from_world(points.reshape(-1, 3))
+        flat = np.where(flat[:, 2:] > 0.2, flat, np.nan)
+        with np.errstate(invalid="ignore"):
+            flat = np.where(np.hypot(flat[:, 0], flat[:, 1])[:, None] < 1.5 * flat[:, 2:], flat, np.nan)
+        return simulated.intrinsics.project(flat).reshape(*points.shape[:-1], 2)
+
+    def boxes(self, camera: str, true_time: float) -> Floats:
+        """Boxes (n, 4) x, y, w, h [px] of the bodies as a camera would see them without the others.
+
+        Cut by the image's border; NaN where nothing of a body is in the picture.
+        """
+        simulated = self.camera(camera)
+        joints = self.joints(np.array([true_time]))[0]
+        pixels = self.seen_by(camera, joints)
+        depth = simulated.pose.camera_from_world(joints.reshape(-1, 3))[:, 2].reshape(joints.shape[:2])
+        reach = joint_radii(self.heights) * simulated.intrinsics.focal / np.maximum(depth, 0.2)
+        reach[:, CROWN] = 0.0
+        lens = simulated.intrinsics
+        limit = np.array([lens.width, lens.height]) - 0.5
+        low = np.clip((pixels - reach[..., None]).min(axis=1), -0.5, limit)
+        high = np.clip((pixels + reach[..., None]).max(axis=1), -0.5, limit)
+        boxes = np.concatenate([low, high - low], axis=1)
+        return np.where((boxes[:, 2:] > 0.0).all(axis=1, keepdims=True), boxes, np.nan)
+
+    def renderer(self, camera: str, rng: np.random.Generator) -> Renderer:
+        from edge.scenes.people.renderer import PeopleRenderer  # OpenCV is only needed to draw
+
+        return PeopleRenderer(self, camera, rng)
+
+
+def joint_radii(heights: Floats) -> Floats:
+    """How far a body reaches around its joints (n, 19) [m]."""
+    from edge.scenes.people.walking import JOINTS
+
+    share = {"crown": 0.0, "head": RADII["head"], "neck": RADII["neck"], "chest": RADII["torso"]}
+    share |= {"pelvis": RADII["pelvis"], "shoulder": 0.045, "elbow": RADII["arm"], "hand": RADII["arm"]}
+    share |= {"hip": RADII["thigh"], "knee": RADII["shank"], "ankle": 0.03, "toe": 0.02}
+    return np.asarray(heights[:, None] * np.array([share[name.partition("_")[0]] for name in JOINTS]))
+
+
+_SKIN = ((150, 178, 224), (120, 150, 205), (84, 112, 165), (60, 82, 128))
+_HAIR = ((30, 36, 48), (48, 72, 105), (92, 140, 178), (122, 124, 128))
+_TOPS = (
+    (52, 44, 190), (165, 92, 40), (70, 140, 60), (215, 216, 220), (48, 46, 50), (40, 170, 215), (150, 70, 130),
+    (120, 118, 112), (165, 150, 60), (80, 110, 200), (110, 60, 40), (60, 90, 100),
+)  # fmt: skip
+_TROUSERS = ((92, 60, 44), (42, 42, 46), (118, 138, 150), (70, 84, 96), (140, 100, 70), (60, 62, 90))
+_SHOES = ((40, 42, 48), (205, 206, 210), (50, 70, 110))
+
+
+def people_room(seed: int, cameras: int, people: int, mixed_fps: bool = False) -> PeopleScene:
+    """The scene ``people`` of a seed; see ``edge.scenes.get_people``."""
+    rng = np.random.default_rng([seed, _STREAMS["people"]])
+    where = _CAMERAS
+    if mixed_fps:
+        fields = {name: getattr(where, name) for name in where.__dataclass_fields__}
+        where = Surroundings(**fields | {"fps": _MIXED})
+    centre = np.array([0.0, 0.0, 0.9])
+    seen = cameras_around(np.random.default_rng([seed, _STREAMS["cameras"]]), centre, cameras, where)
+    tops = rng.permutation(len(_TOPS))
+    walkers = tuple(
+        Person(
+            name=f"person{index}",
+            height=float(np.clip(rng.normal(1.72, 0.09), 1.5, 1.95)),
+            skin=_SKIN[int(rng.integers(len(_SKIN)))],
+            hair=_HAIR[int(rng.integers(len(_HAIR)))],
+            top=_TOPS[int(tops[index])],
+            trousers=_TROUSERS[int(rng.integers(len(_TROUSERS)))],
+            shoes=_SHOES[int(rng.integers(len(_SHOES)))],
+            pattern=("plain", "plain", "stripes", "checks")[int(rng.integers(4))],
+        )
+        for index in range(people)
+    )
+    return PeopleScene("people", seed, seen, walkers, wander(rng, people, _WALKED), ROOM)

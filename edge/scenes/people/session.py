@@ -1,0 +1,99 @@
+"""A recorded session of walkers without drawing a picture: head tops and foot points as labelled points.
+
+Who is who is given, as for the marker: to find that out is the tracking's work, not a recording's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge.scenes.people.scene import PeopleScene
+from protocols.core.clocks import NANOSECONDS
+from protocols.geometry.types import Bools, Floats, Ints
+
+HIDDEN_PX = 3.0
+"""A head's top or a foot point this far inside a nearer body's box is not seen."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PeopleTrack:
+    """What one camera reported, rows in order of time.
+
+    frame: (n,). time: (n,) [s] on the camera's own clock. pixels: (n, 2). size: (n,) [px] from head to foot.
+    label: n names, person0-head, person0-foot, …; truth: true_time (n,) [s].
+    """
+
+    camera: str
+    frame: Ints
+    time: Floats
+    pixels: Floats
+    size: Floats
+    label: tuple[str, ...]
+    true_time: Floats
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+def film_people(
+    scene: PeopleScene, duration_s: float, seed: int, *, pixel_noise: float, drop_fraction: float | None = None
+) -> dict[str, PeopleTrack]:
+    """Film the walkers for ``duration_s`` from true time 0: a track a camera; the same arguments, the same session.
+
+    pixel_noise: std of each coordinate [px]. drop_fraction: of the frames, instead of the cameras' own.
+    """
+    return {
+        camera.name: _film(scene, index, duration_s, np.random.default_rng([seed, index]), pixel_noise, drop_fraction)
+        for index, camera in enumerate(scene.cameras)
+    }
+
+
+def seen(scene: PeopleScene, camera: str, true_time: Floats) -> tuple[Floats, Bools]:
+    """Pixels (t, n, 2, 2) of head tops and foot points, and whether each is seen (t, n, 2).
+
+    Not seen is what lies outside the picture or behind a nearer person.
+    """
+    simulated = scene.camera(camera)
+    lens = simulated.intrinsics
+    points = np.stack([scene.heads(true_time), scene.feet(true_time)], axis=2)
+    pixels = scene.seen_by(camera, points)
+    depth = simulated.pose.camera_from_world(points.reshape(-1, 3))[:, 2].reshape(points.shape[:3])
+    limit = np.array([lens.width, lens.height]) - 0.5
+    with np.errstate(invalid="ignore"):
+        visible = np.asarray(((pixels > -0.5) & (pixels < limit)).all(axis=-1), dtype=np.bool_)
+        for index, moment in enumerate(true_time):
+            boxes = scene.boxes(camera, float(moment))
+            low, high = boxes[:, :2] + HIDDEN_PX, boxes[:, :2] + boxes[:, 2:] - HIDDEN_PX
+            inside = ((pixels[index][:, :, None] > low) & (pixels[index][:, :, None] < high)).all(axis=-1)
+            nearer = depth[index].mean(axis=-1)[None, None] < depth[index].mean(axis=-1)[:, None, None]
+            visible[index] &= ~(inside & nearer).any(axis=-1)
+    return pixels, visible
+
+
+def _film(
+    scene: PeopleScene, which: int, duration_s: float, rng: np.random.Generator, noise: float, drops: float | None
+) -> PeopleTrack:
+    camera = scene.cameras[which]
+    count = max(int((duration_s - camera.start_s) * camera.fps * camera.clock.rate), 0)
+    true_time = camera.capture_times(camera.start_s, 0, count, rng)
+    kept = rng.random(count) >= (camera.drop_fraction if drops is None else drops)
+    stamp = rng.normal(0.0, camera.clock.stamp_noise_s, count)
+    device = np.array([camera.clock.device_time_ns(moment) for moment in true_time], dtype=np.int64)
+    seconds = (device + np.rint(stamp * NANOSECONDS).astype(np.int64)) / NANOSECONDS
+    pixels, visible = seen(scene, camera.name, true_time)
+    visible &= kept[:, None, None]
+    size = np.linalg.norm(pixels[:, :, 0] - pixels[:, :, 1], axis=-1)
+    noisy = pixels + rng.normal(0.0, noise, pixels.shape)
+    frame, person, end = np.nonzero(visible)
+    names = [(f"{one.name}-head", f"{one.name}-foot") for one in scene.people]
+    return PeopleTrack(
+        camera=camera.name,
+        frame=frame.astype(np.int64),
+        time=seconds[frame],
+        pixels=noisy[frame, person, end],
+        size=size[frame, person],
+        label=tuple(names[who][which_end] for who, which_end in zip(person, end, strict=True)),
+        true_time=true_time[frame],
+    )

@@ -1,0 +1,1 @@
+"""Prediction of a target out of view: particle set, road paths, driver model."""

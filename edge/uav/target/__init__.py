@@ -1,0 +1,1 @@
+"""The target: appearance, likelihood, motion history, re-detection, state estimate."""

@@ -1,0 +1,1 @@
+"""Clock alignment between camera, telemetry and vehicle."""

@@ -1,0 +1,1 @@
+"""Video servers: RTSP with H.264 over RTP, and MJPEG over HTTP."""
