@@ -105,9 +105,9 @@ def _fps(config: CameraConfig) -> float:
 
 def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable[[], None] = lambda: None) -> int:
     """Run the hub until it is stopped; its answers are also files where `out` is given. beat: called every round."""
-    from hub.agent import run_hub
-    from hub.live import KnownCalibration, LiveHub, LiveSettings
-    from hub.nodes.host import NodeHost
+    from hub.distributed.network.host import NodeHost
+    from hub.live.agent import run_hub
+    from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
     from protocols.session.calibration import read_calibration
 
     rig = None if config.rig is None else read_rig(config.rig)
@@ -136,7 +136,7 @@ def write_last(hub: object, out: Path) -> None:
     """The hub's last answer, or its last refusal, as the files that `calibrate` writes."""
     # Only here: with it comes the report, which costs a camera agent a fifth of a second of its start.
     from deploy.outputs import write_outputs, write_refusal
-    from hub.live import LiveHub
+    from hub.live.live_hub import LiveHub
 
     assert isinstance(hub, LiveHub)
     if hub.session is None:

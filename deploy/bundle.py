@@ -55,7 +55,8 @@ _WARM = {
     "edge.devices.live.usb, edge.devices.playback.open_video, protocols.bus.transport.zenoh_bus",
     "uav": "deploy.uav, deploy.notify, edge.agents.uav, edge.mavlink.link.connection, "
     "edge.uav.ground_tracker, edge.devices.playback.open_video, protocols.bus.transport.zenoh_bus",
-    "hub": "deploy.agents, hub.agent, hub.calibrate, hub.nodes.host, hub.report, protocols.bus.transport.zenoh_bus",
+    "hub": "deploy.agents, hub.live.agent, hub.calibration.pipeline, hub.distributed.network.host, hub.report, "
+    "protocols.bus.transport.zenoh_bus",
     "recorder": "deploy.record, protocols.bus.transport.zenoh_bus",
     "router": "deploy.commands.router, protocols.bus.router.zenoh_router",
 }

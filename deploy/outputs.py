@@ -60,7 +60,7 @@ def print_advice(rig: Rig, observations: Observations, cameras: Mapping[str, str
 
     cameras: only these; None = all.
     """
-    from hub.guidance import advice_for
+    from hub.calibration.coverage import advice_for
 
     for advice in advice_for(rig, observations, cameras):
         print(f"hint: {advice.text}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from hub.live import KnownCalibration, LiveHub, LiveSettings
+from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.log.read.reader import LogReader

@@ -17,10 +17,10 @@ from edge.detectors.marker.ball import MarkerModel, teach
 from edge.detectors.marker.teach import TaughtDetector, teach_at
 from edge.devices.base import Device, DeviceInfo, Frame
 from edge.lens.solve import lens_from_angle
-from hub.agent import run_hub
-from hub.guidance import ENOUGH
-from hub.live import LiveHub, LiveSettings
-from hub.view.planes import PicturePlanes
+from hub.calibration.coverage import ENOUGH
+from hub.live.agent import run_hub
+from hub.live.live_hub import LiveHub, LiveSettings
+from hub.view.image_planes import PicturePlanes
 from hub.view.server import ViewServer, run_view
 from hub.view.state import ViewState
 from protocols.bus.transport.memory import MemoryBus, MemoryHub

@@ -61,7 +61,7 @@ def load_answer(source: Path, session: Path | None, tell: Callable[[str, float],
         remedy = f"name a folder with {RESULT}, a session folder or a .mcap log"
         raise InputError("neither results nor a session", file=source, remedy=remedy)
     rig, observations, warnings = load_session(source)
-    from hub.calibrate import calibrate
+    from hub.calibration.pipeline import calibrate
 
     outcome: Calibration | Refused
     try:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edge.scenes.people.scene import PeopleScene
-from hub.tracking.camera import TrackingCamera
+from hub.tracking.camera_frame import TrackingCamera
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb

@@ -80,7 +80,7 @@ def calibrate(
         known, rig = _known(from_known, rig)
     command = shlex.join(["syncline", *sys.argv[1:]])
     keep_heap()
-    from hub.calibrate import calibrate as solve
+    from hub.calibration.pipeline import calibrate as solve
 
     began = time.process_time()
     try:

@@ -48,7 +48,7 @@ def report(
     from deploy.reporting import load_answer
     from hub.report import build_report
     from hub.report.measures import usage
-    from hub.report.verdict import judge, judge_refusal
+    from hub.report.quality_assessment import judge, judge_refusal
     from protocols.core.files import write_atomically
 
     file = out or (source / "report.html" if (source / "result.json").is_file() else Path("report.html"))

@@ -48,7 +48,7 @@ def triangulate(
     """
     if out.is_dir():
         raise InputError("a folder of this name is in the way", file=out, remedy="give --out the name of a CSV file")
-    from hub.triangulate import triangulate as solve
+    from hub.trajectory.triangulation import triangulate as solve
     from protocols.core.files import write_atomically
     from protocols.session.calibration import csv_cell, read_calibration
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from hub.report import convergence, image_maps, measures, pair_graph, scene, tables, time_figures
 from hub.report.convergence import Step
 from hub.report.measures import Usage
+from hub.report.quality_assessment import UNIT_WORDS, Verdict, half_interval_ms, judge, judge_refusal
 from hub.report.style import STYLE
 from hub.report.svg import THIN, esc, number, short, whole
-from hub.report.verdict import UNIT_WORDS, Verdict, half_interval_ms, judge, judge_refusal
 from protocols.core.errors import Refused
 from protocols.core.version import VERSION
 from protocols.session.calibration import Calibration

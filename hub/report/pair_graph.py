@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from hub.report.quality_assessment import contradicts
 from hub.report.svg import THIN, at, drawing, esc, line, number, rect, text
-from hub.report.verdict import contradicts
 from protocols.core.errors import Refused
 from protocols.session.calibration import Calibration, PairReport
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from hub.report import measures
 from hub.report.measures import Span, Usage
+from hub.report.quality_assessment import half_interval_ms
 from hub.report.svg import THIN, drawing, line, number, points, rect, short, text, tick_text, ticks, time_axis
-from hub.report.verdict import half_interval_ms
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations

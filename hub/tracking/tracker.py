@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from hub.tracking.camera import Frame, TrackingCamera, frame_of
-from hub.tracking.step import World, moved, step
-from hub.tracking.targets import State, Targets
+from hub.tracking.camera_frame import Frame, TrackingCamera, frame_of
+from hub.tracking.filter.target_states import State, Targets
+from hub.tracking.filter.update import World, moved, step
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.pose import Similarity
 from protocols.messages import syncline_pb2 as pb

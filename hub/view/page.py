@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hub.view.export import calibration_file
-from hub.view.flight_picture import draw, padded, words
-from hub.view.flights import FlightView
 from hub.view.panels import camera_details, camera_table, overview
 from hub.view.scene import Options, decoded
 from hub.view.state import CameraView, ViewState
+from hub.view.uav_overlay import draw, padded, words
+from hub.view.uav_state import FlightView
 
 if TYPE_CHECKING:
     import viser

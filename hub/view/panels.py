@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import math
 
-from hub.guidance import ENOUGH
+from hub.calibration.coverage import ENOUGH
 from hub.report.measures import COLUMNS, ROWS
 from hub.view.state import CameraState, CameraView, ViewState
 

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from google.protobuf.message import Message
 
-from hub.messages import calibration_message, track_messages
+from hub.live.messages import calibration_message, track_messages
 from hub.view.state import ViewState
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError

@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import viser
 
-from hub.view.gate import Gate, is_local
+from hub.view.access_control import Gate, is_local
 from hub.view.page import ACTIONS, Page, new_id
 from hub.view.player import Player, Recording
 from hub.view.scene import Options, SceneDrawing

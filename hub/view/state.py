@@ -12,8 +12,8 @@ from typing import Literal
 import numpy as np
 from google.protobuf.message import Message
 
-from hub.guidance import Guidance
-from hub.view.flights import FlightView
+from hub.calibration.coverage import Guidance
+from hub.view.uav_state import FlightView
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose

@@ -20,8 +20,8 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import numpy as np  # noqa: E402
 
-from hub.calibrate import calibrate  # noqa: E402
-from hub.timing.tracks import smooth_track  # noqa: E402
+from hub.calibration.pipeline import calibrate  # noqa: E402
+from hub.trajectory.image_tracks import smooth_track  # noqa: E402
 from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry import so3  # noqa: E402
 from protocols.geometry.camera import Intrinsics  # noqa: E402

@@ -89,8 +89,8 @@ def adjustment(quick: bool) -> list[Curve]:
 
 def pairs(quick: bool) -> list[Curve]:
     """Timing: seconds of two tracks (lags within them all), and all pairs of a number of cameras."""
-    from hub.pairs import solve_pairs
-    from hub.prepare import prepare
+    from hub.calibration.pair_network import solve_pairs
+    from hub.calibration.preprocessing import prepare
     from tests import rigs
     from tests.bench import pair_timing
     from tests.bench.pair_trials import Regime, make
@@ -109,7 +109,7 @@ def pairs(quick: bool) -> list[Curve]:
 
 def hub(quick: bool) -> list[Curve]:
     """The live hub's estimator without a bus: CPU an observation and memory against cameras at 5 a second for 20 s."""
-    from hub.live import LiveHub, LiveSettings
+    from hub.live.live_hub import LiveHub, LiveSettings
     from protocols.messages import syncline_pb2 as pb
 
     cost = Curve("live hub", "cameras", "µs of CPU an observation")

@@ -27,7 +27,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import numpy as np  # noqa: E402
 
-from hub.calibrate import calibrate  # noqa: E402
+from hub.calibration.pipeline import calibrate  # noqa: E402
 from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry.pose import Pose, Similarity  # noqa: E402
 from protocols.geometry.types import Floats  # noqa: E402

@@ -22,9 +22,9 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import numpy as np  # noqa: E402
 from scipy.signal import lfilter  # noqa: E402
 
-from hub.calibrate import calibrate  # noqa: E402
-from hub.poses.lasting import with_lasting_errors  # noqa: E402
-from hub.poses.problem import Problem, State  # noqa: E402
+from hub.bundle.correlated_noise import with_lasting_errors  # noqa: E402
+from hub.bundle.problem import Problem, State  # noqa: E402
+from hub.calibration.pipeline import calibrate  # noqa: E402
 from protocols.core.clocks import TimeMap  # noqa: E402
 from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry.types import Floats  # noqa: E402
@@ -108,7 +108,9 @@ def run(one: Session, counted: bool) -> Run:
     """One calibration, judged. counted: whether errors that last are looked for."""
     began = time.process_time()
     try:
-        with mock.patch("hub.calibrate.with_lasting_errors", with_lasting_errors if counted else as_rows_of_their_own):
+        with mock.patch(
+            "hub.calibration.pipeline.with_lasting_errors", with_lasting_errors if counted else as_rows_of_their_own
+        ):
             found = calibrate(one.rig, one.observations)
     except Refused:
         return Run(CAMERAS, time.process_time() - began)

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hub.calibrate import calibrate
+from hub.calibration.pipeline import calibrate
 from protocols.core.errors import Refused
 from tests.rigs import simulate
 

@@ -26,9 +26,9 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import numpy as np  # noqa: E402
 from scipy.signal import lfilter  # noqa: E402
 
-from hub.calibrate import calibrate  # noqa: E402
-from hub.live import LiveHub, LiveSettings  # noqa: E402
-from hub.timing.clock_watch import ClockWatch  # noqa: E402
+from hub.calibration.pipeline import calibrate  # noqa: E402
+from hub.clocks.change_detector import ClockWatch  # noqa: E402
+from hub.live.live_hub import LiveHub, LiveSettings  # noqa: E402
 from protocols.core.clocks import NANOSECONDS  # noqa: E402
 from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry.types import Floats  # noqa: E402

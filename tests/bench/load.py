@@ -41,8 +41,8 @@ def resident_mb(pid: int | str = "self") -> float:
 
 def hub(endpoint: str, site: str = "local") -> None:
     """The hub's process: counts, latencies and memory as lines of JSON, one a second, until its input ends."""
-    from hub.agent import settle_memory
-    from hub.live import LiveHub, LiveSettings
+    from hub.live.agent import settle_memory
+    from hub.live.live_hub import LiveHub, LiveSettings
 
     estimator = LiveHub(LiveSettings(window_s=10.0, interval_s=1e9))
     with open_bus(site, BusConfig(mode="client", connect=(endpoint,)), timeout_s=10.0) as bus:

@@ -26,9 +26,9 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 
-from hub.timing.pair import solve_pair  # noqa: E402
-from hub.timing.tracks import smooth_track  # noqa: E402
-from hub.timing.two_view import fundamental_from  # noqa: E402
+from hub.sync.pair_solver import solve_pair  # noqa: E402
+from hub.trajectory.image_tracks import smooth_track  # noqa: E402
+from hub.two_view.relative_pose import fundamental_from  # noqa: E402
 from tests.bench.pair_trials import (  # noqa: E402
     FOCAL,
     MATRIX,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hub.timing.two_view import RelativePose, fundamental_from, relative_pose, tangent_basis
+from hub.two_view.relative_pose import RelativePose, fundamental_from, relative_pose, tangent_basis
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats

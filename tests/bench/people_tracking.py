@@ -21,12 +21,12 @@ from deploy.people_scores import Moment, Scores, clear_mot
 from edge import scenes
 from edge.agents.predictions import Predictions
 from edge.scenes.people.scene import PeopleScene
-from hub.calibrate import calibrate
-from hub.tracking.camera import TrackingCamera
-from hub.tracking.step import World, label_of
-from hub.tracking.telling import prediction_message
+from hub.calibration.pipeline import calibrate
+from hub.tracking.calibration.people import Walkers
+from hub.tracking.camera_frame import TrackingCamera
+from hub.tracking.filter.update import World, label_of
+from hub.tracking.messages import prediction_message
 from hub.tracking.tracker import Tracker
-from hub.tracking.walkers import Walkers
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.core.errors import Refused

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hub.nodes.messages import Notice, Reference, SharedObservation, StateMessage
-from hub.nodes.node import PoseNode
+from hub.distributed.network.messages import Notice, Reference, SharedObservation, StateMessage
+from hub.distributed.network.node import PoseNode
 from protocols.geometry.pose import Pose
 from tests.bench.pose_worlds import Sightings, World
 

@@ -21,7 +21,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import numpy as np  # noqa: E402
 
-from hub.calibrate import calibrate  # noqa: E402
+from hub.calibration.pipeline import calibrate  # noqa: E402
 from protocols.core.clocks import TimeMap  # noqa: E402
 from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry import so3  # noqa: E402

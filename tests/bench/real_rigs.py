@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hub.calibrate import calibrate
+from hub.calibration.pipeline import calibrate
 from protocols.core.clocks import TimeMap
 from protocols.geometry.types import Floats
 from protocols.session.calibration import (

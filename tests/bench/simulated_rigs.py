@@ -24,9 +24,9 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import numpy as np  # noqa: E402
 
 from deploy.heap import keep_heap  # noqa: E402
-from hub.calibrate import calibrate  # noqa: E402
-from hub.prepare import prepare  # noqa: E402
-from hub.timing.tracks import SmoothTrack  # noqa: E402
+from hub.calibration.pipeline import calibrate  # noqa: E402
+from hub.calibration.preprocessing import prepare  # noqa: E402
+from hub.trajectory.image_tracks import SmoothTrack  # noqa: E402
 from protocols.core.clocks import TimeMap  # noqa: E402
 from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry.camera import Intrinsics  # noqa: E402

@@ -14,7 +14,7 @@ import numpy as np
 from deploy.simulated import observations_of, rig_of
 from edge import scenes
 from edge.scenes.marker.session import simulated_session
-from hub.calibrate import calibrate
+from hub.calibration.pipeline import calibrate
 from protocols.core.clocks import CameraTime
 from protocols.core.errors import Refused
 from protocols.geometry.types import Floats

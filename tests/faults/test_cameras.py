@@ -17,7 +17,7 @@ from edge.agents.camera import run_camera_agent
 from edge.detectors.base import Detection
 from edge.devices.base import DeviceInfo, Frame
 from edge.devices.live.opencv_capture import LiveCamera
-from hub.timing.clock_watch import ClockWatch
+from hub.clocks.change_detector import ClockWatch
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.errors import InputError
 from protocols.messages import syncline_pb2 as pb

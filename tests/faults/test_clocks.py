@@ -7,7 +7,7 @@ import pytest
 
 from edge import scenes
 from edge.scenes.marker.session import simulated_session
-from hub.live import LiveHub, LiveSettings
+from hub.live.live_hub import LiveHub, LiveSettings
 from protocols.messages import syncline_pb2 as pb
 from tests.faults.matrix import measured
 

@@ -15,7 +15,7 @@ import numpy as np
 import tomli_w
 
 from deploy.cli import run
-from hub.calibrate import calibrate
+from hub.calibration.pipeline import calibrate
 from tests.films import film_scene
 from tests.unit.test_ball_outline import ball_session
 

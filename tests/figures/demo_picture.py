@@ -13,7 +13,7 @@ from deploy.simulated import observations_of, rig_of
 from edge import scenes
 from edge.scenes.marker.scene import MarkerScene
 from edge.scenes.marker.session import SimulatedTracks, simulated_session
-from hub.calibrate import calibrate
+from hub.calibration.pipeline import calibrate
 from protocols.geometry.pose import Pose, fit_similarity
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration

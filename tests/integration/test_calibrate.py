@@ -8,7 +8,7 @@ from pathlib import Path as File
 import numpy as np
 import pytest
 
-from hub.calibrate import calibrate
+from hub.calibration.pipeline import calibrate
 from protocols.core.errors import EXIT_REFUSED, Refused
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, fit_similarity

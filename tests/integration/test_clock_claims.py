@@ -7,8 +7,8 @@ import threading
 import numpy as np
 import pytest
 
-from hub.agent import run_hub, status_message
-from hub.live import LiveHub, LiveSettings
+from hub.live.agent import run_hub, status_message
+from hub.live.live_hub import LiveHub, LiveSettings
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.clocks import CameraTime
 from protocols.messages import syncline_pb2 as pb

@@ -14,7 +14,7 @@ from google.protobuf.message import Message
 from deploy.cli import run
 from deploy.process_replay import replay_through_hub
 from deploy.replay import replay
-from hub.live import LiveSettings
+from hub.live.live_hub import LiveSettings
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.clocks import NANOSECONDS
 from protocols.log.read.reader import LogReader

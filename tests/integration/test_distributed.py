@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hub.calibrate import calibrate
+from hub.calibration.pipeline import calibrate
 from protocols.core.errors import Refused
 from protocols.geometry.pose import fit_similarity
 from protocols.session.calibration import Calibration

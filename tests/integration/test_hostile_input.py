@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
-from hub.calibrate import calibrate
+from hub.calibration.pipeline import calibrate
 from protocols.core.errors import InputError
 from protocols.core.files import write_together
 from protocols.session.folder import write_observations

@@ -14,11 +14,11 @@ import pytest
 from deploy.cli import run
 from edge.lens.models import MODELS, angle_across, find_model
 from edge.lens.solve import lens_from_angle
-from hub.calibrate import calibrate
-from hub.lens import LARGEST_STD, first_focals, prior_of
-from hub.timing.alignment import PairFit
-from hub.timing.pair import PairSolution
-from hub.timing.two_view import Uncalibrated, relative_pose
+from hub.calibration.pipeline import calibrate
+from hub.calibration.self_calibration import LARGEST_STD, first_focals, prior_of
+from hub.sync.alignment import PairFit
+from hub.sync.pair_solver import PairSolution
+from hub.two_view.relative_pose import Uncalibrated, relative_pose
 from protocols.core.errors import InputError
 from protocols.session.folder import read_folder, write_observations
 from protocols.session.rig import RigCamera, read_rig

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from google.protobuf.message import Message
 
-from hub.live import LiveHub, LiveSettings
+from hub.live.live_hub import LiveHub, LiveSettings
 from protocols.core.clocks import NANOSECONDS
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder

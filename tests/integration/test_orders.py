@@ -9,8 +9,8 @@ from pathlib import Path
 
 from deploy.config import RecorderConfig
 from deploy.recording_orders import record_as_asked, replace_out
-from hub.agent import run_hub
-from hub.live import LiveHub
+from hub.live.agent import run_hub
+from hub.live.live_hub import LiveHub
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.commands import Orders
 from protocols.log.read.reader import LogReader

@@ -13,8 +13,8 @@ from deploy.cli import run
 from deploy.demo_people import score_log
 from deploy.simulated import camera_tables
 from edge import scenes
-from hub.agent import run_hub
-from hub.live import KnownCalibration, LiveHub, LiveSettings
+from hub.live.agent import run_hub
+from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus

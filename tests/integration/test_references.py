@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hub.calibrate import calibrate
+from hub.calibration.pipeline import calibrate
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration
 from tests import rigs

@@ -7,7 +7,7 @@ import pytest
 
 from edge import scenes
 from edge.scenes.marker.scene import MarkerScene
-from hub.calibrate import calibrate
+from hub.calibration.pipeline import calibrate
 from protocols.geometry import so3
 from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations, gather_tracks

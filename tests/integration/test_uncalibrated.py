@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
-from hub.calibrate import calibrate
+from hub.calibration.pipeline import calibrate
 from protocols.core.clocks import TimeMap
 from protocols.core.errors import Refused
 from protocols.geometry.types import Floats

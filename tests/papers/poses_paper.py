@@ -17,7 +17,7 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from hub.nodes.paper import PaperNode, PaperSettings
+from hub.baselines.recursive_poses import PaperNode, PaperSettings
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from tests.bench.pose_runs import feed, network

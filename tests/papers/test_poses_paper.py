@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hub.nodes import paper
+from hub.baselines import recursive_poses
 from protocols.geometry import so3
 from tests.papers.poses_paper import PRINTED, node_run, paper_run
 
@@ -18,27 +18,31 @@ def _two_views(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.nda
 def test_the_correlation_holds_r_k_times_r_l_transposed() -> None:
     points_k, points_l, l_from_k, shift, _ = _two_views(np.random.default_rng(0))
     mean_k, mean_l = points_k.mean(0), points_l.mean(0)
-    found = paper.rotation_of(paper.correlation(paper.centred(points_k, mean_k), paper.centred(points_l, mean_l)))
+    found = recursive_poses.rotation_of(
+        recursive_poses.correlation(
+            recursive_poses.centred(points_k, mean_k), recursive_poses.centred(points_l, mean_l)
+        )
+    )
     np.testing.assert_allclose(found, l_from_k.T, atol=1e-9)
-    np.testing.assert_allclose(paper.direction(mean_k, mean_l, found), shift, atol=1e-9)
+    np.testing.assert_allclose(recursive_poses.direction(mean_k, mean_l, found), shift, atol=1e-9)
 
 
 def test_a_size_tells_the_depth() -> None:
     point = np.array([0.4, -0.3, 5.0])
     row = np.array([[*(point[:2] / point[2]), np.log(1.0 / point[2])]])
-    np.testing.assert_allclose(paper.point_in_camera(row)[0], point)
+    np.testing.assert_allclose(recursive_poses.point_in_camera(row)[0], point)
 
 
 def test_the_reference_keeps_its_attitude() -> None:
     known = so3.exp(np.array([0.1, 0.2, 0.3]))
     away = so3.exp(np.array([0.0, 0.5, 0.0]))
-    matrix = paper.own_matrix(1e6 * known, [(10.0 * away, np.eye(3))])
-    assert so3.angle_between(paper.rotation_of(matrix), known) < 1e-4
+    matrix = recursive_poses.own_matrix(1e6 * known, [(10.0 * away, np.eye(3))])
+    assert so3.angle_between(recursive_poses.rotation_of(matrix), known) < 1e-4
 
 
 def test_nothing_is_forgotten_with_u_1_and_a_part_with_more() -> None:
-    np.testing.assert_allclose(paper.forgotten(np.eye(3), np.eye(3), 1.0), 2 * np.eye(3))
-    np.testing.assert_allclose(paper.forgotten(np.eye(3), np.eye(3), 2.0), 1.5 * np.eye(3))
+    np.testing.assert_allclose(recursive_poses.forgotten(np.eye(3), np.eye(3), 1.0), 2 * np.eye(3))
+    np.testing.assert_allclose(recursive_poses.forgotten(np.eye(3), np.eye(3), 2.0), 1.5 * np.eye(3))
 
 
 def test_a_direction_moves_a_camera_across_and_never_along() -> None:
@@ -46,9 +50,9 @@ def test_a_direction_moves_a_camera_across_and_never_along() -> None:
     position, other = np.array([1.0, 2.0, 3.0]), np.array([4.0, 0.0, 9.0])
     truth = position + np.array([0.3, -0.2, 0.1])
     y = rotation @ (other - truth)
-    h = paper.direction_jacobian(y, rotation)
-    moved, covariance = paper.kalman_position(
-        position, np.eye(3), other, np.zeros((3, 3)), h, paper.PaperSettings(bearing_std=1e-6, drift=0.0)
+    h = recursive_poses.direction_jacobian(y, rotation)
+    moved, covariance = recursive_poses.kalman_position(
+        position, np.eye(3), other, np.zeros((3, 3)), h, recursive_poses.PaperSettings(bearing_std=1e-6, drift=0.0)
     )
     along = (other - truth) / np.linalg.norm(other - truth)
     np.testing.assert_allclose(np.cross(moved - truth, along), 0.0, atol=1e-6)

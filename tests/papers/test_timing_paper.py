@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hub.timing.paper import alternate, corresponding, overall_lag, search_start
+from hub.baselines.alternating_lag import alternate, corresponding, overall_lag, search_start
 from protocols.core.errors import Refused
 from protocols.geometry.camera import Intrinsics
 from protocols.session.observations import Observations, Track

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from hub.timing.pair import PairSolution, solve_pair
-from hub.timing.tracks import smooth_track
-from hub.timing.two_view import fundamental_from
+from hub.sync.pair_solver import PairSolution, solve_pair
+from hub.trajectory.image_tracks import smooth_track
+from hub.two_view.relative_pose import fundamental_from
 from tests.papers.timing_rig import FOCAL, Filmed, LagResult, evaluation_error
 
 
 def default_method(filmed: Filmed) -> LagResult:
-    """Cubic splines, scan of all lags, refinement (hub/timing/pair.py); a refusal keeps its best alignment's errors."""
+    """Cubic splines, scan of all lags, refinement (hub/sync); a refusal keeps its best alignment's errors."""
     tracks = [smooth_track(filmed.time, pixels / FOCAL, FOCAL) for pixels in (filmed.a, filmed.b)]
     if tracks[0] is None or tracks[1] is None:
         return LagResult(filmed.tau, float("nan"), float("nan"), "no track")

@@ -22,11 +22,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hub.timing.fundamental import epipolar_lines, line_distances
-from hub.timing.pair import solve_pair
-from hub.timing.paper import PaperResult, Turn, alternate, corresponding, point_lags
-from hub.timing.tracks import SmoothTrack, smooth_track
-from hub.timing.two_view import fundamental_from, relative_pose
+from hub.baselines.alternating_lag import PaperResult, Turn, alternate, corresponding, point_lags
+from hub.sync.pair_solver import solve_pair
+from hub.trajectory.image_tracks import SmoothTrack, smooth_track
+from hub.two_view.fundamental import epipolar_lines, line_distances
+from hub.two_view.relative_pose import fundamental_from, relative_pose
 from protocols.core.errors import Refused
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats

@@ -13,8 +13,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hub.timing.fundamental import epipolar_lines, line_distances, maximum_likelihood
-from hub.timing.paper import alternate
+from hub.baselines.alternating_lag import alternate
+from hub.two_view.fundamental import epipolar_lines, line_distances, maximum_likelihood
 from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
@@ -148,7 +148,7 @@ Method: TypeAlias = Callable[[Filmed], LagResult]
 
 
 def paper_method(filmed: Filmed) -> LagResult:
-    """The alternating method (hub/timing/paper.py) on frame indices."""
+    """The alternating method (hub/baselines/alternating_lag.py) on frame indices."""
     try:
         found = alternate(filmed.a, filmed.b)
     except Refused as refusal:

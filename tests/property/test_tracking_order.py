@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge import scenes
-from hub.tracking.step import World
-from hub.tracking.targets import State
+from hub.tracking.filter.target_states import State
+from hub.tracking.filter.update import World
 from hub.tracking.tracker import Tracker
 from protocols.messages import syncline_pb2 as pb
 from tests.people_traffic import cameras_of, film

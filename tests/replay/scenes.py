@@ -22,7 +22,7 @@ from edge.scenes import get_people
 from edge.scenes.people.scene import PeopleScene
 from edge.uav.world.patrol import patrol
 from edge.uav.world.world import World
-from hub.live import LiveSettings
+from hub.live.live_hub import LiveSettings
 from protocols.core.clocks import NANOSECONDS
 from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter

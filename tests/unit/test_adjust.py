@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hub.poses import linear
-from hub.poses.adjust import (
+from hub.bundle import bordered_system
+from hub.bundle.adjustment import (
     adjust,
     build_system,
     gauge_tangent,
@@ -16,10 +16,9 @@ from hub.poses.adjust import (
     moved,
     residual_norms,
 )
-from hub.poses.covariance import _inverse_blocks
-from hub.poses.linear import BAND, BorderedSystem, eliminate, solve
-from hub.poses.motion import MotionPrior
-from hub.poses.problem import (
+from hub.bundle.bordered_system import BAND, BorderedSystem, eliminate, solve
+from hub.bundle.covariance import _inverse_blocks
+from hub.bundle.problem import (
     ASPECT,
     CAMERA_PARAMETERS,
     CENTRE,
@@ -38,7 +37,8 @@ from hub.poses.problem import (
     State,
     Trajectory,
 )
-from hub.splines import SplineBasis, fit_spline
+from hub.trajectory.smoothness_prior import MotionPrior
+from hub.trajectory.splines import SplineBasis, fit_spline
 from protocols.geometry.types import Floats
 from tests.rigs import random_lens, random_path, random_poses
 
@@ -293,7 +293,7 @@ def test_border_blocks_take_rows_in_any_order() -> None:
     rng = np.random.default_rng(0)
     index, weights = rng.integers(0, 20, 50), rng.random((50, 4))
     blocks = rng.normal(size=(50, 3, 5))
-    out = linear.border_block(index, weights, blocks.transpose(1, 2, 0), 3 * 24)
+    out = bordered_system.border_block(index, weights, blocks.transpose(1, 2, 0), 3 * 24)
     expected = np.zeros((24, 3, 5))
     for n in range(50):
         for k in range(4):

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hub.prepare import prepare
-from hub.timing import finish, pair
-from hub.timing.alignment import PairFit, PairSettings, Samples
-from hub.timing.refine import WIDE, Noise, refine
-from hub.timing.tracks import SmoothTrack
-from hub.timing.two_view import RelativePose, Uncalibrated, relative_pose
-from hub.timing.verdict import distinct, judge
+from hub.calibration.preprocessing import prepare
+from hub.sync import final_refinement, pair_solver
+from hub.sync.acceptance import distinct, judge
+from hub.sync.alignment import PairFit, PairSettings, Samples
+from hub.trajectory.image_tracks import SmoothTrack
+from hub.two_view.refinement import WIDE, Noise, refine
+from hub.two_view.relative_pose import RelativePose, Uncalibrated, relative_pose
 from tests import rigs
 
 NAMES = ("a", "b")
@@ -82,10 +82,10 @@ def test_a_rate_that_the_motion_does_not_tell_is_a_clocks(monkeypatch: pytest.Mo
     free: list[float] = []
     for seed in (11, 12, 13, 14):
         _, a, b = _tracks(seed, 10.0, 1.0, 0.3)
-        for usual, found in ((finish._USUAL_RATE, held), (1.0, free)):
+        for usual, found in ((final_refinement._USUAL_RATE, held), (1.0, free)):
             with monkeypatch.context() as patch:
-                patch.setattr(finish, "_USUAL_RATE", usual)
-                fit = pair.solve_pair({"": a}, {"": b}, NAMES).fit
+                patch.setattr(final_refinement, "_USUAL_RATE", usual)
+                fit = pair_solver.solve_pair({"": a}, {"": b}, NAMES).fit
             assert fit is not None
             found.append(1e6 * abs(fit.rate - 1.0))
     assert max(held) < 200.0

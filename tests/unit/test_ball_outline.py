@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hub.prepare import prepare
+from hub.calibration.preprocessing import prepare
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.sphere_projection import outline_to_centre

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hub.live import LiveHub, LiveSettings
-from hub.timing.clock_bend import Bend, Bends
-from hub.timing.clock_watch import ClockEvent
+from hub.clocks.change_detector import ClockEvent
+from hub.clocks.rate_change import Bend, Bends
+from hub.live.live_hub import LiveHub, LiveSettings
 from protocols.messages import syncline_pb2 as pb
 from tests import rigs
 from tests.bench.live_clocks import CHANGED, CHANGES_AT_S, Change, stream

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hub.clock_epochs import ClockEpochs
-from hub.timing.clock_watch import ClockEvent, ClockWatch
+from hub.clocks.change_detector import ClockEvent, ClockWatch
+from hub.clocks.segments import ClockEpochs
 from protocols.core.clocks import TimeMap
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, CameraCalibration

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from hub.calibrate import calibrate
-from hub.poses import covariance as cov
-from hub.poses.adjust import adjust
-from hub.poses.motion import MotionPrior
-from hub.poses.problem import CAMERA_PARAMETERS, OFFSET, RATE, CameraState, Problem, Rows, State, Trajectory
-from hub.splines import SplineBasis, fit_spline
+from hub.bundle import covariance as cov
+from hub.bundle.adjustment import adjust
+from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, CameraState, Problem, Rows, State, Trajectory
+from hub.calibration.pipeline import calibrate
+from hub.trajectory.smoothness_prior import MotionPrior
+from hub.trajectory.splines import SplineBasis, fit_spline
 from protocols.geometry.types import Floats
 from tests.rigs import random_lens, random_path, random_poses, simulate
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hub.poses import initialise
-from hub.poses.initialise import _thinned
+from hub.calibration import initialisation
+from hub.calibration.initialisation import _thinned
 from tests.unit.test_adjust import world
 
 
@@ -27,7 +27,7 @@ def test_of_many_rows_a_share_is_taken_but_some_to_every_knot(monkeypatch: pytes
     problem = replace(problem, rows=tuple(rows))
     total = sum(len(part.time) for part in rows)
     for many, every in ((total / 4.0, 4), (total / 1e4, 20)):  # knots are 0.4 s apart: 40 rows
-        monkeypatch.setattr(initialise, "_MANY_ROWS", many * 0.999)
+        monkeypatch.setattr(initialisation, "_MANY_ROWS", many * 0.999)
         for before, after in zip(rows, _thinned(problem, state).rows, strict=True):
             assert len(after.time) == pytest.approx(len(before.time) / every, rel=0.15)
             assert np.isin(after.time, before.time).all()

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import hub.calibrate
-from hub.calibrate import calibrate
+import hub.calibration.pipeline
+from hub.calibration.pipeline import calibrate
 from protocols.session.calibration import Calibration
 from tests import rigs
 
@@ -54,7 +54,7 @@ def test_jitter_is_told_and_neither_poses_nor_stds_pay_for_it(
         off = abs(session.clock_error(name, "cam0", camera.time_map))
         assert off <= 3.5 * camera.time_offset_std
         assert camera.time_offset_std < 0.15 * std
-    monkeypatch.setattr(hub.calibrate, "settle", lambda problem, state, *_: (problem, state))
+    monkeypatch.setattr(hub.calibration.pipeline, "settle", lambda problem, state, *_: (problem, state))
     believed = calibrate(session.rig, session.observations())
     assert turn_error(session, found) < 0.6 * turn_error(session, believed)
     assert turn_error(session, found) < 0.2
@@ -67,7 +67,7 @@ def test_jitter_is_told_and_neither_poses_nor_stds_pay_for_it(
 def test_stamps_that_hold_change_nothing(labels: int, monkeypatch: pytest.MonkeyPatch) -> None:
     session = jittery(SEED, 0.0, labels, outliers=0.03)
     found = calibrate(session.rig, session.observations())
-    monkeypatch.setattr(hub.calibrate, "settle", lambda problem, state, *_: (problem, state))
+    monkeypatch.setattr(hub.calibration.pipeline, "settle", lambda problem, state, *_: (problem, state))
     believed = calibrate(session.rig, session.observations())
     assert not jitters_told(found)
     for name, camera in found.cameras.items():

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hub.poses.gauge import fix_gauge
+from hub.datum.gauge import fix_gauge
 from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, Similarity

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hub.guidance import ENOUGH, LEAST_ROWS, Guidance, advice_for, lacking, parts_without
+from hub.calibration.coverage import ENOUGH, LEAST_ROWS, Guidance, advice_for, lacking, parts_without
 from hub.report.measures import COLUMNS, ROWS
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.observations import gather_tracks

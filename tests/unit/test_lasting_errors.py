@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from hub.poses import lasting
-from hub.poses.adjust import adjust, moved, residual_norms
-from hub.poses.coloured import Markov, coloured, likeliest
-from hub.poses.generalised import Entries, Fit, cost_at, fit, within_reach
-from hub.poses.lasting import as_told, tolerance, with_lasting_errors
-from hub.poses.motion import MotionPrior, motion_prior
-from hub.poses.problem import CAMERA_PARAMETERS, FOCAL, CameraState, Coloured, Problem, Rows, State, Trajectory
-from hub.poses.sigma import honest, modelled
-from hub.splines import SplineBasis, fit_spline
+from hub.bundle import correlated_noise
+from hub.bundle.adjustment import adjust, moved, residual_norms
+from hub.bundle.correlated_noise import as_told, tolerance, with_lasting_errors
+from hub.bundle.gauss_markov import Markov, coloured, likeliest
+from hub.bundle.gls import Entries, Fit, cost_at, fit, within_reach
+from hub.bundle.noise_scale import honest, modelled
+from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, CameraState, Coloured, Problem, Rows, State, Trajectory
+from hub.trajectory.smoothness_prior import MotionPrior, motion_prior
+from hub.trajectory.splines import SplineBasis, fit_spline
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from tests.rigs import random_lens, random_path, random_poses
@@ -199,7 +199,7 @@ def test_a_rig_that_is_held_too_loosely_stays_as_it_is(monkeypatch: pytest.Monke
     problem, truth = rig(6)
     problem, state, _ = adjust(problem, truth, rounds=2, iterations=10)
     assert with_lasting_errors(problem, state)[1].coloured is not None
-    monkeypatch.setattr(lasting, "_LARGEST_TURN_STD", 1e-6)
+    monkeypatch.setattr(correlated_noise, "_LARGEST_TURN_STD", 1e-6)
     assert with_lasting_errors(problem, state)[1] is state
 
 
@@ -257,7 +257,7 @@ def test_told_lenses_have_their_own_noise_whatever_lenses_came_before(monkeypatc
         cameras=tuple(replace(one, intrinsics=zoomed(one.intrinsics, 1.03)) for one in truth.cameras),
     )
     freed, state, _ = adjust(freed, start, rounds=1, iterations=3)
-    monkeypatch.setattr(lasting, "as_told", lambda *_: True)
+    monkeypatch.setattr(correlated_noise, "as_told", lambda *_: True)
     found, after = with_lasting_errors(freed, state)
     assert not found.loose
     plain, fitted, _ = adjust(problem, truth, rounds=1, iterations=10)

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hub.pairs import solve_pairs
-from hub.prepare import prepare
-from hub.timing.alignment import PairSettings, Samples, correlated
-from hub.timing.leaning import Leaning, at_centre, leaning
-from hub.timing.pair import PairSolution, solve_pair
-from hub.timing.refine import WIDE, Noise, Refined, refine
-from hub.timing.tracks import SmoothTrack
-from hub.timing.two_view import Uncalibrated, relative_pose
+from hub.calibration.pair_network import solve_pairs
+from hub.calibration.preprocessing import prepare
+from hub.sync.alignment import PairSettings, Samples, correlated
+from hub.sync.lag_uncertainty import Leaning, at_centre, leaning
+from hub.sync.pair_solver import PairSolution, solve_pair
+from hub.trajectory.image_tracks import SmoothTrack
+from hub.two_view.refinement import WIDE, Noise, Refined, refine
+from hub.two_view.relative_pose import Uncalibrated, relative_pose
 from protocols.geometry.camera import Intrinsics
 from tests import rigs
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hub.poses.adjust import adjust
-from hub.poses.covariance import one_std
-from hub.poses.motion import MotionPrior, motion_prior, motion_terms
-from hub.poses.problem import CameraState, Problem, Rows, State, Trajectory
-from hub.splines import SplineBasis, fit_spline
+from hub.bundle.adjustment import adjust
+from hub.bundle.covariance import one_std
+from hub.bundle.problem import CameraState, Problem, Rows, State, Trajectory
+from hub.trajectory.smoothness_prior import MotionPrior, motion_prior, motion_terms
+from hub.trajectory.splines import SplineBasis, fit_spline
 from protocols.geometry.types import Floats
 from tests.rigs import random_lens, random_path, random_poses
 

@@ -7,12 +7,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hub.nodes.begin import gate_of, total
-from hub.nodes.edge import Summary
-from hub.nodes.messages import StateMessage
-from hub.nodes.node import PoseNode
-from hub.nodes.solve import relative
-from hub.nodes.two_cameras import linearise
+from hub.distributed.factors.factor import Summary
+from hub.distributed.factors.initialise import gate_of, total
+from hub.distributed.factors.linearise import linearise
+from hub.distributed.network.block_solver import relative
+from hub.distributed.network.messages import StateMessage
+from hub.distributed.network.node import PoseNode
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats

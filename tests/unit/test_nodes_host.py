@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from hub.distributed import node_calibration
-from hub.nodes.host import ROLE, NodeHost
-from hub.nodes.wire import edges_from_wire, name_of, number_of
+from hub.distributed.network.host import ROLE, NodeHost
+from hub.distributed.network.serialisation import edges_from_wire, name_of, number_of
+from hub.distributed.solver import node_calibration
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb

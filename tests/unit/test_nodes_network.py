@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hub.nodes.messages import Notice, Reference, SharedObservation, StateMessage
-from hub.nodes.node import PoseNode
-from hub.nodes.pairing import Pairing
+from hub.distributed.network.association import Pairing
+from hub.distributed.network.messages import Notice, Reference, SharedObservation, StateMessage
+from hub.distributed.network.node import PoseNode
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from tests.bench.pose_runs import Network, Traffic, feed, network

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hub.nodes.edge import Summary
-from hub.nodes.spread import each_once, joined, position_stds
-from hub.poses.gauge import fix_gauge
+from hub.datum.gauge import fix_gauge
+from hub.distributed.factors.factor import Summary
+from hub.distributed.network.marginals import each_once, joined, position_stds
 from protocols.geometry.types import Floats
 from protocols.session.rig import Rig, RigCamera
 from tests.bench.pose_runs import Network, feed, network

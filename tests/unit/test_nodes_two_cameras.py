@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hub.nodes.begin import begin
-from hub.nodes.edge import Edge, Summary, stream
-from hub.nodes.gauge import world_from_network
-from hub.nodes.messages import Anchor, Reference
-from hub.nodes.solve import Term, moved, normal_equations, one_term, relative, step_between
-from hub.nodes.two_cameras import Relative, linearise, stacked, triangulate
+from hub.distributed.factors.factor import Edge, Summary, stream
+from hub.distributed.factors.initialise import begin
+from hub.distributed.factors.linearise import Relative, linearise, stacked, triangulate
+from hub.distributed.network.block_solver import Term, moved, normal_equations, one_term, relative, step_between
+from hub.distributed.network.datum import world_from_network
+from hub.distributed.network.messages import Anchor, Reference
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, Similarity
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hub.calibrate import calibrate
-from hub.timing.pair import PairSolution, solve_pair
-from hub.timing.tracks import SmoothTrack, smooth_track
+from hub.calibration.pipeline import calibrate
+from hub.sync.pair_solver import PairSolution, solve_pair
+from hub.trajectory.image_tracks import SmoothTrack, smooth_track
 from protocols.core.errors import Refused
 from protocols.geometry import so3
 from tests.bench.honesty import regular

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hub.timing.pair import PairSolution, solve_pair
-from hub.timing.tracks import SmoothTrack, smooth_track
-from hub.timing.two_view import fundamental_from
+from hub.sync.pair_solver import PairSolution, solve_pair
+from hub.trajectory.image_tracks import SmoothTrack, smooth_track
+from hub.two_view.relative_pose import fundamental_from
 from tests.bench.pair_trials import FOCAL, MATRIX, Regime, Trial, floor, geometry_error, make, map_error, stranger
 
 USUAL = Regime()

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-import hub.pairs
-from hub.pairs import _ToldClocks, solve_pairs
-from hub.prepare import Prepared, prepare
-from hub.timing.kept import Kept
-from hub.timing.pair import PairSolution, _Search, solve_pair
-from hub.timing.promise import promise
-from hub.timing.tracks import smooth_only
+import hub.calibration.pair_network
+from hub.calibration.pair_network import _ToldClocks, solve_pairs
+from hub.calibration.preprocessing import Prepared, prepare
+from hub.sync.pair_ranking import promise
+from hub.sync.pair_solver import PairSolution, _Search, solve_pair
+from hub.sync.track_cache import Kept
+from hub.trajectory.image_tracks import smooth_only
 from tests.rigs import Session, simulate
 
 
@@ -74,7 +74,7 @@ def test_a_search_through_all_lags_is_made_once(monkeypatch: pytest.MonkeyPatch)
     """The thorough search goes on from the refusal of the plain one, and says what it would say without it."""
     prepared = prepared_of(simulate(9, 2, 12.0, strangers=[1]))
     rates: list[float] = []
-    at_rate, solve = _Search.at_rate, hub.pairs._solve
+    at_rate, solve = _Search.at_rate, hub.calibration.pair_network._solve
 
     def counted(
         self: _Search, names: tuple[str, str], rate: float, near: tuple[float, float] | None = None
@@ -90,7 +90,7 @@ def test_a_search_through_all_lags_is_made_once(monkeypatch: pytest.MonkeyPatch)
     assert not once.solved
     assert len(rates) > 5
     assert rates.count(1.0) == 1
-    monkeypatch.setattr(hub.pairs, "_solve", anew)
+    monkeypatch.setattr(hub.calibration.pair_network, "_solve", anew)
     _, (again,) = solve_pairs(prepared, lambda text, share: None, thorough=True)
     assert rates.count(1.0) == 3
     assert again.status == once.status
@@ -117,7 +117,7 @@ def test_what_is_kept_is_of_that_very_track() -> None:
 def test_nothing_is_looked_for_near_a_lag_that_leaves_nothing_in_common(monkeypatch: pytest.MonkeyPatch) -> None:
     prepared = prepared_of(simulate(3, 2, 20.0))
     tracks = [smooth_only(prepared.camera(name).tracks) for name in ("cam0", "cam1")]
-    monkeypatch.setattr("hub.timing.pair.scan_lags", None)  # not to be called
+    monkeypatch.setattr("hub.sync.pair_solver.scan_lags", None)  # not to be called
     answer = solve_pair(tracks[0], tracks[1], ("cam0", "cam1"), near=100.0)
     assert not answer.solved
     assert "other lags were not looked at" in answer.status

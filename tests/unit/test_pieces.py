@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from hub.timing import pieces
-from hub.timing.pieces import PieceScan, scan_pieces
-from hub.timing.scan import GridTrack, PairMoments, grid_tracks, in_grid
-from hub.timing.tracks import smooth_track
+from hub.sync import lts_scan
+from hub.sync.lag_scan import GridTrack, PairMoments, grid_tracks, in_grid
+from hub.sync.lts_scan import PieceScan, scan_pieces
+from hub.trajectory.image_tracks import smooth_track
 from protocols.geometry.types import Floats
 from tests.bench.pair_trials import FOCAL, MATRIX, Regime, Trial, make, stranger
 
@@ -45,7 +45,7 @@ def test_cells_are_the_sums_of_their_bins() -> None:
     a, b = random_grid(1, 40), random_grid(2, 33)
     width, bins = 8, 5
     lags = np.arange(-39, 33)
-    cells = pieces._cells(a, b, lags, width, bins).reshape(len(lags), bins, 6, 6)
+    cells = lts_scan._cells(a, b, lags, width, bins).reshape(len(lags), bins, 6, 6)
     monomial = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
     for row in (0, 20, 39, 41, 60, 71):
         for k in range(bins):
@@ -64,7 +64,7 @@ def test_cells_are_the_sums_of_their_bins() -> None:
 def test_the_cells_of_a_lag_add_up_to_its_moments() -> None:
     a, b = random_grid(3, 40), random_grid(4, 40)
     moments = PairMoments(a, b)
-    cells = pieces._cells(a, b, moments.lags, 8, 5).sum(axis=1).reshape(-1, 6, 6)
+    cells = lts_scan._cells(a, b, moments.lags, 8, 5).sum(axis=1).reshape(-1, 6, 6)
     np.testing.assert_allclose(cells, np.moveaxis(moments.sums(np.arange(len(moments.lags))), -1, 0), atol=1e-9)
 
 
@@ -74,27 +74,27 @@ def cells_of(seed: int) -> tuple[Floats, GridTrack, GridTrack]:
     a, b = moments.a, moments.b
     index = int(np.argmin(np.abs(moments.offset - offset)))
     width = a.weight.shape[1] // 2
-    return pieces._cells(a, b, moments.lags[index : index + 1], width, 1), a, b
+    return lts_scan._cells(a, b, moments.lags[index : index + 1], width, 1), a, b
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_best_geometry_is_the_smallest_eigenvector(seed: int) -> None:
     cells, a, b = cells_of(seed)
     cells = cells[0] / cells[0, :, 35:]
-    moment, norm = pieces._moments(cells, a, b)
+    moment, norm = lts_scan._moments(cells, a, b)
     values, vectors = eigh(norm[0], moment[0])  # the largest of the inverse problem: the norm is singular
-    found, expected = pieces._smallest(cells, a, b)[0], vectors[:, -1] / np.linalg.norm(vectors[:, -1])
+    found, expected = lts_scan._smallest(cells, a, b)[0], vectors[:, -1] / np.linalg.norm(vectors[:, -1])
     assert abs(found @ expected) == pytest.approx(1.0, abs=1e-5)
-    cost = float(pieces._bin_costs(cells[None], found[None], a, b)[0, 0])
+    cost = float(lts_scan._bin_costs(cells[None], found[None], a, b)[0, 0])
     assert cost == pytest.approx(1.0 / values[-1], rel=1e-4)
 
 
 def test_the_misfit_of_a_bin_is_squared_distance_over_noise() -> None:
     cells, a, b = cells_of(0)
     theta = np.random.default_rng(0).normal(size=(1, 9))
-    moment, norm = pieces._moments(cells[0] / cells[0, :, 35:], a, b)
+    moment, norm = lts_scan._moments(cells[0] / cells[0, :, 35:], a, b)
     expected = (theta[0] @ moment[0] @ theta[0]) / (theta[0] @ norm[0] @ theta[0])
-    found = pieces._bin_costs(cells / cells[:, :, 35:], theta, a, b)
+    found = lts_scan._bin_costs(cells / cells[:, :, 35:], theta, a, b)
     assert found[0, 0] == pytest.approx(expected, rel=1e-9)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hub.calibrate import calibrate
+from hub.calibration.pipeline import calibrate
 from protocols.core.errors import InputError
 from protocols.session.calibration import Calibration, read_calibration, write_calibration
 from protocols.session.rig import RigCamera, read_rig

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from hub.timing import two_view
-from hub.timing.refine import NARROW, WIDE, Noise, PointPairs, Refined, refine
-from hub.timing.two_view import Geometry, RelativePose, Uncalibrated, relative_pose
+from hub.two_view import relative_pose as two_view
+from hub.two_view.refinement import NARROW, WIDE, Noise, PointPairs, Refined, refine
+from hub.two_view.relative_pose import Geometry, RelativePose, Uncalibrated, relative_pose
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 from tests.rigs import looking_at, random_path

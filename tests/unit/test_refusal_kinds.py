@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hub import calibrate as calibrating
-from hub.calibrate import calibrate
-from hub.poses import initialise
-from hub.timing.alignment import PairSettings
-from hub.timing.pair import _Search, solve_pair
-from hub.timing.tracks import SmoothTrack, smooth_track
-from hub.triangulate import triangulate
+from hub.calibration import initialisation
+from hub.calibration import pipeline as calibrating
+from hub.calibration.pipeline import calibrate
+from hub.sync.alignment import PairSettings
+from hub.sync.pair_solver import _Search, solve_pair
+from hub.trajectory.image_tracks import SmoothTrack, smooth_track
+from hub.trajectory.triangulation import triangulate
 from protocols.core.errors import Refused
 from tests import rigs
 from tests.unit.test_refusals import TOLD, VERDICTS
@@ -125,8 +125,8 @@ def another_path(patch: pytest.MonkeyPatch) -> str:
 
 
 def no_position(patch: pytest.MonkeyPatch) -> str:
-    patch.setattr(initialise, "_resect", lambda *_: None)
-    patch.setattr(initialise, "_intersect_bearings", lambda *_: None)
+    patch.setattr(initialisation, "_resect", lambda *_: None)
+    patch.setattr(initialisation, "_intersect_bearings", lambda *_: None)
     return told_of(rigs.simulate(1, 3, SECONDS, late=0.5))
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import hub
-from hub.timing.alignment import PairFit, PairSettings
-from hub.timing.two_view import RelativePose
-from hub.timing.verdict import judge
+from hub.sync.acceptance import judge
+from hub.sync.alignment import PairFit, PairSettings
+from hub.two_view.relative_pose import RelativePose
 
 ROOT = Path(hub.__file__).parent
 

@@ -11,9 +11,9 @@ import pytest
 
 from hub.report import build_report, measures
 from hub.report.convergence import adjustment
+from hub.report.quality_assessment import judge, judge_refusal
 from hub.report.remedies import remedy_for
 from hub.report.svg import number, short, ticks
-from hub.report.verdict import judge, judge_refusal
 from protocols.core.errors import Refused
 from protocols.session.calibration import AdjustmentStep, Calibration
 from protocols.session.observations import Observations

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from hub.timing.scan import GridTrack, PairMoments, Scan, candidates, grid_tracks, scan_lags
-from hub.timing.tracks import SmoothTrack, smooth_track
+from hub.sync.lag_scan import GridTrack, PairMoments, Scan, candidates, grid_tracks, scan_lags
+from hub.trajectory.image_tracks import SmoothTrack, smooth_track
 from protocols.geometry.types import Floats
 from tests.rigs import Session, simulate
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hub.poses.adjust import adjust, build_system
-from hub.poses.covariance import covariance
-from hub.poses.sigma import _absorbed, _in_a_row, honest
+from hub.bundle.adjustment import adjust, build_system
+from hub.bundle.covariance import covariance
+from hub.bundle.noise_scale import _absorbed, _in_a_row, honest
 from protocols.geometry.types import Floats
 from tests.unit.test_adjust import dense, world
 

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from hub.timing.scan import GridTrack, PairMoments, grid_tracks, scan_lags
-from hub.timing.significance import COST_FLOOR, Chance, bandwidth, chance
-from hub.timing.tracks import SmoothTrack, smooth_track
+from hub.sync.lag_scan import GridTrack, PairMoments, grid_tracks, scan_lags
+from hub.sync.null_distribution import COST_FLOOR, Chance, bandwidth, chance
+from hub.trajectory.image_tracks import SmoothTrack, smooth_track
 from tests.bench.pair_trials import FOCAL, MATRIX, Regime, Trial, make, stranger
 
 STEP, SIGMA_PX = 0.033, 0.5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hub.splines import SUPPORT, SplineBasis, basis_weights, fit_spline, normal_bands, stretches
+from hub.trajectory.splines import SUPPORT, SplineBasis, basis_weights, fit_spline, normal_bands, stretches
 from protocols.geometry.types import Floats
 
 

@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hub import calibrate as solver
-from hub.calibrate import calibrate
-from hub.prepare import Prepared, prepare
-from hub.timing import finish, pair
-from hub.timing.alignment import PairFit, PairSettings, PairSolution, turned_round
-from hub.timing.tracks import SmoothTrack, smooth_only
-from hub.timing.two_view import RelativePose, Uncalibrated
-from hub.timing.verdict import judge, stands_apart
+from hub.calibration import pipeline as solver
+from hub.calibration.pipeline import calibrate
+from hub.calibration.preprocessing import Prepared, prepare
+from hub.sync import final_refinement, pair_solver
+from hub.sync.acceptance import judge, stands_apart
+from hub.sync.alignment import PairFit, PairSettings, PairSolution, turned_round
+from hub.trajectory.image_tracks import SmoothTrack, smooth_only
+from hub.two_view.relative_pose import RelativePose, Uncalibrated
 from protocols.geometry import so3
 from protocols.session.observations import Observations
 from tests.bench.drone_pairs import Stretch, stretch
@@ -86,27 +86,27 @@ def test_what_is_weak_or_faulty_does_not(best: PairFit, others: list[PairFit]) -
 @pytest.mark.parametrize("seed", [7065, 7131, 7143])
 def test_lenses_a_little_off_keep_no_pair_from_its_answer(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     made, prepared, both = tracks(seed)
-    found = pair.solve_pair(both["a"], both["b"], NAMES, SETTINGS)
+    found = pair_solver.solve_pair(both["a"], both["b"], NAMES, SETTINGS)
     assert found.solved
     lag, turn = off(made, prepared, found)
     assert abs(lag) < 0.01
     assert turn < np.deg2rad(8.0)
-    monkeypatch.setattr(pair, "stands_apart", lambda *_: False)
-    assert "other lags fit" in pair.solve_pair(both["a"], both["b"], NAMES, SETTINGS).status
+    monkeypatch.setattr(pair_solver, "stands_apart", lambda *_: False)
+    assert "other lags fit" in pair_solver.solve_pair(both["a"], both["b"], NAMES, SETTINGS).status
 
 
 @pytest.mark.parametrize("limit", ["largest_doubt", "firm_turn_std", "largest_swing"])
 def test_what_stands_apart_must_be_told_firmly(limit: str) -> None:
     _, _, both = tracks(7065)
     strict = replace(SETTINGS, **{limit: 0.0})
-    assert "other lags fit" in pair.solve_pair(both["a"], both["b"], NAMES, strict).status
+    assert "other lags fit" in pair_solver.solve_pair(both["a"], both["b"], NAMES, strict).status
 
 
 def test_what_rests_on_little_motion_must_be_told_more_firmly() -> None:
     _, _, both = tracks(7131)
     for seconds, solved in ((10.0, True), (100.0, False)):
         strict = replace(SETTINGS, plenty_apart=seconds, largest_short_doubt=1e-3)
-        assert pair.solve_pair(both["a"], both["b"], NAMES, strict).solved == solved
+        assert pair_solver.solve_pair(both["a"], both["b"], NAMES, strict).solved == solved
 
 
 def test_unrelated_tracks_do_not_tell_their_best_lag_firmly(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,20 +117,20 @@ def test_unrelated_tracks_do_not_tell_their_best_lag_firmly(monkeypatch: pytest.
         kinds.append(stands_apart(best, fits, s))
         return kinds[-1]
 
-    monkeypatch.setattr(pair, "stands_apart", spied)
+    monkeypatch.setattr(pair_solver, "stands_apart", spied)
     for one, other in ((7304, 7305), (7318, 7319), (7708, 7709)):
         a, b = tracks(one)[2]["a"], tracks(other)[2]["b"]
-        assert not pair.solve_pair(a, b, NAMES, SETTINGS).solved
+        assert not pair_solver.solve_pair(a, b, NAMES, SETTINGS).solved
     assert all(kinds)
 
 
 def test_of_many_starts_the_likeliest_geometry_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     """Seen from far away: one start ends 30° off, in a valley, and leaves hardly more."""
     made, prepared, both = tracks(7024)
-    found = pair.solve_pair(both["a"], both["b"], NAMES, SETTINGS)
+    found = pair_solver.solve_pair(both["a"], both["b"], NAMES, SETTINGS)
     assert off(made, prepared, found)[1] < np.deg2rad(5.0)
-    monkeypatch.setattr(finish, "_SEEDS", 0)
-    assert off(made, prepared, pair.solve_pair(both["a"], both["b"], NAMES, SETTINGS))[1] > np.deg2rad(20.0)
+    monkeypatch.setattr(final_refinement, "_SEEDS", 0)
+    assert off(made, prepared, pair_solver.solve_pair(both["a"], both["b"], NAMES, SETTINGS))[1] > np.deg2rad(20.0)
 
 
 def test_a_lag_must_be_told_from_either_side() -> None:
@@ -165,8 +165,8 @@ def test_a_pair_by_itself_is_judged_so_beside_a_camera_that_sees_nothing_of_it()
 def test_rotations_that_fit_alike_are_refused() -> None:
     _, _, both = tracks(7024)
     narrow = replace(SETTINGS, largest_turn_apart=0.0)
-    assert "rotations 0° apart" not in pair.solve_pair(both["a"], both["b"], NAMES, SETTINGS).status
-    assert "apart fit the motion alike" in pair.solve_pair(both["a"], both["b"], NAMES, narrow).status
+    assert "rotations 0° apart" not in pair_solver.solve_pair(both["a"], both["b"], NAMES, SETTINGS).status
+    assert "apart fit the motion alike" in pair_solver.solve_pair(both["a"], both["b"], NAMES, narrow).status
 
 
 def test_a_rate_that_nothing_tells_is_held_while_two_cameras_are_adjusted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,7 +187,7 @@ def test_a_rate_that_nothing_tells_is_held_while_two_cameras_are_adjusted(monkey
 
 def test_what_a_rate_was_held_by_is_no_knowledge_of_it() -> None:
     made, prepared, both = tracks(7065)
-    found = pair.solve_pair(both["a"], both["b"], NAMES, SETTINGS)
+    found = pair_solver.solve_pair(both["a"], both["b"], NAMES, SETTINGS)
     assert found.fit is not None
     assert found.fit.rate_std < 1e-3
     solution = solver.solve_network(prepare(made.rig, made.observations), [found], lambda text, share: None)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from edge import scenes
-from hub.tracking.camera import TrackingCamera, frame_of
-from hub.tracking.discovery import Scale
-from hub.tracking.live import LiveTracking
-from hub.tracking.step import World, step
+from hub.tracking.association.initiation import Scale
+from hub.tracking.calibration.vertical import UpFinder
+from hub.tracking.camera_frame import TrackingCamera, frame_of
+from hub.tracking.filter.update import World, step
+from hub.tracking.live_tracking import LiveTracking
 from hub.tracking.tracker import Tracker
-from hub.tracking.upright import UpFinder
 from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics

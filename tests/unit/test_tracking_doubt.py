@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from hub.tracking.associate import COLOUR_STD, alikeness, ambiguity, colour_std
-from hub.tracking.camera import TrackingCamera, frame_of
-from hub.tracking.measure import doubt, heavy
-from hub.tracking.step import World, step
-from hub.tracking.targets import State, Targets
+from hub.tracking.association.assignment import COLOUR_STD, alikeness, ambiguity, colour_std
+from hub.tracking.camera_frame import TrackingCamera, frame_of
+from hub.tracking.filter.measurement import doubt, heavy
+from hub.tracking.filter.target_states import State, Targets
+from hub.tracking.filter.update import World, step
 from hub.tracking.tracker import Tracker
 from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry.camera import Intrinsics

@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hub.tracking import kalman
-from hub.tracking.body import INDEX, MARKER
-from hub.tracking.camera import TrackingCamera
-from hub.tracking.jumps import jumped, weighed
-from hub.tracking.kalman import SIZE
-from hub.tracking.step import World
-from hub.tracking.targets import Targets
+from hub.tracking.camera_frame import TrackingCamera
+from hub.tracking.filter import kalman
+from hub.tracking.filter.kalman import SIZE
+from hub.tracking.filter.manoeuvre import jumped, weighed
+from hub.tracking.filter.target_models import INDEX, MARKER
+from hub.tracking.filter.target_states import Targets
+from hub.tracking.filter.update import World
 from hub.tracking.tracker import Tracker
 from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry.camera import Intrinsics

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hub.tracking import kalman
+from hub.tracking.filter import kalman
 from protocols.geometry.types import Floats
 
 SIZE = kalman.SIZE

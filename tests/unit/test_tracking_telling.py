@@ -8,7 +8,7 @@ import numpy as np
 from google.protobuf.message import Message
 
 from edge import scenes
-from hub.tracking.live import LiveTracking
+from hub.tracking.live_tracking import LiveTracking
 from protocols.core.clocks import NANOSECONDS
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration

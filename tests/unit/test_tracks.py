@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hub.timing.tracks import SmoothTrack, neighbour_test, smooth_track
+from hub.trajectory.image_tracks import SmoothTrack, neighbour_test, smooth_track
 from protocols.geometry.types import Bools, Floats
 from tests.rigs import random_path
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hub.poses.gauge import fix_gauge
-from hub.poses.trust import trusted
+from hub.datum.control_outliers import trusted
+from hub.datum.gauge import fix_gauge
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, Similarity
 from protocols.geometry.types import Floats

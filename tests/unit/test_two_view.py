@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hub.timing import two_view
-from hub.timing.two_view import Geometry, RelativePose, Uncalibrated
+from hub.two_view import relative_pose
+from hub.two_view.relative_pose import Geometry, RelativePose, Uncalibrated
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 from tests.rigs import looking_at
@@ -32,14 +32,14 @@ seeds = pytest.mark.parametrize("seed", range(8))
 @seeds
 def test_true_pairs_have_no_sampson_distance(seed: int) -> None:
     pose, a, b, _, _ = scene(seed)
-    np.testing.assert_allclose(two_view.sampson(pose.essential, a, b, 1e-3, 1e-3), 0, atol=1e-9)
+    np.testing.assert_allclose(relative_pose.sampson(pose.essential, a, b, 1e-3, 1e-3), 0, atol=1e-9)
 
 
 def test_the_sampson_distance_is_in_units_of_the_noise() -> None:
     pose, a, b, _, _ = scene(0, 20_000)
     rng = np.random.default_rng(1)
     noisy_a, noisy_b = a + rng.normal(0, 1e-3, a.shape), b + rng.normal(0, 2e-3, b.shape)
-    distance = two_view.sampson(pose.essential, noisy_a, noisy_b, 1e-3, 2e-3)
+    distance = relative_pose.sampson(pose.essential, noisy_a, noisy_b, 1e-3, 2e-3)
     assert distance.std() == pytest.approx(1.0, rel=0.03)
     assert abs(distance.mean()) < 0.03
 
@@ -47,24 +47,24 @@ def test_the_sampson_distance_is_in_units_of_the_noise() -> None:
 @seeds
 def test_triangulation_finds_depth_in_baselines(seed: int) -> None:
     pose, a, b, baseline, points = scene(seed)
-    depth_a, depth_b = two_view.triangulate_midpoint(pose, a, b)
+    depth_a, depth_b = relative_pose.triangulate_midpoint(pose, a, b)
     np.testing.assert_allclose(depth_a * baseline, points[:, 2], rtol=1e-9)
-    there = depth_a[:, None] * two_view.homogeneous(a) @ pose.rotation.T + pose.direction
-    np.testing.assert_allclose(there, depth_b[:, None] * two_view.homogeneous(b), atol=1e-9)
+    there = depth_a[:, None] * relative_pose.homogeneous(a) @ pose.rotation.T + pose.direction
+    np.testing.assert_allclose(there, depth_b[:, None] * relative_pose.homogeneous(b), atol=1e-9)
 
 
 def test_parallel_rays_have_no_depth() -> None:
     pose = RelativePose(np.eye(3), np.array([1.0, 0, 0]))
-    depths = two_view.triangulate_midpoint(pose, np.zeros((1, 2)), np.zeros((1, 2)))
+    depths = relative_pose.triangulate_midpoint(pose, np.zeros((1, 2)), np.zeros((1, 2)))
     assert np.isnan(depths).all()
-    assert not two_view.in_front(pose, np.zeros((1, 2)), np.zeros((1, 2))).any()
+    assert not relative_pose.in_front(pose, np.zeros((1, 2)), np.zeros((1, 2))).any()
 
 
 @seeds
 def test_decompose_recovers_the_pose(seed: int) -> None:
     pose, a, b, _, _ = scene(seed)
     for sign in (1.0, -1.0):
-        found = two_view.decompose(sign * 3.7 * pose.essential, a, b)
+        found = relative_pose.decompose(sign * 3.7 * pose.essential, a, b)
         assert so3.angle_between(found.rotation, pose.rotation) < 1e-7
         np.testing.assert_allclose(found.direction, pose.direction, atol=1e-7)
         assert np.linalg.det(found.rotation) == pytest.approx(1.0)
@@ -76,7 +76,7 @@ def test_five_points_recover_the_pose_among_hypotheses(seed: int) -> None:
     rng = np.random.default_rng(seed)
     a, b = a + rng.normal(0, 2e-4, a.shape), b + rng.normal(0, 2e-4, b.shape)
     a[:6] += 0.2  # false pairs
-    poses = two_view.five_point(a, b, 1e-3, seed)
+    poses = relative_pose.five_point(a, b, 1e-3, seed)
     assert poses
     assert min(so3.angle_between(found.rotation, pose.rotation) for found in poses) < np.deg2rad(2)
     assert min(np.linalg.norm(found.direction - pose.direction) for found in poses) < 0.05
@@ -84,35 +84,35 @@ def test_five_points_recover_the_pose_among_hypotheses(seed: int) -> None:
 
 def test_five_points_do_not_depend_on_what_ran_before() -> None:
     _, a, b, _, _ = scene(3, 500)
-    first = two_view.five_point(a, b, 1e-3, 7)
-    two_view.five_point(b, a, 1e-2, 8)
-    again = two_view.five_point(a, b, 1e-3, 7)
+    first = relative_pose.five_point(a, b, 1e-3, 7)
+    relative_pose.five_point(b, a, 1e-2, 8)
+    again = relative_pose.five_point(a, b, 1e-3, 7)
     for one, other in zip(first, again, strict=True):
         np.testing.assert_array_equal(one.rotation, other.rotation)
 
 
 def test_too_few_pairs_give_no_hypothesis() -> None:
-    assert two_view.five_point(np.zeros((7, 2)), np.zeros((7, 2)), 1e-3, 0) == []
+    assert relative_pose.five_point(np.zeros((7, 2)), np.zeros((7, 2)), 1e-3, 0) == []
 
 
 @pytest.mark.parametrize("what", ["one point", "a line"])
 def test_degenerate_pairs_do_no_harm(what: str) -> None:
     t = np.zeros(50) if what == "one point" else np.linspace(-0.3, 0.3, 50)
-    for pose in two_view.five_point(np.column_stack([t, t]), np.column_stack([t, 0.5 * t]), 1e-3, 0):
+    for pose in relative_pose.five_point(np.column_stack([t, t]), np.column_stack([t, 0.5 * t]), 1e-3, 0):
         assert np.isfinite(pose.rotation).all()
 
 
 @seeds
 def test_only_the_right_one_of_the_four_poses_is_in_front(seed: int) -> None:
     pose, a, b, _, _ = scene(seed)
-    assert two_view.in_front(pose, a, b).all()
-    assert not two_view.in_front(RelativePose(pose.rotation, -pose.direction), a, b).any()
+    assert relative_pose.in_front(pose, a, b).all()
+    assert not relative_pose.in_front(RelativePose(pose.rotation, -pose.direction), a, b).any()
 
 
 @seeds
 def test_the_inverse_pose_goes_back(seed: int) -> None:
     pose, a, b, _, _ = scene(seed)
-    np.testing.assert_allclose(two_view.sampson(pose.inverse().essential, b, a, 1, 1), 0, atol=1e-12)
+    np.testing.assert_allclose(relative_pose.sampson(pose.inverse().essential, b, a, 1, 1), 0, atol=1e-12)
     again = pose.inverse().inverse()
     np.testing.assert_allclose(again.rotation, pose.rotation, atol=1e-14)
     np.testing.assert_allclose(again.direction, pose.direction, atol=1e-14)
@@ -123,10 +123,10 @@ def test_the_fundamental_matrix_is_the_published_way_round() -> None:
     pose, a, b, _, _ = scene(1)
     lens_a = np.array([[900.0, 0, 640], [0, 905, 360], [0, 0, 1]])
     lens_b = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
-    f = two_view.fundamental_from(pose, lens_a, lens_b)
+    f = relative_pose.fundamental_from(pose, lens_a, lens_b)
     assert np.linalg.norm(f) == pytest.approx(1.0)
     assert np.linalg.matrix_rank(f, tol=1e-12) == 2
-    m_a, m_b = two_view.homogeneous(a) @ lens_a.T, two_view.homogeneous(b) @ lens_b.T
+    m_a, m_b = relative_pose.homogeneous(a) @ lens_a.T, relative_pose.homogeneous(b) @ lens_b.T
     np.testing.assert_allclose(np.einsum("ni,ij,nj->n", m_a, f, m_b), 0, atol=1e-9)
 
 
@@ -134,7 +134,7 @@ def test_the_fundamental_matrix_is_the_published_way_round() -> None:
 def test_the_tangent_basis_is_orthonormal(seed: int) -> None:
     direction = np.random.default_rng(seed).normal(size=3)
     direction /= np.linalg.norm(direction)
-    basis = np.column_stack([direction, two_view.tangent_basis(direction)])
+    basis = np.column_stack([direction, relative_pose.tangent_basis(direction)])
     np.testing.assert_allclose(basis.T @ basis, np.eye(3), atol=1e-14)
 
 
@@ -190,16 +190,16 @@ def test_a_fundamental_matrix_of_nominal_lenses_is_that_of_the_pixels(seed: int)
     nominal = np.array([[1280.0, 0, 639.5], [0, 1280.0, 359.5], [0, 0, 1]])
     other = np.linalg.inv(nominal) @ true
     seen = Uncalibrated.of(np.linalg.inv(other).T @ pose.essential @ np.linalg.inv(other))
-    f = two_view.fundamental_from(seen, nominal, nominal)
-    np.testing.assert_allclose(f, two_view.fundamental_from(pose, true, true), atol=1e-12)
-    m_a, m_b = two_view.homogeneous(a) @ true.T, two_view.homogeneous(b) @ true.T
+    f = relative_pose.fundamental_from(seen, nominal, nominal)
+    np.testing.assert_allclose(f, relative_pose.fundamental_from(pose, true, true), atol=1e-12)
+    m_a, m_b = relative_pose.homogeneous(a) @ true.T, relative_pose.homogeneous(b) @ true.T
     np.testing.assert_allclose(np.einsum("ni,ij,nj->n", m_a, f, m_b), 0, atol=1e-8)
 
 
 def test_without_lenses_nothing_is_behind_and_no_angle_known() -> None:
     _, a, b, _, _ = scene(2)
-    assert two_view.in_front(uncalibrated(2), a, b).all()
-    assert two_view.parallax(uncalibrated(2), a, b) == 0.0
+    assert relative_pose.in_front(uncalibrated(2), a, b).all()
+    assert relative_pose.parallax(uncalibrated(2), a, b) == 0.0
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -219,7 +219,7 @@ def test_a_plane_leaves_noise_also_where_it_is_seen_edge_on_and_a_body_leaves_mo
     def residual(points: Floats) -> float:
         views = (points, (points - [1.5, 0.1, 0.0]) @ so3.exp(np.array([0.0, 0.25, 0.0])).T)
         a, b = (focal * seen[:, :2] / seen[:, 2:] + rng.normal(0, noise, (400, 2)) for seen in views)
-        return two_view.homography_residual(a, b)
+        return relative_pose.homography_residual(a, b)
 
     assert residual(plane) < 2.0 * noise
     assert residual(body) > 6.0 * noise
@@ -238,5 +238,5 @@ def test_a_plane_is_asked_for_of_any_points_without_an_error(kind: str) -> None:
     elif kind == "to infinity":
         b = a / np.where(np.abs(a[:, :1]) < 20, 1e-14, a[:, :1])
     with np.errstate(all="ignore"):
-        left = two_view.homography_residual(a, b)
+        left = relative_pose.homography_residual(a, b)
     assert np.isnan(left) or left >= 0.0

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from hub.view.flight_picture import draw, padded, words
-from hub.view.flights import FlightView
 from hub.view.player import LogRecording, Player
 from hub.view.scene import decoded
 from hub.view.state import ViewState
+from hub.view.uav_overlay import draw, padded, words
+from hub.view.uav_state import FlightView
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import FLIGHT_IMAGE, TARGET, UAV_INFO

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hub.view.access_control import Gate, is_local
 from hub.view.export import calibration_file
-from hub.view.gate import Gate, is_local
+from hub.view.image_planes import pixel_of
 from hub.view.page import marked
 from hub.view.panels import ago, camera_details, camera_table, overview
-from hub.view.planes import pixel_of
 from hub.view.player import CalibrationRecording, LogRecording, Player
 from hub.view.scene import standpoint
 from hub.view.server import answer_to, commands_for

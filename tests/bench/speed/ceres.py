@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pyceres
 
-from hub.poses.linear import THIRD_DIFFERENCE
-from hub.poses.problem import CAMERA_PARAMETERS, Freedom, State
+from hub.bundle.bordered_system import THIRD_DIFFERENCE
+from hub.bundle.problem import CAMERA_PARAMETERS, Freedom, State
 from protocols.geometry.types import Floats, Ints
 from tests.bench.speed.joint import SIGMA_PX, Stacked
 

@@ -18,12 +18,12 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.sparse import coo_array, csr_array
 
-from hub.poses.adjust import Linearised, MotionPrior, _minimise, build_system, linearise, motion_prior, moved
-from hub.poses.graph import ClockGraph, ClockGuess
-from hub.poses.initialise import _camera_state, settle
-from hub.poses.linear import THIRD_DIFFERENCE, third_differences
-from hub.poses.problem import CAMERA_PARAMETERS, GIVEN_PARAMETERS, RATE, Freedom, Problem, State
-from hub.prepare import prepare
+from hub.bundle.adjustment import Linearised, MotionPrior, _minimise, build_system, linearise, motion_prior, moved
+from hub.bundle.bordered_system import THIRD_DIFFERENCE, third_differences
+from hub.bundle.problem import CAMERA_PARAMETERS, GIVEN_PARAMETERS, RATE, Freedom, Problem, State
+from hub.calibration.clock_graph import ClockGraph, ClockGuess
+from hub.calibration.initialisation import _camera_state, settle
+from hub.calibration.preprocessing import prepare
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats, Ints

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from hub.timing.paper import alternate
-from hub.timing.two_view import RelativePose, decompose, homogeneous, sampson
+from hub.baselines.alternating_lag import alternate
+from hub.two_view.relative_pose import RelativePose, decompose, homogeneous, sampson
 from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
 from tests.bench import pair_timing

@@ -1,0 +1,1 @@
+"""Continuous-time bundle adjustment: residuals, normal equations, noise models, covariance."""

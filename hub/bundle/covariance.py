@@ -1,0 +1,238 @@
+"""Covariances of the adjustment's answers, in the gauge in which they are published."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.special import erf
+
+from hub.bundle.bordered_system import BAND, eliminate
+from hub.bundle.normal_equations import build_system
+from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, Problem, State
+from hub.trajectory.smoothness_prior import MotionPrior
+from hub.trajectory.splines import SUPPORT
+from protocols.geometry import so3
+from protocols.geometry.pose import Pose
+from protocols.geometry.types import Floats
+
+_WITHIN = 1.96
+_INSIDE = float(erf(_WITHIN / np.sqrt(2.0)))
+_HALVINGS = 24
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Covariance:
+    """Joint covariance of all camera parameters, and what is needed for the path's.
+
+    cameras: (18 n, 18 n), zero where a parameter was held. carried: (3 m, p) A⁻¹ B over the free columns.
+    free: (p, p) covariance of the free columns. blocks: (k, 24, 24) blocks of A⁻¹ about the diagonal.
+    """
+
+    cameras: Floats
+    carried: Floats
+    free: Floats
+    blocks: Floats
+
+
+def covariance(problem: Problem, state: State, prior: MotionPrior, references: Floats | None = None) -> Covariance:
+    """Covariance at the solution.
+
+    references: (18 n, 18 n) information of surveyed positions, attitudes and distances. Gauge directions
+    that they leave open are held by convention: the first camera's pose and the first baseline.
+    """
+    system, _ = build_system(problem, state, prior, robust=False)
+    parts = eliminate(system)
+    columns = problem.free_columns()
+    information = parts.reduced
+    held = None
+    if problem.freedom.pose:
+        known = np.zeros((len(state.cameras) * CAMERA_PARAMETERS,) * 2) if references is None else references
+        information = information + known[np.ix_(columns, columns)]
+        held = held_rows([camera.pose for camera in state.cameras], known)[:, columns]
+    if held is not None and len(held):
+        _, _, vt = np.linalg.svd(held)
+        tangent = vt[len(held) :].T
+        free = tangent @ np.linalg.inv(tangent.T @ information @ tangent) @ tangent.T
+    elif len(columns):
+        free = np.linalg.inv(information)
+    else:
+        free = np.zeros((0, 0))
+    width = len(state.cameras) * CAMERA_PARAMETERS
+    full = np.zeros((width, width))
+    full[np.ix_(columns, columns)] = free
+    return Covariance(full, parts.carried, free, _inverse_blocks(system.band))
+
+
+def turn_stds(cameras: Floats, state: State) -> Floats:
+    """(n, n) largest std [rad] of the rotation between two cameras in any direction; no gauge enters.
+
+    cameras: (18 n, 18 n) covariance of their parameters.
+    """
+    count = len(state.cameras)
+    out = np.zeros((count, count))
+    for i in range(count):
+        for j in range(i):
+            at = np.r_[i * CAMERA_PARAMETERS : i * CAMERA_PARAMETERS + 3]
+            to = np.r_[j * CAMERA_PARAMETERS : j * CAMERA_PARAMETERS + 3]
+            relative = state.cameras[i].pose.rotation @ state.cameras[j].pose.rotation.T
+            cross = cameras[np.ix_(at, to)] @ relative.T
+            between = cameras[np.ix_(at, at)] + relative @ cameras[np.ix_(to, to)] @ relative.T - cross - cross.T
+            out[i, j] = out[j, i] = float(np.sqrt(max(np.linalg.eigvalsh(between)[-1], 0.0)))
+    return out
+
+
+def gauge_generators(poses: list[Pose]) -> Floats:
+    """(18 n, 7): how all cameras move under a small translation, rotation and scaling of the world."""
+    rows = []
+    for pose in poses:
+        block = np.zeros((CAMERA_PARAMETERS, 7))
+        block[3:6, :3] = np.eye(3)
+        block[:3, 3:6] = -pose.rotation
+        block[3:6, 3:6] = -so3.hat(pose.position)
+        block[3:6, 6] = pose.position
+        rows.append(block)
+    return np.concatenate(rows)
+
+
+def held_rows(poses: list[Pose], references: Floats) -> Floats:
+    """Constraint rows (q, 18 n) on the gauge directions that the references leave open."""
+    generators = gauge_generators(poses)
+    default = np.zeros((7, len(generators)))
+    default[np.arange(6), np.arange(6)] = 1.0
+    apart = poses[1].position - poses[0].position
+    apart = apart / np.linalg.norm(apart)
+    default[6, 3:6] = -apart
+    default[6, CAMERA_PARAMETERS + 3 : CAMERA_PARAMETERS + 6] = apart
+    # Generators scaled to unit effect, so that "known" has one meaning for all seven.
+    scaled = generators / np.linalg.norm(generators, axis=0)
+    known = scaled.T @ references @ scaled
+    values, vectors = np.linalg.eigh(known)
+    opened = vectors[:, values < 1e-6 * max(float(values[-1]), 1e-30)] if values[-1] > 0 else np.eye(7)
+    return np.asarray(opened.T @ np.linalg.inv(default @ scaled) @ default)
+
+
+def time_map_std(cov: Covariance, state: State, camera: int, reference: int) -> float:
+    """Std [s] of the camera's map onto the reference camera's clock, in the middle of its observed span."""
+    if camera == reference:
+        return 0.0
+    now, base = state.cameras[camera], state.cameras[reference]
+    row = np.zeros(len(cov.cameras))
+    row[camera * CAMERA_PARAMETERS + OFFSET] = 1.0
+    at = float(base.camera_time(np.array([now.offset]))[0])
+    row[reference * CAMERA_PARAMETERS + OFFSET] -= 1.0
+    row[reference * CAMERA_PARAMETERS + RATE] -= at - base.centre
+    return float(np.sqrt(max(float(row @ cov.cameras @ row), 0.0)) / base.rate)
+
+
+def common_clock_stds(cov: Covariance, problem: Problem, state: State) -> Floats:
+    """Std [s] (cameras, cameras) of how the clocks of two cameras lie to each other, in the middle of what both saw.
+
+    That is where their lag is used; beyond it, it is as vague as the rates make it. Of cameras that saw nothing at the
+    same time: in the middle of the gap. Diagonal 0.
+    """
+    spans = _observed_spans(problem, state)
+    count = len(state.cameras)
+    out = np.zeros((count, count))
+    for i, j in itertools.combinations(range(count), 2):
+        middle = 0.5 * (max(spans[i, 0], spans[j, 0]) + min(spans[i, 1], spans[j, 1]))
+        row = np.zeros(len(cov.cameras))
+        for camera, sign in ((i, 1.0), (j, -1.0)):
+            now = state.cameras[camera]
+            row[camera * CAMERA_PARAMETERS + OFFSET] = sign
+            row[camera * CAMERA_PARAMETERS + RATE] = sign * (middle - now.offset) / now.rate
+        out[i, j] = out[j, i] = np.sqrt(max(float(row @ cov.cameras @ row), 0.0))
+    return out
+
+
+def _observed_spans(problem: Problem, state: State) -> Floats:
+    """First and last internal reference time (cameras, 2) of each camera's rows."""
+    out = np.tile([np.inf, -np.inf], (len(state.cameras), 1))
+    for part in problem.rows:
+        if len(part.time):
+            times = state.cameras[part.camera].reference_time(part.time)
+            out[part.camera] = min(out[part.camera, 0], times.min()), max(out[part.camera, 1], times.max())
+    return out
+
+
+def position_std(cov: Covariance, camera: int) -> Floats:
+    """Std (3,) of the camera's position."""
+    begin = camera * CAMERA_PARAMETERS + 3
+    variance = np.diag(cov.cameras)[begin : begin + 3]
+    # What the gauge holds comes out of the null space as 1e-30: it is exactly known by definition.
+    return np.asarray(np.sqrt(np.where(variance > 1e-20 * float(np.diag(cov.cameras).max(initial=0.0)), variance, 0.0)))
+
+
+def path_std(cov: Covariance, state: State, label: int, time: Floats) -> Floats:
+    """The std (n,) told of a path at internal reference times (n,): one for three axes, see `one_std`."""
+    base = 3 * sum(path.basis.size for path in state.trajectories[:label])
+    index, weights, _ = state.trajectories[label].basis.weights(time)
+    first = base + 3 * index
+    block, inside = first // BAND, first % BAND
+    columns = index[:, None] + np.arange(SUPPORT)
+    pointers = SUPPORT * np.arange(len(time) + 1)
+    shape = (len(time), state.trajectories[label].basis.size)
+    spread = csr_array((weights.ravel(), columns.ravel(), pointers), shape=shape)
+    out = np.zeros((len(time), 3))
+    for axis in range(3):
+        for a in range(SUPPORT):
+            for b in range(SUPPORT):
+                values = cov.blocks[block, inside + 3 * a + axis, inside + 3 * b + axis]
+                out[:, axis] += weights[:, a] * weights[:, b] * values
+        mine = cov.carried[base + axis : base + 3 * state.trajectories[label].basis.size : 3]
+        carried = spread @ mine
+        out[:, axis] += ((carried @ cov.free) * carried).sum(axis=1)
+    return one_std(np.sqrt(np.maximum(out, 0.0)))
+
+
+def one_std(axes: Floats) -> Floats:
+    """One std (n,) for three axes of stds (n, 3): that within 1.96 of which 95 % of their errors lie.
+
+    Errors of one axis are most often larger than those of the others. Their mean variance would promise too much:
+    of axes of 2, 0.5 and 0.5 mm 92 % lie within 1.96 of it.
+    """
+    low, high = axes.min(axis=1), axes.max(axis=1)
+    least = np.maximum(axes, 1e-12 * np.maximum(high, 1e-300)[:, None])
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        inside = erf(_WITHIN / np.sqrt(2.0) * middle[:, None] / least).mean(axis=1)
+        enough = inside >= _INSIDE
+        low, high = np.where(enough, low, middle), np.where(enough, middle, high)
+    return np.asarray(high)
+
+
+def _inverse_blocks(band: Floats) -> Floats:
+    """Blocks (k, 24, 24) of the inverse of a banded matrix about its diagonal, by block recursion.
+
+    Block i covers rows 12 i … 12 i + 23: every 12 neighbouring rows lie in one of them.
+    """
+    size = band.shape[1]
+    count = -(-size // BAND)
+    diagonal = np.tile(np.eye(BAND), (count, 1, 1))
+    above = np.zeros((count, BAND, BAND))
+    for distance in range(BAND):
+        column = np.arange(distance, size)
+        row = column - distance
+        values = band[BAND - 1 - distance, distance:]
+        same = row // BAND == column // BAND
+        diagonal[row[same] // BAND, row[same] % BAND, column[same] % BAND] = values[same]
+        diagonal[row[same] // BAND, column[same] % BAND, row[same] % BAND] = values[same]
+        above[row[~same] // BAND, row[~same] % BAND, column[~same] % BAND] = values[~same]
+    diagonal += 1e-12 * float(band[-1].max(initial=1.0)) * np.eye(BAND)
+    pivots = np.empty_like(diagonal)
+    pivots[0] = np.linalg.inv(diagonal[0])
+    for i in range(1, count):
+        pivots[i] = np.linalg.inv(diagonal[i] - above[i - 1].T @ pivots[i - 1] @ above[i - 1])
+    out = np.zeros((count, 2 * BAND, 2 * BAND))
+    last = pivots[-1]
+    out[-1, :BAND, :BAND] = last
+    for i in range(count - 2, -1, -1):
+        carry = pivots[i] @ above[i]
+        corner = -carry @ last
+        now = pivots[i] - corner @ carry.T
+        out[i, :BAND, :BAND], out[i, BAND:, BAND:] = now, last
+        out[i, :BAND, BAND:], out[i, BAND:, :BAND] = corner, corner.T
+        last = now
+    return out

@@ -1,0 +1,1 @@
+"""Offline calibration from a session: preprocessing, pair network, reconstruction, result."""

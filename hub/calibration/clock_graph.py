@@ -1,0 +1,126 @@
+"""The graph of camera pairs: one time map per camera from pairwise ones, contradicting pairs set aside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hub.sync.pair_solver import PairSolution, evidence
+from hub.trajectory.image_tracks import Track
+from protocols.geometry.types import Floats
+
+_CONTRADICTION = 0.15  # s: a pair whose lag is that far from what the others say is set aside
+_LAG_STD, _RATE_STD = 0.01, 5e-4  # s; how a pair's lag and a clock's nominal rate are weighed
+_RATE_LEVER = 30.0  # s over which a rate difference is weighed as a time difference
+
+
+@dataclass(frozen=True, slots=True)
+class ClockGuess:
+    """First time map of one camera: ``t = rate * (t_camera - centre) + offset``, times less the epoch."""
+
+    rate: float
+    offset: float
+    centre: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClockGraph:
+    """Clocks of the cameras that hang together, the pairs that agree, and those that don't."""
+
+    clocks: dict[str, ClockGuess]
+    agreeing: tuple[PairSolution, ...]
+    contradicting: tuple[PairSolution, ...]
+
+
+def components(names: list[str], pairs: list[PairSolution]) -> list[list[str]]:
+    """Connected components over solved pairs, largest first, ties by order of names."""
+    parent = {name: name for name in names}
+
+    def root(name: str) -> str:
+        while parent[name] != name:
+            name = parent[name]
+        return name
+
+    for pair in pairs:
+        parent[root(pair.a)] = root(pair.b)
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        groups.setdefault(root(name), []).append(name)
+    return sorted(groups.values(), key=lambda group: (-len(group), names.index(group[0])))
+
+
+def average_clocks(
+    names: list[str], pairs: list[PairSolution], tracks: Mapping[str, Mapping[str, Track]]
+) -> ClockGraph:
+    """L1 average of the pairs' time maps over one connected component (reweighted least squares).
+
+    names: cameras of the component. A pair that contradicts the average is set aside, worst first, as long
+    as it isn't a bridge: the cycles of the graph are the check.
+    """
+    centres = {name: _middle(tracks[name]) for name in names}
+    kept, out = list(pairs), []
+    while True:
+        offsets, rates, errors = _solve(names, kept, centres)
+        worst = int(np.argmax(errors)) if len(errors) else -1
+        if worst < 0 or errors[worst] < _CONTRADICTION:
+            break
+        without = kept[:worst] + kept[worst + 1 :]
+        if len(components(names, without)[0]) < len(names):
+            break  # a bridge cannot contradict anything
+        out.append(kept[worst])
+        kept = without
+    clocks = {name: ClockGuess(rates[i], offsets[i], centres[name]) for i, name in enumerate(names)}
+    return ClockGraph(clocks, tuple(kept), tuple(out))
+
+
+def _middle(tracks: Mapping[str, Track]) -> float:
+    begin = min(float(track.time[0]) for track in tracks.values())
+    end = max(float(track.time[-1]) for track in tracks.values())
+    return 0.5 * (begin + end)
+
+
+def _solve(names: list[str], pairs: list[PairSolution], centres: dict[str, float]) -> tuple[Floats, Floats, Floats]:
+    """Offsets and rates (n,), and how far each pair is off (m,) [s]."""
+    count = len(names)
+    index = {name: i for i, name in enumerate(names)}
+    # Unknowns: offset and rate less 1 per camera. Rows: time agreement at two times around the overlap.
+    rows, right, owner, base_weight = [], [], [], []
+    for number, pair in enumerate(pairs):
+        fit = pair.fit
+        if fit is None:
+            continue
+        a, b = index[pair.a], index[pair.b]
+        middle = fit.middle
+        for time_a in (middle - _RATE_LEVER / 2, middle + _RATE_LEVER / 2):
+            time_b = (time_a - fit.offset) / fit.rate
+            row = np.zeros(2 * count)
+            row[2 * a], row[2 * a + 1] = 1.0, time_a - centres[pair.a]
+            row[2 * b], row[2 * b + 1] = -1.0, -(time_b - centres[pair.b])
+            rows.append(row)
+            right.append(-(time_a - centres[pair.a]) + (time_b - centres[pair.b]))
+            owner.append(number)
+            base_weight.append(np.sqrt(max(evidence(fit), 1e-3)) / _LAG_STD)
+    for i in range(count):  # rates near nominal
+        row = np.zeros(2 * count)
+        row[2 * i + 1] = 1.0
+        rows.append(row)
+        right.append(0.0)
+        owner.append(-1)
+        base_weight.append(1.0 / _RATE_STD)
+    row = np.zeros(2 * count)
+    row[0] = 1.0
+    rows.append(row)
+    right.append(0.0)
+    owner.append(-1)
+    base_weight.append(1e6)
+    matrix, target, owners = np.array(rows), np.array(right), np.array(owner)
+    weight = np.array(base_weight)
+    solution = np.zeros(2 * count)
+    for _ in range(30):
+        solution = np.linalg.lstsq(matrix * weight[:, None], target * weight, rcond=None)[0]
+        error = np.abs(matrix @ solution - target)
+        weight = np.array(base_weight) / np.sqrt(np.where(owners >= 0, np.maximum(error / _LAG_STD, 0.1), 1.0))
+    errors = np.array([error[owners == number].mean() for number in range(len(pairs))])
+    return solution[::2], 1.0 + solution[1::2], errors

@@ -1,0 +1,1 @@
+"""Camera clocks over time: segments, step and rate-change detection, external priors."""

@@ -1,0 +1,1 @@
+"""The datum: gauge, scale, control points and their outlier test."""

@@ -1,0 +1,1 @@
+"""Distributed pose estimation over a network of camera nodes."""

@@ -1,0 +1,1 @@
+"""Relative-pose factors between two cameras: initialisation, linearisation, accumulation."""

@@ -1,0 +1,1 @@
+"""The network of pose nodes: association, localisation, block solver, moved cameras."""

@@ -1,0 +1,1 @@
+"""The hub while cameras stream: estimator, agent and messages."""

@@ -1,0 +1,192 @@
+"""The hub agent: a thin loop between the bus and the live estimator."""
+
+from __future__ import annotations
+
+import gc
+import threading
+import time
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+
+from google.protobuf.message import Message
+
+from hub.distributed.network.host import ROLE as NODES
+from hub.distributed.network.host import NodeHost
+from hub.live.live_hub import LiveHub
+from protocols.bus.base import Bus, Publisher
+from protocols.core.commands import Orders
+from protocols.core.version import VERSION
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.rig import Rig
+from protocols.topics import CALIBRATION, CAMERA_INFO, NODE_STATE, OBSERVATION, PREDICTION, RIG_INFO, STATUS, TRACK
+
+ROLE = "hub"
+_TICK_S = 0.05
+_STATUS_S = 1.0
+_RIG_S = 5.0
+_MOST_TEXT = 2000  # characters of a status message
+
+
+def run_hub(
+    hub: LiveHub,
+    bus: Bus,
+    agent: str,
+    stop: threading.Event,
+    *,
+    rig: Rig | None = None,
+    solved: Callable[[LiveHub], None] | None = None,
+    boot_id: str | None = None,
+    beat: Callable[[], None] = lambda: None,
+    export: Callable[[LiveHub], str] | None = None,
+) -> None:
+    """Gather, solve and publish until ``stop`` is set; then solve once more with all that came.
+
+    solved: called after every solve that gave an answer or a refusal (to write files). beat: called after every round,
+    and within one as the solver gets on, so that a watchdog sees a loop that hangs. export: writes the answer because
+    a view asked; returns what to say.
+    """
+    boot = boot_id or uuid.uuid4().hex
+    nodes = hub.nodes
+    of_nodes = () if nodes is None else (NODE_STATE, CALIBRATION)
+    subscriptions = [bus.subscribe(topic) for topic in (CAMERA_INFO, OBSERVATION, STATUS, *of_nodes)]
+    publishers = {
+        "Calibration": bus.publisher(CALIBRATION, agent),
+        "Track": bus.publisher(TRACK, agent, rate_hz=200.0),
+        "Prediction": bus.publisher(PREDICTION, agent),
+        "RigInfo": bus.publisher(RIG_INFO, agent),
+        "AgentStatus": bus.publisher(STATUS, agent),
+    }
+    orders = Orders(bus, agent, boot, ("recalibrate", "export"))
+    hub.working = beat
+    sequence, next_status, next_rig = 0, 0.0, 0.0
+    said = ""
+
+    def publish(messages: list[Message]) -> None:
+        for message in messages:
+            publishers[message.DESCRIPTOR.name].put(message)
+
+    node_publishers: dict[str, Publisher] = {}
+
+    def publish_nodes(host: NodeHost, now: float) -> None:
+        for state in host.tick(now):
+            if state.camera not in node_publishers:
+                node_publishers[state.camera] = bus.publisher(NODE_STATE, state.camera)
+            node_publishers[state.camera].put(state)
+
+    watch = None if nodes is None else bus.watch_agents()
+    settle_memory()
+    settled = False
+    try:
+        with bus.announce(ROLE, agent, boot), nullcontext() if nodes is None else bus.announce(NODES, agent, boot):
+            while True:
+                last = stop.is_set()
+                if nodes is not None and watch is not None:
+                    for event in watch.drain():
+                        nodes.agents(event.role, event.agent, event.boot_id, alive=event.alive)
+                for subscription in subscriptions:
+                    for received in subscription.drain():
+                        if received.agent != agent or not isinstance(received.message, pb.Calibration):
+                            hub.handle(received.message, received.arrival_ns * 1e-9)
+                for action in orders.take():
+                    hub.counters[f"asked.{action}"] += 1
+                    if action == "recalibrate":
+                        hub.start_anew()
+                        said = "recalibrating, as asked"
+                    elif action == "export":
+                        said = "no folder to export to: set out" if export is None else export(hub)
+                if nodes is not None:
+                    publish_nodes(nodes, time.monotonic())
+                now = time.monotonic()
+                before = hub.counters["solved"] + hub.counters["refused"]
+                publish(hub.tick(now, final=last))
+                answered = hub.counters["solved"] + hub.counters["refused"] > before
+                if answered and not settled:
+                    settled = True
+                    settle_memory()  # the solver's modules have come
+                if solved is not None and answered:
+                    solved(hub)
+                if rig is not None and now >= next_rig:
+                    next_rig = now + _RIG_S
+                    publish([rig_message(rig)])
+                if now >= next_status or last:
+                    next_status = now + _STATUS_S
+                    status = status_message(hub, agent, boot, sequence, [s.counters for s in subscriptions])
+                    wanting = hub.calibration is None or hub.refusal is not None or hub.calibration.refused
+                    advice = [one.text for one in hub.guidance.advice()] if wanting else []
+                    status.message = "; ".join(text for text in (status.message, *advice, said) if text)[:_MOST_TEXT]
+                    publish([status])
+                    sequence += 1
+                beat()
+                if last:
+                    break
+                stop.wait(_TICK_S)
+    finally:
+        for publisher in (*publishers.values(), *node_publishers.values()):
+            publisher.close()
+        if watch is not None:
+            watch.close()
+        orders.close()
+        for subscription in subscriptions:
+            subscription.close()
+
+
+def settle_memory() -> None:
+    """Take what there is now, modules above all, out of the garbage collector's rounds.
+
+    Else each of them stands still for 70 ms, and messages with it. What is freed by its last reference still is.
+    """
+    gc.collect()
+    gc.freeze()
+
+
+def rig_message(rig: Rig) -> pb.RigInfo:
+    """What fixes gauge and scale, for the log."""
+    message = pb.RigInfo(schema_version=1, units=rig.units, clock=rig.clock)
+    for a, b, distance in rig.distances:
+        message.distances.append(pb.RigInfo.Distance(camera_a=a, camera_b=b, distance=distance))
+    if isinstance(rig.up, str):
+        message.up_camera = rig.up
+    elif rig.up is not None:
+        message.up.extend(rig.up.tolist())
+    reference = rig.metadata.get("reference")
+    if isinstance(reference, str):
+        message.reference_camera = reference
+    return message
+
+
+def status_message(
+    hub: LiveHub, agent: str, boot: str, sequence: int, counters: Sequence[Mapping[str, int]]
+) -> pb.AgentStatus:
+    """The hub's health: what it counted, and one line for a person."""
+    solved = hub.calibration is not None
+    message = pb.AgentStatus(
+        schema_version=1,
+        agent=agent,
+        role=ROLE,
+        boot_id=boot,
+        sequence=sequence,
+        state="running" if solved else "starting",
+        message=f"{len(hub.calibration.cameras)} cameras calibrated" if hub.calibration else hub.missing() or "solving",
+        version=VERSION,
+    )
+    for name, count in hub.counters.items():
+        message.counters[name] = count
+    for camera, ppm in hub.clocks.rates_ppm().items():
+        message.gauges[f"ppm.{camera}"[:64]] = ppm
+    alarms = [*hub.clocks.alarms.values(), *hub.clock_contradictions()]
+    if alarms:
+        message.message = "; ".join([*alarms, message.message])[:1000]
+    if hub.tracking is not None and hub.tracking.heard_any:
+        for name, value in hub.tracking.gauges().items():
+            message.gauges[name] = value
+        for name, count in hub.tracking.counters.items():
+            message.counters[name] = count
+    if hub.nodes is not None:
+        message.gauges["nodes"] = len(hub.nodes.cameras())
+        for name, count in hub.nodes.counters.items():
+            message.counters[f"nodes.{name}"] = count
+    for counts in counters:
+        for name, count in counts.items():
+            message.counters[name] = message.counters[name] + count
+    return message

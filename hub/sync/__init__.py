@@ -1,0 +1,1 @@
+"""Synchronisation of a camera pair: lag search, refinement, acceptance tests."""

@@ -1,0 +1,1 @@
+"""Data association: assignment, track initiation, re-identification."""

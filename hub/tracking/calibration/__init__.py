@@ -1,0 +1,1 @@
+"""Calibration input from people: labelled points and the vertical direction."""

@@ -1,0 +1,163 @@
+"""A calibrated camera as tracking sees it, and one frame of it in normalised coordinates and reference time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hub.tracking.filter.target_models import INDEX
+from protocols.core.clocks import NANOSECONDS, TimeMap
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.pose import Pose
+from protocols.geometry.types import Bools, Floats, Ints
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.calibration import CameraCalibration
+
+_DEFAULT_STD_PX = 1.5
+"""Of a detection that tells no covariance."""
+_LEAST_STD_PX = 0.2
+_BORDER = 0.02
+"""Share of the image's sides within which nothing is expected to be found: the border cuts it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackingCamera:
+    """One camera. boot_id: the boot whose clock the time map speaks of; "" = of every one.
+
+    time_std: of the time map [s]. noise_px: of the calibration. low, high: (2,) corners of the image in normalised
+    coordinates, without its border.
+    """
+
+    name: str
+    intrinsics: Intrinsics
+    pose: Pose
+    time_map: TimeMap
+    time_std: float = 0.0
+    noise_px: float = 0.0
+    boot_id: str = ""
+    low: Floats = field(init=False)
+    high: Floats = field(init=False)
+
+    def __post_init__(self) -> None:
+        lens = self.intrinsics
+        x, y = np.linspace(_BORDER, 1 - _BORDER, 9) * lens.width, np.linspace(_BORDER, 1 - _BORDER, 9) * lens.height
+        edge = np.concatenate([[(u, v) for u in x for v in (y[0], y[-1])], [(u, v) for u in (x[0], x[-1]) for v in y]])
+        border = lens.unproject(np.asarray(edge))
+        object.__setattr__(self, "low", np.nanmin(border, axis=0))
+        object.__setattr__(self, "high", np.nanmax(border, axis=0))
+
+    @classmethod
+    def of(cls, camera: CameraCalibration, boot_id: str = "") -> TrackingCamera:
+        """From a solved calibration."""
+        return cls(
+            camera.name,
+            camera.intrinsics,
+            camera.pose,
+            camera.time_map,
+            camera.time_offset_std,
+            min(camera.rms_px, 5.0),
+            boot_id,
+        )
+
+    def reference_ns(self, device_time_ns: int) -> int:
+        """The reference time [ns] of a time on the camera's clock; Unix times as floats would be too coarse."""
+        rate, offset = self.time_map.clock_rate, self.time_map.time_offset
+        return device_time_ns + round((rate - 1.0) * device_time_ns) + round(offset * NANOSECONDS)
+
+    def device_ns(self, reference_ns: int) -> int:
+        """The inverse of `reference_ns`, to a nanosecond."""
+        behind = reference_ns - round(self.time_map.time_offset * NANOSECONDS)
+        return behind - round((1.0 - 1.0 / self.time_map.clock_rate) * behind)
+
+    def sees(self, normalised: Floats, depth: Floats) -> Bools:
+        """Whether points (n, 2) at depths (n,) are well inside the image."""
+        with np.errstate(invalid="ignore"):
+            inside = ((normalised > self.low) & (normalised < self.high)).all(axis=1)
+        return np.asarray(inside & (depth > 0.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """What one camera saw at one moment; (n,) detections in normalised coordinates, NaN where not told.
+
+    reference_ns: corrected time. point, head, foot: (n, 2). noise: (n, 2, 2) of the point; per: (n,) normalised units a
+    pixel there. size: (n,). colour: (n, 3). kind: (n,) index in BODIES. target: track that the camera matched.
+    """
+
+    camera: TrackingCamera
+    reference_ns: int
+    boot_id: str
+    sequence: int
+    point: Floats
+    noise: Floats
+    per: Floats
+    head: Floats
+    foot: Floats
+    size: Floats
+    colour: Floats
+    kind: Ints
+    target: tuple[str, ...]
+
+    @property
+    def key(self) -> tuple[int, str, str, int]:
+        """Frames are handled in this order, however they arrive."""
+        return self.reference_ns, self.camera.name, self.boot_id, self.sequence
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+
+def frame_of(camera: TrackingCamera, message: pb.Observation, reference_ns: int | None = None) -> Frame:
+    """The tracked detections of an observation; those that the lens cannot have made are left out."""
+    found = [detection for detection in message.detections if tracked_kind(detection)]
+    told = [((d.u, d.v), _pair(d.head), _pair(d.foot)) for d in found]
+    pixels = np.array(told, dtype=np.float64).reshape(-1, 2)
+    normalised = np.full(pixels.shape, np.nan)
+    given = np.isfinite(pixels[:, 0])
+    if given.any():
+        normalised[given] = camera.intrinsics.unproject(pixels[given])
+    ends = normalised.reshape(-1, 3, 2)
+    good = np.isfinite(ends[:, 0]).all(axis=1)
+    if not good.all():
+        found = [detection for detection, kept in zip(found, good, strict=True) if kept]
+        ends = ends[good]
+    point = ends[:, 0]
+    inverse = np.linalg.inv(camera.intrinsics.pixel_jacobian(point)) if len(found) else np.zeros((0, 2, 2))
+    noise = np.array([_covariance(d) for d in found]).reshape(-1, 2, 2) + camera.noise_px**2 * np.eye(2)
+    per = np.sqrt(np.abs(np.linalg.det(inverse)))
+    colour = [(d.colour.red, d.colour.green, d.colour.blue) if d.HasField("colour") else (np.nan,) * 3 for d in found]
+    return Frame(
+        camera=camera,
+        reference_ns=camera.reference_ns(message.device_time_ns) if reference_ns is None else reference_ns,
+        boot_id=message.boot_id,
+        sequence=message.sequence,
+        point=point,
+        noise=inverse @ noise @ inverse.transpose(0, 2, 1),
+        per=per,
+        head=ends[:, 1],
+        foot=ends[:, 2],
+        size=np.array([d.size if d.size > 0.0 else np.nan for d in found], dtype=np.float64) * per,
+        colour=np.array(colour, dtype=np.float64).reshape(-1, 3),
+        kind=np.array([INDEX[tracked_kind(d)] for d in found], dtype=np.int64),
+        target=tuple(d.target for d in found),
+    )
+
+
+def tracked_kind(detection: pb.Detection) -> str:
+    """The kind under which a detection is tracked; "" for one of a known marker, whose label tells who it is."""
+    if detection.kind == "marker":
+        return "" if detection.label else "marker"
+    return str(detection.kind)
+
+
+def _covariance(detection: pb.Detection) -> Floats:
+    if len(detection.covariance) != 3:
+        return np.asarray(_DEFAULT_STD_PX**2 * np.eye(2))
+    uu, uv, vv = detection.covariance
+    return np.array([[uu, uv], [uv, vv]]) + _LEAST_STD_PX**2 * np.eye(2)
+
+
+def _pair(told: Sequence[float]) -> tuple[float, float]:
+    return (told[0], told[1]) if len(told) == 2 else (np.nan, np.nan)

@@ -1,0 +1,1 @@
+"""The multi-target Kalman filter: target models, measurement model, update, manoeuvres."""

@@ -1,0 +1,1 @@
+"""Trajectories: image tracks, splines, smoothness prior, triangulation."""

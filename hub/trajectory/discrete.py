@@ -1,0 +1,134 @@
+"""Paths without motion: with one shared clock, rows of the same time correspond and nothing need move smoothly.
+
+``PointBasis`` and ``SampledTrack`` stand where ``SplineBasis`` and ``SmoothTrack`` stand for independent
+clocks: every instant has a point of its own, and a time between instants has none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hub.trajectory.splines import SUPPORT
+from protocols.geometry.types import Bools, Floats, Ints
+
+SAME_TIME = 1e-6
+"""Times [s] that differ by less are one instant: CSV files round."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointBasis:
+    """One point an instant. instants: (n,) sorted times [s].
+
+    Keeps the shape of a cubic spline's basis (four weights a time, three of them 0), so that the same banded
+    system serves both.
+    """
+
+    instants: Floats
+
+    @property
+    def size(self) -> int:
+        """Number of control points; the last three are never used."""
+        return len(self.instants) + SUPPORT - 1
+
+    @property
+    def spacing(self) -> float:
+        """Median time between instants [s]."""
+        return float(np.median(np.diff(self.instants))) if len(self.instants) > 1 else 1.0
+
+    @property
+    def begin(self) -> float:
+        """First instant [s]."""
+        return float(self.instants[0])
+
+    @property
+    def end(self) -> float:
+        """Last instant [s]."""
+        return float(self.instants[-1])
+
+    def locate(self, time: Floats) -> tuple[Ints, Floats, Bools]:
+        """Index of the instant (n,), 0 (n,), and whether there is one (n,)."""
+        index, found = lookup(self.instants, time)
+        return index, np.zeros(len(time)), found
+
+    def weights(self, time: Floats, derivative: int = 0) -> tuple[Ints, Floats, Bools]:
+        """Index (n,), weights (n, 4) and whether there is a point (n,); a point has no velocity."""
+        index, found = lookup(self.instants, time)
+        weights = np.zeros((len(time), SUPPORT))
+        if derivative == 0:
+            weights[:, 0] = 1.0
+        return index, weights, found
+
+    def weights_both(self, time: Floats, beyond: float = 0.0) -> tuple[Ints, Floats, Floats, Bools]:
+        """As `weights` for the value and the first derivative, which is 0; nothing is ``beyond`` a point."""
+        index, weights, found = self.weights(time)
+        return index, weights, np.zeros_like(weights), found
+
+    def evaluate(self, control: Floats, time: Floats, derivative: int = 0) -> Floats:
+        """Values (n, d); NaN where there is no point."""
+        index, weights, found = self.weights(time, derivative)
+        values = weights[:, :1] * control[index]
+        values[~found] = np.nan
+        return values
+
+    def interval_starts(self) -> Ints:
+        """(0,): no knot intervals, hence no motion prior."""
+        return np.zeros(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SampledTrack:
+    """One label of one camera at its instants, in normalised coordinates; see ``SmoothTrack``."""
+
+    epoch: float
+    time: Floats
+    points: Floats
+    inlier: Bools
+    basis: PointBasis
+    sigma: float
+    focal: float
+
+    def at(self, time: Floats, derivative: int = 0) -> Floats:
+        """Points (n, 2) at these very instants, NaN elsewhere; derivatives are 0."""
+        return self.basis.evaluate(self.points, time, derivative)
+
+    @property
+    def sigma_px(self) -> float:
+        """Noise of one coordinate [px]."""
+        return self.sigma * self.focal
+
+    @property
+    def span(self) -> float:
+        """Seconds from the first to the last row."""
+        return float(self.time[-1] - self.time[0])
+
+
+def sampled_track(
+    time: Floats, normalised: Floats, focal: float, epoch: float, sigma_px: float = 0.5
+) -> SampledTrack | None:
+    """The rows as they are; None without any that the lens model can undistort."""
+    good = np.asarray(np.isfinite(normalised).all(axis=1))
+    if not good.any():
+        return None
+    shifted = time[good] - epoch
+    return SampledTrack(epoch, shifted, normalised[good], good, PointBasis(shifted), sigma_px / focal, focal)
+
+
+def lookup(instants: Floats, time: Floats) -> tuple[Ints, Bools]:
+    """Index of the instant of each time (n,), and whether there is one within SAME_TIME."""
+    if len(instants) == 0:
+        return np.zeros(len(time), dtype=np.int64), np.zeros(len(time), dtype=np.bool_)
+    after = np.clip(np.searchsorted(instants, time), 0, len(instants) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = np.abs(instants[before] - time) < np.abs(instants[after] - time)
+    index = np.where(nearer, before, after)
+    return index.astype(np.int64), np.asarray(np.abs(instants[index] - time) < SAME_TIME)
+
+
+def common_instants(times: list[Floats]) -> Floats:
+    """All instants (n,) of several tracks, those within SAME_TIME once."""
+    joined = np.sort(np.concatenate(times)) if times else np.zeros(0)
+    if len(joined) == 0:
+        return joined
+    return joined[np.r_[True, np.diff(joined) > SAME_TIME]]
