@@ -16,8 +16,8 @@ os.environ["MAVLINK20"] = "1"
 from google.protobuf.message import Message
 from pymavlink.dialects.v20 import common as mavlink
 
-from deploy.uav import gimbal_mounting, make_agent
-from deploy.uav_config import ControlConfig, FlightConfig, UavConfig
+from deploy.agents.uav import gimbal_mounting, make_agent
+from deploy.config.uav import ControlConfig, FlightConfig, UavConfig
 from edge.agents.uav import Looking, UavAgent
 from edge.devices.base import Frame
 from edge.devices.playback.playback_clock import AsFastAsPossible

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from deploy.people_scores import Moment, Scores, clear_mot
+from deploy.evaluation.clear_mot import Moment, Scores, clear_mot
 from edge import scenes
 from edge.agents.predictions import Predictions
 from edge.scenes.people.scene import PeopleScene

@@ -23,7 +23,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import numpy as np  # noqa: E402
 
-from deploy.heap import keep_heap  # noqa: E402
+from deploy.agents.malloc_tuning import keep_heap  # noqa: E402
 from hub.calibration.pipeline import calibrate  # noqa: E402
 from hub.calibration.preprocessing import prepare  # noqa: E402
 from hub.trajectory.image_tracks import SmoothTrack  # noqa: E402

@@ -20,7 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from deploy.uav_config import ControlConfig
+from deploy.config.uav import ControlConfig
 from edge.devices.base import Frame
 from edge.devices.simulated.aircraft import Push
 from edge.mavlink.link.connection import Heard

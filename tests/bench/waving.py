@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from deploy.simulated import observations_of, rig_of
+from deploy.simulation.session import observations_of, rig_of
 from edge import scenes
 from edge.scenes.marker.session import simulated_session
 from hub.calibration.pipeline import calibrate

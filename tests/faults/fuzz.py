@@ -172,7 +172,7 @@ def fuzz_config(count: int, seed: int) -> Counter[str]:
     import tempfile
     from pathlib import Path
 
-    from deploy.config import CameraConfig, load
+    from deploy.config.agents import CameraConfig, load
     from protocols.core.errors import InputError
 
     rng, counts = random.Random(f"{seed} config"), Counter[str]()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.bundle import BUDGET_MB, Bundle, Target, folder_size_mb, make_bundle
+from deploy.site.bundle import BUDGET_MB, Bundle, Target, folder_size_mb, make_bundle
 from protocols.core.errors import InputError
 
 HERE = f"{sys.version_info.major}.{sys.version_info.minor}"

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from deploy import keys
 from deploy.cli import run
-from deploy.keys_check import check_site, tls_of
+from deploy.site import keys
+from deploy.site.keys_check import check_site, tls_of
 from protocols.bus.base import Publisher
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.security.access import access_rules

@@ -8,8 +8,8 @@ import re
 import signal
 from pathlib import Path
 
-from deploy.fleet import runs
-from deploy.info import describe_log
+from deploy.logs.info import describe_log
+from deploy.site.fleet import runs
 from tests.integration.test_fleet import fleet, frames, mini, start, state, until
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from deploy.fleet import bring_down, read_state
-from deploy.info import describe_log
-from deploy.rig_folder import find_rig, read_rig_folder
+from deploy.logs.info import describe_log
+from deploy.site.fleet import bring_down, read_state
+from deploy.site.rig_folder import find_rig, read_rig_folder
 
 SECONDS = {"webcams-room": 15, "drone-cage": 20, "oak-array": 25, "companion": 15}
 PATIENCE_S = 420.0

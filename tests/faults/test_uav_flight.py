@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy.uav_config import ControlConfig
-from deploy.uav_demo_outcome import compare
-from deploy.uav_demo_report import write_report
-from deploy.uav_replay import replay_through_uav
+from deploy.config.uav import ControlConfig
+from deploy.demo.flight_outcome import compare
+from deploy.demo.flight_report import write_report
+from deploy.logs.replay_uav import replay_through_uav
 from edge.agents.uav import TOPICS
 from edge.mavlink.roles.autopilot import Faults
 from edge.uav.tracker import State

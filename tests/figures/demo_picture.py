@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.simulated import observations_of, rig_of
+from deploy.simulation.session import observations_of, rig_of
 from edge import scenes
 from edge.scenes.marker.scene import MarkerScene
 from edge.scenes.marker.session import SimulatedTracks, simulated_session

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deploy.notify import Watched
+from deploy.agents.systemd_notify import Watched
 from edge import scenes
 from edge.agents.camera import CameraAgent, run_camera_agent
 from edge.detectors.base import Detection

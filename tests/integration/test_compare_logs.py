@@ -12,8 +12,8 @@ import pytest
 from google.protobuf.message import Message
 
 from deploy.cli import run
-from deploy.process_replay import replay_through_hub
-from deploy.replay import replay
+from deploy.logs.replay import replay
+from deploy.logs.replay_hub import replay_through_hub
 from hub.live.live_hub import LiveSettings
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.clocks import NANOSECONDS

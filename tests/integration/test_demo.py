@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from deploy.cli import run
-from deploy.info import describe_log
+from deploy.logs.info import describe_log
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.doctor import agent
+from deploy.site.doctor import agent
 from protocols.bus.router import probe
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig, TlsConfig
@@ -21,7 +21,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.topics import OBSERVATION, STATUS
 
 pytest.importorskip("cryptography", reason="the extra `keys` is not installed: access rules are not tested")
-from deploy.keys import issue, make_site
+from deploy.site.keys import issue, make_site
 
 SITE = "test"
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("pymavlink", reason="the extra `uav` is not installed: DOCTOR IS NOT TESTED ON MAVLINK")
-from deploy.doctor import examine
-from deploy.doctor.finding import Finding
-from deploy.uav_config import MavlinkConfig, UavConfig
+from deploy.config.uav import MavlinkConfig, UavConfig
+from deploy.site.doctor import examine
+from deploy.site.doctor.finding import Finding
 from edge.devices.playback.playback_clock import RealTime
 from edge.devices.simulated.aircraft import SimulatedAircraft
 from edge.mavlink.link.transport import Udp, Url

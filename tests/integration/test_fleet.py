@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from deploy.fleet import STATE, runs
+from deploy.site.fleet import STATE, runs
 
 HUB = 'id = "hub"\nsite = "mini"\nrig = "rig.toml"\ninterval_s = 1.0\n'
 RIG = '[{0}]\nname = "{0}"\nsize = [640, 480]\n'

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from deploy.agents import start_camera
-from deploy.config import CameraConfig, LogConfig
+from deploy.agents.assembly import start_camera
+from deploy.config.agents import CameraConfig, LogConfig
 from edge import scenes
 from edge.agents.thumbnails import picture_message
 from edge.detectors.marker.ball import MarkerDetector

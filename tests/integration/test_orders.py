@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from deploy.config import RecorderConfig
-from deploy.recording_orders import record_as_asked, replace_out
+from deploy.agents.recorder_commands import record_as_asked, replace_out
+from deploy.config.agents import RecorderConfig
 from hub.live.agent import run_hub
 from hub.live.live_hub import LiveHub
 from protocols.bus.transport.memory import MemoryBus, MemoryHub

@@ -10,8 +10,8 @@ import pytest
 import tomli_w
 
 from deploy.cli import run
-from deploy.demo_people import score_log
-from deploy.simulated import camera_tables
+from deploy.demo.people import score_log
+from deploy.simulation.session import camera_tables
 from edge import scenes
 from hub.live.agent import run_hub
 from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings

@@ -21,7 +21,7 @@ pytest.importorskip("viser")
 
 @pytest.fixture(autouse=True)
 def _own_signals(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("deploy.signals.stop_on_signals", threading.Event)
+    monkeypatch.setattr("deploy.agents.signals.stop_on_signals", threading.Event)
 
 
 def test_two_films_become_a_calibration_without_any_configuration(

@@ -17,10 +17,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from deploy.config import RecorderConfig
-from deploy.info import as_table, describe_log
-from deploy.record import RecorderResult, log_path, run_recorder
-from deploy.replay import replay
+from deploy.agents.recorder import RecorderResult, log_path, run_recorder
+from deploy.config.agents import RecorderConfig
+from deploy.logs.info import as_table, describe_log
+from deploy.logs.replay import replay
 from protocols.bus.base import AgentEvent, Bus, Received
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
@@ -311,9 +311,9 @@ def test_the_table_shows_damage_and_counts(tmp_path: Path) -> None:
 RECORDER = """
 import sys
 from pathlib import Path
-from deploy.config import RecorderConfig
-from deploy.record import run_recorder
-from deploy.signals import stop_on_signals
+from deploy.config.agents import RecorderConfig
+from deploy.agents.recorder import run_recorder
+from deploy.agents.signals import stop_on_signals
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
 stop = stop_on_signals()

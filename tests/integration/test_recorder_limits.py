@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from deploy.agents.recorder import free_bytes, run_recorder
 from deploy.cli import run
-from deploy.commands import agents
-from deploy.config import RecorderConfig
-from deploy.record import free_bytes, run_recorder
+from deploy.commands.agents import run as agents
+from deploy.config.agents import RecorderConfig
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.memory import MemoryBus, MemoryHub

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
-from deploy.reporting import load_answer
+from deploy.offline.report import load_answer
 from protocols.core.errors import Refused
 from protocols.session.calibration import Calibration
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deploy.rerun_export import write_rrd
+from deploy.logs.rerun_export import write_rrd
 from edge.agents.thumbnails import picture_message
 from edge.devices.base import Frame
 from hub.view.player import LogRecording

@@ -18,9 +18,9 @@ import pytest
 os.environ["MAVLINK20"] = "1"
 from pymavlink import mavutil
 
-from deploy import uav
-from deploy.config import load
-from deploy.uav_config import FlightConfig, UavConfig
+from deploy.agents import uav
+from deploy.config.agents import load
+from deploy.config.uav import FlightConfig, UavConfig
 from edge.mavlink.roles.autopilot import ORIGIN
 from edge.uav.world.world import World
 from protocols.bus.transport.memory import MemoryBus, MemoryHub

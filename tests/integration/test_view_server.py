@@ -202,7 +202,7 @@ def test_a_click_goes_to_the_hub_that_is_there(view: ViewServer) -> None:
 def test_bad_use_is_told_in_one_line(
     arguments: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("deploy.signals.stop_on_signals", threading.Event)
+    monkeypatch.setattr("deploy.agents.signals.stop_on_signals", threading.Event)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     assert run(["view", *arguments]) == 2

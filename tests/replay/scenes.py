@@ -14,9 +14,9 @@ from pathlib import Path
 import tomli_w
 
 from deploy.cli import run
-from deploy.process_replay import replay_through_hub
-from deploy.simulated import camera_tables
-from deploy.uav_replay import replay_through_uav
+from deploy.logs.replay_hub import replay_through_hub
+from deploy.logs.replay_uav import replay_through_uav
+from deploy.simulation.session import camera_tables
 from edge.agents.uav import TOPICS
 from edge.scenes import get_people
 from edge.scenes.people.scene import PeopleScene

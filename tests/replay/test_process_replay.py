@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from deploy.compare import as_table, compare_logs
-from deploy.demo_people import score_log
+from deploy.demo.people import score_log
+from deploy.logs.diff import as_table, compare_logs
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.log.read.reader import LogReader

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import deploy
-from deploy.agents import _detector as detector_of
-from deploy.agents import make_device
-from deploy.commands.agents import camera
-from deploy.config import CameraConfig, effective_toml, load
+from deploy.agents.assembly import _detector as detector_of
+from deploy.agents.assembly import make_device
+from deploy.commands.agents.run import camera
+from deploy.config.agents import CameraConfig, effective_toml, load
 from edge import scenes
 from edge.agents.image_health import PictureWatch
 from edge.detectors.marker.ball import MarkerDetector
@@ -21,7 +21,7 @@ from edge.detectors.marker.tag import TagDetector
 from edge.devices.base import Frame
 from protocols.core.errors import InputError
 
-BOARDS = sorted((Path(deploy.__file__).parent / "boards").glob("*.toml"))
+BOARDS = sorted((Path(deploy.__file__).parent / "examples" / "boards").glob("*.toml"))
 DRIVERS = {
     "oak": "OakCamera",
     "usb": "UsbCamera",
@@ -125,6 +125,6 @@ def test_dim_light_noise_and_water_are_no_blur() -> None:
 def test_what_a_boards_bundle_goes_without_is_told(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "cam.toml"
     file.write_text(f'id = "a"\n{text}\n')
-    monkeypatch.setattr("deploy.agents.find_spec", lambda name: None)
+    monkeypatch.setattr("deploy.agents.assembly.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"needs SciPy.*--extra scipy"):
         detector_of(load(file, CameraConfig), None, 30.0)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from deploy.bundle import BUDGET_MB, NEEDS, Target, _lock, _requirements, _script
 from deploy.cli import run
+from deploy.site.bundle import BUDGET_MB, NEEDS, Target, _lock, _requirements, _script
 from protocols.core.errors import InputError
 
 

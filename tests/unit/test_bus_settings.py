@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from deploy.config import HubConfig, load
-from deploy.supervised import checked
+from deploy.agents.startup_checks import checked
+from deploy.config.agents import HubConfig, load
 from protocols.bus.settings import BusConfig, TlsConfig, is_loopback, open_to_others
 from protocols.bus.transport.delivery import cache_size
 from protocols.bus.transport.session import LEASE_MS, MAX_MESSAGE_SIZE, _settings

@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from deploy.config import BusConfig, CameraConfig, HubConfig, RecorderConfig, effective_toml, load
+from deploy.config.agents import BusConfig, CameraConfig, HubConfig, RecorderConfig, effective_toml, load
 from protocols.bus.settings import LOOPBACK_ROUTER, is_loopback
 from protocols.core.errors import InputError
 

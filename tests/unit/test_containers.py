@@ -14,10 +14,10 @@ from typing import Any
 
 import pytest
 
-from deploy.bundle import NEEDS
-from deploy.config import CameraConfig, HubConfig, RecorderConfig, RouterConfig, load
+from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig, RouterConfig, load
+from deploy.site.bundle import NEEDS
 
-FOLDER = Path(__file__).resolve().parents[2] / "deploy" / "containers"
+FOLDER = Path(__file__).resolve().parents[2] / "deploy" / "site" / "containers"
 TEXT = (FOLDER / "Containerfile").read_text(encoding="utf-8")
 HADOLINT = shutil.which("hadolint") or shutil.which(str(Path(sys.executable).parent / "hadolint"))
 

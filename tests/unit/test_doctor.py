@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
-from deploy.doctor import agent, examine, machine
-from deploy.doctor.finding import Finding, exit_status, missing, ok, warn, wrong
+from deploy.site.doctor import agent, examine, machine
+from deploy.site.doctor.finding import Finding, exit_status, missing, ok, warn, wrong
 from edge.agents.clock_quality import kernel_clock
 from edge.devices.base import DeviceInfo, Frame
 from protocols.bus.settings import BusConfig

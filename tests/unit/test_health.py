@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from deploy.config import HealthConfig
-from deploy.health import LIVE_S, Health, HealthServer
+from deploy.agents.health import LIVE_S, Health, HealthServer
+from deploy.config.agents import HealthConfig
 from protocols.bus.base import Refusal
 from protocols.messages import syncline_pb2 as pb
 from protocols.validation.codec import Reason

@@ -9,7 +9,7 @@ import pytest
 
 GROWTH = """
 import os, sys
-from deploy.heap import steady_heap
+from deploy.agents.malloc_tuning import steady_heap
 if sys.argv[1] == "steady" and not steady_heap(give_back=True):
     print("cannot"); sys.exit()
 import numpy as np
@@ -38,7 +38,7 @@ def test_what_a_solver_frees_goes_back_to_the_system() -> None:
 
 FAULTS = """
 import resource, sys
-from deploy.heap import keep_heap
+from deploy.agents.malloc_tuning import keep_heap
 if sys.argv[1] == "kept" and not keep_heap():
     print("cannot"); sys.exit()
 import numpy as np

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from deploy.cli import run
-from deploy.install import units
-from deploy.install.plan import _commands, plan_install
+from deploy.site.install import units
+from deploy.site.install.plan import _commands, plan_install
 
 NEEDS_SYSTEMD = pytest.mark.skipif(
     shutil.which("systemd-analyze") is None, reason="systemd-analyze is not here: UNIT FILES ARE NOT CHECKED"

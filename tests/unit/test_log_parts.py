@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from deploy.cli import run
-from deploy.sessions import load_session
+from deploy.offline.sessions import load_session
 from protocols.core.errors import InputError
 from protocols.log.read.parts import find_parts
 from protocols.log.read.reader import Logged, LogReader

@@ -13,7 +13,7 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.reader import make_reader
 
-from deploy.info import describe_log
+from deploy.logs.info import describe_log
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.log.read.reader import LogReader

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy.notify import ALIVE_FILE, Notifier, Watched
+from deploy.agents.systemd_notify import ALIVE_FILE, Notifier, Watched
 from edge.devices.base import DeviceInfo, Frame, Returning
 
 

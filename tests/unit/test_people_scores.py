@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deploy.people_scores import Moment, clear_mot
+from deploy.evaluation.clear_mot import Moment, clear_mot
 
 
 def moment(truth: dict[str, float], found: dict[str, float]) -> Moment:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
-from deploy.config import CameraConfig, HubConfig, load
-from deploy.fleet import read_state
-from deploy.rig_folder import SHIPPED, find_rig, prepare, read_rig_folder
+from deploy.config.agents import CameraConfig, HubConfig, load
+from deploy.site.fleet import read_state
+from deploy.site.rig_folder import SHIPPED, find_rig, prepare, read_rig_folder
 from edge import scenes
 from edge.scenes.common.scaled import scaled, scaled_lens
 from protocols.core.errors import InputError

@@ -1,0 +1,1 @@
+"""Agents as processes: assembly from configuration, health, systemd, recorder."""

@@ -1,0 +1,240 @@
+"""Puts an agent together from its configuration: which device, which detector, which estimator."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+
+from deploy.agents.malloc_tuning import trim
+from deploy.config.agents import CameraConfig, HubConfig, OakConfig, PiConfig, SimulatedConfig, UsbConfig
+from edge.detectors.base import Detector
+from edge.devices.base import Device
+from protocols.bus.base import Bus
+from protocols.core.errors import EXIT_DONE, InputError
+from protocols.geometry.camera import Intrinsics
+from protocols.session.rig import Rig, RigCamera, read_rig
+
+_DAY_S = 86_400.0
+
+
+def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event, beat: Callable[[], None] = lambda: None) -> int:
+    """Run a camera agent until it is stopped or its recording ends. beat: called with every frame."""
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # a source that doesn't open is told by us, in one line
+    import cv2
+
+    from deploy.agents.systemd_notify import Watched
+    from edge.agents.camera import run_camera_agent
+
+    cv2.setNumThreads(1)  # one core a camera: several agents share a board
+    known = _known_camera(config)
+    device = make_device(config, None if known is None else known.intrinsics)
+    if config.driver == "log":
+        device.open()  # the lens and the rate are in the log
+        if damage := getattr(device, "damage", ""):
+            print(f"{config.id}: the log is damaged, its good part is played: {damage}", file=sys.stderr, flush=True)
+    told = device.info if config.driver in ("simulated", "log") else None
+    lens = told.intrinsics if told is not None else None if known is None else known.intrinsics
+    detector = _detector(config, lens, _fps(config) if told is None or told.fps <= 0.0 else told.fps)
+    run_camera_agent(
+        Watched(device, beat),
+        detector,
+        bus,
+        config.id,
+        stop,
+        known=known,
+        pictures_hz=config.pictures_hz,
+        picture_width=config.picture_width,
+        predictions=config.detector != "marker",
+    )
+    return EXIT_DONE
+
+
+def _detector(config: CameraConfig, lens: Intrinsics | None, fps: float) -> Detector:
+    network = config.driver == "oak" and config.oak is not None and config.oak.nn is not None
+    if (network or config.detector != "marker") and find_spec("scipy") is None:
+        what = "oak.nn" if network else f'detector = "{config.detector}"'
+        raise InputError(
+            f"{what} needs SciPy, which a camera's bundle goes without",
+            remedy="pip install scipy, or make the bundle with --extra scipy",
+        )
+    if config.detector == "marker":
+        from edge.detectors.marker.ball import MarkerDetector, MarkerModel
+
+        marker = config.marker
+        if marker.mode != "colour":
+            from deploy.offline.detect import other_marker
+
+            return other_marker(
+                marker.mode, marker.threshold, marker.dictionary, marker.label, marker.min_size, marker.max_size
+            )
+        model = MarkerModel.default() if marker.colour is None else MarkerModel.of_colour(*marker.colour)
+        return MarkerDetector(
+            replace(model, label=marker.label),
+            intrinsics=lens,
+            min_size=marker.min_size or 0.0,
+            max_size=marker.max_size or math.inf,
+        )
+    moving = config.moving
+    if config.detector == "person":
+        from edge.detectors.people.person import PersonDetector
+
+        # Cameras do not know each other's people: their labels must not look like the same points.
+        return PersonDetector(moving.background, fps, prefix=f"{config.id[:48]}-p")
+    from edge.detectors.moving.vehicle import VehicleDetector
+
+    camera = {"auto": None, "fixed": False, "moving": True}[moving.camera]
+    return VehicleDetector(moving.background, fps, prefix=f"{config.id[:48]}-t", moving=camera)
+
+
+def _fps(config: CameraConfig) -> float:
+    """What the configuration says of the frame rate; 25 where it says nothing."""
+    if config.driver == "video" and config.video is not None and config.video.fps is not None:
+        return config.video.fps
+    tables = {"oak": config.oak, "usb": config.usb, "picamera2": config.picamera2, "rtsp": config.rtsp}
+    table = tables.get(config.driver)
+    return 25.0 if table is None or table.fps is None else table.fps
+
+
+def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable[[], None] = lambda: None) -> int:
+    """Run the hub until it is stopped; its answers are also files where `out` is given. beat: called every round."""
+    from hub.distributed.network.host import NodeHost
+    from hub.live.agent import run_hub
+    from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
+    from protocols.session.calibration import read_calibration
+
+    rig = None if config.rig is None else read_rig(config.rig)
+    nodes = NodeHost(config.id, config.nodes, leave_after_s=config.leave_after_s) if config.pose_nodes else None
+    known = None if config.known is None else KnownCalibration(*read_calibration(config.known))
+    settings = LiveSettings(config.window_s, config.interval_s, solve=config.solve, track=config.track)
+    hub = LiveHub(settings, rig, None if known is not None else nodes, known)
+    export = None if config.out is None else partial(_export, out=config.out)
+    # A solve leaves holes behind it, which would add up.
+    run_hub(hub, bus, config.id, stop, rig=rig, beat=beat, export=export, solved=lambda _: trim())
+    if config.out is not None:
+        write_last(hub, config.out)
+    return EXIT_DONE
+
+
+def _export(hub: object, out: Path) -> str:
+    """Write the files because a view asked for them; one line on what came of it, and never an end of the hub."""
+    try:
+        write_last(hub, out)
+    except InputError as error:
+        return f"not exported: {error}"
+    return f"exported to {out}"
+
+
+def write_last(hub: object, out: Path) -> None:
+    """The hub's last answer, or its last refusal, as the files that `calibrate` writes."""
+    # Only here: with it comes the report, which costs a camera agent a fifth of a second of its start.
+    from deploy.offline.outputs import write_outputs, write_refusal
+    from hub.live.live_hub import LiveHub
+
+    assert isinstance(hub, LiveHub)
+    if hub.session is None:
+        return
+    rig, observations = hub.session
+    if hub.refusal is not None:
+        write_refusal(out, hub.refusal, rig, observations, "syncline hub")
+    elif hub.calibration is not None:
+        write_outputs(out, hub.calibration, rig, observations, "syncline hub")
+
+
+def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:
+    """The device that the configuration names, not yet open."""
+    if config.driver == "simulated":
+        return _simulated(config)
+    if config.driver == "oak":
+        from edge.devices.live.oak import OakCamera, OakSettings
+
+        oak = config.oak or OakConfig()
+        settings = OakSettings(
+            oak.device,
+            oak.socket,
+            oak.size,
+            oak.fps,
+            oak.exposure_us,
+            oak.iso,
+            oak.focus,
+            oak.nn,
+            oak.labels,
+            oak.confidence,
+            prefix=config.id[:48],
+        )
+        return OakCamera(settings, intrinsics=intrinsics)
+    if config.driver == "usb":
+        from edge.devices.live.usb import UsbSettings, open_usb
+
+        usb = config.usb or UsbConfig()
+        place = f"/dev/video{usb.device}" if usb.device.isdigit() else str(usb.device)
+        return open_usb(
+            UsbSettings(place, usb.size, usb.fps, usb.pixels, usb.exposure_us, usb.gain, usb.readout_s),
+            intrinsics=intrinsics,
+        )
+    if config.driver == "picamera2":
+        from edge.devices.live.picamera import PiCamera, PiSettings
+
+        pi = config.picamera2 or PiConfig()
+        made = PiSettings(pi.camera, pi.size, pi.fps, pi.exposure_us, pi.gain, pi.readout_s)
+        return PiCamera(made, intrinsics=intrinsics)
+    if config.driver == "rtsp":
+        from edge.devices.live.network import open_network
+
+        assert config.rtsp is not None  # the configuration has seen to that
+        url, transport = config.rtsp.url, config.rtsp.transport
+        return open_network(url, transport=transport, fps=config.rtsp.fps, intrinsics=intrinsics)
+    from edge.devices.playback.playback_clock import RealTime
+
+    if config.driver == "log":
+        from edge.devices.playback.log_playback import LoggedCamera
+
+        assert config.log is not None  # the configuration has seen to that
+        pace = None if config.log.fast else RealTime(time.time())
+        return LoggedCamera(config.log.file, config.log.camera or config.id, pace=pace, intrinsics=intrinsics)
+    from edge.devices.playback.open_video import open_video
+
+    assert config.video is not None  # the configuration has seen to that
+    return open_video(
+        str(config.video.source),
+        fps=config.video.fps,
+        loop=config.video.loop,
+        pace=RealTime(time.time()),
+        intrinsics=intrinsics,
+    )
+
+
+def _simulated(config: CameraConfig) -> Device:
+    from edge import scenes
+    from edge.devices.playback.playback_clock import RealTime
+    from edge.devices.simulated.camera import SimulatedDevice
+    from edge.scenes.common.scaled import scaled
+
+    world = config.simulated or SimulatedConfig()
+    epoch = world.start_unix_s
+    if epoch is None:
+        epoch = time.time() // _DAY_S * _DAY_S
+    scene = scenes.any_scene(world.scene, world.seed, world.cameras)
+    if world.width is not None or world.fps is not None:
+        scene = scaled(scene, world.width, world.fps)
+    camera = world.camera or config.id
+    return SimulatedDevice(scene, camera, world.seed, RealTime(epoch), duration_s=world.duration_s)
+
+
+def _known_camera(config: CameraConfig) -> RigCamera | None:
+    if config.rig is None:
+        return None
+    rig: Rig = read_rig(config.rig)
+    camera = rig.cameras.get(config.id)
+    if camera is None:
+        raise InputError(
+            f"no camera {config.id!r} ({', '.join(rig.cameras)})", file=config.rig, remedy=f"add [{config.id}] to it"
+        )
+    return camera

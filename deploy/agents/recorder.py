@@ -1,0 +1,207 @@
+"""The recorder: everything of a site that the catalogue calls recorded, into one log."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+import uuid
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from math import inf
+from pathlib import Path
+
+from deploy.config.agents import RecorderConfig, effective_toml
+from protocols.bus.base import Bus, Received, Subscription
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
+from protocols.core.version import VERSION
+from protocols.log.write.rotation import RotatingWriter
+from protocols.log.write.writer import LogWriter
+from protocols.messages import syncline_pb2 as pb
+from protocols.topics import PICTURE, STATUS, TOPICS
+from protocols.validation.codec import SCHEMA_VERSION
+
+ROLE = "record"
+_TICK_S = 0.02
+_SYNC_S = 0.5
+"""Half of the second that may be lost: the writing and the disk need time too."""
+_STATUS_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderResult:
+    """What was recorded. counters: recorded, dropped, lost, skipped, rejected.<reason>, summed over all topics.
+
+    path: the log, or the first of its parts. stopped: why it ended before it was told to; "" if it did not.
+    """
+
+    path: Path
+    messages: int
+    counters: Mapping[str, int]
+    parts: int = 1
+    stopped: str = ""
+
+
+def free_bytes(folder: Path) -> int:
+    """Bytes that may still be written below ``folder``, which need not be there yet."""
+    place = next(parent for parent in (folder, *folder.absolute().parents) if parent.is_dir())
+    return shutil.disk_usage(place).free
+
+
+def disk_bytes(folder: Path) -> int:
+    """Size of the disk below ``folder``, which need not be there yet."""
+    place = next(parent for parent in (folder, *folder.absolute().parents) if parent.is_dir())
+    return shutil.disk_usage(place).total
+
+
+def log_path(out: Path, now: datetime) -> Path:
+    """The file to write: ``out`` itself if it is named .mcap, else a new one in the folder ``out``."""
+    if out.suffix == ".mcap":
+        return out
+    return out / now.strftime("syncline-%Y%m%dT%H%M%SZ.mcap")
+
+
+def run_recorder(
+    config: RecorderConfig,
+    bus: Bus,
+    stop: threading.Event,
+    *,
+    stop_when: Callable[[int], bool] | None = None,
+    boot_id: str | None = None,
+    free: Callable[[Path], int] = free_bytes,
+    beat: Callable[[], None] = lambda: None,
+) -> RecorderResult:
+    """Record until ``stop`` is set, until ``stop_when(messages so far)`` is true, or until the disk is nearly full.
+
+    Log times are the arrival times. Twice a second the log is brought to the disk; each second the recorder's
+    status is published. free: bytes left where the log is. beat: called after every round. Raises InputError if the log
+    exists already or cannot be written, or if the disk is too full to begin.
+    """
+    boot = boot_id or uuid.uuid4().hex
+    path = log_path(config.out, datetime.now(UTC))
+    full = _too_full(config, path, free)
+    if full:
+        raise InputError(f"not recorded: {full}", file=path, remedy="make room, or lower min_free_mb")
+    with _writer(config, path, bus.site, boot) as writer, bus.announce(ROLE, config.id, boot):
+        # Cameras send pictures only where somebody wants them.
+        wanted = [topic for topic in TOPICS if topic.recorded and (config.pictures_hz > 0.0 or topic is not PICTURE)]
+        subscriptions = [bus.subscribe(topic) for topic in wanted]
+        thinned = Thinned(config.pictures_hz)
+        publisher = bus.publisher(STATUS, config.id)
+        status = pb.AgentStatus(
+            schema_version=SCHEMA_VERSION, agent=config.id, role=ROLE, boot_id=boot, state="running", version=VERSION
+        )
+        messages = 0
+        next_sync = next_status = time.monotonic()
+        try:
+            while not stop.is_set() and not (stop_when is not None and stop_when(messages)) and not full:
+                messages += _record(writer, bus.site, subscriptions, thinned)
+                now = time.monotonic()
+                if now >= next_sync:
+                    next_sync = now + _SYNC_S
+                    writer.sync()
+                    full = _too_full(config, path, free)
+                    # Only right after a sync: what it reports as recorded is on the disk.
+                    if now >= next_status or full:
+                        next_status = now + _STATUS_S - _SYNC_S / 2
+                        _report(status, subscriptions, messages, writer.size, full)
+                        publisher.put(status)
+                        status.sequence += 1
+                beat()
+                if not full:
+                    stop.wait(_TICK_S)
+            messages += _record(writer, bus.site, subscriptions, thinned)
+            counters = _counters(subscriptions, messages)
+        finally:
+            publisher.close()
+            for subscription in subscriptions:
+                subscription.close()
+    return RecorderResult(
+        writer.first if isinstance(writer, RotatingWriter) else path,
+        messages,
+        counters,
+        writer.parts if isinstance(writer, RotatingWriter) else 1,
+        full,
+    )
+
+
+def _writer(config: RecorderConfig, path: Path, site: str, boot: str) -> LogWriter | RotatingWriter:
+    metadata = {
+        "syncline": {
+            "site": site,
+            "recorder": config.id,
+            "boot_id": boot,
+            "schema_version": str(SCHEMA_VERSION),
+            "version": VERSION,
+        },
+        "configuration": {"recorder.toml": effective_toml(config)},
+    }
+    if config.part_s is None and config.part_mb is None:
+        return LogWriter(path, metadata, views=config.foxglove)
+    max_bytes = None if config.part_mb is None else round(config.part_mb * 1e6)
+    return RotatingWriter(path, metadata, boot, max_bytes=max_bytes, max_s=config.part_s, views=config.foxglove)
+
+
+def _too_full(config: RecorderConfig, path: Path, free: Callable[[Path], int]) -> str:
+    """Why the disk has no room for more; "" while it has."""
+    left = free(path.parent) / 1e6
+    if left < config.min_free_mb:
+        return f"{left:.0f} MB are free on the disk, min_free_mb is {config.min_free_mb:g}"
+    share = 100.0 * left * 1e6 / disk_bytes(path.parent) if free is free_bytes else 100.0
+    if share < config.min_free_percent:
+        return f"{share:.1f} % of the disk are free, min_free_percent is {config.min_free_percent:g}"
+    return ""
+
+
+class Thinned:
+    """Lets through at most ``hz`` pictures of each camera a second; what else there is, always."""
+
+    def __init__(self, hz: float) -> None:
+        # A picture that comes a little early is the one that was due.
+        self._apart_ns = 0.9 * NANOSECONDS / hz if hz > 0.0 else inf
+        self._last: dict[str, int] = {}
+
+    def keeps(self, received: Received) -> bool:
+        """Whether to record it."""
+        if received.topic is not PICTURE:
+            return True
+        last = self._last.get(received.agent)
+        # A clock that was set back does not end the pictures.
+        if last is not None and 0 <= received.arrival_ns - last < self._apart_ns:
+            return False
+        self._last[received.agent] = received.arrival_ns
+        return True
+
+
+def _record(writer: LogWriter | RotatingWriter, site: str, subscriptions: list[Subscription], thinned: Thinned) -> int:
+    """Write what has arrived, in the order of arrival over all topics."""
+    arrived = [received for subscription in subscriptions for received in subscription.drain()]
+    batch = [received for received in arrived if thinned.keeps(received)]
+    batch.sort(key=lambda received: received.arrival_ns)
+    for received in batch:
+        writer.write(received.topic, received.agent, site, received.message, received.arrival_ns)
+    return len(batch)
+
+
+def _counters(subscriptions: list[Subscription], messages: int) -> dict[str, int]:
+    counts: Counter[str] = Counter()
+    for subscription in subscriptions:
+        counts.update(subscription.counters)
+    counts.pop("received", None)
+    return {"recorded": messages, **counts}
+
+
+def _report(status: pb.AgentStatus, subscriptions: list[Subscription], messages: int, size: int, full: str) -> None:
+    counters = _counters(subscriptions, messages)
+    missing = counters.get("dropped", 0) + counters.get("lost", 0) + counters.get("skipped", 0)
+    status.state = "degraded" if missing else "running"
+    status.message = f"{missing} messages are missing from the log" if missing else f"{messages} messages"
+    if full:
+        status.state, status.message = "stopping", f"recording ended: {full}"
+    status.counters.clear()
+    for name, count in counters.items():
+        status.counters[name] = count
+    status.gauges["log_bytes"] = size

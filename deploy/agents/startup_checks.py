@@ -1,0 +1,44 @@
+"""What every agent's process does around its agent: checks of its certificate, and its health over HTTP."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+from deploy.agents.health import Health, HealthServer
+from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig, RouterConfig
+from protocols.bus.settings import open_to_others
+
+_ROLES: dict[type, str] = {CameraConfig: "camera", HubConfig: "hub", RecorderConfig: "record", RouterConfig: "router"}
+_RENEW_DAYS = 3.0
+
+
+def role_of(settings: Any) -> str:
+    """The role that an agent's configuration is of, as its certificate names it."""
+    kind = type(settings)
+    return _ROLES.get(kind, kind.__name__.removesuffix("Config").lower())
+
+
+def checked(settings: Any) -> None:
+    """Raise InputError where the certificate is not this agent's; warn of one that ends soon, and of open doors."""
+    tls = settings.bus.tls
+    if tls is not None:
+        from protocols.bus.security.tls import check_files, check_owner, days_left
+
+        check_files(tls)
+        check_owner(tls, role_of(settings), settings.id)
+        left = days_left(tls.certificate)
+        if left < _RENEW_DAYS:
+            _warn(f"{tls.certificate} is valid for {left:.1f} days more; renew it with `syncline keys issue`")
+    for endpoint in open_to_others(settings.bus):
+        _warn(f"{endpoint} lets everyone on the network in; see `syncline keys`")
+
+
+def serve_health(settings: Any, health: Health) -> AbstractContextManager[object]:
+    """The HTTP server that [health] asks for, or nothing."""
+    return nullcontext() if settings.health is None else HealthServer(settings.health, health)
+
+
+def _warn(text: str) -> None:
+    print(f"syncline: {text}", file=sys.stderr, flush=True)

@@ -1,0 +1,167 @@
+"""`syncline demo`: the whole line on one machine, ending with recovered against true."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
+
+if TYPE_CHECKING:
+    from rich.live import Live as RichLive
+
+    from deploy.demo.marker import Live
+
+
+def demo(
+    *,
+    seconds: float | None = None,
+    cameras: int | None = None,
+    scene: Literal["marker", "people", "town"] = "marker",
+    out: Path = Path("demo-out"),
+    view: Annotated[bool, Parameter(negative="")] = False,
+    view_port: int = 8080,
+    seed: int = 1,
+    json: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Film a simulated marker with cameras that share no clock, find clocks and places, compare with the truth.
+
+    --scene people: calibrated cameras find people who walk about a room, the hub follows them in 3-D.
+    --scene town: a drone over a town; a ground station selects a car by MAVLink and hears where it is, also when it is
+    out of the picture.
+    Cameras, hub and recorder are processes that talk over Zenoh on this machine. Ends with a table of recovered against
+    true, the log demo.mcap and report.html (people: tracks.csv) in --out. Exit status 3 if the errors are larger than
+    promised.
+
+    Example: syncline demo --cameras 4 --seconds 40 --out demo-out
+
+    Parameters
+    ----------
+    seconds
+        How long to film; without it 30, or 60 for people.
+    cameras
+        How many cameras, 2 to 20; without it 3, or 5 for people.
+    scene
+        marker: a marker waved in a room. people: five walkers in a room. town: a car from a drone.
+    out
+        Folder for the results.
+    view
+        Show it live in a browser too: prints the address to open.
+    view_port
+        Port of the live view; 0 = any free one.
+    seed
+        Of the simulated world: same seed, same cameras and motion.
+    json
+        Print the table as JSON.
+    """
+    if cameras is None:
+        cameras = 5 if scene == "people" else 3
+    if seconds is None:
+        seconds = 60.0 if scene == "people" else 30.0  # what is promised of people is so of a minute
+    if seed < 0:
+        raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
+    if not 2 <= cameras <= 20:
+        raise InputError(f"--cameras {cameras} is out of range", remedy="give 2 to 20")
+    if not 5.0 <= seconds <= 3600.0:
+        raise InputError(f"--seconds {seconds:g} is out of range", remedy="give 5 to 3600")
+    if scene == "town":
+        return _town(out, seconds, seed, view_port if view else None, as_json=json)
+    from deploy.demo.marker import DemoSettings, Fleet
+
+    settings = DemoSettings(scene, seed, cameras, seconds, out, view_port if view else None)
+    if scene == "people":
+        from deploy.demo.people import PeopleFleet, compare_with_people
+
+        people = PeopleFleet(settings)
+        with _display(seconds, people.names, quiet=json, what="people") as show:
+            people.run(show)
+        followed = compare_with_people(out, seed, cameras)
+        if json:
+            print(followed.as_json())
+        else:
+            followed.print(out)
+        return EXIT_DONE if followed.good else EXIT_REFUSED
+    from deploy.evaluation.ground_truth import compare_with_truth
+
+    fleet = Fleet(settings)
+    with _display(seconds, fleet.names, quiet=json) as show:
+        live = fleet.run(show)
+    comparison = compare_with_truth(out, scene, seed, cameras)
+    if json:
+        print(comparison.as_json(live.first_calibration_s))
+    else:
+        comparison.print(live.first_calibration_s, out)
+    return EXIT_DONE if comparison.good else EXIT_REFUSED
+
+
+def _town(out: Path, seconds: float, seed: int, view_port: int | None, *, as_json: bool) -> int:
+    from deploy.demo.flight import run_town
+    from deploy.demo.flight_display import Display
+    from deploy.demo.flight_outcome import as_json as to_json
+    from deploy.demo.flight_outcome import print_outcome
+
+    with Display(seconds, quiet=as_json) as show:
+
+        def viewed(address: str) -> None:
+            print(f"live view: open {address}", file=sys.stderr if as_json else sys.stdout, flush=True)
+
+        outcome = run_town(out, seconds, seed, show, view_port=view_port, viewed=viewed)
+    if as_json:
+        print(to_json(outcome))
+    else:
+        print_outcome(outcome, out)
+    return EXIT_DONE if outcome.good else EXIT_REFUSED
+
+
+class _display:
+    """Live progress: a bar, and what each camera has seen. On a terminal it redraws, elsewhere it prints lines."""
+
+    def __init__(self, seconds: float, names: list[str], quiet: bool, what: str = "marker") -> None:
+        self._seconds, self._names, self._quiet, self._what = seconds, names, quiet, what
+        self._printed = -10.0
+        self._told = False
+        self._live: RichLive | None = None
+
+    def __enter__(self):  # type: ignore[no-untyped-def]
+        if not self._quiet and sys.stdout.isatty():
+            from rich.console import Console
+            from rich.live import Live as RichLive
+
+            self._live = RichLive(console=Console(), refresh_per_second=4, transient=True)
+            self._live.__enter__()
+        return self.show
+
+    def __exit__(self, *details: object) -> None:
+        if self._live is not None:
+            self._live.__exit__(None, None, None)
+
+    def show(self, live: Live) -> None:
+        """Draw the state."""
+        if live.address and not self._told:
+            self._told = True
+            print(f"live view: open {live.address}", file=sys.stderr if self._quiet else sys.stdout, flush=True)
+        if self._quiet:
+            return
+        seen = "  ".join(
+            f"{name} {live.detections.get(name, 0)}/{live.observations.get(name, 0)}" for name in self._names
+        )
+        if self._live is None:
+            if live.elapsed - self._printed >= 5.0:
+                self._printed = live.elapsed
+                print(f"{live.elapsed:5.1f} s  {seen}  {live.status}", flush=True)
+            return
+        from rich.console import Group
+        from rich.progress_bar import ProgressBar
+        from rich.text import Text
+
+        self._live.update(
+            Group(
+                Text(f"filming {live.elapsed:4.0f} of {self._seconds:.0f} s"),
+                ProgressBar(total=self._seconds, completed=min(live.elapsed, self._seconds), width=60),
+                Text(f"{self._what} seen / frames: {seen}"),
+                Text(live.status),
+            )
+        )

@@ -1,0 +1,189 @@
+"""`syncline quick`: two webcams, no configuration."""
+
+from __future__ import annotations
+
+import json as json_module
+import os
+import shlex
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from protocols.core.errors import EXIT_DONE, InputError, Refused
+
+if TYPE_CHECKING:
+    from edge.devices.base import Device
+    from hub.view.server import ViewServer
+
+_Flag = Annotated[bool, Parameter(negative="")]
+
+
+def quick(
+    *,
+    cameras: str = "0,1",
+    source: tuple[Path, ...] = (),
+    simulated: _Flag = False,
+    out: Path = Path("quick-out"),
+    target: str | None = None,
+    rig: Path | None = None,
+    field_of_view: float = 65.0,
+    seconds: float = 300.0,
+    port: int = 8080,
+    headless: _Flag = False,
+    seed: int = 1,
+    json: _Flag = False,
+) -> int:
+    """Calibrate the cameras that are plugged in here: watch, wave a ball, done. No configuration file.
+
+    Prints the address of a page that shows what the cameras see, with a ring around the marker. Click on the ball if
+    it has no ring, wave it where the page says, and it ends by itself once every clock is known to half a
+    millisecond (or by the button Finish). Writes what `syncline calibrate` writes to --out and opens the report.
+
+    Webcams whose lens nobody measured are taken to be --field-of-view degrees wide: times are right, places are
+    rough. `syncline intrinsics` measures a lens; --rig takes it (cameras cam0, cam1, …).
+
+    Example: syncline quick --cameras 0,1 --out quick-out
+
+    Example: syncline quick --source left.mp4 --source right.mp4 --target 310,220,40,40
+
+    Parameters
+    ----------
+    cameras
+        Numbers of the webcams, or /dev/video…, separated by commas.
+    source
+        Video files in place of webcams, one option a file; each is its camera's view of the same time.
+    simulated
+        Two simulated cameras, to try it without any.
+    out
+        Folder for the results.
+    target
+        The marker as a box x,y,w,h in pixels of the first camera's first picture, instead of a click.
+    rig
+        rig.toml with lenses or known places.
+    field_of_view
+        How wide a webcam's picture is, in degrees, where no lens is known.
+    seconds
+        When it ends at the latest.
+    port
+        Of the page; 0 = any free one.
+    headless
+        No page: for scripts.
+    seed
+        Of the simulated world.
+    json
+        Print the result as JSON.
+    """
+    if not 5.0 <= field_of_view <= 170.0:
+        raise InputError(f"--field-of-view {field_of_view:g} is out of range", remedy="give 5 to 170 degrees")
+    if not 1.0 <= seconds <= 86_400.0:
+        raise InputError(f"--seconds {seconds:g} is out of range", remedy="give 1 to 86400")
+    if simulated and source:
+        raise InputError("--simulated and --source exclude each other", remedy="leave one of the two out")
+    if seed < 0:
+        raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
+    box = None if target is None else _box(target)
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+    import cv2
+
+    from deploy.agents.quick import Quick, QuickSettings, show_report
+    from deploy.agents.signals import stop_on_signals
+    from deploy.offline.outputs import remove_outputs, write_outputs, write_refusal
+    from protocols.core.files import check_folder
+    from protocols.session.rig import read_rig
+
+    cv2.setNumThreads(1)
+    check_folder(out)
+    remove_outputs(out)
+    devices = _simulated(seed) if simulated else _films(source) if source else _webcams(cameras)
+    known = None if rig is None else read_rig(rig)
+    view = None if headless else _page(port)
+    told = (lambda text: None) if json else lambda text: print(text, flush=True)
+    settings = QuickSettings(
+        devices, out, field_of_view, live=not source, seconds=seconds, rig=known, target=box, tell=told
+    )
+    run = Quick(settings, view)
+    if view is not None:
+        print(json_module.dumps({"address": view.address}) if json else f"open {view.address}", flush=True)
+    began = time.process_time()
+    hub = run.run(stop_on_signals())
+    if hub.session is None:
+        raise Refused(hub.missing() or "nothing was seen")
+    rig_seen, observations = hub.session
+    guess = f"the lens of {', '.join(run.guessed)} is a guess of {field_of_view:g} degrees: places are rough"
+    warnings = (guess,) if run.guessed else ()
+    command = shlex.join(["syncline", *sys.argv[1:]])
+    cpu = time.process_time() - began
+    if hub.refusal is not None or hub.calibration is None:
+        refusal = hub.refusal or Refused(hub.missing() or "nothing was seen")
+        write_refusal(out, refusal, rig_seen, observations, command, cpu_seconds=cpu, warnings=warnings, echo_json=json)
+    else:
+        found = replace(hub.calibration, warnings=(*warnings, *hub.calibration.warnings), cpu_seconds=cpu)
+        write_outputs(out, found, rig_seen, observations, command, echo_json=json)
+    report = out / "report.html"
+    if view is not None and not show_report(report) and not json:
+        print(f"the report is {report}")
+    if hub.refusal is not None:
+        raise hub.refusal
+    return EXIT_DONE
+
+
+def _box(text: str) -> tuple[float, float, float, float]:
+    try:
+        x, y, w, h = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"--target {text!r} is not four numbers", remedy="give x,y,w,h in pixels") from None
+    if not (w > 0 and h > 0):
+        raise InputError(f"--target {text!r} has no size", remedy="give x,y,w,h in pixels, w and h above 0")
+    return x, y, w, h
+
+
+def _webcams(cameras: str) -> dict[str, Device]:
+    from edge.devices.playback.open_video import open_video
+
+    places = [place.strip() for place in cameras.split(",") if place.strip()]
+    _enough(places, "--cameras")
+    for place in places:
+        if not (place.isdecimal() or place.startswith("/dev/") or "://" in place):
+            raise InputError(f"--cameras {place!r} is no camera", remedy="give numbers, as in 0,1, or /dev/video0")
+    return {f"cam{index}": open_video(place) for index, place in enumerate(places)}
+
+
+def _films(files: tuple[Path, ...]) -> dict[str, Device]:
+    from edge.devices.playback.open_video import open_video
+
+    _enough([str(file) for file in files], "--source")
+    for file in files:
+        if not file.exists():
+            raise InputError("this video does not exist", file=file, remedy="check the path")
+    # As fast as they are read: nobody waves at a file.
+    return {f"cam{index}": open_video(file) for index, file in enumerate(files)}
+
+
+def _simulated(seed: int) -> dict[str, Device]:
+    from edge import scenes
+    from edge.devices.playback.playback_clock import RealTime
+    from edge.devices.simulated.camera import SimulatedDevice
+
+    pace = RealTime(time.time())
+    scene = scenes.get("marker", seed, 2)
+    return {name: SimulatedDevice(scene, name, seed, pace) for name in ("cam0", "cam1")}
+
+
+def _enough(places: list[str], option: str) -> None:
+    if len(places) < 2:
+        raise InputError(f"{option} names {len(places)} of at least 2 cameras", remedy="give two or more")
+    if len(set(places)) < len(places):
+        raise InputError(f"{option} names a camera twice", remedy="give each once")
+
+
+def _page(port: int) -> ViewServer:
+    try:
+        from hub.view.server import ViewServer
+    except ImportError:
+        remedy = 'install it: pip install "syncline[view]", or give --headless'
+        raise InputError("the page needs viser", remedy=remedy) from None
+    return ViewServer(port=port, actions=("recalibrate",))

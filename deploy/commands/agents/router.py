@@ -1,0 +1,92 @@
+"""`syncline router`: what agents on several machines meet at."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+from cyclopts import Parameter
+
+from deploy.agents.signals import stop_on_signals
+from deploy.config.agents import RouterConfig, effective_toml, load
+from protocols.core.errors import EXIT_BUG, EXIT_DONE
+
+if TYPE_CHECKING:
+    from deploy.agents.systemd_notify import Notifier
+
+_RESTARTS = "SYNCLINE_ROUTER_RESTARTS"
+"""Carries the count over a restart that keeps the process; nothing depends on it."""
+
+
+def router(config: Path, /, *, print_config: Annotated[bool, Parameter(negative="")] = False) -> int:
+    """Run a router: agents in client mode connect to it, and it relays between them.
+
+    A canary goes through it four times a second. When nothing passes for 0.9 s it starts itself anew in place; agents
+    reconnect within half a second and what they published meanwhile is recovered.
+
+    Example: syncline router router.toml
+
+    Parameters
+    ----------
+    config
+        TOML file: id, site, [bus] with listen (default tcp/127.0.0.1:7447), connect to other routers, and the tls and
+        access that `syncline keys issue --role router` writes.
+    print_config
+        Show the configuration with all defaults filled in, and stop.
+    """
+    settings = load(config, RouterConfig)
+    if print_config:
+        print(effective_toml(settings), end="")
+        return EXIT_DONE
+    from deploy.agents.health import Health
+    from deploy.agents.startup_checks import checked, serve_health
+    from protocols.bus.base import BusDead
+    from protocols.bus.router.zenoh_router import RulesChanged, run_router
+
+    checked(settings)
+    restarts = int(os.environ.get(_RESTARTS, "0"))
+    notifier = _notifier()
+
+    def again(reason: str) -> NoReturn:
+        print(f"syncline: {reason}; starting anew", file=sys.stderr, flush=True)
+        os.environ[_RESTARTS] = str(restarts + 1)
+        # In place: whatever hangs in this process is gone, and its supervisor need not notice.
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+
+    stop = stop_on_signals()
+    health = Health()
+    try:
+        with serve_health(settings, health):
+            run_router(
+                settings.bus,
+                settings.site,
+                settings.id,
+                stop,
+                died=again,
+                restarts=restarts,
+                ready=lambda listen: print(f"relays at {', '.join(listen)}", flush=True),
+                beat=(lambda: None) if notifier is None else notifier.beat,
+                seen=health.seen,
+            )
+    except RulesChanged:
+        time.sleep(0.2)  # the file is whole by its rename; others of the same `keys issue` may follow
+        again("access rules have changed")
+    except BusDead as error:
+        print(f"syncline: {error}; start it again", file=sys.stderr)
+        return EXIT_BUG
+    finally:
+        if notifier is not None:
+            notifier.stopping()
+    return EXIT_DONE
+
+
+def _notifier() -> Notifier | None:
+    # Its imports cost as much time as all the rest, and a restart is waited for.
+    if "NOTIFY_SOCKET" not in os.environ and "SYNCLINE_ALIVE_FILE" not in os.environ:
+        return None
+    from deploy.agents.systemd_notify import Notifier
+
+    return Notifier.from_environment()

@@ -1,0 +1,184 @@
+"""`syncline view`: a rig in a browser, live or from a log."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from protocols.bus.settings import BusConfig
+from protocols.core.errors import EXIT_BUG, EXIT_DONE, InputError
+
+if TYPE_CHECKING:
+    from hub.view.server import ViewServer
+
+_Flag = Annotated[bool, Parameter(negative="")]
+
+
+def view(
+    source: Path | None = None,
+    /,
+    *,
+    connect: tuple[str, ...] = (),
+    site: str = "",
+    port: int = 8080,
+    listen: str = "127.0.0.1",
+    token: str = "",
+    look_only: _Flag = False,
+    browser: _Flag = False,
+    rerun: Path | None = None,
+    json: _Flag = False,
+) -> int:
+    """Show a rig in a browser: cameras, paths, uncertainty, and what each camera lacks.
+
+    Live from the bus with nothing or an agent's TOML file (its site and [bus] table); a .mcap log plays with a
+    timeline; the folder that `syncline calibrate` wrote shows its cameras and path. Prints the address to open.
+
+    Beyond this machine (--listen) the address carries a token, and nobody sees or does anything without it. The
+    connection is not encrypted: over a network that others share use a tunnel, ssh -L 8080:127.0.0.1:8080 HOST.
+
+    Example: syncline view --connect tcp/192.168.1.5:7447
+
+    Example: syncline view demo-out/demo.mcap
+
+    Example: syncline view out --rerun out.rrd
+
+    Parameters
+    ----------
+    source
+        An agent's TOML file, a .mcap log, or the folder of a calibration. Default: the bus on this machine.
+    connect
+        Where the site's router or agents are.
+    site
+        The site to look at. Default: the file's, or "local".
+    port
+        Of the page; 0 = any free one.
+    listen
+        Address to serve on; 0.0.0.0 = every interface.
+    token
+        Instead of a new one each time.
+    look_only
+        No button acts.
+    browser
+        Open the browser too.
+    rerun
+        Write a .rrd file for the rerun viewer from a log or a calibration instead of serving (needs rerun-sdk).
+    json
+        Print the address as JSON.
+    """
+    recording = None if source is None or source.suffix == ".toml" else _recording(source)
+    if rerun is not None:
+        if recording is None:
+            raise InputError("--rerun goes with a log or a calibration", remedy="name a .mcap file or a folder")
+        from deploy.logs.rerun_export import write_rrd
+
+        count = write_rrd(recording, rerun)
+        print(f"{rerun}: {count} messages")
+        return EXIT_DONE
+    if recording is not None and connect:
+        raise InputError("--connect goes with the bus, not with a recording", remedy="leave one of the two out")
+    serve = _server(listen, port, token, look_only)
+    from deploy.agents.signals import stop_on_signals
+
+    if recording is not None:
+        from hub.view.server import run_replay
+
+        def serve_replay(player: Any) -> ViewServer:
+            return _told(serve(player), browser, json)
+
+        run_replay(recording, serve_replay, stop_on_signals())
+        return EXIT_DONE
+    settings, wanted_site = _bus(source, connect, site)
+    return _live(settings, wanted_site, serve, browser, json)
+
+
+def _live(settings: BusConfig, site: str, serve: Callable[[Any], ViewServer], browser: bool, json: bool) -> int:
+    from deploy.agents.signals import stop_on_signals
+    from hub.view.server import run_view
+    from protocols.bus.base import BusDead, BusStopped
+    from protocols.bus.transport.zenoh_bus import open_bus
+
+    stop = stop_on_signals()
+    shown = _told(serve(None), browser, json)
+    try:
+        with open_bus(site, settings, stop=stop.is_set) as bus:
+            run_view(bus, shown, stop)
+    except BusStopped:
+        pass
+    except BusDead as error:
+        print(f"syncline: the bus has died: {error}; start the view again", file=sys.stderr)
+        return EXIT_BUG
+    finally:
+        shown.close()
+    return EXIT_DONE
+
+
+def _recording(source: Path) -> Any:
+    """What can be played. Raises InputError."""
+    if not source.exists():
+        raise InputError("there is no such file or folder", file=source, remedy="name a log, a folder or a TOML file")
+    from hub.view.player import CalibrationRecording, LogRecording
+
+    if source.is_dir() and (source / "calibration.toml").exists():
+        return CalibrationRecording(source)
+    if source.suffix == ".mcap" or (source.is_dir() and any(source.glob("*.mcap"))):
+        return LogRecording(source)
+    remedy = "name a .mcap log, a folder with calibration.toml, or an agent's .toml file"
+    raise InputError("neither a log nor a calibration", file=source, remedy=remedy)
+
+
+def _bus(source: Path | None, connect: tuple[str, ...], site: str) -> tuple[BusConfig, str]:
+    """How to reach the site. Raises InputError."""
+    if source is None:
+        if not connect:
+            return BusConfig(), site or "local"
+        config = BusConfig(mode="client", connect=connect)
+        config.endpoints()
+        return config, site or "local"
+    from deploy.config.agents import ViewConfig, load
+
+    settings = load(source, ViewConfig)
+    bus = _beside(settings.bus) if not connect else BusConfig(mode="client", connect=connect)
+    bus.endpoints()
+    return bus, site or settings.site
+
+
+def _beside(bus: BusConfig) -> BusConfig:
+    """How to reach the bus of an agent from beside it: where it listens, there is no room for a second one."""
+    if bus.mode == "router" or (bus.listen and not bus.connect):
+        told = bus.endpoints()[1]
+        here = tuple(re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", place) for place in told)
+        return BusConfig(mode="client" if bus.mode == "router" else "peer", connect=here, tls=bus.tls)
+    return bus
+
+
+def _server(listen: str, port: int, token: str, look_only: bool) -> Callable[[Any], ViewServer]:
+    if token and len(token) < 12:
+        raise InputError("--token is too short to keep anyone out", remedy="give 12 letters or more, or leave it out")
+    if not token.isascii() or any(letter in token for letter in "; ,&#+%") or not token.isprintable():
+        raise InputError("--token may not stand in an address", remedy="use letters, digits, '-' and '_'")
+    try:
+        from hub.view.server import ViewServer
+    except ImportError:
+        raise InputError("the view needs viser", remedy='install it: pip install "syncline[view]"') from None
+    return lambda player: ViewServer(listen, port, token=token, look_only=look_only, player=player)
+
+
+def _told(shown: ViewServer, browser: bool, json: bool) -> ViewServer:
+    """Say where it is; a browser is opened by this machine's own means."""
+    if json:
+        import json as json_module
+
+        print(json_module.dumps({"address": shown.address, "port": shown.port}), flush=True)
+    else:
+        print(f"open {shown.address}   (Ctrl-C ends it)", flush=True)
+    if browser:
+        import webbrowser
+
+        if not webbrowser.open(shown.address):
+            print("syncline: no browser could be opened here", file=sys.stderr)
+    return shown

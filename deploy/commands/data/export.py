@@ -1,0 +1,93 @@
+"""`syncline export`: results in other tools' formats, and logs as session folders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from protocols.core.errors import EXIT_DONE, InputError
+
+
+def export(
+    source: Path,
+    /,
+    *,
+    to: Literal["aniposelib", "caliscope", "pose2sim", "freemocap", "opencv", "kalibr", "colmap", "trc", "session"]
+    | None = None,
+    out: Path,
+    units: Literal["m", "cm", "mm"] = "m",
+    json: Annotated[bool, Parameter(negative="")] = False,
+    seed: int = 0,
+) -> int:
+    """Write a calibration or a path in another tool's format, or a log as a session folder.
+
+    aniposelib, caliscope, pose2sim, freemocap: one TOML file in the units that the tool means. kalibr: a camchain YAML
+    with timeshift_cam_imu. opencv: CAMERA.yml a camera for cv2.FileStorage. colmap: cameras.txt, images.txt,
+    points3D.txt. trc: a path for OpenSim, in the world's own axes. session: rig.toml and observations.csv of a log.
+    What a format cannot hold is told.
+
+    Example: syncline export out/calibration.toml --to caliscope --out camera_array.toml
+
+    Example: syncline export out/trajectory.csv --to trc --out path.trc
+
+    Example: syncline export flight.mcap --out my-session
+
+    Parameters
+    ----------
+    source
+        calibration.toml; trajectory.csv or track.csv for trc; a .mcap log for session.
+    to
+        The format; of a .mcap log always session.
+    out
+        The folder for opencv, colmap and session, the file for all others.
+    units
+        Of the lengths in a path, for trc.
+    json
+        Print a summary as JSON.
+    seed
+        Accepted as everywhere; nothing here is drawn at random.
+    """
+    from deploy.offline import exports
+    from deploy.offline.sessions import is_log
+    from protocols.core.files import check_folder, write_together
+
+    log = is_log(source)
+    if to is None and not log:
+        remedy = "give --to aniposelib, caliscope, pose2sim, freemocap, opencv, kalibr, colmap or trc"
+        raise InputError("--to is missing", file=source, remedy=remedy)
+    if log and to not in (None, "session"):
+        remedy = "calibrate it first, then export its calibration.toml"
+        raise InputError(f"a log does not become {to}", file=source, remedy=remedy)
+    if to == "session" and not log:
+        raise InputError("only a .mcap log becomes a session", file=source, remedy="give a log")
+    warnings: tuple[str, ...] = ()
+    if log:
+        check_folder(out)
+        cameras, rows, warnings = exports.export_log(source, out)
+        files = [out / "rig.toml", out / "observations.csv"]
+        told = f"{cameras} cameras, {rows} observations"
+    else:
+        assert to is not None
+        if to in exports.IN_FOLDERS:
+            check_folder(out)
+        elif out.is_dir():
+            raise InputError("a folder of this name is in the way", file=out, remedy="give --out the name of a file")
+        if to == "trc":
+            texts = exports.path_files(source, out, units)
+        else:
+            texts, warnings = exports.calibration_files(source, to, out)
+        write_together(texts)
+        files, told = list(texts), ""
+    if json:
+        import json as json_module
+
+        print(json_module.dumps({"files": [str(file) for file in files], "warnings": list(warnings)}))
+        return EXIT_DONE
+    if told:
+        print(told)
+    for warning in warnings:
+        print(f"warning: {warning}")
+    print(f"written: {', '.join(str(file) for file in files)}")
+    return EXIT_DONE

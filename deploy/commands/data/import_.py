@@ -1,0 +1,131 @@
+"""`syncline import`: other tools' calibrations and tracks, and session folders, into Syncline's own files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from protocols.core.errors import EXIT_DONE, InputError
+
+
+def import_(
+    *sources: Path,
+    out: Path,
+    format: Literal[
+        "aniposelib",
+        "caliscope",
+        "pose2sim",
+        "freemocap",
+        "opencv",
+        "kalibr",
+        "colmap",
+        "caliscope-points",
+        "deeplabcut",
+        "mvus",
+        "session",
+    ]
+    | None = None,
+    units: Literal["m", "cm", "mm"] | None = None,
+    fps: float | None = None,
+    videos: Path | None = None,
+    likelihood: float = 0.6,
+    camera: str | None = None,
+    json: Annotated[bool, Parameter(negative="")] = False,
+    seed: int = 0,
+) -> int:
+    """Read what another tool wrote: a calibration, 2-D tracks, or a session folder that becomes a log.
+
+    Calibrations (aniposelib, caliscope, Pose2Sim, FreeMoCap, OpenCV YAML, Kalibr camchain, COLMAP text) become a
+    rig.toml; with all poses in it, it is a calibration.toml too. Tracks (caliscope CSV, DeepLabCut CSV, mvus text)
+    become an observations.csv, a session folder a .mcap log. What a file is, its content tells.
+
+    Example: syncline import camchain.yaml --out rig.toml
+
+    Example: syncline import cam0DLC_resnet50.csv cam1DLC_resnet50.csv --videos my-videos --out observations.csv
+
+    Example: syncline import my-session --out my-session.mcap
+
+    Parameters
+    ----------
+    sources
+        Files, one a camera where the format is such, or a folder of them.
+    out
+        The rig.toml, observations.csv or .mcap to write.
+    format
+        What the sources are, if their content does not tell.
+    units
+        Of a calibration's lengths, instead of what the format means.
+    fps
+        Frames a second, for tracks that only count frames.
+    videos
+        The tracked videos, each named after its camera: their own frame times are taken (variable frame rates).
+    likelihood
+        DeepLabCut's points that are less likely are left out.
+    camera
+        The camera's name, for tracks in one file; default: the file's name.
+    json
+        Print a summary as JSON.
+    seed
+        Accepted as everywhere; nothing here is drawn at random.
+    """
+    if not sources:
+        raise InputError("nothing to import", remedy="give files, or a folder")
+    if out.is_dir():
+        raise InputError("a folder of this name is in the way", file=out, remedy="give --out the name of a file")
+    if fps is not None and not 0.1 <= fps <= 10_000:
+        raise InputError(f"--fps {fps:g} is out of range", remedy="give frames a second")
+    if not 0.0 <= likelihood <= 1.0:
+        raise InputError(f"--likelihood {likelihood:g} is out of range", remedy="give 0 to 1")
+    if fps is not None and videos is not None:
+        raise InputError("--fps and --videos each tell the frames' times", remedy="keep one")
+    from deploy.offline import imports
+    from protocols.core.files import write_atomically
+    from protocols.session.folder import read_folder, write_observations
+
+    source = imports.recognise(list(sources), format)
+    _check_suffix(source.kind, out)
+    warnings: tuple[str, ...] = ()
+    if source.kind == "session":
+        rig, seen = read_folder(source.files[0])
+        count = imports.session_to_log(rig, seen, out)
+        warnings = seen.warnings
+        if rig.wands:
+            warnings += ("a log does not hold the wand: tell it again in the rig.toml of its export",)
+        told = f"{len(rig.cameras)} cameras, {len(seen)} observations, {count} messages"
+        cameras = list(rig.cameras)
+    elif source.kind in imports.POINTS:
+        seen = imports.read_points(source, imports.frame_clock(fps, videos), likelihood, camera)
+        write_observations(out, seen)
+        warnings = seen.warnings
+        told = f"{len(seen)} observations of {len(seen.labels)} points by {', '.join(seen.cameras)}"
+        cameras = seen.cameras
+    else:
+        foreign = imports.read_calibration_of(source)
+        write_atomically(out, imports.calibration_text(foreign, units, source.files[0]))
+        posed = sum(one.pose is not None for one in foreign.cameras.values())
+        timed = sum(one.time_map is not None for one in foreign.cameras.values())
+        warnings = foreign.warnings
+        if units is None and foreign.units is None and posed:
+            warnings += ("the file tells no units: its lengths are taken for metres (--units)",)
+        told = f"{len(foreign.cameras)} cameras ({', '.join(foreign.cameras)}), {posed} with poses, {timed} with clocks"
+        cameras = list(foreign.cameras)
+    if json:
+        import json as json_module
+
+        document = {"out": str(out), "format": source.kind, "cameras": cameras, "warnings": list(warnings)}
+        print(json_module.dumps(document, allow_nan=False))
+        return EXIT_DONE
+    print(f"{source.kind}: {told}")
+    for warning in warnings:
+        print(f"warning: {warning}")
+    print(f"written: {out}")
+    return EXIT_DONE
+
+
+def _check_suffix(kind: str, out: Path) -> None:
+    """A calibration under the name of a log would be read by nobody."""
+    wanted = {"session": ".mcap", "caliscope-points": ".csv", "deeplabcut": ".csv", "mvus": ".csv"}.get(kind, ".toml")
+    if out.suffix.lower() != wanted:
+        raise InputError(f"{kind} becomes a {wanted} file", file=out, remedy=f"give --out a name that ends in {wanted}")

@@ -1,0 +1,219 @@
+"""`syncline replay`, `recover` and `info`: what to do with a log."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
+
+
+def info(path: Path, /, *, json: Annotated[bool, Parameter(negative="")] = False) -> int:
+    """Show what is in a log (topics, counts, times, damage) or in a session folder.
+
+    Example: syncline info demo-out/demo.mcap
+
+    Parameters
+    ----------
+    path
+        A .mcap log, the folder or the first part of one in several files, or a session folder.
+    json
+        Print it as JSON.
+    """
+    from deploy.offline.sessions import is_log
+
+    if path.is_dir() and not is_log(path):
+        from deploy.offline.session_info import print_session
+
+        print_session(path, as_json=json)
+        return EXIT_DONE
+    from dataclasses import asdict
+
+    from deploy.logs.info import as_table, describe_log
+
+    description = describe_log(path)
+    if json:
+        import json as json_module
+
+        print(json_module.dumps(asdict(description)))
+        return EXIT_DONE
+    from deploy.offline.outputs import wide_console
+
+    wide_console(markup=True).print(as_table(description))
+    return EXIT_DONE
+
+
+def recover(log: Path, /, *, out: Path, json: Annotated[bool, Parameter(negative="")] = False) -> int:
+    """Make a whole log of one that is damaged, was cut off or never closed, and say what was lost.
+
+    Example: syncline recover flight.mcap --out fixed.mcap
+
+    The result is read back with every checksum before it gets its name. Exit status 3 if no message is whole.
+
+    Parameters
+    ----------
+    log
+        The .mcap log; the folder or the first part of one in several files, which become one.
+    out
+        The new log; must not exist.
+    json
+        Print what was saved and lost as JSON.
+    """
+    from protocols.log.read.recovery import recover as make_whole
+
+    recovery = make_whole(log, out)
+    if json:
+        import json as json_module
+        from dataclasses import asdict
+
+        print(json_module.dumps(asdict(recovery)))
+        return EXIT_DONE
+    parts = f" from {recovery.parts} parts" if recovery.parts > 1 else ""
+    print(
+        f"{recovery.path}: {recovery.messages} messages, {recovery.duration_s:.1f} s{parts}, "
+        f"{recovery.bytes / 1e6:.2f} MB; read back and verified"
+    )
+    if recovery.damage:
+        print(f"damage: {recovery.damage}")
+    for key, count in recovery.missing.items():
+        print(f"lost: {count} messages of {key}")
+    if recovery.skipped_bytes:
+        print(f"lost: {recovery.skipped_bytes} bytes that are no records")
+    if recovery.cut:
+        print("lost: what its writer had not yet brought to the disk at the end (a recorder does so twice a second)")
+    if recovery.foreign:
+        print(f"left out: {recovery.foreign} messages of channels that are not Syncline's")
+    if not recovery.damage and not recovery.missing:
+        print("nothing was lost")
+    return EXIT_DONE
+
+
+def replay(
+    log: Path,
+    /,
+    *,
+    rate: str = "1",
+    start: float = 0.0,
+    loop: Annotated[bool, Parameter(negative="")] = False,
+    topics: list[str] | None = None,
+    compare: Path | None = None,
+    tolerance: list[str] | None = None,
+    through: Literal["hub", "uav"] | None = None,
+    out: Path | None = None,
+    calibration: Path | None = None,
+    site: str = "local",
+    connect: list[str] | None = None,
+    json: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Publish the messages of a log onto the bus again, as they came; or compare two logs.
+
+    Example: syncline replay demo-out/demo.mcap --rate 2
+    Example: syncline replay a.mcap --compare b.mcap --topics track --tolerance track.position=1e-6
+    Example: syncline replay demo-out/demo.mcap --through hub --out again.mcap
+
+    A comparison shows count, order and every field beyond its tolerance; exit status 3 if the logs differ.
+
+    Parameters
+    ----------
+    log
+        The .mcap log.
+    rate
+        1 = as recorded, 2 = twice as fast, max = as fast as possible.
+    start
+        Seconds from the log's beginning to leave out.
+    loop
+        Begin again at the end, until stopped; every round looks like agents that were restarted.
+    topics
+        Only these topics of the catalogue; default: all.
+    compare
+        Publish nothing; compare with this log instead.
+    tolerance
+        topic.field=greatest difference in the field's own unit, for --compare; default: 0 for every field.
+    through
+        Publish nothing; let this estimator hear the log, without clock or bus, and write what it says to --out. uav
+        needs a log with pictures.
+    out
+        The new log for --through; must not exist.
+    calibration
+        For --through hub: a calibration.toml to follow people with, instead of solving.
+    site
+        Site to publish on.
+    connect
+        Endpoints of the bus, such as tcp/127.0.0.1:7447.
+    json
+        Print the count as JSON.
+    """
+    try:
+        speed = 0.0 if rate == "max" else float(rate)
+    except ValueError:
+        speed = -1.0
+    if not (speed > 0.0 or rate == "max") or speed > 1e6:
+        raise InputError(f"--rate {rate!r} is not a speed", remedy="give 1, 2, 0.5, … or max")
+    if tolerance and compare is None:
+        raise InputError("--tolerance goes with --compare", remedy="leave it out, or give --compare OTHER.mcap")
+    if (through is None) != (out is None):
+        raise InputError("--through and --out go together", remedy="e.g. --through hub --out again.mcap")
+    if calibration is not None and through != "hub":
+        raise InputError("--calibration goes with --through hub", remedy="leave it out, or give --through hub")
+    if (through or compare) and (rate, start, loop, connect) != ("1", 0.0, False, None):
+        raise InputError(
+            f"--{'through' if through else 'compare'} publishes nothing",
+            remedy="leave out --rate, --start, --loop and --connect",
+        )
+    if through is not None and out is not None:
+        if compare is not None or topics:
+            raise InputError("--through hears a whole log", remedy="leave out --compare and --topics")
+        if through == "uav":
+            from deploy.logs.replay_uav import replay_through_uav
+
+            count, missing = replay_through_uav(log, out)
+            if missing:
+                text = f"{missing} inputs were not recorded: not all that was said comes again"
+                print(f"syncline: {log}: {text}", file=sys.stderr)
+        else:
+            from deploy.logs.replay_hub import replay_through_hub
+
+            count = replay_through_hub(log, out, calibration=calibration)
+        print(f'{{"written": {count}}}' if json else f"{count} messages written to {out}")
+        return EXIT_DONE
+    if compare is not None:
+        return _compare(log, compare, topics, tolerance or [], as_json=json)
+    if not 0.0 <= start < 1e9:
+        raise InputError(f"--start {start} is out of range", remedy="give seconds from the log's beginning")
+    from deploy.agents.signals import stop_on_signals
+    from deploy.logs.replay import replay as play
+    from protocols.bus.base import BusStopped
+    from protocols.bus.settings import BusConfig
+    from protocols.bus.transport.zenoh_bus import open_bus
+    from protocols.log.read.reader import LogReader
+
+    damage = LogReader(log).summary().reason  # told before, not after, an hour of replay
+    if damage:
+        print(f"syncline: {log}: damaged: {damage}; only its good part is played", file=sys.stderr)
+    stop = stop_on_signals()
+    try:
+        with open_bus(site, BusConfig(connect=tuple(connect or ())), stop=stop.is_set) as bus:
+            count = play(log, bus, rate=speed, start_s=start, loop=loop, topics=topics, stop=stop)
+    except BusStopped:
+        count = 0
+    print(f'{{"published": {count}}}' if json else f"{count} messages published")
+    return EXIT_DONE
+
+
+def _compare(log: Path, other: Path, topics: list[str] | None, tolerances: list[str], as_json: bool) -> int:
+    from deploy.logs.diff import as_json as to_json
+    from deploy.logs.diff import as_table, compare_logs, parse_tolerances
+
+    comparison = compare_logs(log, other, parse_tolerances(tolerances), topics)
+    if as_json:
+        import json as json_module
+
+        print(json_module.dumps(to_json(comparison)))
+    else:
+        from deploy.offline.outputs import wide_console
+
+        wide_console(markup=True).print(as_table(comparison), soft_wrap=True)
+    return EXIT_DONE if comparison.equal else EXIT_REFUSED

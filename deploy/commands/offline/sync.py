@@ -1,0 +1,140 @@
+"""`syncline sync`: per-frame reference times of videos, and copies that line up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from deploy.offline.progress import progress_bar
+from protocols.core.errors import EXIT_DONE, InputError
+
+
+def sync(
+    folder: Path,
+    /,
+    *,
+    calibration: Path,
+    out: Path,
+    videos: Literal["retime", "trim", "none"] = "retime",
+    fps: float | None = None,
+    json: Annotated[bool, Parameter(negative="")] = False,
+    seed: int = 0,
+) -> int:
+    """Tell when every frame of every video was taken on one clock, and write videos that line up.
+
+    Writes CAMERA.csv (frame,time,reference_time in seconds) a video, and CAMERA.mp4 over the span that all share.
+    retime: all of one constant rate and length, frame for frame at the same time; synchronised.csv tells which
+    source frame each shows. trim: every source frame once, stamped with its reference time. Sound is left out.
+    Needs the extra "video" (PyAV). Exit status 3 if the videos share no time.
+
+    Example: syncline sync my-videos --calibration out/calibration.toml --out synchronised
+
+    Parameters
+    ----------
+    folder
+        The videos that were calibrated, each named after its camera.
+    calibration
+        The calibration.toml of these videos.
+    out
+        Folder for the results.
+    videos
+        retime, trim, or none: only the tables.
+    fps
+        Frame rate of retimed videos; default: that of the fastest video.
+    json
+        Print a summary as JSON.
+    seed
+        Accepted as everywhere; nothing here is drawn at random.
+    """
+    from protocols.core.files import check_folder, write_together
+
+    check_folder(out)
+    if fps is not None and not 0.1 <= fps <= 1000:
+        raise InputError(f"--fps {fps:g} is out of range", remedy="give frames a second")
+    if fps is not None and videos == "trim":
+        raise InputError("--fps means nothing with --videos trim", remedy="leave one of the two out")
+    if out.exists() and folder.exists() and out.resolve() == folder.resolve():
+        raise InputError("--out is the folder of the videos", file=out, remedy="choose another --out")
+    from deploy.offline import sync as syncing
+    from deploy.offline.video_folder import list_videos
+    from edge.devices.playback.video_reader import Film, has_pyav
+    from protocols.session.calibration import csv_cell, read_calibration
+
+    if not has_pyav():
+        raise InputError("`sync` needs PyAV, which is not installed", remedy="pip install 'syncline[video]'")
+    rig, known = read_calibration(calibration)
+    listed, warnings = list_videos(folder)
+    warnings += [f"{v.path.name}: {v.camera} is not in the calibration" for v in listed if v.camera not in known]
+    used = [video for video in listed if video.camera in known]
+    if not used:
+        names = ", ".join(known)
+        raise InputError(f"no video is named after a camera ({names})", file=folder, remedy="rename the videos")
+    films = {video.camera: Film(video.path) for video in used}
+    maps = {name: known[name].time_map for name in films}
+    spans = {name: syncing.span_of(film, maps[name]) for name, film in films.items()}
+    rate = fps or max(film.info.fps for film in films.values())
+    grid = syncing.common_grid(spans, rate)
+    done: dict[str, syncing.Retimed] = {}
+    total = sum(max(film.info.frames, 1) for film in films.values())
+    before = 0
+    with progress_bar("synchronising", quiet=json) as tell:
+        for name, film in films.items():
+
+            def told(frame: int, name: str = name, before: int = before) -> None:
+                tell(f"{name} frame {frame}", min((before + frame) / total, 1.0))
+
+            target = out / f"{name}.mp4"
+            if videos == "trim":
+                span = syncing.Span(max(s.first for s in spans.values()), min(s.last for s in spans.values()))
+                done[name] = syncing.trim(film, maps[name], span, target, told)
+            else:
+                target_or_none = target if videos == "retime" else None
+                done[name] = syncing.retime(film, maps[name], grid, target_or_none, rate, told)
+            before += film.info.frames
+            warnings += [f"{film.path.name}: {text}" for text in _troubles(film)]
+    files = {out / f"{name}.csv": syncing.times_text(video) for name, video in done.items()}
+    if videos != "trim":
+        files[out / "synchronised.csv"] = syncing.grid_text(grid, done, csv_cell)
+    write_together(files)
+    written = [str(file) for file in files]
+    if videos != "none":
+        written += [str(out / f"{name}.mp4") for name in done]
+    if json:
+        import json as json_module
+
+        document = {
+            "out": str(out),
+            "files": written,
+            "reference": str(rig.metadata.get("reference", next(iter(rig.cameras)))),
+            "fps": rate,
+            "begin": float(grid[0]),
+            "end": float(grid[-1]),
+            "frames": {name: len(video.shown) for name, video in done.items()},
+            "largest_error_s": {name: float(abs(video.error).max(initial=0.0)) for name, video in done.items()},
+            "time_offset_std": {name: known[name].time_offset_std for name in done},
+            "warnings": warnings,
+        }
+        print(json_module.dumps(document, allow_nan=False))
+        return EXIT_DONE
+    print(f"common span: {grid[0]:.3f} to {grid[-1]:.3f} s of the reference clock, {grid[-1] - grid[0]:.3f} s")
+    for name, video in done.items():
+        text = f"{name}: {len(video.time)} frames, clock ± {1e3 * known[name].time_offset_std:.3f} ms"
+        if videos == "retime":
+            middle = 1e3 * float(abs(video.error).mean())
+            worst = 1e3 * float(abs(video.error).max())
+            text += f"; frames shown up to {worst:.1f} ms (mean {middle:.1f}) from the grid"
+        print(text)
+    for warning in warnings:
+        print(f"warning: {warning}")
+    print(f"written: {', '.join(written)}")
+    return EXIT_DONE
+
+
+def _troubles(film: object) -> list[str]:
+    from edge.devices.playback.video_reader import Film
+
+    assert isinstance(film, Film)
+    told = [f"{film.corrupt} frames could not be decoded and were skipped"] if film.corrupt else []
+    return told + ([f"{film.repaired} frames have no usable time stamp"] if film.repaired else [])

@@ -1,0 +1,213 @@
+"""`syncline track`: follow one car in a video, also while it is out of the picture."""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from deploy.offline.progress import progress_bar
+from protocols.core.errors import EXIT_DONE, InputError
+from protocols.core.files import check_folder, write_together
+
+
+def track(
+    video: Path,
+    /,
+    *,
+    target: str,
+    out: Path,
+    start: int = 0,
+    rig: Path | None = None,
+    telemetry: Path | None = None,
+    model: Literal["ground", "paper", "plain"] = "ground",
+    fps: float | None = None,
+    overlay: Annotated[bool, Parameter(negative="")] = False,
+    csv_truth: Path | None = None,
+    json: Annotated[bool, Parameter(negative="")] = False,
+    seed: int = 0,
+) -> int:
+    """Follow one car from the air, also while it is hidden or out of the picture, and say what is known of it.
+
+    Writes track.csv (one row a frame: visible, coasting or lost, with a std) and hypotheses.csv to --out.
+
+    Example: syncline track flight.mp4 --target 312,200,44,20 --out tracked --overlay
+
+    Parameters
+    ----------
+    video
+        A video file, a folder of pictures in the order of their names, or a .mcap log of a UAV agent with [images],
+        which also knows the lens and the mounting.
+    target
+        The car's box in the first tracked frame, x,y,w,h in pixels; x,y is its top left.
+    out
+        Folder for the results.
+    start
+        Index of that frame; 0 is the first.
+    rig
+        A rig.toml with the camera: matrix, distortions, fps, body_from_camera. One camera, or the video's name.
+    telemetry
+        The drone's telemetry.csv: time,qw,qx,qy,qz[,north,east,down], on the video's clock; or a .tlog or .mcap, whose
+        clock is found by the video's own turning. The ground model refuses it without matrix and body_from_camera
+        in --rig: it could not use it.
+    model
+        ground: on the ground plane, the best. paper, plain: the paper's, for comparison.
+    fps
+        Frame rate, instead of the file's time stamps or rig.toml's.
+    overlay
+        Also write overlay.mp4: particles, road and estimate on a canvas larger than the picture.
+    csv_truth
+        A CSV with frame,x,y[,width,height][,inside][,visible]: prints how well the track fits it.
+    json
+        Print a summary as JSON.
+    seed
+        Of the tracker's random numbers.
+    """
+    check_folder(out)
+    _check(video, start, fps, seed)
+    from deploy.evaluation.track_scores import read_truth, score
+    from deploy.offline import track as tracking
+    from deploy.offline.track_log import LoggedPictures, open_pictures
+    from deploy.offline.track_overlay import Overlay
+    from edge.uav import models
+    from edge.uav.tracker import Telemetry
+
+    box = tracking.parse_target(target)
+    camera = tracking.choose_camera(rig, video) if rig is not None else None
+    truth = read_truth(csv_truth) if csv_truth is not None else None
+    lens = camera.intrinsics if camera is not None else None
+    mounting = camera.body_from_camera if camera is not None else None
+    warnings: list[str] = []
+    samples: tuple[Telemetry, ...] = ()
+    own_clock = telemetry is not None and telemetry.suffix.lower() in (".tlog", ".mcap")
+    told: tracking.TelemetryFile | None = None
+    if telemetry is not None and own_clock:
+        from deploy.offline.telemetry_files import read_own_clock
+
+        told = read_own_clock(telemetry)
+    elif telemetry is not None:
+        told = tracking.read_telemetry(telemetry)
+    rate = fps
+    if rate is None and camera is not None and camera.fps > 0 and video.is_dir():
+        rate = camera.fps
+    recording, counted = open_pictures(video, rate, lens)
+    same_log = False
+    if isinstance(recording, LoggedPictures):
+        lens = recording.lens
+        mounting = recording.body_from_camera if mounting is None else mounting
+        same_log = telemetry is not None and telemetry.resolve() == video.resolve()
+    if told is not None and telemetry is not None:
+        if model == "ground" and (lens is None or mounting is None):
+            what = "telemetry says nothing without the camera's matrix and body_from_camera"
+            raise InputError(what, file=telemetry, remedy="give both in --rig, or leave --telemetry out")
+        if told.left_out:
+            warnings.append(f"{telemetry}: {told.left_out} rows hold no sample and were left out")
+        samples = told.samples
+    size = (recording.info.width, recording.info.height)
+    count = tracking.count_frames(video) if counted is None else counted
+    if told is not None and same_log and isinstance(recording, LoggedPictures):
+        # The agent has put both on one clock already.
+        first_s = recording.first_s
+        samples = tuple(replace(sample, time=sample.time - first_s) for sample in told.samples)
+    elif told is not None and own_clock:
+        samples = ()
+        if lens is not None and mounting is not None:
+            from deploy.offline.telemetry_files import onto_video
+
+            with progress_bar(f"looking for the telemetry's clock in {video.name}", quiet=json) as tell:
+                samples, line = onto_video(
+                    told, video, rate, lens, mounting, lambda i: tell(f"frame {i}", i / count if count else 0.0)
+                )
+            if not samples:
+                warnings.append(line)
+    elif told is not None and telemetry is not None:
+        end = count / recording.info.fps if count else float("inf")
+        tracking.check_clock(told, telemetry, start / recording.info.fps, end)
+    tracker = models.get(model, size, lens, mounting, recording.info.fps, seed)
+    rows: list[tracking.Tracked] = []
+    with ExitStack() as stack:
+        tell = stack.enter_context(progress_bar(f"tracking in {video.name}", quiet=json))
+        film = stack.enter_context(Overlay(out / tracking.OVERLAY, recording.info.fps)) if overlay else None
+        stack.callback(recording.close)
+
+        def told_frame(index: int) -> None:
+            tell(f"frame {index}" + (f" of {count}" if count else ""), index / count if count else 0.0)
+
+        for row in tracking.follow(
+            recording,
+            tracker,
+            box,
+            start=start,
+            telemetry=samples,
+            show=film.show if film is not None else None,
+            tell=told_frame,
+        ):
+            # Particles and layers were for the overlay; a long video would fill the memory with them.
+            rows.append(tracking.without_layers(row))
+        write_together(
+            {
+                out / tracking.TRACK: tracking.track_text(rows),
+                out / tracking.HYPOTHESES: tracking.hypotheses_text(rows),
+            }
+        )
+        if film is not None:
+            film.finish()
+    if count and rows[-1].frame + 1 < count:
+        warnings.append(f"{video}: {rows[-1].frame + 1} of {count} frames could be decoded")
+    if recording.repaired:
+        warnings.append(f"{video}: {recording.repaired} frames have no usable time stamp")
+    scores = score(rows, truth, size) if truth is not None else None
+    _tell(out, rows, model, seed, overlay, warnings, scores, json)
+    return EXIT_DONE
+
+
+def _check(video: Path, start: int, fps: float | None, seed: int) -> None:
+    if start < 0:
+        raise InputError(f"--start {start} is negative", remedy="give the index of a frame, 0 is the first")
+    if seed < 0:
+        raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
+    if fps is not None and not 0.1 <= fps <= 10_000:
+        raise InputError(f"--fps {fps:g} is out of range", remedy="give frames a second")
+
+
+def _tell(
+    out: Path,
+    rows: list[Any],
+    model: str,
+    seed: int,
+    overlay: bool,
+    warnings: list[str],
+    scores: dict[str, float | int] | None,
+    as_json: bool,
+) -> None:
+    """The summary: frames by state, the scores, and where the files are."""
+    states = Counter(row.estimate.state.value for row in rows)
+    names = ["track.csv", "hypotheses.csv", *(["overlay.mp4"] if overlay else [])]
+    if as_json:
+        import json
+
+        document: dict[str, Any] = {
+            "out": str(out),
+            "files": names,
+            "model": model,
+            "seed": seed,
+            "first_frame": rows[0].frame,
+            "frames": len(rows),
+            **{state: states.get(state, 0) for state in ("visible", "coasting", "lost")},
+            "warnings": warnings,
+        }
+        if scores is not None:
+            document["scores"] = scores
+        print(json.dumps(document, allow_nan=False))
+        return
+    parts = ", ".join(f"{states.get(state, 0)} {state}" for state in ("visible", "coasting", "lost"))
+    print(f"{len(rows)} frames from {rows[0].frame}: {parts}")
+    for name, value in (scores or {}).items():
+        print(f"{name}: {value}" if isinstance(value, int) else f"{name}: {value:.3f}")
+    for warning in warnings:
+        print(f"warning: {warning}")
+    print(f"written: {', '.join(str(out / name) for name in names)}")

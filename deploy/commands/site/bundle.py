@@ -1,0 +1,71 @@
+"""`syncline bundle`: an offline wheelhouse."""
+
+from __future__ import annotations
+
+import json as jsons
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from protocols.core.errors import EXIT_DONE
+
+
+def bundle(
+    *,
+    platform: Literal["aarch64", "x86_64"] = "aarch64",
+    python: Literal["3.11", "3.12", "3.13"] = "3.11",
+    role: Literal["camera", "uav", "hub", "recorder", "router"] = "camera",
+    extra: list[str] | None = None,
+    out: Path | None = None,
+    json: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Gather everything that a board without a network needs: wheels, and a script that installs them there.
+
+    Only what the role imports is on it. Prints the installed size; a camera (without OAK) or UAV over 350 MB is
+    refused. On the board: sh install.sh
+
+    Example: syncline bundle --platform aarch64 --python 3.11 --role camera --out camera-bundle
+
+    Parameters
+    ----------
+    platform
+        The board's architecture (`uname -m`).
+    python
+        The board's Python (`python3 --version`).
+    role
+        What the board will run.
+    extra
+        What to take along besides: oak, v4l2 (driver "usb"), video (driver "rtsp"), view; or a package, such as scipy
+        for the detectors of people and vehicles. May be given several times.
+    out
+        Folder to carry over; by default named by version, role and platform.
+    json
+        Print sizes as JSON.
+    """
+    from deploy.site.bundle import Target, default_folder, make_bundle
+
+    target = Target(platform, python)
+    made = make_bundle(role, target, out or default_folder(role, target), extra or ())
+    if json:
+        print(
+            jsons.dumps(
+                {
+                    "role": role,
+                    "platform": platform,
+                    "python": python,
+                    "out": str(made.out),
+                    "carried_mb": round(made.carried_mb, 1),
+                    "installed_mb": round(made.installed_mb, 1),
+                    "wheels": {name: round(size / 1e6, 1) for name, size in sorted(made.sizes.items())},
+                }
+            )
+        )
+        return EXIT_DONE
+    largest = sorted(made.sizes.items(), key=lambda item: -item[1])[:5]
+    told = ", ".join(f"{name.partition('-')[0]} {size / 1e6:.0f}" for name, size in largest)
+    print(
+        f"{role}, {platform}, Python {python}: {made.installed_mb:.0f} MB installed ({told}), {len(made.sizes)} wheels"
+    )
+    print(f"{made.carried_mb:.0f} MB to carry over in {made.out}; there: sh install.sh")
+    return EXIT_DONE

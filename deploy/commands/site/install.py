@@ -1,0 +1,139 @@
+"""`syncline install` and `uninstall`: agents as systemd services."""
+
+from __future__ import annotations
+
+import json as jsons
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from protocols.core.errors import EXIT_DONE, InputError
+
+if TYPE_CHECKING:
+    from deploy.site.install.plan import Plan
+
+Flag = Annotated[bool, Parameter(negative="")]
+
+
+def install(
+    role: Literal["camera", "uav", "hub", "recorder", "router"],
+    /,
+    *,
+    config: Path,
+    root: Path = Path("/"),
+    program: str | None = None,
+    dry_run: Flag = False,
+    json: Flag = False,
+) -> int:
+    """Install an agent as a systemd service that starts at boot and is restarted for ever.
+
+    Writes its unit, /etc/syncline/ROLE-ID with the configuration and the files it names, sysusers, tmpfiles and udev
+    rules; its state is below /var/lib/syncline. A second time it changes only what is different. A configuration that
+    the agent would refuse is refused here, before anything is touched.
+
+    Example: sudo syncline install camera --config cam0.toml
+
+    Parameters
+    ----------
+    role
+        What to install.
+    config
+        The agent's TOML file, as `syncline camera FILE` takes it.
+    root
+        Of an image that is being made; nothing is started then.
+    program
+        Path of `syncline` on the target; by default the one that runs now.
+    dry_run
+        Print what would be written and run, and do nothing.
+    json
+        Print it as JSON, with all contents.
+    """
+    from deploy.site.install.plan import apply, plan_install
+
+    _check_root(root)
+    plan = plan_install(role, config, program)
+    if dry_run:
+        _show(plan, root, json)
+        return EXIT_DONE
+    told = apply(plan, root)
+    _tell(plan, told, json)
+    return EXIT_DONE
+
+
+def uninstall(
+    names: list[str] | None = None,
+    /,
+    *,
+    root: Path = Path("/"),
+    purge: Flag = False,
+    dry_run: Flag = False,
+    json: Flag = False,
+) -> int:
+    """Stop agents and take their services away. Recordings and other state are kept.
+
+    Example: sudo syncline uninstall camera-cam0
+
+    Parameters
+    ----------
+    names
+        Agents as ROLE-ID; none = all, with the shared rules.
+    root
+        Of an image.
+    purge
+        Take the configuration below /etc/syncline away too.
+    dry_run
+        Print what would be taken away, and do nothing.
+    json
+        Print it as JSON.
+    """
+    from deploy.site.install.plan import apply, plan_uninstall
+
+    _check_root(root)
+    plan = plan_uninstall(list(names or []), root, purge)
+    if dry_run:
+        _show(plan, root, json)
+        return EXIT_DONE
+    told = apply(plan, root)
+    _tell(plan, [*told, *plan.notes], json)
+    return EXIT_DONE
+
+
+def _check_root(root: Path) -> None:
+    if not root.is_dir():
+        raise InputError("--root is not a folder", file=root, remedy="give the folder in which the image is mounted")
+
+
+def _show(plan: Plan, root: Path, as_json: bool) -> None:
+    if as_json:
+        print(
+            jsons.dumps(
+                {
+                    "name": plan.name,
+                    "files": {place: text.decode(errors="replace") for place, text in plan.files.items()},
+                    "links": plan.links,
+                    "remove": plan.remove,
+                    "commands": plan.commands,
+                    "notes": plan.notes,
+                }
+            )
+        )
+        return
+    for place, content in plan.files.items():
+        print(f"write {place} ({len(content)} bytes, mode {plan.modes[place]:o})")
+    for place, target in plan.links.items():
+        print(f"link {place} -> {target}")
+    for place in plan.remove:
+        print(f"remove {place}")
+    for command in plan.commands:
+        print(f"run {' '.join(command)}" + ("" if root == Path("/") else " (not with --root)"))
+    for note in plan.notes:
+        print(note)
+
+
+def _tell(plan: Plan, told: list[str], as_json: bool) -> None:
+    if as_json:
+        print(jsons.dumps({"name": plan.name, "done": told}))
+        return
+    for line in told or ["nothing to change"]:
+        print(line)

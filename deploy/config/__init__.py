@@ -1,0 +1,1 @@
+"""Configuration files of the agents: structs and their reader."""

@@ -1,0 +1,174 @@
+"""What stands in a UAV agent's configuration file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from deploy.config.agents import OakConfig, Seconds, Seed, VideoConfig, _Agent, _check_id, _Strict
+from protocols.core.errors import InputError
+
+Degrees = Annotated[float, Meta(ge=-180.0, le=180.0)]
+SystemId = Annotated[int, Meta(ge=1, le=255)]
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+
+class MavlinkConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[mavlink]: the link to the autopilot.
+
+    url: "udpin:0.0.0.0:14550", "udpout:host:port", "tcp:host:port" or "serial:/dev/ttyAMA0:921600". vehicle: the only
+    system id that is heard; None = the first autopilot. system: what the camera calls itself; None = as its vehicle,
+    whose part it is. stations: system ids that may give orders; () = any. rate_hz: asked for of attitude and position.
+    key: file of the signing key, 32 bytes or 64 hexadecimal digits: then nothing unsigned is believed. key_state: file
+    of the last times of signing; None = beside the key.
+    """
+
+    url: str = "udpin:127.0.0.1:14550"
+    vehicle: SystemId | None = None
+    system: SystemId | None = None
+    stations: tuple[SystemId, ...] = ()
+    rate_hz: Annotated[float, Meta(ge=1.0, le=100.0)] = 30.0
+    key: Path | None = None
+    key_state: Path | None = None
+
+    def __post_init__(self) -> None:
+        from edge.mavlink.link.transport import parse
+
+        try:
+            parse(self.url)
+        except InputError as error:
+            raise ValueError(f"url: {error.what}; {error.remedy}") from None
+        if self.key_state is not None and self.key is None:
+            raise ValueError("key_state goes with key; add key, or remove it")
+
+
+class ControlConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[control]: what the agent may command. All of it is off unless it is switched on here.
+
+    gimbal: turn it to the target (GIMBAL_MANAGER_SET_PITCHYAW). follow: send FOLLOW_TARGET. The rest are bounds: beyond
+    them nothing is sent. pitch_deg: lowest and highest; rate_deg_s: of the commanded angles. coast_s: longest without
+    seeing the target. std_m: of its place. range_m: from where it was chosen. speed: passed on [m/s].
+    """
+
+    gimbal: bool = False
+    follow: bool = False
+    pitch_deg: tuple[Degrees, Degrees] = (-90.0, 10.0)
+    rate_deg_s: Annotated[float, Meta(gt=0.0, le=180.0)] = 60.0
+    coast_s: Annotated[float, Meta(gt=0.0, le=15.0)] = 8.0
+    std_m: Annotated[float, Meta(gt=0.0, le=100.0)] = 15.0
+    range_m: Annotated[float, Meta(gt=0.0, le=5000.0)] = 300.0
+    speed: Annotated[float, Meta(gt=0.0, le=50.0)] = 20.0
+
+    def __post_init__(self) -> None:
+        if not self.pitch_deg[0] < self.pitch_deg[1]:
+            raise ValueError("pitch_deg is lowest, highest; correct it")
+
+
+class VideoOutConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[video_out]: the picture with the estimate on it.
+
+    stream: "rtsp" = H.264 as ground stations open it by themselves (needs the extra video), "mjpeg" = motion JPEG over
+    HTTP, for browsers. listen: "address:port". beyond_loopback: whether others than this machine may watch; nobody is
+    asked for a password. uri: what ground stations are told; None = rtsp://<listen>/overlay or
+    http://<listen>/stream.mjpg. quality: of the JPEGs. kbps: most of the H.264.
+    """
+
+    stream: Literal["mjpeg", "rtsp"] = "mjpeg"
+    listen: str = "127.0.0.1:8560"
+    beyond_loopback: bool = False
+    uri: Annotated[str, Meta(max_length=159)] | None = None
+    quality: Annotated[int, Meta(ge=20, le=95)] = 75
+    kbps: Annotated[int, Meta(ge=100, le=20_000)] = 2000
+
+    def __post_init__(self) -> None:
+        host, _, port = self.listen.rpartition(":")
+        if not host or not port.isdigit() or int(port) > 65_535:
+            raise ValueError(f'listen {self.listen!r} is no address; write it like "127.0.0.1:8560"')
+        if not (self.beyond_loopback or host == "localhost" or host.startswith("127.")):
+            raise ValueError(
+                f"listen {self.listen!r} is open to the network; take 127.0.0.1, or set beyond_loopback = true"
+            )
+        if self.uri is None and host in ("0.0.0.0", "[::]"):
+            raise ValueError(f"listen {self.listen!r} is no address that can be called; add the uri that stations open")
+        if self.uri is not None and not self.uri.startswith(("rtsp://", "http://", "https://")):
+            raise ValueError(f"uri {self.uri!r} is none that stations open; begin it with rtsp:// or http://")
+
+
+class ImagesConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[images]: pictures on the bus, so that a recorder keeps them and `replay --through uav` can be run.
+
+    The tracker then sees what was sent. quality: of the JPEGs.
+    """
+
+    quality: Annotated[int, Meta(ge=30, le=100)] = 90
+
+
+class FlightConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[simulated]: an aircraft over the simulated town, with its autopilot and camera, in the agent's process.
+
+    autopilot: where the autopilot waits for senders, "host:port"; the agent's url must be "udpout:" to it. seconds: of
+    the flight. flies: "path" = given, loses the car every 12 s; "follow" = hovers, and obeys FOLLOW_TARGET. gimbal: the
+    camera hangs on one. start_unix_s: Unix time of the world's time 0; None = when the agent starts. boot_s: how
+    long the autopilot is up by then. camera_ahead_s: the camera's clock against the world's. drop, duplicate, garble:
+    share of the autopilot's messages; delay_s, jitter_s: of their way. reboot_at: times at which it starts anew.
+    """
+
+    autopilot: str = "127.0.0.1:14551"
+    seed: Seed = 1
+    seconds: Annotated[float, Meta(ge=1.0, le=3600.0)] = 60.0
+    flies: Literal["path", "follow"] = "path"
+    gimbal: bool = False
+    start_unix_s: Annotated[float, Meta(ge=0.0)] | None = None
+    boot_s: Annotated[float, Meta(ge=0.0, le=4e6)] = 123.4
+    camera_ahead_s: Annotated[float, Meta(ge=-1e6, le=1e6)] = 0.0
+    drop: Share = 0.0
+    duplicate: Share = 0.0
+    garble: Share = 0.0
+    delay_s: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.0
+    jitter_s: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.0
+    reboot_at: tuple[Seconds, ...] = ()
+
+    def __post_init__(self) -> None:
+        host, _, port = self.autopilot.rpartition(":")
+        if not host or not port.isdigit() or not 0 < int(port) <= 65_535:
+            raise ValueError(f'autopilot {self.autopilot!r} is no address; write it like "127.0.0.1:14551"')
+
+
+class UavConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The UAV agent. rig: a rig.toml with this camera's matrix and body_from_camera, found by the agent's id.
+
+    mount: "fixed" = on the airframe, "gimbal" = the attitude is the gimbal's, and body_from_camera is from its axes
+    (default: looks along its x axis). model, seed: of the tracker. pictures_hz, picture_width: small pictures a second
+    on the bus while a view or a recorder wants them, and their width [px]; 0 = none, ever.
+    """
+
+    id: str
+    rig: Path | None = None
+    driver: Literal["simulated", "video", "oak"] = "simulated"
+    simulated: FlightConfig | None = None
+    video: VideoConfig | None = None
+    oak: OakConfig | None = None
+    mount: Literal["fixed", "gimbal"] = "fixed"
+    model: Literal["ground", "paper", "plain"] = "ground"
+    seed: Seed = 0
+    mavlink: MavlinkConfig = msgspec.field(default_factory=MavlinkConfig)
+    control: ControlConfig = msgspec.field(default_factory=ControlConfig)
+    video_out: VideoOutConfig | None = None
+    images: ImagesConfig | None = None
+    pictures_hz: Annotated[float, Meta(ge=0.0, le=30.0)] = 2.0
+    picture_width: Annotated[int, Meta(ge=64, le=640)] = 320
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_id(self.id, "id")
+        if self.driver == "video" and self.video is None:
+            raise ValueError('driver = "video" needs a [video] table with source = "…"')
+        if self.oak is not None and self.oak.nn is not None:
+            raise ValueError("oak.nn is for camera agents: this one follows by its own tracker; remove nn")
+        if self.control.gimbal and self.mount != "gimbal":
+            raise ValueError('control.gimbal needs a camera on a gimbal; set mount = "gimbal", or switch it off')
+        if self.driver == "simulated" and (self.simulated or FlightConfig()).gimbal != (self.mount == "gimbal"):
+            raise ValueError("mount and simulated.gimbal contradict each other; correct one")

@@ -1,0 +1,1 @@
+"""The demos: simulated rigs and flights as real processes."""

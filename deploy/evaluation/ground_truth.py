@@ -1,0 +1,145 @@
+"""Recovered against true, for runs on simulated worlds."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from edge import scenes
+from protocols.core.clocks import ReferenceTime
+from protocols.geometry import so3
+from protocols.geometry.pose import Pose
+from protocols.session.calibration import read_calibration
+
+OFFSET_MS, ROTATION_DEG, DIRECTION_DEG = 1.0, 0.3, 0.5
+"""What the demo promises: larger errors are a failure."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraError:
+    """One camera, recovered against true. Offsets in the middle of what it filmed [s], errors in ms and degrees.
+
+    direction: of the camera's position as seen from the reference camera. nan for the reference itself.
+    """
+
+    camera: str
+    true_offset: float
+    recovered_offset: float
+    offset_error_ms: float
+    offset_std_ms: float
+    rotation_error_deg: float
+    direction_error_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """All cameras; missing: cameras without an answer."""
+
+    cameras: tuple[CameraError, ...]
+    missing: tuple[str, ...]
+
+    @property
+    def good(self) -> bool:
+        """Whether every camera is within what the demo promises."""
+        return not self.missing and all(
+            abs(c.offset_error_ms) < OFFSET_MS
+            and c.rotation_error_deg < ROTATION_DEG
+            and c.direction_error_deg < DIRECTION_DEG
+            for c in self.cameras
+        )
+
+    def as_json(self, first_calibration_s: float | None) -> str:
+        """One JSON object."""
+        document = {
+            "good": self.good,
+            "missing": list(self.missing),
+            "first_calibration_s": first_calibration_s,
+            "cameras": [asdict(camera) for camera in self.cameras],
+        }
+        return json.dumps(document)
+
+    def print(self, first_calibration_s: float | None, out: Path) -> None:
+        """A table for a person."""
+        from rich.table import Table
+
+        from deploy.offline.outputs import wide_console
+
+        console = wide_console()
+        table = Table(title="recovered against true", title_justify="left")
+        for column in (
+            "camera",
+            "true offset [s]",
+            "recovered [s]",
+            "error [ms]",
+            "std [ms]",
+            "rotation [°]",
+            "direction [°]",
+        ):
+            table.add_column(column, justify="left" if column == "camera" else "right")
+        for c in self.cameras:
+            table.add_row(
+                c.camera,
+                f"{c.true_offset:.6f}",
+                f"{c.recovered_offset:.6f}",
+                f"{c.offset_error_ms:+.3f}",
+                f"{c.offset_std_ms:.3f}",
+                f"{c.rotation_error_deg:.3f}",
+                f"{c.direction_error_deg:.3f}",
+            )
+        console.print(table)
+        for name in self.missing:
+            console.print(f"{name}: no answer")
+        promise = f"{OFFSET_MS:g} ms, {ROTATION_DEG:g}° and {DIRECTION_DEG:g}°"
+        console.print(f"every camera within {promise}" if self.good else f"NOT every camera is within {promise}")
+        if first_calibration_s is not None:
+            console.print(f"first calibration after {first_calibration_s:.1f} s")
+        console.print(f"log {out / 'demo.mcap'}, report {out / 'report.html'}", soft_wrap=True)
+        console.print(f"again from the log: syncline calibrate {out / 'demo.mcap'} --out again", soft_wrap=True)
+
+
+def compare_with_truth(folder: Path, scene_name: str, seed: int, cameras: int) -> Comparison:
+    """Compare the outputs in a folder with the world that the cameras filmed.
+
+    Poses are compared in the reference camera's own frame, so that no alignment can hide an error.
+    """
+    scene = scenes.get(scene_name, seed, cameras)
+    rig, solved = read_calibration(folder / "calibration.toml")
+    reference = str(rig.metadata.get("reference", next(iter(solved))))
+    base, base_truth = solved[reference].pose, scene.camera(reference).pose
+    seen = np.loadtxt(folder / "trajectory.csv", delimiter=",", skiprows=1, usecols=0, ndmin=1)
+    # The offset alone extrapolates the rate to the clock's epoch; what matters is the map while filming.
+    now = ReferenceTime(float(np.median(seen)))
+    out = []
+    for camera in scene.cameras:
+        if camera.name not in solved:
+            continue
+        found, truth = solved[camera.name], scene.camera(camera.name).pose
+        true_map = scene.true_time_map(camera.name, reference)
+        middle = found.time_map.camera_from_reference(now)
+        true_offset = true_map.reference_from_camera(middle) - middle
+        recovered = found.time_map.reference_from_camera(middle) - middle
+        turn = so3.angle_between(found.pose.rotation @ base.rotation.T, truth.rotation @ base_truth.rotation.T)
+        out.append(
+            CameraError(
+                camera=camera.name,
+                true_offset=true_offset,
+                recovered_offset=recovered,
+                offset_error_ms=1e3 * (recovered - true_offset),
+                offset_std_ms=1e3 * found.time_offset_std,
+                rotation_error_deg=float(np.degrees(turn)),
+                direction_error_deg=0.0
+                if camera.name == reference
+                else _direction(found.pose, base, truth, base_truth),
+            )
+        )
+    return Comparison(tuple(out), tuple(c.name for c in scene.cameras if c.name not in solved))
+
+
+def _direction(found: Pose, base: Pose, truth: Pose, base_truth: Pose) -> float:
+    """Angle [deg] between recovered and true direction from the reference camera, in that camera's axes."""
+    a = base.rotation @ (found.position - base.position)
+    b = base_truth.rotation @ (truth.position - base_truth.position)
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))

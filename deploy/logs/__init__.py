@@ -1,0 +1,1 @@
+"""What is done with logs: replay, summaries, comparison, export to rerun."""

@@ -1,0 +1,1 @@
+"""Offline work on videos, sessions and logs."""

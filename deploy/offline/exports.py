@@ -1,0 +1,51 @@
+"""Results in the formats of other tools: which format takes what, in which units, as which files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from protocols.core.errors import InputError
+from protocols.formats import colmap, toml_rigs, trc, yaml_rigs
+from protocols.formats.cameras import Written, in_units
+from protocols.session.calibration import read_calibration
+
+IN_FOLDERS = ("opencv", "colmap")
+"""Formats of several files: --out is a folder."""
+
+
+def calibration_files(source: Path, to: str, out: Path) -> tuple[dict[Path, str], tuple[str, ...]]:
+    """The files of a calibration in the format ``to``, and what that cannot hold. Raises InputError, Refused."""
+    rig, cameras = read_calibration(source)
+    scale = str(rig.metadata.get("scale", "metric"))
+    if to in toml_rigs.UNITS_OF:
+        written = toml_rigs.write(to, cameras, rig.units, scale, out.name)
+    elif to == "kalibr":
+        metric, warnings = in_units(cameras, rig.units, "m", scale)
+        written = yaml_rigs.write_kalibr(metric, out.name)
+        written = Written(written.files, warnings + written.warnings)
+    elif to == "opencv":
+        written = yaml_rigs.write_opencv(cameras, rig.units)
+    else:
+        written = colmap.write(cameras)
+    folder = out if to in IN_FOLDERS else out.parent
+    return {folder / name: text for name, text in written.files.items()}, written.warnings
+
+
+def path_files(source: Path, out: Path, units: str) -> dict[Path, str]:
+    """A path as TRC. Raises InputError."""
+    return {out: trc.trc_text(source, out.name, units)}
+
+
+def export_log(log: Path, out: Path) -> tuple[int, int, tuple[str, ...]]:
+    """A log as a session folder; returns cameras, observations, warnings. Raises InputError."""
+    from deploy.offline.imports import log_to_session
+    from protocols.log.read.session import session_from_log
+    from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
+
+    for name in (RIG_FILE, OBSERVATIONS_FILE):
+        if (out / name).exists():
+            raise InputError(f"a {name} is there already", file=out, remedy="choose another --out")
+    rig, observations, warnings = session_from_log(log)
+    write_rig(out / RIG_FILE, log_to_session(rig))
+    write_observations(out / OBSERVATIONS_FILE, observations)
+    return len(rig.cameras), len(observations), warnings

@@ -1,0 +1,67 @@
+"""What a session folder holds, for a person and for a machine."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from protocols.session.folder import read_folder
+
+
+def describe_session(folder: Path) -> dict[str, Any]:
+    """Cameras and tracks of a session folder. Raises InputError."""
+    rig, observations = read_folder(folder)
+    cameras = {}
+    for name, camera in rig.cameras.items():
+        tracks = observations.of_camera(name)
+        times = np.concatenate([track.time for track in tracks]) if tracks else np.zeros(0)
+        cameras[name] = {
+            "size": list(camera.size),
+            "fps": camera.fps,
+            "calibrated": camera.intrinsics is not None,
+            "rows": sum(len(track) for track in tracks),
+            "labels": [track.label for track in tracks],
+            "begin": float(times.min()) if len(times) else None,
+            "end": float(times.max()) if len(times) else None,
+        }
+    return {
+        "session": str(folder),
+        "units": rig.units,
+        "clock": rig.clock,
+        "cameras": cameras,
+        "warnings": list(observations.warnings),
+    }
+
+
+def print_session(folder: Path, as_json: bool) -> None:
+    """Print the description."""
+    description = describe_session(folder)
+    if as_json:
+        print(json.dumps(description, allow_nan=False))
+        return
+    from rich.table import Table
+
+    from deploy.offline.outputs import wide_console
+
+    table = Table(title=f"{description['session']}: clocks {description['clock']}", title_justify="left")
+    for column in ("camera", "image", "fps", "lens", "rows", "labels", "from [s]", "to [s]"):
+        table.add_column(column)
+    for name, camera in description["cameras"].items():
+        begin, end = camera["begin"], camera["end"]
+        table.add_row(
+            name,
+            "×".join(str(pixels) for pixels in camera["size"]),
+            f"{camera['fps']:g}",
+            "known" if camera["calibrated"] else "not known",
+            str(camera["rows"]),
+            str(len(camera["labels"])),
+            "" if begin is None else f"{begin:.3f}",
+            "" if end is None else f"{end:.3f}",
+        )
+    console = wide_console()
+    console.print(table)
+    for warning in description["warnings"]:
+        console.print(f"warning: {warning}", soft_wrap=True)

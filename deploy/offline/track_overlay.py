@@ -1,0 +1,112 @@
+"""The overlay video of `track`: a canvas larger than the picture, so that an estimate outside it is seen too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from deploy.offline.track import Tracked
+from edge.uav.tracker import Image, State
+from protocols.core.errors import InputError
+from protocols.geometry.types import Floats
+
+_MARGIN = 0.5  # of the picture, on each side
+_WIDEST = 1280
+_COLOURS = {State.VISIBLE: (80, 220, 80), State.COASTING: (40, 170, 255), State.LOST: (60, 60, 230)}
+_LAYERS = {"road": (110, 80, 30), "tracks": (160, 160, 160)}
+_OTHER_LAYER = (0, 220, 220)
+_PARTICLE = (230, 120, 230)
+
+
+class Overlay:
+    """Writes beside ``file`` and renames at the end: a file of that name is whole. Use as a context manager."""
+
+    def __init__(self, file: Path, fps: float) -> None:
+        self._file, self._fps = file, fps
+        self._part = file.with_name(f".{file.stem}.part{file.suffix}")
+        self._writer: cv2.VideoWriter | None = None
+        self._done = False
+
+    def __enter__(self) -> Overlay:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._writer is not None:
+            self._writer.release()
+        if not self._done:
+            self._part.unlink(missing_ok=True)
+
+    def show(self, image: Image, tracked: Tracked) -> None:
+        """Add one frame. Raises InputError where no video can be written."""
+        canvas = draw(image, tracked)
+        if self._writer is None:
+            self._file.parent.mkdir(parents=True, exist_ok=True)
+            size = (canvas.shape[1], canvas.shape[0])
+            self._writer = cv2.VideoWriter(str(self._part), cv2.VideoWriter.fourcc(*"mp4v"), self._fps, size)
+            if not self._writer.isOpened():
+                raise InputError("no video can be written here", file=self._file, remedy="leave out --overlay")
+        self._writer.write(canvas)
+
+    def finish(self) -> None:
+        """All frames are in: the file takes its name."""
+        if self._writer is not None:
+            self._writer.release()
+            self._writer = None
+            self._part.replace(self._file)
+        self._done = True
+
+
+def draw(image: Image, tracked: Tracked) -> Image:
+    """The picture on a larger canvas (h, w, 3) with road, tracks, ways, particles and the estimate; even sizes."""
+    height, width = image.shape[:2]
+    scale = min(1.0, _WIDEST / (width * (1 + 2 * _MARGIN)))
+    canvas_size = tuple(int(side * (1 + 2 * _MARGIN) * scale) // 2 * 2 for side in (width, height))
+    canvas = np.full((canvas_size[1], canvas_size[0], 3), 28, np.uint8)
+    small = cv2.resize(image, (int(width * scale), int(height * scale)), interpolation=cv2.INTER_AREA)
+    x0, y0 = int(width * _MARGIN * scale), int(height * _MARGIN * scale)
+    canvas[y0 : y0 + small.shape[0], x0 : x0 + small.shape[1]] = small
+    estimate = tracked.estimate
+    for name, points in estimate.layers.items():
+        _dots(canvas, _placed(points, scale, x0, y0), _LAYERS.get(name, _OTHER_LAYER))
+    if estimate.particles is not None:
+        _dots(canvas, _placed(estimate.particles, scale, x0, y0), _PARTICLE)
+    cv2.rectangle(canvas, (x0, y0), (x0 + small.shape[1] - 1, y0 + small.shape[0] - 1), (255, 255, 255), 1)
+    colour = _COLOURS[estimate.state]
+    for hypothesis in estimate.hypotheses:
+        at = _placed(np.array([[hypothesis.x, hypothesis.y]]), scale, x0, y0)[0]
+        if _drawable(at):
+            cv2.circle(canvas, (int(at[0]), int(at[1])), 5, colour, 1, cv2.LINE_AA)
+    at = _placed(np.array([[estimate.x, estimate.y]]), scale, x0, y0)[0]
+    if _drawable(at) and estimate.state is not State.LOST:
+        half = 0.5 * scale * np.array([estimate.width, estimate.height])
+        if np.isfinite(half).all():
+            low, high = (at - half).astype(int), (at + half).astype(int)
+            cv2.rectangle(canvas, (int(low[0]), int(low[1])), (int(high[0]), int(high[1])), colour, 2, cv2.LINE_AA)
+        if np.isfinite(estimate.std):
+            radius = int(min(2.0 * estimate.std * scale, 4000.0))
+            cv2.circle(canvas, (int(at[0]), int(at[1])), radius, colour, 1, cv2.LINE_AA)
+    text = f"{tracked.frame}  {tracked.time:.2f} s  {estimate.state.value}"
+    cv2.putText(canvas, text, (12, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, 1, cv2.LINE_AA)
+    return canvas
+
+
+def _placed(points: Floats, scale: float, x0: int, y0: int) -> Floats:
+    return np.asarray(points * scale + [x0, y0], dtype=np.float64)
+
+
+def _drawable(at: Floats) -> bool:
+    return bool(np.isfinite(at).all() and np.abs(at).max() < 1e4)
+
+
+def _dots(canvas: Image, points: Floats, colour: tuple[int, int, int]) -> None:
+    """Dots of 2 x 2 pixels, those on the canvas."""
+    height, width = canvas.shape[:2]
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(points).all(axis=1)
+        good &= (points > 0).all(axis=1) & (points[:, 0] < width - 2) & (points[:, 1] < height - 2)
+    x, y = points[good].astype(np.int64).T
+    for dy in (0, 1):
+        for dx in (0, 1):
+            canvas[y + dy, x + dx] = colour

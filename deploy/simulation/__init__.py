@@ -1,0 +1,1 @@
+"""Simulated sessions and flights written to disk."""

@@ -1,0 +1,128 @@
+"""Writes a session of the scene ``people``: labelled head tops and foot points, the truth, and videos where asked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from deploy.simulation.session import TRUTH_CALIBRATION, TRUTH_TRAJECTORY, camera_tables
+from edge import scenes
+from edge.scenes.people.scene import PeopleScene
+from edge.scenes.people.session import PeopleTrack, film_people, seen
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
+from protocols.core.files import write_atomically
+from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
+from protocols.session.observations import Observations, gather_tracks
+
+TRUTH_BOXES = "truth_boxes.csv"
+_TRUTH_HZ = 50.0
+
+
+def write_people_session(
+    out: Path,
+    *,
+    seconds: float,
+    cameras: int | None,
+    people: int | None,
+    seed: int,
+    noise_px: float,
+    drops: float | None,
+    render: bool,
+) -> dict[str, Any]:
+    """Film the scene and write the session folder; returns counts. Raises InputError."""
+    scene = scenes.get_people(seed, cameras, people)
+    tracks = film_people(scene, seconds, seed, pixel_noise=noise_px, drop_fraction=drops)
+    rows = sum(len(track) for track in tracks.values())
+    if not rows:
+        raise InputError("no camera saw anybody", remedy="film longer or take another seed")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made: {error.strerror}", file=out, remedy="choose another --out") from None
+    rig, truth = camera_tables(scene, scene.name)
+    write_rig(out / RIG_FILE, rig)
+    write_observations(out / OBSERVATIONS_FILE, people_observations(scene, tracks))
+    write_atomically(out / TRUTH_CALIBRATION, tomli_w.dumps(truth))
+    _write_truth_trajectory(out / TRUTH_TRAJECTORY, scene, seconds)
+    _write_truth_boxes(out / TRUTH_BOXES, scene, tracks)
+    videos = [_write_video(out, scene, name, tracks[name], seed) for name in tracks] if render else []
+    return {
+        "scene": scene.name,
+        "seed": seed,
+        "cameras": len(scene.cameras),
+        "people": len(scene.people),
+        "rows": rows,
+        "seconds": seconds,
+        "videos": videos,
+    }
+
+
+def people_observations(scene: PeopleScene, tracks: dict[str, PeopleTrack]) -> Observations:
+    """What the cameras reported, as a session's observations: two labels a person."""
+    films = list(tracks.values())
+    return gather_tracks(
+        [film.camera for film in films for _ in range(len(film))],
+        [label for film in films for label in film.label],
+        np.concatenate([film.frame for film in films]),
+        np.concatenate([film.time for film in films]),
+        np.concatenate([film.pixels for film in films]),
+        np.concatenate([film.size for film in films]),
+        order=[camera.name for camera in scene.cameras],
+    )
+
+
+def _write_truth_trajectory(file: Path, scene: PeopleScene, seconds: float) -> None:
+    """time,x,y,z,label of head tops and foot points, on the first camera's clock."""
+    clock = scene.cameras[0].clock
+    true_time = np.arange(0.0, seconds, 1.0 / _TRUTH_HZ)
+    camera_time = clock.epoch_ns / NANOSECONDS + clock.rate * true_time
+    lines = ["time,x,y,z,label"]
+    for end, places in (("head", scene.heads(true_time)), ("foot", scene.feet(true_time))):
+        for index, person in enumerate(scene.people):
+            lines += [
+                f"{t:.17g},{x:.17g},{y:.17g},{z:.17g},{person.name}-{end}"
+                for t, (x, y, z) in zip(camera_time, places[:, index], strict=True)
+            ]
+    write_atomically(file, "\n".join(lines) + "\n")
+
+
+def _write_truth_boxes(file: Path, scene: PeopleScene, tracks: dict[str, PeopleTrack]) -> None:
+    """Where every body is in every frame that shows somebody, also hidden ones: boxes as if nobody stood before it."""
+    lines = ["camera,frame,time,person,x,y,w,h,head_u,head_v,foot_u,foot_v,head_seen,foot_seen"]
+    for name, track in tracks.items():
+        frames, first = np.unique(track.frame, return_index=True)
+        pixels, visible = seen(scene, name, track.true_time[first])
+        for row, (frame, at) in enumerate(zip(frames, first, strict=True)):
+            boxes = scene.boxes(name, float(track.true_time[at]))
+            for index, person in enumerate(scene.people):
+                if np.isfinite(boxes[index]).all() and np.isfinite(pixels[row, index]).all():
+                    numbers = ",".join(f"{value:.3f}" for value in (*boxes[index], *pixels[row, index].ravel()))
+                    told = ",".join(str(int(value)) for value in visible[row, index])
+                    lines.append(f"{name},{frame},{track.time[at]:.17g},{person.name},{numbers},{told}")
+    write_atomically(file, "\n".join(lines) + "\n")
+
+
+def _write_video(out: Path, scene: PeopleScene, name: str, track: PeopleTrack, seed: int) -> str:
+    """The camera's frames that are in the session, drawn, in a video of even frame rate."""
+    import cv2
+
+    camera = scene.camera(name)
+    renderer = scene.renderer(name, np.random.default_rng([seed, 9]))
+    file = out / f"{name}.mp4"
+    part = out / f".{name}.part.mp4"
+    size = camera.intrinsics.width, camera.intrinsics.height
+    writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), camera.fps, size)
+    if not writer.isOpened():
+        raise InputError("this OpenCV cannot write videos", file=file, remedy="leave out --render")
+    _, first = np.unique(track.frame, return_index=True)
+    try:
+        for moment in track.true_time[first]:
+            writer.write(renderer.render(float(moment)))
+    finally:
+        writer.release()
+    part.replace(file)
+    return str(file)

@@ -1,0 +1,1 @@
+"""Sites: certificates, rigs as folders, bundles, systemd installation, doctor."""

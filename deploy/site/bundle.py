@@ -1,0 +1,347 @@
+"""A wheelhouse to carry to a board that has no network, and the script that installs it there.
+
+A board needs far less than a workstation: a camera no SciPy, no plotly, no log. So each role has its own list, drawn
+from the project's own requirements, and what is on it is installed without asking for the rest.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from email.message import Message
+from email.parser import HeaderParser
+from importlib.metadata import PackageNotFoundError, metadata, requires
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from protocols.core.errors import InputError, Refused
+from protocols.core.version import VERSION
+
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
+
+_EVERY = (
+    "cyclopts",
+    "eclipse-zenoh",
+    "msgspec",
+    "numpy",
+    "prometheus-client",
+    "protobuf",
+    "rich",
+    "structlog",
+    "tomli-w",
+)
+_LOG = ("mcap", "zstandard", "foxglove-schemas-protobuf")
+NEEDS: dict[str, tuple[str, ...]] = {
+    "camera": (*_EVERY, "opencv-python-headless", "mcap"),
+    "uav": (*_EVERY, "opencv-python-headless", "pymavlink", "pyserial"),
+    "hub": (*_EVERY, *_LOG, "opencv-python-headless", "scipy", "plotly"),
+    "recorder": (*_EVERY, *_LOG),
+    "router": _EVERY,
+}
+"""What a role imports; ``tests/faults/test_bundle.py`` runs each role with nothing else."""
+BUDGET_MB = {"camera": 350.0, "uav": 350.0}
+"""Installed, without an OAK board's depthai."""
+_WARM = {
+    "camera": "deploy.agents.assembly, deploy.offline.detect, deploy.agents.systemd_notify, edge.agents.camera, "
+    "edge.detectors.marker.bright, edge.detectors.marker.ball, edge.detectors.marker.tag, "
+    "edge.devices.playback.log_playback, edge.devices.live.network, edge.devices.live.picamera, "
+    "edge.devices.live.usb, edge.devices.playback.open_video, protocols.bus.transport.zenoh_bus",
+    "uav": "deploy.agents.uav, deploy.agents.systemd_notify, edge.agents.uav, edge.mavlink.link.connection, "
+    "edge.uav.ground_tracker, edge.devices.playback.open_video, protocols.bus.transport.zenoh_bus",
+    "hub": "deploy.agents.assembly, hub.live.agent, hub.calibration.pipeline, hub.distributed.network.host, "
+    "hub.report, protocols.bus.transport.zenoh_bus",
+    "recorder": "deploy.agents.recorder, protocols.bus.transport.zenoh_bus",
+    "router": "deploy.commands.agents.router, protocols.bus.router.zenoh_router",
+}
+_WHEELS = "wheels"
+_GLIBC = 28  # Debian 10 and later, as all our wheels ask for
+_SOURCE = Path(__file__).resolve().parents[2]
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """The board. platform: aarch64 or x86_64. python: "3.11"."""
+
+    platform: str
+    python: str
+
+    def tags(self) -> tuple[str, ...]:
+        """Platform tags that run there, newest first."""
+        return (
+            *(f"manylinux_2_{minor}_{self.platform}" for minor in range(_GLIBC, 16, -1)),
+            f"manylinux2014_{self.platform}",
+        )
+
+    def markers(self) -> dict[str, str]:
+        """The environment in which its requirements' markers are judged."""
+        return {
+            "implementation_name": "cpython",
+            "implementation_version": f"{self.python}.0",
+            "os_name": "posix",
+            "platform_machine": self.platform,
+            "platform_python_implementation": "CPython",
+            "platform_release": "",
+            "platform_system": "Linux",
+            "platform_version": "",
+            "python_full_version": f"{self.python}.0",
+            "python_version": self.python,
+            "sys_platform": "linux",
+            "extra": "",
+        }
+
+
+@dataclass(slots=True)
+class Bundle:
+    """What was made. sizes: wheel → bytes when installed."""
+
+    role: str
+    target: Target
+    out: Path
+    sizes: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def installed_mb(self) -> float:
+        """Size on the board, without Python itself and byte code."""
+        return sum(self.sizes.values()) / 1e6
+
+    @property
+    def carried_mb(self) -> float:
+        """Size of the wheels to carry over."""
+        return sum(path.stat().st_size for path in (self.out / _WHEELS).glob("*.whl")) / 1e6
+
+
+def make_bundle(role: str, target: Target, out: Path, extras: Sequence[str] = (), keep_budget: bool = True) -> Bundle:
+    """Gather wheels and write ``out``.
+
+    extras: optional groups of the project, such as ``oak``, or packages that else only other roles get, such as scipy.
+
+    Raises InputError where the wheels can't be had, Refused where a board's role has grown over its budget.
+    """
+    folder = out / _WHEELS
+    _clean(out)
+    needed = [*_requirements(role, target, extras)]
+    wheel = _own_wheel(folder)
+    _download([str(requirement) for requirement in needed], folder, target)
+    _complete(folder, wheel, target)
+    _download(["pip>=24"], folder, target)
+    bundle = Bundle(role, target, out)
+    pins = []
+    for file in sorted(folder.glob("*.whl")):
+        name, version = _identity(file)
+        if name == "pip":
+            continue
+        bundle.sizes[file.name] = _installed_size(file)
+        pins.append(f"{name}=={version} --hash=sha256:{hashlib.sha256(file.read_bytes()).hexdigest()}")
+    (out / "requirements.txt").write_text("\n".join(pins) + "\n", encoding="utf-8")
+    script = out / "install.sh"
+    script.write_text(_script(role, target), encoding="utf-8")
+    script.chmod(0o755)
+    budget = BUDGET_MB.get(role)
+    if keep_budget and budget is not None and "oak" not in extras and bundle.installed_mb > budget:
+        raise Refused(
+            f"{bundle.installed_mb:.0f} MB installed, a {role} may take {budget:.0f} MB: see the largest wheels"
+        )
+    return bundle
+
+
+def _clean(out: Path) -> None:
+    """Make the folder; take away only what an earlier bundle wrote."""
+    try:
+        if (out / _WHEELS).is_dir():
+            for file in (out / _WHEELS).glob("*.whl"):
+                file.unlink()
+        (out / _WHEELS).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made: {error.strerror}", file=out, remedy="choose another --out") from None
+
+
+def _requirements(role: str, target: Target, extras: Iterable[str]) -> Iterable[Requirement]:
+    """The project's own requirements that this role needs, with their bounds."""
+    from packaging.requirements import Requirement
+    from packaging.utils import canonicalize_name
+
+    try:
+        declared = [Requirement(text) for text in requires("syncline") or ()]
+    except PackageNotFoundError:
+        raise InputError("Syncline is not installed as a package", remedy="pip install -e . in the checkout") from None
+    groups = {
+        str(name).lower() for name in (metadata("syncline").get_all("Provides-Extra") or ()) if str(name) != "dev"
+    }
+    packages = {canonicalize_name(one.name) for one in declared if one.marker is None}
+    strange = [extra for extra in extras if extra not in groups and canonicalize_name(extra) not in packages]
+    if strange:
+        told = ", ".join(sorted(groups))
+        raise InputError(f"no extra {', '.join(strange)}", remedy=f"use {told}, or a package of the project's")
+    wanted = {canonicalize_name(name) for name in (*NEEDS[role], *(one for one in extras if one not in groups))}
+    found = set()
+    for requirement in declared:
+        name = canonicalize_name(requirement.name)
+        marker = requirement.marker
+        of_extra = marker is not None and any(
+            marker.evaluate({**target.markers(), "extra": extra}) and not marker.evaluate(target.markers())
+            for extra in extras
+        )
+        if (name in wanted or of_extra) and name not in found:
+            found.add(name)
+            requirement.marker = None
+            yield requirement
+    if wanted - found:
+        raise InputError(
+            f"the project does not declare {', '.join(sorted(wanted - found))}", remedy="add it to pyproject.toml"
+        )
+
+
+def _own_wheel(folder: Path) -> Path:
+    if not (_SOURCE / "pyproject.toml").is_file():
+        raise InputError("a bundle is made from a checkout of Syncline", remedy="run it from there: pip install -e .")
+    isolation = ["--no-build-isolation"] if find_spec("hatchling") else []
+    _pip(["wheel", "--quiet", "--no-deps", *isolation, "--wheel-dir", str(folder), str(_SOURCE)])
+    return next(folder.glob("syncline-*.whl"))
+
+
+def _download(requirements: Sequence[str], folder: Path, target: Target, deps: bool = True) -> None:
+    compact = target.python.replace(".", "")
+    lock = _lock(target, folder)
+    arguments = [
+        "download",
+        "--quiet",
+        "--only-binary=:all:",
+        "--implementation",
+        "cp",
+        "--python-version",
+        target.python,
+    ]
+    for abi in (f"cp{compact}", "abi3", "none"):
+        arguments += ["--abi", abi]
+    for tag in target.tags():
+        arguments += ["--platform", tag]
+    if lock is not None:
+        arguments += ["--constraint", str(lock)]
+    try:
+        _pip([*arguments, *([] if deps else ["--no-deps"]), "--dest", str(folder), *requirements])
+    finally:
+        if lock is not None:
+            lock.unlink()
+
+
+def _lock(target: Target, folder: Path) -> Path | None:
+    """The checkout's pins that are meant for the target: pip would judge their markers by this machine."""
+    from packaging.requirements import InvalidRequirement, Requirement
+
+    source = _SOURCE / "requirements.lock"
+    if not source.is_file():
+        return None
+    lines = []
+    for line in source.read_text(encoding="utf-8").splitlines():
+        try:
+            requirement = Requirement(line)
+        except InvalidRequirement:
+            continue
+        if requirement.marker is None or requirement.marker.evaluate(target.markers()):
+            requirement.marker = None
+            lines.append(str(requirement))
+    file = folder / ".constraints.txt"
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return file
+
+
+def _complete(folder: Path, own: Path, target: Target) -> None:
+    """Fetch what the wheels ask for on the target, which pip judged by the machine that it runs on."""
+    from packaging.requirements import Requirement
+    from packaging.utils import canonicalize_name
+
+    for _ in range(20):
+        there = {_identity(file)[0] for file in folder.glob("*.whl")}
+        missing: dict[str, str] = {}
+        for file in folder.glob("*.whl"):
+            if file == own:
+                continue  # its own needs are the role's, not all that it declares
+            for text in _metadata(file).get_all("Requires-Dist") or ():
+                requirement = Requirement(text)
+                name = canonicalize_name(requirement.name)
+                if name not in there and (requirement.marker is None or requirement.marker.evaluate(target.markers())):
+                    requirement.marker = None
+                    missing[name] = str(requirement)
+        if not missing:
+            return
+        _download(list(missing.values()), folder, target, deps=False)
+    raise Refused("the wheels' requirements do not come to an end")
+
+
+def _pip(arguments: Sequence[str]) -> None:
+    if not find_spec("pip"):
+        raise InputError("pip is not in this environment", remedy=f"{sys.executable} -m ensurepip")
+    ended = subprocess.run(
+        [sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=1800,
+        check=False,
+    )
+    if ended.returncode:
+        lines = [line for line in ended.stderr.splitlines() if line.startswith("ERROR")]
+        what = lines[0].removeprefix("ERROR: ") if lines else f"pip ended with status {ended.returncode}"
+        raise InputError(what[:300], remedy="check --platform, --python and the connection to the package index")
+
+
+def _metadata(wheel: Path) -> Message:
+    with zipfile.ZipFile(wheel) as archive:
+        name = next(name for name in archive.namelist() if re.fullmatch(r"[^/]+\.dist-info/METADATA", name))
+        return HeaderParser().parsestr(archive.read(name).decode())
+
+
+def _identity(wheel: Path) -> tuple[str, str]:
+    from packaging.utils import parse_wheel_filename
+
+    name, version, _, _ = parse_wheel_filename(wheel.name)
+    return str(name), str(version)
+
+
+def _installed_size(wheel: Path) -> int:
+    with zipfile.ZipFile(wheel) as archive:
+        return sum(item.file_size for item in archive.infolist())
+
+
+def _script(role: str, target: Target) -> str:
+    return f"""\
+#!/bin/sh
+# Installs Syncline {VERSION} for the role {role} from this folder, without a network.
+# Usage: sh install.sh [TARGET]      default /opt/syncline; PYTHON=python3 chooses the interpreter.
+# Once more with a newer bundle updates it; then restart the agents.
+set -eu
+here=$(CDPATH= cd -- "$(dirname -- "$0")" && pwd)
+target=${{1:-/opt/syncline}}
+python=${{PYTHON:-python3}}
+"$python" - <<'CHECK'
+import platform, sys
+found = (platform.machine(), "%d.%d" % sys.version_info[:2])
+if found != ({target.platform!r}, {target.python!r}):
+    sys.exit("install.sh: this bundle is for {target.platform}, Python {target.python}; here are %s, Python %s" % found)
+CHECK
+# Without pip: Debian keeps it in a package of its own. The bundle's runs out of its wheel.
+[ -x "$target/bin/python" ] || "$python" -m venv --without-pip "$target"
+for pip in "$here"/{_WHEELS}/pip-*.whl; do :; done
+"$target/bin/python" "$pip/pip" install --quiet --disable-pip-version-check --no-index --no-compile --no-deps \\
+    --upgrade --require-hashes --find-links "$here/{_WHEELS}" --requirement "$here/requirements.txt"
+# Byte code of what the agent imports, and of nothing else: services may not write here.
+"$target/bin/python" -c "import {_WARM[role]}"
+echo "Syncline {VERSION} ({role}) is in $target: $(du -sm "$target" | cut -f1) MB"
+"$target/bin/syncline" --version
+"""
+
+
+def folder_size_mb(folder: Path) -> float:
+    """Bytes of all files below it [MB]."""
+    return sum(file.lstat().st_size for file in folder.rglob("*") if file.is_file() or file.is_symlink()) / 1e6
+
+
+def default_folder(role: str, target: Target) -> Path:
+    """Where a bundle goes if nothing is said."""
+    return Path(f"syncline-{VERSION}-{role}-{target.platform}-py{target.python}")
