@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 
-.PHONY: demo test lint types contracts check proto lock bench benches faults fuzz soak browser clean
+.PHONY: demo test lint types contracts docs check proto lock bench benches faults fuzz soak browser clean
 
 demo: $(STAMP)
 	$(BIN)/syncline demo --out demo-out
@@ -27,6 +27,11 @@ types: $(STAMP)
 
 contracts: $(STAMP)
 	$(BIN)/lint-imports
+
+# The documentation as a site in build/site; a broken link, anchor or equation is an error. NO_MKDOCS_2_WARNING: the
+# theme's notice about a future version of MkDocs.
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir build/site
 
 check: test lint types contracts
 
