@@ -1,4 +1,4 @@
-"""The one catalogue of topics: key expression, message, rate, recorded?, queue, when it is stale.
+"""The catalogue of bus topics: key expression, message type, rate, recording, queue length, staleness limit.
 
 Publishing, subscribing, liveness, logging and replay all derive from this table, so that a topic is
 added in one place.
@@ -6,35 +6,33 @@ added in one place.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from enum import Enum
 
-from protocols.core.errors import InputError
-
-_ID = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}\Z")
+from protocols.core.names import check_identifier, key_segment
 
 
 class Delivery(Enum):
-    """What happens to a message when the link or the receiver is slow or away."""
+    """Delivery guarantee of a topic when the link or the receiver is slow or disconnected."""
 
     RELIABLE = "reliable"
     """Cached by the publisher, recovered by the subscriber after an outage, in order."""
     LATEST = "latest"
-    """Only the newest counts: late joiners get the last one, a slow reader skips."""
+    """Only the newest message matters: late joiners receive the last one, a slow reader skips messages."""
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One kind of message.
+    """One topic and its settings.
 
-    key: key expression below ``syncline/<site>/``, with ``{id}`` for the agent that publishes it.
+    key: key expression below ``syncline/<site>/``, with ``{id}`` for the key segment of the agent that publishes it
+        (``protocols.core.names.key_segment``).
     message: name of the protobuf message in ``syncline.v1``.
     rate_hz: nominal messages a second from one publisher (0 = on change).
     recorded: whether the recorder writes it.
     queue: messages that a subscriber holds before the oldest is dropped (and counted); 64 MiB is the other bound.
     stale_after_s: silence after which a publisher that is alive counts as stale; 0 = never.
-    bulky: pictures: they wait in a lane of their own on every link, behind everything else.
+    bulky: large images, which are sent at a lower priority than everything else.
     """
 
     name: str
@@ -48,12 +46,12 @@ class Topic:
     bulky: bool = False
 
     def key_for(self, site: str, agent: str) -> str:
-        """The concrete key of one publisher."""
-        return f"syncline/{valid_id(site, 'site')}/{self.key.format(id=valid_id(agent, 'id'))}"
+        """The concrete key of one publisher, named ``agent``."""
+        return f"syncline/{check_identifier(site, 'site')}/{self.key.format(id=key_segment(agent))}"
 
     def key_expression(self, site: str) -> str:
         """Matches every publisher of this topic on a site."""
-        return f"syncline/{valid_id(site, 'site')}/{self.key.format(id='*')}"
+        return f"syncline/{check_identifier(site, 'site')}/{self.key.format(id='*')}"
 
 
 OBSERVATION = Topic("observation", "camera/{id}/observation", "Observation", 30.0, True, Delivery.RELIABLE, 65_536, 2.0)
@@ -93,30 +91,16 @@ TOPICS: tuple[Topic, ...] = (
     ROAD_MAP,
     UAV_INFO,
 )
-BY_NAME: dict[str, Topic] = {topic.name: topic for topic in TOPICS}
+TOPICS_BY_NAME: dict[str, Topic] = {topic.name: topic for topic in TOPICS}
 
 
 def liveliness_key(site: str, role: str, agent: str, boot_id: str) -> str:
     """Key of an agent's liveliness token.
 
-    The boot id is part of it, so that two agents with one id show as two instead of interleaving
-    without a word.
+    The boot id is part of it, so that two agents with one id are seen as two instead of
+    interleaving undetected.
     """
     return (
-        f"syncline/{valid_id(site, 'site')}/alive/{valid_id(role, 'role')}/{valid_id(agent, 'id')}/"
-        f"{valid_id(boot_id, 'boot id')}"
+        f"syncline/{check_identifier(site, 'site')}/alive/{check_identifier(role, 'role')}/{key_segment(agent)}/"
+        f"{check_identifier(boot_id, 'boot id')}"
     )
-
-
-def valid_id(text: str, what: str = "id") -> str:
-    """Return ``text`` if it may stand in a key; raise InputError otherwise.
-
-    A ``?`` or ``*`` in a declared key poisons a router's routing for good, so nothing else than this
-    alphabet ever reaches the bus.
-    """
-    if not _ID.match(text):
-        raise InputError(
-            f"{what} {text!r} is not usable",
-            remedy="use 1 to 63 lower-case letters, digits, '-' or '_', beginning with a letter or digit",
-        )
-    return text

@@ -1,8 +1,8 @@
-"""The paper's own method: lag and fundamental matrix in turns, from F at lag 0 (eqs. 9 to 22).
+"""The asynchronous calibration paper's method: alternating estimation of lag and fundamental matrix (eqs. 9 to 22).
 
-"Calibration of pose and shutter timing of multiple asynchronous cameras". Frames are indices: camera b's
-point of index i + f belongs to camera a's point of index i, with f = lag in frames; f is good for about
-±9 frames from zero, and all the rest of the paper's limits hold. Kept as the reference to beat.
+"Calibration of pose and shutter timing of multiple asynchronous cameras". Frames are indices: camera b's point of index
+i + f corresponds to camera a's point of index i, with f = lag in frames. It converges for about ±9 frames from zero,
+and the paper's other restrictions apply. Kept as a baseline for comparison.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hub.two_view.fundamental import epipolar_lines, line_distances, maximum_likelihood
+from hub.two_view.fundamental import epipolar_lines, line_distances, maximum_likelihood_fundamental
 from protocols.core.errors import Refused
 from protocols.geometry.types import Bools, Floats
 
-_TOLERANCE = 1e-6  # relative fall of E below which eq. 22 counts as "no longer falls"
-_MOST_TURNS = 60
+_TOLERANCE = 1e-6  # relative decrease of E below which the iteration has converged (eq. 22)
+_MAX_ITERATIONS = 60
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Turn:
+class Iteration:
     """One iteration n. lag: f⁽ⁿ⁾ in frames. lags: f_i (eq. 14), NaN where no crossing. distance: E⁽ⁿ⁾ (eq. 21)."""
 
     lag: float
@@ -30,39 +30,39 @@ class Turn:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PaperResult:
-    """lag: frames by which b's index runs ahead for the same instant. fundamental: ``m_aᵀ F m_b = 0``."""
+class AlternatingLagResult:
+    """lag: frames by which b's index is ahead at the same instant. fundamental: ``m_aᵀ F m_b = 0``."""
 
     lag: float
     fundamental: Floats
     distance: float
-    turns: tuple[Turn, ...]
+    iterations: tuple[Iteration, ...]
 
 
-def alternate(a: Floats, b: Floats, start_lag: float = 0.0) -> PaperResult:
+def estimate_alternately(a: Floats, b: Floats, start_lag: float = 0.0) -> AlternatingLagResult:
     """The paper's iteration on two tracks by frame index.
 
     a: (n, 2), b: (m, 2) undistorted pixels; NaN where a frame has no marker. Raises Refused where fewer
     than 8 indices correspond or no epipolar line crosses the other track.
     """
-    points_a, points_b, _ = corresponding(a, b, start_lag)
-    fundamental = maximum_likelihood(points_a, points_b)
-    turns: list[Turn] = [
-        Turn(start_lag, np.full(len(a), np.nan), fundamental, _distance(fundamental, points_a, points_b))
+    points_a, points_b, _ = corresponding_points(a, b, start_lag)
+    fundamental = maximum_likelihood_fundamental(points_a, points_b)
+    iterations: list[Iteration] = [
+        Iteration(start_lag, np.full(len(a), np.nan), fundamental, _mean_line_distance(fundamental, points_a, points_b))
     ]
-    while len(turns) < _MOST_TURNS:
-        last = turns[-1]
+    while len(iterations) < _MAX_ITERATIONS:
+        last = iterations[-1]
         lags = point_lags(last.fundamental, a, b, last.lag)
         lag = overall_lag(lags)
-        points_a, points_b, _ = corresponding(a, b, lag)
-        fundamental = maximum_likelihood(points_a, points_b)
-        turn = Turn(lag, lags, fundamental, _distance(fundamental, points_a, points_b))
-        turns.append(turn)
-        # Eq. 22. From F⁽⁰⁾ the distance may rise once before the lag has a say.
-        if len(turns) > 2 and not turn.distance < last.distance * (1.0 - _TOLERANCE):
+        points_a, points_b, _ = corresponding_points(a, b, lag)
+        fundamental = maximum_likelihood_fundamental(points_a, points_b)
+        iteration = Iteration(lag, lags, fundamental, _mean_line_distance(fundamental, points_a, points_b))
+        iterations.append(iteration)
+        # Eq. 22. From F⁽⁰⁾ the distance may rise once before the lag is first updated.
+        if len(iterations) > 2 and not iteration.distance < last.distance * (1.0 - _TOLERANCE):
             break
-    best = min(turns[1:], key=lambda turn: turn.distance)
-    return PaperResult(best.lag, best.fundamental, best.distance, tuple(turns))
+    best = min(iterations[1:], key=lambda iteration: iteration.distance)
+    return AlternatingLagResult(best.lag, best.fundamental, best.distance, tuple(iterations))
 
 
 def search_start(lag: float) -> int:
@@ -77,11 +77,11 @@ def point_lags(fundamental: Floats, a: Floats, b: Floats, lag: float) -> Floats:
     begin = search_start(lag)
     for i in np.flatnonzero(np.isfinite(a).all(axis=1)):
         distance = b @ lines[i, :2] + lines[i, 2]
-        out[i] = _walk(distance, int(i), int(i) + begin)
+        out[i] = _search_crossing(distance, int(i), int(i) + begin)
     return out
 
 
-def _walk(distance: Floats, i: int, at: int) -> float:
+def _search_crossing(distance: Floats, i: int, at: int) -> float:
     """Steps 1 to 4 for one point. distance: signed, of every point of b from the epipolar line."""
     size = len(distance)
     if not (0 <= at < size) or not np.isfinite(distance[at]):
@@ -116,7 +116,7 @@ def overall_lag(lags: Floats) -> float:
     return float(known[bins == peak].mean())
 
 
-def corresponding(a: Floats, b: Floats, lag: float) -> tuple[Floats, Floats, Bools]:
+def corresponding_points(a: Floats, b: Floats, lag: float) -> tuple[Floats, Floats, Bools]:
     """Point pairs at a lag (eqs. 19, 20): a_i and b interpolated at i + f. Returns also which i were used."""
     index = np.arange(len(a)) + lag
     low = np.floor(index).astype(np.int64)
@@ -131,6 +131,6 @@ def corresponding(a: Floats, b: Floats, lag: float) -> tuple[Floats, Floats, Boo
     return a[good], between[good], good
 
 
-def _distance(fundamental: Floats, a: Floats, b: Floats) -> float:
+def _mean_line_distance(fundamental: Floats, a: Floats, b: Floats) -> float:
     """E (eq. 21): mean distance of b's points from the epipolar lines of a's [px]."""
     return float(np.abs(line_distances(epipolar_lines(fundamental, a), b)).mean())

@@ -1,7 +1,7 @@
-"""The paper's own distributed estimate, eqs. (1) to (19) in corrected form (METHODS C): the reference to beat.
+"""The distributed pose paper's recursive estimator, eqs. (1) to (19) in corrected form: a baseline for comparison.
 
-Convention: ``X_k = R_k (X - t_k)``. The paper prints ``[R t]`` in eqs. (11) and (12); right is ``R [I | -t]``. Its
-``R_l R_k^-1`` in eqs. (1), (2) and (19) is the other way about: the sum of ``X_k X_lᵀ`` gives ``R_k R_lᵀ``.
+Convention: ``X_k = R_k (X - t_k)``. The paper prints ``[R t]`` in eqs. (11) and (12); correct is ``R [I | -t]``. Its
+``R_l R_k^-1`` in eqs. (1), (2) and (19) is inverted: the sum of ``X_k X_lᵀ`` gives ``R_k R_lᵀ``.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 
-LEAST = 4
-"""Shared observations before an edge tells anything."""
+MIN_OBSERVATIONS = 4
+"""Shared observations before an edge is used."""
 
 
 @dataclass(frozen=True, slots=True)
-class PaperSettings:
+class RecursivePoseSettings:
     """The paper's constants; it prints no values.
 
     known_variance, unknown_variance: p1 and p2 of eq. (3). known_weight: q1 of eq. (4), against the edges' unit
-    vectors. forget: u of eq. (5), at each update; 1 forgets nothing. bearing_std: of a direction [rad].
-    drift: variance added at each update (Q).
+    vectors. forget: forgetting factor u of eq. (5), at each update; 1 = no forgetting. bearing_std: of a direction
+    [rad]. drift: process noise variance at each update (Q).
     """
 
     known_variance: float = 1e-6
@@ -36,11 +36,11 @@ class PaperSettings:
 
 
 def point_in_camera(rows: Floats) -> Floats:
-    """Points (n, 3) up to one unit, from rows (n, 3) of x, y, log size, normalised; eqs. (13), (14)."""
+    """Points (n, 3) up to a common scale, from rows (n, 3) of x, y, log size, normalised; eqs. (13), (14)."""
     return np.asarray(np.column_stack([rows[:, :2], np.ones(len(rows))]) * np.exp(-rows[:, 2])[:, None])
 
 
-def centred(points: Floats, mean: Floats) -> Floats:
+def centred_directions(points: Floats, mean: Floats) -> Floats:
     """Unit vectors (n, 3) from the mean (3,) to points (n, 3); eqs. (16), (17)."""
     apart = points - mean
     return np.asarray(apart / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-12))
@@ -61,23 +61,28 @@ def direction(mean_k: Floats, mean_l: Floats, k_from_l: Floats) -> Floats:
     return np.asarray(mean_k - k_from_l @ mean_l)
 
 
-def forgotten(matrix: Floats, fresh: Floats, forget: float) -> Floats:
-    """M_kl after one more observation; eq. (5): forgets for u > 1 only."""
-    return np.asarray(matrix / forget + fresh)
+def discounted_sum(matrix: Floats, new_correlation: Floats, forget: float) -> Floats:
+    """M_kl after one more observation; eq. (5): forgetting for u > 1 only."""
+    return np.asarray(matrix / forget + new_correlation)
 
 
-def own_matrix(known: Floats, edges: list[tuple[Floats, Floats]]) -> Floats:
+def attitude_matrix(known: Floats, edges: list[tuple[Floats, Floats]]) -> Floats:
     """M_kk (3, 3) from the prior ``known`` (3, 3) and (M_ki, R_i) of the neighbours; eqs. (4), (6), prior kept."""
     return np.asarray(known + sum((m @ rotation for m, rotation in edges), np.zeros((3, 3))))
 
 
 def direction_jacobian(y: Floats, rotation: Floats) -> Floats:
     """H (2, 3) = [I₂ 0] R_y R_k with ``R_y y/‖y‖ = e₃``; eq. (8)."""
-    return np.asarray((so3.taking(y, np.array([0.0, 0.0, 1.0])) @ rotation)[:2])
+    return np.asarray((so3.rotation_between(y, np.array([0.0, 0.0, 1.0])) @ rotation)[:2])
 
 
 def kalman_position(
-    position: Floats, covariance: Floats, other: Floats, other_covariance: Floats, h: Floats, settings: PaperSettings
+    position: Floats,
+    covariance: Floats,
+    other: Floats,
+    other_covariance: Floats,
+    h: Floats,
+    settings: RecursivePoseSettings,
 ) -> tuple[Floats, Floats]:
     """t_k (3,) and its covariance after one direction to ``other``; eqs. (7), (9), (10) with process noise and G."""
     covariance = covariance + settings.drift * np.eye(3)
@@ -90,18 +95,18 @@ def kalman_position(
 
 
 @dataclass(slots=True, eq=False)
-class _PaperEdge:
-    """Means of one neighbour's shared points, M_kl, and the ``fresh`` correlation that it lacks yet."""
+class _Edge:
+    """Means of one neighbour's shared points, M_kl, and the ``new_correlation`` not yet added to it."""
 
     points_k: Floats
     points_l: Floats
     matrix: Floats
-    fresh: Floats
+    new_correlation: Floats
     count: int = 0
 
 
-class PaperNode:
-    """One camera by the paper. start: its first guess; references: what is known exactly."""
+class RecursivePoseNode:
+    """Recursive estimator of one camera. start: initial pose; position_known, attitude_known: exactly known parts."""
 
     def __init__(
         self,
@@ -109,15 +114,15 @@ class PaperNode:
         *,
         position_known: bool = False,
         attitude_known: bool = False,
-        settings: PaperSettings | None = None,
+        settings: RecursivePoseSettings | None = None,
     ) -> None:
-        self.settings = settings or PaperSettings()
+        self.settings = settings or RecursivePoseSettings()
         self.rotation, self.position = start.rotation, start.position
         variance = self.settings.known_variance if position_known else self.settings.unknown_variance
         self.covariance = variance * np.eye(3)  # eq. (3)
         self.position_known = position_known
         self.known = self.settings.known_weight * start.rotation if attitude_known else np.zeros((3, 3))  # eq. (4)
-        self._edges: dict[int, _PaperEdge] = {}
+        self._edges: dict[int, _Edge] = {}
 
     @property
     def pose(self) -> Pose:
@@ -128,29 +133,33 @@ class PaperNode:
         """One shared point, rows (3,) in this camera and the neighbour: eqs. (13) to (19) and (5)."""
         edge = self._edges.get(neighbour)
         if edge is None:
-            edge = self._edges[neighbour] = _PaperEdge(np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)))
+            edge = self._edges[neighbour] = _Edge(np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)))
         point_k, point_l = point_in_camera(seen_k[None])[0], point_in_camera(seen_l[None])[0]
         edge.count += 1
         edge.points_k = edge.points_k + (point_k - edge.points_k) / edge.count
         edge.points_l = edge.points_l + (point_l - edge.points_l) / edge.count
-        if edge.count < LEAST:
+        if edge.count < MIN_OBSERVATIONS:
             return
-        fresh = correlation(centred(point_k[None], edge.points_k), centred(point_l[None], edge.points_l))
-        edge.fresh = edge.fresh + fresh  # eq. (2): the sum over the observations between two updates
+        new_correlation = correlation(
+            centred_directions(point_k[None], edge.points_k), centred_directions(point_l[None], edge.points_l)
+        )
+        edge.new_correlation = (
+            edge.new_correlation + new_correlation
+        )  # eq. (2): the sum over the observations between two updates
 
     def update(self, poses: dict[int, tuple[Pose, Floats]], latest: list[int]) -> None:
         """Sections 3.3.1 and 3.3.2: attitude by all edges, position by the ``latest`` ones.
 
         poses: (pose, position's covariance (3, 3)) of the neighbours.
         """
-        ready = {k: edge for k, edge in self._edges.items() if edge.count > 2 * LEAST and k in poses}
+        ready = {k: edge for k, edge in self._edges.items() if edge.count > 2 * MIN_OBSERVATIONS and k in poses}
         if not ready:
             return
         for edge in ready.values():
-            if edge.fresh.any():
-                edge.matrix = forgotten(edge.matrix, edge.fresh, self.settings.forget)
-                edge.fresh = np.zeros((3, 3))
-        matrix = own_matrix(self.known, [(edge.matrix, poses[k][0].rotation) for k, edge in ready.items()])
+            if edge.new_correlation.any():
+                edge.matrix = discounted_sum(edge.matrix, edge.new_correlation, self.settings.forget)
+                edge.new_correlation = np.zeros((3, 3))
+        matrix = attitude_matrix(self.known, [(edge.matrix, poses[k][0].rotation) for k, edge in ready.items()])
         self.rotation = rotation_of(matrix)
         for k in latest:
             if k not in ready or self.position_known:

@@ -1,7 +1,7 @@
-"""One adjustment of everything: 3-D spline, poses, time maps, and where asked focal length and k1.
+"""Continuous-time bundle adjustment: 3-D spline, poses, time maps, and optionally focal length and k1.
 
-Levenberg-Marquardt on the reprojection error of the raw rows (every row at its own time: METHODS A.6),
-with a motion prior on the spline's third differences whose strength comes from the data.
+Levenberg-Marquardt on the reprojection error of the raw rows, each at its own time (asynchronous calibration paper,
+section A.6), with a motion prior on the spline's third differences whose weight is estimated from the data.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from hub.bundle.bordered_system import solve
-from hub.bundle.normal_equations import assemble, build_system, weighed
+from hub.bundle.normal_equations import assemble, build_system, weigh_residuals
 from hub.bundle.problem import (
     ASPECT,
     CAMERA_PARAMETERS,
@@ -25,62 +25,67 @@ from hub.bundle.problem import (
     P1,
     RATE,
     READOUT,
+    AdjustmentState,
     CameraState,
     Problem,
-    Rows,
-    State,
+    TrackObservations,
 )
-from hub.bundle.residuals import Linearised, linearise, predict, residual_norms
+from hub.bundle.residuals import LinearisedResiduals, linearise, predict, residual_norms
+from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.trajectory.discrete import PointBasis
-from hub.trajectory.smoothness_prior import MotionPrior, motion_prior
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.calibration import AdjustmentStep
 
-_CUT = 5.0  # rows beyond this many sigma are false detections
-_LEAST_SIGMA = 0.05  # px
-_ROUGH, _FINE = 1e-4, 1e-7  # gain, as a share of the cost, at which a round and the last one end
+_OUTLIER_SIGMA = 5.0  # rows beyond this many sigma are rejected as outliers
+_MIN_SIGMA_PX = 0.05  # px
+_COARSE_TOLERANCE, _FINE_TOLERANCE = (
+    1e-4,
+    1e-7,
+)  # relative decrease of the cost at which a round, and the last one, has converged
 
 
 def adjust(
     problem: Problem,
-    state: State,
+    state: AdjustmentState,
     *,
     iterations: int = 40,
     rounds: int = 4,
-    roughly: bool = False,
+    coarse: bool = False,
     progress: Callable[[str], None] | None = None,
-) -> tuple[Problem, State, MotionPrior]:
-    """Solve: robust rounds first, then the rows that fit with full weight.
+) -> tuple[Problem, AdjustmentState, SmoothnessPrior]:
+    """Solve: robust rounds first, then the inliers with full weight.
 
-    roughly: for a start, which is adjusted again.
-    Returns the problem with the rows that count marked, the state, and the motion prior used.
+    coarse: stop early, for an initial estimate that is adjusted again.
+    Returns the problem with inliers marked, the state, and the motion prior used.
     """
-    prior = motion_prior(problem, state, first=True)
+    prior = estimate_smoothness(problem, state, weak=True)
     robust = True
     steps = list(state.steps)
-    for turn in range(rounds):
-        last = turn == rounds - 1
-        most = iterations if last else max(4, iterations // 3)
-        state = _minimise(problem, state, prior, robust, most, _ROUGH, steps, roughly)
-        state = replace(state, sigma=noise(problem, state))
-        prior = motion_prior(problem, state)
-        if turn >= rounds - 2:
+    for round_index in range(rounds):
+        last = round_index == rounds - 1
+        max_iterations = iterations if last else max(4, iterations // 3)
+        state = _minimise(problem, state, prior, robust, max_iterations, _COARSE_TOLERANCE, steps, coarse)
+        state = replace(state, sigma=estimate_noise(problem, state))
+        prior = estimate_smoothness(problem, state)
+        if round_index >= rounds - 2:
             problem = mark_inliers(problem, state)
             robust = False
         if progress is not None:
-            progress(f"adjustment {turn + 1}/{rounds}: {float(np.median(state.sigma)):.2f} px")
-    state = _minimise(problem, state, prior, robust, iterations, _ROUGH if roughly else _FINE, steps, roughly)
-    return problem, replace(state, sigma=noise(problem, state), steps=tuple(steps)), prior
+            progress(f"adjustment {round_index + 1}/{rounds}: {float(np.median(state.sigma)):.2f} px")
+    state = _minimise(
+        problem, state, prior, robust, iterations, _COARSE_TOLERANCE if coarse else _FINE_TOLERANCE, steps, coarse
+    )
+    return problem, replace(state, sigma=estimate_noise(problem, state), steps=tuple(steps)), prior
 
 
-def noise(problem: Problem, state: State) -> Floats:
+def estimate_noise(problem: Problem, state: AdjustmentState) -> Floats:
     """Robust noise (cameras,) of one pixel coordinate from the median residual.
 
-    Separate points take up three of the few coordinates that see each of them: there one noise is shared
-    (told apart, it would all be put on one camera) and corrected for what the points have absorbed.
+    Each separate point absorbs three of the few coordinates that observe it. There all cameras share one noise
+    (separate estimates would attribute all of it to one camera), corrected for the redundancy.
     """
     sigma = state.sigma.copy()
     if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
@@ -94,12 +99,12 @@ def noise(problem: Problem, state: State) -> Floats:
         values = np.concatenate(parts) if parts else np.zeros(0)
         values = values[np.isfinite(values)]
         if len(values) >= 8:
-            sigma[camera] = max(_LEAST_SIGMA, float(np.median(values)) / 1.1774)
+            sigma[camera] = max(_MIN_SIGMA_PX, float(np.median(values)) / 1.1774)
     return sigma
 
 
-def _pooled_noise(problem: Problem, state: State) -> float:
-    parts, points = [], 0
+def _pooled_noise(problem: Problem, state: AdjustmentState) -> float:
+    parts, point_count = [], 0
     for label, path in enumerate(state.trajectories):
         seen = np.zeros(path.basis.size, dtype=np.bool_)
         for rows in problem.rows:
@@ -109,63 +114,63 @@ def _pooled_noise(problem: Problem, state: State) -> float:
                 parts.append(norms[good])
                 index = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[good]))[0]
                 seen[index] = True
-        points += int(seen.sum())
+        point_count += int(seen.sum())
     norms = np.concatenate(parts)
-    left = max(2 * len(norms) - 3 * points, 0.05 * len(norms))
-    return max(_LEAST_SIGMA, float(np.median(norms)) / 1.1774 * float(np.sqrt(2 * len(norms) / left)))
+    redundancy = max(2 * len(norms) - 3 * point_count, 0.05 * len(norms))
+    return max(_MIN_SIGMA_PX, float(np.median(norms)) / 1.1774 * float(np.sqrt(2 * len(norms) / redundancy)))
 
 
-def mark_inliers(problem: Problem, state: State) -> Problem:
-    """The problem with only those rows in use that lie within the cut."""
+def mark_inliers(problem: Problem, state: AdjustmentState) -> Problem:
+    """The problem with only the rows within the outlier threshold in use."""
     out = []
     for rows in problem.rows:
         norms = residual_norms(rows, state.cameras[rows.camera], state.trajectories[rows.label])
         with np.errstate(invalid="ignore"):
-            out.append(rows.using(norms < _CUT * state.sigma[rows.camera]))
-    return replace(problem, rows=tuple(_without_single_views(out, state)))
+            out.append(rows.using(norms < _OUTLIER_SIGMA * state.sigma[rows.camera]))
+    return replace(problem, rows=tuple(_reject_single_views(out, state)))
 
 
-def _without_single_views(parts: list[Rows], state: State) -> list[Rows]:
-    """Separate points need two cameras each: one ray alone leaves the point free along it."""
+def _reject_single_views(parts: list[TrackObservations], state: AdjustmentState) -> list[TrackObservations]:
+    """Reject separate points seen by one camera only: a single ray does not determine depth."""
     out = list(parts)
     for label, path in enumerate(state.trajectories):
         if not isinstance(path.basis, PointBasis):
             continue
-        mine = [i for i, rows in enumerate(out) if rows.label == label]
-        places = {i: path.basis.locate(state.cameras[out[i].camera].reference_time(out[i].time))[0] for i in mine}
+        of_label = [i for i, rows in enumerate(out) if rows.label == label]
+        indices = {i: path.basis.locate(state.cameras[out[i].camera].reference_time(out[i].time))[0] for i in of_label}
         count = np.zeros(path.basis.size)
-        for i in mine:
-            count += np.bincount(places[i][out[i].use], minlength=path.basis.size) > 0
-        for i in mine:
-            out[i] = out[i].using(out[i].use & (count[places[i]] >= 2))
+        for i in of_label:
+            count += np.bincount(indices[i][out[i].use], minlength=path.basis.size) > 0
+        for i in of_label:
+            out[i] = out[i].using(out[i].use & (count[indices[i]] >= 2))
     return out
 
 
-def gauge_tangent(problem: Problem, state: State) -> Floats | None:
-    """Orthonormal directions (p, q) in which the free camera parameters may move without touching the gauge.
+def gauge_tangent(problem: Problem, state: AdjustmentState) -> Floats | None:
+    """Orthonormal directions (p, q) in which the free camera parameters may move with the gauge fixed.
 
-    Held: pose of the first anchor, distance between the two anchors. None where poses are fixed.
+    Fixed: pose of the first anchor, distance between the two anchors. None where poses are not free.
     """
-    if not problem.freedom.pose:
+    if not problem.free_parameters.pose:
         return None
     columns = problem.free_columns()
     first, second = problem.anchors
     width = len(state.cameras) * CAMERA_PARAMETERS
-    held = np.zeros((7, width))
-    held[np.arange(6), first * CAMERA_PARAMETERS + np.arange(6)] = 1.0
-    apart = state.cameras[second].pose.position - state.cameras[first].pose.position
-    apart = apart / np.linalg.norm(apart)
-    held[6, second * CAMERA_PARAMETERS + 3 : second * CAMERA_PARAMETERS + 6] = apart
-    _, _, vt = np.linalg.svd(held[:, columns])
+    constraints = np.zeros((7, width))
+    constraints[np.arange(6), first * CAMERA_PARAMETERS + np.arange(6)] = 1.0
+    baseline = state.cameras[second].pose.position - state.cameras[first].pose.position
+    baseline = baseline / np.linalg.norm(baseline)
+    constraints[6, second * CAMERA_PARAMETERS + 3 : second * CAMERA_PARAMETERS + 6] = baseline
+    _, _, vt = np.linalg.svd(constraints[:, columns])
     return np.asarray(vt[7:].T)
 
 
-def moved(problem: Problem, state: State, path_step: Floats, camera_step: Floats) -> State:
+def apply_step(problem: Problem, state: AdjustmentState, path_step: Floats, camera_step: Floats) -> AdjustmentState:
     """The state after a step of the free parameters."""
     full = np.zeros(len(state.cameras) * CAMERA_PARAMETERS)
     full[problem.free_columns()] = camera_step
     cameras = tuple(
-        _moved_camera(camera, full[i * CAMERA_PARAMETERS : (i + 1) * CAMERA_PARAMETERS])
+        _apply_camera_step(camera, full[i * CAMERA_PARAMETERS : (i + 1) * CAMERA_PARAMETERS])
         for i, camera in enumerate(state.cameras)
     )
     paths, at = [], 0
@@ -176,7 +181,7 @@ def moved(problem: Problem, state: State, path_step: Floats, camera_step: Floats
     return replace(state, cameras=cameras, trajectories=tuple(paths))
 
 
-def _moved_camera(camera: CameraState, step: Floats) -> CameraState:
+def _apply_camera_step(camera: CameraState, step: Floats) -> CameraState:
     pose = Pose(so3.exp(step[:3]) @ camera.pose.rotation, camera.pose.position + step[3:6])
     lens = camera.intrinsics
     if np.any(step[FOCAL:]):
@@ -204,39 +209,45 @@ def _moved_camera(camera: CameraState, step: Floats) -> CameraState:
 
 def _minimise(
     problem: Problem,
-    state: State,
-    prior: MotionPrior,
+    state: AdjustmentState,
+    prior: SmoothnessPrior,
     robust: bool,
     iterations: int,
-    least_gain: float,
+    tolerance: float,
     steps: list[AdjustmentStep],
-    growing: bool,
-) -> State:
-    """Levenberg-Marquardt; appends where it begins and every step that it takes to ``steps``."""
+    incremental: bool,
+) -> AdjustmentState:
+    """Levenberg-Marquardt; appends the initial cost and every accepted step to ``steps``."""
     damping = 1e-4
-    now = weighed(problem, state, prior, robust)
-    cost, system = now.cost, None
-    counting = max(2 * sum(len(part.time) if robust else int(part.use.sum()) for part in problem.rows), 1)
+    current = weigh_residuals(problem, state, prior, robust)
+    cost, system = current.cost, None
+    residual_count = max(2 * sum(len(part.time) if robust else int(part.use.sum()) for part in problem.rows), 1)
     stage = (
-        "first poses" if growing else "free lenses" if problem.freedom.lens else "robust" if robust else "fitting rows"
+        "first poses"
+        if incremental
+        else "free lenses"
+        if problem.free_parameters.lens
+        else "robust"
+        if robust
+        else "fitting rows"
     )
     pixels = float(np.sqrt(np.mean(state.sigma**2)))
-    steps.append(AdjustmentStep(stage, pixels * float(np.sqrt(max(cost, 0.0) / counting))))
+    steps.append(AdjustmentStep(stage, pixels * float(np.sqrt(max(cost, 0.0) / residual_count))))
     for _ in range(iterations):
-        system = system or assemble(problem, state, prior, now)
+        system = system or assemble(problem, state, prior, current)
         try:
             path_step, camera_step = solve(system, damping, gauge_tangent(problem, state))
         except np.linalg.LinAlgError:
             damping *= 10.0
             continue
-        trial = moved(problem, state, path_step, camera_step)
-        there = weighed(problem, trial, prior, robust)
-        if np.isfinite(there.cost) and there.cost < cost:
-            gain = cost - there.cost
-            state, now, cost, system = trial, there, there.cost, None
-            steps.append(AdjustmentStep(stage, pixels * float(np.sqrt(max(cost, 0.0) / counting))))
+        trial = apply_step(problem, state, path_step, camera_step)
+        trial_residuals = weigh_residuals(problem, trial, prior, robust)
+        if np.isfinite(trial_residuals.cost) and trial_residuals.cost < cost:
+            gain = cost - trial_residuals.cost
+            state, current, cost, system = trial, trial_residuals, trial_residuals.cost, None
+            steps.append(AdjustmentStep(stage, pixels * float(np.sqrt(max(cost, 0.0) / residual_count))))
             damping = max(damping / 10.0, 1e-12)
-            if gain < least_gain * cost:
+            if gain < tolerance * cost:
                 break
         else:
             damping = max(damping * 10.0, 1e-8)
@@ -246,16 +257,16 @@ def _minimise(
 
 
 __all__ = [
-    "Linearised",
-    "MotionPrior",
+    "LinearisedResiduals",
+    "SmoothnessPrior",
     "adjust",
+    "apply_step",
     "build_system",
+    "estimate_noise",
+    "estimate_smoothness",
     "gauge_tangent",
     "linearise",
     "mark_inliers",
-    "motion_prior",
-    "moved",
-    "noise",
     "predict",
     "residual_norms",
 ]

@@ -1,10 +1,10 @@
-"""The linear algebra of the adjustment: a banded trajectory block with a dense border of camera parameters.
+"""Linear solver of the adjustment: banded trajectory block with a dense border of camera parameters (Schur complement).
 
     [ A  B ] [ control points ]   [ g ]
     [ Bᵀ C ] [ cameras        ] = [ h ]
 
-A is banded because a time touches four control points; eliminating it costs time linear in the length of
-the recording (Schur complement C - Bᵀ A⁻¹ B).
+A is banded because the spline at one time depends on four control points; eliminating it costs time linear in the
+length of the recording (Schur complement C - Bᵀ A⁻¹ B).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hub.trajectory.splines import SUPPORT, SplineBasis
 from protocols.geometry.types import Floats, Ints
 
 BAND = 3 * SUPPORT
-"""Upper bands kept: four control points of three coordinates."""
+"""Upper bands stored: four control points of three coordinates."""
 
 
 @dataclass(slots=True, eq=False)
@@ -39,10 +39,10 @@ class BorderedSystem:
 
 
 class PathBlocks:
-    """Sums over rows into the band and the border of one label's path; size: its control points.
+    """Accumulates rows into the band and the border of the trajectory block; size: number of control points.
 
-    A row touches four control points. Sums over rows are products with a sparse matrix of their weights; the band is
-    put together once, from sums for each first control point.
+    A row depends on four control points. Sums over rows are products with a sparse matrix of their weights; the band is
+    assembled once, from sums for each first control point.
     """
 
     def __init__(self, size: int) -> None:
@@ -55,27 +55,27 @@ class PathBlocks:
         for p, (a, b) in enumerate(_PAIRS):
             products[:, p] = weights[:, a] * weights[:, b]
         columns = len(_PAIRS) * index[:, None] + np.arange(len(_PAIRS))
-        sums = summed(products, columns, np.ascontiguousarray(upper.T), self._sums.shape[0] * len(_PAIRS))
+        sums = sparse_row_sums(products, columns, np.ascontiguousarray(upper.T), self._sums.shape[0] * len(_PAIRS))
         self._sums += sums.reshape(self._sums.shape)
 
     def add_rows(self, index: Ints, weights: Floats, terms: Floats, weighted: Floats) -> tuple[Floats, Floats]:
-        """Add rows' normal matrix; returns what else is in it: (3 size, p) with the path, and (p, p) without.
+        """Add the rows' normal matrix; returns its path-by-others block (3 size, p) and others-by-others block (p, p).
 
-        terms: (2, 3 + p, n) derivatives of both image axes by the point and by p others, or what stands in their place;
-        weighted: the same times the rows' weights. index (n,), weights (n, 4): control points of each row's point.
+        terms: (2, 3 + p, n) derivatives of both image axes by the point and by p other columns (the residual may be
+        one); weighted: the same times the rows' weights. index (n,), weights (n, 4): control points of each row.
         """
-        # The point's three rows, by the point's and the others' columns.
+        # The point's three rows of the normal matrix, over the point's and the other columns.
         products = weighted[0, :3, None] * terms[0] + weighted[1, :3, None] * terms[1]
         self.add(index, weights, products[_ROWS, _COLUMNS])
-        spread = self.spread(index, weights, products[:, 3:])
-        return spread, weighted[0, 3:] @ terms[0, 3:].T + weighted[1, 3:] @ terms[1, 3:].T
+        scatter = self.scatter(index, weights, products[:, 3:])
+        return scatter, weighted[0, 3:] @ terms[0, 3:].T + weighted[1, 3:] @ terms[1, 3:].T
 
-    def spread(self, index: Ints, weights: Floats, values: Floats) -> Floats:
+    def scatter(self, index: Ints, weights: Floats, values: Floats) -> Floats:
         """Sum over rows of w ⊗ value: (3 size, p) of values (3, p, n)."""
         return border_block(index, weights, values, 3 * self.size)
 
     def band(self) -> Floats:
-        """The band (12, 3 size) of all that was added."""
+        """The band (12, 3 size) of the sum of all rows."""
         out = np.zeros((BAND, 3 * self.size))
         for p, (a, b) in enumerate(_PAIRS):
             for i in range(3):
@@ -95,14 +95,14 @@ def border_block(index: Ints, weights: Floats, values: Floats, size: int) -> Flo
     width = values.shape[1]
     columns = index[:, None] + np.arange(SUPPORT)
     rows_first = np.ascontiguousarray(values.transpose(2, 0, 1)).reshape(-1, 3 * width)
-    return summed(weights, columns, rows_first, size // 3 + SUPPORT).reshape(-1, width)[:size]
+    return sparse_row_sums(weights, columns, rows_first, size // 3 + SUPPORT).reshape(-1, width)[:size]
 
 
-def summed(weights: Floats, columns: Ints, values: Floats, size: int) -> Floats:
+def sparse_row_sums(weights: Floats, columns: Ints, values: Floats, size: int) -> Floats:
     """Sums (size, p) over rows of weights (n, k) at columns (n, k) times values (n, p)."""
     rows, each = weights.shape
-    spread = csc_array((weights.ravel(), columns.ravel(), each * np.arange(rows + 1)), shape=(size, rows))
-    return np.asarray(spread @ values)
+    scatter = csc_array((weights.ravel(), columns.ravel(), each * np.arange(rows + 1)), shape=(size, rows))
+    return np.asarray(scatter @ values)
 
 
 def third_difference_band(basis: SplineBasis | PointBasis, weight: Floats, metric: Floats) -> Floats:
@@ -111,26 +111,26 @@ def third_difference_band(basis: SplineBasis | PointBasis, weight: Floats, metri
     weight: (m,). metric: (3, 3), symmetric.
     """
     size = basis.size
-    begun = np.zeros(size)  # weight of the interval that begins at a control point
-    begun[basis.interval_starts()] = weight
+    starting_weight = np.zeros(size)  # weight of the interval that begins at a control point
+    starting_weight[basis.interval_starts()] = weight
     sums = np.zeros((SUPPORT, size))  # by distance of two control points, at the later one
     for a, b in _PAIRS:
-        sums[b - a, b:] += THIRD_DIFFERENCE[a] * THIRD_DIFFERENCE[b] * begun[: size - b]
+        sums[b - a, b:] += THIRD_DIFFERENCE[a] * THIRD_DIFFERENCE[b] * starting_weight[: size - b]
     band = np.zeros((BAND, 3 * size))
     for distance in range(SUPPORT):
         for j in range(3):
             top = BAND - 1 - 3 * distance - j
-            above = metric[: 3 if distance else j + 1, j, None]
-            band[top : top + len(above), 3 * distance + j :: 3] = above * sums[distance, distance:]
+            upper_metric = metric[: 3 if distance else j + 1, j, None]
+            band[top : top + len(upper_metric), 3 * distance + j :: 3] = upper_metric * sums[distance, distance:]
     return band
 
 
-def third_difference_gradient(basis: SplineBasis | PointBasis, pulls: Floats) -> Floats:
+def third_difference_gradient(basis: SplineBasis | PointBasis, gradients: Floats) -> Floats:
     """(3 n,): what pulls (m, 3) on the third differences are to the control points."""
     out = np.zeros((basis.size, 3))
     index = basis.interval_starts()
     for k, coefficient in enumerate(THIRD_DIFFERENCE):
-        out[index + k] += coefficient * pulls
+        out[index + k] += coefficient * gradients
     return out.ravel()
 
 
@@ -145,52 +145,54 @@ def third_differences(basis: SplineBasis | PointBasis, control: Floats) -> Float
 
 @dataclass(slots=True, eq=False)
 class Elimination:
-    """The path block factored and the cameras' reduced system. factor: Cholesky band of A.
+    """The factored path block and the reduced camera system. factor: Cholesky band of A.
 
     carried: (3 n, p) A⁻¹ B. reduced: (p, p) Schur complement.
     """
 
     factor: Floats
-    carried: Floats
+    a_inv_b: Floats
     reduced: Floats
 
 
 def eliminate(system: BorderedSystem, damping: float = 0.0) -> Elimination:
-    """Factor A (damped on its diagonal) and form the Schur complement. Raises LinAlgError if not definite."""
-    factor = _factored(system.band, damping)
-    carried = cho_solve_banded((factor, False), system.border, check_finite=False)
-    reduced = system.corner - system.border.T @ carried
-    return Elimination(factor, np.asarray(carried), np.asarray(0.5 * (reduced + reduced.T)))
+    """Factor A (damped on its diagonal) and form the Schur complement. Raises LinAlgError if not positive definite."""
+    factor = _damped_cholesky(system.band, damping)
+    a_inv_b = cho_solve_banded((factor, False), system.border, check_finite=False)
+    reduced = system.corner - system.border.T @ a_inv_b
+    return Elimination(factor, np.asarray(a_inv_b), np.asarray(0.5 * (reduced + reduced.T)))
 
 
-def cho_solve_path(parts: Elimination, right: Floats) -> Floats:
+def cho_solve_path(parts: Elimination, rhs: Floats) -> Floats:
     """A⁻¹ right, (3 n,) of (3 n,)."""
-    return np.asarray(cho_solve_banded((parts.factor, False), right, check_finite=False))
+    return np.asarray(cho_solve_banded((parts.factor, False), rhs, check_finite=False))
 
 
 def solve(system: BorderedSystem, damping: float, tangent: Floats | None) -> tuple[Floats, Floats]:
-    """Damped step (path (3 n,), cameras (p,)) that lowers the cost.
+    """Levenberg-Marquardt step (path (3 n,), cameras (p,)).
 
-    tangent: (p, q) orthonormal directions that the cameras may move in (the gauge is held); None = all.
+    tangent: (p, q) orthonormal directions in which the cameras may move (the gauge is fixed); None = all.
     """
-    factor = _factored(system.band, damping)
-    # Half of what `eliminate` does is enough: with A = Uᵀ U and H = U⁻ᵀ [B g], Hᵀ H holds Bᵀ A⁻¹ B and Bᵀ A⁻¹ g.
-    half = np.empty((factor.shape[1], len(system.gradient_cameras) + 1), order="F")
-    half[:, :-1], half[:, -1] = system.border, system.gradient_path
-    half, _ = dtbtrs(factor, half, trans="T", overwrite_b=True)  # fails where a diagonal is 0, as the factor's never is
-    gram = half.T @ half
-    right = gram[:-1, -1] - system.gradient_cameras
-    matrix = system.corner - gram[:-1, :-1] + damping * np.diag(np.diag(system.corner)) + 1e-12 * np.eye(len(right))
+    factor = _damped_cholesky(system.band, damping)
+    # Half of the work of `eliminate` is enough: with A = Uᵀ U and H = U⁻ᵀ [B g], Hᵀ H holds Bᵀ A⁻¹ B and Bᵀ A⁻¹ g.
+    half_solved = np.empty((factor.shape[1], len(system.gradient_cameras) + 1), order="F")
+    half_solved[:, :-1], half_solved[:, -1] = system.border, system.gradient_path
+    half_solved, _ = dtbtrs(
+        factor, half_solved, trans="T", overwrite_b=True
+    )  # fails only on a zero diagonal, which the factor never has
+    gram = half_solved.T @ half_solved
+    rhs = gram[:-1, -1] - system.gradient_cameras
+    matrix = system.corner - gram[:-1, :-1] + damping * np.diag(np.diag(system.corner)) + 1e-12 * np.eye(len(rhs))
     if tangent is None:
-        cameras = np.linalg.solve(matrix, right)
+        cameras = np.linalg.solve(matrix, rhs)
     else:
-        cameras = tangent @ np.linalg.solve(tangent.T @ matrix @ tangent, tangent.T @ right)
+        cameras = tangent @ np.linalg.solve(tangent.T @ matrix @ tangent, tangent.T @ rhs)
     path = cho_solve_banded((factor, False), system.gradient_path + system.border @ cameras, check_finite=False)
     return -np.asarray(path), np.asarray(cameras)
 
 
-def _factored(band: Floats, damping: float) -> Floats:
-    """Cholesky band of A, damped on its diagonal. Raises LinAlgError if not definite."""
+def _damped_cholesky(band: Floats, damping: float) -> Floats:
+    """Cholesky band of A, damped on its diagonal. Raises LinAlgError if not positive definite."""
     band = band.copy()
     band[-1] += damping * band[-1] + 1e-12 * float(band[-1].max(initial=1.0))
     return np.asarray(cholesky_banded(band, check_finite=False))

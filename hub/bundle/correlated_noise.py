@@ -1,9 +1,9 @@
-"""Errors that last for seconds: found where they are, and then counted for what they are.
+"""Re-fit of the adjustment where residuals are autocorrelated: generalised least squares with Gauss-Markov noise.
 
-Where residuals are alike from frame to frame, the adjustment is made again by generalised least squares
-(`generalised`), and the lenses, whose errors look just like that, are estimated whole under priors of what a given
-lens may be off by. With rows taken as separate a freed lens takes up what a detector errs by; with lasting errors and
-two numbers of each lens free, these two take up the rest of the lens.
+Where residuals are correlated from frame to frame, the adjustment is repeated by generalised least squares (`gls`).
+Lens errors have the same appearance, so all lens parameters are estimated too, under priors for how far given
+intrinsics may be off. With independent rows a free lens absorbs the detector's errors; with correlated noise and only
+two free parameters a lens, those two absorb the errors of its other parameters.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from hub.bundle.adjustment import noise
-from hub.bundle.covariance import turn_stds
-from hub.bundle.gauss_markov import coloured
-from hub.bundle.gls import Fit, fit, within_reach
-from hub.bundle.noise_scale import together
+from hub.bundle.adjustment import estimate_noise
+from hub.bundle.covariance import relative_rotation_stds
+from hub.bundle.gauss_markov import estimate_correlated_noise
+from hub.bundle.gls import GlsSolution, is_tractable, solve_gls
+from hub.bundle.noise_scale import correlation_inflation
 from hub.bundle.normal_equations import camera_priors
 from hub.bundle.problem import (
     ASPECT,
@@ -27,24 +27,24 @@ from hub.bundle.problem import (
     K2,
     K3,
     P1,
+    AdjustmentState,
     LensPrior,
     Problem,
-    State,
 )
+from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.trajectory.discrete import PointBasis
-from hub.trajectory.smoothness_prior import motion_prior
 from protocols.geometry.camera import Intrinsics
 from protocols.session.calibration import AdjustmentStep
 
-_LEAST_ALIKE = 4.0
-"""Residuals that must count as one before they are looked at for errors that last."""
-_LARGEST_TURN_STD = 0.0175
-"""Std [rad] of a camera's orientation beyond which too little is told for errors to be told from the path."""
+_MIN_INFLATION = 4.0
+"""Variance inflation by autocorrelation (rows per effective row) from which the noise is modelled as correlated."""
+_MAX_ROTATION_STD = 0.0175
+"""Std [rad] of a camera's orientation above which correlated errors and trajectory cannot be distinguished."""
 _LENS = (FOCAL, CENTRE, CENTRE + 1, K1, K2, K3, ASPECT, P1, P1 + 1)
 
 
-def tolerance(lens: Intrinsics) -> LensPrior:
-    """What a lens that somebody measured may be off by in the field: a zoom's play, a crop, a stabiliser."""
+def lens_tolerance(lens: Intrinsics) -> LensPrior:
+    """Prior for how far measured intrinsics may be off in the field: play of a zoom, a crop, an image stabiliser."""
     return LensPrior(
         focal=lens.focal,
         focal_std=0.01,
@@ -60,43 +60,43 @@ def tolerance(lens: Intrinsics) -> LensPrior:
     )
 
 
-def with_lasting_errors(problem: Problem, state: State) -> tuple[Problem, State]:
-    """The adjustment made again where errors last; else both as they are.
+def refit_with_correlated_noise(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
+    """Problem and state after the re-fit where residuals are autocorrelated; otherwise both unchanged.
 
-    problem, state: adjusted. Both stay too where poses are given, where clocks are shared or frames' own times were
-    found, where a recording is too long for it (`generalised.within_reach`), and where it would leave a camera's
-    orientation looser than 1°.
+    problem, state: adjusted. Both are also unchanged where poses are given, where clocks are shared, where frame times
+    were estimated, where the recording is too long (`gls.is_tractable`), and where the re-fit would leave the std of a
+    camera's orientation above 1°.
     """
-    unfit = state.jitter is not None or not problem.freedom.clock or not problem.freedom.pose
-    if unfit or any(isinstance(path.basis, PointBasis) for path in state.trajectories):
+    excluded = state.jitter is not None or not problem.free_parameters.clock or not problem.free_parameters.pose
+    if excluded or any(isinstance(path.basis, PointBasis) for path in state.trajectories):
         return problem, state
     cameras = range(len(state.cameras))
-    if max(together(problem, state, camera) for camera in cameras) < _LEAST_ALIKE:
+    if max(correlation_inflation(problem, state, camera) for camera in cameras) < _MIN_INFLATION:
         return problem, state
-    kinds = coloured(problem, state)
-    if not within_reach(problem, kinds):
+    noise_model = estimate_correlated_noise(problem, state)
+    if not is_tractable(problem, noise_model):
         return problem, state
-    told = replace(problem, freedom=replace(problem.freedom, lens=False))
-    found = replace(told, loose=tuple(tolerance(lens) for lens in problem.nominal))
+    nominal_problem = replace(problem, free_parameters=replace(problem.free_parameters, lens=False))
+    found = replace(nominal_problem, lens_tolerances=tuple(lens_tolerance(lens) for lens in problem.nominal))
     try:
-        best = fit(found, state, motion_prior(found, state), kinds)
-        if as_told(found, best):
-            # The state may have been adjusted with other lenses: its residuals tell of these too.
-            found, start = told, _with_told_lenses(told, state)
-            best = fit(told, start, motion_prior(told, start), kinds)
-            kinds = coloured(told, best.state)
-            best = fit(told, best.state, motion_prior(told, best.state), kinds)
-        loosest = _loosest_turn(found, best)
+        best = solve_gls(found, state, estimate_smoothness(found, state), noise_model)
+        if prefers_nominal_lenses(found, best):
+            # The state may have been adjusted with other lenses, and its residuals contain their errors.
+            found, start = nominal_problem, _with_nominal_lenses(nominal_problem, state)
+            best = solve_gls(nominal_problem, start, estimate_smoothness(nominal_problem, start), noise_model)
+            noise_model = estimate_correlated_noise(nominal_problem, best.state)
+            best = solve_gls(nominal_problem, best.state, estimate_smoothness(nominal_problem, best.state), noise_model)
+        rotation_std = _largest_rotation_std(found, best)
     except np.linalg.LinAlgError:
         return problem, state
-    if not (np.isfinite(best.cost) and loosest <= _LARGEST_TURN_STD):
+    if not (np.isfinite(best.cost) and rotation_std <= _MAX_ROTATION_STD):
         return problem, state
-    after = replace(best.state, sigma=noise(found, best.state), coloured=kinds)
-    step = AdjustmentStep("lasting errors", float(np.sqrt(np.mean(after.sigma**2))))
-    return found, replace(after, steps=(*after.steps, step))
+    refitted = replace(best.state, sigma=estimate_noise(found, best.state), correlated_noise=noise_model)
+    step = AdjustmentStep("correlated noise", float(np.sqrt(np.mean(refitted.sigma**2))))
+    return found, replace(refitted, steps=(*refitted.steps, step))
 
 
-def _with_told_lenses(problem: Problem, state: State) -> State:
+def _with_nominal_lenses(problem: Problem, state: AdjustmentState) -> AdjustmentState:
     cameras = (
         camera if problem.lens_prior(i) is not None else replace(camera, intrinsics=problem.nominal[i])
         for i, camera in enumerate(state.cameras)
@@ -104,33 +104,33 @@ def _with_told_lenses(problem: Problem, state: State) -> State:
     return replace(state, cameras=tuple(cameras))
 
 
-def _loosest_turn(problem: Problem, best: Fit) -> float:
-    """Std [rad] of the rotation of the camera that is least tied to any other."""
-    stds = turn_stds(best.covariance_of(problem), best.state)
+def _largest_rotation_std(problem: Problem, best: GlsSolution) -> float:
+    """Largest over the cameras of the smallest relative rotation std [rad] to any other camera."""
+    stds = relative_rotation_stds(best.covariance_of(problem), best.state)
     np.fill_diagonal(stds, np.inf)
     return float(stds.min(axis=1).max())
 
 
-def as_told(problem: Problem, best: Fit) -> bool:
-    """Whether lenses exactly as told are likelier than ones that are off by about their tolerance.
+def prefers_nominal_lenses(problem: Problem, best: GlsSolution) -> bool:
+    """Whether exactly nominal lenses have a higher marginal likelihood than lenses free within their tolerance.
 
-    problem: with loose lenses. The ratio of the two likelihoods is that of the densities of "off by nothing" before
-    and after the rows were seen (Savage and Dickey), with both taken as Gaussian.
+    problem: with lens tolerances. The Bayes factor is the Savage-Dickey density ratio: prior over posterior density at
+    zero lens offset, both taken as Gaussian.
     """
     columns = problem.free_columns()
     terms = {
         column: (value, std)
         for column, value, std in camera_priors(problem, best.state)
         if column % CAMERA_PARAMETERS in _LENS
-        and not (problem.guessed and problem.guessed[column // CAMERA_PARAMETERS] is not None)
+        and not (problem.lens_priors and problem.lens_priors[column // CAMERA_PARAMETERS] is not None)
     }
     if not terms:
-        return False  # nobody told any of them
-    mine = np.array([i for i, column in enumerate(columns) if int(column) in terms], dtype=np.int64)
-    off, std = np.array([terms[int(columns[i])] for i in mine]).T
-    after = best.free[np.ix_(mine, mine)]
-    surprise = float(off @ np.linalg.solve(after, off))
-    return bool(surprise + np.linalg.slogdet(after)[1] < 2.0 * np.log(std).sum())
+        return False  # no lens was given
+    lens_rows = np.array([i for i, column in enumerate(columns) if int(column) in terms], dtype=np.int64)
+    offset, std = np.array([terms[int(columns[i])] for i in lens_rows]).T
+    posterior = best.free[np.ix_(lens_rows, lens_rows)]
+    quadratic = float(offset @ np.linalg.solve(posterior, offset))
+    return bool(quadratic + np.linalg.slogdet(posterior)[1] < 2.0 * np.log(std).sum())
 
 
-__all__ = ["as_told", "tolerance", "with_lasting_errors"]
+__all__ = ["lens_tolerance", "prefers_nominal_lenses", "refit_with_correlated_noise"]

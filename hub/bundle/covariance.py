@@ -1,4 +1,4 @@
-"""Covariances of the adjustment's answers, in the gauge in which they are published."""
+"""Covariances of the adjusted cameras, clocks and trajectories, in the published gauge."""
 
 from __future__ import annotations
 
@@ -11,50 +11,56 @@ from scipy.special import erf
 
 from hub.bundle.bordered_system import BAND, eliminate
 from hub.bundle.normal_equations import build_system
-from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, Problem, State
-from hub.trajectory.smoothness_prior import MotionPrior
+from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, AdjustmentState, Problem
+from hub.bundle.smoothness_prior import SmoothnessPrior
 from hub.trajectory.splines import SUPPORT
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 
-_WITHIN = 1.96
-_INSIDE = float(erf(_WITHIN / np.sqrt(2.0)))
+_Z_95 = 1.96
+_COVERAGE_95 = float(erf(_Z_95 / np.sqrt(2.0)))
 _HALVINGS = 24
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Covariance:
-    """Joint covariance of all camera parameters, and what is needed for the path's.
+    """Joint covariance of all camera parameters, and the blocks needed for that of the path.
 
-    cameras: (18 n, 18 n), zero where a parameter was held. carried: (3 m, p) A⁻¹ B over the free columns.
+    cameras: (18 n, 18 n), zero where a parameter is fixed. carried: (3 m, p) A⁻¹ B over the free columns.
     free: (p, p) covariance of the free columns. blocks: (k, 24, 24) blocks of A⁻¹ about the diagonal.
     """
 
     cameras: Floats
-    carried: Floats
+    a_inv_b: Floats
     free: Floats
     blocks: Floats
 
 
-def covariance(problem: Problem, state: State, prior: MotionPrior, references: Floats | None = None) -> Covariance:
+def covariance(
+    problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, control_information: Floats | None = None
+) -> Covariance:
     """Covariance at the solution.
 
-    references: (18 n, 18 n) information of surveyed positions, attitudes and distances. Gauge directions
-    that they leave open are held by convention: the first camera's pose and the first baseline.
+    control_information: (18 n, 18 n) information of control points: surveyed positions, attitudes and distances. Gauge
+    directions that they leave free are fixed by convention: the first camera's pose and the first baseline.
     """
     system, _ = build_system(problem, state, prior, robust=False)
     parts = eliminate(system)
     columns = problem.free_columns()
     information = parts.reduced
-    held = None
-    if problem.freedom.pose:
-        known = np.zeros((len(state.cameras) * CAMERA_PARAMETERS,) * 2) if references is None else references
-        information = information + known[np.ix_(columns, columns)]
-        held = held_rows([camera.pose for camera in state.cameras], known)[:, columns]
-    if held is not None and len(held):
-        _, _, vt = np.linalg.svd(held)
-        tangent = vt[len(held) :].T
+    constraints = None
+    if problem.free_parameters.pose:
+        prior_information = (
+            np.zeros((len(state.cameras) * CAMERA_PARAMETERS,) * 2)
+            if control_information is None
+            else control_information
+        )
+        information = information + prior_information[np.ix_(columns, columns)]
+        constraints = gauge_constraints([camera.pose for camera in state.cameras], prior_information)[:, columns]
+    if constraints is not None and len(constraints):
+        _, _, vt = np.linalg.svd(constraints)
+        tangent = vt[len(constraints) :].T
         free = tangent @ np.linalg.inv(tangent.T @ information @ tangent) @ tangent.T
     elif len(columns):
         free = np.linalg.inv(information)
@@ -63,11 +69,11 @@ def covariance(problem: Problem, state: State, prior: MotionPrior, references: F
     width = len(state.cameras) * CAMERA_PARAMETERS
     full = np.zeros((width, width))
     full[np.ix_(columns, columns)] = free
-    return Covariance(full, parts.carried, free, _inverse_blocks(system.band))
+    return Covariance(full, parts.a_inv_b, free, _inverse_blocks(system.band))
 
 
-def turn_stds(cameras: Floats, state: State) -> Floats:
-    """(n, n) largest std [rad] of the rotation between two cameras in any direction; no gauge enters.
+def relative_rotation_stds(cameras: Floats, state: AdjustmentState) -> Floats:
+    """(n, n) largest std [rad] of the rotation between two cameras over all axes; independent of the gauge.
 
     cameras: (18 n, 18 n) covariance of their parameters.
     """
@@ -85,7 +91,7 @@ def turn_stds(cameras: Floats, state: State) -> Floats:
 
 
 def gauge_generators(poses: list[Pose]) -> Floats:
-    """(18 n, 7): how all cameras move under a small translation, rotation and scaling of the world."""
+    """(18 n, 7): motion of all cameras under a small translation, rotation and scaling of the world."""
     rows = []
     for pose in poses:
         block = np.zeros((CAMERA_PARAMETERS, 7))
@@ -97,24 +103,24 @@ def gauge_generators(poses: list[Pose]) -> Floats:
     return np.concatenate(rows)
 
 
-def held_rows(poses: list[Pose], references: Floats) -> Floats:
-    """Constraint rows (q, 18 n) on the gauge directions that the references leave open."""
+def gauge_constraints(poses: list[Pose], control_information: Floats) -> Floats:
+    """Constraint rows (q, 18 n) that fix the gauge directions that the control points leave free."""
     generators = gauge_generators(poses)
     default = np.zeros((7, len(generators)))
     default[np.arange(6), np.arange(6)] = 1.0
-    apart = poses[1].position - poses[0].position
-    apart = apart / np.linalg.norm(apart)
-    default[6, 3:6] = -apart
-    default[6, CAMERA_PARAMETERS + 3 : CAMERA_PARAMETERS + 6] = apart
-    # Generators scaled to unit effect, so that "known" has one meaning for all seven.
+    baseline = poses[1].position - poses[0].position
+    baseline = baseline / np.linalg.norm(baseline)
+    default[6, 3:6] = -baseline
+    default[6, CAMERA_PARAMETERS + 3 : CAMERA_PARAMETERS + 6] = baseline
+    # Generators scaled to unit norm, so that one threshold serves all seven.
     scaled = generators / np.linalg.norm(generators, axis=0)
-    known = scaled.T @ references @ scaled
-    values, vectors = np.linalg.eigh(known)
-    opened = vectors[:, values < 1e-6 * max(float(values[-1]), 1e-30)] if values[-1] > 0 else np.eye(7)
-    return np.asarray(opened.T @ np.linalg.inv(default @ scaled) @ default)
+    prior_information = scaled.T @ control_information @ scaled
+    values, vectors = np.linalg.eigh(prior_information)
+    free_directions = vectors[:, values < 1e-6 * max(float(values[-1]), 1e-30)] if values[-1] > 0 else np.eye(7)
+    return np.asarray(free_directions.T @ np.linalg.inv(default @ scaled) @ default)
 
 
-def time_map_std(cov: Covariance, state: State, camera: int, reference: int) -> float:
+def time_map_std(cov: Covariance, state: AdjustmentState, camera: int, reference: int) -> float:
     """Std [s] of the camera's map onto the reference camera's clock, in the middle of its observed span."""
     if camera == reference:
         return 0.0
@@ -127,11 +133,11 @@ def time_map_std(cov: Covariance, state: State, camera: int, reference: int) -> 
     return float(np.sqrt(max(float(row @ cov.cameras @ row), 0.0)) / base.rate)
 
 
-def common_clock_stds(cov: Covariance, problem: Problem, state: State) -> Floats:
-    """Std [s] (cameras, cameras) of how the clocks of two cameras lie to each other, in the middle of what both saw.
+def relative_clock_stds(cov: Covariance, problem: Problem, state: AdjustmentState) -> Floats:
+    """Std [s] (cameras, cameras) of the relative clock offset of two cameras, in the middle of their common span.
 
-    That is where their lag is used; beyond it, it is as vague as the rates make it. Of cameras that saw nothing at the
-    same time: in the middle of the gap. Diagonal 0.
+    That is where their lag is used; away from it the uncertain rates increase the std. For cameras without a common
+    span: in the middle of the gap. Diagonal 0.
     """
     spans = _observed_spans(problem, state)
     count = len(state.cameras)
@@ -147,7 +153,7 @@ def common_clock_stds(cov: Covariance, problem: Problem, state: State) -> Floats
     return out
 
 
-def _observed_spans(problem: Problem, state: State) -> Floats:
+def _observed_spans(problem: Problem, state: AdjustmentState) -> Floats:
     """First and last internal reference time (cameras, 2) of each camera's rows."""
     out = np.tile([np.inf, -np.inf], (len(state.cameras), 1))
     for part in problem.rows:
@@ -161,12 +167,12 @@ def position_std(cov: Covariance, camera: int) -> Floats:
     """Std (3,) of the camera's position."""
     begin = camera * CAMERA_PARAMETERS + 3
     variance = np.diag(cov.cameras)[begin : begin + 3]
-    # What the gauge holds comes out of the null space as 1e-30: it is exactly known by definition.
+    # A coordinate fixed by the gauge comes out of the null space as 1e-30: its variance is 0 by definition.
     return np.asarray(np.sqrt(np.where(variance > 1e-20 * float(np.diag(cov.cameras).max(initial=0.0)), variance, 0.0)))
 
 
-def path_std(cov: Covariance, state: State, label: int, time: Floats) -> Floats:
-    """The std (n,) told of a path at internal reference times (n,): one for three axes, see `one_std`."""
+def path_std(cov: Covariance, state: AdjustmentState, label: int, time: Floats) -> Floats:
+    """Std (n,) of a path at internal reference times (n,): one for three axes, see `equivalent_std`."""
     base = 3 * sum(path.basis.size for path in state.trajectories[:label])
     index, weights, _ = state.trajectories[label].basis.weights(time)
     first = base + 3 * index
@@ -174,32 +180,32 @@ def path_std(cov: Covariance, state: State, label: int, time: Floats) -> Floats:
     columns = index[:, None] + np.arange(SUPPORT)
     pointers = SUPPORT * np.arange(len(time) + 1)
     shape = (len(time), state.trajectories[label].basis.size)
-    spread = csr_array((weights.ravel(), columns.ravel(), pointers), shape=shape)
+    basis_matrix = csr_array((weights.ravel(), columns.ravel(), pointers), shape=shape)
     out = np.zeros((len(time), 3))
     for axis in range(3):
         for a in range(SUPPORT):
             for b in range(SUPPORT):
                 values = cov.blocks[block, inside + 3 * a + axis, inside + 3 * b + axis]
                 out[:, axis] += weights[:, a] * weights[:, b] * values
-        mine = cov.carried[base + axis : base + 3 * state.trajectories[label].basis.size : 3]
-        carried = spread @ mine
-        out[:, axis] += ((carried @ cov.free) * carried).sum(axis=1)
-    return one_std(np.sqrt(np.maximum(out, 0.0)))
+        sensitivity = cov.a_inv_b[base + axis : base + 3 * state.trajectories[label].basis.size : 3]
+        a_inv_b = basis_matrix @ sensitivity
+        out[:, axis] += ((a_inv_b @ cov.free) * a_inv_b).sum(axis=1)
+    return equivalent_std(np.sqrt(np.maximum(out, 0.0)))
 
 
-def one_std(axes: Floats) -> Floats:
-    """One std (n,) for three axes of stds (n, 3): that within 1.96 of which 95 % of their errors lie.
+def equivalent_std(axes: Floats) -> Floats:
+    """One std (n,) for three axes with stds (n, 3): 95 % of the errors of all axes lie within 1.96 of it.
 
-    Errors of one axis are most often larger than those of the others. Their mean variance would promise too much:
-    of axes of 2, 0.5 and 0.5 mm 92 % lie within 1.96 of it.
+    The error of one axis is usually larger than those of the others, so the mean variance would be optimistic: for axes
+    of 2, 0.5 and 0.5 mm only 92 % lie within 1.96 of its root.
     """
     low, high = axes.min(axis=1), axes.max(axis=1)
     least = np.maximum(axes, 1e-12 * np.maximum(high, 1e-300)[:, None])
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        inside = erf(_WITHIN / np.sqrt(2.0) * middle[:, None] / least).mean(axis=1)
-        enough = inside >= _INSIDE
-        low, high = np.where(enough, low, middle), np.where(enough, middle, high)
+        inside = erf(_Z_95 / np.sqrt(2.0) * middle[:, None] / least).mean(axis=1)
+        wide_enough = inside >= _COVERAGE_95
+        low, high = np.where(wide_enough, low, middle), np.where(wide_enough, middle, high)
     return np.asarray(high)
 
 

@@ -1,9 +1,9 @@
-"""How a camera's errors are alike in time: white noise, and a Gauss-Markov process that lasts for seconds.
+"""Noise model of a camera's residuals: white noise plus a first-order Gauss-Markov process, by maximum likelihood.
 
-What a detector takes for the middle of a thing, and what a lens does to it, changes with where the thing is, and so as
-slowly as it moves. Of each camera and image axis: ``r(t) = white + lasting(t)``, with the covariance
-``lasting² exp(-|dt| / seconds)``. The three numbers are those of maximum likelihood; the precision of a first-order
-process is tridiagonal, so that a likelihood costs time linear in the rows.
+Errors of a detector's centre and of a lens depend on where the target is in the image, so they change as slowly as it
+moves. For each camera and image axis: ``r(t) = white + correlated(t)``, where the correlated part has the covariance
+``correlated_std² exp(-|dt| / time_constant)``. The three parameters are estimated by maximum likelihood; the precision
+matrix of a first-order process is tridiagonal, so evaluating the likelihood costs time linear in the rows.
 """
 
 from __future__ import annotations
@@ -13,112 +13,112 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from hub.bundle.problem import Coloured, Problem, State
+from hub.bundle.problem import AdjustmentState, CorrelatedNoise, Problem
 from hub.bundle.residuals import predict
 from protocols.geometry.types import Floats
 
-_MOST_ROWS = 6000
-"""Rows of one label from which a camera's noise is told, in a row."""
-_LEAST_ROWS = 50
-_LEAST_PX = 0.05
-_SHARES = (1e-3, 0.999)
-"""Least and largest share of the variance that lasts."""
-_SECONDS = (0.1, 30.0)
-_STEP, _FINEST = 1.0, 0.1  # of the logarithms that are searched
+_MAX_ROWS = 6000
+"""Most consecutive rows of one label from which a camera's noise is estimated."""
+_MIN_ROWS = 50
+_MIN_STD_PX = 0.05
+_CORRELATED_SHARE_RANGE = (1e-3, 0.999)
+"""Smallest and largest share of the variance in the correlated part."""
+_TIME_CONSTANT_RANGE_S = (0.1, 30.0)
+_FIRST_STEP, _LAST_STEP = 1.0, 0.1  # of the coordinate search, in the log parameters
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Markov:
+class GaussMarkov:
     """Samples of a Gauss-Markov process of unit variance at times (n,).
 
-    kept: (n - 1,) correlation of neighbours. fresh: (n,) variance of what is new in each; the first's is 1.
+    correlation: (n - 1,) between neighbouring samples. innovation: (n,) innovation variance of each; the first's is 1.
     """
 
-    kept: Floats
-    fresh: Floats
+    correlation: Floats
+    innovation: Floats
 
     @classmethod
-    def over(cls, time: Floats, seconds: float) -> Markov:
-        """Of sorted times (n,) [s]; seconds: the time constant."""
-        kept = np.exp(-np.maximum(np.diff(time), 1e-6) / seconds)
-        return cls(kept, np.r_[1.0, 1.0 - kept**2])
+    def sampled_at(cls, time: Floats, time_constant: float) -> GaussMarkov:
+        """The process at sorted times (n,) [s]; time_constant [s]."""
+        correlation = np.exp(-np.maximum(np.diff(time), 1e-6) / time_constant)
+        return cls(correlation, np.r_[1.0, 1.0 - correlation**2])
 
     def precision(self) -> Floats:
         """(2, n) upper band of the inverse of the samples' covariance."""
-        band = np.zeros((2, len(self.fresh)))
-        band[1] = 1.0 / self.fresh
-        band[1, :-1] += self.kept**2 / self.fresh[1:]
-        band[0, 1:] = -self.kept / self.fresh[1:]
+        band = np.zeros((2, len(self.innovation)))
+        band[1] = 1.0 / self.innovation
+        band[1, :-1] += self.correlation**2 / self.innovation[1:]
+        band[0, 1:] = -self.correlation / self.innovation[1:]
         return band
 
 
-def coloured(problem: Problem, state: State) -> Coloured:
-    """The noise of every camera, from the residuals of the rows in use.
+def estimate_correlated_noise(problem: Problem, state: AdjustmentState) -> CorrelatedNoise:
+    """Noise model of every camera, estimated from the residuals of the rows in use.
 
-    Of a camera with fewer than 50 of them: all white. Labels with fewer than 8 are not looked at.
+    A camera with fewer than 50 of them gets white noise only. Labels with fewer than 8 are ignored.
     """
     count = len(state.cameras)
-    out = Coloured(state.sigma.copy(), np.full(count, _LEAST_PX), np.ones(count))
+    out = CorrelatedNoise(state.sigma.copy(), np.full(count, _MIN_STD_PX), np.ones(count))
     for camera in range(count):
         parts = _residuals(problem, state, camera)
-        if sum(len(time) for time, _ in parts) >= _LEAST_ROWS:
-            out.white[camera], out.lasting[camera], out.seconds[camera] = likeliest(parts)
+        if sum(len(time) for time, _ in parts) >= _MIN_ROWS:
+            out.white_std[camera], out.correlated_std[camera], out.time_constant[camera] = fit_maximum_likelihood(parts)
     return out
 
 
-def likeliest(parts: list[tuple[Floats, Floats]]) -> tuple[float, float, float]:
-    """White and lasting std [px] and the time constant [s] of residuals: (times (n,), (n, 2)) of each label."""
+def fit_maximum_likelihood(parts: list[tuple[Floats, Floats]]) -> tuple[float, float, float]:
+    """White std [px], correlated std [px] and time constant [s]; parts: (times (n,), residuals (n, 2)) by label."""
 
-    def misfit(share: float, seconds: float) -> tuple[float, float]:
-        """-2 log likelihood but for constants, at the best variance; that variance."""
+    def minus_two_log_likelihood(share: float, time_constant: float) -> tuple[float, float]:
+        """-2 log likelihood up to a constant at the optimal total variance, and that variance."""
         white, squares, logdet, count = 1.0 - share, 0.0, 0.0, 0
-        for time, off in parts:
-            process = Markov.over(time, seconds)
+        for time, residual in parts:
+            process = GaussMarkov.sampled_at(time, time_constant)
             band = process.precision() / share
-            # log |white I + lasting| of n samples, by the determinant lemma
-            logdet -= 2.0 * float(np.log(1.0 / (share * process.fresh)).sum())
+            # log |white I + correlated| of n samples, by the matrix determinant lemma
+            logdet -= 2.0 * float(np.log(1.0 / (share * process.innovation)).sum())
             band[1] += 1.0 / white
             factor = cholesky_banded(band, check_finite=False)
             logdet += 4.0 * float(np.log(factor[1]).sum()) + 2.0 * len(time) * np.log(white)
-            smooth = cho_solve_banded((factor, False), off / white, check_finite=False)
-            squares += float((off * (off - smooth)).sum()) / white
+            smooth = cho_solve_banded((factor, False), residual / white, check_finite=False)
+            squares += float((residual * (residual - smooth)).sum()) / white
             count += 2 * len(time)
         variance = squares / count
         return count * float(np.log(max(variance, 1e-300))) + logdet, variance
 
-    def at(odds: float, log_seconds: float) -> tuple[float, float, float, float]:
-        share = float(np.clip(1.0 / (1.0 + np.exp(-odds)), *_SHARES))
-        seconds = float(np.clip(np.exp(log_seconds), *_SECONDS))
-        return (*misfit(share, seconds), share, seconds)
+    def at(log_odds: float, log_time_constant: float) -> tuple[float, float, float, float]:
+        share = float(np.clip(1.0 / (1.0 + np.exp(-log_odds)), *_CORRELATED_SHARE_RANGE))
+        time_constant = float(np.clip(np.exp(log_time_constant), *_TIME_CONSTANT_RANGE_S))
+        return (*minus_two_log_likelihood(share, time_constant), share, time_constant)
 
-    here, best, step = np.zeros(2), at(0.0, 0.0), _STEP
-    while step > _FINEST:
+    position, best, step = np.zeros(2), at(0.0, 0.0), _FIRST_STEP
+    while step > _LAST_STEP:
         for move in (np.array([step, 0.0]), np.array([-step, 0.0]), np.array([0.0, step]), np.array([0.0, -step])):
-            there = at(*(here + move))
-            if there[0] < best[0]:
-                here, best = here + move, there
+            candidate = at(*(position + move))
+            if candidate[0] < best[0]:
+                position, best = position + move, candidate
                 break
         else:
             step *= 0.5
-    _, variance, share, seconds = best
+    _, variance, share, time_constant = best
     return (
-        max(float(np.sqrt((1.0 - share) * variance)), _LEAST_PX),
-        max(float(np.sqrt(share * variance)), _LEAST_PX),
-        seconds,
+        max(float(np.sqrt((1.0 - share) * variance)), _MIN_STD_PX),
+        max(float(np.sqrt(share * variance)), _MIN_STD_PX),
+        time_constant,
     )
 
 
-def _residuals(problem: Problem, state: State, camera: int) -> list[tuple[Floats, Floats]]:
+def _residuals(problem: Problem, state: AdjustmentState, camera: int) -> list[tuple[Floats, Floats]]:
     """Times (n,) and residuals (n, 2) of each label's used rows, in order of time."""
     out = []
     for rows in problem.rows:
         if rows.camera != camera or np.count_nonzero(rows.use) < 8:
             continue
-        off = (predict(rows, state.cameras[camera], state.trajectories[rows.label]) - rows.pixels)[rows.use]
-        good = np.isfinite(off).all(axis=1)
-        time, off = rows.time[rows.use][good], off[good]
+        residual = (predict(rows, state.cameras[camera], state.trajectories[rows.label]) - rows.pixels)[rows.use]
+        good = np.isfinite(residual).all(axis=1)
+        time, residual = rows.time[rows.use][good], residual[good]
         order = np.argsort(time, kind="stable")
-        first = max(0, (len(order) - _MOST_ROWS) // 2)
-        order = order[first : first + _MOST_ROWS]
-        out.append((time[order], off[order]))
+        first = max(0, (len(order) - _MAX_ROWS) // 2)
+        order = order[first : first + _MAX_ROWS]
+        out.append((time[order], residual[order]))
     return out

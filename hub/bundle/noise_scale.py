@@ -1,7 +1,8 @@
-"""The noise that the covariances go by: the median residual, corrected for what it hides.
+"""Noise scale for the covariances: the median residual corrected for redundancy and for autocorrelation.
 
-A path with many knots follows part of the noise, so that residuals are smaller than the noise was. And errors of
-lenses and clocks last from frame to frame, so that n residuals tell less than n separate ones would.
+A trajectory with many knots absorbs part of the noise, so residuals are smaller than the noise (redundancy, trace of
+the hat matrix). Errors of lenses and clocks are correlated from frame to frame, so the effective sample size is smaller
+than the number of residuals.
 """
 
 from __future__ import annotations
@@ -12,51 +13,53 @@ import numpy as np
 
 from hub.bundle.bordered_system import BAND
 from hub.bundle.covariance import Covariance, covariance
-from hub.bundle.problem import CAMERA_PARAMETERS, Problem, Rows, State
+from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, Problem, TrackObservations
 from hub.bundle.residuals import linearise, predict
+from hub.bundle.smoothness_prior import SmoothnessPrior
 from hub.trajectory.discrete import PointBasis
-from hub.trajectory.smoothness_prior import MotionPrior
 from hub.trajectory.splines import SUPPORT
 from protocols.geometry.types import Floats
 
-_MOST_ROWS = 2000
-"""Rows of a camera of which the absorbed share is taken; evenly spread."""
-_LEAST_LEFT = 0.2
-"""Least share of the numbers that a camera must have left after what the path absorbed."""
-_LONGEST_S = 2.0
-"""Time [s] over which residuals are looked at for erring together."""
-_MOST_TOGETHER = 1000.0
-_LEAST_PAIRS = 200
-"""Pairs of residuals at one lag from which their correlation is told."""
-_TOLD = 3.0
-"""Sigma by which a correlation must stand out before it is believed."""
+_MAX_ROWS = 2000
+"""Most rows of a camera over which the trace of the hat matrix is taken, evenly spaced."""
+_MIN_REDUNDANCY = 0.2
+"""Smallest redundancy of a camera: share of its residuals not absorbed by the fit."""
+_MAX_LAG_S = 2.0
+"""Largest lag [s] of the autocorrelation of residuals."""
+_MAX_INFLATION = 1000.0
+_MIN_PAIRS = 200
+"""Fewest pairs of residuals at one lag for an estimate of their correlation."""
+_SIGNIFICANCE_SIGMA = 3.0
+"""Sigma by which a correlation must exceed 0 to count."""
 
 
-def honest(problem: Problem, state: State, prior: MotionPrior) -> State:
-    """The state with ``sigma`` (cameras,) as a covariance must have it; nothing else changes.
+def rescale_noise(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior) -> AdjustmentState:
+    """The state with ``sigma`` (cameras,) scaled for use in covariances; nothing else changes.
 
-    Separate points (a shared clock) come with their own correction (`adjust.noise`) and stay.
+    Separate points (a shared clock) have their own correction (`adjustment.estimate_noise`) and stay unchanged.
     """
     if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
         return state
     found = covariance(problem, state, prior)
-    absorbed, alike = np.zeros(len(state.cameras)), np.ones(len(state.cameras))
-    numbers = np.zeros(len(state.cameras))
+    fitted_parameters, inflation = np.zeros(len(state.cameras)), np.ones(len(state.cameras))
+    residual_count = np.zeros(len(state.cameras))
     for rows in problem.rows:
-        numbers[rows.camera] += 2.0 * float(np.count_nonzero(rows.use))
-        absorbed[rows.camera] += _absorbed(problem, state, found, rows)
+        residual_count[rows.camera] += 2.0 * float(np.count_nonzero(rows.use))
+        fitted_parameters[rows.camera] += _hat_matrix_trace(problem, state, found, rows)
     for camera in range(len(state.cameras)):
-        alike[camera] = max(together(problem, state, camera), modelled(problem, state, camera))
-    left = np.maximum(1.0 - absorbed / np.maximum(numbers, 1.0), _LEAST_LEFT)
-    return replace(state, sigma=state.sigma * np.sqrt(alike / left))
+        inflation[camera] = max(
+            correlation_inflation(problem, state, camera), modelled_inflation(problem, state, camera)
+        )
+    redundancy = np.maximum(1.0 - fitted_parameters / np.maximum(residual_count, 1.0), _MIN_REDUNDANCY)
+    return replace(state, sigma=state.sigma * np.sqrt(inflation / redundancy))
 
 
-def _absorbed(problem: Problem, state: State, found: Covariance, rows: Rows) -> float:
-    """How many of the rows' numbers the fit follows: the trace of the hat matrix over them."""
+def _hat_matrix_trace(problem: Problem, state: AdjustmentState, found: Covariance, rows: TrackObservations) -> float:
+    """Trace of the hat matrix over the rows: how many of their residual coordinates the fit absorbs."""
     used = np.flatnonzero(rows.use)
     if not len(used):
         return 0.0
-    pick = used[np.unique(np.linspace(0, len(used) - 1, min(len(used), _MOST_ROWS)).astype(np.int64))]
+    pick = used[np.unique(np.linspace(0, len(used) - 1, min(len(used), _MAX_ROWS)).astype(np.int64))]
     use = np.zeros_like(rows.use)
     use[pick] = True
     line = linearise(rows.using(use), state.cameras[rows.camera], state.trajectories[rows.label], CAMERA_PARAMETERS)
@@ -66,86 +69,93 @@ def _absorbed(problem: Problem, state: State, found: Covariance, rows: Rows) -> 
     blocks = found.blocks[(first // BAND)[:, None, None], inside[:, :, None], inside[:, None, :]]
     w, n = line.weights, len(line.index)
     point = np.einsum("na,naibj,nb->nij", w, blocks.reshape(n, SUPPORT, 3, SUPPORT, 3), w, optimize=True)
-    trace = float(np.einsum("npi,nij,npj->", line.by_point, point, line.by_point, optimize=True))
+    trace = float(np.einsum("npi,nij,npj->", line.point_jacobian, point, line.point_jacobian, optimize=True))
     if found.free.size:
-        around = found.carried[first[:, None] + np.arange(BAND)].reshape(n, SUPPORT, 3, -1)
-        shift = -line.by_point @ np.einsum("na,naip->nip", w, around)
+        sensitivity = found.a_inv_b[first[:, None] + np.arange(BAND)].reshape(n, SUPPORT, 3, -1)
+        shift = -line.point_jacobian @ np.einsum("na,naip->nip", w, sensitivity)
         columns = problem.free_columns()
-        mine = np.flatnonzero(columns // CAMERA_PARAMETERS == rows.camera)
-        shift[:, :, mine] += line.by_camera[:, :, columns[mine] % CAMERA_PARAMETERS]
+        camera_columns = np.flatnonzero(columns // CAMERA_PARAMETERS == rows.camera)
+        shift[:, :, camera_columns] += line.camera_jacobian[:, :, columns[camera_columns] % CAMERA_PARAMETERS]
         trace += float(np.einsum("npi,ij,npj->", shift, found.free, shift, optimize=True))
     return trace / float(state.sigma[rows.camera]) ** 2 * len(used) / len(pick)
 
 
-def modelled(problem: Problem, state: State, camera: int) -> float:
-    """How many residuals count as one by the noise that was found; 1 where none was."""
-    if state.coloured is None:
+def modelled_inflation(problem: Problem, state: AdjustmentState, camera: int) -> float:
+    """Rows per effective row (n / effective n) by the estimated noise model; 1 without one."""
+    if state.correlated_noise is None:
         return 1.0
     times = [np.unique(rows.time[rows.use]) for rows in problem.rows if rows.camera == camera]
     if not any(len(time) > 1 for time in times):
         return 1.0
-    white, lasting = float(state.coloured.white[camera]) ** 2, float(state.coloured.lasting[camera]) ** 2
+    white, correlated = (
+        float(state.correlated_noise.white_std[camera]) ** 2,
+        float(state.correlated_noise.correlated_std[camera]) ** 2,
+    )
     step = float(np.median(np.concatenate([np.diff(time) for time in times])))
-    kept = float(np.exp(-step / state.coloured.seconds[camera]))
-    return 1.0 + 2.0 * lasting / (white + lasting) * kept / max(1.0 - kept, 1e-6)
+    correlation = float(np.exp(-step / state.correlated_noise.time_constant[camera]))
+    return 1.0 + 2.0 * correlated / (white + correlated) * correlation / max(1.0 - correlation, 1e-6)
 
 
-def together(problem: Problem, state: State, camera: int) -> float:
-    """How many of a camera's residuals count as one: those in a row of a label, times those of a frame's labels.
+def correlation_inflation(problem: Problem, state: AdjustmentState, camera: int) -> float:
+    """Rows per effective row (n / effective n) of a camera: serial inflation times inflation within a frame.
 
-    1 + 2 sum of the correlations from frame to frame, and 1 + (labels - 1) times that within a frame, as far as these
-    stand out.
+    1 + 2 sum of the autocorrelations over frames, and 1 + (labels - 1) times the correlation within a frame, as far as
+    these are significant.
     """
     parts: list[tuple[Floats, Floats]] = []
     for rows in problem.rows:
         if rows.camera != camera or np.count_nonzero(rows.use) < 8:
             continue
-        off = (predict(rows, state.cameras[camera], state.trajectories[rows.label]) - rows.pixels)[rows.use]
-        good = np.isfinite(off).all(axis=1)
-        parts.append((rows.stamps[rows.use][good], off[good]))
-    frames = _in_a_frame(parts)
-    return frames * _in_a_row(parts, frames)
+        residual = (predict(rows, state.cameras[camera], state.trajectories[rows.label]) - rows.pixels)[rows.use]
+        good = np.isfinite(residual).all(axis=1)
+        parts.append((rows.stamps[rows.use][good], residual[good]))
+    frames = _within_frame_inflation(parts)
+    return frames * _serial_inflation(parts, frames)
 
 
-def _in_a_frame(parts: list[tuple[Floats, Floats]]) -> float:
-    """parts: stamps (n,) and residuals (n, 2), one entry a label."""
+def _within_frame_inflation(parts: list[tuple[Floats, Floats]]) -> float:
+    """Inflation by correlation between the labels of a frame; parts: stamps (n,) and residuals (n, 2) by label."""
     if len(parts) < 2:
         return 1.0
-    off = np.concatenate([part[1] for part in parts])
+    residual = np.concatenate([part[1] for part in parts])
     stamps, frame = np.unique(np.concatenate([part[0] for part in parts]), return_inverse=True)
-    shown = np.bincount(frame, minlength=len(stamps))
-    others = shown - 1.0
-    pairs = float((shown * others).sum()) / 2.0
-    variance = float(np.mean(off**2))
-    if pairs < _LEAST_PAIRS or variance <= 0.0:
+    label_count = np.bincount(frame, minlength=len(stamps))
+    others = label_count - 1.0
+    pairs = float((label_count * others).sum()) / 2.0
+    variance = float(np.mean(residual**2))
+    if pairs < _MIN_PAIRS or variance <= 0.0:
         return 1.0
-    sums = np.stack([np.bincount(frame, column, len(stamps)) for column in off.T])
-    correlation = (float((sums**2).sum()) - float((off**2).sum())) / (4.0 * pairs * variance)
-    if correlation < _TOLD / np.sqrt(2.0 * pairs):
+    sums = np.stack([np.bincount(frame, column, len(stamps)) for column in residual.T])
+    correlation = (float((sums**2).sum()) - float((residual**2).sum())) / (4.0 * pairs * variance)
+    if correlation < _SIGNIFICANCE_SIGMA / np.sqrt(2.0 * pairs):
         return 1.0
-    return 1.0 + float((shown * others).sum() / shown.sum()) * correlation
+    return 1.0 + float((label_count * others).sum() / label_count.sum()) * correlation
 
 
-def _in_a_row(parts: list[tuple[Floats, Floats]], frames: float = 1.0) -> float:
-    """parts: as above, in any order. frames: how many labels of a frame count as one: so few are their pairs."""
-    parts = [(time[order], off[order].T.copy()) for time, off in parts for order in [np.argsort(time, kind="stable")]]
+def _serial_inflation(parts: list[tuple[Floats, Floats]], frames: float = 1.0) -> float:
+    """Inflation by autocorrelation over frames; parts: as above, in any order; frames: inflation within a frame."""
+    parts = [
+        (time[order], residual[order].T.copy())
+        for time, residual in parts
+        for order in [np.argsort(time, kind="stable")]
+    ]
     steps = np.concatenate([np.diff(time) for time, _ in parts]) if parts else np.zeros(0)
     step = float(np.median(steps)) if len(steps) else 0.0
-    variance = float(np.mean(np.concatenate([off for _, off in parts], axis=1) ** 2)) if parts else 0.0
+    variance = float(np.mean(np.concatenate([residual for _, residual in parts], axis=1) ** 2)) if parts else 0.0
     if step <= 0.0 or variance <= 0.0:
         return 1.0
     total = 1.0
-    for lag in range(1, round(_LONGEST_S / step) + 1):
+    for lag in range(1, round(_MAX_LAG_S / step) + 1):
         product, pairs = 0.0, 0
-        for time, off in parts:
+        for time, residual in parts:
             if lag < len(time):
                 near = np.abs(time[lag:] - time[:-lag] - lag * step) < 0.5 * step
-                product += float(((off[:, lag:] * off[:, :-lag]) @ near).sum())
+                product += float(((residual[:, lag:] * residual[:, :-lag]) @ near).sum())
                 pairs += int(np.count_nonzero(near))
-        if pairs < _LEAST_PAIRS:
+        if pairs < _MIN_PAIRS:
             break
         correlation = 0.5 * product / pairs / variance
-        if correlation < _TOLD * np.sqrt(frames / (2.0 * pairs)):
+        if correlation < _SIGNIFICANCE_SIGMA * np.sqrt(frames / (2.0 * pairs)):
             break
         total += 2.0 * correlation
-    return min(total, _MOST_TOGETHER)
+    return min(total, _MAX_INFLATION)

@@ -1,4 +1,4 @@
-"""The adjustment's cost at a state, and its normal equations over all paths and free camera parameters."""
+"""Cost of the adjustment at a state, and its normal equations over all paths and free camera parameters."""
 
 from __future__ import annotations
 
@@ -18,136 +18,154 @@ from hub.bundle.problem import (
     P1,
     RATE,
     READOUT,
+    AdjustmentState,
     LensPrior,
     Problem,
-    Rows,
-    State,
+    TrackObservations,
 )
-from hub.bundle.residuals import Look, Stacked, derivatives, look_together
-from hub.trajectory.smoothness_prior import MotionPrior, motion_cost, motion_terms
+from hub.bundle.residuals import ResidualEvaluation, StackedTrajectories, evaluate_labels, jacobians
+from hub.bundle.smoothness_prior import SmoothnessPrior, smoothness_cost, smoothness_terms
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
-WIDTH = 4.0
+CAUCHY_WIDTH = 4.0
 """Cauchy width in sigma of the 2-D residual: nearly efficient for Gaussian noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Weighed:
-    """The rows at a state by camera, what each weighs, and the cost of all and of the priors."""
+class WeightedResiduals:
+    """Residuals at a state by camera, the weight of each row, and the total cost with the priors."""
 
     cameras: tuple[int, ...]
-    looks: tuple[Look, ...]
+    evaluations: tuple[ResidualEvaluation, ...]
     weights: tuple[Floats, ...]
     cost: float
 
 
-def weighed(problem: Problem, state: State, prior: MotionPrior, robust: bool) -> Weighed:
-    """Residuals and the cost: what of `assemble` is cheap."""
+def weigh_residuals(
+    problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, robust: bool
+) -> WeightedResiduals:
+    """Residuals, robust weights and the cost: the cheap part of `assemble`."""
     cost = sum(
-        motion_cost(path, prior.weights[label], prior.sizes[label] if prior.sizes else None)
+        smoothness_cost(path, prior.weights[label], prior.scatters[label] if prior.scatters else None)
         for label, path in enumerate(state.trajectories)
     )
     cost += sum((value / std) ** 2 for _, value, std in camera_priors(problem, state))
-    # A point behind the camera or off the path costs what a gross outlier does, and pulls nothing.
-    gross = WIDTH**2 * np.log1p((100.0 / WIDTH) ** 2) if robust else 100.0**2
-    by_camera: dict[int, list[Rows]] = {}
+    # A point behind the camera or off the path costs as much as a gross outlier, and has no gradient.
+    gross_error_cost = CAUCHY_WIDTH**2 * np.log1p((100.0 / CAUCHY_WIDTH) ** 2) if robust else 100.0**2
+    by_camera: dict[int, list[TrackObservations]] = {}
     for rows in problem.rows:
         by_camera.setdefault(rows.camera, []).append(rows)
-    paths = Stacked.of(state.trajectories)
-    looks, weights = [], []
+    paths = StackedTrajectories.of(state.trajectories)
+    evaluations, weights = [], []
     for camera, parts in by_camera.items():
-        seen = look_together(parts, state.cameras[camera], paths)
-        over = 1.0 / state.sigma[camera] ** 2
-        squared = (seen.residual[0] ** 2 + seen.residual[1] ** 2) * over
+        residuals = evaluate_labels(parts, state.cameras[camera], paths)
+        information = 1.0 / state.sigma[camera] ** 2
+        squared = (residuals.residual[0] ** 2 + residuals.residual[1] ** 2) * information
         if robust:
-            ratio = squared / WIDTH**2
-            weights.append(np.where(seen.valid, over / (1.0 + ratio), 0.0))
-            losses = WIDTH**2 * np.log1p(ratio)
+            ratio = squared / CAUCHY_WIDTH**2
+            weights.append(np.where(residuals.valid, information / (1.0 + ratio), 0.0))
+            losses = CAUCHY_WIDTH**2 * np.log1p(ratio)
         else:
-            weights.append(np.where(seen.valid, over, 0.0))
+            weights.append(np.where(residuals.valid, information, 0.0))
             losses = squared
-        cost += float(np.where(seen.valid, losses, gross).sum())
-        looks.append(seen)
-    return Weighed(tuple(by_camera), tuple(looks), tuple(weights), float(cost))
+        cost += float(np.where(residuals.valid, losses, gross_error_cost).sum())
+        evaluations.append(residuals)
+    return WeightedResiduals(tuple(by_camera), tuple(evaluations), tuple(weights), float(cost))
 
 
-def build_system(problem: Problem, state: State, prior: MotionPrior, robust: bool) -> tuple[BorderedSystem, float]:
+def build_system(
+    problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, robust: bool
+) -> tuple[BorderedSystem, float]:
     """Normal equations over all labels' control points and the free camera parameters, and the cost."""
-    seen = weighed(problem, state, prior, robust)
-    return assemble(problem, state, prior, seen), seen.cost
+    residuals = weigh_residuals(problem, state, prior, robust)
+    return assemble(problem, state, prior, residuals), residuals.cost
 
 
-def assemble(problem: Problem, state: State, prior: MotionPrior, seen: Weighed) -> BorderedSystem:
-    """The normal equations at a state whose rows are ``seen``."""
-    sizes = [3 * path.basis.size for path in state.trajectories]
-    bases = np.r_[0, np.cumsum(sizes)].astype(int)
+def assemble(
+    problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, residuals: WeightedResiduals
+) -> BorderedSystem:
+    """The normal equations at a state whose rows are ``residuals``."""
+    scatters = [3 * path.basis.size for path in state.trajectories]
+    first_columns = np.r_[0, np.cumsum(scatters)].astype(int)
     columns = problem.free_columns()
     system = BorderedSystem(
-        np.zeros((12, bases[-1])),
-        np.zeros((bases[-1], len(columns)), order="F"),  # as LAPACK wants it
+        np.zeros((12, first_columns[-1])),
+        np.zeros((first_columns[-1], len(columns)), order="F"),  # LAPACK's layout
         np.zeros((len(columns), len(columns))),
-        np.zeros(bases[-1]),
+        np.zeros(first_columns[-1]),
         np.zeros(len(columns)),
     )
-    blocks = PathBlocks(bases[-1] // 3)
-    for which, one, weight in zip(seen.cameras, seen.looks, seen.weights, strict=True):
-        mine = np.flatnonzero(columns // CAMERA_PARAMETERS == which)
-        by = derivatives(one, state.cameras[which], (columns[mine] % CAMERA_PARAMETERS).tolist())
-        terms = np.concatenate([by, one.residual[:, None]], axis=1)
+    blocks = PathBlocks(first_columns[-1] // 3)
+    for camera, one, weight in zip(residuals.cameras, residuals.evaluations, residuals.weights, strict=True):
+        camera_columns = np.flatnonzero(columns // CAMERA_PARAMETERS == camera)
+        jacobian = jacobians(one, state.cameras[camera], (columns[camera_columns] % CAMERA_PARAMETERS).tolist())
+        terms = np.concatenate([jacobian, one.residual[:, None]], axis=1)
         weighted = terms * weight
-        spread, own = blocks.add_rows(one.index, one.weights, terms, weighted)
-        system.gradient_path += spread[:, -1]
-        if len(mine):
-            system.border[:, mine[0] : mine[-1] + 1] = spread[:, :-1]
-            system.corner[np.ix_(mine, mine)] = own[:-1, :-1]
-            system.gradient_cameras[mine] = own[:-1, -1]
+        path_terms, camera_terms = blocks.add_rows(one.index, one.weights, terms, weighted)
+        system.gradient_path += path_terms[:, -1]
+        if len(camera_columns):
+            system.border[:, camera_columns[0] : camera_columns[-1] + 1] = path_terms[:, :-1]
+            system.corner[np.ix_(camera_columns, camera_columns)] = camera_terms[:-1, :-1]
+            system.gradient_cameras[camera_columns] = camera_terms[:-1, -1]
     system.band += blocks.band()
     for label, path in enumerate(state.trajectories):
-        part = slice(bases[label], bases[label + 1])
-        band, gradient, _ = motion_terms(path, prior.weights[label], prior.sizes[label] if prior.sizes else None)
+        part = slice(first_columns[label], first_columns[label + 1])
+        band, gradient, _ = smoothness_terms(
+            path, prior.weights[label], prior.scatters[label] if prior.scatters else None
+        )
         system.band[:, part] += band
         system.gradient_path[part] += gradient
-    place = {int(column): i for i, column in enumerate(columns)}
+    column_index = {int(column): i for i, column in enumerate(columns)}
     for column, value, std in camera_priors(problem, state):
-        if column in place:
-            system.corner[place[column], place[column]] += 1.0 / std**2
-            system.gradient_cameras[place[column]] += value / std**2
+        if column in column_index:
+            system.corner[column_index[column], column_index[column]] += 1.0 / std**2
+            system.gradient_cameras[column_index[column]] += value / std**2
     return system
 
 
-def camera_priors(problem: Problem, state: State) -> list[tuple[int, float, float]]:
+def camera_priors(problem: Problem, state: AdjustmentState) -> list[tuple[int, float, float]]:
     """Column, difference and std of every prior on rates, readouts and lenses."""
-    freedom, out = problem.freedom, list[tuple[int, float, float]]()
-    for camera, (now, nominal) in enumerate(zip(state.cameras, problem.nominal, strict=True)):
+    free_parameters, out = problem.free_parameters, list[tuple[int, float, float]]()
+    for camera, (current, nominal) in enumerate(zip(state.cameras, problem.nominal, strict=True)):
         base = camera * CAMERA_PARAMETERS
-        terms = [(RATE, now.rate - 1.0, freedom.rate_std)]
-        if freedom.readout:
-            terms.append((READOUT, now.readout, freedom.readout_std))
-        guess = problem.lens_prior(camera)
-        if guess is not None:
-            terms.append((FOCAL, float(np.log(now.intrinsics.focal / guess.focal)), guess.focal_std))
-            off = now.intrinsics.matrix[:2, 2] - guess.centre
-            terms += [(CENTRE, float(off[0]), guess.centre_std), (CENTRE + 1, float(off[1]), guess.centre_std)]
-            terms.append((K1, float(now.intrinsics.distortions[0] - guess.k1), guess.k1_std))
-            terms.append((K2, float(now.intrinsics.distortions[1] - guess.k2), guess.k2_std))
-            terms += _finer_priors(now.intrinsics, nominal, guess)
-        elif freedom.lens:
-            terms.append((FOCAL, float(np.log(now.intrinsics.focal / nominal.focal)), freedom.focal_std))
-            terms.append((K1, float(now.intrinsics.distortions[0] - nominal.distortions[0]), freedom.k1_std))
+        terms = [(RATE, current.rate - 1.0, free_parameters.rate_std)]
+        if free_parameters.readout:
+            terms.append((READOUT, current.readout, free_parameters.readout_std))
+        lens_prior = problem.lens_prior(camera)
+        if lens_prior is not None:
+            terms.append((FOCAL, float(np.log(current.intrinsics.focal / lens_prior.focal)), lens_prior.focal_std))
+            shift = current.intrinsics.matrix[:2, 2] - lens_prior.centre
+            terms += [
+                (CENTRE, float(shift[0]), lens_prior.centre_std),
+                (CENTRE + 1, float(shift[1]), lens_prior.centre_std),
+            ]
+            terms.append((K1, float(current.intrinsics.distortions[0] - lens_prior.k1), lens_prior.k1_std))
+            terms.append((K2, float(current.intrinsics.distortions[1] - lens_prior.k2), lens_prior.k2_std))
+            terms += _further_lens_priors(current.intrinsics, nominal, lens_prior)
+        elif free_parameters.lens:
+            terms.append((FOCAL, float(np.log(current.intrinsics.focal / nominal.focal)), free_parameters.focal_std))
+            terms.append(
+                (K1, float(current.intrinsics.distortions[0] - nominal.distortions[0]), free_parameters.k1_std)
+            )
         out += [(base + column, value, std) for column, value, std in terms]
     return out
 
 
-def _finer_priors(now: Intrinsics, nominal: Intrinsics, guess: LensPrior) -> list[tuple[int, float, float]]:
-    """Column, difference and std of what a lens has beside focal length, centre, k1 and k2."""
-    third = 2 if now.fisheye else 4
-    aspect = np.log(now.matrix[1, 1] / now.matrix[0, 0] / nominal.matrix[1, 1] * nominal.matrix[0, 0])
+def _further_lens_priors(
+    current: Intrinsics, nominal: Intrinsics, lens_prior: LensPrior
+) -> list[tuple[int, float, float]]:
+    """Column, difference and std of the priors on k3, aspect ratio, p1 and p2."""
+    third = 2 if current.fisheye else 4
+    aspect = np.log(current.matrix[1, 1] / current.matrix[0, 0] / nominal.matrix[1, 1] * nominal.matrix[0, 0])
     terms = [
-        (K3, float(now.distortions[third] - nominal.distortions[third]), guess.k3_std),
-        (ASPECT, float(aspect), guess.aspect_std),
+        (K3, float(current.distortions[third] - nominal.distortions[third]), lens_prior.k3_std),
+        (ASPECT, float(aspect), lens_prior.aspect_std),
     ]
-    if not now.fisheye:
-        off = now.distortions[2:4] - nominal.distortions[2:4]
-        terms += [(P1, float(off[0]), guess.tangential_std), (P1 + 1, float(off[1]), guess.tangential_std)]
+    if not current.fisheye:
+        shift = current.distortions[2:4] - nominal.distortions[2:4]
+        terms += [
+            (P1, float(shift[0]), lens_prior.tangential_std),
+            (P1 + 1, float(shift[1]), lens_prior.tangential_std),
+        ]
     return terms

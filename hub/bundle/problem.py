@@ -1,4 +1,4 @@
-"""What the joint adjustment knows and what it looks for: plain data, no algorithm."""
+"""Data of the bundle adjustment: observations, parameters, priors and state. No algorithm."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from protocols.geometry.types import Bools, Floats, Ints
 from protocols.session.calibration import AdjustmentStep
 
 CAMERA_PARAMETERS = 18
-"""Columns of one camera: rotation 0..2, position 3..5, offset 6, rate 7, log focal length 8, k1 9, readout 10; of a
-lens that was not measured also the principal point 11, 12, k2 13, k3 14, log fy/fx 15 and, of a pinhole lens, p1, p2
+"""Columns of one camera: rotation 0..2, position 3..5, offset 6, rate 7, log focal length 8, k1 9, readout 10; for
+a lens that was not measured also the principal point 11, 12, k2 13, k3 14, log fy/fx 15 and, for a pinhole lens, p1, p2
 16, 17."""
 OFFSET, RATE, FOCAL, K1, READOUT, CENTRE, K2, K3, ASPECT, P1 = 6, 7, 8, 9, 10, 11, 13, 14, 15, 16
 GIVEN_PARAMETERS = 11
-"""Columns of a camera whose lens is given; the others are never free."""
+"""Columns of a camera with given intrinsics; the others are never free."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraState:
     """One camera's estimate: pose, intrinsics and time map.
 
-    The time map is kept about ``centre``, a time in the middle of what the camera saw, so that offset and
-    rate hardly depend on each other: ``t = rate * (t_camera - centre) + offset`` with t the internal
-    reference time [s] and t_camera less the camera's epoch. readout: seconds from the image's first row to its last,
-    negative where the last is read first; the camera's time is that of the middle row.
+    The time map is parametrised about ``centre``, the middle of the camera's observed span, so that offset and
+    rate are nearly uncorrelated: ``t = rate * (t_camera - centre) + offset`` with t the internal
+    reference time [s] and t_camera relative to the camera's epoch. readout: rolling-shutter readout time [s] from the
+    image's first row to its last, negative where the last row is read first; camera times are those of the middle row.
     """
 
     intrinsics: Intrinsics
@@ -39,31 +39,31 @@ class CameraState:
     centre: float
     readout: float = 0.0
 
-    def below_middle(self, pixels: Floats) -> Floats:
-        """How far (n,) pixels (n, 2) are below the image's middle: -0.5 in its first row, 0.5 in its last."""
+    def row_offset(self, pixels: Floats) -> Floats:
+        """Image row (n,) of pixels (n, 2) relative to the middle row: -0.5 in the first row, 0.5 in the last."""
         height = max(self.intrinsics.height - 1, 1)
         return np.asarray(np.clip(pixels[:, 1], 0, height) / height - 0.5)
 
-    def shot(self, time: Floats, pixels: Floats) -> Floats:
-        """Camera times (n,) at which pixels (n, 2) of images of ``time`` (n,) were read."""
-        return time + self.readout * self.below_middle(pixels) if self.readout else time
+    def row_time(self, time: Floats, pixels: Floats) -> Floats:
+        """Camera times (n,) at which the rows of pixels (n, 2) were read, in frames with times ``time`` (n,)."""
+        return time + self.readout * self.row_offset(pixels) if self.readout else time
 
     def reference_time(self, time: Floats) -> Floats:
-        """Internal reference times (n,) of camera times (n,) less the epoch."""
+        """Internal reference times (n,) of camera times (n,) relative to the epoch."""
         return np.asarray(self.rate * (time - self.centre) + self.offset)
 
     def camera_time(self, reference: Floats) -> Floats:
-        """Camera times (n,) less the epoch of internal reference times (n,)."""
+        """Camera times (n,), relative to the epoch, of internal reference times (n,)."""
         return np.asarray((reference - self.offset) / self.rate + self.centre)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rows:
+class TrackObservations:
     """Observations of one label by one camera.
 
-    camera, label: indices. time: (n,) on the camera's clock less its epoch [s]. pixels: (n, 2) distorted.
-    use: (n,) rows that count. stamp: (n,) what the frames' stamps said, where ``time`` is not that: a told readout or a
-    frame's own time (`frame_times`) has moved it.
+    camera, label: indices. time: (n,) on the camera's clock relative to its epoch [s]. pixels: (n, 2) distorted.
+    use: (n,) inliers. stamp: (n,) the frames' original timestamps where ``time`` differs from them, because it is
+    corrected for a given readout or by an estimated frame time (`timestamp_jitter`).
     """
 
     camera: int
@@ -75,11 +75,11 @@ class Rows:
 
     @property
     def stamps(self) -> Floats:
-        """Stamps (n,) of the rows' frames [s]: one a frame."""
+        """Timestamps (n,) of the rows' frames [s]: the same for all rows of a frame."""
         return self.time if self.stamp is None else self.stamp
 
-    def using(self, use: Bools) -> Rows:
-        """The same rows with other ones counting."""
+    def using(self, use: Bools) -> TrackObservations:
+        """The same rows with another inlier mask."""
         return replace(self, use=use)
 
 
@@ -91,30 +91,33 @@ class Trajectory:
     control: Floats
 
     def at(self, time: Floats, derivative: int = 0) -> Floats:
-        """Positions (n, 3) or a derivative; NaN outside the stretches."""
+        """Positions (n, 3) or a derivative; NaN outside the observed intervals."""
         return self.basis.evaluate(self.control, time, derivative)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Coloured:
-    """Noise of one image axis by camera. white, lasting: (cameras,) std [px]. seconds: (cameras,) time constant."""
+class CorrelatedNoise:
+    """White plus Gauss-Markov noise of one image axis, by camera.
 
-    white: Floats
-    lasting: Floats
-    seconds: Floats
+    white_std, correlated_std: (cameras,) [px]. time_constant: (cameras,) [s].
+    """
 
-    def of(self, cameras: list[int]) -> Coloured:
-        """The same of some cameras, in this order."""
-        return Coloured(self.white[cameras], self.lasting[cameras], self.seconds[cameras])
+    white_std: Floats
+    correlated_std: Floats
+    time_constant: Floats
+
+    def select(self, cameras: list[int]) -> CorrelatedNoise:
+        """The noise of these cameras, in this order."""
+        return CorrelatedNoise(self.white_std[cameras], self.correlated_std[cameras], self.time_constant[cameras])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class State:
-    """Everything that the adjustment moves.
+class AdjustmentState:
+    """All parameters that the adjustment estimates.
 
-    sigma: (cameras,) noise of one pixel coordinate. steps: the way here. jitter: (cameras,) std [s] of the cameras'
-    stamps where the frames' own times were found (`frame_times`); None = they were not looked for, or none jitter.
-    coloured: noise by which errors that last were counted (`generalised`); None = rows err by themselves.
+    sigma: (cameras,) noise of one pixel coordinate. steps: convergence history. jitter: (cameras,) std [s] of the
+    cameras' timestamps where frame times were estimated (`timestamp_jitter`); None = not estimated, or no jitter found.
+    correlated_noise: noise model of the re-fit by generalised least squares (`gls`); None = independent rows.
     """
 
     cameras: tuple[CameraState, ...]
@@ -122,16 +125,16 @@ class State:
     sigma: Floats
     steps: tuple[AdjustmentStep, ...] = ()
     jitter: Floats | None = None
-    coloured: Coloured | None = None
+    correlated_noise: CorrelatedNoise | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class LensPrior:
-    """What is known beforehand of a lens that nobody measured: it is always estimated.
+    """Prior of a lens whose parameters are all estimated.
 
     focal: [px], focal_std: of its logarithm. centre: (u, v) of the principal point, centre_std: [px]. k1, k2: the
-    first distortion coefficients, k1_std, k2_std: theirs; k3_std, tangential_std, aspect_std: of what is 0 beforehand
-    (k3 less its own, p1 and p2, log fy/fx less its own).
+    first distortion coefficients, k1_std, k2_std: their stds; k3_std, tangential_std, aspect_std: of parameters with
+    prior mean 0 (k3 and log fy/fx relative to their nominal values, p1 and p2).
     """
 
     focal: float
@@ -148,12 +151,12 @@ class LensPrior:
 
 
 @dataclass(frozen=True, slots=True)
-class Freedom:
-    """What may move, and priors.
+class FreeParameters:
+    """Which parameters are free, and their priors.
 
     pose, clock, lens: whether poses, time maps, and focal length with k1 are estimated.
     readout: whether rolling-shutter readouts are. focal_std: prior std of log focal length. k1_std: prior std of k1.
-    rate_std: prior std of a rate about 1: crystals err by 50 ppm, what is told of frame rates by 1000.
+    rate_std: prior std of a rate about 1: crystals err by 50 ppm, nominal frame rates by 1000.
     readout_std: prior std [s] of a readout about 0.
     """
 
@@ -169,41 +172,41 @@ class Freedom:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """Observations and what is fixed.
+    """Observations and fixed quantities of a bundle adjustment.
 
-    rows: all observations. nominal: intrinsics as given (priors of the lens). clock_reference: index of the camera
-    whose clock is the internal time. anchors: two cameras whose pose and distance fix the gauge. freedom: what may
-    move. guessed: by camera, priors of lenses that were not measured, None = given; () = all are. timed: by camera,
-    whether its readout was told, so that its rows' times count it already; () = none was. loose: by camera, by how much
-    lenses that are given may be off where they are estimated all the same; () = they are not.
+    rows: all observations. nominal: given intrinsics (prior means of the lens). clock_reference: index of the camera
+    whose clock is the internal time. anchors: the two cameras whose pose and distance fix the gauge. lens_priors: by
+    camera, priors of lenses that were not measured, None = given; () = all are given. readout_given: by camera, whether
+    its readout was given, so that the rows' times are already corrected; () = none was. lens_tolerances: by camera,
+    priors for given lenses that are estimated all the same; () = they are fixed.
     """
 
-    rows: tuple[Rows, ...]
+    rows: tuple[TrackObservations, ...]
     nominal: tuple[Intrinsics, ...]
     clock_reference: int
     anchors: tuple[int, int]
-    freedom: Freedom = field(default_factory=Freedom)
-    guessed: tuple[LensPrior | None, ...] = ()
-    timed: tuple[bool, ...] = ()
-    loose: tuple[LensPrior, ...] = ()
+    free_parameters: FreeParameters = field(default_factory=FreeParameters)
+    lens_priors: tuple[LensPrior | None, ...] = ()
+    readout_given: tuple[bool, ...] = ()
+    lens_tolerances: tuple[LensPrior, ...] = ()
 
     def lens_prior(self, camera: int) -> LensPrior | None:
-        """The prior of a lens that is estimated whole; None = at most its focal length and k1 are."""
-        guess = self.guessed[camera] if self.guessed else None
-        return self.loose[camera] if guess is None and self.loose else guess
+        """The prior of a lens whose parameters are all estimated; None = at most focal length and k1 are."""
+        prior = self.lens_priors[camera] if self.lens_priors else None
+        return self.lens_tolerances[camera] if prior is None and self.lens_tolerances else prior
 
     def free_columns(self) -> Ints:
         """Indices of the free camera parameters in the stacked vector of CAMERA_PARAMETERS each."""
         columns: list[int] = []
         for camera in range(len(self.nominal)):
             base = camera * CAMERA_PARAMETERS
-            if self.freedom.pose:
+            if self.free_parameters.pose:
                 columns += range(base, base + 6)
-            if self.freedom.clock and camera != self.clock_reference:
+            if self.free_parameters.clock and camera != self.clock_reference:
                 columns += [base + OFFSET, base + RATE]
-            if self.freedom.lens or self.lens_prior(camera) is not None:
+            if self.free_parameters.lens or self.lens_prior(camera) is not None:
                 columns += [base + FOCAL, base + K1]
-            if self.freedom.readout and not (self.timed and self.timed[camera]):
+            if self.free_parameters.readout and not (self.readout_given and self.readout_given[camera]):
                 columns.append(base + READOUT)
             if self.lens_prior(camera) is not None:
                 columns += range(base + CENTRE, base + (P1 if self.nominal[camera].fisheye else CAMERA_PARAMETERS))

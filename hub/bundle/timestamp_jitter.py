@@ -1,10 +1,11 @@
-"""Stamps that jitter: every frame's own time, found from where its labels lie along their motion.
+"""Timestamp jitter: exposure times of individual frames, estimated from residuals along the targets' motion.
 
-A webcam's stamp is when its picture was fetched, not when it was taken: tens of milliseconds either way, another in
-every frame. What a frame shows then lies off along the motion by one time for all its labels, and not across it; errors
-of lenses and paths have no such reason, and last from frame to frame. So one time a frame is found, held by how much
-the camera's stamps jitter (found as well), in turn with the adjustment; a label alone is then trusted across its motion
-more than along it. Mean and trend of these times stay the clock's own offset and rate.
+A webcam's timestamp is the time at which a frame was fetched, not exposed: it errs by tens of milliseconds,
+independently in every frame. All labels of a frame are then displaced along their motion by one common time shift, and
+not across it; errors of lenses and paths have no preferred direction and are correlated from frame to frame. So one
+time shift a frame is estimated, with a Gaussian prior whose std (the jitter, estimated too) is the camera's,
+alternating with the adjustment. A single label then constrains the path across its motion more than along it. Mean and
+linear trend of the shifts are removed: they are the clock's offset and rate.
 """
 
 from __future__ import annotations
@@ -16,176 +17,182 @@ import numpy as np
 from scipy.special import fdtri
 
 from hub.bundle.adjustment import adjust
-from hub.bundle.problem import OFFSET, Problem, State
+from hub.bundle.problem import OFFSET, AdjustmentState, Problem
 from hub.bundle.residuals import linearise
 from hub.trajectory.discrete import PointBasis
 from protocols.geometry.types import Bools, Floats, Ints
 
-_LEAST_FRAMES = 25
-_DOUBT = 1e-4
-"""Chance of so much along the motion, against across it, where stamps don't jitter."""
-_LEAST_RATIO = 2.0
-"""Least of that: where stamps add less than the rows' own noise, their frames' times are not worth finding."""
-_MOST_ROUNDS = 15
-_SETTLED = 0.03
-"""Change of the frames' times, against their jitter, at which they have settled."""
-_REWEIGHTED = 4
-_NEAR = 6.0  # sigma beyond which a row or a frame is a false detection
-_LEAST_SIGMA = 0.05  # px
-_ROBUST = 1.4826  # sigma of a Gaussian from its median absolute value
-_WIDTH = 4.0  # Cauchy width in sigma of one row, as in the adjustment
-_LARGEST = 0.1
-"""s: a jitter beyond this is not believed."""
+_MIN_FRAMES = 25
+_FALSE_ALARM_PROBABILITY = 1e-4
+"""False-alarm probability of the variance ratio (F-test, along against across the motion) without jitter."""
+_MIN_VARIANCE_RATIO = 2.0
+"""Smallest variance ratio: with jitter below the rows' own noise, estimating frame times is not worth it."""
+_MAX_ROUNDS = 15
+_CONVERGED_SHARE = 0.03
+"""Change of the frame times relative to their jitter at which the iteration has converged."""
+_REWEIGHTINGS = 4
+_OUTLIER_SIGMA = 6.0  # sigma beyond which a row or a frame is an outlier
+_MIN_SIGMA_PX = 0.05  # px
+_MAD_TO_SIGMA = 1.4826  # std of a Gaussian from its median absolute value
+_CAUCHY_WIDTH = 4.0  # Cauchy width in sigma of one row, as in the adjustment
+_MAX_JITTER_S = 0.1
+"""s: upper limit of the estimated jitter."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Frames:
-    """Rows of one camera by frame.
+class _FrameRows:
+    """Rows of one camera grouped by frame.
 
-    frame: (n,) index of a row's frame. stamp: (m,) [s]. off: (n, 2) residuals [px] at the stamps' times. speed: (n, 2)
-    of the point in the image [px/s].
+    frame: (n,) index of a row's frame. stamp: (m,) timestamps [s]. residual: (n, 2) [px] at the timestamps. velocity:
+    (n, 2) of the point in the image [px/s].
     """
 
     frame: Ints
     stamp: Floats
-    off: Floats
-    speed: Floats
+    residual: Floats
+    velocity: Floats
 
     def sums(self, values: Floats) -> Floats:
         """Sums (m,) of values (n,) over the rows of each frame."""
         return np.asarray(np.bincount(self.frame, values, len(self.stamp)), dtype=np.float64)
 
 
-def settle(problem: Problem, state: State, progress: Callable[[str], None] | None = None) -> tuple[Problem, State]:
-    """The frames' own times, and all else adjusted to them; both unchanged where no stamps are seen to jitter.
+def estimate_frame_times(
+    problem: Problem, state: AdjustmentState, progress: Callable[[str], None] | None = None
+) -> tuple[Problem, AdjustmentState]:
+    """Estimate frame times and re-adjust; problem and state are returned unchanged where no jitter is detected.
 
-    problem, state: adjusted. Returns the problem with the rows' times moved, and the state with ``jitter`` (cameras,)
-    [s]; 0 = the camera's stamps hold, as far as its frames tell.
+    problem, state: adjusted. Returns the problem with corrected row times, and the state with ``jitter`` (cameras,)
+    [s]; 0 = no jitter detected for that camera.
     """
-    if any(isinstance(path.basis, PointBasis) for path in state.trajectories) or not problem.freedom.clock:
+    if any(isinstance(path.basis, PointBasis) for path in state.trajectories) or not problem.free_parameters.clock:
         return problem, state
     cameras = range(len(state.cameras))
     found, fitted = problem, state
     jitter = np.zeros(len(cameras))
-    for turn in range(_MOST_ROUNDS):
+    for round_index in range(_MAX_ROUNDS):
         parts = [_frames(problem, found, fitted, camera) for camera in cameras]
-        jitter = np.array([_jitter(part, float(fitted.sigma[i])) for i, part in enumerate(parts)])
+        jitter = np.array([_jitter_std(part, float(fitted.sigma[i])) for i, part in enumerate(parts)])
         if not jitter.any():
             return problem, state
-        shifts = [_shifts(part, float(fitted.sigma[i]), float(jitter[i])) for i, part in enumerate(parts)]
-        shifted = _shifted(problem, parts, shifts)
+        shifts = [_posterior_shifts(part, float(fitted.sigma[i]), float(jitter[i])) for i, part in enumerate(parts)]
+        shifted = _apply_shifts(problem, parts, shifts)
         steps = [after.time - before.time for after, before in zip(shifted.rows, found.rows, strict=True)]
         moved = float(np.sqrt(np.mean(np.concatenate(steps) ** 2)))
         found, fitted, _ = adjust(shifted, fitted, rounds=2, iterations=9)
         if progress is not None:
-            progress(f"times of frames {turn + 1}: {float(np.median(fitted.sigma)):.2f} px")
-        if moved < _SETTLED * float(jitter.max()):
+            progress(f"frame times {round_index + 1}: {float(np.median(fitted.sigma)):.2f} px")
+        if moved < _CONVERGED_SHARE * float(jitter.max()):
             break
     return found, replace(fitted, jitter=jitter)
 
 
-def _frames(given: Problem, now: Problem, state: State, camera: int) -> _Frames:
-    """A camera's rows, less those that no other time brings near the path: they lie off across their motion too.
+def _frames(stamped: Problem, current: Problem, state: AdjustmentState, camera: int) -> _FrameRows:
+    """A camera's rows by frame, without those displaced across their motion, which no time shift explains.
 
-    given: with the stamps' times.
+    stamped: the problem with the original timestamps.
     """
-    stamps, offs, speeds = [np.zeros(0)], [np.zeros((0, 2))], [np.zeros((0, 2))]
-    for before, rows in zip(given.rows, now.rows, strict=True):
+    stamps, residuals, velocities = [np.zeros(0)], [np.zeros((0, 2))], [np.zeros((0, 2))]
+    for before, rows in zip(stamped.rows, current.rows, strict=True):
         if rows.camera != camera:
             continue
-        every = np.ones(len(rows.time), dtype=np.bool_)
-        line = linearise(rows.using(every), state.cameras[camera], state.trajectories[rows.label])
-        speed = line.by_camera[:, :, OFFSET] * state.cameras[camera].rate
-        off = line.residual - speed * (rows.time - before.time)[:, None]
-        across = np.abs(_across(off, speed)) / np.maximum(np.linalg.norm(speed, axis=1), 1e-9)
+        all_rows = np.ones(len(rows.time), dtype=np.bool_)
+        line = linearise(rows.using(all_rows), state.cameras[camera], state.trajectories[rows.label])
+        velocity = line.camera_jacobian[:, :, OFFSET] * state.cameras[camera].rate
+        residual = line.residual - velocity * (rows.time - before.time)[:, None]
+        across = np.abs(_transverse(residual, velocity)) / np.maximum(np.linalg.norm(velocity, axis=1), 1e-9)
         good = line.valid & np.isfinite(across)
-        good &= across < _NEAR * max(_ROBUST * float(np.median(across[good])) if good.any() else 0.0, _LEAST_SIGMA)
+        good &= across < _OUTLIER_SIGMA * max(
+            _MAD_TO_SIGMA * float(np.median(across[good])) if good.any() else 0.0, _MIN_SIGMA_PX
+        )
         stamps.append(rows.stamps[good])
-        offs.append(off[good])
-        speeds.append(speed[good])
+        residuals.append(residual[good])
+        velocities.append(velocity[good])
     stamp, frame = np.unique(np.concatenate(stamps), return_inverse=True)
-    return _Frames(frame, stamp, np.concatenate(offs), np.concatenate(speeds))
+    return _FrameRows(frame, stamp, np.concatenate(residuals), np.concatenate(velocities))
 
 
-def _across(off: Floats, speed: Floats) -> Floats:
-    """Residuals (n,) across the motion, times its speed."""
-    return np.asarray(off[:, 1] * speed[:, 0] - off[:, 0] * speed[:, 1])
+def _transverse(residual: Floats, velocity: Floats) -> Floats:
+    """Residuals (n,) across the motion, times the speed."""
+    return np.asarray(residual[:, 1] * velocity[:, 0] - residual[:, 0] * velocity[:, 1])
 
 
-def _alone(frames: _Frames, sigma: float) -> tuple[Floats, Floats, Floats]:
-    """Each frame's time by itself (m,) [s], what it rests on (m,) [px²/s²], and the same across the motion (m,)."""
-    across = _across(frames.off, frames.speed)
-    along = (frames.off * frames.speed).sum(axis=1)
-    square = (frames.speed**2).sum(axis=1)
-    weight = np.ones(len(along))
-    alone = side = told = np.zeros(len(frames.stamp))
-    for _ in range(_REWEIGHTED):
-        told = frames.sums(weight * square)
-        over = 1.0 / np.where(told > 0.0, told, 1.0)
-        alone, side = -frames.sums(weight * along) * over, frames.sums(weight * across) * over
-        left = frames.off + frames.speed * alone[frames.frame, None]
-        weight = 1.0 / (1.0 + (left**2).sum(axis=1) / (_WIDTH * sigma) ** 2)
-    return alone, told, side
-
-
-def _jitter(frames: _Frames, sigma: float) -> float:
-    """Std [s] of the stamps of one camera; 0 where what lies along the motion is no more than what lies across it.
-
-    From frame to frame only: what lasts is an error of the lens or of the path, not of stamps.
+def _independent_shifts(frames: _FrameRows, sigma: float) -> tuple[Floats, Floats, Floats]:
+    """Maximum-likelihood time shift of each frame (m,) [s], its information (m,) [px²/s²], and the transverse analogue
+    (m,) [s], which noise alone produces.
     """
-    alone, told, side = _alone(frames, sigma)
-    good = told > 0.0
-    if np.count_nonzero(good) < _LEAST_FRAMES:
+    across = _transverse(frames.residual, frames.velocity)
+    along = (frames.residual * frames.velocity).sum(axis=1)
+    square = (frames.velocity**2).sum(axis=1)
+    weight = np.ones(len(along))
+    shift = transverse = information = np.zeros(len(frames.stamp))
+    for _ in range(_REWEIGHTINGS):
+        information = frames.sums(weight * square)
+        over = 1.0 / np.where(information > 0.0, information, 1.0)
+        shift, transverse = -frames.sums(weight * along) * over, frames.sums(weight * across) * over
+        left = frames.residual + frames.velocity * shift[frames.frame, None]
+        weight = 1.0 / (1.0 + (left**2).sum(axis=1) / (_CAUCHY_WIDTH * sigma) ** 2)
+    return shift, information, transverse
+
+
+def _jitter_std(frames: _FrameRows, sigma: float) -> float:
+    """Std [s] of one camera's timestamps; 0 unless residuals along the motion are significantly larger than across it.
+
+    From differences of successive frames only: correlated errors come from the lens or the path, not from timestamps.
+    """
+    shift, information, transverse = _independent_shifts(frames, sigma)
+    good = information > 0.0
+    if np.count_nonzero(good) < _MIN_FRAMES:
         return 0.0
-    fast = told >= np.median(told[good])
-    usual = _ROBUST * float(np.median(np.abs(np.diff(alone[fast])))) / np.sqrt(2.0)
-    good &= _believed(alone, told, sigma, usual)
-    if np.count_nonzero(good) < _LEAST_FRAMES:
+    fast = information >= np.median(information[good])
+    typical = _MAD_TO_SIGMA * float(np.median(np.abs(np.diff(shift[fast])))) / np.sqrt(2.0)
+    good &= _is_inlier(shift, information, sigma, typical)
+    if np.count_nonzero(good) < _MIN_FRAMES:
         return 0.0
-    weight = 2.0 / (1.0 / told[good][1:] + 1.0 / told[good][:-1])
-    along = 0.5 * float((weight * np.diff(alone[good]) ** 2).sum())
-    across = 0.5 * float((weight * np.diff(side[good]) ** 2).sum())
-    enough = max(_LEAST_RATIO, float(fdtri(len(weight), len(weight), 1.0 - _DOUBT)))
-    if along < enough * across:
+    weight = 2.0 / (1.0 / information[good][1:] + 1.0 / information[good][:-1])
+    along = 0.5 * float((weight * np.diff(shift[good]) ** 2).sum())
+    across = 0.5 * float((weight * np.diff(transverse[good]) ** 2).sum())
+    threshold = max(_MIN_VARIANCE_RATIO, float(fdtri(len(weight), len(weight), 1.0 - _FALSE_ALARM_PROBABILITY)))
+    if along < threshold * across:
         return 0.0
-    return min(float(np.sqrt((along - across) / weight.sum())), _LARGEST)
+    return min(float(np.sqrt((along - across) / weight.sum())), _MAX_JITTER_S)
 
 
-def _believed(alone: Floats, told: Floats, sigma: float, jitter: float) -> Bools:
-    """(m,) frames whose time by itself may be jitter and noise; any other is a false detection."""
-    return np.asarray(np.abs(alone) < _NEAR * np.sqrt(jitter**2 + sigma**2 / np.maximum(told, 1e-9)))
+def _is_inlier(shift: Floats, information: Floats, sigma: float, jitter: float) -> Bools:
+    """(m,) frames whose shift is explained by jitter and noise; the others are outliers."""
+    return np.asarray(np.abs(shift) < _OUTLIER_SIGMA * np.sqrt(jitter**2 + sigma**2 / np.maximum(information, 1e-9)))
 
 
-def _shifts(frames: _Frames, sigma: float, jitter: float) -> Floats:
-    """Each frame's time less its stamp (m,) [s]: its labels' word against the jitter's, mean and trend taken out."""
-    alone, told, side = _alone(frames, sigma)
-    good = (told > 0.0) & _believed(alone, told, sigma, jitter)
+def _posterior_shifts(frames: _FrameRows, sigma: float, jitter: float) -> Floats:
+    """Posterior mean of each frame's time minus its timestamp (m,) [s] under the jitter prior, linear trend removed."""
+    shift, information, transverse = _independent_shifts(frames, sigma)
+    good = (information > 0.0) & _is_inlier(shift, information, sigma, jitter)
     if jitter == 0.0 or not good.any():
         return np.zeros(len(frames.stamp))
-    # What labels of a frame have in common across their motion, they have along it too: no row is better than that.
-    noise = max(sigma**2, float((told * side**2)[good].mean()))
-    weight = np.where(good, told / (noise + told * jitter**2), 0.0)
-    free = _without_trend(frames.stamp, alone, weight)
-    return np.where(good, free * (told * jitter**2) / (noise + told * jitter**2), 0.0)
+    # A common error of a frame's labels across the motion also exists along it: a lower bound of the frame's noise.
+    noise = max(sigma**2, float((information * transverse**2)[good].mean()))
+    weight = np.where(good, information / (noise + information * jitter**2), 0.0)
+    free = _detrended(frames.stamp, shift, weight)
+    return np.where(good, free * (information * jitter**2) / (noise + information * jitter**2), 0.0)
 
 
-def _without_trend(time: Floats, values: Floats, weight: Floats) -> Floats:
-    """Values (n,) less their weighted straight line: that is the clock's offset and rate."""
-    about = time - np.average(time, weights=weight)
-    line = np.column_stack([np.ones(len(time)), about]) * np.sqrt(weight)[:, None]
+def _detrended(time: Floats, values: Floats, weight: Floats) -> Floats:
+    """Values (n,) minus their weighted straight line, which belongs to the clock's offset and rate."""
+    centred = time - np.average(time, weights=weight)
+    line = np.column_stack([np.ones(len(time)), centred]) * np.sqrt(weight)[:, None]
     fitted = np.linalg.lstsq(line, values * np.sqrt(weight), rcond=None)[0]
-    return np.asarray(values - fitted[0] - fitted[1] * about)
+    return np.asarray(values - fitted[0] - fitted[1] * centred)
 
 
-def _shifted(given: Problem, parts: list[_Frames], shifts: list[Floats]) -> Problem:
-    """The problem with every frame at its own time, and all rows asked again."""
+def _apply_shifts(stamped: Problem, parts: list[_FrameRows], shifts: list[Floats]) -> Problem:
+    """The problem with every frame at its estimated time, and all rows in use again."""
     out = []
-    for rows in given.rows:
+    for rows in stamped.rows:
         stamp = parts[rows.camera].stamp
-        late = np.zeros(len(rows.time))
+        frame_shift = np.zeros(len(rows.time))
         if len(stamp):
             index = np.clip(np.searchsorted(stamp, rows.stamps), 0, len(stamp) - 1)
-            late = np.where(stamp[index] == rows.stamps, shifts[rows.camera][index], 0.0)
-        every = np.ones(len(rows.time), dtype=np.bool_)
-        out.append(replace(rows, time=rows.time + late, stamp=rows.stamps, use=every))
-    return replace(given, rows=tuple(out))
+            frame_shift = np.where(stamp[index] == rows.stamps, shifts[rows.camera][index], 0.0)
+        all_rows = np.ones(len(rows.time), dtype=np.bool_)
+        out.append(replace(rows, time=rows.time + frame_shift, stamp=rows.stamps, use=all_rows))
+    return replace(stamped, rows=tuple(out))

@@ -1,7 +1,7 @@
-"""Where to wave the marker: which camera has seen too little of it, and in which part of its picture.
+"""Image coverage of the marker, and advice where to move it: which camera has seen too little of it, and where.
 
-A pure estimator: observations in, advice out. Two cameras are tied together by motion that crosses much of both
-pictures; a marker that stays in one corner tells of a pose only what that corner can.
+A pure estimator: observations in, advice out. Two cameras are calibrated well by motion that crosses much of both
+images; a marker that stays in one corner constrains a pose only as far as that corner does.
 """
 
 from __future__ import annotations
@@ -13,35 +13,35 @@ from typing import Literal
 import numpy as np
 from google.protobuf.message import Message
 
-from hub.report.measures import COLUMNS, ROWS, covered_parts
+from hub.report.measures import COLUMNS, ROWS, covered_cells
 from protocols.geometry.types import Bools
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
-ENOUGH = 0.35
-"""Share of a picture's parts that the marker should have passed through."""
-LEAST_ROWS = 90
-"""Detections below which a camera can hardly be tied to another."""
-_MOST = 2  # pieces of advice at a time: more is not followed
+MIN_COVERAGE = 0.35
+"""Share of the image cells in which the marker should have been seen."""
+MIN_DETECTIONS = 90
+"""Detections below which a camera can hardly be calibrated with another."""
+_MAX_ADVICE = 2  # pieces of advice at a time: people do not follow more
 
 Kind = Literal["silent", "unseen", "few", "narrow"]
 
 
 @dataclass(frozen=True, slots=True)
-class Advice:
-    """What one camera lacks. coverage: share of its picture in which it saw the marker, 0..1. where: parts of the
-    picture that lack it, as words ("left", "top right"). text: the sentence for a person."""
+class CoverageAdvice:
+    """Advice on one camera. coverage: share of its image in which it saw the marker, 0..1. regions: parts of the image
+    without the marker, as words ("left", "top right"). text: the sentence for a person."""
 
     camera: str
     kind: Kind
     coverage: float
-    where: tuple[str, ...]
+    regions: tuple[str, ...]
     text: str
 
 
-class Guidance:
-    """Counts in which parts of each camera's picture the marker was seen."""
+class CoverageMonitor:
+    """Counts detections of the marker in the cells of each camera's image."""
 
     def __init__(self) -> None:
         self._sizes: dict[str, tuple[int, int]] = {}
@@ -50,7 +50,7 @@ class Guidance:
         self._rows: dict[str, int] = {}
 
     def handle(self, message: Message) -> None:
-        """Take a CameraInfo or an Observation; others are ignored."""
+        """Add a CameraInfo or an Observation; other messages are ignored."""
         if isinstance(message, pb.CameraInfo):
             self._sizes[message.camera] = (message.width, message.height)
             self._counts.setdefault(message.camera, np.zeros((ROWS, COLUMNS), dtype=np.int64))
@@ -66,69 +66,74 @@ class Guidance:
             row = min(max(int((best.v + 0.5) * ROWS / size[1]), 0), ROWS - 1)
             self._counts[name][row, column] += 1
 
-    def start_anew(self) -> None:
-        """Forget what was seen; the cameras stay known."""
+    def reset(self) -> None:
+        """Clear the counts; the cameras stay known."""
         for counts in self._counts.values():
             counts[:] = 0
         self._frames.clear()
         self._rows.clear()
 
-    def covered(self, camera: str) -> Bools:
-        """(ROWS, COLUMNS): the parts of a camera's picture where it saw the marker."""
+    def covered_cells(self, camera: str) -> Bools:
+        """(ROWS, COLUMNS): cells of a camera's image in which it saw the marker."""
         counts = self._counts.get(camera)
         return np.zeros((ROWS, COLUMNS), dtype=np.bool_) if counts is None else np.asarray(counts > 0)
 
     def coverage(self, camera: str) -> float:
-        """Share of a camera's picture in which it saw the marker, 0..1."""
-        return float(self.covered(camera).mean())
+        """Share of a camera's image in which it saw the marker, 0..1."""
+        return float(self.covered_cells(camera).mean())
 
-    def advice(self, most: int = _MOST) -> list[Advice]:
-        """What is missing, the worst first; empty when every camera has seen enough."""
+    def advice(self, max_advice: int = _MAX_ADVICE) -> list[CoverageAdvice]:
+        """Advice, the most urgent first; empty when every camera has seen enough."""
         cameras = sorted({*self._sizes, *self._frames})
         found = [
-            lacking(name, self._frames.get(name, 0), self._rows.get(name, 0), self.covered(name)) for name in cameras
+            camera_advice(name, self._frames.get(name, 0), self._rows.get(name, 0), self.covered_cells(name))
+            for name in cameras
         ]
-        return _worst([advice for advice in found if advice is not None], most)
+        return _most_urgent([advice for advice in found if advice is not None], max_advice)
 
 
-def lacking(camera: str, frames: int, rows: int, covered: Bools) -> Advice | None:
-    """What one camera lacks, None if nothing. frames: it sent; rows: those in which the marker was seen."""
+def camera_advice(camera: str, frames: int, rows: int, covered: Bools) -> CoverageAdvice | None:
+    """Advice on one camera, None if none is needed. frames: received from it; rows: those with a detection."""
     share = float(covered.mean())
-    where = parts_without(covered)
+    regions = uncovered_regions(covered)
     if frames == 0:
-        return Advice(camera, "silent", 0.0, (), f"{camera} sends no frames: check that it runs")
+        return CoverageAdvice(camera, "silent", 0.0, (), f"{camera} sends no frames: check that it runs")
     if rows == 0:
-        return Advice(camera, "unseen", 0.0, (), f"{camera} has not seen the marker yet: wave it in front of it")
+        return CoverageAdvice(
+            camera, "unseen", 0.0, (), f"{camera} has not seen the marker yet: wave it in front of it"
+        )
     percent = f"{camera} has seen the marker in {100 * share:.0f} % of its view"
-    if share < ENOUGH:
-        aim = f" at the {_listed(where[:2])} of its picture" if where else ""
-        return Advice(camera, "narrow", share, where, f"{percent}: wave it{aim}")
-    if rows < LEAST_ROWS:
+    if share < MIN_COVERAGE:
+        aim = f" at the {_listed(regions[:2])} of its picture" if regions else ""
+        return CoverageAdvice(camera, "narrow", share, regions, f"{percent}: wave it{aim}")
+    if rows < MIN_DETECTIONS:
         text = f"{camera} has seen the marker in {rows} frames only: wave it there for longer"
-        return Advice(camera, "few", share, where, text)
+        return CoverageAdvice(camera, "few", share, regions, text)
     return None
 
 
-def advice_for(rig: Rig, observations: Observations, cameras: Mapping[str, str] | None = None) -> list[Advice]:
-    """The same of a recorded session. cameras: only these are looked at, e.g. the refused ones; None = all."""
+def session_advice(
+    rig: Rig, observations: Observations, cameras: Mapping[str, str] | None = None
+) -> list[CoverageAdvice]:
+    """Advice on a recorded session. cameras: only these are considered, e.g. the refused ones; None = all."""
     found = []
     for name, camera in rig.cameras.items():
         if cameras is not None and name not in cameras:
             continue
         pixels = [track.pixels for track in observations.of_camera(name)]
         rows = np.concatenate(pixels) if pixels else np.zeros((0, 2))
-        covered = covered_parts(rows, camera.size) if len(rows) else np.zeros((ROWS, COLUMNS), dtype=np.bool_)
-        advice = lacking(name, max(len(rows), 1), len(rows), covered)
+        covered = covered_cells(rows, camera.size) if len(rows) else np.zeros((ROWS, COLUMNS), dtype=np.bool_)
+        advice = camera_advice(name, max(len(rows), 1), len(rows), covered)
         if advice is not None:
             found.append(advice)
-    return _worst(found, _MOST)
+    return _most_urgent(found, _MAX_ADVICE)
 
 
-def parts_without(covered: Bools) -> tuple[str, ...]:
-    """Sides and corners of a picture that lack the marker, the emptiest first.
+def uncovered_regions(covered: Bools) -> tuple[str, ...]:
+    """Sides and corners of the image without the marker, the emptiest first.
 
-    covered: (ROWS, COLUMNS). A side is named where two thirds of its third are empty, not counting what another side
-    has named already.
+    covered: (ROWS, COLUMNS). A side is named if at least two thirds of the outer third of the image there are empty,
+    not counting cells of a side already named.
     """
     rows, columns = covered.shape
     upper, lower = max(1, rows // 3), rows - max(1, rows // 3)
@@ -139,19 +144,19 @@ def parts_without(covered: Bools) -> tuple[str, ...]:
         "top": np.s_[:upper, :],
         "bottom": np.s_[lower:, :],
     }
-    told = np.zeros_like(covered)
-    named: list[str] = []
-    while len(named) < len(sides):
+    named_cells = np.zeros_like(covered)
+    uncovered_sides: list[str] = []
+    while len(uncovered_sides) < len(sides):
         empty = {
-            name: float((~covered[part] & ~told[part]).sum()) / max(float((~told[part]).sum()), 1.0)
+            name: float((~covered[part] & ~named_cells[part]).sum()) / max(float((~named_cells[part]).sum()), 1.0)
             for name, part in sides.items()
-            if name not in named
+            if name not in uncovered_sides
         }
         name = max(empty, key=lambda side: empty[side])
         if empty[name] < 2 / 3:
             break
-        named.append(name)
-        told[sides[name]] = True
+        uncovered_sides.append(name)
+        named_cells[sides[name]] = True
     corners = {
         "top left": np.s_[:upper, :first],
         "top right": np.s_[:upper, last:],
@@ -159,13 +164,13 @@ def parts_without(covered: Bools) -> tuple[str, ...]:
         "bottom right": np.s_[lower:, last:],
         "centre": np.s_[upper:lower, first:last],
     }
-    missed = [name for name, part in corners.items() if not (covered[part] | told[part]).any()]
-    return (*named, *missed)
+    uncovered_corners = [name for name, part in corners.items() if not (covered[part] | named_cells[part]).any()]
+    return (*uncovered_sides, *uncovered_corners)
 
 
-def _worst(found: list[Advice], most: int) -> list[Advice]:
+def _most_urgent(found: list[CoverageAdvice], max_advice: int) -> list[CoverageAdvice]:
     order: dict[Kind, int] = {"silent": 0, "unseen": 1, "narrow": 2, "few": 3}
-    return sorted(found, key=lambda advice: (order[advice.kind], advice.coverage, advice.camera))[:most]
+    return sorted(found, key=lambda advice: (order[advice.kind], advice.coverage, advice.camera))[:max_advice]
 
 
 def _listed(words: tuple[str, ...]) -> str:

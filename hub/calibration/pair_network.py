@@ -1,12 +1,11 @@
-"""All pairs of a session's cameras, each by itself; and clocks whose seconds are no seconds.
+"""Synchronisation of all camera pairs of a session, and correction of wrong frame rates.
 
-Times made of frame numbers with a wrong frame rate run 0.4 to 2.5 times as fast as they should. To look for
-that in every pair is dear, so only cameras that nothing ties to the others are tried at such rates. What is
-found becomes the camera's pace: from then on its times are counted at it, and everything behind sees clocks
-that run about alike.
+Times made from frame numbers with a wrong frame rate run 0.4 to 2.5 times as fast as they should. Searching for that in
+every pair is slow, so only cameras that are not connected to the others are tried at such rates. The rate found becomes
+the camera's time scale: its times are multiplied by it, so that later steps see clock rates near 1.
 
-Where the pictures leave several lags open (a motion that repeats itself), what time services say of the cameras'
-clocks may choose among them. It is asked last, so that it changes no answer that the pictures give.
+Where the images are consistent with several lags (periodic motion), external clock priors may select one of them. They
+are used last, so that they change no lag that the images determine.
 """
 
 from __future__ import annotations
@@ -18,140 +17,150 @@ from dataclasses import replace
 
 import numpy as np
 
-from hub.calibration.clock_graph import components
-from hub.calibration.preprocessing import Prepared
-from hub.clocks.external_prior import CAMERA_DELAY, Claim
-from hub.sync.pair_ranking import promise
-from hub.sync.pair_solver import PairFit, PairSettings, PairSolution, evidence, solve_pair
-from hub.sync.track_cache import Kept
+from hub.bundle.preprocessing import PreparedSession
+from hub.clocks.clock_graph import connected_components
+from hub.clocks.external_prior import MAX_CAMERA_DELAY_S, ExternalClockPrior
+from hub.sync.common_clock import solve_common_clock_pair
+from hub.sync.hypothesis import PairFit, PairSolution, evidence
+from hub.sync.pair_ranking import ranking_score
+from hub.sync.pair_solver import solve_pair
+from hub.sync.settings import PairSettings
+from hub.sync.track_cache import TrackCache
 from hub.trajectory.image_tracks import smooth_only
-from hub.two_view.common_clock import solve_shared_pair
-from hub.two_view.relative_pose import relative_pose
-from protocols.session.calibration import Known
+from hub.two_view.relative_pose import relative_pose_between
+from protocols.session.calibration import FixedCalibration
 
 Progress = Callable[[str, float], None]
-"""Told what is being done and how much of the whole is done (0..1)."""
+"""Progress callback: (what is being done, share of the whole that is done, 0..1)."""
 
-FAR_FROM_ONE = 0.01
-"""No clock is off by that much: its times were made with a wrong frame rate."""
+RATE_TOLERANCE = 0.01
+"""Relative rate error above which times must have been made with a wrong frame rate: no clock is off by that much."""
 _FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
-_SAME_RATIO = 0.01
-_FEW = 8  # cameras whose pairs are all looked at closely
-_SEVERAL = 3  # cameras that tell of each other
-_MUCH = 8.0  # s of common motion
-_WIDEST_CLAIM = 0.5  # s on either side: a claim as vague as that chooses nothing
+_RATIO_TOLERANCE = 0.01
+_SMALL_NETWORK = 8  # cameras up to which all failed guided searches are repeated over all lags
+_MIN_REDUNDANT = 3  # cameras from which on pairs are checked against each other
+_LONG_OVERLAP = 8.0  # s of common motion
+_MAX_PRIOR_WINDOW = 0.5  # s on either side: a less precise prior selects nothing
 
 
 def solve_pairs(
-    prepared: Prepared,
-    tell: Progress,
+    prepared: PreparedSession,
+    report: Progress,
     *,
     thorough: bool = False,
-    known: Known | None = None,
-    claims: Mapping[str, Claim] | None = None,
-) -> tuple[Prepared, list[PairSolution]]:
-    """All pairs of cameras, lensless ones included, and the session at the paces that were found.
+    known: FixedCalibration | None = None,
+    clock_priors: Mapping[str, ExternalClockPrior] | None = None,
+) -> tuple[PreparedSession, list[PairSolution]]:
+    """All pairs of cameras, uncalibrated ones included, and the session with the time scales that were found.
 
-    thorough: whether to try rates that a wrongly told frame rate makes, for cameras that nothing ties.
-    known: given poses; then only lags and rates are sought where both have one. claims: what the cameras' machines
-    say of their clocks; it chooses where the pictures leave lags open, which a warning tells, and nowhere else.
+    thorough: whether to try rates that a wrong nominal frame rate causes, for unconnected cameras. known: given poses;
+    pairs of two such cameras then estimate lag and rate only. clock_priors: external clock priors by camera; they
+    select a lag only where the images leave it ambiguous, which a warning reports.
     """
     names = prepared.names
     todo = list(itertools.combinations(names, 2))
-    many = len(names) > _FEW and not prepared.shared_clock
+    is_large = len(names) > _SMALL_NETWORK and not prepared.shared_clock
     pairs: dict[tuple[str, str], PairSolution] = {}
-    plain: dict[tuple[str, str], PairSolution] = {}
-    told, kept = _ToldClocks(), Kept()
-    sort = len(todo) > 1 and not prepared.shared_clock
-    for done, (a, b) in enumerate(_most_promising_first(prepared, todo, tell, kept) if sort else todo):
-        tell(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
-        near = None if prepared.shared_clock else told.lag(prepared, a, b)
-        answer = _solve(prepared, (a, b), known, near=near, kept=kept)
-        # Where the others' clocks are right, a pair that sees much must agree; if not, it is heard for itself.
-        if near is not None and not answer.solved and (not many or _sees_much(answer)):
-            answer, near = _solve(prepared, (a, b), known, kept=kept), None
-        if near is None:
-            plain[a, b] = answer
-        if claims and not answer.solved and not prepared.shared_clock:
-            answer, warning = _chosen_by_claims(prepared, answer, known, claims)
+    unguided: dict[tuple[str, str], PairSolution] = {}
+    synchronised, cache = _SynchronisedGroups(), TrackCache()
+    is_ranked = len(todo) > 1 and not prepared.shared_clock
+    for done, (a, b) in enumerate(_ranked(prepared, todo, report, cache) if is_ranked else todo):
+        report(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
+        predicted_lag = None if prepared.shared_clock else synchronised.lag(prepared, a, b)
+        solution = _solve(prepared, (a, b), known, predicted_lag=predicted_lag, cache=cache)
+        # If the predicted lag is right, a pair with a long overlap must agree with it; else it is solved over all lags.
+        if predicted_lag is not None and not solution.solved and (not is_large or _has_long_overlap(solution)):
+            solution, predicted_lag = _solve(prepared, (a, b), known, cache=cache), None
+        if predicted_lag is None:
+            unguided[a, b] = solution
+        if clock_priors and not solution.solved and not prepared.shared_clock:
+            solution, warning = _disambiguated_by_priors(prepared, solution, known, clock_priors)
             prepared = replace(prepared, warnings=prepared.warnings + warning)
-        pairs[a, b] = answer
-        told.hear(answer)
+        pairs[a, b] = solution
+        synchronised.add(solution)
     pairs = {both: pairs[both] for both in todo}  # in the rig's order
-    if len(names) >= _SEVERAL and not prepared.shared_clock and known is None:
-        for both in _by_themselves(pairs):
-            if plain.get(both) is not pairs[both]:
-                continue  # chosen by what the machines claim: the search through all lags left it open
-            tell(f"pair {both[0]}–{both[1]} by itself", 0.56)
-            pairs[both] = plain[both] = _solve(prepared, both, known, alone=True, kept=kept)
+    if len(names) >= _MIN_REDUNDANT and not prepared.shared_clock and known is None:
+        for both in _isolated_pairs(pairs):
+            if unguided.get(both) is not pairs[both]:
+                continue  # selected by external clock priors: ambiguous over all lags
+            report(f"pair {both[0]}–{both[1]} by itself", 0.56)
+            pairs[both] = unguided[both] = _solve(prepared, both, known, standalone=True, cache=cache)
     if thorough and not prepared.shared_clock:
-        prepared = _tie_at_other_rates(prepared, pairs, plain, known, tell)
+        prepared = _connect_at_other_rates(prepared, pairs, unguided, known, report)
     return prepared, list(pairs.values())
 
 
-def _by_themselves(pairs: Mapping[tuple[str, str], PairSolution]) -> list[tuple[str, str]]:
-    """The solved pairs whose cameras no other pair ties to anything: what they tell must stand by itself."""
-    ties = Counter(name for both, answer in pairs.items() if answer.solved for name in both)
-    return [both for both, answer in pairs.items() if answer.solved and max(ties[name] for name in both) == 1]
+def _isolated_pairs(pairs: Mapping[tuple[str, str], PairSolution]) -> list[tuple[str, str]]:
+    """Solved pairs whose cameras are in no other solved pair: nothing else checks their lag."""
+    counts = Counter(name for both, solution in pairs.items() if solution.solved for name in both)
+    return [both for both, solution in pairs.items() if solution.solved and max(counts[name] for name in both) == 1]
 
 
-def _chosen_by_claims(
-    prepared: Prepared, answer: PairSolution, known: Known | None, claims: Mapping[str, Claim]
+def _disambiguated_by_priors(
+    prepared: PreparedSession,
+    solution: PairSolution,
+    known: FixedCalibration | None,
+    clock_priors: Mapping[str, ExternalClockPrior],
 ) -> tuple[PairSolution, tuple[str, ...]]:
-    """The alignment about the lag that the two machines claim, if it explains what was seen as well as any does.
+    """The alignment near the lag of the two external clock priors, if it fits as well as any other.
 
-    answer: of the search through all lags, unsolved. Returned unchanged, without a warning, where it found no
-    alignment at all, where nothing near the claim stands, or where what stands there agrees for less than half of
-    the time or leaves clearly more than the best does elsewhere: then the claim is wrong.
+    solution: of the search over all lags, unsolved. It is returned unchanged, without a warning, if it has no
+    alignment at all, or if there is none near the prior lag, or one whose inlier support is less than half or whose
+    residuals are clearly larger than the best alignment's: then the prior is wrong.
     """
-    if answer.fit is None or answer.a not in claims or answer.b not in claims:
-        return answer, ()
-    one, other = claims[answer.a], claims[answer.b]
-    window = one.error + other.error + CAMERA_DELAY
-    if not window <= _WIDEST_CLAIM:
-        return answer, ()
-    # t_unix = t_a + m_a = t_b + m_b, on the session's times, which begin at each camera's epoch
-    lag = other.unix_minus_camera - one.unix_minus_camera + prepared.epochs[answer.b] - prepared.epochs[answer.a]
-    settings = PairSettings(near_window=window)
-    near = _solve(prepared, (answer.a, answer.b), known, near=lag, settings=settings)
-    best, fit = answer.fit, near.fit
-    if not near.solved or fit is None or abs(fit.lag - lag) > window:
-        return answer, ()
-    if evidence(fit) < settings.accept_ratio * evidence(best):
-        return answer, ()
-    if fit.sigma_px > settings.worse_than_noise * max(best.sigma_px, settings.sigma_px):
-        return answer, ()
-    warning = (
-        f"{answer.a}–{answer.b}: the motion alone leaves several lags open ({answer.status}); of them the one was "
-        f"taken that the machines' clocks claim, to {1e3 * window:.3g} ms"
+    if solution.fit is None or solution.a not in clock_priors or solution.b not in clock_priors:
+        return solution, ()
+    one, other = clock_priors[solution.a], clock_priors[solution.b]
+    lag_window = one.error_bound + other.error_bound + MAX_CAMERA_DELAY_S
+    if not lag_window <= _MAX_PRIOR_WINDOW:
+        return solution, ()
+    # t_unix = t_a + m_a = t_b + m_b, with times from each camera's time origin
+    lag = (
+        other.unix_minus_camera
+        - one.unix_minus_camera
+        + prepared.time_origins[solution.b]
+        - prepared.time_origins[solution.a]
     )
-    return near, (warning,)
+    settings = PairSettings(predicted_lag_window=lag_window)
+    guided = _solve(prepared, (solution.a, solution.b), known, predicted_lag=lag, settings=settings)
+    best, fit = solution.fit, guided.fit
+    if not guided.solved or fit is None or abs(fit.lag - lag) > lag_window:
+        return solution, ()
+    if evidence(fit) < settings.max_evidence_ratio * evidence(best):
+        return solution, ()
+    if fit.residual_px > settings.competing_residual_ratio_at_noise * max(best.residual_px, settings.sigma_px):
+        return solution, ()
+    warning = (
+        f"{solution.a}–{solution.b}: the motion alone is consistent with several lags ({solution.status}); "
+        f"the one near the external clock priors was selected (within {1e3 * lag_window:.3g} ms)"
+    )
+    return guided, (warning,)
 
 
-def _sees_much(answer: PairSolution) -> bool:
-    return answer.fit is not None and answer.fit.moving_overlap > _MUCH
+def _has_long_overlap(solution: PairSolution) -> bool:
+    return solution.fit is not None and solution.fit.moving_overlap > _LONG_OVERLAP
 
 
-def _most_promising_first(
-    prepared: Prepared, todo: list[tuple[str, str]], tell: Progress, kept: Kept
+def _ranked(
+    prepared: PreparedSession, todo: list[tuple[str, str]], report: Progress, cache: TrackCache
 ) -> list[tuple[str, str]]:
-    """The pairs, those first that a coarse scan of all lags likes best: once cameras are tied, the rest is cheap."""
-    likes = {}
+    """The pairs by descending ranking score of a coarse lag scan; lags within connected groups are then predicted."""
+    scores = {}
     for a, b in todo:
-        tell(f"coarse look at {a}–{b}", 0.05)
+        report(f"coarse scan of {a}–{b}", 0.05)
         tracks_a, tracks_b = (smooth_only(prepared.camera(name).tracks) for name in (a, b))
-        likes[a, b] = promise(tracks_a, tracks_b, kept=kept)
-    return sorted(todo, key=lambda pair: -likes[pair])
+        scores[a, b] = ranking_score(tracks_a, tracks_b, cache=cache)
+    return sorted(todo, key=lambda pair: -scores[pair])
 
 
-class _ToldClocks:
-    """Groups of cameras that solved pairs tie, each with one time: ``t_group = rate * t + offset``."""
+class _SynchronisedGroups:
+    """Groups of cameras connected by solved pairs, each with a common time: ``t_group = rate * t + offset``."""
 
     def __init__(self) -> None:
         self._maps: dict[str, tuple[str, float, float]] = {}
 
-    def hear(self, pair: PairSolution) -> None:
-        """Join the groups of a solved pair's cameras; what is tied already stays as it is."""
+    def add(self, pair: PairSolution) -> None:
+        """Merge the groups of a solved pair's cameras; a pair within one group changes nothing."""
         if not pair.solved or pair.fit is None:
             return
         for name in (pair.a, pair.b):
@@ -166,39 +175,39 @@ class _ToldClocks:
             if group == group_b:
                 self._maps[name] = (group_a, rate * r, rate * o + offset)
 
-    def lag(self, prepared: Prepared, a: str, b: str) -> float | None:
-        """``t_a - t_b`` [s] in the middle of the time that both recorded; None where nothing ties them."""
+    def lag(self, prepared: PreparedSession, a: str, b: str) -> float | None:
+        """``t_a - t_b`` [s] in the middle of the common recording time; None if they are not connected."""
         if a not in self._maps or b not in self._maps or self._maps[a][0] != self._maps[b][0]:
             return None
         (_, rate_a, offset_a), (_, rate_b, offset_b) = self._maps[a], self._maps[b]
         rate, offset = rate_b / rate_a, (offset_b - offset_a) / rate_a
-        begin_a, end_a = _span(prepared, a)
-        begin_b, end_b = (rate * time + offset for time in _span(prepared, b))
+        begin_a, end_a = _time_span(prepared, a)
+        begin_b, end_b = (rate * time + offset for time in _time_span(prepared, b))
         middle = 0.5 * (max(begin_a, begin_b) + min(end_a, end_b))
         return middle - (middle - offset) / rate
 
 
 def _solve(
-    prepared: Prepared,
+    prepared: PreparedSession,
     names: tuple[str, str],
-    known: Known | None,
+    known: FixedCalibration | None,
     *,
     thorough: bool = False,
-    near: float | None = None,
+    predicted_lag: float | None = None,
     settings: PairSettings | None = None,
-    plain: PairSolution | None = None,
-    kept: Kept | None = None,
-    alone: bool = False,
+    unguided: PairSolution | None = None,
+    cache: TrackCache | None = None,
+    standalone: bool = False,
 ) -> PairSolution:
     a, b = (prepared.camera(name).tracks for name in names)
     if prepared.shared_clock:
-        return solve_shared_pair(a, b, names)
+        return solve_common_clock_pair(a, b, names)
     given = None
     if known is not None and all(name in known.cameras for name in names):
-        given = relative_pose(known.cameras[names[0]].pose, known.cameras[names[1]].pose)
+        given = relative_pose_between(known.cameras[names[0]].pose, known.cameras[names[1]].pose)
     calibrated = all(name in prepared.cameras for name in names)
-    # With more cameras the adjustment frees lenses itself and judges each clock: a vague lag is a start.
-    settings = replace(settings or PairSettings(), firm=alone or len(prepared.names) < _SEVERAL)
+    # With more cameras the adjustment estimates lenses and tests each clock: an imprecise lag suffices to start.
+    settings = replace(settings or PairSettings(), standalone=standalone or len(prepared.names) < _MIN_REDUNDANT)
     return solve_pair(
         smooth_only(a),
         smooth_only(b),
@@ -207,27 +216,27 @@ def _solve(
         given,
         calibrated=calibrated,
         thorough=thorough,
-        near=near,
-        plain=plain,
-        kept=kept,
+        predicted_lag=predicted_lag,
+        previous_refusal=unguided,
+        cache=cache,
     )
 
 
-def _tie_at_other_rates(
-    prepared: Prepared,
+def _connect_at_other_rates(
+    prepared: PreparedSession,
     pairs: dict[tuple[str, str], PairSolution],
-    plain: dict[tuple[str, str], PairSolution],
-    known: Known | None,
-    tell: Progress,
-) -> Prepared:
-    """Tie what is not tied to the largest group at rates far from 1; ``pairs`` are replaced in place.
+    unguided: dict[tuple[str, str], PairSolution],
+    known: FixedCalibration | None,
+    report: Progress,
+) -> PreparedSession:
+    """Connect cameras outside the largest group at rates far from 1; ``pairs`` are replaced in place.
 
-    A group of several that is tied by one pair is paced as a whole, and its other pairs are solved again. plain: what
-    searches through all lags said, which are not made again.
+    A group that gets connected by one pair is rescaled as a whole, and its other pairs are solved again. unguided:
+    results of searches over all lags, which are not repeated.
     """
     names, tried = prepared.names, set[tuple[str, str]]()
     while True:
-        groups = components(names, [pair for pair in pairs.values() if pair.solved])
+        groups = connected_components(names, [pair for pair in pairs.values() if pair.solved])
         largest = groups[0] if groups else []
         found = None
         for a, b in pairs:
@@ -235,84 +244,87 @@ def _tie_at_other_rates(
             if not across or (a, b) in tried:
                 continue
             tried.add((a, b))
-            tell(f"pair {a}–{b} at other frame rates", 0.57)
-            answer = _solve(prepared, (a, b), known, thorough=True, plain=plain.get((a, b)))
-            if answer.solved and answer.fit is not None:
-                found = answer, answer.fit
+            report(f"pair {a}–{b} at other frame rates", 0.57)
+            solution = _solve(prepared, (a, b), known, thorough=True, unguided=unguided.get((a, b)))
+            if solution.solved and solution.fit is not None:
+                found = solution, solution.fit
                 break
         if found is None:
             return prepared
-        answer, fit = found
-        stays = answer.b if len(largest) > 1 and answer.b in largest else answer.a
-        moves = answer.a if stays == answer.b else answer.b
-        group = next(group for group in groups if moves in group)
-        factor = fit.rate if moves == answer.b else 1.0 / fit.rate
-        prepared = prepared.paced(group, factor)
-        pairs[answer.a, answer.b] = answer
+        solution, fit = found
+        fixed = solution.b if len(largest) > 1 and solution.b in largest else solution.a
+        rescaled = solution.a if fixed == solution.b else solution.b
+        group = next(group for group in groups if rescaled in group)
+        factor = fit.rate if rescaled == solution.b else 1.0 / fit.rate
+        prepared = prepared.with_time_scale(group, factor)
+        pairs[solution.a, solution.b] = solution
         for (a, b), pair in pairs.items():
             if a in group or b in group:
-                plain.pop((a, b), None)
-            if (a in group) == (b in group) or pair is answer:
-                pairs[a, b] = _paced(pair, *(factor if name in group else 1.0 for name in (a, b)))
+                unguided.pop((a, b), None)
+            if (a in group) == (b in group) or pair is solution:
+                pairs[a, b] = _rescaled(pair, *(factor if name in group else 1.0 for name in (a, b)))
             else:
-                pairs[a, b] = plain[a, b] = _solve(prepared, (a, b), known)
+                pairs[a, b] = unguided[a, b] = _solve(prepared, (a, b), known)
 
 
-def _paced(pair: PairSolution, factor_a: float, factor_b: float) -> PairSolution:
-    """A pair after its clocks were made to run so many times as fast."""
+def _rescaled(pair: PairSolution, factor_a: float, factor_b: float) -> PairSolution:
+    """A pair's solution after the times of its cameras were multiplied by the factors."""
     if pair.fit is None:
         return pair
     fit = pair.fit
-    paced = replace(
-        fit, rate=fit.rate * factor_a / factor_b, offset=fit.offset * factor_a, middle=fit.middle * factor_a
+    rescaled = replace(
+        fit, rate=fit.rate * factor_a / factor_b, offset=fit.offset * factor_a, mid_time=fit.mid_time * factor_a
     )
-    return replace(pair, fit=paced, others=())
+    return replace(pair, fit=rescaled, alternatives=())
 
 
-def rate_warnings(prepared: Prepared, pairs: list[PairSolution]) -> tuple[str, ...]:
-    """One sentence for each camera whose times run far faster or slower than those of most others it is tied to."""
-    if not any(abs(pace - 1.0) > FAR_FROM_ONE for pace in prepared.paces.values()):
+def frame_rate_warnings(prepared: PreparedSession, pairs: list[PairSolution]) -> tuple[str, ...]:
+    """One sentence for each camera whose times run much faster or slower than those of most connected cameras."""
+    if not any(abs(time_scale - 1.0) > RATE_TOLERANCE for time_scale in prepared.time_scales.values()):
         return ()
-    tied = components(prepared.names, [pair for pair in pairs if pair.solved])[0]
-    usual = max(tied, key=lambda name: sum(_alike(prepared, name, other) for other in tied))
-    alike = [name for name in tied if _alike(prepared, name, usual)]
+    connected = connected_components(prepared.names, [pair for pair in pairs if pair.solved])[0]
+    typical = max(connected, key=lambda name: sum(_same_time_scale(prepared, name, other) for other in connected))
+    consistent = [name for name in connected if _same_time_scale(prepared, name, typical)]
     out = []
-    for name in tied:
-        if name in alike:
+    for name in connected:
+        if name in consistent:
             continue
-        ratio = prepared.pace(usual) / prepared.pace(name)
-        told, actual = _frame_rates(ratio, _rows_a_second(prepared, name))
-        if 2 * len(alike) > len(tied):
-            doubt = f"the others': were they made with {told} fps for {actual}?"
+        ratio = prepared.time_scale(typical) / prepared.time_scale(name)
+        nominal, actual = _likely_frame_rates(ratio, _observed_frame_rate(prepared, name))
+        if 2 * len(consistent) > len(connected):
+            comparison = f"the others': were they made with {nominal} fps for {actual}?"
         else:
-            told_usual, actual_usual = _frame_rates(1.0 / ratio, _rows_a_second(prepared, usual))
-            doubt = (
-                f"{usual}'s: were they made with {told} fps for {actual}, "
-                f"or {usual}'s with {told_usual} for {actual_usual}?"
+            nominal_typical, actual_typical = _likely_frame_rates(1.0 / ratio, _observed_frame_rate(prepared, typical))
+            comparison = (
+                f"{typical}'s: were they made with {nominal} fps for {actual}, "
+                f"or {typical}'s with {nominal_typical} for {actual_typical}?"
             )
-        out.append(f"{name}: its times run {ratio:.4g} times as fast as {doubt}")
+        out.append(f"{name}: its times run {ratio:.4g} times as fast as {comparison}")
     return tuple(out)
 
 
-def _alike(prepared: Prepared, a: str, b: str) -> bool:
-    return abs(prepared.pace(a) / prepared.pace(b) - 1.0) < FAR_FROM_ONE
+def _same_time_scale(prepared: PreparedSession, a: str, b: str) -> bool:
+    return abs(prepared.time_scale(a) / prepared.time_scale(b) - 1.0) < RATE_TOLERANCE
 
 
-def _rows_a_second(prepared: Prepared, name: str) -> float:
-    """The camera's frame rate as its own times tell it."""
+def _observed_frame_rate(prepared: PreparedSession, name: str) -> float:
+    """The camera's frame rate by its own time stamps."""
     interval = min(float(np.median(np.diff(track.time))) for track in prepared.camera(name).tracks.values())
-    return prepared.pace(name) / interval
+    return prepared.time_scale(name) / interval
 
 
-def _frame_rates(ratio: float, told: float) -> tuple[str, str]:
-    """The frame rate that times were likely made with, and the true one, where they run ``ratio`` times as fast."""
-    usual = [(a, b) for a in _FRAME_RATES for b in _FRAME_RATES if abs(b / a / ratio - 1.0) < _SAME_RATIO]
-    likely = min(usual, key=lambda pair: abs(pair[0] - told), default=(told, told * ratio))
+def _likely_frame_rates(ratio: float, observed: float) -> tuple[str, str]:
+    """The frame rate that times were likely made with, and the true one, if they run ``ratio`` times as fast.
+
+    observed: frame rate by the camera's own time stamps.
+    """
+    standard = [(a, b) for a in _FRAME_RATES for b in _FRAME_RATES if abs(b / a / ratio - 1.0) < _RATIO_TOLERANCE]
+    likely = min(standard, key=lambda pair: abs(pair[0] - observed), default=(observed, observed * ratio))
     return f"{likely[0]:.3g}", f"{likely[1]:.3g}"
 
 
-def timing_told(name: str, prepared: Prepared, pairs: list[PairSolution]) -> str:
-    """What solved pairs say of a camera's clock: "12.3450 s against cam0, …"; "" where none is solved."""
+def describe_timing(name: str, prepared: PreparedSession, pairs: list[PairSolution]) -> str:
+    """Lags of a camera from its solved pairs: "12.3450 s against cam0, …"; "" where none is solved."""
     parts = []
     for pair in pairs:
         if not pair.solved or pair.fit is None or name not in (pair.a, pair.b):
@@ -322,18 +334,18 @@ def timing_told(name: str, prepared: Prepared, pairs: list[PairSolution]) -> str
     return ", ".join(parts)
 
 
-def pair_lag(prepared: Prepared, pair: PairSolution, fit: PairFit) -> float:
-    """``t_a - t_b`` [s] as the cameras' clocks show it, in the middle of the time that both recorded."""
-    begin_a, end_a = _span(prepared, pair.a)
-    begin_b, end_b = (fit.rate * time + fit.offset for time in _span(prepared, pair.b))
+def pair_lag(prepared: PreparedSession, pair: PairSolution, fit: PairFit) -> float:
+    """``t_a - t_b`` [s] on the cameras' own clocks, in the middle of the common recording time."""
+    begin_a, end_a = _time_span(prepared, pair.a)
+    begin_b, end_b = (fit.rate * time + fit.offset for time in _time_span(prepared, pair.b))
     middle = 0.5 * (max(begin_a, begin_b) + min(end_a, end_b))
-    shown_a = prepared.epochs[pair.a] + middle / prepared.pace(pair.a)
-    return shown_a - prepared.epochs[pair.b] - (middle - fit.offset) / fit.rate / prepared.pace(pair.b)
+    shown_a = prepared.time_origins[pair.a] + middle / prepared.time_scale(pair.a)
+    return shown_a - prepared.time_origins[pair.b] - (middle - fit.offset) / fit.rate / prepared.time_scale(pair.b)
 
 
-def _span(prepared: Prepared, name: str) -> tuple[float, float]:
+def _time_span(prepared: PreparedSession, name: str) -> tuple[float, float]:
     tracks = prepared.camera(name).tracks.values()
     return min(float(track.time[0]) for track in tracks), max(float(track.time[-1]) for track in tracks)
 
 
-__all__ = ["Progress", "pair_lag", "rate_warnings", "solve_pairs", "timing_told"]
+__all__ = ["Progress", "describe_timing", "frame_rate_warnings", "pair_lag", "solve_pairs"]

@@ -1,66 +1,58 @@
-"""The whole line of the hub: tracks → pairs → graph → poses → one adjustment → a published calibration.
+"""The calibration pipeline: tracks, camera pairs, clock graph, reconstruction, bundle adjustment, calibration.
 
-No sockets, files or clocks: `calibrate` offline and the live hub run the same code.
+No sockets, files or clocks: `syncline calibrate` and the live hub run the same code.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hub.baselines.session_lags import paper_pair
+from hub.baselines.session_lags import solve_pair_by_paper
 from hub.bundle import covariance as cov
 from hub.bundle import rolling_shutter
-from hub.bundle.adjustment import adjust, noise, residual_norms
-from hub.bundle.correlated_noise import with_lasting_errors
-from hub.bundle.noise_scale import together
-from hub.bundle.problem import Freedom, Problem, State
-from hub.bundle.timestamp_jitter import settle
-from hub.calibration.clock_graph import ClockGraph, ClockGuess, average_clocks, components
-from hub.calibration.initialisation import Scaffold, agreement, grow, place_known
-from hub.calibration.pair_network import Progress, rate_warnings, solve_pairs, timing_told
-from hub.calibration.preprocessing import NO_INTRINSICS, Prepared, prepare
-from hub.calibration.result import focal_stds, lone_pair_report, publish
-from hub.calibration.self_calibration import LARGEST_STD, refocused, self_calibrated
-from hub.clocks.external_prior import Claim
-from hub.sync.pair_solver import PairSolution
+from hub.bundle.adjustment import adjust, estimate_noise, residual_norms
+from hub.bundle.correlated_noise import refit_with_correlated_noise
+from hub.bundle.initialisation import (
+    Reconstruction,
+    inlier_share,
+    reconstruct_incrementally,
+    reconstruct_with_known_poses,
+)
+from hub.bundle.noise_scale import correlation_inflation
+from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
+from hub.bundle.problem import AdjustmentState, FreeParameters, Problem
+from hub.bundle.smoothness_prior import estimate_smoothness
+from hub.bundle.timestamp_jitter import estimate_frame_times
+from hub.calibration.pair_network import Progress, describe_timing, frame_rate_warnings, solve_pairs
+from hub.calibration.result import assemble_calibration, focal_stds, isolated_pair_report
+from hub.calibration.self_calibration import MAX_FOCAL_STD, initial_self_calibration, with_updated_lenses
+from hub.calibration.solution import Solution
+from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate, connected_components, synchronise_clocks
+from hub.clocks.external_prior import ExternalClockPrior
+from hub.sync.hypothesis import PairSolution
 from hub.trajectory.image_tracks import smooth_only
-from hub.trajectory.smoothness_prior import motion_prior
 from hub.two_view.relative_pose import fundamental_from
 from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
-from protocols.session.calibration import Calibration, Known
+from protocols.session.calibration import Calibration, FixedCalibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
 if TYPE_CHECKING:
-    from hub.distributed.solver import PlacedByNodes
+    from hub.distributed.solver import DistributedPoseSolver
 
-_LEAST_AGREEMENT = 0.5  # share of a camera's rows that must fit the common path
-_LEAST_ROWS = 30
-_LARGEST_TURN_STD = 0.05  # rad
-_LARGEST_CLOCK_STD = 10e-3  # s: a frame is more than three of them
-_FARTHEST_FROM_PAIR = 20e-3  # s
-_APART = "the path tells its clock"
-_LENS_ROUNDS = 3
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Solution:
-    """An adjusted network in the internal gauge, before publication."""
-
-    scaffold: Scaffold
-    pairs: tuple[PairSolution, ...]
-    refused: dict[str, str]
-    prepared: Prepared
-    solver: str
-    warnings: tuple[str, ...] = field(default=())
-    known: Known | None = None
-    """Poses that were given and stay: then their world is the published one."""
+_MIN_INLIER_SHARE = 0.5  # share of a camera's rows that must fit the trajectory
+_MIN_ROWS = 30
+_MAX_ROTATION_STD = 0.05  # rad
+_MAX_CLOCK_STD = 10e-3  # s: a frame is more than three of them
+_MAX_LAG_CHANGE = 20e-3  # s
+_LAG_CONFLICT = "the trajectory puts its clock"
+_LENS_ITERATIONS = 3
 
 
 def calibrate(
@@ -69,64 +61,66 @@ def calibrate(
     progress: Progress | None = None,
     *,
     solver: str = "joint",
-    known: Known | None = None,
+    known: FixedCalibration | None = None,
     thorough: bool = False,
     seed: int = 0,
-    claims: Mapping[str, Claim] | None = None,
+    clock_priors: Mapping[str, ExternalClockPrior] | None = None,
 ) -> Calibration:
-    """Timing and poses of all cameras from what they saw, with no guess.
+    """Timing and poses of all cameras from their observations, without initial values.
 
-    solver: "joint", or "paper" (the paper's alternating method: no adjustment, same frame rates, lags of
-    a few frames). known: intrinsics and poses that are given; then only timing and paths are sought.
-    thorough: whether cameras that nothing ties get a second, far dearer search: clock rates that a
-    wrongly told frame rate makes (times made of frame numbers: a live camera's are not), and torn tracks.
-    seed: of the samples by which pose nodes begin ("distributed"); the other solvers draw nothing at random.
-    claims: what cameras' machines say of their clocks; asked only where the pictures leave lags open.
-    Raises Refused, with a reason for every camera and what is known of pairs, where fewer than two can be placed.
+    solver: "joint" (bundle adjustment), "distributed" (pose nodes), or "paper" (the asynchronous calibration paper's
+    alternating method: no adjustment, equal frame rates, lags of a few frames). known: given intrinsics and poses;
+    then only timing and trajectories are estimated. thorough: whether unconnected cameras get a second, far slower
+    search over clock rates that a wrong nominal frame rate causes (times made from frame numbers, which a live
+    camera's are not) and over interrupted tracks. seed: of the random samples of the pose nodes; the other solvers are
+    deterministic. clock_priors: external clock priors by camera, used only where the images leave lags ambiguous.
+    Raises Refused, with a reason for every camera and the pair reports, where fewer than two cameras can be placed.
     """
-    tell = progress or (lambda text, share: None)
+    report = progress or (lambda text, share: None)
     if known is not None:
-        rig = with_known_lenses(rig, known)
+        rig = with_known_intrinsics(rig, known)
     prepared = prepare(rig, observations)
-    by_sizes = False
+    has_sizes = False
     if solver == "paper" and known is None:
-        from hub.baselines.session_poses import all_sized  # the other solvers are spared the nodes
+        from hub.baselines.session_poses import all_tracks_have_sizes  # the other solvers do not need to load it
 
-        by_sizes = all_sized(prepared, observations)
-    if by_sizes and prepared.shared_clock:
-        pairs = []  # nothing to find
+        has_sizes = all_tracks_have_sizes(prepared, observations)
+    if has_sizes and prepared.shared_clock:
+        pairs = []  # no lags to estimate
     elif solver == "paper" and known is None:
-        pairs = paper_pairs(prepared, observations, tell)
+        pairs = paper_pairs(prepared, observations, report)
     else:
-        prepared, pairs = solve_pairs(prepared, tell, thorough=thorough, known=known, claims=claims)
+        prepared, pairs = solve_pairs(prepared, report, thorough=thorough, known=known, clock_priors=clock_priors)
         prepared = replace(
             prepared,
-            refused=_with_timing(prepared, pairs),
-            warnings=prepared.warnings + rate_warnings(prepared, pairs),
+            refused=_with_known_timing(prepared, pairs),
+            warnings=prepared.warnings + frame_rate_warnings(prepared, pairs),
         )
     try:
         if known is not None:
-            solution = solve_known(prepared, pairs, known, tell)
+            solution = solve_with_known_poses(prepared, pairs, known, report)
         elif solver == "paper":
-            solution = solve_paper(prepared, pairs, tell, observations if by_sizes else None)
+            solution = solve_paper(prepared, pairs, report, observations if has_sizes else None)
         elif solver == "distributed":
-            from hub.distributed.solver import PlacedByNodes
+            from hub.distributed.solver import DistributedPoseSolver
 
-            solution = solve_network(prepared, pairs, tell, PlacedByNodes(rig, prepared, observations, tell, seed))
+            solution = solve_network(
+                prepared, pairs, report, DistributedPoseSolver(rig, prepared, observations, report, seed)
+            )
         else:
-            solution = solve_with_guesses(rig, prepared, pairs, tell)
-        tell("covariances", 0.95)
-        return publish(rig, solution)
+            solution = solve_with_unknown_lenses(rig, prepared, pairs, report)
+        report("covariances", 0.95)
+        return assemble_calibration(rig, solution)
     except Refused as refusal:
-        apart = {name: reason for name, reason in refusal.cameras.items() if reason.startswith(_APART)}
-        left = [replace(pair, status=apart[pair.b]) if pair.b in apart else pair for pair in pairs]
-        refusal.pairs = tuple(lone_pair_report(pair, prepared) for pair in left)
+        conflicting = {name: reason for name, reason in refusal.cameras.items() if reason.startswith(_LAG_CONFLICT)}
+        rejected = [replace(pair, status=conflicting[pair.b]) if pair.b in conflicting else pair for pair in pairs]
+        refusal.pairs = tuple(isolated_pair_report(pair, prepared) for pair in rejected)
         refusal.warnings = prepared.warnings
         raise
 
 
-def with_known_lenses(rig: Rig, known: Known) -> Rig:
-    """The rig with the intrinsics of a known calibration, which may have been refined since, and its readouts."""
+def with_known_intrinsics(rig: Rig, known: FixedCalibration) -> Rig:
+    """The rig with the intrinsics and readouts of a given calibration, which may have been refined."""
     cameras = {
         name: replace(
             camera,
@@ -141,17 +135,17 @@ def with_known_lenses(rig: Rig, known: Known) -> Rig:
     return replace(rig, cameras=cameras)
 
 
-def paper_pairs(prepared: Prepared, observations: Observations, tell: Progress) -> list[PairSolution]:
-    """All pairs by the paper's method. Raises Refused for a shared clock, where there is no lag to find."""
+def paper_pairs(prepared: PreparedSession, observations: Observations, report: Progress) -> list[PairSolution]:
+    """All pairs by the asynchronous calibration paper's method. Raises Refused for a shared clock (no lags)."""
     if prepared.shared_clock:
         raise Refused('the paper\'s method finds lags, and clock = "shared" says there are none', {})
     pairs = []
     todo = list(itertools.combinations(prepared.cameras, 2))
     for done, (a, b) in enumerate(todo):
-        tell(f"pair {a}–{b}", 0.05 + 0.7 * done / max(len(todo), 1))
+        report(f"pair {a}–{b}", 0.05 + 0.7 * done / max(len(todo), 1))
         first, second = prepared.cameras[a], prepared.cameras[b]
         pairs.append(
-            paper_pair(
+            solve_pair_by_paper(
                 (smooth_only(first.tracks), smooth_only(second.tracks)),
                 (observations.by_label(a), observations.by_label(b)),
                 (first.intrinsics, second.intrinsics),
@@ -161,282 +155,323 @@ def paper_pairs(prepared: Prepared, observations: Observations, tell: Progress) 
     return pairs
 
 
-def solve_with_guesses(rig: Rig, prepared: Prepared, pairs: list[PairSolution], tell: Progress) -> Solution:
-    """The network with the cameras whose lens nobody measured, as far as the common path tells their focal lengths.
+def solve_with_unknown_lenses(
+    rig: Rig, prepared: PreparedSession, pairs: list[PairSolution], report: Progress
+) -> Solution:
+    """The network with cameras of unknown intrinsics, where the common trajectory determines their focal lengths.
 
-    Where it does not, those cameras are refused with what is known of their timing, as if they had not been tried.
+    Where it does not, those cameras are refused with their timing, as if no self-calibration had been tried.
     """
-    trial, seen = self_calibrated(rig, prepared, pairs)
+    trial, trial_pairs = initial_self_calibration(rig, prepared, pairs)
     if trial is prepared:
-        return solve_network(prepared, pairs, tell)
-    tell("focal lengths", 0.58)
+        return solve_network(prepared, pairs, report)
+    report("focal lengths", 0.58)
     try:
-        for _ in range(_LENS_ROUNDS):
-            solution = solve_network(trial, seen, tell)
-            found = dict(zip(solution.scaffold.names, solution.scaffold.state.cameras, strict=True))
-            trial, seen, changed = refocused(trial, seen, {name: one.intrinsics for name, one in found.items()})
+        for _ in range(_LENS_ITERATIONS):
+            solution = solve_network(trial, trial_pairs, report)
+            found = dict(zip(solution.reconstruction.names, solution.reconstruction.state.cameras, strict=True))
+            lenses = {name: camera.intrinsics for name, camera in found.items()}
+            trial, trial_pairs, changed = with_updated_lenses(trial, trial_pairs, lenses)
             if not changed:
                 break
     except Refused as refusal:
-        told = {name: refusal.cameras.get(name, "") for name in trial.cameras if trial.cameras[name].guess is not None}
-        return solve_network(replace(prepared, refused=_with_attempt(prepared, told)), pairs, tell)
-    guessed = [name for name in trial.cameras if trial.cameras[name].guess is not None]
-    left = {name: solution.refused[name] for name in guessed if name in solution.refused}
+        reasons = {
+            name: refusal.cameras.get(name, "") for name in trial.cameras if trial.cameras[name].lens_prior is not None
+        }
+        return solve_network(replace(prepared, refused=_with_lens_failure(prepared, reasons)), pairs, report)
+    uncalibrated = [name for name in trial.cameras if trial.cameras[name].lens_prior is not None]
+    left = {name: solution.refused[name] for name in uncalibrated if name in solution.refused}
     refused = solution.refused | {
-        name: reason for name, reason in _with_attempt(prepared, left).items() if name in left
+        name: reason for name, reason in _with_lens_failure(prepared, left).items() if name in left
     }
-    # What is told of a refused camera's pairs is what they said before a lens was tried.
-    lenses = {name: prepared.camera(name).intrinsics.matrix for name in prepared.names}
+    # Pairs of a refused camera are reported as they were before self-calibration.
+    matrices = {name: prepared.camera(name).intrinsics.matrix for name in prepared.names}
     before = {
-        (pair.a, pair.b): replace(pair, fundamental=fundamental_from(pair.fit.geometry, lenses[pair.a], lenses[pair.b]))
+        (pair.a, pair.b): replace(
+            pair, fundamental=fundamental_from(pair.fit.geometry, matrices[pair.a], matrices[pair.b])
+        )
         for pair in pairs
         if {pair.a, pair.b} & set(left) and pair.fit is not None and pair.solved
     }
-    told_pairs = tuple(before.get((pair.a, pair.b), pair) for pair in solution.pairs)
-    return replace(solution, refused=_ordered(refused, prepared), pairs=told_pairs)
+    reported_pairs = tuple(before.get((pair.a, pair.b), pair) for pair in solution.pairs)
+    return replace(solution, refused=_ordered(refused, prepared), pairs=reported_pairs)
 
 
-def _with_attempt(prepared: Prepared, told: dict[str, str]) -> dict[str, str]:
-    """Reasons of refused cameras, and why the path does not tell the lens of those that were tried."""
+def _with_lens_failure(prepared: PreparedSession, failures: dict[str, str]) -> dict[str, str]:
+    """Reasons of refused cameras, with the failure of self-calibration for those that were tried."""
     return {
-        name: f"{reason}; its lens could not be found from the path: {told[name]}" if told.get(name) else reason
+        name: f"{reason}; its lens could not be estimated from the trajectory: {failures[name]}"
+        if failures.get(name)
+        else reason
         for name, reason in prepared.refused.items()
     }
 
 
 def solve_network(
-    prepared: Prepared, pairs: list[PairSolution], tell: Progress, nodes: PlacedByNodes | None = None
+    prepared: PreparedSession,
+    pairs: list[PairSolution],
+    report: Progress,
+    distributed_solver: DistributedPoseSolver | None = None,
 ) -> Solution:
-    """From pairs to one adjusted network; cameras that don't fit are refused by name.
+    """One adjusted network from the pairs; cameras that do not fit are refused with a reason.
 
-    nodes: places the cameras of a graph; None = one after the other, then all in one adjustment.
+    distributed_solver: places the cameras with pose nodes; None = incremental reconstruction and bundle adjustment.
     """
     refused = dict(prepared.refused)
-    freedom = Freedom(clock=not prepared.shared_clock)
-    graph = _connect(prepared, list(prepared.cameras), pairs, refused)
-    held = replace(freedom, rate_std=_rate_std(graph, freedom.rate_std))
+    free_parameters = FreeParameters(clock=not prepared.shared_clock)
+    graph = _largest_component(prepared, list(prepared.cameras), pairs, refused)
+    with_rate_prior = replace(free_parameters, rate_std=_rate_prior_std(graph, free_parameters.rate_std))
     while True:
-        if nodes is not None:
-            scaffold, unplaced = nodes(graph)
+        if distributed_solver is not None:
+            reconstruction, unplaced = distributed_solver(graph)
         else:
-            scaffold, unplaced = grow(
-                prepared.cameras, graph, prepared.rows, prepared.labels, lambda text: tell(text, 0.6), held
+            reconstruction, unplaced = reconstruct_incrementally(
+                prepared.cameras, graph, prepared.rows, prepared.labels, lambda text: report(text, 0.6), with_rate_prior
             )
-            scaffold = _adjust_all(scaffold, tell)
-            # What the rate was held by is no knowledge of it: stds are by what is known of clocks.
-            free = replace(scaffold.problem.freedom, rate_std=freedom.rate_std)
-            scaffold.problem = replace(scaffold.problem, freedom=free)
+            reconstruction = _final_adjustment(reconstruction, report)
+            # The narrow rate prior only stabilises the estimate; stds are computed with the usual one.
+            usual = replace(reconstruction.problem.free_parameters, rate_std=free_parameters.rate_std)
+            reconstruction.problem = replace(reconstruction.problem, free_parameters=usual)
         refused |= unplaced
-        bad = [name for name in scaffold.names if not _fits(scaffold, name)]
-        # A lens that was guessed may be what is wrong with all the others.
-        bad = [name for name in bad if prepared.cameras[name].guess is not None] or bad
-        if bad:
-            # The worst one goes, and what it may have spoilt is made again without it.
-            worst = min(bad, key=lambda name: agreement(scaffold, name)[0])
-            share, count = agreement(scaffold, worst)
-            refused[worst] = f"only {100 * share:.0f} % of its {count} observations fit the path that the others see"
+        inconsistent = [name for name in reconstruction.names if not _fits_trajectory(reconstruction, name)]
+        # A wrong lens of an uncalibrated camera may be the cause of all the others' misfit: it goes first.
+        inconsistent = [name for name in inconsistent if prepared.cameras[name].lens_prior is not None] or inconsistent
+        if inconsistent:
+            # The worst one is removed, and the reconstruction that it may have distorted is repeated without it.
+            worst = min(inconsistent, key=lambda name: inlier_share(reconstruction, name)[0])
+            share, count = inlier_share(reconstruction, worst)
+            refused[worst] = (
+                f"only {100 * share:.0f} % of its {count} observations fit the trajectory seen by the other cameras"
+            )
         else:
-            worst, reason = _vaguest_lens(scaffold)
+            worst, reason = _least_certain_lens(reconstruction)
             if not reason:
-                worst, reason = _loosest(scaffold)
+                worst, reason = _least_certain_camera(reconstruction)
             if not reason:
-                worst, reason = _apart_from_pair(scaffold, graph)
+                worst, reason = _conflicts_with_pair(reconstruction, graph)
             if not reason:
                 break
             refused[worst] = reason
-        remaining = [name for name in scaffold.names if name != worst]
+        remaining = [name for name in reconstruction.names if name != worst]
         if len(remaining) < 2:
             raise Refused(f"no two cameras can be placed ({worst}: {refused[worst]})", refused)
-        graph = _connect(prepared, remaining, list(graph.agreeing), refused)
+        graph = _largest_component(prepared, remaining, list(graph.inlier_pairs), refused)
     warnings = tuple(
-        f"pair {pair.a}–{pair.b} contradicts the other pairs and was set aside" for pair in graph.contradicting
+        f"pair {pair.a}–{pair.b} contradicts the other pairs and was rejected" for pair in graph.outlier_pairs
     )
     solver = "joint"
-    if nodes is not None:
-        solver, warnings = "distributed", warnings + nodes.warnings
-    return Solution(scaffold, tuple(pairs), _ordered(refused, prepared), prepared, solver, warnings)
+    if distributed_solver is not None:
+        solver, warnings = "distributed", warnings + distributed_solver.warnings
+    return Solution(reconstruction, tuple(pairs), _ordered(refused, prepared), prepared, solver, warnings)
 
 
-def _rate_std(graph: ClockGraph, usual: float) -> float:
-    """Prior std of rates: narrow where two cameras have only each other and epipolar lines did not tell the rate.
+def _rate_prior_std(graph: ClockGraph, usual: float) -> float:
+    """Prior std of clock rates: narrow for an isolated pair whose epipolar geometry did not determine the rate.
 
-    The path would not tell it either, and a rate thousands of ppm off carries the lag away with it.
+    The trajectory would not determine it either, and a rate error of thousands of ppm would shift the lag.
     """
-    told = [pair.fit.rate_std for pair in graph.agreeing if pair.fit is not None and np.isfinite(pair.fit.lag_doubt)]
-    return min([usual, *told])
+    stds = [
+        pair.fit.rate_prior_std
+        for pair in graph.inlier_pairs
+        if pair.fit is not None and np.isfinite(pair.fit.total_lag_std)
+    ]
+    return min([usual, *stds])
 
 
-def _vaguest_lens(scaffold: Scaffold) -> tuple[str, str]:
-    """The unmeasured camera whose focal length the path tells worst, and how badly; "" where all are told well."""
-    stds = focal_stds(scaffold.problem, scaffold.state)
+def _least_certain_lens(reconstruction: Reconstruction) -> tuple[str, str]:
+    """The uncalibrated camera with the largest focal length std, and the reason; "" where all are within the limit."""
+    stds = focal_stds(reconstruction.problem, reconstruction.state)
     worst = int(np.argmax(stds))
-    if stds[worst] <= LARGEST_STD:
+    if stds[worst] <= MAX_FOCAL_STD:
         return "", ""
-    return scaffold.names[worst], f"the common motion tells its focal length only to {100 * stds[worst]:.1f} % (std)"
+    return reconstruction.names[
+        worst
+    ], f"the common motion determines its focal length only to {100 * stds[worst]:.1f} % (std)"
 
 
-def _loosest(scaffold: Scaffold) -> tuple[str, str]:
-    """The camera that is least tied to any other, and what is too uncertain about it; "" for nothing."""
-    problem, state = scaffold.problem, scaffold.state
-    found = cov.covariance(problem, state, motion_prior(problem, state))
-    turns = cov.turn_stds(found.cameras, state)
+def _least_certain_camera(reconstruction: Reconstruction) -> tuple[str, str]:
+    """The camera whose pose or clock relative to every other is most uncertain, and the reason; "" if within limits."""
+    problem, state = reconstruction.problem, reconstruction.state
+    found = cov.covariance(problem, state, estimate_smoothness(problem, state))
+    turns = cov.relative_rotation_stds(found.cameras, state)
     clocks = np.zeros_like(turns)
-    if problem.freedom.clock:
-        clocks = cov.common_clock_stds(found, problem, state)
+    if problem.free_parameters.clock:
+        clocks = cov.relative_clock_stds(found, problem, state)
     for between, limit, unit, text in (
-        (turns, _LARGEST_TURN_STD, np.rad2deg(1.0), "the common motion tells its orientation only to {:.1f}° (std)"),
-        (clocks, _LARGEST_CLOCK_STD, 1e3, "the common motion tells its clock only to {:.1f} ms (std, mid-overlap)"),
+        (
+            turns,
+            _MAX_ROTATION_STD,
+            np.rad2deg(1.0),
+            "the common motion determines its orientation only to {:.1f}° (std)",
+        ),
+        (clocks, _MAX_CLOCK_STD, 1e3, "the common motion determines its clock only to {:.1f} ms (std, mid-overlap)"),
     ):
         np.fill_diagonal(between, np.inf)
         best = between.min(axis=1)
-        # Of two that are alike, the later one: the first camera is most often the reference.
+        # Of two with equal std, the later one: the first camera is usually the reference.
         loosest = int(len(best) - 1 - np.argmax(best[::-1]))
         if best[loosest] > limit:
-            return scaffold.names[loosest], text.format(unit * best[loosest])
+            return reconstruction.names[loosest], text.format(unit * best[loosest])
     return "", ""
 
 
-def _apart_from_pair(scaffold: Scaffold, graph: ClockGraph) -> tuple[str, str]:
-    """The later camera of a pair by itself whose lag the adjustment did not leave where it was, and by how much.
+def _conflicts_with_pair(reconstruction: Reconstruction, graph: ClockGraph) -> tuple[str, str]:
+    """The later camera of an isolated pair whose lag the adjustment moved too far, and the reason; "" if none.
 
-    Epipolar lines and the path are two ways to the lag that lean on other things: where they differ, one of them is
-    wrong. Of three cameras and more a pair's lag is a beginning only.
+    Epipolar geometry and trajectory are two estimates of the lag with different sensitivities: where they differ, one
+    of them is wrong. With three and more cameras a pair's lag is only an initial value.
     """
-    for pair in graph.agreeing:
-        if pair.fit is None or not np.isfinite(pair.fit.lag_doubt):
+    for pair in graph.inlier_pairs:
+        if pair.fit is None or not np.isfinite(pair.fit.total_lag_std):
             continue
-        a, b = (scaffold.state.cameras[scaffold.names.index(name)] for name in (pair.a, pair.b))
-        at_a = np.array([pair.fit.middle])
+        a, b = (reconstruction.state.cameras[reconstruction.names.index(name)] for name in (pair.a, pair.b))
+        at_a = np.array([pair.fit.mid_time])
         at_b = (at_a - pair.fit.offset) / pair.fit.rate
-        apart = float(abs(a.reference_time(at_a) - b.reference_time(at_b))[0])
-        if apart > _FARTHEST_FROM_PAIR:
-            return pair.b, f"{_APART} {1e3 * apart:.0f} ms apart from what epipolar lines tell"
+        difference = float(abs(a.reference_time(at_a) - b.reference_time(at_b))[0])
+        if difference > _MAX_LAG_CHANGE:
+            return pair.b, f"{_LAG_CONFLICT} {1e3 * difference:.0f} ms from the lag of the epipolar geometry"
     return "", ""
 
 
 def solve_paper(
-    prepared: Prepared, pairs: list[PairSolution], tell: Progress, sized: Observations | None = None
+    prepared: PreparedSession, pairs: list[PairSolution], report: Progress, sized: Observations | None = None
 ) -> Solution:
-    """Network from the paper's pairs: clocks averaged, nothing adjusted.
+    """Network from the pairs of the paper's method: averaged clocks, no adjustment.
 
-    Poses by resection, or, where all rows tell sizes (``sized``), by the paper's distributed method.
+    Poses by resection, or, where all rows have sizes (``sized``), by the distributed pose paper's method.
     """
     refused = dict(prepared.refused)
     if pairs or sized is None:
-        graph = _connect(prepared, list(prepared.cameras), pairs, refused)
+        graph = _largest_component(prepared, list(prepared.cameras), pairs, refused)
     else:
-        graph = ClockGraph({name: ClockGuess(1.0, 0.0, 0.0) for name in prepared.cameras}, (), ())
-    tell("placing", 0.8)
+        graph = ClockGraph({name: TimeMapEstimate(1.0, 0.0, 0.0) for name in prepared.cameras}, (), ())
+    report("placing", 0.8)
     if sized is None:
-        scaffold, unplaced = grow(prepared.cameras, graph, prepared.rows, prepared.labels, freedom=None)
+        reconstruction, unplaced = reconstruct_incrementally(
+            prepared.cameras, graph, prepared.rows, prepared.labels, free_parameters=None
+        )
     else:
-        from hub.baselines.session_poses import place_by_paper
+        from hub.baselines.session_poses import reconstruct_by_paper
 
-        scaffold, unplaced = place_by_paper(prepared, sized, graph)
+        reconstruction, unplaced = reconstruct_by_paper(prepared, sized, graph)
     if prepared.shared_clock:
-        freedom = replace(scaffold.problem.freedom, clock=False)
-        scaffold.problem = replace(scaffold.problem, freedom=freedom)
-    scaffold.state = replace(scaffold.state, sigma=noise(scaffold.problem, scaffold.state))
-    warning = "the paper's method adjusts nothing: its stds count independent noise only and are too small"
-    return Solution(scaffold, tuple(pairs), _ordered(refused | unplaced, prepared), prepared, "paper", (warning,))
+        free_parameters = replace(reconstruction.problem.free_parameters, clock=False)
+        reconstruction.problem = replace(reconstruction.problem, free_parameters=free_parameters)
+    reconstruction.state = replace(
+        reconstruction.state, sigma=estimate_noise(reconstruction.problem, reconstruction.state)
+    )
+    warning = "the paper's method has no adjustment: its stds assume independent noise and are too small"
+    return Solution(reconstruction, tuple(pairs), _ordered(refused | unplaced, prepared), prepared, "paper", (warning,))
 
 
-def solve_known(prepared: Prepared, pairs: list[PairSolution], known: Known, tell: Progress) -> Solution:
-    """Only clocks and paths: intrinsics and poses are given and stay as they are."""
+def solve_with_known_poses(
+    prepared: PreparedSession, pairs: list[PairSolution], known: FixedCalibration, report: Progress
+) -> Solution:
+    """Clocks and trajectories only, at given intrinsics and poses."""
     refused = dict(prepared.refused)
     for name in [name for name in prepared.cameras if name not in known.cameras]:
         refused[name] = "not in the known calibration"
     cameras = {name: camera for name, camera in prepared.cameras.items() if name in known.cameras}
     inside = replace(prepared, cameras=cameras)
-    graph = _connect(inside, list(cameras), pairs, refused)
-    tell("adjusting", 0.75)
+    graph = _largest_component(inside, list(cameras), pairs, refused)
+    report("adjusting", 0.75)
     poses = {name: known.cameras[name].pose for name in graph.clocks}
-    scaffold = place_known(cameras, graph, prepared.rows, prepared.labels, poses, not prepared.shared_clock)
-    problem, state, _ = adjust(scaffold.problem, scaffold.state)
-    solution = replace_solution(scaffold, *settle(problem, state))
-    return Solution(solution, tuple(pairs), _ordered(refused, prepared), inside, "joint", known=known)
+    reconstruction = reconstruct_with_known_poses(
+        cameras, graph, prepared.rows, prepared.labels, poses, not prepared.shared_clock
+    )
+    problem, state, _ = adjust(reconstruction.problem, reconstruction.state)
+    converged = _with_state(reconstruction, *estimate_frame_times(problem, state))
+    return Solution(converged, tuple(pairs), _ordered(refused, prepared), inside, "joint", known=known)
 
 
-def _connect(prepared: Prepared, names: list[str], pairs: list[PairSolution], refused: dict[str, str]) -> ClockGraph:
-    """The largest group of ``names`` that solved pairs tie together; the others are entered in ``refused``.
+def _largest_component(
+    prepared: PreparedSession, names: list[str], pairs: list[PairSolution], refused: dict[str, str]
+) -> ClockGraph:
+    """Clock graph of the largest component of ``names`` over solved pairs; the others are entered in ``refused``.
 
     Raises Refused, with every camera's reason, where no pair is solved.
     """
     placeable = [pair for pair in pairs if pair.a in prepared.cameras and pair.b in prepared.cameras]
     solved = [pair for pair in placeable if pair.solved and pair.a in names and pair.b in names]
     if not solved:
-        reasons = refused | {name: _why_unplaced(name, prepared, pairs) for name in names}
-        raise Refused(_why_nothing(prepared, placeable, refused), _ordered(reasons, prepared))
-    groups = components(names, solved)
+        reasons = refused | {name: _unplaced_reason(name, prepared, pairs) for name in names}
+        raise Refused(_no_pair_reason(prepared, placeable, refused), _ordered(reasons, prepared))
+    groups = connected_components(names, solved)
     for name in [name for name in names if name not in groups[0]]:
-        refused[name] = _why_alone(name, groups, pairs)
+        refused[name] = _disconnected_reason(name, groups, pairs)
     inside = [pair for pair in solved if pair.a in groups[0] and pair.b in groups[0]]
     if prepared.shared_clock:
-        return ClockGraph({name: ClockGuess(1.0, 0.0, 0.0) for name in groups[0]}, tuple(inside), ())
-    return average_clocks(groups[0], inside, {name: prepared.cameras[name].tracks for name in groups[0]})
+        return ClockGraph({name: TimeMapEstimate(1.0, 0.0, 0.0) for name in groups[0]}, tuple(inside), ())
+    return synchronise_clocks(groups[0], inside, {name: prepared.cameras[name].tracks for name in groups[0]})
 
 
-def _with_timing(prepared: Prepared, pairs: list[PairSolution]) -> dict[str, str]:
-    """Reasons of the refused, where cameras without intrinsics say what is known of their clocks."""
+def _with_known_timing(prepared: PreparedSession, pairs: list[PairSolution]) -> dict[str, str]:
+    """Reasons of the refused cameras, with the estimated timing of those without intrinsics."""
     refused = dict(prepared.refused)
-    for name in prepared.lensless:
-        told = timing_told(name, prepared, pairs)
+    for name in prepared.uncalibrated:
+        timing = describe_timing(name, prepared, pairs)
         refused[name] = (
-            f"no intrinsics: only its timing is known (pairs in result.json: {told}); run `syncline intrinsics`"
-            if told
-            else f"{NO_INTRINSICS}; nor is its timing known ({_tried(name, pairs) or 'no other camera'})"
+            f"no intrinsics: only its timing is known (pairs in result.json: {timing}); run `syncline intrinsics`"
+            if timing
+            else f"{NO_INTRINSICS}; nor is its timing known ({_failed_pairs(name, pairs) or 'no other camera'})"
         )
     return refused
 
 
-def _ordered(refused: dict[str, str], prepared: Prepared) -> dict[str, str]:
+def _ordered(refused: dict[str, str], prepared: PreparedSession) -> dict[str, str]:
     """Reasons in the rig's order."""
-    return {name: refused[name] for name in prepared.order if name in refused}
+    return {name: refused[name] for name in prepared.camera_order if name in refused}
 
 
-def _fits(scaffold: Scaffold, name: str) -> bool:
-    share, count = agreement(scaffold, name)
-    return share >= _LEAST_AGREEMENT and count >= _LEAST_ROWS
+def _fits_trajectory(reconstruction: Reconstruction, name: str) -> bool:
+    share, count = inlier_share(reconstruction, name)
+    return share >= _MIN_INLIER_SHARE and count >= _MIN_ROWS
 
 
-def _adjust_all(scaffold: Scaffold, tell: Progress) -> Scaffold:
-    """The final adjustment, with the lens freed where the data clearly ask for it."""
-    tell("adjusting", 0.75)
-    problem, state, _ = adjust(scaffold.problem, scaffold.state, progress=lambda text: tell(text, 0.75))
-    problem, state = settle(problem, state, lambda text: tell(text, 0.8))
-    tell("adjusting the lenses", 0.85)
-    freed = replace(problem, freedom=replace(problem.freedom, lens=True))
-    freed_problem, freed_state, _ = adjust(freed, state, rounds=2, progress=lambda text: tell(text, 0.85))
-    if _prefers(freed_problem, freed_state, problem, state):
+def _final_adjustment(reconstruction: Reconstruction, report: Progress) -> Reconstruction:
+    """The final adjustment, with lenses and readouts estimated where the data clearly support it."""
+    report("adjusting", 0.75)
+    problem, state, _ = adjust(reconstruction.problem, reconstruction.state, progress=lambda text: report(text, 0.75))
+    problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
+    report("adjusting the lenses", 0.85)
+    freed = replace(problem, free_parameters=replace(problem.free_parameters, lens=True))
+    freed_problem, freed_state, _ = adjust(freed, state, rounds=2, progress=lambda text: report(text, 0.85))
+    if _bic_prefers(freed_problem, freed_state, problem, state):
         problem, state = freed_problem, freed_state
-    if problem.freedom.clock and rolling_shutter.worth_freeing(problem, state, motion_prior(problem, state)):
-        tell("adjusting the readouts", 0.9)
-        read_problem, read_state, _ = adjust(rolling_shutter.freed(problem), state, rounds=2)
-        if rolling_shutter.plausible(read_state) and _prefers(read_problem, read_state, problem, state, 1):
+    if problem.free_parameters.clock and rolling_shutter.are_readouts_observable(
+        problem, state, estimate_smoothness(problem, state)
+    ):
+        report("adjusting the readouts", 0.9)
+        read_problem, read_state, _ = adjust(rolling_shutter.with_free_readouts(problem), state, rounds=2)
+        if rolling_shutter.are_readouts_plausible(read_state) and _bic_prefers(
+            read_problem, read_state, problem, state, 1
+        ):
             problem, state = read_problem, read_state
-    tell("errors that last", 0.92)
-    problem, state = with_lasting_errors(problem, state)
-    return replace_solution(scaffold, problem, state)
+    report("correlated noise", 0.92)
+    problem, state = refit_with_correlated_noise(problem, state)
+    return _with_state(reconstruction, problem, state)
 
 
-def replace_solution(scaffold: Scaffold, problem: Problem, state: State) -> Scaffold:
-    """The scaffold with another problem and state."""
-    return Scaffold(scaffold.names, scaffold.labels, problem, state)
+def _with_state(reconstruction: Reconstruction, problem: Problem, state: AdjustmentState) -> Reconstruction:
+    """The reconstruction with another problem and state."""
+    return Reconstruction(reconstruction.names, reconstruction.labels, problem, state)
 
 
-def _prefers(freed: Problem, freed_state: State, fixed: Problem, fixed_state: State, each: int = 2) -> bool:
-    """Whether ``each`` parameters a camera (focal length and k1) are worth it (Bayesian information criterion).
+def _bic_prefers(
+    freed: Problem, freed_state: AdjustmentState, fixed: Problem, fixed_state: AdjustmentState, parameters: int = 2
+) -> bool:
+    """Whether ``parameters`` more per camera (focal length and k1) are justified (Bayesian information criterion).
 
-    The robust likelihood of all rows under each answer's own noise decides; rows that err alike count as one.
+    It uses the robust likelihood of all rows under each solution's own noise, at the effective sample size.
     """
     cameras = range(len(fixed_state.cameras))
-    alike = np.array([together(freed, freed_state, camera) for camera in cameras])
-    rows = sum(len(part.time) / alike[part.camera] for part in fixed.rows)
-    gain = float(((_deviances(fixed, fixed_state) - _deviances(freed, freed_state)) / alike).sum())
-    return bool(gain > each * len(cameras) * np.log(max(rows, 2)))
+    inflation = np.array([correlation_inflation(freed, freed_state, camera) for camera in cameras])
+    rows = sum(len(part.time) / inflation[part.camera] for part in fixed.rows)
+    gain = float(((_deviances(fixed, fixed_state) - _deviances(freed, freed_state)) / inflation).sum())
+    return bool(gain > parameters * len(cameras) * np.log(max(rows, 2)))
 
 
-def _deviances(problem: Problem, state: State) -> Floats:
+def _deviances(problem: Problem, state: AdjustmentState) -> Floats:
     """(cameras,) twice the negative logarithm of the likelihood of each camera's rows."""
     total = np.zeros(len(state.cameras))
     for part in problem.rows:
@@ -447,46 +482,50 @@ def _deviances(problem: Problem, state: State) -> Floats:
     return total
 
 
-def _why_nothing(prepared: Prepared, pairs: list[PairSolution], refused: dict[str, str]) -> str:
+def _no_pair_reason(prepared: PreparedSession, pairs: list[PairSolution], refused: dict[str, str]) -> str:
     if not pairs:
-        short = refused | dict.fromkeys(prepared.lensless, "no intrinsics")
-        told = "; ".join(f"{name}: {reason}" for name, reason in short.items())
+        short = refused | dict.fromkeys(prepared.uncalibrated, "no intrinsics")
+        listed = "; ".join(f"{name}: {reason}" for name, reason in short.items())
         remedy = (
-            "; tell their lenses: `syncline intrinsics` with a board, --model or --field-of-view"
-            if prepared.lensless
+            "; give their intrinsics: `syncline intrinsics` with a board, --model or --field-of-view"
+            if prepared.uncalibrated
             else "; film the marker with two cameras or more at the same time"
         )
-        return f"fewer than two cameras can be placed ({told}){remedy}" if told else "one camera only: a pair is needed"
-    told = "; ".join(f"{pair.a}–{pair.b}: {pair.status}" for pair in pairs[:6])
-    return f"no pair of cameras could be tied together ({told})"
+        return (
+            f"fewer than two cameras can be placed ({listed}){remedy}"
+            if listed
+            else "one camera only: a pair is needed"
+        )
+    listed = "; ".join(f"{pair.a}–{pair.b}: {pair.status}" for pair in pairs[:6])
+    return f"no pair of cameras could be synchronised ({listed})"
 
 
-def _why_unplaced(name: str, prepared: Prepared, pairs: list[PairSolution]) -> str:
-    """Why a camera with intrinsics that is tied to none other with them has no place."""
-    told = timing_told(name, prepared, pairs)
-    if told:
-        return f"only its timing is known (pairs in result.json: {told}): tied to no other camera with intrinsics"
-    return _tried(name, pairs) or "no other camera to compare with"
+def _unplaced_reason(name: str, prepared: PreparedSession, pairs: list[PairSolution]) -> str:
+    """Why a camera with intrinsics that is connected to no other such camera has no pose."""
+    timing = describe_timing(name, prepared, pairs)
+    if timing:
+        return (
+            f"only its timing is known (pairs in result.json: {timing}): connected to no other camera with intrinsics"
+        )
+    return _failed_pairs(name, pairs) or "no other camera to compare with"
 
 
-def _tried(name: str, pairs: list[PairSolution]) -> str:
+def _failed_pairs(name: str, pairs: list[PairSolution]) -> str:
     return "; ".join(
         f"with {p.b if p.a == name else p.a}: {p.status}" for p in pairs if name in (p.a, p.b) and not p.solved
     )
 
 
-def _why_alone(name: str, groups: list[list[str]], pairs: list[PairSolution]) -> str:
+def _disconnected_reason(name: str, groups: list[list[str]], pairs: list[PairSolution]) -> str:
     mine = next(group for group in groups if name in group)
-    tried = _tried(name, pairs)
+    tried = _failed_pairs(name, pairs)
     if len(mine) > 1:
-        return f"tied only to {', '.join(other for other in mine if other != name)}, not to the rest ({tried})"
-    return f"could not be tied to any camera ({tried})"
+        return f"connected only to {', '.join(other for other in mine if other != name)}, not to the rest ({tried})"
+    return f"could not be connected to any camera ({tried})"
 
 
 __all__ = [
-    "Freedom",
     "Progress",
-    "Solution",
     "calibrate",
     "solve_network",
 ]

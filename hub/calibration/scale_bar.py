@@ -1,4 +1,4 @@
-"""A wand: two labelled points at a known distance from each other, which tells the scale without a survey."""
+"""Scale bars (`wand` in rig.toml): two labelled points at a known distance, which fix the scale without a survey."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hub.bundle.problem import Problem, State
-from hub.datum.gauge import Gauge
+from hub.bundle.datum.gauge import Gauge
+from hub.bundle.problem import AdjustmentState, Problem
 from protocols.core.errors import Refused
 from protocols.geometry.pose import Similarity
 from protocols.geometry.types import Bools, Floats
 from protocols.session.rig import Rig
 
-_WITHIN = 0.2  # s: a point counts as seen by a camera if it saw it this near
-_STEP = 0.05  # s between looks
-_LEAST = 10
-_STIFF = 0.2  # robust spread of a wand's length, relative: more is no wand
-_INDEPENDENT = 0.25  # s between looks whose errors are independent
-_LEAST_STD = 1e-4  # relative: no wand is measured better
-_FAR, _TOLD_STD, _DISAGREE = 5.0, 2e-3, 0.02
+_SEEN_WITHIN = 0.2  # s: a camera observes a point at a time if it has an observation this near
+_SAMPLING_STEP = 0.05  # s between samples
+_MIN_SAMPLES = 10
+_MAX_LENGTH_SPREAD = 0.2  # relative robust spread of the length; more means that it is not rigid
+_CORRELATION_TIME = 0.25  # s between samples with independent errors
+_MIN_STD = 1e-4  # relative: lower bound of the std
+_MAX_CONFLICT_SIGMAS, _GIVEN_LENGTH_STD, _MAX_DISAGREEMENT = 5.0, 2e-3, 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class WandLength:
-    """One wand as the paths measure it. length: told [rig units]. measured: the same in the solution's units.
+class ScaleBarMeasurement:
+    """One scale bar measured from the trajectories. length: given [rig units]. measured: in the solution's units.
     std: relative, of the measurement."""
 
     labels: tuple[str, str]
@@ -33,70 +33,77 @@ class WandLength:
     std: float
 
 
-def measured_wands(rig: Rig, labels: list[str], problem: Problem, state: State) -> list[WandLength]:
-    """The rig's wands whose two labels are seen together. Raises Refused where one bends."""
+def measure_scale_bars(
+    rig: Rig, labels: list[str], problem: Problem, state: AdjustmentState
+) -> list[ScaleBarMeasurement]:
+    """The rig's scale bars whose two labels are seen together. Raises Refused where one is not rigid."""
     out = []
-    for a, b, length in rig.wands:
+    for a, b, length in rig.scale_bars:
         if a not in labels or b not in labels:
             continue
-        apart = _apart(problem, state, labels.index(a), labels.index(b))
-        if len(apart) < _LEAST:
+        distances = _distances(problem, state, labels.index(a), labels.index(b))
+        if len(distances) < _MIN_SAMPLES:
             continue
-        middle = float(np.median(apart))
-        spread = 1.4826 * float(np.median(np.abs(apart - middle))) / middle
-        if spread > _STIFF:
+        median = float(np.median(distances))
+        spread = 1.4826 * float(np.median(np.abs(distances - median))) / median
+        if spread > _MAX_LENGTH_SPREAD:
             raise Refused(
-                f"the wand {a}–{b} is {100 * spread:.0f} % longer and shorter while it moves: are these its two ends?"
+                f"the length of the scale bar (wand) {a}–{b} varies by {100 * spread:.0f} % while it moves: "
+                "are these its two ends?"
             )
-        std = 1.2533 * spread / np.sqrt(max(len(apart) * _STEP / _INDEPENDENT, 1.0))
-        out.append(WandLength((a, b), length, middle, float(std)))
+        std = 1.2533 * spread / np.sqrt(max(len(distances) * _SAMPLING_STEP / _CORRELATION_TIME, 1.0))
+        out.append(ScaleBarMeasurement((a, b), length, median, float(std)))
     return out
 
 
-def scaled_by_wands(gauge: Gauge, wands: list[WandLength]) -> Gauge:
-    """The world at the wands' scale, each weighed by its std, where nothing else tells it; a warning if they differ."""
-    if not wands:
+def scaled_by_bars(gauge: Gauge, bars: list[ScaleBarMeasurement]) -> Gauge:
+    """The gauge at the bars' scale, weighted by their stds, unless control points fix the scale; warns of conflicts."""
+    if not bars:
         return gauge
     s = gauge.similarity
-    factor = np.array([wand.length / (s.scale * wand.measured) for wand in wands])
-    weight = np.array([max(wand.std, _LEAST_STD) ** -2 for wand in wands])
+    factor = np.array([bar.length / (s.scale * bar.measured) for bar in bars])
+    weight = np.array([max(bar.std, _MIN_STD) ** -2 for bar in bars])
     mean = float((weight * factor).sum() / weight.sum())
     if gauge.scale == "metric":
-        std = max(float(weight.sum() ** -0.5), _TOLD_STD)
-        if abs(mean - 1.0) <= _FAR * std:
+        std = max(float(weight.sum() ** -0.5), _GIVEN_LENGTH_STD)
+        if abs(mean - 1.0) <= _MAX_CONFLICT_SIGMAS * std:
             return gauge
-        warning = f"the wand is {100 * abs(mean - 1.0):.1f} % {'longer' if mean > 1 else 'shorter'} by its told length"
-        return replace(gauge, warnings=(*gauge.warnings, f"{warning} than by the other references, which decide"))
+        comparison = f"{100 * abs(mean - 1.0):.1f} % {'longer' if mean > 1 else 'shorter'}"
+        warning = f"the scale bar (wand) is {comparison} by its given length than by the control points, which are used"
+        return replace(gauge, warnings=(*gauge.warnings, warning))
     warnings = tuple(text for text in gauge.warnings if "fix no scale" not in text)
     spread = float(np.abs(factor / mean - 1.0).max())
-    if spread > _DISAGREE:
-        warnings += (f"the wands disagree by {100 * spread:.1f} %: is one told wrongly?",)
+    if spread > _MAX_DISAGREEMENT:
+        warnings += (f"the scale bars (wands) disagree by {100 * spread:.1f} %: is one of the given lengths wrong?",)
     return replace(
         gauge, similarity=Similarity(mean * s.scale, s.rotation, mean * s.shift), scale="metric", warnings=warnings
     )
 
 
-def _apart(problem: Problem, state: State, a: int, b: int) -> Floats:
-    """Distances (n,) between two paths where at least two cameras see each."""
+def _distances(problem: Problem, state: AdjustmentState, a: int, b: int) -> Floats:
+    """Distances (n,) between two trajectories at times when at least two cameras see each."""
     paths = [state.trajectories[label] for label in (a, b)]
     begin = max(path.basis.begin for path in paths)
     end = min(path.basis.end for path in paths)
-    time = np.arange(begin, end, _STEP)
+    time = np.arange(begin, end, _SAMPLING_STEP)
     if not len(time):
         return np.zeros(0)
-    good = _seen(problem, state, a, time) & _seen(problem, state, b, time)
+    good = _seen_by_two(problem, state, a, time) & _seen_by_two(problem, state, b, time)
     distance = np.linalg.norm(paths[0].at(time) - paths[1].at(time), axis=1)
     return np.asarray(distance[good & np.isfinite(distance)])
 
 
-def _seen(problem: Problem, state: State, label: int, time: Floats) -> Bools:
+def _seen_by_two(problem: Problem, state: AdjustmentState, label: int, time: Floats) -> Bools:
     count = np.zeros(len(time))
     for number, camera in enumerate(state.cameras):
-        mine = [rows.time[rows.use] for rows in problem.rows if rows.camera == number and rows.label == label]
-        joined = np.concatenate(mine) if mine else np.zeros(0)
-        if len(joined) < 2:
+        observed = [rows.time[rows.use] for rows in problem.rows if rows.camera == number and rows.label == label]
+        times = np.concatenate(observed) if observed else np.zeros(0)
+        if len(times) < 2:
             continue
-        seen = np.sort(camera.reference_time(joined))
-        after = np.clip(np.searchsorted(seen, time), 1, len(seen) - 1)
-        count += np.minimum(np.abs(seen[after] - time), np.abs(time - seen[after - 1])) <= _WITHIN
+        observation_times = np.sort(camera.reference_time(times))
+        after = np.clip(np.searchsorted(observation_times, time), 1, len(observation_times) - 1)
+        count += (
+            np.minimum(np.abs(observation_times[after] - time), np.abs(time - observation_times[after - 1]))
+            <= _SEEN_WITHIN
+        )
     return count >= 2

@@ -1,7 +1,7 @@
-"""Delays of a camera's frames, arrival at the hub less device time, as lines over time: their bends and jumps.
+"""Changepoint fits to frame delays (arrival at the hub less device time): a change of slope, or a step.
 
-Each bin is the frame with the lowest delay of half a second. An estimator's arithmetic; what is made of it stands in
-`clock_watch`.
+Each bin holds the frame with the lowest delay of half a second. Pure arithmetic; the detector that uses it is
+`hub.clocks.change_detector`.
 """
 
 from __future__ import annotations
@@ -13,168 +13,173 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from protocols.geometry.types import Floats
 
-DRIFT = 1e-4
-"""Least change of rate that is told; crystals change by a tenth of it with the temperature."""
-MOST_DRIFT = 2e-3
-"""Greatest change of rate that is one: no crystal does more. Beyond, frames are held up on their way, more and more."""
-SPANS = (4, 5, 6, 8, 12)
-"""Bins since the bend, any of which may tell it."""
-LEVEL = 4
-"""Bins by which the delay just before the bend is told."""
-LEAST_S = 2e-5
-"""Scatter of delays that is always reckoned with."""
-_MOST_SOON = 6e-4
-"""As MOST_DRIFT while there are only few seconds of it: clocks are slewed at 500 ppm. Faster ones await more."""
-_SIGMAS = 6.0
-_CROOKED = 0.15
-"""What an even rise may leave of itself, for it did not begin with a bin"""
-_UNLIKE_A_JUMP = 0.3
-"""What it may leave of what a jump of delays would"""
-_LATE_BINS = 4
-"""From so many late ones in a row on they are no chance"""
-_USUALLY = 1.2
-"""So few bins tell their spread too small now and then"""
+MIN_RATE_CHANGE = 1e-4
+"""Smallest rate change that is reported; with temperature, crystals change by a tenth of it."""
+MAX_RATE_CHANGE = 2e-3
+"""Largest plausible rate change: no crystal does more. A steeper slope is a growing network or processing delay."""
+WINDOW_BINS = (4, 5, 6, 8, 12)
+"""Lengths, in bins, of the windows after a possible changepoint; each is tested."""
+LEVEL_BINS = 4
+"""Bins that are averaged for the delay just before the changepoint."""
+MIN_SCATTER_S = 2e-5
+"""Lower bound of the scatter of delays [s]."""
+_MAX_EARLY_RATE_CHANGE = 6e-4
+"""As MAX_RATE_CHANGE for the shorter windows: time services slew at 500 ppm. Faster changes need the longest window."""
+_DETECTION_SIGMAS = 6.0
+_RAMP_MISFIT = 0.15
+"""Residual of a ramp relative to its height: its onset does not coincide with a bin"""
+_MAX_RAMP_TO_STEP_MISFIT = 0.3
+"""Largest ratio of the ramp's to the step's sum of squared residuals"""
+_PERSISTENT_LATE_BINS = 4
+"""As many late bins in a row are taken as real, not as single delayed frames"""
+_SMALL_SAMPLE_FACTOR = 1.2
+"""A scatter from so few bins is sometimes underestimated"""
 
 
 @dataclass(slots=True)
-class Rise:
-    """A drift that was told, while the seconds after it tell it better. number: of the event.
+class RateChangeEstimator:
+    """Least-squares refinement of a detected rate change by the bins after it. Times in device seconds.
 
-    first_at, first_rise: the bend as first told, at device time ``told``. line, sigma: of the delays before it.
-    count … product: sums over the bins since the bend of 1, time, its square, the delay over the line, their product;
-    times from first_at. late: bins in a row that were far later than awaited.
+    change_index: of the change in the detector's list. first_onset, first_slope_change: the changepoint as first
+    estimated, at device time ``detected_at``. baseline, sigma: line (delay at time 0, slope) and scatter of the delays
+    before it. count, sum_t, sum_tt, sum_d, sum_td: sums over the bins since the onset of 1, t, t², d and t d, with t
+    from first_onset and d the delay in excess of the baseline. late_in_a_row: consecutive bins far later than expected.
     """
 
-    number: int
-    first_at: float
-    told: float
-    line: tuple[float, float]
+    change_index: int
+    first_onset: float
+    detected_at: float
+    baseline: tuple[float, float]
     sigma: float
-    at: float
-    rise: float
-    first_rise: float
+    onset: float
+    slope_change: float
+    first_slope_change: float
     count: int = 0
-    time: float = 0.0
-    square: float = 0.0
-    delay: float = 0.0
-    product: float = 0.0
-    late: int = 0
+    sum_t: float = 0.0
+    sum_tt: float = 0.0
+    sum_d: float = 0.0
+    sum_td: float = 0.0
+    late_in_a_row: int = 0
 
-    def take(self, time: float, delay: float) -> None:
-        """One more bin: the line through what delays are over the old one."""
-        over = delay - self.line[0] - self.line[1] * time
-        awaited = self.rise * (time - self.at)
-        room = 4.0 * self.sigma + 1e-4
-        # Frames that are held up for once tell nothing; what comes sooner than awaited, or is late for long, does.
-        self.late = self.late + 1 if over > awaited + room else 0
-        if 0 < self.late < _LATE_BINS:
-            over = awaited + room
-        time -= self.first_at
+    def update(self, time: float, delay: float) -> None:
+        """Add one bin and fit the line of the excess delays again."""
+        excess = delay - self.baseline[0] - self.baseline[1] * time
+        expected = self.slope_change * (time - self.onset)
+        margin = 4.0 * self.sigma + 1e-4
+        # A single delayed frame carries no information; one earlier than expected, or persistent lateness, does.
+        self.late_in_a_row = self.late_in_a_row + 1 if excess > expected + margin else 0
+        if 0 < self.late_in_a_row < _PERSISTENT_LATE_BINS:
+            excess = expected + margin
+        time -= self.first_onset
         self.count += 1
-        self.time += time
-        self.square += time * time
-        self.delay += over
-        self.product += time * over
-        spread = self.square - self.time * self.time / self.count
+        self.sum_t += time
+        self.sum_tt += time * time
+        self.sum_d += excess
+        self.sum_td += time * excess
+        spread = self.sum_tt - self.sum_t * self.sum_t / self.count
         if spread <= 0.0:
             return
-        rise = (self.product - self.time * self.delay / self.count) / spread
-        at = (self.time - self.delay / rise) / self.count if rise != 0.0 else 0.0
-        if rise * self.rise <= 0.0 or not abs(at) <= 1.0:
-            # It did not begin that long before or after: then the rate alone is told.
-            at = min(max(at, -1.0), 1.0) if rise * self.rise > 0.0 else 0.0
-            rise = (self.product - at * self.delay) / (self.square - 2.0 * at * self.time + self.count * at * at)
-        self.at, self.rise = self.first_at + at, rise
+        slope_change = (self.sum_td - self.sum_t * self.sum_d / self.count) / spread
+        at = (self.sum_t - self.sum_d / slope_change) / self.count if slope_change != 0.0 else 0.0
+        if slope_change * self.slope_change <= 0.0 or not abs(at) <= 1.0:
+            # The onset cannot be that far from the first estimate: bound it and estimate the slope alone.
+            at = min(max(at, -1.0), 1.0) if slope_change * self.slope_change > 0.0 else 0.0
+            slope_change = (self.sum_td - at * self.sum_d) / (
+                self.sum_tt - 2.0 * at * self.sum_t + self.count * at * at
+            )
+        self.onset, self.slope_change = self.first_onset + at, slope_change
 
 
 @dataclass(slots=True)
-class Jump:
-    """A step that was told by two time stamps, while delays after it tell it better. number: of the event.
+class StepEstimator:
+    """Refinement of a detected clock step by the delays after it.
 
-    step, std: as first told [s]. line, sigma: of the delays before it, on the old clock. count, total: of the bins
-    after it, and of the steps that each tells.
+    change_index: of the change in the detector's list. step, std: first estimate from two time stamps [s]. baseline,
+    sigma: line (delay at time 0, slope) and scatter of the delays before it, on the old clock. count, total: number of
+    accepted bins after it, and the sum of their steps. bins_seen: number of all bins after it.
     """
 
-    number: int
+    change_index: int
     step: float
     std: float
-    line: tuple[float, float]
+    baseline: tuple[float, float]
     sigma: float
     count: int = 0
     total: float = 0.0
-    heard: int = 0
+    bins_seen: int = 0
 
-    def take(self, time: float, delay: float) -> tuple[float, float]:
-        """One more bin, on the new clock; returns the step as it is known by now, and its std [s]."""
-        # What was put into the new clock is missing from the delay: delay + step = level + slope (time - step).
-        told = (self.line[0] + self.line[1] * time - delay) / (1.0 + self.line[1])
-        self.heard += 1
-        if abs(told - self.step) < 5.0 * float(np.hypot(self.std, self.sigma)):  # else the way is another one too
+    def update(self, time: float, delay: float) -> tuple[float, float]:
+        """Add one bin, on the new clock; returns the present estimate of the step and its std [s]."""
+        # The step of the clock lowers the delay by as much: delay + step = level + slope (time - step).
+        observed = (self.baseline[0] + self.baseline[1] * time - delay) / (1.0 + self.baseline[1])
+        self.bins_seen += 1
+        if abs(observed - self.step) < 5.0 * float(np.hypot(self.std, self.sigma)):  # else the network path changed too
             self.count += 1
-            self.total += told
+            self.total += observed
         if not self.count:
             return self.step, self.std
-        # The bins before err together: more than a few after tell no more.
+        # The error of the baseline is common to all bins: more than a few of them add nothing.
         stamps, delays = 1.0 / self.std**2, min(self.count, 3) / self.sigma**2
         mean = (stamps * self.step + delays * self.total / self.count) / (stamps + delays)
         return mean, float(1.0 / np.sqrt(stamps + delays))
 
 
-def left_its_line(bins: Floats, span: int, known: float) -> bool:
-    """Whether delays (n, 2) rise or fall evenly over the last ``span`` bins as they never did in as many before.
+def slope_has_changed(bins: Floats, span: int, expected_slope: float) -> bool:
+    """Test for a slope change over the last ``span`` of the bins (n, 2): device time, delay [s].
 
-    known: how steeply they usually do, over longer than these bins.
+    The slope must be significant against the slopes of all earlier windows of the same length, within the plausible
+    rates, and must fit better than a step. expected_slope: rms of slopes over a longer past than these bins.
     """
-    level, slope, sigma = line(bins[:-span])
-    time, over = bins[:, 0], bins[:, 1] - level - slope * bins[:, 0]
-    # Over what they were just before, at every place: the last one is judged by all that have no part in it.
-    before = np.convolve(over, np.full(LEVEL, 1.0 / LEVEL), "valid")[:-span]
-    since = sliding_window_view(time, span + 1)[LEVEL - 1 :]
+    level, slope, sigma = fit_line(bins[:-span])
+    time, excess = bins[:, 0], bins[:, 1] - level - slope * bins[:, 0]
+    # Delays over the level just before each window; the last window is compared with those that do not overlap it.
+    before = np.convolve(excess, np.full(LEVEL_BINS, 1.0 / LEVEL_BINS), "valid")[:-span]
+    since = sliding_window_view(time, span + 1)[LEVEL_BINS - 1 :]
     since = since[:, 1:] - since[:, :1]
-    rise = sliding_window_view(over, span)[LEVEL:] - before[:, None]
+    rise = sliding_window_view(excess, span)[LEVEL_BINS:] - before[:, None]
     weight = (since**2).sum(axis=1)
     slopes = (since * rise).sum(axis=1) / weight
     change = float(slopes[-1])
-    most = MOST_DRIFT if span == SPANS[-1] else _MOST_SOON
-    if not DRIFT < abs(change) < most:
+    most = MAX_RATE_CHANGE if span == WINDOW_BINS[-1] else _MAX_EARLY_RATE_CHANGE
+    if not MIN_RATE_CHANGE < abs(change) < most:
         return False
-    usual = _USUALLY * max(float(np.sqrt((slopes[:-span] ** 2).mean())), known)
-    if abs(change) <= _SIGMAS * float(np.hypot(usual, sigma / np.sqrt(weight[-1]))):
+    usual_slope = _SMALL_SAMPLE_FACTOR * max(float(np.sqrt((slopes[:-span] ** 2).mean())), expected_slope)
+    if abs(change) <= _DETECTION_SIGMAS * float(np.hypot(usual_slope, sigma / np.sqrt(weight[-1]))):
         return False
-    left = rise[-1] - change * since[-1]
-    beside = float(left @ left)
-    if beside > span * float(np.hypot(_CROOKED * change * since[-1, -1], 1.3 * sigma)) ** 2:
+    residual = rise[-1] - change * since[-1]
+    ramp_misfit = float(residual @ residual)
+    if ramp_misfit > span * float(np.hypot(_RAMP_MISFIT * change * since[-1, -1], 1.3 * sigma)) ** 2:
         return False
-    # A delay that is another one from some frame on, the route being another, is no rise.
-    return beside < _UNLIKE_A_JUMP * min(_jump(rise[-1], first) for first in range(span - 1))
+    # A delay that changes at one frame and stays (another route) is a step, not a ramp.
+    return ramp_misfit < _MAX_RAMP_TO_STEP_MISFIT * min(_step_misfit(rise[-1], first) for first in range(span - 1))
 
 
-def _jump(over: Floats, first: int) -> float:
-    """Sum of squares that a jump of delays (n,) before the one at ``first`` leaves."""
-    return float((over[:first] ** 2).sum() + ((over[first:] - over[first:].mean()) ** 2).sum())
+def _step_misfit(excess: Floats, first: int) -> float:
+    """Sum of squared residuals of excess delays (n,) about a step just before index ``first``."""
+    return float((excess[:first] ** 2).sum() + ((excess[first:] - excess[first:].mean()) ** 2).sum())
 
 
-def bend(bins: Floats, span: int) -> tuple[float, float]:
-    """When delays (n, 2) left their old line, and by how much they rise faster since then.
+def fit_changepoint(bins: Floats, span: int) -> tuple[float, float]:
+    """Onset time [s] and change of slope of the best continuous two-segment line through the bins (n, 2).
 
-    The line with one bend about the last ``span`` bins that fits best; its place is one of a grid, six to a bin.
+    The onset is searched on a grid of six places a bin about the beginning of the last ``span`` bins.
     """
     time, delay = bins[:, 0], bins[:, 1]
     best, found = np.inf, (0.0, 0.0)
     for at in np.linspace(time[-span - 3], time[-3], 6 * span + 1):
         rows = np.column_stack([np.ones_like(time), time, np.maximum(time - at, 0.0)])
         fitted = np.linalg.lstsq(rows, delay, rcond=None)[0]
-        left = float(((rows @ fitted - delay) ** 2).sum())
-        if left < best:
-            best, found = left, (float(at), float(fitted[2]))
+        misfit = float(((rows @ fitted - delay) ** 2).sum())
+        if misfit < best:
+            best, found = misfit, (float(at), float(fitted[2]))
     return found
 
 
-def line(bins: Floats) -> tuple[float, float, float]:
-    """Delay at time 0 and slope of the line through bins (n, 2), and the scatter around it, never below LEAST_S."""
+def fit_line(bins: Floats) -> tuple[float, float, float]:
+    """Delay at time 0, slope and residual scatter (at least MIN_SCATTER_S) of the line through the bins (n, 2)."""
     time, delay = bins[:, 0], bins[:, 1]
     middle, mean = float(time.mean()), float(delay.mean())
     away = time - middle
     slope = float(away @ delay) / float(away @ away)
     rest = delay - mean - slope * away
-    return mean - slope * middle, slope, max(float(np.sqrt(rest @ rest / max(len(bins) - 2, 1))), LEAST_S)
+    return mean - slope * middle, slope, max(float(np.sqrt(rest @ rest / max(len(bins) - 2, 1))), MIN_SCATTER_S)

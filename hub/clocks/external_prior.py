@@ -1,9 +1,10 @@
-"""What cameras' machines claim of their clocks: held against what the pictures say, and asked where these say nothing.
+"""External clock priors (NTP, PTP): checked against the calibration, and used only where the images are ambiguous.
 
-A time service ties a machine's clock to Unix time, t_unix = t_camera + m, and says within what. Two cameras that are
-both so tied are tied to each other, which the calibration has found too, from the pictures. Where the two contradict
-each other by more than both allow, a clock is wrong or a camera stamps late; the pictures are believed. Only where
-they leave several lags open (periodic motion) the claim chooses among these (`hub/calibration/pair_network.py`).
+A time service gives the offset of a camera's clock from Unix time, t_unix = t_camera + m, and a bound of its error.
+Two such cameras have a known lag, which the calibration estimates independently from the images. Where both differ by
+more than their uncertainties, a clock is wrong or a camera's time stamps are late; the image-based estimate is kept.
+Only where the images leave several lags (periodic motion) does the prior select one of them
+(`hub.calibration.pair_network`).
 """
 
 from __future__ import annotations
@@ -17,86 +18,87 @@ from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration
 
-CAMERA_DELAY = 0.1
-"""Seconds of a camera's own, which no time service knows: what is stamped on arrival is late by that."""
-_STDS = 3.0
+MAX_CAMERA_DELAY_S = 0.1
+"""Largest delay from exposure to time stamp [s], unknown to time services: frames stamped on arrival are late."""
+_TEST_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class Claim:
-    """Of one run (boot) of a camera. unix_minus_camera: t_unix - t_camera [s]. error: of Unix time, as claimed [s]."""
+class ExternalClockPrior:
+    """Prior of one run (boot id) of a camera's clock. unix_minus_camera: t_unix - t_camera, error_bound: of it [s]."""
 
-    boot: str
+    boot_id: str
     unix_minus_camera: float
-    error: float
+    error_bound: float
 
 
-class ClockClaims:
-    """Remembers each camera's latest claim, and its latest picture's time."""
+class ExternalClockPriors:
+    """The latest prior of each camera, and the time of its latest observation."""
 
     def __init__(self) -> None:
-        self._claims: dict[str, Claim] = {}
+        self._priors: dict[str, ExternalClockPrior] = {}
         self._now: dict[str, float] = {}
 
     def handle(self, message: pb.Observation | pb.AgentStatus) -> None:
-        """Take what a camera's agent says of itself, or when it saw something."""
+        """Add a camera agent's status (its prior), or an observation (its time)."""
         if isinstance(message, pb.Observation):
             self._now[message.camera] = message.device_time_ns / NANOSECONDS
             return
         if message.role != "camera":
             return
         gauges = message.gauges
-        tied = gauges.get("clock_synchronised", 0.0) > 0.0 and "clock_error_s" in gauges
-        if tied and "unix_minus_camera_s" in gauges:
-            claim = Claim(message.boot_id, gauges["unix_minus_camera_s"], gauges["clock_error_s"])
-            self._claims[message.agent] = claim
+        synchronised = gauges.get("clock_synchronised", 0.0) > 0.0 and "clock_error_s" in gauges
+        if synchronised and "unix_minus_camera_s" in gauges:
+            prior = ExternalClockPrior(message.boot_id, gauges["unix_minus_camera_s"], gauges["clock_error_s"])
+            self._priors[message.agent] = prior
         else:
-            self._claims.pop(message.agent, None)
+            self._priors.pop(message.agent, None)
 
-    def of(self, boots: Mapping[str, str]) -> dict[str, Claim]:
-        """The claims of the runs (boots) of cameras that are spoken of."""
-        return {name: claim for name, claim in self._claims.items() if claim.boot == boots.get(name)}
+    def for_boots(self, boots: Mapping[str, str]) -> dict[str, ExternalClockPrior]:
+        """The priors that belong to the given boot ids, by camera."""
+        return {name: prior for name, prior in self._priors.items() if prior.boot_id == boots.get(name)}
 
     def contradictions(self, calibration: Calibration, boots: Mapping[str, str]) -> list[str]:
-        """One line for each camera whose claim the calibration contradicts. boots: those it speaks of.
+        """One line for each camera whose prior contradicts the calibration. boots: boot ids of the calibrated cameras.
 
-        Of two cameras nobody can say which is wrong; of more, those away from the median are told.
+        Of two cameras it cannot be decided which one is wrong; of more, those that differ from the median are reported.
         """
-        told_of = self.of(boots)
-        claims = {name: told_of[name] for name in calibration.cameras if name in told_of and name in self._now}
-        if len(claims) < 2:
+        valid = self.for_boots(boots)
+        priors = {name: valid[name] for name in calibration.cameras if name in valid and name in self._now}
+        if len(priors) < 2:
             return []
-        first = next(iter(claims))
-        unix = self._now[first] + claims[first].unix_minus_camera
-        # One moment of Unix time on the reference clock, by each camera's claim and time map: the same if all is well.
-        moments = {
+        first = next(iter(priors))
+        unix = self._now[first] + priors[first].unix_minus_camera
+        # One Unix time on the reference clock by each camera's prior and time map: equal if all are consistent.
+        reference_times = {
             name: float(
-                calibration.cameras[name].time_map.reference_from_camera(CameraTime(unix - claim.unix_minus_camera))
+                calibration.cameras[name].time_map.reference_from_camera(CameraTime(unix - prior.unix_minus_camera))
             )
-            for name, claim in claims.items()
+            for name, prior in priors.items()
         }
-        usual = statistics.median_low(list(moments.values()))
-        against = next(name for name, moment in moments.items() if moment == usual)
-        told = []
-        for name, moment in moments.items():
+        median = statistics.median_low(list(reference_times.values()))
+        against = next(name for name, reference_time in reference_times.items() if reference_time == median)
+        lines = []
+        for name, reference_time in reference_times.items():
             a, b = calibration.cameras[name], calibration.cameras[against]
-            allowed = claims[name].error + claims[against].error + CAMERA_DELAY
-            allowed += _STDS * math.hypot(a.time_offset_std, b.time_offset_std)
-            if not math.isfinite(moment) or not abs(moment - usual) > allowed:
+            allowed = priors[name].error_bound + priors[against].error_bound + MAX_CAMERA_DELAY_S
+            allowed += _TEST_SIGMAS * math.hypot(a.time_offset_std, b.time_offset_std)
+            if not math.isfinite(reference_time) or not abs(reference_time - median) > allowed:
                 continue
-            one = name if name != calibration.reference or len(claims) > 2 else against
-            away = abs(moment - usual)
+            one = name if name != calibration.reference or len(priors) > 2 else against
+            difference = abs(reference_time - median)
             other = against if one == name else name
-            told.append(
-                f"{one}'s clock says it is synchronised to {_short(claims[one].error)} and {other}'s to "
-                f"{_short(claims[other].error)}, the pictures say {_short(away)} off: a clock is wrong, or a camera's "
-                f"times are late; the pictures are believed"
+            lines.append(
+                f"{one}'s clock reports synchronisation to {_format_seconds(priors[one].error_bound)} and {other}'s to "
+                f"{_format_seconds(priors[other].error_bound)}, but the images show a difference of "
+                f"{_format_seconds(difference)}: a clock is wrong, or a camera's time stamps are late; the estimate "
+                f"from the images is used"
             )
-        return told
+        return lines
 
 
-def _short(seconds: float) -> str:
-    """Two or three digits, in s, ms or µs."""
+def _format_seconds(seconds: float) -> str:
+    """Seconds with two or three digits, in s, ms or µs."""
     for unit, factor in (("s", 1.0), ("ms", 1e3)):
         if seconds * factor >= 1.0:
             return f"{seconds * factor:.3g} {unit}"

@@ -1,9 +1,9 @@
-"""A clock that began to run faster or slower, told on the line that it ran on before.
+"""A clock whose rate changed, as a piecewise-linear map: new time stamps expressed on the clock before the change.
 
-Until enough was seen to solve for the new clock by itself, the old one must serve: what is seen is put where the old
-clock would have shown it, by the shift and the rate that arrivals tell (`clock_watch`). So the old map keeps rows up to
-the present, in place of being carried on beyond them; and the rows between the bend and its detection, which the old
-clock never showed so, are put right too.
+Until there are enough observations to calibrate the new clock segment, the previous one stays in use: new time stamps
+are converted to what the previous clock would have shown, by the step and the rate change that arrival times give
+(`hub.clocks.change_detector`). The previous time map is then supported by rows up to the present and need not be
+extrapolated. The rows between the onset and its detection were stamped by the changed clock; they are corrected too.
 """
 
 from __future__ import annotations
@@ -12,89 +12,96 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hub.clocks.change_detector import ClockEvent
+from hub.clocks.change_detector import ClockChange
 from protocols.geometry.types import Floats
 
 _SECOND_NS = 1_000_000_000
-_SPLIT_S = 1e-5
-"""More than rounding, less than between two frames."""
+_TIME_TOLERANCE_S = 1e-5
+"""More than rounding, less than a frame interval."""
 
 
 @dataclass(frozen=True, slots=True)
-class Bend:
-    """From ``at_s`` [s, the clock's own time] on the clock runs ``1 + rate`` times as fast; told at ``told_s``.
+class RateChange:
+    """From ``onset_s`` [s, the clock's own time] on the clock runs ``1 + rate_change`` times as fast.
 
-    before, after: names of the epoch that ended there and of the one that began. put: ``at_s`` and ``rate`` as first
-    told, by which frames were put on the old clock as they came.
+    previous_segment, segment: names of the clock segments before and after. detected_at_s: time of detection on the
+    new clock. first_estimate: ``onset_s`` and ``rate_change`` as first estimated, by which frames are converted to the
+    previous clock as they arrive.
     """
 
-    before: str
-    after: str
-    at_s: float
-    rate: float
-    told_s: float
-    put: tuple[float, float]
+    previous_segment: str
+    segment: str
+    onset_s: float
+    rate_change: float
+    detected_at_s: float
+    first_estimate: tuple[float, float]
 
     @classmethod
-    def of(cls, event: ClockEvent) -> Bend:
-        """The bend of an event of kind "drift". Raises ValueError for one that changes no rate."""
-        if event.rate == 0.0:
-            raise ValueError(f"{event.kind} of {event.camera}: the rate stays")
-        at = event.at_s - event.step_s / event.rate
-        return cls(event.before, event.boot, at, event.rate, event.at_s, (at, event.rate))
+    def of(cls, change: ClockChange) -> RateChange:
+        """From a change of kind "drift". Raises ValueError for one that leaves the rate as it is."""
+        if change.rate_change == 0.0:
+            raise ValueError(f"{change.kind} of {change.camera}: no rate change")
+        onset, rate = change.detected_at_s - change.step_s / change.rate_change, change.rate_change
+        return cls(change.previous_segment, change.segment, onset, rate, change.detected_at_s, (onset, rate))
 
-    def amended(self, event: ClockEvent | None) -> Bend:
-        """The same bend as ``event`` tells it by now; None = nothing new."""
-        if event is None or event.rate == 0.0:
+    def refined(self, change: ClockChange | None) -> RateChange:
+        """The same rate change in its present estimate ``change``; None = nothing new."""
+        if change is None or change.rate_change == 0.0:
             return self
-        return replace(self, at_s=event.at_s - event.step_s / event.rate, rate=event.rate)
+        onset = change.detected_at_s - change.step_s / change.rate_change
+        return replace(self, onset_s=onset, rate_change=change.rate_change)
 
-    def on_old_clock(self, device_ns: int) -> int:
-        """What the old clock would show [ns] where the new one shows ``device_ns``, a time after the bend."""
-        at_s, rate = self.put
-        return device_ns - round(rate * (device_ns - round(at_s * _SECOND_NS)))
+    def to_previous_clock(self, device_ns: int) -> int:
+        """Time [ns] on the previous clock where the new one shows ``device_ns``, a time after the onset."""
+        onset_s, rate = self.first_estimate
+        return device_ns - round(rate * (device_ns - round(onset_s * _SECOND_NS)))
 
-    def straightened(self, time: Floats) -> Floats:
-        """Times (n,) [s] of the old epoch, put right.
+    def corrected(self, time: Floats) -> Floats:
+        """Times (n,) [s] of the previous segment, corrected to the present estimate.
 
-        Those between the bend and ``told_s`` are as the clock showed them, later ones as they were put.
+        Those between the onset and ``detected_at_s`` are as the camera stamped them; later ones were converted by the
+        first estimate.
         """
-        at, rate = self.put
-        came_late = time > self.told_s - rate * (self.told_s - at) - _SPLIT_S
-        right = came_late if self.put == (self.at_s, self.rate) else np.zeros(time.shape, dtype=np.bool_)
-        shown = np.where(came_late, at + (time - at) / (1.0 - rate), time)
-        return np.asarray(np.where(right | (shown <= self.at_s), time, shown - self.rate * (shown - self.at_s)))
+        onset, rate = self.first_estimate
+        converted = time > self.detected_at_s - rate * (self.detected_at_s - onset) - _TIME_TOLERANCE_S
+        unchanged = self.first_estimate == (self.onset_s, self.rate_change)
+        final = converted if unchanged else np.zeros(time.shape, dtype=np.bool_)
+        shown = np.where(converted, onset + (time - onset) / (1.0 - rate), time)
+        corrected = shown - self.rate_change * (shown - self.onset_s)
+        return np.asarray(np.where(final | (shown <= self.onset_s), time, corrected))
 
 
-class Bends:
-    """The latest bend of each camera, for as long as the epoch before it serves."""
+class RateChanges:
+    """The latest rate change of each camera, for as long as the clock segment before it is in use."""
 
     def __init__(self) -> None:
-        self._of: dict[str, Bend] = {}
+        self._latest: dict[str, RateChange] = {}
 
-    def handle(self, event: ClockEvent) -> None:
-        """Take an event; a step ends what a bend began."""
-        self._of.pop(event.camera, None)
-        if event.kind == "drift":
-            self._of[event.camera] = Bend.of(event)
+    def handle(self, change: ClockChange) -> None:
+        """Add a change; a step ends the conversion that a rate change began."""
+        self._latest.pop(change.camera, None)
+        if change.kind == "drift":
+            self._latest[change.camera] = RateChange.of(change)
 
-    def serving(self, camera: str, boot: str) -> Bend | None:
-        """The camera's bend, if ``boot`` is the epoch before it; forgets it if not: then the new clock is settled."""
-        bend = self._of.get(camera)
-        if bend is not None and bend.before != boot:
-            del self._of[camera]
+    def active(self, camera: str, boot: str) -> RateChange | None:
+        """The camera's rate change if ``boot`` is the segment before it; else the change is dropped as obsolete."""
+        found = self._latest.get(camera)
+        if found is not None and found.previous_segment != boot:
+            del self._latest[camera]
             return None
-        return bend
+        return found
 
-    def on_old_clock(self, camera: str, boot: str, device_ns: int) -> tuple[str, int] | None:
-        """The old epoch's name and time [ns] for a frame of the new epoch ``boot``; None where nothing bent."""
-        bend = self._of.get(camera)
-        return None if bend is None or bend.after != boot else (bend.before, bend.on_old_clock(device_ns))
+    def to_previous_clock(self, camera: str, boot: str, device_ns: int) -> tuple[str, int] | None:
+        """Previous segment and time [ns] on it of a frame of the new segment ``boot``; None without a rate change."""
+        found = self._latest.get(camera)
+        if found is None or found.segment != boot:
+            return None
+        return found.previous_segment, found.to_previous_clock(device_ns)
 
     @property
     def cameras(self) -> list[str]:
-        """Cameras whose clock bent of late."""
-        return list(self._of)
+        """Cameras with a recent rate change."""
+        return list(self._latest)
 
 
-__all__ = ["Bend", "Bends"]
+__all__ = ["RateChange", "RateChanges"]

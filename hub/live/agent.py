@@ -15,7 +15,7 @@ from hub.distributed.network.host import ROLE as NODES
 from hub.distributed.network.host import NodeHost
 from hub.live.live_hub import LiveHub
 from protocols.bus.base import Bus, Publisher
-from protocols.core.commands import Orders
+from protocols.bus.commands import CommandSubscription
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import Rig
@@ -25,7 +25,7 @@ ROLE = "hub"
 _TICK_S = 0.05
 _STATUS_S = 1.0
 _RIG_S = 5.0
-_MOST_TEXT = 2000  # characters of a status message
+_MAX_TEXT = 2000  # characters of a status message
 
 
 def run_hub(
@@ -35,21 +35,21 @@ def run_hub(
     stop: threading.Event,
     *,
     rig: Rig | None = None,
-    solved: Callable[[LiveHub], None] | None = None,
+    on_result: Callable[[LiveHub], None] | None = None,
     boot_id: str | None = None,
     beat: Callable[[], None] = lambda: None,
     export: Callable[[LiveHub], str] | None = None,
 ) -> None:
-    """Gather, solve and publish until ``stop`` is set; then solve once more with all that came.
+    """Process messages, solve and publish until ``stop`` is set; then solve once more with all data.
 
-    solved: called after every solve that gave an answer or a refusal (to write files). beat: called after every round,
-    and within one as the solver gets on, so that a watchdog sees a loop that hangs. export: writes the answer because
-    a view asked; returns what to say.
+    on_result: called after every solve that gave a calibration or a refusal (to write files). beat: watchdog heartbeat,
+    called after every loop and during a solve as it progresses, so that a watchdog detects a hanging loop. export:
+    writes the calibration on request of a view; returns a status text.
     """
     boot = boot_id or uuid.uuid4().hex
     nodes = hub.nodes
-    of_nodes = () if nodes is None else (NODE_STATE, CALIBRATION)
-    subscriptions = [bus.subscribe(topic) for topic in (CAMERA_INFO, OBSERVATION, STATUS, *of_nodes)]
+    node_topics = () if nodes is None else (NODE_STATE, CALIBRATION)
+    subscriptions = [bus.subscribe(topic) for topic in (CAMERA_INFO, OBSERVATION, STATUS, *node_topics)]
     publishers = {
         "Calibration": bus.publisher(CALIBRATION, agent),
         "Track": bus.publisher(TRACK, agent, rate_hz=200.0),
@@ -57,10 +57,10 @@ def run_hub(
         "RigInfo": bus.publisher(RIG_INFO, agent),
         "AgentStatus": bus.publisher(STATUS, agent),
     }
-    orders = Orders(bus, agent, boot, ("recalibrate", "export"))
-    hub.working = beat
+    orders = CommandSubscription(bus, agent, boot, ("recalibrate", "export"))
+    hub.on_progress = beat
     sequence, next_status, next_rig = 0, 0.0, 0.0
-    said = ""
+    last_action = ""
 
     def publish(messages: list[Message]) -> None:
         for message in messages:
@@ -75,15 +75,15 @@ def run_hub(
             node_publishers[state.camera].put(state)
 
     watch = None if nodes is None else bus.watch_agents()
-    settle_memory()
-    settled = False
+    freeze_garbage_collector()
+    memory_frozen = False
     try:
         with bus.announce(ROLE, agent, boot), nullcontext() if nodes is None else bus.announce(NODES, agent, boot):
             while True:
                 last = stop.is_set()
                 if nodes is not None and watch is not None:
                     for event in watch.drain():
-                        nodes.agents(event.role, event.agent, event.boot_id, alive=event.alive)
+                        nodes.on_liveliness(event.role, event.agent, event.boot_id, alive=event.alive)
                 for subscription in subscriptions:
                     for received in subscription.drain():
                         if received.agent != agent or not isinstance(received.message, pb.Calibration):
@@ -91,30 +91,32 @@ def run_hub(
                 for action in orders.take():
                     hub.counters[f"asked.{action}"] += 1
                     if action == "recalibrate":
-                        hub.start_anew()
-                        said = "recalibrating, as asked"
+                        hub.reset()
+                        last_action = "recalibrating, as requested"
                     elif action == "export":
-                        said = "no folder to export to: set out" if export is None else export(hub)
+                        last_action = "no folder to export to: set out" if export is None else export(hub)
                 if nodes is not None:
                     publish_nodes(nodes, time.monotonic())
                 now = time.monotonic()
                 before = hub.counters["solved"] + hub.counters["refused"]
                 publish(hub.tick(now, final=last))
-                answered = hub.counters["solved"] + hub.counters["refused"] > before
-                if answered and not settled:
-                    settled = True
-                    settle_memory()  # the solver's modules have come
-                if solved is not None and answered:
-                    solved(hub)
+                has_result = hub.counters["solved"] + hub.counters["refused"] > before
+                if has_result and not memory_frozen:
+                    memory_frozen = True
+                    freeze_garbage_collector()  # the solver's modules have been loaded
+                if on_result is not None and has_result:
+                    on_result(hub)
                 if rig is not None and now >= next_rig:
                     next_rig = now + _RIG_S
                     publish([rig_message(rig)])
                 if now >= next_status or last:
                     next_status = now + _STATUS_S
                     status = status_message(hub, agent, boot, sequence, [s.counters for s in subscriptions])
-                    wanting = hub.calibration is None or hub.refusal is not None or hub.calibration.refused
-                    advice = [one.text for one in hub.guidance.advice()] if wanting else []
-                    status.message = "; ".join(text for text in (status.message, *advice, said) if text)[:_MOST_TEXT]
+                    needs_advice = hub.calibration is None or hub.refusal is not None or hub.calibration.refused
+                    advice = [one.text for one in hub.guidance.advice()] if needs_advice else []
+                    status.message = "; ".join(text for text in (status.message, *advice, last_action) if text)[
+                        :_MAX_TEXT
+                    ]
                     publish([status])
                     sequence += 1
                 beat()
@@ -131,17 +133,17 @@ def run_hub(
             subscription.close()
 
 
-def settle_memory() -> None:
-    """Take what there is now, modules above all, out of the garbage collector's rounds.
+def freeze_garbage_collector() -> None:
+    """Exclude all present objects, above all modules, from garbage collection.
 
-    Else each of them stands still for 70 ms, and messages with it. What is freed by its last reference still is.
+    Otherwise each full collection stops the process for 70 ms and delays messages. Reference counting still frees them.
     """
     gc.collect()
     gc.freeze()
 
 
 def rig_message(rig: Rig) -> pb.RigInfo:
-    """What fixes gauge and scale, for the log."""
+    """The message with the rig's gauge and scale information, for the log."""
     message = pb.RigInfo(schema_version=1, units=rig.units, clock=rig.clock)
     for a, b, distance in rig.distances:
         message.distances.append(pb.RigInfo.Distance(camera_a=a, camera_b=b, distance=distance))
@@ -158,15 +160,15 @@ def rig_message(rig: Rig) -> pb.RigInfo:
 def status_message(
     hub: LiveHub, agent: str, boot: str, sequence: int, counters: Sequence[Mapping[str, int]]
 ) -> pb.AgentStatus:
-    """The hub's health: what it counted, and one line for a person."""
-    solved = hub.calibration is not None
+    """The hub's status: counters, gauges, and one line of text."""
+    calibrated = hub.calibration is not None
     message = pb.AgentStatus(
         schema_version=1,
         agent=agent,
         role=ROLE,
         boot_id=boot,
         sequence=sequence,
-        state="running" if solved else "starting",
+        state="running" if calibrated else "starting",
         message=f"{len(hub.calibration.cameras)} cameras calibrated" if hub.calibration else hub.missing() or "solving",
         version=VERSION,
     )
@@ -177,7 +179,7 @@ def status_message(
     alarms = [*hub.clocks.alarms.values(), *hub.clock_contradictions()]
     if alarms:
         message.message = "; ".join([*alarms, message.message])[:1000]
-    if hub.tracking is not None and hub.tracking.heard_any:
+    if hub.tracking is not None and hub.tracking.has_detections:
         for name, value in hub.tracking.gauges().items():
             message.gauges[name] = value
         for name, count in hub.tracking.counters.items():

@@ -1,4 +1,4 @@
-"""A calibration and its paths as the messages that go over the bus and into the log."""
+"""Calibration and trajectories as messages for the bus and the log."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from protocols.session.calibration import Calibration, TrajectoryTable
 SCHEMA_VERSION = 1
 
 
-def calibration_message(calibration: Calibration, revision: int, boots: dict[str, str]) -> pb.Calibration:
-    """The solved calibration. boots: by camera, the boot whose clock its time map speaks of."""
+def calibration_message(calibration: Calibration, revision: int, boot_ids: dict[str, str]) -> pb.Calibration:
+    """The message of a solved calibration. boot_ids: by camera, the boot id of the clock its time map refers to."""
     message = pb.Calibration(
         schema_version=SCHEMA_VERSION,
         revision=revision,
@@ -37,7 +37,7 @@ def calibration_message(calibration: Calibration, revision: int, boots: dict[str
                 matrix=lens.matrix.ravel().tolist(),
                 distortions=lens.distortions.tolist(),
                 fisheye=lens.fisheye,
-                boot_id=boots.get(name, ""),
+                boot_id=boot_ids.get(name, ""),
             )
         )
     message.refused.extend(pb.Refusal(camera=name, reason=reason) for name, reason in calibration.refused.items())
@@ -45,14 +45,14 @@ def calibration_message(calibration: Calibration, revision: int, boots: dict[str
 
 
 def refusal_message(reason: str, cameras: dict[str, str], revision: int, status: str) -> pb.Calibration:
-    """No calibration yet. status: "refused" or "collecting"; reason: what is missing."""
+    """The message of no calibration. status: "refused" or "collecting"; reason: what is missing."""
     message = pb.Calibration(schema_version=SCHEMA_VERSION, revision=revision, status=status, reason=reason)
     message.refused.extend(pb.Refusal(camera=name, reason=why) for name, why in cameras.items())
     return message
 
 
 def track_messages(table: TrajectoryTable, after: float, sequence: int) -> list[pb.Track]:
-    """The part of a path after a reference time [s], one message a sample."""
+    """The part of a trajectory after a reference time [s], one message per sample. sequence: of the first message."""
     out: list[pb.Track] = []
     for index in np.flatnonzero(table.time > after):
         variance = float(table.std[index]) ** 2

@@ -1,4 +1,4 @@
-"""report.html: one offline page that says what a calibration is worth, and shows why."""
+"""report.html: one offline page with the quality assessment of a calibration and the data behind it."""
 
 from hub.report.page import build_report
 

@@ -1,4 +1,4 @@
-"""How the answer settled: the misfit after every step of the adjustment, and each clock's std while cameras filmed."""
+"""Convergence figures: residual per step of the bundle adjustment, and std of the clock offsets over a recording."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ _DASHES = ("", "9 4", "2 4", "14 4 2 4", "5 2", "1 3")
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
-    """One calibration of a recorded hub: seconds since the log began, and the std of each camera's offset [s]."""
+class OffsetStdSample:
+    """One calibration in a log: seconds since its start, and the std of each camera's time offset [s]."""
 
     seconds: float
     time_offset_std: dict[str, float]
 
 
-def convergence(history: tuple[Step, ...], reference: str) -> str:
-    """The stds over time on a logarithmic scale, a line of its own dashes a camera; "" for fewer than two answers."""
+def offset_std_history(history: tuple[OffsetStdSample, ...], reference: str) -> str:
+    """The offset stds over time on a log scale, one dashed line per camera; "" for fewer than two calibrations."""
     names = sorted({name for step in history for name in step.time_offset_std if name != reference})
     series = {
         name: [
@@ -57,27 +57,29 @@ def convergence(history: tuple[Step, ...], reference: str) -> str:
         ends.append((heights[-1], name, steps[-1][1]))
     place = -math.inf
     for height, name, std in sorted(ends):
-        place = max(height, place + 15)  # names do not lie over each other
+        place = max(height, place + 15)  # labels do not overlap
         label = f"{name} ±{THIN}{short(std, figures=2)}{THIN}ms"
         parts.append(text(_LEFT + inner + 10, place + 4, label, "tick"))
     parts.append(text(_LEFT + inner / 2, _HEIGHT - 6, "seconds since the recording began", "tick", "middle"))
     first = number(series[next(iter(series))][0][0], 1)
-    return drawing(_WIDTH, max(_HEIGHT, place + 10), parts, f"Std of the clocks after every answer, from {first} s on")
+    return drawing(
+        _WIDTH, max(_HEIGHT, place + 10), parts, f"Std of the clock offsets after each calibration, from {first} s on"
+    )
 
 
 _STAGES = {
     "first poses": "cameras added",
     "robust": "all rows, robust",
-    "fitting rows": "the rows that fit",
-    "free lenses": "lenses freed",
-    "lasting errors": "errors that last",
+    "fitting rows": "inlier rows",
+    "free lenses": "free intrinsics",
+    "correlated noise": "correlated noise",
 }
 
 
-def adjustment(steps: tuple[AdjustmentStep, ...]) -> str:
-    """The misfit after every step of the last adjustment, on a logarithmic scale; "" for fewer than two.
+def adjustment_history(steps: tuple[AdjustmentStep, ...]) -> str:
+    """The residual after each step of the last bundle adjustment, on a logarithmic scale; "" for fewer than two.
 
-    A round begins where a line ends: rows and noise are weighed anew there. Each stage has its own mark and name.
+    A new line starts where rows and noise are reweighted. Each stage has its own marker and label.
     """
     steps = tuple(step for step in steps if math.isfinite(step.residual_px) and step.residual_px > 0.0)
     if len(steps) < 2:
@@ -106,10 +108,10 @@ def adjustment(steps: tuple[AdjustmentStep, ...]) -> str:
             middle = (x(index - 1) + x(index)) / 2
             ends = f'x1="{at(middle)}" y1="{at(top)}" x2="{at(middle)}" y2="{at(bottom)}"'
             parts.append(f'<line class="grid" {ends} stroke-dasharray="4 4"/>')
-        side = "end" if index == len(steps) - 1 else "start"  # a last step's name would leave the page
+        side = "end" if index == len(steps) - 1 else "start"  # the label of the last step would leave the page
         parts.append(text(x(index), top - 10, _STAGES.get(step.stage, step.stage), "tick", side))
     for index in range(1, len(steps) + 1):
-        # A round starts with the state that the one before left, weighed anew: no line leads there.
+        # A reweighted round starts from the same state with another residual: no line connects them.
         if (
             index == len(steps)
             or steps[index].residual_px >= values[index - 1]
@@ -126,12 +128,12 @@ def adjustment(steps: tuple[AdjustmentStep, ...]) -> str:
     parts.append(text(x(len(steps) - 1), y(values[-1]) - 10, f"{last}{THIN}px", "tick", "end"))
     parts.append(text(_LEFT + inner / 2, _HEIGHT - 12, f"{len(steps)} steps of the adjustment", "tick", "middle"))
     return drawing(
-        _WIDTH, _HEIGHT, parts, f"Misfit after each of {len(steps)} steps of the adjustment, {last} px at last"
+        _WIDTH, _HEIGHT, parts, f"Residual after each of {len(steps)} steps of the adjustment, {last} px at the end"
     )
 
 
 def _levels(low: float, high: float) -> list[float]:
-    """1, 2 and 5 times powers of ten from below ``low`` to above ``high``; two at least."""
+    """1, 2 and 5 times powers of ten from below ``low`` to above ``high``; at least two."""
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1
     steps = [step * 10.0**power for power in range(first, last + 1) for step in (1.0, 2.0, 5.0)]
     begin = max(index for index, step in enumerate(steps) if step <= low)
@@ -140,7 +142,7 @@ def _levels(low: float, high: float) -> list[float]:
 
 
 def _mark(x: float, y: float, kind: int) -> str:
-    """A circle, a square or a diamond."""
+    """A circle, square or diamond marker."""
     if kind % 3 == 0:
         return f'<circle class="dot" cx="{at(x)}" cy="{at(y)}" r="3.5"/>'
     turn = f' transform="rotate(45 {at(x)} {at(y)})"' if kind % 3 == 2 else ""

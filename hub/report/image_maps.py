@@ -1,4 +1,4 @@
-"""Maps of the image: where each camera saw the point, and which way its residuals point there."""
+"""Maps over the image of each camera: detections, and mean residual vectors."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from protocols.session.calibration import Calibration
 
 _WIDTH = 340.0
 _ARROW_BINS = 16
-_LEAST_ROWS = 3  # an arrow of fewer rows is noise
-_MOST_DOTS = 400
+_MIN_ROWS = 3  # the mean residual of fewer rows is noise
+_MAX_DOTS = 400
 
 
 def residual_maps(calibration: Calibration) -> str:
-    """One map a camera: grey where it saw the point, arrows for the mean residual there, one scale for all."""
+    """One map per camera: grey level by number of rows, arrows for mean residuals, one arrow scale for all."""
     bins = {}
     for name, camera in calibration.cameras.items():
         residuals = calibration.residuals.get(name)
@@ -26,17 +26,17 @@ def residual_maps(calibration: Calibration) -> str:
             )
     if not bins:
         return ""
-    told = np.concatenate(
-        [np.linalg.norm(b.mean[b.count >= _LEAST_ROWS], axis=1) for b in bins.values()] or [np.zeros(1)]
+    magnitudes = np.concatenate(
+        [np.linalg.norm(b.mean[b.count >= _MIN_ROWS], axis=1) for b in bins.values()] or [np.zeros(1)]
     )
-    typical = float(np.quantile(told, 0.9)) if len(told) else 1.0
+    typical = float(np.quantile(magnitudes, 0.9)) if len(magnitudes) else 1.0
     unit = next((step for step in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0) if step >= typical), 20.0)
     cell = _WIDTH / _ARROW_BINS
     maps = []
     for name, found in bins.items():
         camera = calibration.cameras[name]
         size = (camera.intrinsics.width, camera.intrinsics.height)
-        covered = measures.covered_parts(calibration.residuals[name][:, 1:3], size)
+        covered = measures.covered_cells(calibration.residuals[name][:, 1:3], size)
         caption = (
             f"<b>{esc(name)}</b> {number(camera.rms_px, 2)}{THIN}px · {whole(int(found.count.sum()))} rows · "
             f"{100 * covered.mean():.0f}{THIN}% of the image"
@@ -45,7 +45,7 @@ def residual_maps(calibration: Calibration) -> str:
     arrow = f'<svg viewBox="0 0 40 10" class="sample">{_arrow(4, 5, 4 + 1.15 * cell, 5)}</svg>'
     legend = (
         f'<p class="legend"><span>{arrow}mean residual of {short(unit, figures=1)}{THIN}px '
-        "(seen minus predicted)</span>"
+        "(observed minus predicted)</span>"
         '<span><i class="swatch few"></i>few rows</span><span><i class="swatch many"></i>many rows</span>'
         '<span><i class="swatch none"></i>none</span></p>'
     )
@@ -68,10 +68,10 @@ def _map(name: str, found: measures.ResidualBins, size: tuple[int, int], per_px:
         level = 1 + min(4, int(4.999 * np.log1p(count) / max(most, 1e-9)))
         tip = f"{int(count)} rows, rms {rms:.2f} px, mean ({mean[0]:+.2f}, {mean[1]:+.2f}) px"
         parts.append(rect(x - w / 2, y - h / 2, w, h, f"cell c{level}", tip))
-        if count >= _LEAST_ROWS:
+        if count >= _MIN_ROWS:
             step = mean * per_px
             reach = float(np.hypot(*step))
-            if reach > 2.5 * w:  # a wild bin must not cross the whole map
+            if reach > 2.5 * w:  # an outlier bin must not cross the whole map
                 step = step * (2.5 * w / reach)
             arrows.append(_arrow(x - step[0] / 2, y - step[1] / 2, x + step[0] / 2, y + step[1] / 2))
     parts.append(_cross(size, scale))
@@ -84,7 +84,7 @@ def _cross(size: tuple[int, int], scale: float) -> str:
 
 
 def _arrow(x1: float, y1: float, x2: float, y2: float) -> str:
-    """A shaft with a head whose size follows its length; a dot where it has none."""
+    """An arrow whose head scales with its length; a dot if it is too short."""
     dx, dy = x2 - x1, y2 - y1
     reach = float(np.hypot(dx, dy))
     if reach < 1.5:
@@ -98,16 +98,16 @@ def _arrow(x1: float, y1: float, x2: float, y2: float) -> str:
 
 
 def seen_maps(rows: dict[str, Floats], sizes: dict[str, tuple[int, int]]) -> str:
-    """Where each camera saw the point, as dots; rows: camera time, u, v (n, 3) of each."""
+    """The detections of each camera as dots; rows: camera time, u, v (n, 3) by camera."""
     maps = []
     for name, seen in rows.items():
         size = sizes[name]
         scale = _WIDTH / size[0]
         height = size[1] * scale
         parts = [rect(0.5, 0.5, _WIDTH - 1, height - 1, "image"), _cross(size, scale)]
-        for u, v in seen[measures.thinned(len(seen), _MOST_DOTS), 1:3]:
+        for u, v in seen[measures.thinned_indices(len(seen), _MAX_DOTS), 1:3]:
             parts.append(f'<circle class="seen" cx="{at((u + 0.5) * scale)}" cy="{at((v + 0.5) * scale)}" r="1.6"/>')
-        share = 100 * measures.covered_parts(seen[:, 1:3], size).mean() if len(seen) else 0.0
+        share = 100 * measures.covered_cells(seen[:, 1:3], size).mean() if len(seen) else 0.0
         caption = f"<b>{esc(name)}</b> {whole(len(seen))} rows · {share:.0f}{THIN}% of the image"
         picture = drawing(_WIDTH, height, parts, f"Where {name} saw the point")
         maps.append(f"<figure>{picture}<figcaption>{caption}</figcaption></figure>")

@@ -1,4 +1,4 @@
-"""The numbers behind the report: what was used, where in the image, and who saw the point when."""
+"""Statistics for the report: row usage, image coverage, residual bins, and visibility over time."""
 
 from __future__ import annotations
 
@@ -12,56 +12,56 @@ from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
 COLUMNS, ROWS = 8, 5
-"""The grid in which coverage of an image is counted."""
+"""The grid in which image coverage is counted."""
 SEEN_WITHIN = 0.2
-"""A camera counts as seeing the point for this long around a row [s]."""
+"""The point counts as visible within this time around a row [s]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Usage:
-    """Rows of one camera: how many there were, how many the answer rests on, and the time between two [s]."""
+class RowUsage:
+    """Rows of one camera: total count, count used by the solution, and the frame interval [s]."""
 
     total: int
     used: int
     interval: float
     covered: Bools
-    """(ROWS, COLUMNS): parts of the image in which a used row lies."""
+    """(ROWS, COLUMNS): cells of the image that contain a used row."""
 
     @property
     def share(self) -> float:
-        """Share of the rows that were used."""
+        """Fraction of the rows that were used."""
         return self.used / self.total if self.total else 0.0
 
     @property
     def coverage(self) -> float:
-        """Share of the image's parts that were reached."""
+        """Fraction of the image's cells that are covered."""
         return float(self.covered.mean())
 
 
-def usage(calibration: Calibration, rig: Rig, observations: Observations) -> dict[str, Usage]:
-    """The rows of every solved camera."""
+def row_usage(calibration: Calibration, rig: Rig, observations: Observations) -> dict[str, RowUsage]:
+    """Row statistics of every solved camera."""
     out = {}
     for name in calibration.cameras:
         residuals = calibration.residuals.get(name, np.zeros((0, 5)))
-        times = rows_of(observations, name)[:, 0]
+        times = camera_rows(observations, name)[:, 0]
         size = calibration.cameras[name].intrinsics
-        out[name] = Usage(
+        out[name] = RowUsage(
             total=max(len(times), len(residuals)),
             used=len(residuals),
             interval=frame_interval(rig, observations, name),
-            covered=covered_parts(residuals[:, 1:3], (size.width, size.height)),
+            covered=covered_cells(residuals[:, 1:3], (size.width, size.height)),
         )
     return out
 
 
-def rows_of(observations: Observations, camera: str) -> Floats:
+def camera_rows(observations: Observations, camera: str) -> Floats:
     """Camera time, u, v (n, 3) of all rows of a camera."""
     parts = [np.column_stack([track.time, track.pixels]) for track in observations.of_camera(camera)]
     return np.concatenate(parts) if parts else np.zeros((0, 3))
 
 
 def frame_interval(rig: Rig, observations: Observations, camera: str) -> float:
-    """Seconds between two frames: of the nominal rate, or as the rows come; 0 where unknown."""
+    """Frame interval [s]: from the nominal rate, or the median between rows; 0 if unknown."""
     fps = rig.cameras[camera].fps if camera in rig.cameras else 0.0
     if fps > 0:
         return 1.0 / fps
@@ -69,15 +69,15 @@ def frame_interval(rig: Rig, observations: Observations, camera: str) -> float:
     return float(np.median(np.concatenate(steps))) if steps else 0.0
 
 
-def covered_parts(pixels: Floats, size: tuple[int, int]) -> Bools:
-    """(ROWS, COLUMNS): which parts of the image hold at least one of the pixels (n, 2)."""
+def covered_cells(pixels: Floats, size: tuple[int, int]) -> Bools:
+    """(ROWS, COLUMNS): which cells of the image contain at least one of the pixels (n, 2)."""
     out = np.zeros((ROWS, COLUMNS), dtype=np.bool_)
-    column, row = _parts(pixels, size, COLUMNS, ROWS)
+    column, row = _cell_indices(pixels, size, COLUMNS, ROWS)
     out[row, column] = True
     return out
 
 
-def _parts(pixels: Floats, size: tuple[int, int], columns: int, rows: int) -> tuple[Ints, Ints]:
+def _cell_indices(pixels: Floats, size: tuple[int, int], columns: int, rows: int) -> tuple[Ints, Ints]:
     # OpenCV's pixel centres are whole numbers: the image reaches from -0.5 to size - 0.5.
     column = np.clip(np.floor((pixels[:, 0] + 0.5) / size[0] * columns), 0, columns - 1).astype(np.int64)
     row = np.clip(np.floor((pixels[:, 1] + 0.5) / size[1] * rows), 0, rows - 1).astype(np.int64)
@@ -85,7 +85,7 @@ def _parts(pixels: Floats, size: tuple[int, int], columns: int, rows: int) -> tu
 
 
 def empty_regions(covered: Bools) -> list[str]:
-    """Ninths of the image that were hardly reached, as words."""
+    """Names of the ninths of the image without any covered cell."""
     out = []
     for down, name in zip(np.array_split(np.arange(ROWS), 3), ("top", "middle", "bottom"), strict=True):
         for across, side in zip(np.array_split(np.arange(COLUMNS), 3), ("left", "centre", "right"), strict=True):
@@ -96,7 +96,7 @@ def empty_regions(covered: Bools) -> list[str]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualBins:
-    """Residuals by place in the image: only bins with rows.
+    """Residuals binned by image position: only bins with rows.
 
     centre: (n, 2) [px]. mean: (n, 2) mean residual [px]. rms: (n,) [px]. count: (n,).
     """
@@ -109,18 +109,18 @@ class ResidualBins:
 
     @property
     def systematic(self) -> float:
-        """Share of the squared residuals that the bins' means explain (0..1), bins of 8 rows or more."""
+        """Fraction of the squared residuals explained by the bins' means (0..1), for bins of 8 rows or more."""
         enough = self.count >= 8
         total = float((self.count[enough] * self.rms[enough] ** 2).sum())
-        # A mean of n noisy rows is not zero: that much is expected of it and taken off.
+        # The mean of n noisy rows is not zero: its expected square is subtracted.
         explained = (self.count[enough] * (self.mean[enough] ** 2).sum(axis=1) - self.rms[enough] ** 2).sum()
         return max(float(explained) / total, 0.0) if total > 0 else 0.0
 
 
 def residual_bins(residuals: Floats, size: tuple[int, int], columns: int = 16) -> ResidualBins:
-    """Mean residuals (n, 5: time, u, v, du, dv) over a grid of about square cells."""
+    """Bin residuals (n, 5: time, u, v, du, dv) over a grid of nearly square cells."""
     rows = max(1, round(columns * size[1] / size[0]))
-    column, row = _parts(residuals[:, 1:3], size, columns, rows)
+    column, row = _cell_indices(residuals[:, 1:3], size, columns, rows)
     index, inverse = np.unique(row * columns + column, return_inverse=True)
     count = np.bincount(inverse, minlength=len(index))
     safe = np.maximum(count, 1)
@@ -135,7 +135,7 @@ Span = tuple[float, float]
 
 
 def spans(time: Floats, gap: float = 2 * SEEN_WITHIN) -> list[Span]:
-    """Stretches of time [s] without a longer gap than ``gap``."""
+    """Intervals of time [s] without a gap longer than ``gap``."""
     if not len(time):
         return []
     time = np.sort(time)
@@ -146,7 +146,7 @@ def spans(time: Floats, gap: float = 2 * SEEN_WITHIN) -> list[Span]:
 
 
 def shared_spans(seen: list[list[Span]], at_least: int = 2, reach: float = SEEN_WITHIN) -> list[Span]:
-    """Stretches in which at least so many cameras saw the point within ``reach`` seconds."""
+    """Intervals in which at least ``at_least`` cameras saw the point within ``reach`` seconds."""
     events: list[tuple[float, int]] = []
     for camera in seen:
         for begin, end in camera:
@@ -162,23 +162,23 @@ def shared_spans(seen: list[list[Span]], at_least: int = 2, reach: float = SEEN_
     return out
 
 
-def length(stretches: list[Span]) -> float:
-    """Seconds in all."""
-    return sum(end - begin for begin, end in stretches)
+def total_length(intervals: list[Span]) -> float:
+    """Total duration [s]."""
+    return sum(end - begin for begin, end in intervals)
 
 
 def seen_on_reference(calibration: Calibration, observations: Observations) -> dict[str, list[Span]]:
-    """When each solved camera saw anything, on the reference clock."""
+    """Intervals in which each solved camera has detections, on the reference clock."""
     out = {}
     for name, camera in calibration.cameras.items():
-        time = rows_of(observations, name)[:, 0]
+        time = camera_rows(observations, name)[:, 0]
         clock = camera.time_map
         out[name] = spans(clock.clock_rate * time + clock.time_offset)
     return out
 
 
-def path_share(calibration: Calibration, observations: Observations) -> tuple[float, float]:
-    """Share of the time in which two cameras saw one point that has a path, and that time [s]."""
+def trajectory_coverage(calibration: Calibration, observations: Observations) -> tuple[float, float]:
+    """Fraction of the time in which two cameras saw a point that its trajectory covers, and that time [s]."""
     covered = wanted = 0.0
     tables = {table.label: table for table in calibration.trajectories}
     for label in observations.labels:
@@ -188,20 +188,20 @@ def path_share(calibration: Calibration, observations: Observations) -> tuple[fl
             if track is not None:
                 seen.append(spans(camera.time_map.clock_rate * track.time + camera.time_map.time_offset))
         both = shared_spans(seen)
-        wanted += length(both)
+        wanted += total_length(both)
         if label in tables:
             time = tables[label].time
             step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-            covered += length(shared_spans([both, spans(time, max(0.1, 2.5 * step))], reach=0.0))
+            covered += total_length(shared_spans([both, spans(time, max(0.1, 2.5 * step))], reach=0.0))
     return (covered / wanted if wanted > 0 else 0.0), wanted
 
 
-def up_in_world(calibration: Calibration, rig: Rig) -> Floats:
-    """A unit vector (3,) that points up: told by the rig, else as most cameras are held."""
+def estimate_up(calibration: Calibration, rig: Rig) -> Floats:
+    """Up as a unit vector (3,) in the world frame: from the rig, else the mean up direction of the cameras."""
     levelled = np.array([0.0, -1.0, 0.0])
     poses = {name: camera.pose for name, camera in calibration.cameras.items()}
     if isinstance(rig.up, str) and rig.up in poses:
-        return np.asarray(poses[rig.up].rotation.T @ rig.up_seen_by(rig.up))
+        return np.asarray(poses[rig.up].rotation.T @ rig.up_in_camera(rig.up))
     surveyed = any(camera.rotation is not None or camera.position is not None for camera in rig.cameras.values())
     if rig.up is not None and not isinstance(rig.up, str):
         return rig.up if surveyed else np.array([0.0, 0.0, 1.0])
@@ -209,12 +209,12 @@ def up_in_world(calibration: Calibration, rig: Rig) -> Floats:
     if np.linalg.norm(mean) < 0.2:
         return np.array([0.0, 0.0, 1.0])
     mean = mean / np.linalg.norm(mean)
-    if surveyed and mean[2] > 0.5:  # a surveyed world's z points up almost always
+    if surveyed and mean[2] > 0.5:  # the z axis of a surveyed world almost always points up
         return np.array([0.0, 0.0, 1.0])
     return np.asarray(mean)
 
 
-def thinned(count: int, limit: int) -> Ints:
+def thinned_indices(count: int, limit: int) -> Ints:
     """At most ``limit`` evenly spread indices of ``count``, first and last among them."""
     if count <= limit:
         return np.arange(count)

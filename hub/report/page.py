@@ -1,11 +1,17 @@
-"""The page: verdict first, then the evidence, then where it comes from. One file that opens offline."""
+"""The HTML page of report.html: quality assessment, figures and tables, provenance. One file that opens offline."""
 
 from __future__ import annotations
 
 from hub.report import convergence, image_maps, measures, pair_graph, scene, tables, time_figures
-from hub.report.convergence import Step
-from hub.report.measures import Usage
-from hub.report.quality_assessment import UNIT_WORDS, Verdict, half_interval_ms, judge, judge_refusal
+from hub.report.convergence import OffsetStdSample
+from hub.report.measures import RowUsage
+from hub.report.quality_assessment import (
+    UNIT_WORDS,
+    QualityAssessment,
+    assess_quality,
+    assess_refusal,
+    half_interval_ms,
+)
 from hub.report.style import STYLE
 from hub.report.svg import THIN, esc, number, short, whole
 from protocols.core.errors import Refused
@@ -14,33 +20,33 @@ from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
-# The page forbids itself to load anything: what it needs is in it.
+# The page forbids loading any resource: it is self-contained.
 _POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline' 'unsafe-eval'; "
     "img-src data: blob:; font-src data:; worker-src blob:"
 )
 
-_WORDS = (
+_GLOSSARY = (
     (
         "Clock offset and rate",
         "Reference time = rate × camera time + offset. A rate 100 ppm above 1 gains 6 ms a minute.",
     ),
     (
         "± (95 %)",
-        "The true value lies within this of the told one in 95 of 100 cases, if the residuals are what they seem.",
+        "95 % interval: the true value is within this of the estimate in 95 of 100 cases, if the noise model holds.",
     ),
     (
         "Lag of a pair",
-        "The first camera’s clock less the second’s at one instant, in the middle of the time both saw the point.",
+        "The first camera’s clock minus the second’s, in the middle of the time in which both saw the point.",
     ),
     (
         "Residual",
-        "The distance in the image between where the point was seen and where the solved path and camera put it.",
+        "Reprojection error: the image distance between a detection and the projection of the trajectory.",
     ),
-    ("rms", "Root mean square: the size that counts large residuals more."),
+    ("rms", "Root mean square."),
     (
         "First baseline",
-        "The distance between the first two cameras; the unit of length where nothing of known size was given.",
+        "The distance between the first two cameras; the unit of length if no distance or position was given.",
     ),
 )
 
@@ -50,12 +56,12 @@ def build_report(
     rig: Rig,
     observations: Observations,
     command: str = "",
-    history: tuple[Step, ...] = (),
+    history: tuple[OffsetStdSample, ...] = (),
 ) -> str:
     """report.html: one file, no more than 6 MB, that loads nothing; the same input gives the same bytes.
 
-    outcome: the calibration, or the refusal that was raised instead of one. command: as it was typed. history: what a
-    live hub answered on the way, of a log.
+    outcome: the calibration, or the refusal that was raised instead. command: the command line. history: the offset
+    stds of a live hub's calibrations over a log.
     """
     if isinstance(outcome, Refused):
         return _refusal_page(outcome, rig, observations, command)
@@ -63,24 +69,24 @@ def build_report(
 
 
 def _calibration_page(
-    calibration: Calibration, rig: Rig, observations: Observations, command: str, history: tuple[Step, ...]
+    calibration: Calibration, rig: Rig, observations: Observations, command: str, history: tuple[OffsetStdSample, ...]
 ) -> str:
-    used = measures.usage(calibration, rig, observations)
-    verdict = judge(calibration, rig, observations, used)
-    drawn = scene.build_scene(calibration, rig)
-    counts = {name: len(measures.rows_of(observations, name)) for name in calibration.refused}
+    used = measures.row_usage(calibration, rig, observations)
+    assessment = assess_quality(calibration, rig, observations, used)
+    drawn = scene.build_rig_figure(calibration, rig)
+    counts = {name: len(measures.camera_rows(observations, name)) for name in calibration.refused}
     several = f" over {len(calibration.trajectories)} points" if len(calibration.trajectories) > 1 else ""
     parts = [
-        _verdict(verdict, _key_figures(calibration, rig, observations, used)),
+        _assessment_section(assessment, _key_figures(calibration, rig, observations, used)),
         _section("Cameras", "", tables.cameras(calibration, used)),
         _section(
             "Refused cameras",
-            "These have no table in calibration.toml; the others do not suffer from it.",
+            "These have no table in calibration.toml; the other cameras are not affected.",
             tables.refused(calibration.refused, counts) if calibration.refused else "",
         ),
         _section(
             "Clock offsets",
-            "How sharply each camera’s clock is known: the dot is the estimate, the bar its 95 % interval.",
+            "Uncertainty of each camera’s time offset: the dot is the estimate, the bar its 95 % interval.",
             "" if rig.shared_clock else time_figures.offset_intervals(calibration, used),
         ),
         _section(
@@ -90,32 +96,32 @@ def _calibration_page(
         ),
         _section(
             "Pairs",
-            "Every pair of cameras is solved by itself first, then checked against the others round every loop.",
+            "Every pair of cameras is solved separately, then checked for consistency with the others around loops.",
             _pairs(calibration),
         ),
         _section(
             "Scene",
-            f"Where the cameras stand and how the point moved{several}. Drag to turn, scroll to come nearer; "
-            "the path begins at the circle and ends at the diamond.",
+            f"Camera poses and the trajectory of the point{several}. Drag to rotate, scroll to zoom; "
+            "the trajectory starts at the circle and ends at the diamond.",
             f'<div class="frame screen"><div id="{scene.DIV}"></div></div>{scene.plan_and_side(drawn)}',
         ),
         _section(
             "Residuals in the image",
-            "Arrows that point every way are noise; neighbours that agree tell of a lens that is not quite known.",
+            "Arrows in random directions are noise; neighbouring arrows that agree indicate inaccurate intrinsics.",
             image_maps.residual_maps(calibration),
         ),
         _section(
             "Residuals over time",
-            "The line is the median in pixels, the band holds the middle 80 %. A step tells of a bumped camera, "
-            "a slope of a clock that changes its rate.",
+            "The line is the median in pixels, the band the 10 to 90 % range. A step indicates a moved camera, "
+            "a slope a clock whose rate changes.",
             time_figures.residuals_over_time(calibration),
         ),
         _section(
-            "Who saw the point when",
-            "Only where two or more cameras see the point at once is there anything to measure.",
+            "Visibility of the point",
+            "Only times at which two or more cameras see the point contribute to the calibration.",
             time_figures.time_line(calibration, observations),
         ),
-        _words(),
+        _glossary(),
     ]
     facts = {
         "Syncline": calibration.version,
@@ -123,55 +129,55 @@ def _calibration_page(
         "Reference clock": calibration.reference,
         "Lengths": calibration.units if calibration.scale == "metric" else "arbitrary: the first baseline is 1",
     }
-    parts.append(_section("Where this comes from", "", tables.provenance(facts, rig, command)))
-    return _document("Calibration report", verdict, parts, scene.scene_script(drawn))
+    parts.append(_section("Provenance", "", tables.provenance(facts, rig, command)))
+    return _document("Calibration report", assessment, parts, scene.rig_figure_script(drawn))
 
 
 def _refusal_page(refused: Refused, rig: Rig, observations: Observations, command: str) -> str:
-    verdict = judge_refusal(refused, rig)
-    rows = {name: measures.rows_of(observations, name) for name in rig.cameras}
+    assessment = assess_refusal(refused, rig)
+    rows = {name: measures.camera_rows(observations, name) for name in rig.cameras}
     sizes = {name: camera.size for name, camera in rig.cameras.items()}
-    told = {name: refused.cameras.get(name, "") for name in rig.cameras}
-    reasons = {name: reason or "no reason of its own: see above" for name, reason in told.items()}
+    reasons_by_camera = {name: refused.cameras.get(name, "") for name in rig.cameras}
+    reasons = {name: reason or "no separate reason: see above" for name, reason in reasons_by_camera.items()}
     seen = {name: part for name, part in rows.items() if len(part)}
     parts = [
-        _verdict(verdict, ""),
+        _assessment_section(assessment, ""),
         _section(
             "Cameras",
-            "What each camera gave, why it could not be tied to another, and what helps.",
+            "The rows of each camera, why it could not be connected to another, and what to do.",
             tables.refused(reasons, {name: len(part) for name, part in rows.items()}),
         ),
         _section(
             "Pairs",
-            "What could be told of two cameras by themselves: these lags hold, only places and paths are missing.",
+            "Results of camera pairs: these lags are valid, only poses and trajectories are missing.",
             tables.pairs(refused) if any(pair.status == "ok" for pair in refused.pairs) else "",
         ),
         _section(
             "When each camera saw the point",
-            "The clocks are not known, so each row starts at the camera’s own first observation.",
+            "The clocks are unknown, so each row starts at the camera’s own first observation.",
             time_figures.own_time_lines(rows),
         ),
         _section(
             "Where each camera saw the point",
-            "Motion that crosses much of every image, at different depths, ties cameras together best.",
+            "Motion across most of every image, at different depths, constrains the calibration best.",
             image_maps.seen_maps(seen, sizes) if seen else "",
         ),
-        _section("Where this comes from", "", tables.provenance({"Syncline": VERSION}, rig, command)),
+        _section("Provenance", "", tables.provenance({"Syncline": VERSION}, rig, command)),
     ]
-    return _document("Calibration refused", verdict, parts, "")
+    return _document("Calibration refused", assessment, parts, "")
 
 
-def _key_figures(calibration: Calibration, rig: Rig, observations: Observations, used: dict[str, Usage]) -> str:
+def _key_figures(calibration: Calibration, rig: Rig, observations: Observations, used: dict[str, RowUsage]) -> str:
     total = len(calibration.cameras) + len(calibration.refused)
     others = [camera for name, camera in calibration.cameras.items() if name != calibration.reference]
-    share, seconds = measures.path_share(calibration, observations)
+    share, seconds = measures.trajectory_coverage(calibration, observations)
     keys = [(f"{len(calibration.cameras)}{THIN}/{THIN}{total}", "cameras solved")]
     if others and not rig.shared_clock:
         worst = max(others, key=half_interval_ms)
         keys.append(
             (
                 f"± {short(half_interval_ms(worst), figures=2)}{THIN}ms",
-                f"widest clock interval ({worst.name}, 95{THIN}%)",
+                f"largest time offset interval ({worst.name}, 95{THIN}%)",
             )
         )
     rows = sum(part.used for part in used.values())
@@ -180,9 +186,12 @@ def _key_figures(calibration: Calibration, rig: Rig, observations: Observations,
         keys.append((f"{number((square / rows) ** 0.5, 2)}{THIN}px", f"rms residual of {whole(rows)} rows"))
     if seconds > 0:
         time = f"the {short(seconds)} s" if len(calibration.trajectories) < 2 else "the time"
-        keys.append((f"{100 * share:.0f}{THIN}%", f"of {time} that two cameras saw has a 3-D path"))
+        keys.append((f"{100 * share:.0f}{THIN}%", f"of {time} that two cameras saw has a 3-D trajectory"))
     keys.append(
-        (UNIT_WORDS.get(calibration.units, calibration.units), "unit of length, from the rig’s references")
+        (
+            UNIT_WORDS.get(calibration.units, calibration.units),
+            "unit of length, from the rig’s control points or distances",
+        )
         if calibration.scale == "metric"
         else ("arbitrary", "scale (timing is not affected)")
     )
@@ -191,32 +200,33 @@ def _key_figures(calibration: Calibration, rig: Rig, observations: Observations,
     )
 
 
-def _verdict(verdict: Verdict, keys: str) -> str:
+def _assessment_section(assessment: QualityAssessment, keys: str) -> str:
     def listed(level: str) -> str:
-        items = [f'<li class="{f.level}">{tables.code(f.text)}</li>' for f in verdict.findings if f.level == level]
+        items = [f'<li class="{f.level}">{tables.code(f.text)}</li>' for f in assessment.findings if f.level == level]
         return "".join(items)
 
     not_good, good = listed("attention") + listed("note"), listed("good")
     columns = []
     if good:
-        columns.append(f'<div><h3>What is good</h3><ul class="findings">{good}</ul></div>')
-    heading = "Why" if verdict.level == "refused" else "What to know" if not listed("attention") else "What isn’t"
+        columns.append(f'<div><h3>Good</h3><ul class="findings">{good}</ul></div>')
+    heading = "Why" if assessment.level == "refused" else "Problems" if listed("attention") else "Notes"
     if not_good:
         columns.append(f'<div><h3>{heading}</h3><ul class="findings">{not_good}</ul></div>')
-    todo = "".join(f"<li>{tables.code(_capital(text))}</li>" for text in verdict.todo)
+    todo = "".join(f"<li>{tables.code(_capital(text))}</li>" for text in assessment.actions)
     todo = f'<h3>What to do</h3><ol class="todo">{todo}</ol>' if todo else "<h3>What to do</h3><p>Nothing.</p>"
-    if verdict.level == "refused":
+    if assessment.level == "refused":
         columns.append(f"<div>{todo}</div>")
         todo = ""
     return (
-        f'<section class="verdict {verdict.level}"><h1>{esc(verdict.headline)}</h1>'
-        f'<p class="lead">{esc(verdict.summary)}</p>{keys}<div class="columns">{"".join(columns)}</div>{todo}</section>'
+        f'<section class="assessment {assessment.level}"><h1>{esc(assessment.headline)}</h1>'
+        f'<p class="lead">{esc(assessment.summary)}</p>{keys}'
+        f'<div class="columns">{"".join(columns)}</div>{todo}</section>'
     )
 
 
 def _pairs(calibration: Calibration) -> str:
     listed = tables.pairs(calibration)
-    drawn = pair_graph.pair_graph(calibration)
+    drawn = pair_graph.draw_pair_graph(calibration)
     if not drawn:
         return listed
     legend = pair_graph.legend(calibration)
@@ -225,31 +235,31 @@ def _pairs(calibration: Calibration) -> str:
     return f'{legend}<div class="graph"><div>{drawn}</div><div>{listed}</div></div>'
 
 
-def _convergence(calibration: Calibration, rig: Rig, history: tuple[Step, ...]) -> str:
-    steps = convergence.adjustment(calibration.convergence)
-    clocks = "" if rig.shared_clock else convergence.convergence(history, calibration.reference)
+def _convergence(calibration: Calibration, rig: Rig, history: tuple[OffsetStdSample, ...]) -> str:
+    steps = convergence.adjustment_history(calibration.convergence)
+    clocks = "" if rig.shared_clock else convergence.offset_std_history(history, calibration.reference)
     return "".join(
         f'<p class="lead">{lead}</p>{figure}'
         for lead, figure in (
             (
-                "The misfit after every step of the adjustment, in pixels: it falls, and ends level. Where it jumps "
-                "between steps, rows and noise were weighed anew.",
+                "Residual after each step of the bundle adjustment in pixels; it should fall and level off. Where it "
+                "jumps between steps, rows and noise were reweighted.",
                 steps,
             ),
-            ("The std of each clock after every answer of the hub, as the recording went on.", clocks),
+            ("Std of each camera’s time offset after every calibration of the hub, over the recording.", clocks),
         )
         if figure
     )
 
 
-def _words() -> str:
-    items = "".join(f"<dt>{esc(word)}</dt><dd>{esc(meaning)}</dd>" for word, meaning in _WORDS)
-    inner = f'<details><summary>What the words mean</summary><dl class="words">{items}</dl></details>'
+def _glossary() -> str:
+    items = "".join(f"<dt>{esc(word)}</dt><dd>{esc(meaning)}</dd>" for word, meaning in _GLOSSARY)
+    inner = f'<details><summary>Glossary</summary><dl class="words">{items}</dl></details>'
     return f'<section class="screen">{inner}</section>'
 
 
 def _section(title: str, lead: str, content: str) -> str:
-    """A section, or nothing where it has no content."""
+    """A section, or "" without content."""
     if not content:
         return ""
     lead = f'<p class="lead">{esc(lead)}</p>' if lead else ""
@@ -257,14 +267,14 @@ def _section(title: str, lead: str, content: str) -> str:
 
 
 def _capital(text: str) -> str:
-    # A camera's name stays as it is written.
+    # A leading camera name is not capitalised.
     return text if ":" in text.split(" ")[0] else text[:1].upper() + text[1:]
 
 
-def _document(title: str, verdict: Verdict, parts: list[str], script: str) -> str:
+def _document(title: str, assessment: QualityAssessment, parts: list[str], script: str) -> str:
     scripts = ""
     if script:
-        from plotly.offline import get_plotlyjs  # 50 ms and 5 MB that only a report needs
+        from plotly.offline import get_plotlyjs  # imported here: it costs 50 ms and 5 MB
 
         scripts = f"<script>{get_plotlyjs()}</script>\n<script>{script}</script>\n"
     body = "\n".join(part for part in parts if part)
@@ -272,7 +282,7 @@ def _document(title: str, verdict: Verdict, parts: list[str], script: str) -> st
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{esc(verdict.headline)} · Syncline</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        f"<title>{esc(assessment.headline)} · Syncline</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
         f'<header class="top"><b>Syncline</b><span>{esc(title)}</span></header>\n'
         f"<main>\n{body}\n</main>\n{scripts}</body>\n</html>\n"
     )

@@ -1,62 +1,63 @@
-"""The pair graph: cameras as nodes, every pair that was tried as an edge that reads without colour."""
+"""The pair graph: cameras as nodes, tried pairs as edges, readable without colour; a matrix for many cameras."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from hub.report.quality_assessment import contradicts
+from hub.report.quality_assessment import is_contradicting
 from hub.report.svg import THIN, at, drawing, esc, line, number, rect, text
 from protocols.core.errors import Refused
-from protocols.session.calibration import Calibration, PairReport
+from protocols.core.pair_report import PairReport
+from protocols.session.calibration import Calibration
 
-_MOST_LABELS = 15  # more lags than this would cover each other
-_MOST_NODES = 8  # beyond, edges are a ball of wool and a matrix reads better
+_MAX_LABELS = 15  # more labels than this would overlap
+_MAX_NODES = 8  # beyond, a matrix is more readable
 
 
 def edge_kind(outcome: Calibration | Refused, pair: PairReport) -> str:
     """ "agrees", "contradicts" or "refused"."""
     if pair.status != "ok":
         return "refused"
-    return "contradicts" if contradicts(outcome, pair) else "agrees"
+    return "contradicts" if is_contradicting(outcome, pair) else "agrees"
 
 
-def pair_graph(calibration: Calibration) -> str:
-    """A drawing of all cameras and pairs, with lags on the edges where there is room; "" without pairs."""
+def draw_pair_graph(calibration: Calibration) -> str:
+    """SVG of all cameras and pairs, with lags on the edges where there is room; "" without pairs."""
     names = [*calibration.cameras, *calibration.refused]
     pairs = [pair for pair in calibration.pairs if pair.cameras[0] in names and pair.cameras[1] in names]
     if not pairs:
         return ""
-    if len(names) > _MOST_NODES:
+    if len(names) > _MAX_NODES:
         return _matrix(calibration, names, pairs)
     width, height = 480.0, 380.0 if len(names) > 2 else 150.0
-    place = _places(len(names), width, height)
+    place = _node_positions(len(names), width, height)
     parts: list[str] = []
     labels: list[str] = []
-    tied = [pair for pair in pairs if edge_kind(calibration, pair) != "refused"]
+    connected = [pair for pair in pairs if edge_kind(calibration, pair) != "refused"]
     for pair in pairs:
         i, j = names.index(pair.cameras[0]), names.index(pair.cameras[1])
         kind = edge_kind(calibration, pair)
         (x1, y1), (x2, y2) = place[i], place[j]
         tip = f"{pair.cameras[0]}–{pair.cameras[1]}: {pair.status}"
         parts.append(f"<g><title>{esc(tip)}</title>{line(x1, y1, x2, y2, f'edge {kind}')}</g>")
-        if kind != "refused" and pair.lag_s is not None and len(tied) <= _MOST_LABELS:
+        if kind != "refused" and pair.lag_s is not None and len(connected) <= _MAX_LABELS:
             share = _label_share(abs(i - j), len(names))
             x, y = x1 + share * (x2 - x1), y1 + share * (y2 - y1)
             lag = f"{number(pair.lag_s, 3, sign=True)}{THIN}s"
             half = 3.9 * len(lag) + 3
             labels.append(rect(x - half, y - 10, 2 * half, 20, "paper") + text(x, y + 4.5, lag, "", "middle"))
     nodes = [_node(name, *place[i], name in calibration.refused) for i, name in enumerate(names)]
-    told = f"{len(tied)} of {len(pairs)} pairs of {len(names)} cameras were tied together"
-    return drawing(width, height, [*parts, *labels, *nodes], told, most=width)
+    label = f"{len(connected)} of {len(pairs)} pairs of {len(names)} cameras were connected"
+    return drawing(width, height, [*parts, *labels, *nodes], label, max_width=width)
 
 
 def is_matrix(calibration: Calibration) -> bool:
-    """Whether there are so many cameras that pairs are shown as a matrix."""
-    return len(calibration.cameras) + len(calibration.refused) > _MOST_NODES
+    """Whether pairs are shown as a matrix, because there are many cameras."""
+    return len(calibration.cameras) + len(calibration.refused) > _MAX_NODES
 
 
 def _matrix(calibration: Calibration, names: list[str], pairs: list[PairReport]) -> str:
-    """A sign for every pair: a disc agrees, a crossed disc contradicts, a small ring was not tied."""
+    """One sign per pair: a disc is consistent, a cross is a rejected outlier, a small ring is not connected."""
     cell = 30.0 if len(names) <= 25 else 18.0
     left = 8.0 * max(len(name) for name in names) + 14
     size = cell * len(names)
@@ -77,8 +78,8 @@ def _matrix(calibration: Calibration, names: list[str], pairs: list[PairReport])
             x, y = left + cell * (column + 0.5), 10 + cell * (row + 0.5)
             parts.append(f"<g>{tip}{_sign(kind, x, y, 0.27 * cell)}</g>")
     wide = left + size + 10
-    told = f"How {len(pairs)} pairs of {len(names)} cameras were judged"
-    return drawing(wide, size + left + 20, parts, told, most=wide)
+    label = f"Results of {len(pairs)} pairs of {len(names)} cameras"
+    return drawing(wide, size + left + 20, parts, label, max_width=wide)
 
 
 def _sign(kind: str, x: float, y: float, radius: float) -> str:
@@ -90,10 +91,10 @@ def _sign(kind: str, x: float, y: float, radius: float) -> str:
     return f"{cross}{line(x - radius, y + radius, x + radius, y - radius, 'clash')}"
 
 
-def _places(count: int, width: float, height: float) -> list[tuple[float, float]]:
+def _node_positions(count: int, width: float, height: float) -> list[tuple[float, float]]:
     if count == 2:
         return [(90.0, height / 2), (width - 90.0, height / 2)]
-    # A square stands on its side so that its edges are level; other figures stand on a side's middle.
+    # For an even number of nodes the polygon is rotated by half a step, so that its edges are level.
     turn = -np.pi / 2 - (np.pi / count if count % 2 == 0 else 0.0) + 2 * np.pi * np.arange(count) / count
     across, down = np.cos(turn), np.sin(turn)
     x = width / 2 + (width / 2 - 60) * across / np.abs(across).max()
@@ -101,9 +102,9 @@ def _places(count: int, width: float, height: float) -> list[tuple[float, float]
     return [(float(a), float(b)) for a, b in zip(x, y, strict=True)]
 
 
-def _label_share(apart: int, count: int) -> float:
-    """Where on an edge its lag stands: chords that cross in the middle carry it to one side."""
-    return 0.5 if count < 4 or apart in (1, count - 1) else 0.3
+def _label_share(separation: int, count: int) -> float:
+    """Position of the lag label along an edge: off-centre for chords, which cross in the middle."""
+    return 0.5 if count < 4 or separation in (1, count - 1) else 0.3
 
 
 def _node(name: str, x: float, y: float, refused: bool) -> str:
@@ -117,12 +118,12 @@ def _node(name: str, x: float, y: float, refused: bool) -> str:
 
 
 def legend(calibration: Calibration) -> str:
-    """What the kinds of lines or signs mean."""
+    """Legend of the line styles or signs."""
     matrix = is_matrix(calibration)
     kinds = (
-        ("agrees", "agrees with the others"),
-        ("contradicts", "set aside: contradicts the others"),
-        ("refused", "not tied"),
+        ("agrees", "consistent with the others"),
+        ("contradicts", "rejected as outlier: contradicts the others"),
+        ("refused", "not connected"),
     )
     parts = []
     for kind, words in kinds:

@@ -1,4 +1,4 @@
-"""The verdict on a calibration: what is good, what isn't, and what to do about it."""
+"""Quality assessment of a calibration for the report: findings by severity, and recommended actions."""
 
 from __future__ import annotations
 
@@ -7,25 +7,26 @@ from dataclasses import dataclass
 from typing import Literal
 
 from hub.report import measures
-from hub.report.measures import Usage
+from hub.report.measures import RowUsage
 from hub.report.remedies import remedy_for
 from hub.report.svg import THIN, number, short
 from protocols.core.errors import Refused
-from protocols.session.calibration import Calibration, CameraCalibration, PairReport
+from protocols.core.pair_report import PairReport
+from protocols.session.calibration import Calibration, CameraCalibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
 Level = Literal["good", "note", "attention"]
 
 INTERVAL_95 = 1.96
-"""Standard deviations to either side that hold 95 % of a normal distribution."""
+"""Half width of the 95 % interval of a normal distribution, in standard deviations."""
 
-_EXACT_MS = 2.0  # half a 95 % interval that is good whatever the frame rate
+_GOOD_MS = 2.0  # half of a 95 % interval that is good at any frame rate
 _GOOD_SHARE_OF_FRAME, _POOR_SHARE_OF_FRAME = 0.05, 0.25
-_SLOW_PPM, _WRONG_PPM = 300.0, 2000.0  # crystals drift by 50 ppm; nominal frame rates lie by 1000
-_WRONG_RATE_PPM = 10_000.0  # and these are no clocks but frame numbers
+_SLOW_PPM, _WRONG_PPM = 300.0, 2000.0  # crystals drift by 50 ppm; nominal frame rates are off by up to 1000
+_WRONG_RATE_PPM = 10_000.0  # beyond this the times are frame numbers, not a clock
 _GOOD_PX_AT_1920 = 1.5
-_LENS_SHARE = 0.4  # of the squared residuals that the place in the image explains
+_LENS_SHARE = 0.4  # of the squared residuals that the image position explains
 _FEW_ROWS, _VERY_FEW_ROWS = 0.7, 0.5
 _LITTLE_COVERAGE = 0.25
 UNIT_WORDS = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
@@ -33,37 +34,39 @@ _GOOD_PATH, _POOR_PATH = 0.97, 0.9
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing that was judged. todo: what to do about it, "" where nothing need be done."""
+class QualityFinding:
+    """One finding of the assessment. action: what to do about it, "" = nothing."""
 
     level: Level
     text: str
-    todo: str = ""
+    action: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
-    """The headline, its level ("good", "attention" or "refused"), a sentence, and the findings in order."""
+class QualityAssessment:
+    """Overall level ("good", "attention" or "refused"), headline, one-sentence summary, and findings in order."""
 
     level: Literal["good", "attention", "refused"]
     headline: str
     summary: str
-    findings: tuple[Finding, ...]
+    findings: tuple[QualityFinding, ...]
 
-    def of(self, level: Level) -> list[Finding]:
+    def of(self, level: Level) -> list[QualityFinding]:
         """The findings of one level."""
         return [finding for finding in self.findings if finding.level == level]
 
     @property
-    def todo(self) -> list[str]:
-        """What to do, most urgent first, each once."""
+    def actions(self) -> list[str]:
+        """Recommended actions, most urgent first, without duplicates."""
         ordered = [*self.of("attention"), *self.of("note"), *self.of("good")]
-        return list(dict.fromkeys(finding.todo for finding in ordered if finding.todo))
+        return list(dict.fromkeys(finding.action for finding in ordered if finding.action))
 
 
-def judge(calibration: Calibration, rig: Rig, observations: Observations, used: dict[str, Usage]) -> Verdict:
-    """The verdict on a solved session."""
-    findings: list[Finding] = []
+def assess_quality(
+    calibration: Calibration, rig: Rig, observations: Observations, used: dict[str, RowUsage]
+) -> QualityAssessment:
+    """Assess a solved session."""
+    findings: list[QualityFinding] = []
     findings += _cameras(calibration, rig)
     findings += _timing(calibration, rig, used)
     findings += _rates(calibration, rig)
@@ -72,33 +75,33 @@ def judge(calibration: Calibration, rig: Rig, observations: Observations, used: 
     findings += _image(used)
     findings += _path(calibration, observations)
     findings += _scale(calibration)
-    findings += [Finding("attention", _sentence(text), _warning_todo(text)) for text in calibration.warnings]
-    findings += [Finding("note", _sentence(text)) for text in observations.warnings]
+    findings += [QualityFinding("attention", _sentence(text), _warning_action(text)) for text in calibration.warnings]
+    findings += [QualityFinding("note", _sentence(text)) for text in observations.warnings]
     count, total = len(calibration.cameras), len(calibration.cameras) + len(calibration.refused)
     troubled = any(finding.level == "attention" for finding in findings)
     solved = f"all {count} cameras" if count == total else f"{count} of {total} cameras"
-    return Verdict(
+    return QualityAssessment(
         level="attention" if troubled else "good",
         headline=f"Usable with care: {solved} calibrated" if troubled else f"Good: {solved} calibrated",
-        summary="Timing and poses were found, but look at the points marked “!” before you rely on them."
+        summary="Timing and poses were estimated, but check the points marked “!” before you rely on them."
         if troubled
-        else "Timing and poses are consistent with everything that the cameras saw.",
+        else "Timing and poses are consistent with all observations.",
         findings=tuple(findings),
     )
 
 
-def judge_refusal(refused: Refused, rig: Rig) -> Verdict:
-    """The verdict where no two cameras could be tied together."""
-    findings = [Finding("attention", _sentence(refused.reason), remedy_for(refused.reason))]
+def assess_refusal(refused: Refused, rig: Rig) -> QualityAssessment:
+    """Assess a session in which no two cameras could be connected."""
+    findings = [QualityFinding("attention", _sentence(refused.reason), remedy_for(refused.reason))]
     for name in rig.cameras:
         if name in refused.cameras:
             reason = refused.cameras[name]
-            findings.append(Finding("attention", f"{name}: {reason}.", remedy_for(reason)))
-    findings += [Finding("attention", _sentence(text), _warning_todo(text)) for text in refused.warnings]
-    return Verdict(
+            findings.append(QualityFinding("attention", f"{name}: {reason}.", remedy_for(reason)))
+    findings += [QualityFinding("attention", _sentence(text), _warning_action(text)) for text in refused.warnings]
+    return QualityAssessment(
         "refused",
-        "Refused: there is no trustworthy answer in this session",
-        "No calibration was written: a wrong one would be worse than none. Here is why, and what to change.",
+        "Refused: there is no trustworthy result in this session",
+        "No calibration was written, because it would not be reliable. The reasons and remedies are listed below.",
         tuple(findings),
     )
 
@@ -112,8 +115,8 @@ def _ppm(camera: CameraCalibration) -> float:
     return 1e6 * (camera.time_map.clock_rate - 1.0)
 
 
-def contradicts(outcome: Calibration | Refused, pair: PairReport) -> bool:
-    """Whether the pair was set aside because the others contradict it."""
+def is_contradicting(outcome: Calibration | Refused, pair: PairReport) -> bool:
+    """Whether the pair was rejected as an outlier, because the others contradict it."""
     names = {f"{pair.cameras[0]}–{pair.cameras[1]}", f"{pair.cameras[1]}–{pair.cameras[0]}"}
     return any("contradicts" in text and any(name in text for name in names) for text in outcome.warnings)
 
@@ -126,76 +129,78 @@ def _listed(names: list[str]) -> str:
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
 
 
-def _cameras(calibration: Calibration, rig: Rig) -> list[Finding]:
+def _cameras(calibration: Calibration, rig: Rig) -> list[QualityFinding]:
     if not calibration.refused:
-        return [Finding("good", f"Every camera could be tied in: {_listed(list(calibration.cameras))}.")]
+        return [QualityFinding("good", f"Every camera is connected: {_listed(list(calibration.cameras))}.")]
     return [
-        Finding("attention", f"{name} was refused: {reason.rstrip('.')}.", f"{name}: {remedy_for(reason)}")
+        QualityFinding("attention", f"{name} was refused: {reason.rstrip('.')}.", f"{name}: {remedy_for(reason)}")
         for name, reason in calibration.refused.items()
     ]
 
 
-def _timing(calibration: Calibration, rig: Rig, used: dict[str, Usage]) -> list[Finding]:
+def _timing(calibration: Calibration, rig: Rig, used: dict[str, RowUsage]) -> list[QualityFinding]:
     if rig.shared_clock:
-        return [Finding("good", "The cameras share one clock, as the rig says: no offsets were sought.")]
+        return [
+            QualityFinding("good", "The cameras share one clock according to the rig: no time offsets were estimated.")
+        ]
     others = [camera for name, camera in calibration.cameras.items() if name != calibration.reference]
-    # A clock at an impossible rate is told of below; its interval means nothing.
-    sane = [camera for camera in others if abs(_ppm(camera)) <= _WRONG_PPM]
-    out: list[Finding] = []
+    # A clock with an implausible rate is reported in `_rates`; its interval is meaningless.
+    plausible = [camera for camera in others if abs(_ppm(camera)) <= _WRONG_PPM]
+    out: list[QualityFinding] = []
     worst = 0.0
-    for camera in sane:
+    for camera in plausible:
         half, interval = half_interval_ms(camera), 1e3 * used[camera.name].interval
-        if half <= max(_EXACT_MS, _GOOD_SHARE_OF_FRAME * interval):
+        if half <= max(_GOOD_MS, _GOOD_SHARE_OF_FRAME * interval):
             worst = max(worst, half)
             continue
         poor = interval <= 0 or half > _POOR_SHARE_OF_FRAME * interval
         of_frame = f", {100 * half / interval:.0f} % of a frame" if interval > 0 else ""
         out.append(
-            Finding(
+            QualityFinding(
                 "attention" if poor else "note",
-                f"{camera.name} fires within ±{THIN}{short(half, figures=2)}{THIN}ms of what is told "
-                f"(95{THIN}%){of_frame}: that is not sharp.",
+                f"{camera.name}: the time offset is known to ±{THIN}{short(half, figures=2)}{THIN}ms only "
+                f"(95{THIN}%){of_frame}: that is imprecise.",
                 f"{camera.name}: record longer while the point moves fast and changes direction in its view.",
             )
         )
-    if not out and sane:
-        who = "Clocks are" if len(sane) == len(others) else "The other clocks are"
-        told = f"{who} known to ±{THIN}{short(worst, figures=2)}{THIN}ms or better (95{THIN}%)."
-        out.append(Finding("good", told))
+    if not out and plausible:
+        subject = "Clocks are" if len(plausible) == len(others) else "The other clocks are"
+        text = f"{subject} known to ±{THIN}{short(worst, figures=2)}{THIN}ms or better (95{THIN}%)."
+        out.append(QualityFinding("good", text))
     return out
 
 
-def _rates(calibration: Calibration, rig: Rig) -> list[Finding]:
+def _rates(calibration: Calibration, rig: Rig) -> list[QualityFinding]:
     if rig.shared_clock:
         return []
     out = []
     for name, camera in calibration.cameras.items():
         ppm = _ppm(camera)
         if abs(ppm) > _WRONG_RATE_PPM:
-            continue  # a warning of the solver tells it
+            continue  # reported by a warning of the solver
         if abs(ppm) > _WRONG_PPM:
             out.append(
-                Finding(
+                QualityFinding(
                     "attention",
                     f"{name}’s clock runs {number(ppm, 0, sign=True)}{THIN}ppm against {calibration.reference}’s: "
-                    "hardly a clock does that.",
+                    "implausible for a clock.",
                     f"{name}: check its fps and that its times are those of capture; if they are, record longer.",
                 )
             )
         elif abs(ppm) > _SLOW_PPM:
             out.append(
-                Finding(
+                QualityFinding(
                     "note",
                     f"{name}’s clock runs {number(ppm, 0, sign=True)}{THIN}ppm against {calibration.reference}’s "
                     f"({short(abs(ppm) * 0.06, figures=2)}{THIN}ms a minute): its nominal frame rate is a little off. "
-                    "The answer allows for it.",
+                    "The calibration accounts for it.",
                 )
             )
     return out
 
 
-def _pixels(calibration: Calibration, used: dict[str, Usage]) -> list[Finding]:
-    out: list[Finding] = []
+def _pixels(calibration: Calibration, used: dict[str, RowUsage]) -> list[QualityFinding]:
+    out: list[QualityFinding] = []
     fine = []
     for name, camera in calibration.cameras.items():
         lens = camera.intrinsics
@@ -204,12 +209,12 @@ def _pixels(calibration: Calibration, used: dict[str, Usage]) -> list[Finding]:
         if camera.rms_px > limit:
             level: Level = "attention" if camera.rms_px > 2 * limit else "note"
             out.append(
-                Finding(
+                QualityFinding(
                     level,
                     f"{name} leaves {rms} (up to {short(limit)} is usual): "
-                    "detections, lens or frame times are less exact.",
-                    f"{name}: see its residual map; where arrows agree, renew its lens with `syncline intrinsics`; "
-                    "where they don’t, the detections scatter.",
+                    "detections, intrinsics or time stamps are inaccurate.",
+                    f"{name}: see its residual map; where neighbouring arrows agree, calibrate its lens with "
+                    "`syncline intrinsics`; where they do not, the detections are noisy.",
                 )
             )
         else:
@@ -219,65 +224,67 @@ def _pixels(calibration: Calibration, used: dict[str, Usage]) -> list[Finding]:
             share = measures.residual_bins(residuals, (lens.width, lens.height)).systematic
             if share > _LENS_SHARE:
                 out.append(
-                    Finding(
+                    QualityFinding(
                         "note",
-                        f"In {name}, {100 * share:.0f} % of the squared residuals depend on the place in the image: "
-                        "the lens model is not quite right.",
-                        f"{name}: measure its lens with `syncline intrinsics`.",
+                        f"In {name}, {100 * share:.0f} % of the squared residuals depend on the position in the image: "
+                        "the lens model is inaccurate.",
+                        f"{name}: calibrate its lens with `syncline intrinsics`.",
                     )
                 )
         rows = used[name]
         if rows.total and rows.share < _FEW_ROWS:
             out.append(
-                Finding(
+                QualityFinding(
                     "attention" if rows.share < _VERY_FEW_ROWS else "note",
-                    f"{name}: only {100 * rows.share:.0f} % of its rows fit one path; "
+                    f"{name}: only {100 * rows.share:.0f} % of its rows fit one trajectory; "
                     "the rest are false detections or other points.",
-                    f"{name}: teach or mask the detector so that it sees the one point only.",
+                    f"{name}: train or mask the detector so that it detects only this point.",
                 )
             )
     if fine:
         texts = f"{number(min(fine), 2)} to {number(max(fine), 2)}" if len(fine) > 1 else number(fine[0], 2)
-        who = "All cameras fit" if len(fine) == len(calibration.cameras) else "The other cameras fit"
-        out.insert(0, Finding("good", f"{who} within a pixel or so: {texts}{THIN}px (root mean square)."))
+        subject = "All cameras fit" if len(fine) == len(calibration.cameras) else "The other cameras fit"
+        out.insert(0, QualityFinding("good", f"{subject} within about a pixel: {texts}{THIN}px (root mean square)."))
     return out
 
 
-def _pairs(calibration: Calibration) -> list[Finding]:
+def _pairs(calibration: Calibration) -> list[QualityFinding]:
     names = list(calibration.cameras)
-    good = [p for p in calibration.pairs if p.status == "ok" and not contradicts(calibration, p)]
+    good = [p for p in calibration.pairs if p.status == "ok" and not is_contradicting(calibration, p)]
     good = [p for p in good if p.cameras[0] in names and p.cameras[1] in names]
     if not good:
         return []
     tried = len([p for p in calibration.pairs if p.cameras[0] in names and p.cameras[1] in names])
     out = []
-    alone = [name for name in names if sum(name in p.cameras for p in good) == 1] if len(names) > 2 else []
-    if alone:
-        is_tied, it, ties = ("is", "it", "that tie") if len(alone) == 1 else ("are", "each", "those ties")
+    single = [name for name in names if sum(name in p.cameras for p in good) == 1] if len(names) > 2 else []
+    if single:
+        verb, it, edges = ("is", "it", "this edge") if len(single) == 1 else ("are", "each", "these edges")
         out.append(
-            Finding(
+            QualityFinding(
                 "note",
-                f"{_listed(alone)} {is_tied} tied in through one pair{' each' if it == 'each' else ''} only "
-                f"({len(good)} of {tried} pairs agree): no other pair checks {ties}.",
-                f"Move the point where {_listed(alone)} see{'s' if it == 'it' else ''} it "
+                f"{_listed(single)} {verb} connected through one pair{' each' if it == 'each' else ''} only "
+                f"({len(good)} of {tried} pairs agree): no other pair checks {edges}.",
+                f"Move the point where {_listed(single)} see{'s' if it == 'it' else ''} it "
                 "together with more of the others.",
             )
         )
     if len(names) == 2:
-        out.append(Finding("note", "Two cameras make one pair: no third camera checks it."))
+        out.append(QualityFinding("note", "Two cameras make one pair: no third camera checks it."))
     elif not out:
-        out.append(Finding("good", f"{len(good)} of {tried} pairs agree, and every camera is in two or more of them."))
+        out.append(
+            QualityFinding("good", f"{len(good)} of {tried} pairs agree, and every camera is in two or more of them.")
+        )
     return out
 
 
-def _image(used: dict[str, Usage]) -> list[Finding]:
+def _image(used: dict[str, RowUsage]) -> list[QualityFinding]:
     little = {name: rows for name, rows in used.items() if rows.used and rows.coverage < _LITTLE_COVERAGE}
     out = []
     for name, rows in little.items():
         where = measures.empty_regions(rows.covered)
         aim = f": nothing at the {_listed(where[:4])}" if where else ""
         out.append(
-            Finding(
+            QualityFinding(
                 "note",
                 f"{name} saw the point in {100 * rows.coverage:.0f} % of its image only{aim}.",
                 "Move the point through more of the image of " + _listed(list(little)) + ".",
@@ -285,31 +292,35 @@ def _image(used: dict[str, Usage]) -> list[Finding]:
         )
     if not out and used:
         least = min(rows.coverage for rows in used.values())
-        out.append(Finding("good", f"The point passed through {100 * least:.0f} % or more of every image."))
+        out.append(QualityFinding("good", f"The point passed through {100 * least:.0f} % or more of every image."))
     return out
 
 
-def _path(calibration: Calibration, observations: Observations) -> list[Finding]:
-    share, seconds = measures.path_share(calibration, observations)
+def _path(calibration: Calibration, observations: Observations) -> list[QualityFinding]:
+    share, seconds = measures.trajectory_coverage(calibration, observations)
     if seconds <= 0:
         return []
     time = f"the {short(seconds)}{THIN}s" if len(observations.labels) < 2 else "the time"
-    text = f"The 3-D path covers {100 * share:.0f} % of {time} in which two cameras saw a point."
+    text = f"The 3-D trajectory covers {100 * share:.0f} % of {time} in which two cameras saw a point."
     level: Level = "good" if share >= _GOOD_PATH else "note" if share >= _POOR_PATH else "attention"
-    todo = (
+    action = (
         ""
         if level == "good"
-        else "Look at the time line: where two cameras see the point without a path, one of them errs."
+        else "Check the visibility: where two cameras see the point without a trajectory, one of them is wrong."
     )
-    return [Finding(level, text, todo)]
+    return [QualityFinding(level, text, action)]
 
 
-def _scale(calibration: Calibration) -> list[Finding]:
+def _scale(calibration: Calibration) -> list[QualityFinding]:
     if calibration.scale == "metric":
-        return [Finding("good", f"Lengths are real: the rig’s references fix the scale, in {calibration.units}.")]
+        return [
+            QualityFinding(
+                "good", f"The scale is metric: the rig’s control points or distances fix it, in {calibration.units}."
+            )
+        ]
     names = list(calibration.cameras)
     return [
-        Finding(
+        QualityFinding(
             "note",
             f"The scale is arbitrary: the distance from {names[0]} to {names[1]} counts as 1. "
             "Timing does not depend on it.",
@@ -320,14 +331,14 @@ def _scale(calibration: Calibration) -> list[Finding]:
     ]
 
 
-def _warning_todo(text: str) -> str:
+def _warning_action(text: str) -> str:
     if "were they made with" in text:
         name = text.split(":")[0]
         return (
-            f"{name}: make its times again with the true frame rate, or use them with the clock_rate of "
-            "calibration.toml: the answer allows for it."
+            f"{name}: create its time stamps again with the true frame rate, or use them with the clock_rate of "
+            "calibration.toml: the calibration accounts for it."
         )
     match = re.search(r"pair (\S+)–(\S+) contradicts", text)
     if match is None:
         return ""
-    return f"Check that {match[1]} and {match[2]} followed the same point, and record longer while both see it."
+    return f"Check that {match[1]} and {match[2]} detected the same point, and record longer while both see it."

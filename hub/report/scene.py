@@ -1,4 +1,4 @@
-"""The scene: cameras as frusta with their names and the path, in 3-D and as plan and side view."""
+"""Figure of the rig: camera frusta and trajectories, as an interactive 3-D view and as plan and side view."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from protocols.session.rig import Rig
 Rows = Sequence[Sequence[float | None]]
 
 MOST_POINTS = 3000
-_BREAK = 0.5  # a path is not drawn across a longer gap [s]
+_BREAK = 0.5  # a trajectory is not drawn across a longer gap [s]
 _NAVY, _ORANGE, _GREY = "#123a5f", "#c2510a", "#667"
 DIV = "scene-3d"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
-    """What is drawn, in axes right, ahead, up.
+class RigFigure:
+    """The geometry of the figure in display axes, with the third axis up.
 
-    paths: one (n, 3) a stretch of path. cameras: centre and the four far corners (5, 3) by name.
-    axes: their names. world: whether these are the world's own axes.
+    paths: (n, 3) per trajectory segment. cameras: centre and the four far corners of the frustum (5, 3) by name. axes:
+    names of the axes. unit: of length.
     """
 
     paths: list[Floats]
@@ -39,11 +39,11 @@ class Scene:
     unit: str
 
 
-def build_scene(calibration: Calibration, rig: Rig) -> Scene:
-    """The scene with up pointing up, whatever the world's axes are."""
-    up = measures.up_in_world(calibration, rig)
+def build_rig_figure(calibration: Calibration, rig: Rig) -> RigFigure:
+    """The figure in display axes with up vertical, whatever the world axes are."""
+    up = measures.estimate_up(calibration, rig)
     turn, own_axes = _display_from_world(calibration, up)
-    paths = _stretches(calibration)
+    paths = _path_segments(calibration)
     places = np.array([camera.pose.position for camera in calibration.cameras.values()])
     everything = np.concatenate([places, *paths])
     extent = float(np.linalg.norm(np.ptp(everything, axis=0)))
@@ -52,15 +52,15 @@ def build_scene(calibration: Calibration, rig: Rig) -> Scene:
     for name, camera in calibration.cameras.items():
         lens = camera.intrinsics
         half = np.array([lens.width / lens.matrix[0, 0], lens.height / lens.matrix[1, 1]]) / 2
-        half = half / max(1.0, float(half.max()) / 0.8)  # a very wide lens must not swamp the picture
+        half = half / max(1.0, float(half.max()) / 0.8)  # a very wide lens must not dominate the figure
         cameras[name] = _frustum(camera.pose, half, size) @ turn.T
     unit = calibration.units if calibration.scale == "metric" else "× first baseline"
     axes = ("x", "y", "z") if own_axes else ("right", "ahead", "up")
-    return Scene([path @ turn.T for path in paths], cameras, axes, unit)
+    return RigFigure([path @ turn.T for path in paths], cameras, axes, unit)
 
 
 def _display_from_world(calibration: Calibration, up: Floats) -> tuple[Floats, bool]:
-    """Rotation (3, 3) to axes right, ahead, up as the first camera looks; identity where z is up already."""
+    """Rotation (3, 3) from world to right, ahead, up of the first camera; True if it is the identity (z is up)."""
     if up[2] > 1 - 1e-6:
         return np.eye(3), True
     first = next(iter(calibration.cameras.values())).pose.rotation
@@ -71,13 +71,13 @@ def _display_from_world(calibration: Calibration, up: Floats) -> tuple[Floats, b
     return np.stack([np.cross(ahead, up), ahead, up]), False
 
 
-def _stretches(calibration: Calibration) -> list[Floats]:
+def _path_segments(calibration: Calibration) -> list[Floats]:
     tables = [table for table in calibration.trajectories if len(table.time)]
     total = sum(len(table.time) for table in tables)
     out = []
     for table in tables:
         share = max(2, int(MOST_POINTS * len(table.time) / max(total, 1)))
-        chosen = measures.thinned(len(table.time), share)
+        chosen = measures.thinned_indices(len(table.time), share)
         time, position = table.time[chosen], table.position[chosen]
         usual = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
         cuts = np.flatnonzero(np.diff(time) > max(_BREAK, 3 * usual)) + 1
@@ -90,15 +90,15 @@ def _frustum(pose: Pose, half: Floats, size: float) -> Floats:
     return pose.world_from_camera(size * np.array([(0.0, 0.0, 0.0), *((x, y, 1.0) for x, y in corners)]))
 
 
-def scene_script(scene: Scene) -> str:
-    """JavaScript that draws the scene into the element DIV, once plotly is there."""
+def rig_figure_script(figure: RigFigure) -> str:
+    """JavaScript that draws the figure into the element DIV with plotly."""
     data: list[dict[str, Any]] = []
     broken: list[Sequence[float | None]] = []
-    for path in scene.paths:
+    for path in figure.paths:
         broken += [*([_round(value) for value in row] for row in path), [None, None, None]]
     if broken:
         data.append(_trace(broken, "lines", "path", line={"color": _ORANGE, "width": 4}))
-        ends = [scene.paths[0][0], scene.paths[-1][-1]]
+        ends = [figure.paths[0][0], figure.paths[-1][-1]]
         data.append(
             _trace(
                 [[_round(v) for v in end] for end in ends],
@@ -109,12 +109,12 @@ def scene_script(scene: Scene) -> str:
                 hoverinfo="text",
             )
         )
-    for name, corners in scene.cameras.items():
+    for name, corners in figure.cameras.items():
         order = (1, 2, 3, 4, 1, 0, 2, None, 3, 0, 4)
         edges: Rows = [[None] * 3 if i is None else [_round(v) for v in corners[i]] for i in order]
         data.append(_trace(edges, "lines", name, line={"color": _NAVY, "width": 4}, hoverinfo="skip", showlegend=False))
-    centres = [[_round(v) for v in corners[0]] for corners in scene.cameras.values()]
-    names = list(scene.cameras)
+    centres = [[_round(v) for v in corners[0]] for corners in figure.cameras.values()]
+    names = list(figure.cameras)
     data.append(
         _trace(
             centres,
@@ -127,12 +127,12 @@ def scene_script(scene: Scene) -> str:
             hovertemplate="%{text}<br>%{x:.3g}, %{y:.3g}, %{z:.3g}<extra></extra>",
         )
     )
-    unit = f" [{scene.unit}]"
+    unit = f" [{figure.unit}]"
     axis = {"gridcolor": "#d5dae0", "zeroline": False, "showbackground": False, "color": "#445"}
-    middle, half = _box(scene)
+    middle, half = _box(figure)
     axes = {
         f"{key}axis": {**axis, "title": {"text": name + unit}, "range": [_round(m - h), _round(m + h)]}
-        for key, name, m, h in zip("xyz", scene.axes, middle, half, strict=True)
+        for key, name, m, h in zip("xyz", figure.axes, middle, half, strict=True)
     }
     ratio = 1.7 * half / np.linalg.norm(half)
     layout = {
@@ -140,35 +140,43 @@ def scene_script(scene: Scene) -> str:
             **axes,
             "aspectmode": "manual",
             "aspectratio": dict(zip("xyz", (_round(value) for value in ratio), strict=True)),
-            "camera": _viewpoint(scene),
+            "camera": _viewpoint(figure),
         },
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
         "showlegend": False,
         "paper_bgcolor": "#fff",
         "font": {"family": "system-ui, sans-serif", "color": "#223"},
     }
-    buttons = ["zoom3d", "pan3d", "orbitRotation", "tableRotation", "resetCameraDefault3d"]  # none that leaves the page
+    buttons = [
+        "zoom3d",
+        "pan3d",
+        "orbitRotation",
+        "tableRotation",
+        "resetCameraDefault3d",
+    ]  # no button that sends data elsewhere
     config = {"displaylogo": False, "responsive": True, "modeBarButtons": [buttons]}
     arguments = ",".join(_script_safe(part) for part in (data, layout, config))
     return f'Plotly.newPlot("{DIV}",{arguments});'
 
 
-def _box(scene: Scene) -> tuple[Floats, Floats]:
-    """Middle and half sides (3,) of a box that holds everything, with no side too thin to see."""
-    everything = np.concatenate([*scene.cameras.values(), *scene.paths])
+def _box(figure: RigFigure) -> tuple[Floats, Floats]:
+    """Centre and half sides (3,) of a bounding box, with a minimum thickness."""
+    everything = np.concatenate([*figure.cameras.values(), *figure.paths])
     low, high = everything.min(axis=0), everything.max(axis=0)
     half = 0.54 * (high - low)
     return 0.5 * (low + high), np.maximum(half, max(0.15 * float(half.max()), 1e-9))
 
 
-def _viewpoint(scene: Scene) -> dict[str, Any]:
-    """From behind the cameras and above, so that they stand in front and the path beyond them."""
+def _viewpoint(figure: RigFigure) -> dict[str, Any]:
+    """Initial plotly viewpoint: above and behind the cameras, with the trajectory beyond them."""
     towards = np.zeros(3)
-    for corners in scene.cameras.values():
+    for corners in figure.cameras.values():
         towards += (corners[1:].mean(axis=0) - corners[0]) / np.linalg.norm(corners[1:].mean(axis=0) - corners[0])
     flat = towards[:2]
-    # A ring of cameras looks nowhere in particular: then any side is as good.
-    behind = -flat / np.linalg.norm(flat) if np.linalg.norm(flat) > 0.3 * len(scene.cameras) else np.array([-0.6, -0.8])
+    # A ring of cameras has no common viewing direction: any side will do.
+    behind = (
+        -flat / np.linalg.norm(flat) if np.linalg.norm(flat) > 0.3 * len(figure.cameras) else np.array([-0.6, -0.8])
+    )
     side = np.array([behind[1], -behind[0]])
     x, y = 1.3 * behind + 0.65 * side
     return {
@@ -192,13 +200,13 @@ def _markup(name: str) -> str:
 
 
 def _script_safe(value: Any) -> str:
-    """JSON that can stand inside a <script> element."""
+    """JSON that is safe inside a <script> element."""
     return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
-def plan_and_side(scene: Scene) -> str:
-    """The scene from above and from the side, true to scale; they print, and need no script."""
-    everything = np.concatenate([*scene.cameras.values(), *scene.paths])
+def plan_and_side(figure: RigFigure) -> str:
+    """Plan and side view to scale as SVG, for printing and without scripts."""
+    everything = np.concatenate([*figure.cameras.values(), *figure.paths])
     low, high = everything.min(axis=0), everything.max(axis=0)
     width, pad = 490.0, 46.0
     span = np.maximum(high - low, 1e-9)
@@ -207,12 +215,12 @@ def plan_and_side(scene: Scene) -> str:
     views = []
     for first, second, title in ((0, 1, "From above"), (0, 2, "From the side")):
         height = max(float(span[second]) * scale, 60.0) + 2 * pad + 16
-        views.append(_view(scene, first, second, low, high, scale, width, height, title))
+        views.append(_view(figure, first, second, low, high, scale, width, height, title))
     return f'<div class="views">{"".join(views)}</div>'
 
 
 def _view(
-    scene: Scene,
+    figure: RigFigure,
     first: int,
     second: int,
     low: Floats,
@@ -230,18 +238,18 @@ def _view(
         )
 
     parts = [f'<rect class="image" x="0.5" y="0.5" width="{at(width - 1)}" height="{at(height - 1)}"/>']
-    for path in scene.paths:
+    for path in figure.paths:
         x, y = place(path)
         parts.append(f'<polyline class="track" points="{points(x, y)}"/>')
-    for corners in scene.cameras.values():
+    for corners in figure.cameras.values():
         x, y = place(corners)
         parts.append(f'<polygon class="frustum" points="{points(x[1:], y[1:])}"/>')
         parts += [line(x[0], y[0], x[i], y[i], "frustumline") for i in range(1, 5)]
         parts.append(f'<circle class="estimate" cx="{at(x[0])}" cy="{at(y[0])}" r="3"/>')
     taken: list[tuple[float, float]] = []
-    for name, corners in scene.cameras.items():
+    for name, corners in figure.cameras.items():
         x, y = place(corners)
-        # The name stands away from the direction of view if no other name does.
+        # The label is placed away from the viewing direction, unless another label is there.
         tries = [17.0, -9.0, 33.0, -25.0, 49.0, -41.0]
         if y[1:].mean() > y[0] + 1:
             tries[0], tries[1] = tries[1], tries[0]
@@ -250,14 +258,14 @@ def _view(
         spot = float(y[0]) + (free[0] if free else tries[0])
         taken.append((float(x[0]), spot))
         parts.append(text(x[0], spot, name, "halo strong", "middle"))
-    if scene.paths:
-        x, y = place(np.array([scene.paths[0][0], scene.paths[-1][-1]]))
+    if figure.paths:
+        x, y = place(np.array([figure.paths[0][0], figure.paths[-1][-1]]))
         parts.append(f'<circle class="start" cx="{at(x[0])}" cy="{at(y[0])}" r="4.5"/>')
         parts.append(f'<path class="end" d="M{at(x[1] - 5)} {at(y[1])}l5 -5 5 5 -5 5z"/>')
     bar = round_below((width / 4) / scale)
     parts.append(line(14, height - 14, 14 + bar * scale, height - 14, "scalebar"))
     parts.append(
-        text(14, height - 20, f"{number(bar, max(0, -math.floor(math.log10(bar) + 1e-9)))}{THIN}{scene.unit}", "tick")
+        text(14, height - 20, f"{number(bar, max(0, -math.floor(math.log10(bar) + 1e-9)))}{THIN}{figure.unit}", "tick")
     )
-    parts.append(text(width - 12, height - 14, f"{scene.axes[first]} →  {scene.axes[second]} ↑", "tick", "end"))
+    parts.append(text(width - 12, height - 14, f"{figure.axes[first]} →  {figure.axes[second]} ↑", "tick", "end"))
     return f"<figure>{drawing(width, height, parts, title)}<figcaption><b>{title}</b></figcaption></figure>"

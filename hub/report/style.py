@@ -18,9 +18,9 @@ small{font-size:12px;color:var(--soft);font-weight:400}
 .quiet{color:var(--soft)}
 code{font:13px/1.4 ui-monospace,SFMono-Regular,Menlo,Consolas,"Liberation Mono",monospace;
 background:#eef1f5;padding:1px 5px;border-radius:4px;overflow-wrap:anywhere}
-.verdict{border-left:8px solid var(--good);padding-left:22px}
-.verdict.attention{border-left-color:var(--orange);border-left-style:double}
-.verdict.refused{border-left-color:var(--bad);border-left-style:double}
+.assessment{border-left:8px solid var(--good);padding-left:22px}
+.assessment.attention{border-left-color:var(--orange);border-left-style:double}
+.assessment.refused{border-left-color:var(--bad);border-left-style:double}
 .keys{display:grid;grid-template-columns:repeat(auto-fit,minmax(150px,1fr));gap:12px;margin:18px 0 20px}
 .keys div{border:1px solid var(--line);border-radius:8px;padding:10px 14px}
 .keys b{display:block;font-size:22px;line-height:1.25;font-variant-numeric:tabular-nums;white-space:nowrap}
@@ -107,7 +107,7 @@ section{padding:18px 16px}}
 @page{margin:14mm}
 body{background:#fff;font-size:11.5px}
 section{border:0;border-top:1px solid #999;border-radius:0;padding:12px 0;margin:0}
-section.verdict{border-left-width:8px;padding-left:14px;border-top:0}
+section.assessment{border-left-width:8px;padding-left:14px;border-top:0}
 header.top,main{max-width:none;padding:0}
 h1{font-size:20px}h2{font-size:15px}
 h2,h3,p.lead,p.legend{break-after:avoid}

@@ -1,4 +1,4 @@
-"""Small pieces of SVG and HTML: escaped text, short numbers, axes. Everything here is deterministic."""
+"""SVG and HTML elements: escaped text, formatted numbers, axes. All output is deterministic."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def esc(text: object) -> str:
 
 
 def number(value: float | None, digits: int = 3, *, sign: bool = False) -> str:
-    """A number for people, with ``digits`` decimals and a true minus; "–" where there is none."""
+    """A number with ``digits`` decimals and a typographic minus; "–" if None or not finite."""
     if value is None or not math.isfinite(value):
         return "–"
     text = f"{value:+.{digits}f}" if sign else f"{value:.{digits}f}"
@@ -28,7 +28,7 @@ def number(value: float | None, digits: int = 3, *, sign: bool = False) -> str:
 
 
 def short(value: float | None, *, sign: bool = False, figures: int = 3) -> str:
-    """A number for people with about ``figures`` significant figures, never in powers of ten."""
+    """A number with about ``figures`` significant figures, without exponent."""
     if value is None or not math.isfinite(value):
         return "–"
     size = abs(value)
@@ -41,12 +41,12 @@ def short(value: float | None, *, sign: bool = False, figures: int = 3) -> str:
 
 
 def whole(value: int) -> str:
-    """A whole number with its thousands set apart."""
+    """An integer with thousands separators."""
     return f"{value:,}".replace(",", THIN)
 
 
 def at(value: float) -> str:
-    """A coordinate inside a drawing, to a tenth of a pixel."""
+    """A drawing coordinate, to a tenth of a pixel."""
     text = f"{value:.1f}"
     text = text.removesuffix(".0")
     return "0" if text == "-0" else text
@@ -83,7 +83,7 @@ def tick_text(value: float, values: list[float]) -> str:
 
 
 def line(x1: float, y1: float, x2: float, y2: float, kind: str) -> str:
-    """A line of a class of the style sheet."""
+    """A line with a CSS class of the style sheet."""
     return f'<line class="{kind}" x1="{at(x1)}" y1="{at(y1)}" x2="{at(x2)}" y2="{at(y2)}"/>'
 
 
@@ -100,12 +100,12 @@ def text(x: float, y: float, content: str, kind: str = "", anchor: str = "start"
     return f'<text{style}{place} x="{at(x)}" y="{at(y)}">{esc(content)}</text>'
 
 
-def drawing(width: float, height: float, parts: Iterable[str], label: str, most: float = 0.0) -> str:
-    """A whole drawing that scales with its column, up to ``most`` pixels wide (0: any).
+def drawing(width: float, height: float, parts: Iterable[str], label: str, max_width: float = 0.0) -> str:
+    """A complete SVG that scales with its column, up to ``max_width`` pixels wide (0: any).
 
-    label: what a reader who can't see it is told.
+    label: text for screen readers.
     """
-    limit = f' style="max-width:{at(most)}px"' if most else ""
+    limit = f' style="max-width:{at(max_width)}px"' if max_width else ""
     frame = f'<svg viewBox="0 0 {at(width)} {at(height)}"{limit} role="img" aria-label="{esc(label)}">'
     return f"{frame}{''.join(parts)}</svg>"
 

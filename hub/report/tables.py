@@ -7,7 +7,7 @@ from importlib import metadata
 
 import numpy as np
 
-from hub.report.measures import Usage
+from hub.report.measures import RowUsage
 from hub.report.pair_graph import edge_kind
 from hub.report.quality_assessment import half_interval_ms
 from hub.report.remedies import remedy_for
@@ -18,12 +18,12 @@ from protocols.session.calibration import Calibration
 from protocols.session.rig import Rig
 
 _LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "plotly")
-_MOST_OPEN = 30  # more pairs than this are folded away
-_SIGNS = {"agrees": "✓ agrees", "contradicts": "≠ contradicts the others", "refused": "✕"}
+_MAX_UNFOLDED = 30  # more pairs than this are folded away
+_SIGNS = {"agrees": "✓ consistent", "contradicts": "≠ contradicts the others", "refused": "✕"}
 
 
 def table(head: list[str], rows: list[list[str]], *, numeric: int = 0, kind: str = "") -> str:
-    """A table of ready HTML cells; the columns from ``numeric`` on are aligned right (0: none)."""
+    """An HTML table of HTML cells; the columns from ``numeric`` on are right-aligned (0: none)."""
     top = "".join(f"<th{_numeric(i, numeric)}>{cell}</th>" for i, cell in enumerate(head))
     body = "".join(
         "<tr>" + "".join(f"<td{_numeric(i, numeric)}>{cell}</td>" for i, cell in enumerate(row)) + "</tr>"
@@ -36,8 +36,8 @@ def _numeric(column: int, first: int) -> str:
     return ' class="n"' if 0 < first <= column else ""
 
 
-def cameras(calibration: Calibration, used: dict[str, Usage]) -> str:
-    """One row a camera: its clock, its place, and how well it fits."""
+def cameras(calibration: Calibration, used: dict[str, RowUsage]) -> str:
+    """One row per camera: clock, position, residual, rows used."""
     unit = calibration.units if calibration.scale == "metric" else "first baseline = 1"
     head = [
         "Camera",
@@ -52,13 +52,13 @@ def cameras(calibration: Calibration, used: dict[str, Usage]) -> str:
         reference = name == calibration.reference
         half = half_interval_ms(camera)
         offset = number(camera.time_map.time_offset, 6, sign=not reference)
-        around = '<small class="quiet">reference</small>' if reference else f"± {short(half, figures=2)}"
+        uncertainty = '<small class="quiet">reference</small>' if reference else f"± {short(half, figures=2)}"
         ppm = 1e6 * (camera.time_map.clock_rate - 1.0)
         total = used[name].total
         rows.append(
             [
                 f"<b>{esc(name)}</b>",
-                f'{offset} <span class="pm">{around}</span>',
+                f'{offset} <span class="pm">{uncertainty}</span>',
                 number(ppm, 1, sign=not reference),
                 _position(camera.pose.position, camera.position_std),
                 number(camera.rms_px, 2),
@@ -72,38 +72,38 @@ def _position(position: Floats, std: Floats) -> str:
     worst = float(np.max(std))
     size = float(np.linalg.norm(position))
     if not np.isfinite(worst) or worst < 1e-9 * max(size, 1.0):
-        digits, around = 3, "fixed"
+        digits, uncertainty = 3, "fixed"
     else:
-        # Two figures of the uncertainty are told, and the position to the same place.
+        # Two significant figures of the uncertainty, and the position with as many decimals.
         digits = int(np.clip(1 - np.floor(np.log10(worst)), 0, 6))
-        around = f"± {worst:.{digits}f}"
+        uncertainty = f"± {worst:.{digits}f}"
     place = ", ".join(number(value, digits) for value in position)
-    return f'{place} <span class="pm">{around}</span>'
+    return f'{place} <span class="pm">{uncertainty}</span>'
 
 
 def pairs(outcome: Calibration | Refused) -> str:
-    """One row a pair: lag at the middle of the overlap, rate, and how it was judged."""
+    """One row per pair: result, lag at the middle of the overlap, clock rate, inliers, noise."""
     if not outcome.pairs:
         return ""
     head = [
         "Pair",
-        "Verdict",
+        "Result",
         "Lag <small>s</small>",
         "Rate <small>ppm</small>",
-        "Agree <small>%</small>",
+        "Inliers <small>%</small>",
         "Noise <small>px</small>",
     ]
     rows, why = [], []
     for pair in outcome.pairs:
         kind = edge_kind(outcome, pair)
-        verdict = _SIGNS[kind] + (" not tied" if kind == "refused" else "")
+        assessment = _SIGNS[kind] + (" not connected" if kind == "refused" else "")
         if kind == "refused":
             why.append(f"<li><b>{esc(pair.cameras[0])}–{esc(pair.cameras[1])}</b>: {esc(pair.status)}</li>")
         ppm = None if pair.clock_rate is None else 1e6 * (pair.clock_rate - 1.0)
         rows.append(
             [
                 f"{esc(pair.cameras[0])}–{esc(pair.cameras[1])}",
-                verdict,
+                assessment,
                 number(pair.lag_s, 4, sign=True),
                 number(ppm, 1, sign=True),
                 number(None if pair.inliers is None else 100 * pair.inliers, 0),
@@ -111,15 +111,15 @@ def pairs(outcome: Calibration | Refused) -> str:
             ]
         )
     inner = table(head, rows, numeric=2, kind="pairs")
-    # Reasons are sentences: in a cell they would make it a hand high.
+    # Reasons are sentences, too long for a table cell.
     inner += f'<ul class="why">{"".join(why)}</ul>' if why else ""
-    if len(rows) <= _MOST_OPEN:
+    if len(rows) <= _MAX_UNFOLDED:
         return inner
     return f"<details><summary>All {len(rows)} pairs</summary>{inner}</details>"
 
 
 def refused(reasons: dict[str, str], counts: dict[str, int]) -> str:
-    """One row a refused camera: what it gave, why it was refused, what to do."""
+    """One row per refused camera: number of rows, reason, what to do."""
     rows = [
         [f"<b>{esc(name)}</b>", whole(counts.get(name, 0)), esc(reason), code(_capital(remedy_for(reason)))]
         for name, reason in reasons.items()
@@ -128,7 +128,7 @@ def refused(reasons: dict[str, str], counts: dict[str, int]) -> str:
 
 
 def code(text: str) -> str:
-    """Escaped text in which what stands between backticks is set as code."""
+    """Escaped text with the parts between backticks set as code."""
     parts = esc(text).split("`")
     return "".join(f"<code>{part}</code>" if index % 2 else part for index, part in enumerate(parts))
 
@@ -138,7 +138,7 @@ def _capital(text: str) -> str:
 
 
 def provenance(facts: dict[str, str], rig: Rig, command: str) -> str:
-    """Where the report comes from: what was run, on what, with which versions."""
+    """Provenance: command, input, versions."""
     versions = [f"Python {platform.python_version()}"]
     for name in _LIBRARIES:
         try:

@@ -1,11 +1,11 @@
-"""Figures over time: offsets with their intervals, residuals as the session went on, who saw the point when."""
+"""Figures over time: time offsets with 95 % intervals, residuals over the session, visibility of the point."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from hub.report import measures
-from hub.report.measures import Span, Usage
+from hub.report.measures import RowUsage, Span
 from hub.report.quality_assessment import half_interval_ms
 from hub.report.svg import THIN, drawing, line, number, points, rect, short, text, tick_text, ticks, time_axis
 from protocols.geometry.types import Floats
@@ -13,12 +13,12 @@ from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations
 
 _WIDTH, _LEFT, _RIGHT = 1000.0, 130.0, 16.0
-_MOST_SPANS = 400  # drawn a camera; a recording of hours has more
-_TIME_BINS, _ROWS_A_BIN = 250, 8  # no more than so many bins; rows in one for its quantiles to mean anything
+_MAX_SPANS = 400  # drawn per camera; long recordings have more
+_TIME_BINS, _ROWS_A_BIN = 250, 8  # largest number of bins; rows per bin for meaningful quantiles
 
 
-def offset_intervals(calibration: Calibration, used: dict[str, Usage]) -> str:
-    """Each camera's offset with its 95 % interval, drawn around the estimate on one scale in milliseconds."""
+def offset_intervals(calibration: Calibration, used: dict[str, RowUsage]) -> str:
+    """Each camera's time offset with its 95 % interval around the estimate, on a common scale in milliseconds."""
     names = list(calibration.cameras)
     halves = {name: half_interval_ms(calibration.cameras[name]) for name in names}
     finite = [half for half in halves.values() if np.isfinite(half)]
@@ -61,7 +61,7 @@ def offset_intervals(calibration: Calibration, used: dict[str, Usage]) -> str:
 
 
 def residuals_over_time(calibration: Calibration) -> str:
-    """Median residual and the band of the middle 80 %, one strip a camera, on the reference clock."""
+    """Median residual and the 10 to 90 % band, one strip per camera, on the reference clock."""
     series: dict[str, tuple[Floats, Floats]] = {}
     for name, camera in calibration.cameras.items():
         rows = calibration.residuals.get(name)
@@ -94,7 +94,7 @@ def residuals_over_time(calibration: Calibration) -> str:
 
 
 def _band(time: Floats, norms: Floats, low: float, high: float, base: float, strip: float, top: float) -> list[str]:
-    """Band and median of one camera, broken where it saw nothing."""
+    """Band and median of one camera, interrupted where it has no rows."""
     cells = int(np.clip(len(time) / _ROWS_A_BIN, 20, _TIME_BINS))
     width = (high - low) / cells
     number_of = np.clip(((time - low) / width).astype(np.int64), 0, cells - 1)
@@ -116,19 +116,19 @@ def _band(time: Floats, norms: Floats, low: float, high: float, base: float, str
 
 
 def time_line(calibration: Calibration, observations: Observations) -> str:
-    """Who saw the point when, when two cameras did, and where there is a path, on the reference clock."""
+    """Visibility of the point by camera, by two or more cameras, and trajectory coverage, on the reference clock."""
     seen = measures.seen_on_reference(calibration, observations)
-    rows: list[tuple[str, list[Span], str]] = [(name, stretches, "bar") for name, stretches in seen.items()]
+    rows: list[tuple[str, list[Span], str]] = [(name, intervals, "bar") for name, intervals in seen.items()]
     rows.append(("two or more", measures.shared_spans(list(seen.values())), "bar both"))
     path = [table.time for table in calibration.trajectories if len(table.time)]
     if path:
         step = max(float(np.median(np.diff(time))) if len(time) > 1 else 0.1 for time in path)
         rows.append(("3-D path", measures.spans(np.concatenate(path), max(0.1, 2.5 * step)), "bar path"))
-    return _bars(rows, "seconds on the reference clock", "Who saw the point when")
+    return _bars(rows, "seconds on the reference clock", "Visibility of the point by camera")
 
 
 def own_time_lines(rows: dict[str, Floats]) -> str:
-    """Who saw the point when, each camera on its own clock from its first row; rows: time, u, v of each."""
+    """Visibility of the point, each camera on its own clock from its first row; rows: time, u, v by camera."""
     bars: list[tuple[str, list[Span], str]] = [
         (name, measures.spans(seen[:, 0] - seen[:, 0].min()) if len(seen) else [], "bar") for name, seen in rows.items()
     ]
@@ -136,7 +136,7 @@ def own_time_lines(rows: dict[str, Floats]) -> str:
 
 
 def _bars(rows: list[tuple[str, list[Span], str]], axis: str, label: str) -> str:
-    every = [span for _, stretches, _ in rows for span in stretches]
+    every = [span for _, intervals, _ in rows for span in intervals]
     if not every:
         return ""
     low = min(begin for begin, _ in every)
@@ -145,15 +145,15 @@ def _bars(rows: list[tuple[str, list[Span], str]], axis: str, label: str) -> str
     bottom = row * len(rows) + 4
     height = bottom + 38
     parts = time_axis(low, high, _LEFT, inner, 0, bottom)
-    for index, (name, stretches, kind) in enumerate(rows):
+    for index, (name, intervals, kind) in enumerate(rows):
         y = row * index + 5
         parts.append(text(0, y + 13, name, "rowname"))
         parts.append(line(_LEFT, y + 9, _LEFT + inner, y + 9, "grid"))
-        chosen = [stretches[i] for i in measures.thinned(len(stretches), _MOST_SPANS)]
+        chosen = [intervals[i] for i in measures.thinned_indices(len(intervals), _MAX_SPANS)]
         for begin, end in chosen:
             x = _LEFT + inner * (begin - low) / (high - low)
             width = max(inner * (end - begin) / (high - low), 1.2)
             parts.append(rect(x, y, width, 18, kind, f"{name}: {begin:.2f} s to {end:.2f} s"))
-        parts.append(text(_WIDTH - _RIGHT, y + 13, f"{short(measures.length(stretches))}{THIN}s", "tick", "end"))
+        parts.append(text(_WIDTH - _RIGHT, y + 13, f"{short(measures.total_length(intervals))}{THIN}s", "tick", "end"))
     parts.append(text(_LEFT + inner / 2, height - 6, axis, "tick", "middle"))
     return drawing(_WIDTH, height, parts, label)

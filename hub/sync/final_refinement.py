@@ -1,4 +1,4 @@
-"""The last refinement of a pair's answer, and whether the motion tells its lag and rotation well enough to give it."""
+"""Final maximum-likelihood refinement of an accepted alignment, and tests of its precision and sensitivity."""
 
 from __future__ import annotations
 
@@ -7,168 +7,199 @@ from dataclasses import replace
 
 import numpy as np
 
-from hub.sync.alignment import PairFit, PairSettings, PairSolution, Samples
-from hub.sync.lag_uncertainty import at_centre, leaning
+from hub.sync.hypothesis import PairFit, PairSolution
+from hub.sync.lag_uncertainty import estimate_lag_uncertainty, recentred
+from hub.sync.samples import Samples
+from hub.sync.settings import PairSettings
 from hub.trajectory.image_tracks import SmoothTrack
-from hub.two_view.refinement import WIDE, Noise, Refined, refine
-from hub.two_view.relative_pose import Geometry, RelativePose, five_point, in_front
+from hub.two_view.refinement import FINAL_WIDTH, NoiseModel, RefinementResult, refine
+from hub.two_view.relative_pose import RelativePose, TwoViewGeometry, five_point, in_front
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 
-NEAR_PX = 10.0
-"""What may belong to the geometry of a scan in pieces [px]."""
-_SEEDS = 8  # of five-point hypotheses, each followed to its end
-_STARTS_SAMPLES, _STARTS_STEPS = 300, 60
-_SUBSET = 150
-_IN_FRONT = 0.95
-_SAME_LAG = 0.1  # s
-_AS_LIKELY = 6.0  # squared stds between geometries that are told apart, residuals that are alike counted as one
-_RATE_TOLD = 5.0  # std, residuals that are alike counted as one
-_USUAL_RATE = 2e-4  # std of a clock's rate, where the motion does not tell it
+LTS_INLIER_PX = 10.0
+"""Distance [px] up to which a sample is an inlier of the geometry of an LTS scan."""
+_FIVE_POINT_SEEDS = 8  # random seeds of five-point hypotheses, each refined to convergence
+_START_SAMPLES, _START_ITERATIONS = 300, 60
+_FIVE_POINT_SUBSET = 150
+_MIN_IN_FRONT = 0.95
+_MAX_LAG_CHANGE = 0.1  # s from the fit's lag
+_LIKELIHOOD_MARGIN = 6.0  # chi-square between distinguishable geometries, by effective sample size
+_MIN_RATE_SIGNIFICANCE = 5.0  # std, by effective sample size: above it the motion determines the rate
+_TYPICAL_RATE_STD = 2e-4  # prior std of a clock's rate, where the motion does not determine it
 
 
-def finish(
-    answer: PairSolution,
+def refine_and_test(
+    solution: PairSolution,
     fit: PairFit,
     a: Sequence[SmoothTrack],
     b: Sequence[SmoothTrack],
     s: PairSettings,
     *,
-    fixed: bool = False,
-    pieces: bool = False,
+    fixed_geometry: bool = False,
+    lts: bool = False,
 ) -> PairSolution:
-    """The answer with all samples, the tracks' own noise and hardly any robustness left, and its stds; or a refusal.
+    """Refine an alignment with all samples, the tracks' own noise and a wide robust kernel; refuse it if imprecise.
 
-    a, b: tracks of the same labels. fixed: the geometry is given. pieces: only what is near the geometry counts.
+    a, b: tracks of the same labels in the same order. fixed_geometry: the geometry is given. lts: use only inliers of
+    the fit's geometry. With intrinsics and ``s.standalone``, rotation ambiguity and lag sensitivity are tested too.
+    Returns the solution with the refined fit and its stds, or unsolved with the reason.
     """
-    samples = Samples(a, b, fit.offset, s, s.all_samples)
-    if pieces:
-        samples.keep_near(fit.geometry.matrix, fit.rate, fit.offset, NEAR_PX)
-    own = [max(float(np.median([t.sigma for t in one])), 0.1 / one[0].focal) for one in (a, b)]
-    misfit = max(1.0, fit.sigma_px / (0.5 * (own[0] * a[0].focal + own[1] * b[0].focal)))
-    noise = Noise(own[0] * misfit, own[1] * misfit, s.rate_std)
-    slowness = 1.0 / fit.rate
-    posed = isinstance(fit.geometry, RelativePose) and not fixed
-    if posed and s.firm and not pieces:
-        likeliest, apart = _likeliest(samples, fit, noise)
-        if apart > s.largest_turn_apart:
-            reason = f"rotations {np.rad2deg(apart):.0f}° apart fit the motion alike"
-            return replace(answer, status=reason, fit=fit)
-        fit = replace(fit, geometry=likeliest)
+    samples = Samples(a, b, fit.offset, s, s.final_samples)
+    if lts:
+        samples.keep_inliers(fit.geometry.matrix, fit.rate, fit.offset, LTS_INLIER_PX)
+    sigma = [max(float(np.median([t.sigma for t in one])), 0.1 / one[0].focal) for one in (a, b)]
+    misfit = max(1.0, fit.residual_px / (0.5 * (sigma[0] * a[0].focal + sigma[1] * b[0].focal)))
+    noise = NoiseModel(sigma[0] * misfit, sigma[1] * misfit, s.rate_prior_std)
+    inverse_rate = 1.0 / fit.rate
+    has_pose = isinstance(fit.geometry, RelativePose) and not fixed_geometry
+    if has_pose and s.standalone and not lts:
+        most_likely, ambiguity = _most_likely_geometry(samples, fit, noise)
+        if ambiguity > s.max_rotation_ambiguity:
+            reason = f"rotations {np.rad2deg(ambiguity):.0f}° apart fit the motion equally well"
+            return replace(solution, status=reason, fit=fit)
+        fit = replace(fit, geometry=most_likely)
     found = refine(
         samples,
         fit.geometry,
-        slowness * (samples.centre - fit.offset),
+        inverse_rate * (samples.centre - fit.offset),
         1.0,
         noise,
-        slowness=slowness,
-        fixed_geometry=fixed,
-        narrowest=WIDE,
+        inverse_rate=inverse_rate,
+        fixed_geometry=fixed_geometry,
+        final_width=FINAL_WIDTH,
     )
     if found is None:
-        return answer
-    found, covariance, rate_std = _usual_rate(samples, found, noise, fixed)
-    rate = 1.0 / found.slowness
-    last = samples.judge(found.cost, rate, samples.centre - rate * found.middle, found.geometry)
+        return solution
+    found, covariance, rate_prior_std = _with_rate_prior(samples, found, noise, fixed_geometry)
+    rate = 1.0 / found.inverse_rate
+    last = samples.evaluate(found.cost, rate, samples.centre - rate * found.intercept, found.geometry)
     last = replace(
         last,
-        log10_chance=fit.log10_chance,
+        log10_false_alarm=fit.log10_false_alarm,
         lag_std=float(np.sqrt(max(covariance[-2, -2], 0.0))),
-        turn_std=float(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))) if posed else 0.0,
-        rate_std=rate_std,
+        rotation_std=float(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))) if has_pose else 0.0,
+        rate_prior_std=rate_prior_std,
     )
-    speed = float(np.nanmedian(np.linalg.norm(samples.of_b((samples.time - last.offset) / rate)[1], axis=1)))
+    speed = float(np.nanmedian(np.linalg.norm(samples.interpolate_b((samples.time - last.offset) / rate)[1], axis=1)))
     a_pixel = 1.0 / max(speed * b[0].focal, 1e-9)
-    if last.lag_std > min(max(s.largest_lag_std, a_pixel), s.largest_slow_lag_std):
-        return replace(answer, status=f"the motion tells the lag only to {1e3 * last.lag_std:.0f} ms (std)", fit=last)
-    sure = fit.log10_chance is not None and fit.log10_chance < s.sure_log10_chance
-    if last.turn_std > (s.sure_turn_std if sure else s.largest_turn_std):
-        reason = f"the motion tells the relative rotation only to {np.rad2deg(last.turn_std):.1f}° (std)"
-        return replace(answer, status=reason, fit=last)
-    answer = replace(answer, fit=last)
-    return _firm(answer, last, samples, found, noise, rate_std, s) if posed and s.firm else answer
+    if last.lag_std > min(max(s.max_lag_std, a_pixel), s.max_slow_lag_std):
+        return replace(
+            solution, status=f"the motion determines the lag only to {1e3 * last.lag_std:.0f} ms (std)", fit=last
+        )
+    certain_lag = fit.log10_false_alarm is not None and fit.log10_false_alarm < s.certain_lag_log10_false_alarm
+    if last.rotation_std > (s.max_rotation_std_certain_lag if certain_lag else s.max_rotation_std):
+        reason = f"the motion determines the relative rotation only to {np.rad2deg(last.rotation_std):.1f}° (std)"
+        return replace(solution, status=reason, fit=last)
+    solution = replace(solution, fit=last)
+    return (
+        _test_sensitivity(solution, last, samples, found, noise, rate_prior_std, s)
+        if has_pose and s.standalone
+        else solution
+    )
 
 
-def _likeliest(samples: Samples, fit: PairFit, noise: Noise) -> tuple[Geometry, float]:
-    """The likeliest geometry of many starts at about the fit's lag, and how far others as likely are turned [rad].
+def _most_likely_geometry(samples: Samples, fit: PairFit, noise: NoiseModel) -> tuple[TwoViewGeometry, float]:
+    """Most likely geometry of many starts near the fit's lag, and the largest angle [rad] to equally likely rotations.
 
-    Seen from far away, rotation and direction hardly show by themselves: from one start a search ends somewhere in a
-    valley of tens of degrees, at a cost that looks like the noise.
+    Distant motion hardly separates rotation and direction (bas-relief ambiguity): from one start the search ends
+    anywhere in a valley of tens of degrees, at a cost near the noise.
     """
-    few = samples.thinned(_STARTS_SAMPLES)
-    middle = (few.centre - fit.offset) / fit.rate
-    a, b = few.at(fit.rate, fit.offset)
+    coarse = samples.thinned(_START_SAMPLES)
+    intercept = (coarse.centre - fit.offset) / fit.rate
+    a, b = coarse.points_at(fit.rate, fit.offset)
     both = np.isfinite(b).all(axis=1)
     a, b = a[both], b[both]
-    usual = replace(noise, rate_std=_USUAL_RATE)
+    typical = replace(noise, rate_prior_std=_TYPICAL_RATE_STD)
     threshold = 3.0 * min(noise.sigma_a, noise.sigma_b)
     starts = [fit.geometry]
-    for seed in range(_SEEDS):
-        starts += five_point(a, b, threshold, seed, _SUBSET)
-    ends = []
+    for seed in range(_FIVE_POINT_SEEDS):
+        starts += five_point(a, b, threshold, seed, _FIVE_POINT_SUBSET)
+    minima = []
     for start in starts:
-        end = refine(few, start, middle, 1.0, usual, slowness=1.0 / fit.rate, iterations=_STARTS_STEPS, narrowest=WIDE)
-        if end is not None and in_front(end.geometry, a, b).mean() > _IN_FRONT and abs(end.middle - middle) < _SAME_LAG:
-            ends.append(end)
-    if not ends:
+        minimum = refine(
+            coarse,
+            start,
+            intercept,
+            1.0,
+            typical,
+            inverse_rate=1.0 / fit.rate,
+            iterations=_START_ITERATIONS,
+            final_width=FINAL_WIDTH,
+        )
+        if (
+            minimum is not None
+            and in_front(minimum.geometry, a, b).mean() > _MIN_IN_FRONT
+            and abs(minimum.intercept - intercept) < _MAX_LAG_CHANGE
+        ):
+            minima.append(minimum)
+    if not minima:
         return fit.geometry, 0.0
-    best = min(ends, key=lambda end: end.cost)
-    worst = best.cost + _AS_LIKELY * few.together(best) / max(len(a), 1)
-    turns = [so3.angle_between(_turn(end), _turn(best)) for end in ends if end.cost < worst]
-    return best.geometry, max(turns)
+    best = min(minima, key=lambda minimum: minimum.cost)
+    cost_limit = best.cost + _LIKELIHOOD_MARGIN * coarse.autocorrelation_time(best) / max(len(a), 1)
+    angles = [
+        so3.angle_between(_rotation_of(minimum), _rotation_of(best)) for minimum in minima if minimum.cost < cost_limit
+    ]
+    return best.geometry, max(angles)
 
 
-def _turn(found: Refined) -> Floats:
+def _rotation_of(found: RefinementResult) -> Floats:
     if not isinstance(found.geometry, RelativePose):
         raise TypeError("a fundamental matrix has no rotation")
     return found.geometry.rotation
 
 
-def _usual_rate(samples: Samples, found: Refined, noise: Noise, fixed: bool) -> tuple[Refined, Floats, float]:
-    """The fit with the rate that clocks usually have, where the motion does not tell it; its covariance and prior."""
+def _with_rate_prior(
+    samples: Samples, found: RefinementResult, noise: NoiseModel, fixed_geometry: bool
+) -> tuple[RefinementResult, Floats, float]:
+    """The fit, with a typical rate prior if the motion does not determine the rate; its covariance and prior std."""
     covariance: Floats = np.asarray(np.linalg.pinv(found.normal, hermitian=True))
-    together = samples.together(found)
-    if abs(found.slowness - 1.0) >= _RATE_TOLD * np.sqrt(together * covariance[-1, -1]):
-        return found, covariance, noise.rate_std
-    wide = np.sqrt(together)
-    usual = refine(
+    autocorrelation_time = samples.autocorrelation_time(found)
+    if abs(found.inverse_rate - 1.0) >= _MIN_RATE_SIGNIFICANCE * np.sqrt(autocorrelation_time * covariance[-1, -1]):
+        return found, covariance, noise.rate_prior_std
+    inflation = np.sqrt(autocorrelation_time)
+    typical = refine(
         samples,
         found.geometry,
-        found.middle,
+        found.intercept,
         1.0,
-        Noise(noise.sigma_a * wide, noise.sigma_b * wide, _USUAL_RATE),
-        fixed_geometry=fixed,
-        narrowest=WIDE,
+        NoiseModel(noise.sigma_a * inflation, noise.sigma_b * inflation, _TYPICAL_RATE_STD),
+        fixed_geometry=fixed_geometry,
+        final_width=FINAL_WIDTH,
     )
-    if usual is None:
-        return found, covariance, noise.rate_std
-    return usual, np.asarray(np.linalg.pinv(usual.normal, hermitian=True) / together), _USUAL_RATE
+    if typical is None:
+        return found, covariance, noise.rate_prior_std
+    return typical, np.asarray(np.linalg.pinv(typical.normal, hermitian=True) / autocorrelation_time), _TYPICAL_RATE_STD
 
 
-def _firm(
-    answer: PairSolution,
+def _test_sensitivity(
+    solution: PairSolution,
     fit: PairFit,
     samples: Samples,
-    found: Refined,
-    noise: Noise,
-    rate_std: float,
+    found: RefinementResult,
+    noise: NoiseModel,
+    rate_prior_std: float,
     s: PairSettings,
 ) -> PairSolution:
-    """The answer, at the lag that lenses not exactly as told leave likeliest where they could move it far."""
-    few = samples.thinned(s.samples)
+    """Test of the lag's sensitivity to lens errors and left-out samples; the solution with the lag so estimated."""
+    coarse = samples.thinned(s.refinement_samples)
     sigma = noise.sigma_a, noise.sigma_b
-    lean = leaning(few, at_centre(found, samples.centre, few), sigma, rate_std, s.largest_lag_std)
-    rate = 1.0 / lean.slowness
-    fit = replace(fit, rate=rate, offset=few.centre - rate * lean.middle, lag_doubt=lean.std)
-    if lean.std > s.largest_doubt:
-        told = f"{1e3 * lean.std:.0f} ms (std)"
-        reason = f"the motion tells the lag only to {told}, with lenses and shutters not exactly as told"
-        return replace(answer, status=reason, fit=fit)
-    if lean.swing > s.largest_swing:
-        told = f"{1e3 * lean.swing:.0f} ms"
-        reason = f"the motion tells the lag only to {told}: that far it moves without a fifth of what was seen"
-        return replace(answer, status=reason, fit=fit)
-    return replace(answer, fit=fit)
+    uncertainty = estimate_lag_uncertainty(
+        coarse, recentred(found, samples.centre, coarse), sigma, rate_prior_std, s.max_lag_std
+    )
+    rate = 1.0 / uncertainty.inverse_rate
+    fit = replace(fit, rate=rate, offset=coarse.centre - rate * uncertainty.intercept, total_lag_std=uncertainty.std)
+    if uncertainty.std > s.max_total_lag_std:
+        std = f"{1e3 * uncertainty.std:.0f} ms (std)"
+        reason = f"the motion determines the lag only to {std}, with lens and readout uncertainty included"
+        return replace(solution, status=reason, fit=fit)
+    if uncertainty.leave_out_change > s.max_leave_out_change:
+        change = f"{1e3 * uncertainty.leave_out_change:.0f} ms"
+        reason = (
+            f"the motion determines the lag only to {change}: it changes by that much without a fifth of the samples"
+        )
+        return replace(solution, status=reason, fit=fit)
+    return replace(solution, fit=fit)
 
 
-__all__ = ["NEAR_PX", "finish"]
+__all__ = ["LTS_INLIER_PX", "refine_and_test"]

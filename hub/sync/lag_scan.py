@@ -1,8 +1,8 @@
-"""Every alignment of two image tracks at once: which lags make one epipolar geometry possible.
+"""Scan of all lags of two image tracks: epipolar cost of the best fundamental matrix at every lag.
 
-METHODS A, step 2, for all lags together: the 9x9 moment matrix of ``s_a(t) ⊗ s_b(t + lag)`` is made of 36
-cross-correlations, done by FFT; its smallest generalised eigenvalue (Taubin's normalisation) is the mean
-squared epipolar distance, in units of the noise, that the best fundamental matrix leaves at that lag.
+The 9x9 moment matrix of ``s_a(t) ⊗ s_b(t + lag)`` consists of 36 cross-correlations, computed for all lags by FFT. Its
+smallest generalised eigenvalue under Taubin's normalisation is the mean squared epipolar distance, over the squared
+noise, that the best fundamental matrix leaves at that lag.
 """
 
 from __future__ import annotations
@@ -14,29 +14,31 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
+from hub.sync.settings import PairSettings
 from hub.trajectory.image_tracks import SmoothTrack
 from protocols.geometry.types import Bools, Floats, Ints
 
-_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-PAIR_OF = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-"""Which of the six monomials is the product of two homogeneous coordinates."""
-_OF_A, _OF_B = (PAIR_OF[np.ix_(index, index)] for index in np.divmod(np.arange(9), 3))
-"""(9, 9): which of the monomials of a, and of b, an entry of ``(s_a ⊗ s_b)(s_a ⊗ s_b)ᵀ`` is the product of."""
-_SIDE = np.array([0, 1, 3, 4, 6, 7])
-"""Entries of ``s_a ⊗ s_b`` that hold one of b's two coordinates, which have noise."""
-_ITERATIONS = 6
-_PARALLEL = 1e-10  # part of a vector that is not along the other, squared, below which it tells nothing
-_COMPARED = 400
-_SLOW_PX = 20.0  # px/s: image speed at which a moment counts half
-_CHUNK = 4096  # lags per batch of eigenvalue problems
+_MONOMIALS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+MONOMIAL_INDEX = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+"""Index of the product of two homogeneous coordinates among the six monomials (x², xy, x, y², y, 1)."""
+_MONOMIAL_OF_A, _MONOMIAL_OF_B = (MONOMIAL_INDEX[np.ix_(index, index)] for index in np.divmod(np.arange(9), 3))
+"""(9, 9): the monomials of a, and of b, whose product is an entry of ``(s_a ⊗ s_b)(s_a ⊗ s_b)ᵀ``."""
+_NOISY_IN_B = np.array([0, 1, 3, 4, 6, 7])
+"""Entries of ``s_a ⊗ s_b`` with one of b's two noisy coordinates."""
+_ITERATIONS = 6  # of the inverse iteration
+_MIN_ORTHOGONAL = 1e-10  # squared relative length of a vector orthogonal to the other, below which the two are parallel
+_COMPARISON_LAGS = 400  # scanned outside a lag window, for comparison
+_HALF_WEIGHT_SPEED_PX = 20.0  # px/s: image speed at which a sample has half weight
+_BATCH = 4096  # lags per batch of eigenvalue problems
+_SCAN_STEPS = (0.01, 0.0125, 0.016, 0.02, 0.025, 0.033, 0.05)  # s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GridTrack:
-    """One camera's tracks on a regular grid of its time, in coordinates centred and scaled for conditioning.
+    """One camera's tracks resampled on a regular time grid, in centred and scaled coordinates for conditioning.
 
     begin: time of the first sample [s]. step: [s]. points: (labels, n, 2). weight: (labels, n) 0 where there is
-    no track, near 0 where it stands still, up to 1 where it moves. sigma: noise in the scaled coordinates.
+    no track, near 0 where the point stands still, up to 1 where it moves. sigma: noise std in the scaled coordinates.
     transform: (3, 3), scaled from normalised homogeneous coordinates.
     """
 
@@ -48,29 +50,42 @@ class GridTrack:
     transform: Floats
 
 
+def fast_image_speed(track: SmoothTrack) -> float:
+    """Image speed [px/s] of a track: its 90 % quantile."""
+    speed = track.at(track.time, 1)
+    return float(np.quantile(np.sqrt(speed[:, 0] ** 2 + speed[:, 1] ** 2), 0.9)) * track.focal
+
+
+def scan_step(speed_px: float, s: PairSettings) -> float:
+    """Grid step of the lag scan [s] in which a point at ``speed_px`` [px/s] moves by about ``scan_step_px``."""
+    target = s.scan_step_px / max(speed_px, 1e-9)
+    allowed = [step for step in _SCAN_STEPS if s.min_scan_step <= step <= min(s.max_scan_step, target)]
+    return max(allowed, default=s.min_scan_step)
+
+
 def grid_tracks(tracks: Sequence[SmoothTrack], step: float, sigma_px: float) -> GridTrack:
-    """Sample one camera's tracks, one a label, every ``step`` seconds; sigma_px: the noise to reckon with."""
+    """Resample one camera's tracks, one per label, every ``step`` [s]. sigma_px: assumed image noise std [px]."""
     begin = float(np.floor(min(track.basis.begin for track in tracks) / step) * step)
     end = max(track.basis.end for track in tracks)
     time = begin + step * np.arange(int(np.ceil((end - begin) / step)) + 1, dtype=np.float64)
     points = np.stack([track.at(time) for track in tracks])
     focal = tracks[0].focal
     speed = np.stack([np.linalg.norm(track.at(time, 1), axis=1) for track in tracks]) * focal
-    there = np.asarray(np.isfinite(points).all(axis=2))
-    # Several labels are rarely independent: together they count as the root of their number.
+    present = np.asarray(np.isfinite(points).all(axis=2))
+    # Labels are rarely independent: n of them count as sqrt(n).
     share = len(tracks) ** -0.25  # a moment has a's weight times b's
-    weight = np.where(there, share * speed / (speed + _SLOW_PX), 0.0)
-    points = np.where(there[:, :, None], points, 0.0)
+    weight = np.where(present, share * speed / (speed + _HALF_WEIGHT_SPEED_PX), 0.0)
+    points = np.where(present[:, :, None], points, 0.0)
     total = max(float(weight.sum()), 1e-9)
     centre = (weight[:, :, None] * points).sum(axis=(0, 1)) / total
     variance = float((weight * ((points - centre) ** 2).sum(axis=2)).sum()) / total / 2.0
-    spread = np.sqrt(max(variance, 1e-12))
-    transform = np.array([[1 / spread, 0, -centre[0] / spread], [0, 1 / spread, -centre[1] / spread], [0, 0, 1.0]])
-    return GridTrack(begin, step, (points - centre) / spread, weight, sigma_px / focal / spread, transform)
+    scale = np.sqrt(max(variance, 1e-12))
+    transform = np.array([[1 / scale, 0, -centre[0] / scale], [0, 1 / scale, -centre[1] / scale], [0, 0, 1.0]])
+    return GridTrack(begin, step, (points - centre) / scale, weight, sigma_px / focal / scale, transform)
 
 
-def busiest(track: GridTrack, seconds: float) -> GridTrack:
-    """The stretch of that many seconds in which a camera's tracks move most; all of it where it is no longer."""
+def most_active_window(track: GridTrack, seconds: float) -> GridTrack:
+    """The window of ``seconds`` with the most motion; the whole track if it is not longer."""
     length = max(1, round(seconds / track.step))
     total = np.cumsum(np.r_[0.0, track.weight.sum(axis=0)])
     if len(total) - 1 <= length:
@@ -86,11 +101,11 @@ def busiest(track: GridTrack, seconds: float) -> GridTrack:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scan:
-    """Scan over all lags.
+class LagScan:
+    """Epipolar cost at every lag.
 
-    offset: (n,) time maps ``t_a = t_b + offset`` [s]. support: (n,) seconds in which both move.
-    cost: (n,) mean squared epipolar distance over the noise; inf where the support is too small.
+    offset: (n,) time maps ``t_a = t_b + offset`` [s]. support: (n,) seconds in which both tracks move.
+    cost: (n,) mean squared epipolar distance over the squared noise; inf where not computed.
     """
 
     offset: Floats
@@ -99,9 +114,10 @@ class Scan:
 
 
 class PairMoments:
-    """The 36 cross-correlations of two grid tracks, from which the moments of any lag are read.
+    """Moment matrices of two grid tracks at any lag, from 36 cross-correlations of monomials.
 
-    Which lags have enough in common is known at once; the rest is made for the lags that are asked for first.
+    lags: (n,) in grid steps. offset: (n,) time maps ``t_a = t_b + offset`` [s]. support: (n,) seconds in which both
+    tracks move, computed at once; the moments are computed for the lags that are first requested, and kept.
     """
 
     def __init__(self, a: GridTrack, b: GridTrack) -> None:
@@ -114,72 +130,72 @@ class PairMoments:
         common = self._weight[self.lags % self._length]
         self.support: Floats = np.asarray(np.maximum(common, 0.0) * a.step, dtype=np.float64)
         self._column = np.full(len(self.lags), -1, dtype=np.int64)
-        self._moments = np.zeros((len(_PAIRS), len(_PAIRS), 0))
+        self._moments = np.zeros((len(_MONOMIALS), len(_MONOMIALS), 0))
 
     def _correlation(self, of_a: NDArray[np.complex128], of_b: NDArray[np.complex128]) -> Floats:
-        """c[lag] = sum_n a[n] b[n + lag], all labels together; negative lags from the end.
+        """c[lag] = sum_n a[n] b[n + lag], summed over labels; negative lags from the end.
 
-        of_a: spectrum (labels, m). of_b: (labels, m), or (labels, k, m) for k correlations at once: in half the time.
+        of_a: spectrum (labels, m). of_b: (labels, m), or (labels, k, m) for k correlations at once, in half the time.
         """
         product = of_a[0] * of_b[0]
         for k in range(1, len(of_a)):
             product += of_a[k] * of_b[k]
         return np.asarray(irfft(product, self._length, overwrite_x=True), dtype=np.float64)
 
-    def near(self, offset: float, window: float) -> Bools:
+    def within(self, offset: float, window: float) -> Bools:
         """Lags (n,) within ``window`` of ``offset`` [s]."""
         return np.asarray(np.abs(self.offset - offset) <= window)
 
-    def sums(self, which: Ints) -> Floats:
-        """(6, 6, m) sums of the monomials' products at chosen lags."""
+    def moment_sums(self, which: Ints) -> Floats:
+        """(6, 6, m) sums of products of monomials of a and of b at lags of index ``which`` (m,)."""
         missing = which[self._column[which] < 0]
         if len(missing):
             place = self.lags[missing] % self._length
-            made = np.empty((len(_PAIRS), len(_PAIRS), len(missing)))
+            fresh = np.empty((len(_MONOMIALS), len(_MONOMIALS), len(missing)))
             spectra_a = np.conj(rfft(monomials(self.a), self._length))
             spectra_b = rfft(monomials(self.b), self._length)
-            for i in range(len(_PAIRS)):
-                made[i] = self._correlation(spectra_a[:, i], spectra_b).take(place, axis=1)
+            for i in range(len(_MONOMIALS)):
+                fresh[i] = self._correlation(spectra_a[:, i], spectra_b).take(place, axis=1)
             self._column[missing] = self._moments.shape[2] + np.arange(len(missing))
-            self._moments = np.concatenate([self._moments, made], axis=2) if self._moments.size else made
+            self._moments = np.concatenate([self._moments, fresh], axis=2) if self._moments.size else fresh
         if len(which) == self._moments.shape[2] and bool((self._column[which] == np.arange(len(which))).all()):
             return self._moments
         return self._moments[:, :, self._column[which]]
 
     def matrices(self, which: Ints) -> tuple[Floats, Floats]:
-        """Moment matrices (m, 9, 9) and Taubin's normalisation (m, 9, 9) of chosen lags, per sample."""
-        sums = self.sums(which)
+        """Moment matrices (m, 9, 9) and Taubin's normalisation (m, 9, 9) of lags ``which`` (m,), per sample."""
+        sums = self.moment_sums(which)
         c = np.moveaxis(sums / np.maximum(sums[5, 5], 1e-9), -1, 0)
-        full = c[:, PAIR_OF][:, :, :, PAIR_OF]  # (m, i, j, k, l): sum a_i a_j b_k b_l
+        full = c[:, MONOMIAL_INDEX][:, :, :, MONOMIAL_INDEX]  # (m, i, j, k, l): sum a_i a_j b_k b_l
         moment = full.transpose(0, 1, 3, 2, 4).reshape(-1, 9, 9)
-        return moment, normalisation(full, self.a.sigma, self.b.sigma)
+        return moment, taubin_normalisation(full, self.a.sigma, self.b.sigma)
 
-    def costs(self, which: Ints) -> Floats:
-        """Smallest generalised eigenvalue (m,) at chosen lags: squared distance over noise."""
+    def min_costs(self, which: Ints) -> Floats:
+        """Smallest generalised eigenvalue (m,) at lags ``which``: mean squared distance over the squared noise."""
         out = np.full(len(which), np.inf)
-        sums = self.sums(which)
-        for begin in range(0, len(which), _CHUNK):
-            part = slice(begin, begin + _CHUNK)
-            out[part] = eigen_costs(sums[:, :, part], self.a.sigma, self.b.sigma)
+        sums = self.moment_sums(which)
+        for begin in range(0, len(which), _BATCH):
+            part = slice(begin, begin + _BATCH)
+            out[part] = smallest_eigenvalues(sums[:, :, part], self.a.sigma, self.b.sigma)
         return out
 
-    def costs_of(self, which: Ints, matrix: Floats) -> Floats:
-        """Mean squared distance over noise (m,) that a known ``m_aᵀ F m_b = 0`` leaves at chosen lags."""
-        theta = in_grid(matrix, self.a, self.b).reshape(3, 3)
+    def costs_given(self, which: Ints, matrix: Floats) -> Floats:
+        """Mean squared distance over the squared noise (m,) under a given ``m_aᵀ F m_b = 0`` at lags ``which``."""
+        theta = to_grid_coordinates(matrix, self.a, self.b).reshape(3, 3)
         plane = np.diag([1.0, 1.0, 0.0])
-        misfit = np.zeros((len(_PAIRS), len(_PAIRS)))
-        np.add.at(misfit, (_OF_A, _OF_B), np.outer(theta, theta))
-        of_a, of_b = np.zeros(len(_PAIRS)), np.zeros(len(_PAIRS))
-        np.add.at(of_b, PAIR_OF, self.a.sigma**2 * theta.T @ plane @ theta)
-        np.add.at(of_a, PAIR_OF, self.b.sigma**2 * theta @ plane @ theta.T)
-        chosen = self.sums(which)
+        misfit = np.zeros((len(_MONOMIALS), len(_MONOMIALS)))
+        np.add.at(misfit, (_MONOMIAL_OF_A, _MONOMIAL_OF_B), np.outer(theta, theta))
+        of_a, of_b = np.zeros(len(_MONOMIALS)), np.zeros(len(_MONOMIALS))
+        np.add.at(of_b, MONOMIAL_INDEX, self.a.sigma**2 * theta.T @ plane @ theta)
+        np.add.at(of_a, MONOMIAL_INDEX, self.b.sigma**2 * theta @ plane @ theta.T)
+        chosen = self.moment_sums(which)
         noise = of_b @ chosen[5] + of_a @ chosen[:, 5]
         total = np.maximum(chosen[5, 5], 1e-9)
         left = np.tensordot(misfit, chosen, 2)
         return np.asarray(np.maximum(left / total, 0.0) / np.maximum(noise / total, 1e-30))
 
     def fundamental(self, which: int) -> Floats:
-        """The best matrix (3, 3) at one lag, in normalised coordinates: ``m_aᵀ F m_b = 0``, norm 1."""
+        """The best fundamental matrix (3, 3) at one lag, of normalised points: ``m_aᵀ F m_b = 0``, norm 1."""
         moment, norm = self.matrices(np.array([which]))
         reduced = moment[0, :8, :8] - np.outer(moment[0, :8, 8], moment[0, 8, :8]) / moment[0, 8, 8]
         lower = np.linalg.inv(np.linalg.cholesky(norm[0, :8, :8] + 1e-14 * np.eye(8)))
@@ -190,7 +206,7 @@ class PairMoments:
         return np.asarray(matrix / np.linalg.norm(matrix))
 
 
-def normalisation(full: Floats, sigma_a: float, sigma_b: float) -> Floats:
+def taubin_normalisation(full: Floats, sigma_a: float, sigma_b: float) -> Floats:
     """Taubin's normalisation (m, 9, 9) of moments ``full`` (m, 3, 3, 3, 3), sum of a_i a_j b_k b_l."""
     plane = np.diag([1.0, 1.0, 0.0])
     bb, aa = full[:, 2, 2], full[:, :, :, 2, 2]
@@ -199,65 +215,65 @@ def normalisation(full: Floats, sigma_a: float, sigma_b: float) -> Floats:
     return np.asarray((first + second).reshape(-1, 9, 9))
 
 
-def eigen_costs(moments: Floats, sigma_a: float, sigma_b: float) -> Floats:
+def smallest_eigenvalues(moments: Floats, sigma_a: float, sigma_b: float) -> Floats:
     """Smallest generalised eigenvalues (m,) of moments (6, 6, m) under Taubin's normalisation.
 
-    By inverse iteration, all lags at a time: an eigenvalue comes out at most a few per cent too large where the
-    next one is nearly as small, which says the same: no geometry stands out at that lag.
+    By inverse iteration over all lags at once. An eigenvalue is at most a few per cent too large where the next one is
+    nearly as small, that is where no geometry is distinguished at that lag anyway.
     """
     scaled = moments / np.maximum(moments[5, 5], 1e-9)
-    factor, pivots = _factors(_reduced(scaled))
-    noise_a, noise_b = (sigma_b**2 * scaled[:, 5])[PAIR_OF], (sigma_a**2 * scaled[5])[PAIR_OF]
+    factor, pivots = _ldl_factors(_eliminate_constant(scaled))
+    noise_a, noise_b = (sigma_b**2 * scaled[:, 5])[MONOMIAL_INDEX], (sigma_a**2 * scaled[5])[MONOMIAL_INDEX]
     start = np.repeat(np.cos(1.7 * np.arange(1.0, 9.0) ** 2)[:, None], moments.shape[2], axis=1)
-    image = _normalised(noise_a, noise_b, start)
+    image = _apply_normalisation(noise_a, noise_b, start)
     vector, by_moment = start, image
     for _ in range(_ITERATIONS):
         by_moment = image
-        vector = _solved(factor, pivots, image)
-        image = _normalised(noise_a, noise_b, vector)
+        vector = _ldl_solve(factor, pivots, image)
+        image = _apply_normalisation(noise_a, noise_b, vector)
         over = 1.0 / np.sqrt(np.maximum((vector * image).sum(axis=0), 1e-300))
         vector *= over
         image *= over
         by_moment = by_moment * over
-    # The last two vectors together are worth as many iterations again.
-    last = _solved(factor, pivots, image)
-    return np.maximum(_least_of_two(vector, last, by_moment, image, _normalised(noise_a, noise_b, last)), 0.0)
+    # A Rayleigh-Ritz step on the last two vectors is worth as many iterations again.
+    last = _ldl_solve(factor, pivots, image)
+    return np.maximum(_rayleigh_ritz(vector, last, by_moment, image, _apply_normalisation(noise_a, noise_b, last)), 0.0)
 
 
-def _reduced(scaled: Floats) -> Floats:
-    """Moment matrices (8, 8, m), their lower halves only, of scaled moments (6, 6, m), constant term eliminated.
+def _eliminate_constant(scaled: Floats) -> Floats:
+    """Moment matrices (8, 8, m), lower triangles only, of scaled moments (6, 6, m), the constant term eliminated.
 
-    That term is free: its row of the normalisation is zero.
+    The constant term has no noise: its row of the normalisation is zero.
     """
     out = np.empty((8, 8, scaled.shape[2]))
-    border = scaled[_OF_A[:8, 8], _OF_B[:8, 8]]
+    border = scaled[_MONOMIAL_OF_A[:8, 8], _MONOMIAL_OF_B[:8, 8]]
     share = border / scaled[5, 5]
     for p in range(8):
         np.multiply(border[: p + 1], -share[p], out=out[p, : p + 1])
         for q in range(p + 1):
-            out[p, q] += scaled[_OF_A[p, q], _OF_B[p, q]]
+            out[p, q] += scaled[_MONOMIAL_OF_A[p, q], _MONOMIAL_OF_B[p, q]]
     return out
 
 
-def _normalised(noise_a: Floats, noise_b: Floats, vector: Floats) -> Floats:
-    """Taubin's normalisation, by the noise that a's and b's monomials (3, 3, m) carry, of vectors (8, m)."""
+def _apply_normalisation(noise_a: Floats, noise_b: Floats, vector: Floats) -> Floats:
+    """Product (8, m) of Taubin's normalisation with vectors (8, m). noise_a, noise_b: (3, 3, m) of monomials."""
     out = np.empty_like(vector)
     np.einsum("jlm,ilm->ijm", noise_b, vector[:6].reshape(2, 3, -1), out=out[:6].reshape(2, 3, -1))
     out[6:] = 0.0
-    out[_SIDE] += np.einsum("ikm,kjm->ijm", noise_a, vector[_SIDE].reshape(3, 2, -1)).reshape(6, -1)
+    out[_NOISY_IN_B] += np.einsum("ikm,kjm->ijm", noise_a, vector[_NOISY_IN_B].reshape(3, 2, -1)).reshape(6, -1)
     return out
 
 
-def _least_of_two(y: Floats, z: Floats, moment_y: Floats, norm_y: Floats, norm_z: Floats) -> Floats:
-    """Smallest generalised eigenvalues (m,) over the spans of y and z (n, m), of which z is one iteration on.
+def _rayleigh_ritz(y: Floats, z: Floats, moment_y: Floats, norm_y: Floats, norm_z: Floats) -> Floats:
+    """Smallest generalised eigenvalues (m,) over the spans of y and z (n, m), z being the next iterate of y.
 
-    moment_y, norm_y, norm_z: the moments' and the normalisation's products with them; y's length under that is 1.
+    moment_y, norm_y, norm_z: products of the moments and of the normalisation with them; y has length 1 in that norm.
     """
     moment_yz, moment_z = np.ones(y.shape[1]), (z * norm_y).sum(axis=0)
     length, along = np.maximum((z * norm_z).sum(axis=0), 1e-300), (y * norm_z).sum(axis=0)
     value, share = moment_z / length, along / length
     rest = np.maximum(1.0 - along * share, 0.0)
-    apart = rest > _PARALLEL
+    apart = rest > _MIN_ORTHOGONAL
     safe = np.where(apart, rest, 1.0)
     across = (moment_yz - share * moment_z) ** 2 / (length * safe)
     other = ((y * moment_y).sum(axis=0) - 2.0 * share * moment_yz + share**2 * moment_z) / safe
@@ -266,7 +282,7 @@ def _least_of_two(y: Floats, z: Floats, moment_y: Floats, norm_y: Floats, norm_z
     return np.asarray(np.where(apart, value - lower, value))
 
 
-def _factors(work: Floats) -> tuple[Floats, Floats]:
+def _ldl_factors(work: Floats) -> tuple[Floats, Floats]:
     """L (n, n, m), below its diagonal, and D (n, m) of symmetric ``L D Lᵀ`` (n, n, m), in place of its lower half."""
     least = 1e-13 * np.maximum(np.einsum("ppm->m", work), 1e-300)
     for k in range(len(work)):
@@ -278,7 +294,7 @@ def _factors(work: Floats) -> tuple[Floats, Floats]:
     return work, np.einsum("ppm->pm", work)
 
 
-def _solved(factor: Floats, pivots: Floats, right: Floats) -> Floats:
+def _ldl_solve(factor: Floats, pivots: Floats, right: Floats) -> Floats:
     """(n, m) solutions of ``L D Lᵀ x = right``."""
     out = right.copy()
     for k in range(len(out)):
@@ -289,71 +305,83 @@ def _solved(factor: Floats, pivots: Floats, right: Floats) -> Floats:
     return out
 
 
-def fixed_costs(moment: Floats, norm: Floats, theta: Floats) -> Floats:
-    """Mean squared distances over noise (m,) that one matrix ``theta`` (9,) leaves."""
+def costs_given_geometry(moment: Floats, norm: Floats, theta: Floats) -> Floats:
+    """Mean squared distances over the squared noise (m,) under one matrix ``theta`` (9,).
+
+    moment, norm: (m, 9, 9) moments and their normalisation.
+    """
     return np.asarray(np.maximum((moment @ theta @ theta) / np.maximum(norm @ theta @ theta, 1e-30), 0.0))
 
 
-def in_grid(matrix: Floats, a: GridTrack, b: GridTrack) -> Floats:
-    """The (9,) entries, in the grids' coordinates, of ``m_aᵀ F m_b = 0`` (3, 3) of normalised points."""
+def to_grid_coordinates(matrix: Floats, a: GridTrack, b: GridTrack) -> Floats:
+    """Entries (9,), in the grids' coordinates, of a matrix (3, 3) of normalised points, ``m_aᵀ F m_b = 0``."""
     return np.asarray(np.linalg.inv(a.transform).T @ matrix @ np.linalg.inv(b.transform)).reshape(9)
 
 
 def monomials(track: GridTrack) -> Floats:
-    """(labels, 6, n): weight times the six products of the homogeneous coordinates."""
+    """(labels, 6, n): weight times the six monomials of the homogeneous coordinates."""
     x, y = track.points[:, :, 0], track.points[:, :, 1]
-    out = np.empty((len(x), len(_PAIRS), x.shape[1]))
+    out = np.empty((len(x), len(_MONOMIALS), x.shape[1]))
     out[:, 2], out[:, 4], out[:, 5] = track.weight * x, track.weight * y, track.weight
     out[:, 0], out[:, 1], out[:, 3] = out[:, 2] * x, out[:, 2] * y, out[:, 4] * y
     return out
 
 
 def scan_lags(
-    moments: PairMoments, least_support: float, known: Floats | None = None, near: tuple[float, float] | None = None
-) -> Scan:
-    """Cost at every lag with at least ``least_support`` seconds of common motion.
+    moments: PairMoments,
+    min_scan_support: float,
+    known_fundamental: Floats | None = None,
+    lag_window: tuple[float, float] | None = None,
+) -> LagScan:
+    """Cost at every lag with at least ``min_scan_support`` seconds of common motion.
 
-    known: (3, 3) ``m_aᵀ F m_b = 0`` of normalised points, where the geometry is given. near: offset and
-    window [s] where the offset is about known: of the other lags a few hundred, to compare with.
+    known_fundamental: (3, 3) ``m_aᵀ F m_b = 0`` of normalised points, where the geometry is given. lag_window: offset
+    and half-width [s] to scan; of the other lags then only a few hundred, for comparison.
     """
     cost = np.full(len(moments.lags), np.inf)
-    looked_at = moments.support >= least_support
-    if near is not None:
-        thinned = np.zeros_like(looked_at)
-        thinned[:: max(1, len(thinned) // _COMPARED)] = True
-        looked_at &= thinned | moments.near(*near)
-    which = np.flatnonzero(looked_at)
+    selected = moments.support >= min_scan_support
+    if lag_window is not None:
+        thinned = np.zeros_like(selected)
+        thinned[:: max(1, len(thinned) // _COMPARISON_LAGS)] = True
+        selected &= thinned | moments.within(*lag_window)
+    which = np.flatnonzero(selected)
     if len(which):
-        cost[which] = moments.costs(which) if known is None else moments.costs_of(which, known)
-    return Scan(moments.offset, moments.support, cost)
+        cost[which] = (
+            moments.min_costs(which) if known_fundamental is None else moments.costs_given(which, known_fundamental)
+        )
+    return LagScan(moments.offset, moments.support, cost)
 
 
-def candidates(scan: Scan, per_stratum: int, at_most: int, near: tuple[float, float] | None = None) -> Ints:
-    """Lags worth a closer look: local minima of the cost, the best few in each octave of support.
+def candidate_lags(
+    scan: LagScan, candidates_per_octave: int, max_candidates: int, lag_window: tuple[float, float] | None = None
+) -> Ints:
+    """Indices of candidate lags: local minima of the cost, the best few in each octave of support.
 
-    Where little overlaps, any lag fits: comparing only lags of like support keeps the truth on the list.
-    near: offset and window [s] outside which none is.
+    Any lag fits where little overlaps; comparing only lags of similar support keeps the true lag on the list.
+    lag_window: offset and half-width [s] that contain all candidates.
     """
-    return ranked(scan, per_stratum, near)[0][:at_most]
+    return ranked_minima(scan, candidates_per_octave, lag_window)[0][:max_candidates]
 
 
-def ranked(scan: Scan, per_stratum: int, near: tuple[float, float] | None = None) -> tuple[Ints, Floats]:
-    """Those lags, and what speaks for them: seconds of support times how much better than usual; best first."""
+def ranked_minima(
+    scan: LagScan, candidates_per_octave: int, lag_window: tuple[float, float] | None = None
+) -> tuple[Ints, Floats]:
+    """Candidate lags and their scores, best first: support [s] times the log of the median cost over the lag's."""
     cost = scan.cost
     with np.errstate(invalid="ignore"):
         minimum: Bools = np.isfinite(cost)
         minimum[1:] &= ~(cost[1:] > cost[:-1])
         minimum[:-1] &= cost[:-1] <= cost[1:]
-    if near is not None:
-        minimum &= np.abs(scan.offset - near[0]) <= near[1]
+    if lag_window is not None:
+        minimum &= np.abs(scan.offset - lag_window[0]) <= lag_window[1]
     where = np.flatnonzero(minimum)
     octave = np.floor(np.log2(scan.support[where])).astype(np.int64)
     chosen: list[tuple[float, int]] = []
     for level in np.unique(octave):
         members = where[octave == level]
-        usual = max(float(np.median(cost[np.isfinite(cost) & (scan.support >= 2.0**level)])), 1e-9)
-        for index in members[np.argsort(cost[members], kind="stable")][:per_stratum]:
-            rank = scan.support[index] * np.log(usual / max(float(cost[index]), 0.05) + 1.0)
+        median = max(float(np.median(cost[np.isfinite(cost) & (scan.support >= 2.0**level)])), 1e-9)
+        for index in members[np.argsort(cost[members], kind="stable")][:candidates_per_octave]:
+            rank = scan.support[index] * np.log(median / max(float(cost[index]), 0.05) + 1.0)
             chosen.append((-float(rank), int(index)))
     chosen.sort()
     return np.array([index for _, index in chosen], dtype=np.int64), np.array([-rank for rank, _ in chosen])

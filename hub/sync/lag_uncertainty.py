@@ -1,9 +1,9 @@
-"""How far a pair's lag leans on lenses that are only about as told, and on any one part of the motion.
+"""Uncertainty of a pair's lag: std with lens and readout errors as consider parameters, and leave-out change.
 
-Where a path is nearly flat or slow, a focal length 1 % off or rows that are read one after another move the lag by
-more than noise does, and residuals do not tell it. So both lenses' errors and readouts are parameters too, under
-priors as wide as those errors usually are: consider parameters first (Schmidt's filter: they add to the covariance),
-which is cheap, and freed where that leaves the lag in doubt. Residuals that are alike count as one.
+Where a path is nearly planar or slow, a focal length that is 1 % off or a rolling shutter shifts the lag by more than
+noise does, and residuals do not show it. So the errors of both lenses and the readout times are parameters with priors
+of their usual size: consider parameters (Schmidt: not estimated, but added to the covariance), which is cheap, and
+estimated where the std of the lag is then too large. Autocorrelated residuals count by their effective sample size.
 """
 
 from __future__ import annotations
@@ -12,186 +12,201 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hub.sync.alignment import Samples, correlated
-from hub.two_view.refinement import WIDE, Refined
+from hub.sync.samples import Samples, autocorrelation
+from hub.two_view.refinement import FINAL_WIDTH, RefinementResult
 from hub.two_view.relative_pose import RelativePose, homogeneous
 from protocols.geometry.types import Bools, Floats
 
-_LENS = (0.015, 0.012, 0.012, 0.02)
-"""Std of what is told of a lens: log focal length, principal point (normalised), k1."""
-_READOUT = 0.02
-"""Std [s] of the time in which a shutter rolls over one unit of normalised height: 15 ms for most pictures."""
-_TOLERANCE = np.array([*_LENS, *_LENS, _READOUT, _READOUT])
-_POSE = 5
-_MIDDLE, _SLOWNESS = _POSE, _POSE + 1
-_PARTS = 5
+_LENS_STD = (0.015, 0.012, 0.012, 0.02)
+"""Std of given intrinsics: log focal length, principal point (normalised), k1."""
+_READOUT_STD = 0.02
+"""Std of the rolling-shutter readout time [s] per unit of normalised height: about 15 ms for most images."""
+_CONSIDER_STD = np.array([*_LENS_STD, *_LENS_STD, _READOUT_STD, _READOUT_STD])
+_POSE_DOF = 5
+_INTERCEPT, _INVERSE_RATE = _POSE_DOF, _POSE_DOF + 1
+_LEAVE_OUT_PARTS = 5  # contiguous folds of the samples
 _ITERATIONS = 20
-_STILL = 1e-5  # relative fall of the cost at which a search ends
-_GIVEN_UP = 1e6  # damping
+_MIN_RELATIVE_DECREASE = 1e-5  # of the cost, at which the iteration has converged
+_MAX_DAMPING = 1e6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Leaning:
-    """The time map ``t_b = slowness * (t_a - centre) + middle`` in the samples' centre, and how firm it is.
+class LagUncertainty:
+    """Time map ``t_b = inverse_rate * (t_a - centre) + intercept``, centre of the samples, and its uncertainty.
 
-    std [s]: of middle, lenses and readouts included. swing [s]: the most that it moves when a fifth of the samples, in
-    a row, is left out; 0 where it was not looked at.
+    std: of the intercept [s], lens and readout uncertainty included. leave_out_change: greatest change of the intercept
+    [s] when a contiguous fifth of the samples is left out (jackknife); 0 where not computed.
     """
 
-    slowness: float
-    middle: float
+    inverse_rate: float
+    intercept: float
     std: float
-    swing: float = 0.0
+    leave_out_change: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _State:
-    """lens: (10,) log focal length, centre (2) and k1 of a, then of b, then both readouts [s per unit of height]."""
+class _Parameters:
+    """Pose, time map and lens errors.
+
+    lens_errors: (10,) log focal length, principal point (2) and k1 of a, then of b, then both readout times [s per
+    unit of normalised height].
+    """
 
     pose: RelativePose
-    middle: float
-    slowness: float
-    lens: Floats
+    intercept: float
+    inverse_rate: float
+    lens_errors: Floats
 
-    def moved(self, step: Floats) -> _State:
-        return _State(
-            self.pose.moved(step[:_POSE]),
-            self.middle + float(step[_MIDDLE]),
-            self.slowness + float(step[_SLOWNESS]),
-            self.lens + step[_SLOWNESS + 1 :],
+    def retract(self, step: Floats) -> _Parameters:
+        return _Parameters(
+            self.pose.retract(step[:_POSE_DOF]),
+            self.intercept + float(step[_INTERCEPT]),
+            self.inverse_rate + float(step[_INVERSE_RATE]),
+            self.lens_errors + step[_INVERSE_RATE + 1 :],
         )
 
 
-def leaning(samples: Samples, found: Refined, sigma: tuple[float, float], rate_std: float, sure: float) -> Leaning:
-    """How firm the lag of ``found`` is; where it is less so than ``sure`` [s], with the lenses freed.
+def estimate_lag_uncertainty(
+    samples: Samples, found: RefinementResult, sigma: tuple[float, float], rate_prior_std: float, std_limit: float
+) -> LagUncertainty:
+    """Std of the lag of ``found``; where it exceeds ``std_limit`` [s], the lenses are estimated too.
 
-    found: with a relative pose, ``middle`` in the samples' centre. sigma: noise of normalised points of a and of b.
-    rate_std: prior of the rate about 1. Raises TypeError for a fundamental matrix.
+    Then time map, std and leave-out change are of the fit with lenses. found: with a relative pose, its intercept at
+    the samples' centre. sigma: noise std of normalised points of a and of b. rate_prior_std: of the rate about 1.
+    Raises TypeError for a fundamental matrix.
     """
     if not isinstance(found.geometry, RelativePose):
-        raise TypeError("without lenses there are no lenses to free")
-    state = _State(found.geometry, found.middle, found.slowness, np.zeros(len(_TOLERANCE)))
-    every = np.ones(samples.count, dtype=np.bool_)
-    residual, jacobian = _rows(samples, state, sigma, every)
+        raise TypeError("a fundamental matrix has no lenses to estimate")
+    parameters = _Parameters(found.geometry, found.intercept, found.inverse_rate, np.zeros(len(_CONSIDER_STD)))
+    all_samples = np.ones(samples.count, dtype=np.bool_)
+    residual, jacobian = _residuals(samples, parameters, sigma, all_samples)
     scale = max(float(np.median(np.abs(residual))) / 0.6745, 1e-9)
-    prior = np.concatenate([np.zeros(_MIDDLE + 1), [rate_std**-2], _TOLERANCE**-2])
-    weight = _robust(residual, WIDE * scale)
-    over = _over_white(residual, jacobian[:, : _SLOWNESS + 1], weight, scale, prior[: _SLOWNESS + 1])
-    std = _considered(jacobian / (scale * over), weight, prior)
-    if std <= sure:
-        return Leaning(found.slowness, found.middle, std)
-    noise, width = (sigma[0] * scale * over, sigma[1] * scale * over), WIDE / over
-    freed, std = _solve(samples, state, noise, width, prior, every)
-    part = np.argsort(np.argsort(samples.time)) * _PARTS // samples.count
-    without = [_solve(samples, freed, noise, width, prior, part != k)[0] for k in range(_PARTS)]
-    swing = max(abs(one.middle - freed.middle) for one in without)
-    return Leaning(freed.slowness, freed.middle, std, swing)
-
-
-def _over_white(residual: Floats, jacobian: Floats, weight: Floats, scale: float, prior: Floats) -> float:
-    """By how much residuals that are alike make the lag's std larger than as many separate ones (n,) would.
-
-    A sandwich with the residuals' own correlations: what is alike for long the geometry takes up, and the lag is
-    spared.
-    """
-    correlations = correlated(residual)
-    spread = scale * np.sqrt(max(2.0 * float(correlations.sum()) - 1.0, 1.0))
-    weighted = jacobian * weight[:, None]
-    covariance = np.linalg.pinv(weighted.T @ jacobian / spread**2 + np.diag(prior), hermitian=True)[_MIDDLE]
-    share = weighted @ covariance * (scale / spread**2)  # what a residual moves the lag by
-    along = share @ share + 2.0 * sum(
-        float(one) * float(share[lag:] @ share[:-lag]) for lag, one in enumerate(correlations[1:], start=1)
+    prior = np.concatenate([np.zeros(_INTERCEPT + 1), [rate_prior_std**-2], _CONSIDER_STD**-2])
+    weight = _cauchy_weight(residual, FINAL_WIDTH * scale)
+    inflation = _autocorrelation_inflation(
+        residual, jacobian[:, : _INVERSE_RATE + 1], weight, scale, prior[: _INVERSE_RATE + 1]
     )
-    return float(max(spread / scale * np.sqrt(max(along, 0.0) / covariance[_MIDDLE]), 1.0))
+    std = _consider_std(jacobian / (scale * inflation), weight, prior)
+    if std <= std_limit:
+        return LagUncertainty(found.inverse_rate, found.intercept, std)
+    noise, width = (sigma[0] * scale * inflation, sigma[1] * scale * inflation), FINAL_WIDTH / inflation
+    refined, std = _estimate_with_lenses(samples, parameters, noise, width, prior, all_samples)
+    fold = np.argsort(np.argsort(samples.time)) * _LEAVE_OUT_PARTS // samples.count
+    left_out = [
+        _estimate_with_lenses(samples, refined, noise, width, prior, fold != k)[0] for k in range(_LEAVE_OUT_PARTS)
+    ]
+    leave_out_change = max(abs(one.intercept - refined.intercept) for one in left_out)
+    return LagUncertainty(refined.inverse_rate, refined.intercept, std, leave_out_change)
 
 
-def _considered(jacobian: Floats, weight: Floats, prior: Floats) -> float:
-    """Std of the lag where the lenses stay as told: by noise, and by what their tolerance does to it."""
-    own = _SLOWNESS + 1
+def _autocorrelation_inflation(
+    residual: Floats, jacobian: Floats, weight: Floats, scale: float, prior: Floats
+) -> float:
+    """Factor by which autocorrelation of the residuals (n,) inflates the std of the lag.
+
+    Sandwich covariance with the residuals' autocorrelation: slowly varying errors are mostly absorbed by the geometry
+    and affect the lag less.
+    """
+    rho = autocorrelation(residual)
+    inflated_scale = scale * np.sqrt(max(2.0 * float(rho.sum()) - 1.0, 1.0))
+    weighted = jacobian * weight[:, None]
+    covariance = np.linalg.pinv(weighted.T @ jacobian / inflated_scale**2 + np.diag(prior), hermitian=True)[_INTERCEPT]
+    influence = weighted @ covariance * (scale / inflated_scale**2)  # change of the lag per residual
+    variance = influence @ influence + 2.0 * sum(
+        float(one) * float(influence[lag:] @ influence[:-lag]) for lag, one in enumerate(rho[1:], start=1)
+    )
+    return float(max(inflated_scale / scale * np.sqrt(max(variance, 0.0) / covariance[_INTERCEPT]), 1.0))
+
+
+def _consider_std(jacobian: Floats, weight: Floats, prior: Floats) -> float:
+    """Std of the lag with given lenses: noise covariance plus consider covariance of the lens errors."""
+    estimated = _INVERSE_RATE + 1
     weighted = jacobian * weight[:, None]
     normal = weighted.T @ jacobian
-    covariance = np.linalg.pinv(normal[:own, :own] + np.diag(prior[:own]), hermitian=True)
-    leant = covariance[_MIDDLE] @ normal[:own, own:] * _TOLERANCE
-    return float(np.sqrt(covariance[_MIDDLE, _MIDDLE] + leant @ leant))
+    covariance = np.linalg.pinv(normal[:estimated, :estimated] + np.diag(prior[:estimated]), hermitian=True)
+    systematic = covariance[_INTERCEPT] @ normal[:estimated, estimated:] * _CONSIDER_STD
+    return float(np.sqrt(covariance[_INTERCEPT, _INTERCEPT] + systematic @ systematic))
 
 
-def _solve(
-    samples: Samples, state: _State, noise: tuple[float, float], width: float, prior: Floats, use: Bools
-) -> tuple[_State, float]:
-    """Levenberg-Marquardt over all parameters, and the std of the lag. use: (n,) the samples that count."""
+def _estimate_with_lenses(
+    samples: Samples, parameters: _Parameters, noise: tuple[float, float], width: float, prior: Floats, use: Bools
+) -> tuple[_Parameters, float]:
+    """Levenberg-Marquardt over all 17 parameters, and the std of the lag. use: (n,) mask of the samples."""
 
-    def system(at: _State) -> tuple[Floats, Floats, float]:
-        residual, jacobian = _rows(samples, at, noise, use)
-        weighted = jacobian * _robust(residual, width)[:, None]
-        off = np.concatenate([np.zeros(_MIDDLE + 1), [at.slowness - 1.0], at.lens])
-        cost = width**2 * float(np.log1p((residual / width) ** 2).sum()) + float((prior * off * off).sum())
-        return weighted.T @ jacobian + np.diag(prior), weighted.T @ residual + prior * off, cost
+    def system(at: _Parameters) -> tuple[Floats, Floats, float]:
+        residual, jacobian = _residuals(samples, at, noise, use)
+        weighted = jacobian * _cauchy_weight(residual, width)[:, None]
+        deviation = np.concatenate([np.zeros(_INTERCEPT + 1), [at.inverse_rate - 1.0], at.lens_errors])
+        cost = width**2 * float(np.log1p((residual / width) ** 2).sum()) + float((prior * deviation * deviation).sum())
+        return weighted.T @ jacobian + np.diag(prior), weighted.T @ residual + prior * deviation, cost
 
     damping = 1e-3
-    normal, gradient, cost = system(state)
+    normal, gradient, cost = system(parameters)
     for _ in range(_ITERATIONS):
         step = np.linalg.solve(normal + np.diag(damping * np.diag(normal) + 1e-12), -gradient)
-        trial = state.moved(np.asarray(step, dtype=np.float64))
-        there = system(trial)
-        if there[2] < cost:
-            done = cost - there[2] < _STILL * cost
-            state, (normal, gradient, cost) = trial, there
+        trial = parameters.retract(np.asarray(step, dtype=np.float64))
+        trial_system = system(trial)
+        if trial_system[2] < cost:
+            done = cost - trial_system[2] < _MIN_RELATIVE_DECREASE * cost
+            parameters, (normal, gradient, cost) = trial, trial_system
             damping = max(damping / 5.0, 1e-9)
             if done:
                 break
         else:
             damping *= 8.0
-            if damping > _GIVEN_UP:
+            if damping > _MAX_DAMPING:
                 break
-    return state, float(np.sqrt(np.linalg.pinv(normal, hermitian=True)[_MIDDLE, _MIDDLE]))
+    return parameters, float(np.sqrt(np.linalg.pinv(normal, hermitian=True)[_INTERCEPT, _INTERCEPT]))
 
 
-def _rows(samples: Samples, state: _State, noise: tuple[float, float], use: Bools) -> tuple[Floats, Floats]:
-    """Sampson distances over the noise (n,), and their derivatives (n, 17): pose, middle, slowness, lenses."""
-    lever = samples.time - samples.centre
-    time = state.slowness * lever + state.middle
-    readout_a, readout_b = state.lens[-2:]
-    # A row below the middle is read later; b's own one is known well enough at the time without that.
-    height_b = np.nan_to_num(samples.of_b(time)[0][:, 1])
-    b, speed = samples.of_b(time + readout_a * samples.points[:, 1] - readout_b * height_b)
-    there = np.isfinite(b[:, 0]) & use
-    a, b, speed, lever = samples.points[there], b[there], speed[there], lever[there]
-    true_a, true_b = _freed(a, state.lens[:4]), _freed(b, state.lens[4:8])
-    matrix = state.pose.matrix
+def _residuals(
+    samples: Samples, parameters: _Parameters, noise: tuple[float, float], use: Bools
+) -> tuple[Floats, Floats]:
+    """Sampson distances over the noise (n,), and their Jacobian (n, 17): pose, intercept, inverse rate, lens errors."""
+    centred_time = samples.time - samples.centre
+    time = parameters.inverse_rate * centred_time + parameters.intercept
+    readout_a, readout_b = parameters.lens_errors[-2:]
+    # Rows below the middle are read later; b's height is accurate enough without its own readout correction.
+    height_b = np.nan_to_num(samples.interpolate_b(time)[0][:, 1])
+    b, speed = samples.interpolate_b(time + readout_a * samples.points[:, 1] - readout_b * height_b)
+    present = np.isfinite(b[:, 0]) & use
+    a, b, speed, centred_time = samples.points[present], b[present], speed[present], centred_time[present]
+    true_a, true_b = _with_lens_errors(a, parameters.lens_errors[:4]), _with_lens_errors(b, parameters.lens_errors[4:8])
+    matrix = parameters.pose.matrix
     line_a, line_b = homogeneous(true_b) @ matrix, homogeneous(true_a) @ matrix.T
     variance = noise[0] ** 2 * (line_a[:, :2] ** 2).sum(axis=1) + noise[1] ** 2 * (line_b[:, :2] ** 2).sum(axis=1)
-    over = 1.0 / np.sqrt(np.maximum(variance, 1e-30))
-    jacobian = np.empty((len(a), _SLOWNESS + 1 + len(_TOLERANCE)))
+    inverse_noise = 1.0 / np.sqrt(np.maximum(variance, 1e-30))
+    jacobian = np.empty((len(a), _INVERSE_RATE + 1 + len(_CONSIDER_STD)))
     products = homogeneous(true_b)[:, :, None] * homogeneous(true_a)[:, None, :]
-    jacobian[:, :_POSE] = products.reshape(-1, 9) @ state.pose.tangents().reshape(_POSE, 9).T
-    jacobian[:, _MIDDLE] = (line_b[:, :2] * speed).sum(axis=1)
-    jacobian[:, _SLOWNESS] = jacobian[:, _MIDDLE] * lever
-    jacobian[:, 7:11] = _by_lens(a, line_a)
-    jacobian[:, 11:15] = _by_lens(b, line_b)
-    jacobian[:, 15] = jacobian[:, _MIDDLE] * a[:, 1]
-    jacobian[:, 16] = -jacobian[:, _MIDDLE] * b[:, 1]
-    return (homogeneous(true_b) * line_b).sum(axis=1) * over, jacobian * over[:, None]
+    jacobian[:, :_POSE_DOF] = products.reshape(-1, 9) @ parameters.pose.tangents().reshape(_POSE_DOF, 9).T
+    jacobian[:, _INTERCEPT] = (line_b[:, :2] * speed).sum(axis=1)
+    jacobian[:, _INVERSE_RATE] = jacobian[:, _INTERCEPT] * centred_time
+    jacobian[:, 7:11] = _lens_jacobian(a, line_a)
+    jacobian[:, 11:15] = _lens_jacobian(b, line_b)
+    jacobian[:, 15] = jacobian[:, _INTERCEPT] * a[:, 1]
+    jacobian[:, 16] = -jacobian[:, _INTERCEPT] * b[:, 1]
+    return (homogeneous(true_b) * line_b).sum(axis=1) * inverse_noise, jacobian * inverse_noise[:, None]
 
 
-def _freed(points: Floats, lens: Floats) -> Floats:
-    """Normalised points (n, 2) under a lens that is off by ``lens`` (4,) from what they were made with."""
-    moved = (points - lens[1:3]) * np.exp(-lens[0])
-    return np.asarray(moved * (1.0 - lens[3] * (moved**2).sum(axis=1, keepdims=True)))
+def _with_lens_errors(points: Floats, lens_errors: Floats) -> Floats:
+    """Normalised points (n, 2) corrected for ``lens_errors`` (4,) of the intrinsics they were computed with."""
+    corrected = (points - lens_errors[1:3]) * np.exp(-lens_errors[0])
+    return np.asarray(corrected * (1.0 - lens_errors[3] * (corrected**2).sum(axis=1, keepdims=True)))
 
 
-def _by_lens(points: Floats, line: Floats) -> Floats:
-    """Derivatives (n, 4) of the distances from lines (n, 3) by the four numbers of a lens, to first order."""
-    along = (points * line[:, :2]).sum(axis=1)
-    return -np.column_stack([along, line[:, 0], line[:, 1], along * (points**2).sum(axis=1)])
+def _lens_jacobian(points: Floats, line: Floats) -> Floats:
+    """Derivatives (n, 4) of the distances from lines (n, 3) by the four lens errors, to first order."""
+    variance = (points * line[:, :2]).sum(axis=1)
+    return -np.column_stack([variance, line[:, 0], line[:, 1], variance * (points**2).sum(axis=1)])
 
 
-def _robust(residual: Floats, width: float) -> Floats:
+def _cauchy_weight(residual: Floats, width: float) -> Floats:
     return np.asarray(1.0 / (1.0 + (residual / width) ** 2))
 
 
-def at_centre(found: Refined, centre: float, samples: Samples) -> Refined:
-    """``found`` of samples with the centre ``centre``, in the centre of others."""
-    return replace(found, middle=found.middle + found.slowness * (samples.centre - centre))
+def recentred(found: RefinementResult, centre: float, samples: Samples) -> RefinementResult:
+    """``found`` of samples centred at ``centre`` [s], with its intercept at the centre of ``samples``."""
+    return replace(found, intercept=found.intercept + found.inverse_rate * (samples.centre - centre))
 
 
-__all__ = ["Leaning", "at_centre", "leaning"]
+__all__ = ["LagUncertainty", "estimate_lag_uncertainty", "recentred"]

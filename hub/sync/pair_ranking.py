@@ -1,35 +1,36 @@
-"""Which of many pairs of cameras to look at first."""
+"""Ranking of camera pairs by a coarse lag scan."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from hub.sync.alignment import PairSettings, grid_step
-from hub.sync.lag_scan import PairMoments, ranked, scan_lags
-from hub.sync.track_cache import Kept
+from hub.sync.lag_scan import PairMoments, ranked_minima, scan_lags, scan_step
+from hub.sync.settings import PairSettings
+from hub.sync.track_cache import TrackCache
 from hub.trajectory.image_tracks import SmoothTrack
 
-_COARSER = 8.0  # than the step of the scan proper
+_COARSENING = 8.0  # times the grid step of the full scan
 
 
-def promise(
+def ranking_score(
     tracks_a: Mapping[str, SmoothTrack],
     tracks_b: Mapping[str, SmoothTrack],
     settings: PairSettings | None = None,
-    kept: Kept | None = None,
+    cache: TrackCache | None = None,
 ) -> float:
-    """What a coarse scan says for any alignment of two cameras: seconds of support times how much better than usual.
+    """Ranking score of a pair: the best candidate's score (`lag_scan.ranked_minima`) in a coarse scan of all lags.
 
-    Tells which of many pairs to try first, and nothing else. kept: what other pairs of these cameras asked already.
+    Only for the order in which pairs are solved; 0 without common labels or candidates. cache: grids that other pairs
+    of these cameras have computed.
     """
-    s, kept = settings or PairSettings(), kept or Kept()
+    s, cache = settings or PairSettings(), cache or TrackCache()
     labels = [label for label in tracks_a if label in tracks_b]
     if not labels:
         return 0.0
     a, b = [tracks_a[k] for k in labels], [tracks_b[k] for k in labels]
-    step = _COARSER * grid_step(max(kept.fast_motion(track) for track in (*a, *b)), s)
-    # A step moves the point by that much more than in the scan proper.
-    sigma = s.sigma_px * _COARSER
-    scan = scan_lags(PairMoments(kept.grid(a, step, sigma), kept.grid(b, step, sigma)), s.least_support)
-    found = ranked(scan, 1)[1]
+    step = _COARSENING * scan_step(max(cache.fast_image_speed(track) for track in (*a, *b)), s)
+    # The point moves by that much more in a grid step than in the full scan.
+    sigma = s.sigma_px * _COARSENING
+    scan = scan_lags(PairMoments(cache.grid(a, step, sigma), cache.grid(b, step, sigma)), s.min_scan_support)
+    found = ranked_minima(scan, 1)[1]
     return float(found[0]) if len(found) else 0.0

@@ -1,1 +1,1 @@
-"""Targets in 3-D from single-camera observations, each at its own time. No sockets, threads, files or clocks."""
+"""Multi-target tracking in 3-D from asynchronous single-camera detections. No sockets, threads, files or clocks."""

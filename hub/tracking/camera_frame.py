@@ -1,4 +1,4 @@
-"""A calibrated camera as tracking sees it, and one frame of it in normalised coordinates and reference time."""
+"""A calibrated camera for tracking, and the detections of one frame in normalised coordinates and reference time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hub.tracking.filter.target_models import INDEX
+from hub.tracking.filter.target_models import KIND_INDEX
 from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
@@ -16,18 +16,18 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration
 
 _DEFAULT_STD_PX = 1.5
-"""Of a detection that tells no covariance."""
-_LEAST_STD_PX = 0.2
+"""Of a detection without a covariance."""
+_MIN_STD_PX = 0.2
 _BORDER = 0.02
-"""Share of the image's sides within which nothing is expected to be found: the border cuts it."""
+"""Border as a fraction of the image's sides in which no detection is expected: targets are truncated there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackingCamera:
-    """One camera. boot_id: the boot whose clock the time map speaks of; "" = of every one.
+    """One calibrated camera. boot_id: the boot whose clock the time map refers to; "" = any.
 
-    time_std: of the time map [s]. noise_px: of the calibration. low, high: (2,) corners of the image in normalised
-    coordinates, without its border.
+    time_std: of the time map's offset [s]. noise_px: std of the calibration's residuals. low, high: (2,) corners of the
+    image without its border, in normalised coordinates.
     """
 
     name: str
@@ -49,7 +49,7 @@ class TrackingCamera:
         object.__setattr__(self, "high", np.nanmax(border, axis=0))
 
     @classmethod
-    def of(cls, camera: CameraCalibration, boot_id: str = "") -> TrackingCamera:
+    def from_calibration(cls, camera: CameraCalibration, boot_id: str = "") -> TrackingCamera:
         """From a solved calibration."""
         return cls(
             camera.name,
@@ -72,18 +72,19 @@ class TrackingCamera:
         return behind - round((1.0 - 1.0 / self.time_map.clock_rate) * behind)
 
     def sees(self, normalised: Floats, depth: Floats) -> Bools:
-        """Whether points (n, 2) at depths (n,) are well inside the image."""
+        """Whether points (n, 2), normalised, at depths (n,) are inside the image without its border."""
         with np.errstate(invalid="ignore"):
             inside = ((normalised > self.low) & (normalised < self.high)).all(axis=1)
         return np.asarray(inside & (depth > 0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
-    """What one camera saw at one moment; (n,) detections in normalised coordinates, NaN where not told.
+class FrameDetections:
+    """The n detections of one frame in normalised image coordinates, NaN where missing.
 
-    reference_ns: corrected time. point, head, foot: (n, 2). noise: (n, 2, 2) of the point; per: (n,) normalised units a
-    pixel there. size: (n,). colour: (n, 3). kind: (n,) index in BODIES. target: track that the camera matched.
+    reference_ns: capture time on the reference clock. point, head, foot: (n, 2). noise: (n, 2, 2) covariance of the
+    point; units_per_px: (n,) normalised units per pixel there. size: (n,). colour: (n, 3). kind: (n,) index in
+    TARGET_MODELS. target: label of the track that the camera's own tracker matched, "" = none.
     """
 
     camera: TrackingCamera
@@ -92,7 +93,7 @@ class Frame:
     sequence: int
     point: Floats
     noise: Floats
-    per: Floats
+    units_per_px: Floats
     head: Floats
     foot: Floats
     size: Floats
@@ -102,51 +103,53 @@ class Frame:
 
     @property
     def key(self) -> tuple[int, str, str, int]:
-        """Frames are handled in this order, however they arrive."""
+        """The order in which frames are processed, whatever their order of arrival."""
         return self.reference_ns, self.camera.name, self.boot_id, self.sequence
 
     def __len__(self) -> int:
         return len(self.point)
 
 
-def frame_of(camera: TrackingCamera, message: pb.Observation, reference_ns: int | None = None) -> Frame:
-    """The tracked detections of an observation; those that the lens cannot have made are left out."""
+def frame_detections(
+    camera: TrackingCamera, message: pb.Observation, reference_ns: int | None = None
+) -> FrameDetections:
+    """The trackable detections of an observation; those that cannot be undistorted are left out."""
     found = [detection for detection in message.detections if tracked_kind(detection)]
-    told = [((d.u, d.v), _pair(d.head), _pair(d.foot)) for d in found]
-    pixels = np.array(told, dtype=np.float64).reshape(-1, 2)
+    pixel_pairs = [((d.u, d.v), _pixel_or_nan(d.head), _pixel_or_nan(d.foot)) for d in found]
+    pixels = np.array(pixel_pairs, dtype=np.float64).reshape(-1, 2)
     normalised = np.full(pixels.shape, np.nan)
     given = np.isfinite(pixels[:, 0])
     if given.any():
         normalised[given] = camera.intrinsics.unproject(pixels[given])
-    ends = normalised.reshape(-1, 3, 2)
-    good = np.isfinite(ends[:, 0]).all(axis=1)
+    parts = normalised.reshape(-1, 3, 2)
+    good = np.isfinite(parts[:, 0]).all(axis=1)
     if not good.all():
         found = [detection for detection, kept in zip(found, good, strict=True) if kept]
-        ends = ends[good]
-    point = ends[:, 0]
+        parts = parts[good]
+    point = parts[:, 0]
     inverse = np.linalg.inv(camera.intrinsics.pixel_jacobian(point)) if len(found) else np.zeros((0, 2, 2))
     noise = np.array([_covariance(d) for d in found]).reshape(-1, 2, 2) + camera.noise_px**2 * np.eye(2)
-    per = np.sqrt(np.abs(np.linalg.det(inverse)))
+    units_per_px = np.sqrt(np.abs(np.linalg.det(inverse)))
     colour = [(d.colour.red, d.colour.green, d.colour.blue) if d.HasField("colour") else (np.nan,) * 3 for d in found]
-    return Frame(
+    return FrameDetections(
         camera=camera,
         reference_ns=camera.reference_ns(message.device_time_ns) if reference_ns is None else reference_ns,
         boot_id=message.boot_id,
         sequence=message.sequence,
         point=point,
         noise=inverse @ noise @ inverse.transpose(0, 2, 1),
-        per=per,
-        head=ends[:, 1],
-        foot=ends[:, 2],
-        size=np.array([d.size if d.size > 0.0 else np.nan for d in found], dtype=np.float64) * per,
+        units_per_px=units_per_px,
+        head=parts[:, 1],
+        foot=parts[:, 2],
+        size=np.array([d.size if d.size > 0.0 else np.nan for d in found], dtype=np.float64) * units_per_px,
         colour=np.array(colour, dtype=np.float64).reshape(-1, 3),
-        kind=np.array([INDEX[tracked_kind(d)] for d in found], dtype=np.int64),
+        kind=np.array([KIND_INDEX[tracked_kind(d)] for d in found], dtype=np.int64),
         target=tuple(d.target for d in found),
     )
 
 
 def tracked_kind(detection: pb.Detection) -> str:
-    """The kind under which a detection is tracked; "" for one of a known marker, whose label tells who it is."""
+    """The kind under which a detection is tracked; "" for a labelled marker, which is identified by its label."""
     if detection.kind == "marker":
         return "" if detection.label else "marker"
     return str(detection.kind)
@@ -156,8 +159,8 @@ def _covariance(detection: pb.Detection) -> Floats:
     if len(detection.covariance) != 3:
         return np.asarray(_DEFAULT_STD_PX**2 * np.eye(2))
     uu, uv, vv = detection.covariance
-    return np.array([[uu, uv], [uv, vv]]) + _LEAST_STD_PX**2 * np.eye(2)
+    return np.array([[uu, uv], [uv, vv]]) + _MIN_STD_PX**2 * np.eye(2)
 
 
-def _pair(told: Sequence[float]) -> tuple[float, float]:
-    return (told[0], told[1]) if len(told) == 2 else (np.nan, np.nan)
+def _pixel_or_nan(pixel_pairs: Sequence[float]) -> tuple[float, float]:
+    return (pixel_pairs[0], pixel_pairs[1]) if len(pixel_pairs) == 2 else (np.nan, np.nan)

@@ -1,4 +1,4 @@
-"""Tracking while cameras stream: takes observations and calibrations, gives tracks and predictions."""
+"""Live tracking: observations and calibrations in, track and prediction messages out."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from google.protobuf.message import Message
 
-from hub.tracking.association.initiation import Scale
-from hub.tracking.calibration.vertical import UpFinder
+from hub.tracking.association.initiation import LengthScale
+from hub.tracking.calibration.vertical import VerticalEstimator
 from hub.tracking.camera_frame import TrackingCamera, tracked_kind
 from hub.tracking.filter.kalman import LOG_SIZE
 from hub.tracking.filter.target_models import PERSON
-from hub.tracking.filter.target_states import State
+from hub.tracking.filter.target_states import MultiTargetState
 from hub.tracking.messages import prediction_message, track_messages
 from hub.tracking.tracker import Tracker
 from protocols.core.clocks import NANOSECONDS
@@ -25,17 +25,17 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration
 
 _METRES = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
-_ROOM_M = 5.0
-"""How far apart cameras of unknown scale are taken to be, until people tell it by their height."""
-_MOVED, _TURNED = 1e-6, 1e-6
-_UP_EVERY = 20
+_TYPICAL_SPACING_M = 5.0
+"""Assumed distance of cameras if the scale is unknown, until it is estimated from the heights of people."""
+_POSITION_TOLERANCE, _ANGLE_TOLERANCE = 1e-6, 1e-6
+_UP_EVERY_FRAMES = 20
 
 
 @dataclass(frozen=True, slots=True)
 class TrackingSettings:
-    """interval_s: between two tellings. lag_s: how much later than another camera's an observation may come.
+    """interval_s: between two publications. lag_s: how much later than another camera's an observation may arrive.
 
-    ahead_s: how far ahead of the newest frame predictions are.
+    ahead_s: prediction horizon after the newest frame.
     """
 
     interval_s: float = 0.05
@@ -44,166 +44,175 @@ class TrackingSettings:
 
 
 class LiveTracking:
-    """The tracker and what it needs of the world, live: which way up is, how large a metre is."""
+    """The tracker with online estimates of the vertical and of the scale of the world."""
 
     def __init__(self, settings: TrackingSettings | None = None) -> None:
         self.settings = settings or TrackingSettings()
         self.tracker = Tracker(lag_s=self.settings.lag_s)
-        self._finder = UpFinder()
-        self._known_up: Floats | None = None
-        self._scale = Scale()
-        self._boots: dict[str, str] = {}
+        self._vertical = VerticalEstimator()
+        self._given_up: Floats | None = None
+        self._scale = LengthScale()
+        self._boot_ids: dict[str, str] = {}
         self._sequence = 0
         self._predictions = 0
         self._next = -float("inf")
-        self._told_ns: int | None = None
-        self._told: set[int] = set()
-        self._heard = 0
+        self._published_ns: int | None = None
+        self._published: set[int] = set()
+        self._used_frames = 0
         self._clock: tuple[str, str] | None = None
-        self.heard_any = False
+        self.has_detections = False
 
     @property
     def counters(self) -> Counter[str]:
-        """Frames by what became of them."""
+        """Frames by how they were handled."""
         return self.tracker.counters
 
     def calibrate(
         self,
         cameras: Mapping[str, CameraCalibration],
-        boots: Mapping[str, str],
+        boot_ids: Mapping[str, str],
         *,
         reference: str,
         scale: str,
         units: str,
         up: Floats | None,
     ) -> None:
-        """Take over a calibration. boots: whose clocks it speaks of, "" = any. reference: whose clock all times are on.
+        """Use a new calibration.
 
-        up: of its world; None = not known.
+        boot_ids: by camera, the boot id of the clock it refers to, "" = any. reference: the camera whose clock is the
+        reference. up: (3,) unit vector in its world frame; None = unknown.
         """
-        clock = (reference, boots.get(reference, ""))
+        clock = (reference, boot_ids.get(reference, ""))
         if clock != self._clock and self._clock is not None:
-            self.tracker.forget()  # all times mean something else now
+            self.tracker.reset()  # all times refer to another clock now
         self._clock = clock
-        new = {name: TrackingCamera.of(camera, boots.get(name, "")) for name, camera in cameras.items()}
+        new = {
+            name: TrackingCamera.from_calibration(camera, boot_ids.get(name, "")) for name, camera in cameras.items()
+        }
         change = None
         if self.tracker.cameras:
-            change = _change(self.tracker.cameras, new)
+            change = _gauge_change(self.tracker.cameras, new)
         metric = scale == "metric"
-        metre = _METRES.get(units, 1.0) if metric else _guess(new)
+        units_per_m = _METRES.get(units, 1.0) if metric else _guessed_units_per_m(new)
         if not metric and not self._scale.metric and change is not None:
-            metre = self._scale.metre * change.scale
+            units_per_m = self._scale.units_per_m * change.scale
         elif not metric and not self._scale.metric and self.tracker.cameras:
-            metre = self._scale.metre
-        self._scale = Scale(metre, metric)
-        self._known_up = up
+            units_per_m = self._scale.units_per_m
+        self._scale = LengthScale(units_per_m, metric)
+        self._given_up = up
         self.tracker.calibrate(new, change)
-        self._set_world(up if up is not None else self._found_up())
+        self._set_parameters(up if up is not None else self._estimated_up())
 
     def handle(self, message: Message) -> None:
-        """Take one observation; other messages are ignored."""
+        """Process one observation; other messages are ignored."""
         if not isinstance(message, pb.Observation):
             return
-        if not self.heard_any:
-            self.heard_any = any(tracked_kind(detection) for detection in message.detections)
-            if not self.heard_any:
+        if not self.has_detections:
+            self.has_detections = any(tracked_kind(detection) for detection in message.detections)
+            if not self.has_detections:
                 return
         if not self.tracker.cameras:
             return
         camera = self.tracker.cameras.get(message.camera)
-        self._boots[message.camera] = message.boot_id
-        if self.tracker.handle(message) and camera is not None and self._known_up is None:
-            frame = self.tracker.newest_taken
+        self._boot_ids[message.camera] = message.boot_id
+        if self.tracker.handle(message) and camera is not None and self._given_up is None:
+            frame = self.tracker.newest_frame
             assert frame is not None
-            self._finder.handle(frame)
-            self._heard += 1
-            if self._heard % _UP_EVERY == 0 and self.tracker.world.up is None:
-                up = self._found_up()
+            self._vertical.handle(frame)
+            self._used_frames += 1
+            if self._used_frames % _UP_EVERY_FRAMES == 0 and self.tracker.parameters.up is None:
+                up = self._estimated_up()
                 if up is not None:
-                    self._set_world(up)
+                    self._set_parameters(up)
 
     def tick(self, now: float) -> list[Message]:
-        """Tracks and predictions, at most every ``interval_s``; now: any monotonic clock [s]."""
-        if now < self._next or not self.tracker.cameras or not self.heard_any:
+        """Track and prediction messages, at most every ``interval_s``; now: any monotonic clock [s]."""
+        if now < self._next or not self.tracker.cameras or not self.has_detections:
             return []
         self._next = now + self.settings.interval_s
         state = self.tracker.advance()
-        if state.time_ns is None or state.time_ns == self._told_ns:
+        if state.time_ns is None or state.time_ns == self._published_ns:
             return []
-        told_ns, self._told_ns = self._told_ns, state.time_ns
+        published_ns, self._published_ns = self._published_ns, state.time_ns
         every_ns = round(self.settings.interval_s * NANOSECONDS)
-        # Where a busy machine held the hub up, its tracks have no hole all the same.
-        passed = [] if told_ns is None else self.tracker.passed(told_ns, every_ns)
-        self._learn_scale()
-        out: list[Message] = [track for each in (*passed, state) for track in self._tracks(each)]
+        # If a busy machine delayed the hub, the missed times are published now, so that tracks have no gaps.
+        states_since = [] if published_ns is None else self.tracker.states_since(published_ns, every_ns)
+        self._update_scale()
+        out: list[Message] = [track for each in (*states_since, state) for track in self._tracks(each)]
         ahead = state.time_ns + round(self.settings.ahead_s * NANOSECONDS)
-        cameras, world = self.tracker.cameras, self.tracker.world
-        out.append(prediction_message(self.tracker.at(ahead), ahead, cameras, self._boots, world, self._predictions))
+        cameras, parameters = self.tracker.cameras, self.tracker.parameters
+        out.append(
+            prediction_message(
+                self.tracker.predicted_at(ahead), ahead, cameras, self._boot_ids, parameters, self._predictions
+            )
+        )
         self._predictions += 1
         return out
 
     def gauges(self) -> dict[str, float]:
-        """Figures for the hub's status."""
+        """Gauges for the hub's status."""
         targets = self.tracker.targets
         return {"tracks": float(targets.confirmed.sum()), "tentative_tracks": float((~targets.confirmed).sum())}
 
-    def _tracks(self, state: State) -> list[pb.Track]:
-        """What is told of a state; who was told before and is no more, is told to be lost."""
+    def _tracks(self, state: MultiTargetState) -> list[pb.Track]:
+        """Track messages of a state, including state "lost" for published tracks that have ended."""
         assert state.time_ns is not None
-        lost = tuple(one for one in state.gone if one.number in self._told)
-        out = track_messages(state.targets, state.time_ns, lost, self.tracker.world, self._sequence)
+        lost = tuple(one for one in state.lost_tracks if one.number in self._published)
+        out = track_messages(state.targets, state.time_ns, lost, self.tracker.parameters, self._sequence)
         self._sequence += len(out)
-        self._told = set(state.targets.number[state.targets.confirmed].tolist())
+        self._published = set(state.targets.number[state.targets.confirmed].tolist())
         return out
 
-    def _found_up(self) -> Floats | None:
-        return self._finder.find({name: camera.pose for name, camera in self.tracker.cameras.items()})
+    def _estimated_up(self) -> Floats | None:
+        return self._vertical.estimate({name: camera.pose for name, camera in self.tracker.cameras.items()})
 
-    def _set_world(self, up: Floats | None) -> None:
-        self.tracker.set_world(replace(self.tracker.world, up=up, scale=self._scale))
+    def _set_parameters(self, up: Floats | None) -> None:
+        self.tracker.set_parameters(replace(self.tracker.parameters, up=up, scale=self._scale))
 
-    def _learn_scale(self) -> None:
-        """With arbitrary scale, people tell how large a metre is: as tall as people are."""
-        if self._scale.metric or self.tracker.world.up is None:
+    def _update_scale(self) -> None:
+        """With arbitrary scale, estimate the world units per metre from the heights of tracked people."""
+        if self._scale.metric or self.tracker.parameters.up is None:
             return
         targets = self.tracker.targets
-        tall = np.exp(targets.mean[targets.confirmed & (targets.kind == 0), LOG_SIZE])
-        if len(tall):
-            metre = float(np.median(tall)) / PERSON.size_m
-            if abs(np.log(metre / self._scale.metre)) > 0.1:
-                self._scale = Scale(metre, False)
-                self._set_world(self.tracker.world.up)
+        sizes = np.exp(targets.mean[targets.confirmed & (targets.kind == 0), LOG_SIZE])
+        if len(sizes):
+            units_per_m = float(np.median(sizes)) / PERSON.size_m
+            if abs(np.log(units_per_m / self._scale.units_per_m)) > 0.1:
+                self._scale = LengthScale(units_per_m, False)
+                self._set_parameters(self.tracker.parameters.up)
 
 
-def _guess(cameras: Mapping[str, TrackingCamera]) -> float:
-    """World units in a metre, if cameras stand about a room."""
+def _guessed_units_per_m(cameras: Mapping[str, TrackingCamera]) -> float:
+    """Guess of the world units per metre, for cameras spaced as in a room."""
     places = np.array([camera.pose.position for camera in cameras.values()])
-    apart = np.linalg.norm(places[:, None] - places[None], axis=2)
-    apart = apart[apart > 0.0]
-    return float(np.median(apart)) / _ROOM_M if len(apart) else 1.0
+    distances = np.linalg.norm(places[:, None] - places[None], axis=2)
+    distances = distances[distances > 0.0]
+    return float(np.median(distances)) / _TYPICAL_SPACING_M if len(distances) else 1.0
 
 
-def _change(old: Mapping[str, TrackingCamera], new: Mapping[str, TrackingCamera]) -> Similarity | None:
-    """How the world has moved between two calibrations; None where it has not."""
+def _gauge_change(old: Mapping[str, TrackingCamera], new: Mapping[str, TrackingCamera]) -> Similarity | None:
+    """Similarity between the world frames of two calibrations; None if they are the same."""
     common = [name for name in new if name in old]
     if not common:
         return Similarity(1.0, np.eye(3), np.zeros(3))
     before, after = [old[name].pose for name in common], [new[name].pose for name in common]
-    if all(_same(a, b) for a, b in zip(before, after, strict=True)):
+    if all(_is_same_pose(a, b) for a, b in zip(before, after, strict=True)):
         return None
     span = max(float(np.ptp(np.array([pose.position for pose in before]), axis=0).max()), 1e-9)
-    # A camera's axes, as long as the rig, fix what few cameras' places leave open.
+    # Points on the cameras' axes, at the scale of the rig, fix the rotation that few camera positions leave free.
     source = np.concatenate([np.vstack([p.position, p.position + 0.5 * span * p.rotation]) for p in before])
     ends = np.array([p.position for p in after])
-    stretch = 1.0
+    scale_ratio = 1.0
     if len(common) > 1:
         centres = np.array([p.position for p in before])
-        stretch = float(np.ptp(ends, axis=0).max() and np.linalg.norm(ends - ends.mean(axis=0)))
-        stretch /= max(float(np.linalg.norm(centres - centres.mean(axis=0))), 1e-12)
-    target = np.concatenate([np.vstack([p.position, p.position + 0.5 * span * stretch * p.rotation]) for p in after])
+        scale_ratio = float(np.ptp(ends, axis=0).max() and np.linalg.norm(ends - ends.mean(axis=0)))
+        scale_ratio /= max(float(np.linalg.norm(centres - centres.mean(axis=0))), 1e-12)
+    target = np.concatenate(
+        [np.vstack([p.position, p.position + 0.5 * span * scale_ratio * p.rotation]) for p in after]
+    )
     return fit_similarity(source, target)
 
 
-def _same(one: Pose, other: Pose) -> bool:
-    turned = so3.angle_between(one.rotation, other.rotation)
-    return bool(np.abs(one.position - other.position).max() < _MOVED and turned < _TURNED)
+def _is_same_pose(one: Pose, other: Pose) -> bool:
+    angle = so3.angle_between(one.rotation, other.rotation)
+    return bool(np.abs(one.position - other.position).max() < _POSITION_TOLERANCE and angle < _ANGLE_TOLERANCE)

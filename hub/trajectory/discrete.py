@@ -1,7 +1,7 @@
-"""Paths without motion: with one shared clock, rows of the same time correspond and nothing need move smoothly.
+"""Discrete-time trajectories for a shared clock: observations of equal time correspond; no smoothness is assumed.
 
-``PointBasis`` and ``SampledTrack`` stand where ``SplineBasis`` and ``SmoothTrack`` stand for independent
-clocks: every instant has a point of its own, and a time between instants has none.
+``PointBasis`` and ``SampledTrack`` replace ``SplineBasis`` and ``SmoothTrack``, which serve independent clocks: every
+instant has its own point, and there is none between instants.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ import numpy as np
 from hub.trajectory.splines import SUPPORT
 from protocols.geometry.types import Bools, Floats, Ints
 
-SAME_TIME = 1e-6
-"""Times [s] that differ by less are one instant: CSV files round."""
+INSTANT_TOLERANCE_S = 1e-6
+"""Times [s] that differ by less are the same instant: CSV files round."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointBasis:
-    """One point an instant. instants: (n,) sorted times [s].
+    """One point per instant. instants: (n,) sorted times [s].
 
-    Keeps the shape of a cubic spline's basis (four weights a time, three of them 0), so that the same banded
+    It has the interface of a cubic spline basis (four weights a time, three of them 0), so that the same banded
     system serves both.
     """
 
@@ -29,12 +29,12 @@ class PointBasis:
 
     @property
     def size(self) -> int:
-        """Number of control points; the last three are never used."""
+        """Number of control points; the last three are unused."""
         return len(self.instants) + SUPPORT - 1
 
     @property
     def spacing(self) -> float:
-        """Median time between instants [s]."""
+        """Median interval between instants [s]."""
         return float(np.median(np.diff(self.instants))) if len(self.instants) > 1 else 1.0
 
     @property
@@ -49,19 +49,19 @@ class PointBasis:
 
     def locate(self, time: Floats) -> tuple[Ints, Floats, Bools]:
         """Index of the instant (n,), 0 (n,), and whether there is one (n,)."""
-        index, found = lookup(self.instants, time)
+        index, found = find_instants(self.instants, time)
         return index, np.zeros(len(time)), found
 
     def weights(self, time: Floats, derivative: int = 0) -> tuple[Ints, Floats, Bools]:
         """Index (n,), weights (n, 4) and whether there is a point (n,); a point has no velocity."""
-        index, found = lookup(self.instants, time)
+        index, found = find_instants(self.instants, time)
         weights = np.zeros((len(time), SUPPORT))
         if derivative == 0:
             weights[:, 0] = 1.0
         return index, weights, found
 
-    def weights_both(self, time: Floats, beyond: float = 0.0) -> tuple[Ints, Floats, Floats, Bools]:
-        """As `weights` for the value and the first derivative, which is 0; nothing is ``beyond`` a point."""
+    def weights_and_derivatives(self, time: Floats, extrapolation: float = 0.0) -> tuple[Ints, Floats, Floats, Bools]:
+        """As `weights`, for the value and the first derivative, which is 0; ``extrapolation`` has no effect."""
         index, weights, found = self.weights(time)
         return index, weights, np.zeros_like(weights), found
 
@@ -73,7 +73,7 @@ class PointBasis:
         return values
 
     def interval_starts(self) -> Ints:
-        """(0,): no knot intervals, hence no motion prior."""
+        """(0,): no knot intervals, hence no smoothness prior."""
         return np.zeros(0, dtype=np.int64)
 
 
@@ -81,7 +81,7 @@ class PointBasis:
 class SampledTrack:
     """One label of one camera at its instants, in normalised coordinates; see ``SmoothTrack``."""
 
-    epoch: float
+    time_origin: float
     time: Floats
     points: Floats
     inlier: Bools
@@ -90,7 +90,7 @@ class SampledTrack:
     focal: float
 
     def at(self, time: Floats, derivative: int = 0) -> Floats:
-        """Points (n, 2) at these very instants, NaN elsewhere; derivatives are 0."""
+        """Points (n, 2) at instants of the track, NaN elsewhere; derivatives are 0."""
         return self.basis.evaluate(self.points, time, derivative)
 
     @property
@@ -105,30 +105,30 @@ class SampledTrack:
 
 
 def sampled_track(
-    time: Floats, normalised: Floats, focal: float, epoch: float, sigma_px: float = 0.5
+    time: Floats, normalised: Floats, focal: float, time_origin: float, sigma_px: float = 0.5
 ) -> SampledTrack | None:
-    """The rows as they are; None without any that the lens model can undistort."""
+    """The rows unchanged; None if the lens model can undistort none of them."""
     good = np.asarray(np.isfinite(normalised).all(axis=1))
     if not good.any():
         return None
-    shifted = time[good] - epoch
-    return SampledTrack(epoch, shifted, normalised[good], good, PointBasis(shifted), sigma_px / focal, focal)
+    shifted = time[good] - time_origin
+    return SampledTrack(time_origin, shifted, normalised[good], good, PointBasis(shifted), sigma_px / focal, focal)
 
 
-def lookup(instants: Floats, time: Floats) -> tuple[Ints, Bools]:
-    """Index of the instant of each time (n,), and whether there is one within SAME_TIME."""
+def find_instants(instants: Floats, time: Floats) -> tuple[Ints, Bools]:
+    """Index of the nearest instant to each time (n,), and whether it is within INSTANT_TOLERANCE_S."""
     if len(instants) == 0:
         return np.zeros(len(time), dtype=np.int64), np.zeros(len(time), dtype=np.bool_)
     after = np.clip(np.searchsorted(instants, time), 0, len(instants) - 1)
     before = np.maximum(after - 1, 0)
     nearer = np.abs(instants[before] - time) < np.abs(instants[after] - time)
     index = np.where(nearer, before, after)
-    return index.astype(np.int64), np.asarray(np.abs(instants[index] - time) < SAME_TIME)
+    return index.astype(np.int64), np.asarray(np.abs(instants[index] - time) < INSTANT_TOLERANCE_S)
 
 
-def common_instants(times: list[Floats]) -> Floats:
-    """All instants (n,) of several tracks, those within SAME_TIME once."""
+def merged_instants(times: list[Floats]) -> Floats:
+    """All instants (n,) of several tracks, merged within INSTANT_TOLERANCE_S."""
     joined = np.sort(np.concatenate(times)) if times else np.zeros(0)
     if len(joined) == 0:
         return joined
-    return joined[np.r_[True, np.diff(joined) > SAME_TIME]]
+    return joined[np.r_[True, np.diff(joined) > INSTANT_TOLERANCE_S]]

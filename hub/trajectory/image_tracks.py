@@ -1,6 +1,6 @@
-"""From a raw image track to a smooth one: false detections dropped, noise measured, gaps kept apart.
+"""Image tracks: outlier rejection, robust spline smoothing and noise estimate, split at gaps and discontinuities.
 
-METHODS A, step 1: neighbour test, then a robust cubic spline whose knot spacing comes from the data by
+Asynchronous calibration paper, step 1: a neighbour test, then a robust cubic spline whose knot spacing is chosen by
 generalised cross-validation.
 """
 
@@ -13,43 +13,43 @@ from typing import TypeAlias
 import numpy as np
 
 from hub.trajectory.discrete import SampledTrack
-from hub.trajectory.splines import SplineBasis, fit_spline, stretches
+from hub.trajectory.splines import SplineBasis, fit_spline, split_at_gaps
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.session.observations import Track as RawTrack
 
-LONGEST_PAUSE = 43_200.0
-"""A longer gap [s] between two rows of a camera is a jump of its clock, not a pause."""
-SHORTEST_GAP = 0.2
+MAX_PAUSE_S = 43_200.0
+"""A longer gap [s] between two rows of a camera is a step of its clock, not a pause."""
+BRIDGED_GAP_S = 0.2
 """Gaps [s] up to this are bridged by the spline at any frame rate."""
-GAP_INTERVALS = 3.2
-"""… and so are gaps of up to this many median intervals (labels on every fourth frame)."""
+BRIDGED_INTERVALS = 3.2
+"""… and so are gaps of up to this many median intervals (e.g. labels on every fourth frame)."""
 _SPACINGS = (2.5, 4.0, 6.0, 9.0, 14.0)  # knot spacings tried, in median intervals
-_FINE_SPACING = 0.5  # where the widest of those is the best: knots twice as dense as the points, held by
-_FINE_STIFFNESS = (1e-2, 1e-1, 1.0)  # third differences, as strongly as cross-validation wants
-_STIFFNESS = 1e-3  # only closes empty intervals
+_FINE_SPACING = 0.5  # for fast motion or underfit: knots twice as dense as the points, regularised by
+_FINE_STIFFNESS = (1e-2, 1e-1, 1.0)  # third differences; the strength is chosen by cross-validation
+_STIFFNESS = 1e-3  # only bridges empty intervals
 _SPACING_LIMITS = (0.06, 0.8)  # s
-_BRIDGED_SPACINGS = 1.5  # a pause in which so smooth a track can't have gone anywhere else
+_BRIDGED_KNOTS = 1.5  # gaps of so many knot intervals are bridged: so smooth a track cannot leave its path in them
 _NEIGHBOURS = 4
 _NEIGHBOUR_QUANTILE = 0.2
-_JUMP_PASSES = 4
-_JUMP = 3.0  # times the accelerations that a track's faster tenth shows
-_CUT = 4.0  # residuals beyond this many sigma are false detections
-_LEAST_POINTS = 4  # in a stretch
-_NEVER_SUSPECT_PX = 1.5
-_SUSPECT_PX = 3.0  # noise that is rather motion too fast for the knots
-# Labels drawn between hand-set ones are exactly straight: without a floor the honest rest looks false.
-_LEAST_SIGMA_PX = 0.05
+_DISCONTINUITY_PASSES = 4
+_DISCONTINUITY_FACTOR = 3.0  # times the 90 % quantile of the track's accelerations
+_OUTLIER_SIGMAS = 4.0  # residuals beyond this many sigma are false detections
+_MIN_POINTS = 4  # per stretch
+_MIN_OUTLIER_PX = 1.5
+_UNDERFIT_PX = 3.0  # more noise than this is rather motion too fast for the knots
+# Interpolated labels are exactly straight: without a floor the hand-set ones would look like outliers.
+_MIN_SIGMA_PX = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothTrack:
     """One label of one camera as a function of the camera's time, in normalised coordinates.
 
-    time: (n,) of the inliers [s], on the camera's clock less ``epoch``. points: (n, 2) inlier measurements.
-    inlier: (m,) of the rows given. sigma: noise of one coordinate. focal: [px], to speak of pixels.
+    time: (n,) of the inliers [s], on the camera's clock less ``time_origin``. points: (n, 2) of the inliers.
+    inlier: (m,) of the given rows. sigma: noise of one coordinate. focal: [px], to convert to pixels.
     """
 
-    epoch: float
+    time_origin: float
     time: Floats
     points: Floats
     inlier: Bools
@@ -57,20 +57,25 @@ class SmoothTrack:
     control: Floats
     sigma: float
     focal: float
-    jumps: Floats = field(default_factory=lambda: np.zeros(0))
-    """(k,) times [s] at which the detector seems to have taken up another thing."""
+    discontinuities: Floats = field(default_factory=lambda: np.zeros(0))
+    """(k,) times [s] at which the detector probably switched to another object."""
 
     def at(self, time: Floats, derivative: int = 0) -> Floats:
         """Smoothed normalised coordinates (n, 2) (or their derivative); NaN in gaps."""
         return self.basis.evaluate(self.control, time, derivative)
 
-    def point_and_speed(self, time: Floats) -> tuple[Floats, Floats]:
-        """Smoothed normalised coordinates and their speeds [1/s], (n, 2) each; NaN in gaps."""
-        return self.basis.evaluate_both(self.control, time)
+    def point_and_velocity(self, time: Floats) -> tuple[Floats, Floats]:
+        """Smoothed normalised coordinates and their velocities [1/s], (n, 2) each; NaN in gaps."""
+        return self.basis.evaluate_with_derivatives(self.control, time)
 
     def scaled(self, factor: float) -> SmoothTrack:
-        """The same track on a clock whose seconds are 1 / ``factor`` of these."""
-        return replace(self, time=self.time * factor, basis=self.basis.scaled(factor), jumps=self.jumps * factor)
+        """The same track with its times multiplied by ``factor``."""
+        return replace(
+            self,
+            time=self.time * factor,
+            basis=self.basis.scaled(factor),
+            discontinuities=self.discontinuities * factor,
+        )
 
     @property
     def sigma_px(self) -> float:
@@ -83,40 +88,42 @@ class SmoothTrack:
         return float(self.time[-1] - self.time[0])
 
 
-Track: TypeAlias = SmoothTrack | SampledTrack
-"""A track of either kind: smooth for independent clocks, sampled for a shared one."""
+ImageTrack: TypeAlias = SmoothTrack | SampledTrack
+"""A track of either kind: smooth for independent clocks, sampled for a shared clock."""
 
 
-def smooth_track(time: Floats, normalised: Floats, focal: float, epoch: float | None = None) -> SmoothTrack | None:
-    """Clean and smooth one track; None if fewer than a handful of points hang together.
+def smooth_track(
+    time: Floats, normalised: Floats, focal: float, time_origin: float | None = None
+) -> SmoothTrack | None:
+    """Reject outliers of one track and smooth it; None with too few connected points.
 
     time: (n,) [s], increasing. normalised: (n, 2), undistorted; rows with NaN are left out.
-    epoch: time that becomes 0; default the first row's.
+    time_origin: time that becomes 0; default the first row's time.
     """
-    origin = float(time[0]) if epoch is None and len(time) else float(epoch or 0.0)
+    origin = float(time[0]) if time_origin is None and len(time) else float(time_origin or 0.0)
     shifted = time - origin
     usable = np.isfinite(normalised).all(axis=1)
-    if usable.sum() < 2 * _LEAST_POINTS:
+    if usable.sum() < 2 * _MIN_POINTS:
         return None
     rows = np.flatnonzero(usable)
     t, x = shifted[rows], normalised[rows]
-    good = neighbour_test(t, x, floor=_NEVER_SUSPECT_PX / focal)
+    good = neighbour_test(t, x, floor=_MIN_OUTLIER_PX / focal)
     interval = float(np.median(np.diff(t)))
-    gap = max(SHORTEST_GAP, GAP_INTERVALS * interval)
-    jumps = _jumps(t, x, good)
-    best: _Fit | None = None
+    gap = max(BRIDGED_GAP_S, BRIDGED_INTERVALS * interval)
+    discontinuities = _discontinuities(t, x, good)
+    best: _SplineFit | None = None
     for factor in _SPACINGS:
         spacing = float(np.clip(factor * interval, *_SPACING_LIMITS))
         if best is not None and spacing == best.basis.spacing:
             continue
-        fit = _robust_fit(t, x, good, jumps, spacing, _STIFFNESS, gap, focal)
+        fit = _robust_fit(t, x, good, discontinuities, spacing, _STIFFNESS, gap, focal)
         if fit is not None and (best is None or fit.score < best.score):
             best = fit
     if best is not None and (
-        best.basis.spacing <= max(_SPACINGS[0] * interval, _SPACING_LIMITS[0]) or best.sigma * focal > _SUSPECT_PX
+        best.basis.spacing <= max(_SPACINGS[0] * interval, _SPACING_LIMITS[0]) or best.sigma * focal > _UNDERFIT_PX
     ):
         for stiffness in _FINE_STIFFNESS:
-            fit = _robust_fit(t, x, good, jumps, _FINE_SPACING * interval, stiffness, gap, focal)
+            fit = _robust_fit(t, x, good, discontinuities, _FINE_SPACING * interval, stiffness, gap, focal)
             if fit is not None and fit.score < best.score:
                 best = fit
     if best is None:
@@ -124,19 +131,19 @@ def smooth_track(time: Floats, normalised: Floats, focal: float, epoch: float | 
     basis, control, inlier, sigma = best.basis, best.control, best.inlier, best.sigma
     mask = np.zeros(len(time), dtype=np.bool_)
     mask[rows[inlier]] = True
-    return SmoothTrack(origin, t[inlier], x[inlier], mask, basis, control, sigma, focal, jumps)
+    return SmoothTrack(origin, t[inlier], x[inlier], mask, basis, control, sigma, focal, discontinuities)
 
 
-def without_jumps(tracks: list[RawTrack]) -> tuple[list[RawTrack], str]:
-    """One camera's tracks without the rows before or after its clock jumped; and what was left out, or "".
+def without_clock_steps(tracks: list[RawTrack]) -> tuple[list[RawTrack], str]:
+    """One camera's tracks without the rows before or after a step of its clock; and what was left out, or "".
 
-    A board that learns the time while it records (1970 to now) has two clocks in one recording. Nobody films
-    with a pause of half a day: a gap that long is a jump, and the part with most rows is kept.
+    A board that receives the time while it records (1970 to now) has two clock segments in one recording. No recording
+    pauses for half a day: so long a gap is a clock step, and the part with most rows is kept.
     """
     if not tracks:
         return tracks, ""
     times = np.sort(np.concatenate([track.time for track in tracks]))
-    cuts = np.flatnonzero(np.diff(times) > LONGEST_PAUSE)
+    cuts = np.flatnonzero(np.diff(times) > MAX_PAUSE_S)
     if len(cuts) == 0:
         return tracks, ""
     parts = np.split(times, cuts + 1)
@@ -154,24 +161,24 @@ def without_jumps(tracks: list[RawTrack]) -> tuple[list[RawTrack], str]:
                     size=track.size[inside],
                 )
             )
-    lost = len(times) - len(kept)
-    jump = float(np.diff(times)[cuts].max())
-    return out, f"its clock jumps by {jump:.0f} s; {lost} of {len(times)} rows on the other side are left out"
+    dropped = len(times) - len(kept)
+    step = float(np.diff(times)[cuts].max())
+    return out, f"its clock steps by {step:.0f} s; {dropped} of {len(times)} rows on the other side are left out"
 
 
 def neighbour_test(time: Floats, points: Floats, floor: float) -> Bools:
-    """Which points (n,) agree with a line between some of their neighbours.
+    """Inliers (n,): points that agree with lines through some of their neighbours.
 
-    Each point is compared with linear interpolation between each of its 4 predecessors and successors;
-    the 20 % quantile of the residuals survives 40 % false neighbours, where the median breaks at 30 %.
-    Then again with the neighbours that passed, of which few are false, and also with lines through two of one
-    side, on which the last points before a jump lie. floor: residual below which a point is
-    never suspected.
+    Each point is compared with linear interpolation between each of its 4 predecessors and successors; the 20 %
+    quantile of the residuals tolerates 40 % outliers among the neighbours, where the median breaks down at 30 %. A
+    second pass uses the neighbours that passed, few of which are outliers, and also lines through two neighbours of
+    one side, which suit the last points before a discontinuity. floor: residual below which a point is always an
+    inlier.
     """
     good = np.ones(len(time), dtype=np.bool_)
     for one_sided in (False, True):
         score = _neighbour_score(time, points, good, one_sided)
-        # The 40 % quantile lies among the true points even where 40 % are false.
+        # The 40 % quantile lies among the inliers even with 40 % outliers.
         limit = max(floor, 6.0 * float(np.quantile(score, 0.4)))
         again = np.asarray(score <= limit)
         if again.all() or again.sum() < 2 * _NEIGHBOURS:
@@ -181,7 +188,7 @@ def neighbour_test(time: Floats, points: Floats, floor: float) -> Bools:
 
 
 def _neighbour_score(time: Floats, points: Floats, good: Bools, one_sided: bool) -> Floats:
-    """20 % quantile (n,) of the distances of each point from lines through two good neighbours."""
+    """20 % quantile (n,) of each point's distances from lines through two good neighbours."""
     rows = np.flatnonzero(good)
     t, x = time[rows], points[rows]
     before = np.searchsorted(rows, np.arange(len(time))) - 1
@@ -194,7 +201,7 @@ def _neighbour_score(time: Floats, points: Floats, good: Bools, one_sided: bool)
         lines += [(j, i) for j in range(1, _NEIGHBOURS) for i in range(j)]
         lines += [(_NEIGHBOURS + i, _NEIGHBOURS + j) for j in range(1, _NEIGHBOURS) for i in range(j)]
     residuals = np.empty((len(lines), len(time)))
-    with np.errstate(divide="ignore", invalid="ignore"):  # where one of the two is not there
+    with np.errstate(divide="ignore", invalid="ignore"):  # where one of the two does not exist
         for k, (low, high) in enumerate(lines):
             share = (time - t_near[low]) / (t_near[high] - t_near[low])
             across = points[:, 0] - x_near[low] - share * (x_near[high] - x_near[low])
@@ -204,12 +211,12 @@ def _neighbour_score(time: Floats, points: Floats, good: Bools, one_sided: bool)
     known = np.isfinite(residuals).sum(axis=0)
     pick = np.maximum(0, np.ceil(_NEIGHBOUR_QUANTILE * known).astype(np.int64) - 1)
     score = residuals[pick, np.arange(len(time))]
-    return np.where(known > 0, score, 0.0)  # the very ends have no neighbours on one side
+    return np.where(known > 0, score, 0.0)  # the ends have no neighbours on one side
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Fit:
-    """One spline through a track. score: generalised cross-validation [normalised coordinates squared]."""
+class _SplineFit:
+    """A spline fit to a track. score: generalised cross-validation [normalised coordinates squared]."""
 
     score: float
     basis: SplineBasis
@@ -218,95 +225,104 @@ class _Fit:
     sigma: float
 
 
-def _jumps(t: Floats, x: Floats, good: Bools) -> Floats:
-    """Times (k,) [s] between two points that no motion of this track joins: the detector took up another thing.
+def _discontinuities(t: Floats, x: Floats, good: Bools) -> Floats:
+    """Times (k,) [s] of discontinuities, at which the detector switched to another object.
 
-    Seen from both sides: what extrapolation misses, taken as an acceleration, is far beyond the track's own.
+    Tested from both sides: the extrapolation error, expressed as an acceleration, is far above the track's own.
     """
     rows = np.flatnonzero(good)
-    for turn in range(_JUMP_PASSES):
-        if len(rows) < 2 * _LEAST_POINTS:
+    for iteration in range(_DISCONTINUITY_PASSES):
+        if len(rows) < 2 * _MIN_POINTS:
             break
         at, pos = t[rows], x[rows]
         dt = np.diff(at)
-        speed = np.diff(pos, axis=0) / dt[:, None]
-        # Between i and i + 1: from the speed before, and from the speed after.
-        bend = np.linalg.norm(np.diff(speed, axis=0), axis=1) / (0.5 * (dt[1:] + dt[:-1]))
-        limit = _JUMP * float(np.quantile(bend, 0.9))
-        where = np.flatnonzero(np.minimum(bend[:-1], bend[1:]) > limit) + 1
-        # A piece of a few points is no other thing but false points, and the rest is looked at without them.
+        velocity = np.diff(pos, axis=0) / dt[:, None]
+        # Acceleration between i and i + 1, from the velocity before and from the velocity after.
+        acceleration = np.linalg.norm(np.diff(velocity, axis=0), axis=1) / (0.5 * (dt[1:] + dt[:-1]))
+        limit = _DISCONTINUITY_FACTOR * float(np.quantile(acceleration, 0.9))
+        where = np.flatnonzero(np.minimum(acceleration[:-1], acceleration[1:]) > limit) + 1
+        # A part of a few points is outliers rather than another object; the test is repeated without them.
         lengths = np.diff(np.r_[0, where + 1, len(rows)])
-        short = np.repeat(lengths < _LEAST_POINTS, lengths)
-        if not short.any() or turn == _JUMP_PASSES - 1:
+        short = np.repeat(lengths < _MIN_POINTS, lengths)
+        if not short.any() or iteration == _DISCONTINUITY_PASSES - 1:
             return np.asarray(0.5 * (at[where] + at[where + 1]))
         rows = rows[~short]
     return np.zeros(0)
 
 
 def _robust_fit(
-    t: Floats, x: Floats, good: Bools, jumps: Floats, spacing: float, stiffness: float, gap: float, focal: float
-) -> _Fit | None:
-    """Spline by reweighting, on stretches that neither long pauses nor jumps cut."""
+    t: Floats,
+    x: Floats,
+    good: Bools,
+    discontinuities: Floats,
+    spacing: float,
+    stiffness: float,
+    gap: float,
+    focal: float,
+) -> _SplineFit | None:
+    """Spline fit with iterative outlier rejection, on stretches split at long gaps and discontinuities."""
     inlier = good.copy()
     basis, control, sigma = None, None, np.inf
-    gap = max(gap, _BRIDGED_SPACINGS * spacing)
-    piece = np.searchsorted(jumps, t)
+    gap = max(gap, _BRIDGED_KNOTS * spacing)
+    part_index = np.searchsorted(discontinuities, t)
     for step in range(6):
-        inlier &= _in_stretches(t, inlier, gap, piece)
+        inlier &= _in_stretches(t, inlier, gap, part_index)
         count = int(inlier.sum())
-        if count < 2 * _LEAST_POINTS:
+        if count < 2 * _MIN_POINTS:
             return None
-        begins, ends = stretches(t[inlier], gap, piece[inlier])
-        basis = SplineBasis.within(begins, ends, spacing)
+        begins, ends = split_at_gaps(t[inlier], gap, part_index[inlier])
+        basis = SplineBasis.spanning(begins, ends, spacing)
         control = fit_spline(basis, t[inlier], x[inlier], np.ones(count), stiffness=stiffness)
         residual = np.linalg.norm(basis.evaluate(control, t) - x, axis=1)
         counts = np.diff(np.searchsorted(t[inlier], np.r_[begins, np.inf]))
-        freedom = _freedom(counts, basis.intervals + 3, stiffness)
+        degrees_of_freedom = _degrees_of_freedom(counts, basis.intervals + 3, stiffness)
         n = float(count)
-        left = max(n - freedom, 0.02 * n)
+        left = max(n - degrees_of_freedom, 0.02 * n)
         # Median of a Rayleigh variable: 1.1774 sigma.
-        sigma = max(_LEAST_SIGMA_PX / focal, float(np.median(residual[inlier])) / 1.1774 * np.sqrt(n / left))
+        sigma = max(_MIN_SIGMA_PX / focal, float(np.median(residual[inlier])) / 1.1774 * np.sqrt(n / left))
         with np.errstate(invalid="ignore"):
-            again = residual < max(_CUT * sigma * (2.0 if step == 0 else 1.0), _NEVER_SUSPECT_PX / focal)
+            again = residual < max(_OUTLIER_SIGMAS * sigma * (2.0 if step == 0 else 1.0), _MIN_OUTLIER_PX / focal)
         if np.array_equal(again, inlier):
             break
         inlier = again
     if basis is None or control is None:
         return None
-    squared = np.minimum(residual[inlier], _CUT * sigma) ** 2
+    squared = np.minimum(residual[inlier], _OUTLIER_SIGMAS * sigma) ** 2
     kept = float(inlier.sum())
-    score = float(squared.mean()) * (kept / max(kept - freedom, 0.02 * kept)) ** 2
-    # A spacing that throws many points away is no better for fitting the rest.
+    score = float(squared.mean()) * (kept / max(kept - degrees_of_freedom, 0.02 * kept)) ** 2
+    # A spacing that rejects many points must not win by fitting the rest well.
     score *= (float(good.sum()) / kept) ** 2
-    return _Fit(score, basis, control, inlier, sigma)
+    return _SplineFit(score, basis, control, inlier, sigma)
 
 
-def _freedom(points: Ints, controls: Ints, stiffness: float) -> float:
-    """Degrees of freedom of a fit: the trace of its smoother, by frequency as for evenly spaced points.
+def _degrees_of_freedom(points: Ints, control_counts: Ints, stiffness: float) -> float:
+    """Effective degrees of freedom of a fit: the trace of its smoother matrix, by frequency for evenly spaced points.
 
     points, controls: (s,) of each stretch.
     """
-    # A third difference passes |2 sin(w / 2)|^6. Where there are fewer points than controls, a track has no
-    # frequencies beyond the points' own; a control then shares in points / controls rows.
-    rows = np.minimum(points / controls, 1.0)[:, None]
+    # The squared third difference has the gain |2 sin(w / 2)|^6. With fewer points than control points a track has
+    # no frequencies above the points' own; a control point then has points / controls rows.
+    rows = np.minimum(points / control_counts, 1.0)[:, None]
     phase = np.linspace(0.0, np.pi, 65)[1:] * rows
-    share = 1.0 / (1.0 + stiffness * (2.0 * np.sin(0.5 * phase)) ** 6 / np.maximum(points / controls, 1e-9)[:, None])
-    return float((np.minimum(points, controls) * share.mean(axis=1)).sum())
+    share = 1.0 / (
+        1.0 + stiffness * (2.0 * np.sin(0.5 * phase)) ** 6 / np.maximum(points / control_counts, 1e-9)[:, None]
+    )
+    return float((np.minimum(points, control_counts) * share.mean(axis=1)).sum())
 
 
-def _in_stretches(t: Floats, inlier: Bools, gap: float, piece: Ints) -> Bools:
-    """Inliers that hang together with at least a handful of others."""
+def _in_stretches(t: Floats, inlier: Bools, gap: float, part_index: Ints) -> Bools:
+    """Inliers in stretches of at least _MIN_POINTS points."""
     out = np.zeros(len(t), dtype=np.bool_)
     rows = np.flatnonzero(inlier)
     if len(rows) == 0:
         return out
-    cut = (np.diff(t[rows]) > gap) | (np.diff(piece[rows]) > 0)
+    cut = (np.diff(t[rows]) > gap) | (np.diff(part_index[rows]) > 0)
     for part in np.split(rows, np.flatnonzero(cut) + 1):
-        if len(part) >= _LEAST_POINTS:
+        if len(part) >= _MIN_POINTS:
             out[part] = True
     return out
 
 
-def smooth_only(tracks: Mapping[str, Track]) -> dict[str, SmoothTrack]:
-    """The smooth ones of a camera's tracks, by label."""
+def smooth_only(tracks: Mapping[str, ImageTrack]) -> dict[str, SmoothTrack]:
+    """The smooth tracks among a camera's tracks, by label."""
     return {label: track for label, track in tracks.items() if isinstance(track, SmoothTrack)}

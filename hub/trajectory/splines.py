@@ -1,7 +1,7 @@
-"""Uniform cubic B-splines over separate stretches of time, and their robust banded fit.
+"""Uniform cubic B-splines over disjoint stretches of time, and their banded least-squares fit.
 
-One basis serves the smoothing of an image track (hub.timing) and the 3-D trajectory of the joint
-adjustment (hub.poses). A stretch is a span without long gaps; each has its own control points, and all
+One basis serves the smoothing of image tracks (`hub.trajectory.image_tracks`) and the 3-D trajectories of the bundle
+adjustment (`hub.bundle`). A stretch is a time span without long gaps; each has its own control points, and all
 control points lie in one vector, so that every normal matrix is banded.
 """
 
@@ -15,12 +15,12 @@ from scipy.linalg import solveh_banded
 from protocols.geometry.types import Bools, Floats, Ints
 
 SUPPORT = 4
-"""Control points that act at one time."""
+"""Control points with non-zero weight at one time (the order of a cubic spline)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplineBasis:
-    """Cubic B-splines with knots every ``spacing`` seconds (``widths`` in truth) on each stretch.
+    """Cubic B-splines with knots about every ``spacing`` seconds (exactly: ``widths``) on each stretch.
 
     starts: (s,) first knot of each stretch [s]. intervals: (s,) knot intervals of each.
     """
@@ -29,7 +29,7 @@ class SplineBasis:
     starts: Floats
     intervals: Ints
     widths: Floats
-    """(s,) knot interval of each stretch [s]: ``spacing``, or a little less where a stretch is filled exactly."""
+    """(s,) knot interval of each stretch [s]: ``spacing``, or slightly less where a stretch is covered exactly."""
     offsets: Ints = field(init=False)
     """(s,) index of each stretch's first control point."""
 
@@ -38,16 +38,16 @@ class SplineBasis:
         object.__setattr__(self, "offsets", np.cumsum(each) - each)
 
     @classmethod
-    def over(cls, begins: Floats, ends: Floats, spacing: float) -> SplineBasis:
+    def covering(cls, begins: Floats, ends: Floats, spacing: float) -> SplineBasis:
         """A basis that covers the stretches [begins[i], ends[i]], sorted and disjoint."""
         intervals = np.maximum(1, np.ceil((ends - begins) / spacing - 1e-9)).astype(np.int64)
-        # A stretch that is no multiple of the spacing is covered evenly from both sides.
+        # A stretch that is not a multiple of the spacing is exceeded equally at both ends.
         starts = begins - 0.5 * (intervals * spacing - (ends - begins))
         return cls(spacing, starts, intervals, np.full(len(starts), spacing))
 
     @classmethod
-    def within(cls, begins: Floats, ends: Floats, spacing: float) -> SplineBasis:
-        """A basis whose stretches are exactly [begins[i], ends[i]], so that they may follow each other at once."""
+    def spanning(cls, begins: Floats, ends: Floats, spacing: float) -> SplineBasis:
+        """A basis whose stretches are exactly [begins[i], ends[i]]; they may touch."""
         intervals = np.maximum(1, np.ceil((ends - begins) / spacing - 1e-9)).astype(np.int64)
         return cls(spacing, begins, intervals, np.maximum((ends - begins) / intervals, 1e-9))
 
@@ -67,26 +67,26 @@ class SplineBasis:
         return float(self.starts[-1] + self.intervals[-1] * self.widths[-1])
 
     @property
-    def middles(self) -> Floats:
-        """(size,) times about which the control points act [s]."""
-        stretches = zip(self.starts, self.widths, self.intervals, strict=True)
-        return np.concatenate([start + width * (np.arange(count + 3) - 1.0) for start, width, count in stretches])
+    def centres(self) -> Floats:
+        """(size,) time on which each control point's basis function is centred [s]."""
+        each = zip(self.starts, self.widths, self.intervals, strict=True)
+        return np.concatenate([start + width * (np.arange(count + 3) - 1.0) for start, width, count in each])
 
-    def locate(self, time: Floats, beyond: float = 0.0) -> tuple[Ints, Floats, Bools, Floats]:
-        """First control point (n,), place in the knot interval (n,) in [0, 1], inside a stretch (n,), width (n,).
+    def locate(self, time: Floats, extrapolation: float = 0.0) -> tuple[Ints, Floats, Bools, Floats]:
+        """First control point (n,), parameter u in the knot interval (n,), inside a stretch (n,), interval width (n,).
 
-        beyond: knot intervals by which the polynomials at a stretch's ends go on; there the place is outside [0, 1].
+        extrapolation: knot intervals by which a stretch's end polynomials are extended; there u is outside [0, 1].
         """
         known = np.isfinite(time)
         if not known.all():
             time = np.where(known, time, self.starts[0])
-        stretch = np.searchsorted(self.starts - beyond * self.widths, time, side="right") - 1
+        stretch = np.searchsorted(self.starts - extrapolation * self.widths, time, side="right") - 1
         inside = known & (stretch >= 0)
         np.maximum(stretch, 0, out=stretch)
         width = self.widths[stretch]
         place = (time - self.starts[stretch]) / width
         count = self.intervals[stretch]
-        inside &= place <= count + beyond + 1e-9
+        inside &= place <= count + extrapolation + 1e-9
         interval = np.clip(place, 0.0, count - 1.0).astype(np.int64)
         place -= interval
         return self.offsets[stretch] + interval, place, inside, width
@@ -102,34 +102,34 @@ class SplineBasis:
             weights /= (width**derivative)[:, None]
         return index, weights, inside
 
-    def weights_both(self, time: Floats, beyond: float = 0.0) -> tuple[Ints, Floats, Floats, Bools]:
-        """First control point (n,), the weights of value and of first derivative (n, 4) each, inside (n,).
+    def weights_and_derivatives(self, time: Floats, extrapolation: float = 0.0) -> tuple[Ints, Floats, Floats, Bools]:
+        """First control point (n,), the weights of value and first derivative, (n, 4) each, and inside (n,).
 
-        beyond: as for `locate`.
+        extrapolation: as in `locate`.
         """
-        index, u, inside, width = self.locate(time, beyond)
+        index, u, inside, width = self.locate(time, extrapolation)
         return index, basis_weights(u), basis_weights(u, 1) / width[:, None], inside
 
     def evaluate(self, control: Floats, time: Floats, derivative: int = 0) -> Floats:
         """Values (n, d) at ``time`` of the spline with ``control`` (size, d); NaN outside the stretches."""
         index, weights, inside = self.weights(time, derivative)
-        values = combined(control, index, weights)
+        values = weighted_sums(control, index, weights)
         if not inside.all():
             values[~inside] = np.nan
         return values
 
-    def evaluate_both(self, control: Floats, time: Floats) -> tuple[Floats, Floats]:
+    def evaluate_with_derivatives(self, control: Floats, time: Floats) -> tuple[Floats, Floats]:
         """Values and first derivatives, (n, d) each, at ``time``; NaN outside the stretches."""
         index, u, inside, width = self.locate(time)
-        values = combined(control, index, basis_weights(u))
-        slopes = combined(control, index, basis_weights(u, 1)) / width[:, None]
+        values = weighted_sums(control, index, basis_weights(u))
+        slopes = weighted_sums(control, index, basis_weights(u, 1)) / width[:, None]
         if not inside.all():
             values[~inside] = np.nan
             slopes[~inside] = np.nan
         return values, slopes
 
     def scaled(self, factor: float) -> SplineBasis:
-        """The same basis on a time axis stretched by ``factor``."""
+        """The same basis on a time axis scaled by ``factor``."""
         return SplineBasis(self.spacing * factor, self.starts * factor, self.intervals, self.widths * factor)
 
     def interval_starts(self) -> Ints:
@@ -162,10 +162,10 @@ def basis_weights(u: Floats, derivative: int = 0) -> Floats:
     return out.T
 
 
-def combined(control: Floats, index: Ints, weights: Floats) -> Floats:
+def weighted_sums(control: Floats, index: Ints, weights: Floats) -> Floats:
     """Sums (n, d) of four control points from ``index`` (n,) on, of ``control`` (size, d), with ``weights`` (n, 4)."""
     out = np.empty((control.shape[1], len(index)))
-    # Coordinate by coordinate: numpy is slow along axes of two or three.
+    # One coordinate at a time: numpy is slow along axes of length two or three.
     for values, column in zip(out, np.ascontiguousarray(control.T), strict=True):
         np.multiply(weights[:, 0], column.take(index), out=values)
         for k in range(1, SUPPORT):
@@ -186,7 +186,7 @@ def normal_bands(index: Ints, weights: Floats, row_weight: Floats, size: int) ->
 def fit_spline(basis: SplineBasis, time: Floats, values: Floats, row_weight: Floats, stiffness: float = 1e-6) -> Floats:
     """Weighted least-squares control points (size, d) of ``values`` (n, d) at ``time`` (n,).
 
-    stiffness: weight of squared third differences relative to one row; only closes empty intervals.
+    stiffness: weight of squared third differences relative to one row; it only bridges empty intervals.
     """
     index, weights, inside = basis.weights(time)
     used = np.where(inside, row_weight, 0.0)
@@ -202,15 +202,15 @@ def fit_spline(basis: SplineBasis, time: Floats, values: Floats, row_weight: Flo
     return np.asarray(solveh_banded(bands, target, check_finite=False))
 
 
-def stretches(time: Floats, longest_gap: float, piece: Ints | None = None) -> tuple[Floats, Floats]:
-    """Begins and ends of the stretches of sorted ``time`` (n,) that no gap over ``longest_gap`` cuts.
+def split_at_gaps(time: Floats, max_gap: float, part: Ints | None = None) -> tuple[Floats, Floats]:
+    """Begins and ends of the stretches of sorted ``time`` (n,), split at gaps longer than ``max_gap``.
 
-    piece: (n,) rising numbers; where they change, a stretch ends too.
+    part: (n,) non-decreasing numbers; a stretch also ends where they change.
     """
     if len(time) == 0:
         return np.zeros(0), np.zeros(0)
-    apart = np.diff(time) > longest_gap
-    if piece is not None:
-        apart |= np.diff(piece) > 0
-    cuts = np.flatnonzero(apart)
+    is_split = np.diff(time) > max_gap
+    if part is not None:
+        is_split |= np.diff(part) > 0
+    cuts = np.flatnonzero(is_split)
     return time[np.r_[0, cuts + 1]], time[np.r_[cuts, len(time) - 1]]

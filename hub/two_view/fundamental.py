@@ -1,7 +1,7 @@
-"""The fundamental matrix of two uncalibrated views by maximum likelihood (7 degrees of freedom).
+"""Fundamental matrix of pixel correspondences: eight-point algorithm, maximum likelihood, epipolar lines.
 
-``F = U diag(cos a, sin a, 0) Vᵀ`` with rotations U, V, so that rank 2 and norm 1 hold at every step;
-convention ``m_aᵀ F m_b = 0`` (eq. 5 of the paper on timing).
+``F = U diag(cos a, sin a, 0) Vᵀ`` with rotations U, V (7 degrees of freedom), so that rank 2 and norm 1 hold at every
+step; convention ``m_aᵀ F m_b = 0`` (asynchronous calibration paper, eq. 5).
 """
 
 from __future__ import annotations
@@ -12,21 +12,24 @@ from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 
-_LEAST_PAIRS = 8
+_MIN_PAIRS = 8
 
 
-def conditioner(points: Floats) -> Floats:
-    """(3, 3) transform that centres pixels (n, 2) and scales them to unit variance (Hartley)."""
+def hartley_normalisation(points: Floats) -> Floats:
+    """Hartley's normalising transform (3, 3): centres points (n, 2) and scales them to unit variance."""
     centre = points.mean(axis=0)
     spread = max(float(np.sqrt(((points - centre) ** 2).mean())), 1e-12)
     return np.array([[1 / spread, 0, -centre[0] / spread], [0, 1 / spread, -centre[1] / spread], [0, 0, 1.0]])
 
 
 def eight_point(a: Floats, b: Floats) -> Floats:
-    """Rank-2 matrix (3, 3), norm 1, from >= 8 pairs of points (n, 2): smallest singular vector, then rank 2."""
-    if len(a) < _LEAST_PAIRS:
-        raise Refused(f"{len(a)} point pairs; a fundamental matrix needs {_LEAST_PAIRS}")
-    ta, tb = conditioner(a), conditioner(b)
+    """Normalised eight-point algorithm: rank-2 F (3, 3), norm 1, of n >= 8 point pairs a, b (n, 2).
+
+    Raises Refused for fewer than 8 pairs.
+    """
+    if len(a) < _MIN_PAIRS:
+        raise Refused(f"{len(a)} point pairs; a fundamental matrix needs {_MIN_PAIRS}")
+    ta, tb = hartley_normalisation(a), hartley_normalisation(b)
     ha = np.column_stack([a, np.ones(len(a))]) @ ta.T
     hb = np.column_stack([b, np.ones(len(b))]) @ tb.T
     rows = (ha[:, :, None] * hb[:, None, :]).reshape(-1, 9)
@@ -36,14 +39,14 @@ def eight_point(a: Floats, b: Floats) -> Floats:
     return np.asarray(matrix / np.linalg.norm(matrix))
 
 
-def maximum_likelihood(a: Floats, b: Floats, start: Floats | None = None, iterations: int = 50) -> Floats:
-    """F (3, 3), norm 1, that minimises the Sampson distance of pairs of points (n, 2).
+def maximum_likelihood_fundamental(a: Floats, b: Floats, start: Floats | None = None, iterations: int = 50) -> Floats:
+    """Maximum-likelihood F (3, 3), norm 1: minimises the Sampson distance of point pairs a, b (n, 2).
 
     start: (3, 3); default the eight-point solution. Raises Refused for fewer than 8 pairs.
     """
     first = eight_point(a, b) if start is None else start
-    # Work in conditioned pixels with one common scale, so that the Sampson distance keeps its meaning.
-    ta, tb = conditioner(a), conditioner(b)
+    # In normalised coordinates, with the ratio of scales kept so that the Sampson distance is in pixels of one size.
+    ta, tb = hartley_normalisation(a), hartley_normalisation(b)
     inverse_scale = ta[0, 0] / tb[0, 0]
     ha = np.column_stack([a, np.ones(len(a))]) @ ta.T
     hb = np.column_stack([b, np.ones(len(b))]) @ tb.T
@@ -76,7 +79,7 @@ def maximum_likelihood(a: Floats, b: Floats, start: Floats | None = None, iterat
 
 
 def epipolar_lines(matrix: Floats, a: Floats) -> Floats:
-    """Lines (n, 3) in image b, ``lᵀ m_b = 0``, of points a (n, 2); first two entries are a unit normal."""
+    """Epipolar lines (n, 3) in image b, ``lᵀ m_b = 0``, of points a (n, 2); the first two entries are a unit normal."""
     lines = np.column_stack([a, np.ones(len(a))]) @ matrix
     return np.asarray(lines / np.maximum(np.linalg.norm(lines[:, :2], axis=1), 1e-300)[:, None])
 
@@ -93,11 +96,11 @@ def _compose(u: Floats, vt: Floats, angle: float) -> Floats:
 def _residuals(
     u: Floats, vt: Floats, angle: float, ha: Floats, hb: Floats, inverse_scale: float
 ) -> tuple[Floats, Floats]:
-    """Sampson residuals (n,) and their derivative (n, 7) with the denominators' change included."""
+    """Sampson residuals (n,) and their Jacobian (n, 7) by central differences, denominators included."""
 
     def value(matrix: Floats) -> Floats:
         la, lb = hb @ matrix.T, ha @ matrix
-        # Image a's pixels were scaled by another factor than b's: weigh them back to one pixel.
+        # The two images are scaled by different factors: weighted back to pixels of one size.
         variance = (la[:, :2] ** 2).sum(1) * inverse_scale**2 + (lb[:, :2] ** 2).sum(1)
         return np.asarray((ha * la).sum(1) / np.sqrt(np.maximum(variance, 1e-300)))
 

@@ -1,7 +1,9 @@
-"""Refinement of two-view geometry, lag and rate on the Sampson distance: reweighted Levenberg-Marquardt.
+"""Robust refinement of two-view geometry, lag and clock rate on the Sampson distance.
 
-METHODS A, step 3. The robust weight (Cauchy) begins wide, at the misfit of the start, and narrows to the
-noise, so that a start from a coarse grid of lags is drawn in before outliers are let go.
+Levenberg-Marquardt with Cauchy weights (iteratively reweighted least squares), in place of the alternation of the
+asynchronous calibration paper. The width of the Cauchy weight starts at the misfit of the initial guess and is halved
+down to the noise (graduated non-convexity), so that starts from a coarse grid of lags converge before outliers lose
+their weight. Sampson distance: Hartley and Zisserman, Multiple View Geometry, sec. 11.4.3.
 """
 
 from __future__ import annotations
@@ -11,119 +13,129 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hub.two_view.relative_pose import Geometry, RelativePose
+from hub.two_view.relative_pose import RelativePose, TwoViewGeometry
 from protocols.geometry.types import Floats
 
-NARROW = 2.0
-"""Width [sigma] of the robust weight at which a search ends."""
-WIDE = 4.0
-"""… and at which a final fit ends: 0.996 of the efficiency of least squares."""
-_LEAST_ROWS = 12
+SEARCH_WIDTH = 2.0
+"""Final width [sigma] of the Cauchy weight in a search."""
+FINAL_WIDTH = 4.0
+"""Final width [sigma] of the Cauchy weight in a final fit: 0.996 of the efficiency of least squares."""
+_MIN_ROWS = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointPairs:
-    """Corresponding normalised points. a, b: (n, 2). speed: (n, 2) of b by its time. lever: (n,) time of a
-    less the samples' centre [s]."""
+    """Corresponding normalised points.
+
+    a, b: (n, 2). velocity_b: (n, 2) derivative of b by b's time [1/s]. centred_time: (n,) time of a minus the
+    samples' centre [s].
+    """
 
     a: Floats
     b: Floats
-    speed: Floats
-    lever: Floats
+    velocity_b: Floats
+    centred_time: Floats
 
 
 Sampler = Callable[[float, float], PointPairs]
-"""Point pairs under ``t_b = slowness * (t_a - centre) + middle``, given (slowness, middle)."""
+"""Point pairs under the time map ``t_b = inverse_rate * (t_a - centre) + intercept``: f(inverse_rate, intercept)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Noise:
-    """sigma_a, sigma_b: noise in normalised coordinates. rate_std: prior of the rate."""
+class NoiseModel:
+    """Image noise and clock-rate prior.
+
+    sigma_a, sigma_b: noise std of normalised points of a and of b. rate_prior_std: prior std of the rate about 1.
+    """
 
     sigma_a: float
     sigma_b: float
-    rate_std: float
+    rate_prior_std: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Refined:
-    """Mean robust cost a row, the time map ``t_b = slowness * (t_a - centre) + middle``, and the geometry.
+class RefinementResult:
+    """Estimate of two-view geometry and time map ``t_b = inverse_rate * (t_a - centre) + intercept``.
 
-    normal: (k + 2, k + 2) inverse covariance, for unit noise, of the geometry's steps, the middle and the slowness.
+    cost: mean robust cost of a point pair, in units of the squared noise. intercept: b's time [s] at the samples'
+    centre. normal: (k + 2, k + 2) normal matrix, the inverse covariance for unit noise, of the geometry's k local
+    parameters, intercept and inverse rate.
     """
 
     cost: float
-    slowness: float
-    middle: float
-    geometry: Geometry
+    inverse_rate: float
+    intercept: float
+    geometry: TwoViewGeometry
     normal: Floats
 
 
 def refine(
     sampler: Sampler,
-    geometry: Geometry,
-    middle: float,
-    scale: float,
-    noise: Noise,
+    geometry: TwoViewGeometry,
+    intercept: float,
+    initial_misfit: float,
+    noise: NoiseModel,
     *,
-    slowness: float = 1.0,
+    inverse_rate: float = 1.0,
     fixed_geometry: bool = False,
     iterations: int = 25,
-    narrowest: float = NARROW,
-) -> Refined | None:
-    """Refine from a start; None where nothing overlaps or the rate runs away.
+    final_width: float = SEARCH_WIDTH,
+) -> RefinementResult | None:
+    """Refine geometry, lag and rate from an initial guess; None without overlap or if the rate diverges.
 
-    scale: misfit over noise to begin with. fixed_geometry: only lag and rate move.
+    sampler: point pairs at a time map. geometry, intercept [s], inverse_rate: initial guess. initial_misfit: its
+    residual over the noise, from which the Cauchy width starts. fixed_geometry: estimate lag and rate only.
+    final_width: of the Cauchy weight [sigma].
     """
-    damping, width = 1e-3, max(3.0 * scale, narrowest)
-    now = _system(sampler, geometry, slowness, middle, width, noise, fixed_geometry)
-    if now is None:
+    damping, width = 1e-3, max(3.0 * initial_misfit, final_width)
+    system = _normal_equations(sampler, geometry, inverse_rate, intercept, width, noise, fixed_geometry)
+    if system is None:
         return None
     for _ in range(iterations):
-        normal, gradient, cost = now
+        normal, gradient, cost = system
         damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
         step: Floats = np.asarray(np.linalg.solve(damped, -gradient), dtype=np.float64)
-        trial_geometry = geometry if fixed_geometry else geometry.moved(step[:-2])
-        trial_at = slowness + float(step[-1]), middle + float(step[-2])
-        trial = _system(sampler, trial_geometry, *trial_at, width, noise, fixed_geometry)
+        trial_geometry = geometry if fixed_geometry else geometry.retract(step[:-2])
+        trial_map = inverse_rate + float(step[-1]), intercept + float(step[-2])
+        trial = _normal_equations(sampler, trial_geometry, *trial_map, width, noise, fixed_geometry)
         if trial is not None and trial[2] < cost:
-            geometry, (slowness, middle) = trial_geometry, trial_at
+            geometry, (inverse_rate, intercept) = trial_geometry, trial_map
             damping = max(damping / 5.0, 1e-9)
-            if width == narrowest:
-                now = trial
+            if width == final_width:
+                system = trial
                 if cost - trial[2] < 1e-4 * cost:
                     break
                 continue
-        elif width == narrowest:
+        elif width == final_width:
             damping *= 8.0
             if damping > 1e3:
                 break
             continue
-        width = max(narrowest, 0.5 * width)
-        now = _system(sampler, geometry, slowness, middle, width, noise, fixed_geometry)
-        if now is None:
+        width = max(final_width, 0.5 * width)
+        system = _normal_equations(sampler, geometry, inverse_rate, intercept, width, noise, fixed_geometry)
+        if system is None:
             return None
-    if not 0.5 < slowness < 2.0 or width > narrowest:
+    if not 0.5 < inverse_rate < 2.0 or width > final_width:
         return None
-    return Refined(now[2], slowness, middle, geometry, now[0])
+    return RefinementResult(system[2], inverse_rate, intercept, geometry, system[0])
 
 
-def _system(
+def _normal_equations(
     sampler: Sampler,
-    geometry: Geometry,
-    slowness: float,
-    middle: float,
+    geometry: TwoViewGeometry,
+    inverse_rate: float,
+    intercept: float,
     width: float,
-    noise: Noise,
+    noise: NoiseModel,
     fixed_geometry: bool,
 ) -> tuple[Floats, Floats, float] | None:
     """Normal matrix, gradient and mean robust cost; None without overlap.
 
-    Columns: the geometry's steps (none where it is fixed), lag, slowness.
+    Parameters: the geometry's local ones (none if it is fixed), intercept, inverse rate.
     """
-    pairs = sampler(slowness, middle)
+    pairs = sampler(inverse_rate, intercept)
     count = len(pairs.a)
-    if count < _LEAST_ROWS:
+    if count < _MIN_ROWS:
         return None
     matrix = geometry.matrix
     line_b = pairs.a @ matrix[:, :2].T
@@ -144,14 +156,14 @@ def _system(
         products[:, :2, 2] = pairs.b
         products[:, 2, 2] = 1.0
         jacobian[:, :free] = products.reshape(count, 9) @ geometry.tangents().reshape(free, 9).T
-    jacobian[:, free] = line_b[:, 0] * pairs.speed[:, 0] + line_b[:, 1] * pairs.speed[:, 1]
-    jacobian[:, free + 1] = jacobian[:, free] * pairs.lever
+    jacobian[:, free] = line_b[:, 0] * pairs.velocity_b[:, 0] + line_b[:, 1] * pairs.velocity_b[:, 1]
+    jacobian[:, free + 1] = jacobian[:, free] * pairs.centred_time
     jacobian *= over[:, None]
     weighted = jacobian / (1.0 + ratio)[:, None]
     normal = weighted.T @ jacobian
     gradient = weighted.T @ residual
-    prior = 1.0 / noise.rate_std**2
+    prior = 1.0 / noise.rate_prior_std**2
     normal[-1, -1] += prior
-    gradient[-1] += prior * (slowness - 1.0)
-    cost = float((width**2 * np.log1p(ratio)).sum()) + prior * (slowness - 1.0) ** 2
+    gradient[-1] += prior * (inverse_rate - 1.0)
+    cost = float((width**2 * np.log1p(ratio)).sum()) + prior * (inverse_rate - 1.0) ** 2
     return normal, gradient, cost / count

@@ -1,8 +1,7 @@
-"""Two calibrated views: essential matrix, Sampson distance, and which side is in front.
+"""Two-view geometry: essential and fundamental matrix, Sampson distance, cheirality, five-point hypotheses.
 
-Convention: ``X_b = R X_a + t`` with |t| = 1, ``E = [t]x R``, ``s_bᵀ E s_a = 0`` for normalised
-homogeneous points. The published fundamental matrix is the transpose way round, ``m_aᵀ F m_b = 0``
-(eq. 5 of the paper).
+Convention: ``X_b = R X_a + t`` with |t| = 1, ``E = [t]x R``, ``s_bᵀ E s_a = 0`` for normalised homogeneous points.
+The published fundamental matrix is the transpose, ``m_aᵀ F m_b = 0`` (asynchronous calibration paper, eq. 5).
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 
-from hub.two_view.fundamental import conditioner
+from hub.two_view.fundamental import hartley_normalisation
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
@@ -21,9 +20,9 @@ from protocols.geometry.types import Bools, Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativePose:
-    """``X_b = rotation @ X_a + direction * baseline`` with an unknown baseline.
+    """Relative pose up to scale: ``X_b = rotation @ X_a + direction * baseline`` with an unknown baseline.
 
-    rotation: (3, 3), b from a. direction: (3,), unit.
+    rotation: (3, 3), b from a. direction: (3,) unit vector, in b's axes.
     """
 
     rotation: Floats
@@ -40,26 +39,26 @@ class RelativePose:
         return self.essential
 
     def tangents(self) -> Floats:
-        """(5, 3, 3) derivatives of ``matrix`` by the steps of `moved`."""
-        axes, cross = two_axes_of(self.direction), so3.hat(self.direction)
+        """(5, 3, 3) derivatives of ``matrix`` by the local parameters of `retract`."""
+        axes, cross = orthogonal_axes(self.direction), so3.hat(self.direction)
         turns = [cross @ so3.hat(axis) @ self.rotation for axis in np.eye(3)]
         return np.stack(turns + [so3.hat(axis) @ self.rotation for axis in axes])
 
-    def moved(self, step: Floats) -> RelativePose:
-        """After a step (5,): a turn [rad], then the direction along its two tangents."""
-        direction = self.direction + step[3:5] @ two_axes_of(self.direction)
+    def retract(self, step: Floats) -> RelativePose:
+        """The pose after a local step (5,): rotation vector [rad], then the direction along its two tangents."""
+        direction = self.direction + step[3:5] @ orthogonal_axes(self.direction)
         return RelativePose(so3.exp(step[:3]) @ self.rotation, direction / np.linalg.norm(direction))
 
     def inverse(self) -> RelativePose:
-        """The pose of a from b."""
+        """The relative pose of a from b."""
         return RelativePose(self.rotation.T, -self.rotation.T @ self.direction)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Uncalibrated:
-    """The fundamental matrix ``left diag(cos a, sin a, 0) right`` of two views with unknown lenses.
+class FundamentalMatrix:
+    """Fundamental matrix ``left diag(cos a, sin a, 0) right`` of two views without intrinsics, 7 degrees of freedom.
 
-    left, right: (3, 3) rotations. angle: [rad]. Rank 2 and norm 1 hold at every step.
+    left, right: (3, 3) rotations. angle: a [rad]. Rank 2 and Frobenius norm 1 hold after every step.
     """
 
     left: Floats
@@ -67,8 +66,8 @@ class Uncalibrated:
     angle: float
 
     @classmethod
-    def of(cls, matrix: Floats) -> Uncalibrated:
-        """The nearest rank-2 matrix to (3, 3) ``s_bᵀ M s_a = 0``."""
+    def of(cls, matrix: Floats) -> FundamentalMatrix:
+        """The rank-2 matrix nearest to a matrix (3, 3), ``s_bᵀ M s_a = 0``."""
         u, d, vt = np.linalg.svd(matrix)
         u, vt = u * np.sign(np.linalg.det(u)), vt * np.sign(np.linalg.det(vt))
         return cls(u, vt, float(np.arctan2(d[1], d[0])))
@@ -79,38 +78,41 @@ class Uncalibrated:
         return np.asarray((self.left * np.array([np.cos(self.angle), np.sin(self.angle), 0.0])) @ self.right)
 
     def tangents(self) -> Floats:
-        """(7, 3, 3) derivatives of ``matrix`` by the steps of `moved`."""
+        """(7, 3, 3) derivatives of ``matrix`` by the local parameters of `retract`."""
         matrix = self.matrix
         turns = [so3.hat(axis) @ matrix for axis in np.eye(3)] + [matrix @ so3.hat(axis) for axis in np.eye(3)]
         along = (self.left * np.array([-np.sin(self.angle), np.cos(self.angle), 0.0])) @ self.right
         return np.stack([*turns, along])
 
-    def moved(self, step: Floats) -> Uncalibrated:
-        """After a step (7,): turns of the left and of the right rotation [rad], and of the angle."""
+    def retract(self, step: Floats) -> FundamentalMatrix:
+        """The matrix after a local step (7,): rotation vectors of left and of right, and the angle [rad]."""
         left, right = so3.exp(step[:3]) @ self.left, self.right @ so3.exp(step[3:6])
-        return Uncalibrated(left, right, self.angle + float(step[6]))
+        return FundamentalMatrix(left, right, self.angle + float(step[6]))
 
 
-Geometry: TypeAlias = RelativePose | Uncalibrated
-"""What two views have in common: with known lenses a pose, without them a fundamental matrix."""
+TwoViewGeometry: TypeAlias = RelativePose | FundamentalMatrix
+"""Geometry of two views: a relative pose with intrinsics, a fundamental matrix without."""
 
 
-def relative_pose(a: Pose, b: Pose) -> RelativePose:
-    """The relative pose of two placed cameras. Raises ValueError if they stand in one point."""
-    apart = b.rotation @ (a.position - b.position)
-    length = float(np.linalg.norm(apart))
+def relative_pose_between(a: Pose, b: Pose) -> RelativePose:
+    """The relative pose, b from a, of two cameras with poses. Raises ValueError for coincident centres."""
+    baseline = b.rotation @ (a.position - b.position)
+    length = float(np.linalg.norm(baseline))
     if length < 1e-12:
-        raise ValueError("two cameras in one point have no epipolar geometry")
-    return RelativePose(b.rotation @ a.rotation.T, apart / length)
+        raise ValueError("two cameras with one centre have no epipolar geometry")
+    return RelativePose(b.rotation @ a.rotation.T, baseline / length)
 
 
 def homogeneous(points: Floats) -> Floats:
-    """(n, 3) of (n, 2)."""
+    """Homogeneous coordinates (n, 3) of points (n, 2)."""
     return np.column_stack([points, np.ones(len(points))])
 
 
 def sampson(essential: Floats, a: Floats, b: Floats, sigma_a: float, sigma_b: float) -> Floats:
-    """Signed Sampson distances (n,) in units of the noise of normalised points a, b (n, 2)."""
+    """Signed Sampson distances (n,) of normalised points a, b (n, 2), over their noise std sigma_a, sigma_b.
+
+    Hartley and Zisserman, Multiple View Geometry, sec. 11.4.3. essential: (3, 3), ``s_bᵀ E s_a = 0``.
+    """
     ha, hb = homogeneous(a), homogeneous(b)
     line_b, line_a = ha @ essential.T, hb @ essential
     variance = sigma_b**2 * (line_b[:, :2] ** 2).sum(axis=1) + sigma_a**2 * (line_a[:, :2] ** 2).sum(axis=1)
@@ -118,7 +120,7 @@ def sampson(essential: Floats, a: Floats, b: Floats, sigma_a: float, sigma_b: fl
 
 
 def triangulate_midpoint(pose: RelativePose, a: Floats, b: Floats) -> tuple[Floats, Floats]:
-    """Depth-like distances along both rays (n,), (n,), baseline = 1; least squares, NaN for parallel rays."""
+    """Depths (n,) along the rays of a and of b, in units of the baseline, by least squares; NaN for parallel rays."""
     ray_a, ray_b = homogeneous(a) @ pose.rotation.T, homogeneous(b)
     # baseline * direction = s_b ray_b - s_a ray_a
     aa, bb, ab = (ray_a**2).sum(1), (ray_b**2).sum(1), (ray_a * ray_b).sum(1)
@@ -128,82 +130,86 @@ def triangulate_midpoint(pose: RelativePose, a: Floats, b: Floats) -> tuple[Floa
     return (ab * bt - bb * at) / determinant, (aa * bt - ab * at) / determinant
 
 
-def in_front(pose: Geometry, a: Floats, b: Floats) -> Bools:
-    """Which point pairs (n,) lie in front of both cameras; without lenses nothing says that one doesn't."""
-    if isinstance(pose, Uncalibrated):
+def in_front(pose: TwoViewGeometry, a: Floats, b: Floats) -> Bools:
+    """Cheirality: which point pairs (n,) lie in front of both cameras; all without intrinsics."""
+    if isinstance(pose, FundamentalMatrix):
         return np.ones(len(a), dtype=np.bool_)
     depth_a, depth_b = triangulate_midpoint(pose, a, b)
     with np.errstate(invalid="ignore"):
         return np.asarray((depth_a > 0) & (depth_b > 0))
 
 
-def parallax(pose: Geometry, a: Floats, b: Floats) -> float:
-    """Median angle [rad] between the two rays of a point, a, b (n, 2) normalised; 0 without lenses."""
-    if isinstance(pose, Uncalibrated) or len(a) == 0:
+def parallax(pose: TwoViewGeometry, a: Floats, b: Floats) -> float:
+    """Median parallax angle [rad] of normalised points a, b (n, 2); 0 without intrinsics."""
+    if isinstance(pose, FundamentalMatrix) or len(a) == 0:
         return 0.0
     rays_a, rays_b = homogeneous(a) @ pose.rotation.T, homogeneous(b)
     cosine = (rays_a * rays_b).sum(1) / np.linalg.norm(rays_a, axis=1) / np.linalg.norm(rays_b, axis=1)
     return float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
-def decompose(essential: Floats, a: Floats, b: Floats) -> RelativePose:
-    """The one of the four poses of an (approximate) essential matrix with most points in front."""
+def decompose_essential(essential: Floats, a: Floats, b: Floats) -> RelativePose:
+    """Of the four relative poses of an (approximate) essential matrix (3, 3) the one with most points in front.
+
+    a, b: normalised points (n, 2).
+    """
     u, _, vt = np.linalg.svd(essential)
     u, vt = u * np.sign(np.linalg.det(u)), vt * np.sign(np.linalg.det(vt))
-    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    options = [RelativePose(u @ w @ vt, sign * u[:, 2]) for w in (turn, turn.T) for sign in (1.0, -1.0)]
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    options = [RelativePose(u @ w @ vt, sign * u[:, 2]) for w in (quarter, quarter.T) for sign in (1.0, -1.0)]
     return max(options, key=lambda option: int(in_front(option, a, b).sum()))
 
 
-_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-"""Which of the upper six entries of a symmetric matrix each of its nine is."""
+_SYMMETRIC_INDEX = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+"""Index of each entry of a symmetric 3x3 matrix among its six upper ones."""
 
 
 def homography_residual(a: Floats, b: Floats) -> float:
-    """Robust distance (sigma of one coordinate, units of a and b, which are alike) that the best homography leaves.
+    """Robust residual std of the best homography from a to b, per coordinate, in the common unit of a and b.
 
-    Near the noise, it says that all points lie in one plane or the cameras stand in one place: then the
-    essential matrix is not determined. Distances are judged against what noise alike in both makes of them
-    (Sampson's: e^T (1 + J J^T)^-1 e, times 2 so that where J is a rotation it is the distance in b): a plane that is
-    seen nearly edge-on magnifies noise in both directions. a, b: (n, 2), n >= 8; nan for fewer.
+    Near the noise, all points lie in one plane or the camera centres coincide: then the essential matrix is not
+    determined. Distances are weighted by their covariance under equal noise in both images (Sampson's
+    e^T (1 + J J^T)^-1 e, times 2 so that it is the distance in b where J is a rotation), because a plane that is seen
+    nearly edge-on magnifies the noise. a, b: (n, 2), n >= 8; nan for fewer.
     """
     if len(a) < 8:
         return float("nan")
-    scale_a, scale_b = conditioner(a), conditioner(b)
-    # Coordinate by coordinate, rows last: numpy is slow along axes of two or three.
+    scale_a, scale_b = hartley_normalisation(a), hartley_normalisation(b)
+    # Coordinates first, points last: numpy is slow along axes of length two or three.
     ha, (x, y, _) = scale_a @ homogeneous(a).T, scale_b @ homogeneous(b).T
     outer = ha[[0, 0, 0, 1, 1, 2]] * ha[[0, 1, 2, 1, 2, 2]]
     of_b = np.stack([np.ones_like(x), -x, -y, x * x + y * y], axis=1)
     weight, none = np.ones(len(a)), np.zeros((3, 3))
     for _ in range(4):
-        # The normal matrix of the rows (ha, 0, -x ha) and (0, ha, -y ha).
-        plain, by_x, by_y, by_both = (outer @ (of_b * np.square(weight)[:, None])).T[:, _SYMMETRIC]
+        # Normal matrix of the DLT rows (ha, 0, -x ha) and (0, ha, -y ha).
+        plain, by_x, by_y, by_both = (outer @ (of_b * np.square(weight)[:, None])).T[:, _SYMMETRIC_INDEX]
         normal = np.block([[plain, none, by_x], [none, plain, by_y], [by_x, by_y, by_both]])
         homography = np.linalg.eigh(normal)[1][:, 0].reshape(3, 3)
-        moved = homography @ ha
-        depth = np.where(np.abs(moved[2]) > 1e-12, moved[2], 1e-12)
-        image = moved[:2] / depth
+        mapped = homography @ ha
+        depth = np.where(np.abs(mapped[2]) > 1e-12, mapped[2], 1e-12)
+        image = mapped[:2] / depth
         distance = np.hypot(image[0] - x, image[1] - y)
-        # The algebraic error grows with the depth; divided out, rows count by distance in the image.
+        # The algebraic error grows with the depth; division by it makes rows count by image distance.
         weight = 1.0 / np.abs(depth) / (1.0 + (distance / max(3.0 * float(np.median(distance)), 1e-12)) ** 2)
         weight /= weight.max()
-    # The map's derivative (2, 2, n) at each point, in units of b over units of a.
+    # Jacobian (2, 2, n) of the homography at each point, in units of b over units of a.
     slope = (homography[:2, :2, None] - image[:, None] * homography[2, :2, None]) / depth
     slope *= float(scale_a[0, 0] / scale_b[0, 0])
     error = image - np.stack([x, y])
-    # In closed form: for points near the map's horizon 1 + J J^T is singular to within rounding.
+    # In closed form: for points near the vanishing line 1 + J J^T is singular to within rounding.
     area = slope[0, 0] * slope[1, 1] - slope[0, 1] * slope[1, 0]
     determinant = 1.0 + np.square(slope).sum(axis=(0, 1)) + np.square(area)
-    # J^T applied to the error turned by a right angle: the adjugate of J J^T.
+    # J^T applied to the error rotated by a right angle: the adjugate of J J^T.
     along = slope[0] * error[1] - slope[1] * error[0]
     squared = 2.0 * (np.square(error).sum(axis=0) + np.square(along).sum(axis=0)) / determinant
     return float(np.median(np.sqrt(np.maximum(squared, 0.0)))) / 1.1774 / float(scale_b[0, 0])
 
 
 def five_point(a: Floats, b: Floats, threshold: float, seed: int, subset: int = 300) -> list[RelativePose]:
-    """Poses from five-point RANSAC (OpenCV) over random subsets of the pairs; deterministic in ``seed``.
+    """Relative-pose hypotheses from five-point RANSAC (Nistér; OpenCV) on a random subset; deterministic in ``seed``.
 
-    a, b: normalised points (n, 2). threshold: inlier distance in normalised coordinates.
+    a, b: normalised points (n, 2). threshold: inlier distance in normalised coordinates. subset: largest number of
+    pairs used. Empty for fewer than 8 pairs or where no matrix is found.
     """
     rng = np.random.default_rng(seed)
     poses: list[RelativePose] = []
@@ -224,22 +230,25 @@ def five_point(a: Floats, b: Floats, threshold: float, seed: int, subset: int = 
         return poses
     for matrix in np.asarray(found, dtype=np.float64).reshape(-1, 3, 3):
         if np.isfinite(matrix).all():
-            poses.append(decompose(matrix, a[pick], b[pick]))
+            poses.append(decompose_essential(matrix, a[pick], b[pick]))
     return poses
 
 
-def fundamental_from(pose: Geometry, matrix_a: Floats, matrix_b: Floats) -> Floats:
-    """Fundamental matrix (3, 3) of undistorted pixels, ``m_aᵀ F m_b = 0``, Frobenius norm 1 (eqs. 4, 5)."""
+def fundamental_from(pose: TwoViewGeometry, matrix_a: Floats, matrix_b: Floats) -> Floats:
+    """Fundamental matrix (3, 3) of undistorted pixels, ``m_aᵀ F m_b = 0``, Frobenius norm 1.
+
+    matrix_a, matrix_b: (3, 3) camera matrices. Asynchronous calibration paper, eqs. 4 and 5.
+    """
     f = np.linalg.inv(matrix_a).T @ pose.matrix.T @ np.linalg.inv(matrix_b)
     f = f / np.linalg.norm(f)
     largest = np.unravel_index(int(np.argmax(np.abs(f))), f.shape)
     return np.asarray(f * np.sign(f[largest]))
 
 
-def two_axes_of(direction: Floats) -> Floats:
+def orthogonal_axes(direction: Floats) -> Floats:
     """Two unit vectors (2, 3) orthogonal to ``direction`` (3,) and to each other."""
     x, y, z = (float(value) for value in direction)
-    # The axis least along the direction, crossed with it.
+    # Cross product with the coordinate axis least aligned with the direction.
     least = min(range(3), key=lambda k: abs((x, y, z)[k]))
     first = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))[least]
     length = (first[0] ** 2 + first[1] ** 2 + first[2] ** 2) ** 0.5
@@ -249,4 +258,4 @@ def two_axes_of(direction: Floats) -> Floats:
 
 def tangent_basis(direction: Floats) -> Floats:
     """Two unit vectors (3, 2) orthogonal to ``direction`` (3,) and to each other."""
-    return two_axes_of(direction).T
+    return orthogonal_axes(direction).T

@@ -1,1 +1,1 @@
-"""The live view: what the bus says of a rig, in a browser."""
+"""Live view of a site in a browser: cameras, trajectories and drones from bus messages or a recording."""

@@ -1,8 +1,8 @@
-"""Who may look: viser serves everyone who finds its port, so every request passes here first.
+"""Access control of the view's HTTP and WebSocket server: Host and Origin checks, and a token beyond loopback.
 
-On loopback any program of this machine may look, but no page of another site in the same browser: the request's
-Host must be this machine's, and a WebSocket's Origin the same. Beyond loopback a token is asked for once in the
-address (``?token=…``) and kept as a cookie.
+Viser itself serves every client that reaches its port. On loopback every program of this machine has access, but no
+page of another site in the same browser: the request's Host must be this machine, and a WebSocket's Origin must equal
+it. Beyond loopback a token is required once in the address (``?token=…``) and kept as a cookie.
 """
 
 from __future__ import annotations
@@ -20,35 +20,35 @@ _COOKIE = "syncline-view"
 _LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 
 
-class Gate:
-    """Lets requests through or not. token: "" = none is asked for, which is for loopback only."""
+class AccessControl:
+    """Accepts or refuses requests. token: "" = none is required, which is for loopback only."""
 
     def __init__(self, token: str = "") -> None:
         self.token = token
         self.refused = 0
 
     def allows(self, path: str, headers: Any) -> bool:
-        """Whether a request may pass. path: with its query; headers: a mapping with ``get``."""
+        """Whether a request is accepted. path: with its query; headers: a mapping with ``get``."""
         host, origin = headers.get("Host") or "", headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
             return False  # a page of another site
         if not self.token:
-            # Another site's name that was made to resolve to this machine has another Host.
+            # DNS rebinding: a foreign name that resolves to this machine has another Host.
             return is_local(urlsplit(f"//{host}").hostname or "")
         given = parse_qs(urlsplit(path).query).get("token", [""])[0] or _cookie(headers.get("Cookie") or "")
         return hmac.compare_digest(given.encode(), self.token.encode())
 
     def wrap(self, inner: Callable[[Any, Any], Any] | None) -> Callable[[Any, Any], Any]:
-        """A ``process_request`` of websockets' server that asks this gate before ``inner``."""
+        """A ``process_request`` of websockets' server that checks access before ``inner``."""
 
         def process(connection: Any, request: Any) -> Any:
             if not self.allows(request.path, request.headers):
                 self.refused += 1
-                text = "This view asks for its token: open the address that `syncline view` printed.\n"
+                text = "This view requires its token: open the address that `syncline view` printed.\n"
                 return connection.respond(http.HTTPStatus.FORBIDDEN, text)
             response = None if inner is None else inner(connection, request)
             if response is not None:
-                # What a figure says on this page is nobody else's: no framing, no leaking of the token.
+                # The page is private: no framing, no leaking of the token in the Referer.
                 response.headers["Referrer-Policy"] = "no-referrer"
                 response.headers["X-Frame-Options"] = "DENY"
                 if self.token:
@@ -59,8 +59,8 @@ class Gate:
         return process
 
     @contextmanager
-    def before_every_server(self) -> Iterator[None]:
-        """While open, servers that websockets starts ask this gate: viser offers no other way in."""
+    def guard_new_servers(self) -> Iterator[None]:
+        """While open, servers that websockets starts use this access control: viser has no other hook."""
         import websockets.asyncio.server as server
 
         original = server.serve
@@ -76,7 +76,7 @@ class Gate:
 
 
 def is_local(host: str) -> bool:
-    """Whether a host name or address means this machine and nobody else can reach it."""
+    """Whether a host name or address is loopback."""
     if host.lower() in _LOCAL_NAMES:
         return True
     try:

@@ -1,4 +1,4 @@
-"""calibration.toml out of what the bus said, for a browser to keep."""
+"""calibration.toml from the messages of the bus, for download in the browser."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from protocols.core.version import VERSION
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.builder import rig_camera
+from protocols.session.builder import rig_camera_from_info
 from protocols.session.calibration import Calibration, CameraCalibration, calibration_text
 from protocols.session.rig import Rig
 
 
 def calibration_file(state: ViewState) -> str:
-    """The text of calibration.toml; "" where nothing is solved yet."""
+    """The text of calibration.toml; "" if nothing is solved yet."""
     solved = state.solved
     if solved is None:
         return ""
     infos = {name: camera.info for name, camera in state.cameras.items() if camera.info is not None}
-    rig = Rig({name: rig_camera(info) for name, info in infos.items()}, solved.units)
+    rig = Rig({name: rig_camera_from_info(info) for name, info in infos.items()}, solved.units)
     cameras = {}
     for found in solved.cameras:
         info = infos.get(found.camera)

@@ -1,4 +1,4 @@
-"""The cameras' pictures side by side in the scene, to be clicked on: before anything is calibrated."""
+"""The cameras' images side by side in the 3-D view, for clicking on pixels before anything is calibrated."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hub.view.page import marked
-from hub.view.scene import decoded
+from hub.view.page import draw_detections
+from hub.view.scene import decode_jpeg
 from hub.view.state import ViewState
 from protocols.geometry.types import Floats
 
 if TYPE_CHECKING:
     import viser
 
-_WIDTH, _GAP = 1.0, 0.06  # of a picture and between two, in the scene's units
+_WIDTH, _GAP = 1.0, 0.06  # of an image and between two, in the scene's units
 
 
-class PicturePlanes:
-    """Pictures in the plane z = 0, x to the right, y down. clicked: (camera, u, v) in pixels of the camera's image."""
+class ImagePlanes:
+    """Images in the plane z = 0, x to the right, y down. clicked: (camera, u, v) in pixels of the camera's image."""
 
     def __init__(self, server: viser.ViserServer, clicked: Callable[[str, float, float], None]) -> None:
         self._server = server
@@ -32,7 +32,7 @@ class PicturePlanes:
         self._count = 0
 
     def update(self, state: ViewState) -> None:
-        """Bring the pictures up to date."""
+        """Show the newest images."""
         names = [name for name, camera in state.cameras.items() if camera.picture is not None]
         if len(names) != self._count:
             self.clear()
@@ -42,12 +42,12 @@ class PicturePlanes:
             camera = state.cameras[name]
             if camera.picture is None or self._shown.get(name) == camera.pictures:
                 continue
-            image = decoded(camera.picture.jpeg)
+            image = decode_jpeg(camera.picture.jpeg)
             if image is None:
                 continue
             self._shown[name] = camera.pictures
             self._sizes[name] = (camera.picture.width, camera.picture.height)
-            image = marked(image, camera)
+            image = draw_detections(image, camera)
             if name in self._images:
                 self._images[name].image = image
                 continue
@@ -64,7 +64,7 @@ class PicturePlanes:
             )
 
     def clear(self) -> None:
-        """Take the pictures away."""
+        """Remove the images."""
         for handle in (*self._images.values(), *self._labels.values()):
             handle.remove()
         self._images.clear()
@@ -90,7 +90,7 @@ class PicturePlanes:
 
 
 def pixel_of(origin: Floats, direction: Floats, index: int, size: tuple[int, int]) -> tuple[float, float] | None:
-    """The pixel of picture ``index`` that a ray meets, None beside it. size: the image's (width, height)."""
+    """The pixel of image ``index`` that a ray intersects, None outside. size: the image's (width, height)."""
     if abs(direction[2]) < 1e-12:
         return None
     x, y, _ = origin - direction * (origin[2] / direction[2])

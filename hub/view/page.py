@@ -1,4 +1,4 @@
-"""The view's panel: state, cameras, buttons, what is drawn, and the timeline of a replay."""
+"""The view's panels: site status, cameras, buttons, display options, drones, and the timeline of a replay."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import numpy as np
 
 from hub.view.export import calibration_file
 from hub.view.panels import camera_details, camera_table, overview
-from hub.view.scene import Options, decoded
+from hub.view.scene import DisplayOptions, decode_jpeg
 from hub.view.state import CameraView, ViewState
-from hub.view.uav_overlay import draw, padded, words
-from hub.view.uav_state import FlightView
+from hub.view.uav_overlay import draw_uav, pad_to_aspect, uav_panel_html
+from hub.view.uav_state import UavView
 
 if TYPE_CHECKING:
     import viser
@@ -28,29 +28,30 @@ ACTIONS = {
     "export": "Export",
 }
 _HINTS = {
-    "start_recording": "Every recorder of the site begins a new log.",
-    "stop_recording": "Every recorder of the site ends its log; it is whole then.",
-    "recalibrate": "The hub forgets what it has gathered and begins again: after a camera was moved.",
-    "export": "The hub writes its files now, and your browser gets calibration.toml.",
+    "start_recording": "Every recorder of the site starts a new log.",
+    "stop_recording": "Every recorder of the site closes its log.",
+    "recalibrate": "The hub discards its observations and starts again, for example after a camera was moved.",
+    "export": "The hub writes its files now, and your browser downloads calibration.toml.",
 }
 
 
-class Page:
+class ViewPage:
     """Panels of one server.
 
-    asked: actions that were clicked, for the loop to send. allowed: whether buttons act. actions: which there are.
+    requested_actions: actions that were clicked, to be sent by the loop. allowed: whether buttons are enabled. actions:
+    the buttons to show.
     """
 
     def __init__(
         self,
         server: viser.ViserServer,
-        options: Options,
+        options: DisplayOptions,
         *,
         allowed: bool,
         player: Player | None = None,
         actions: tuple[str, ...] = tuple(ACTIONS),
     ) -> None:
-        self.asked: deque[str] = deque(maxlen=32)
+        self.requested_actions: deque[str] = deque(maxlen=32)
         self.options = options
         self._server = server
         self._player = player
@@ -58,14 +59,14 @@ class Page:
         self._now = 0.0
         self._texts: dict[int, str] = {}
         gui = server.gui
-        # Sharing would go through a server of viser's makers: a rig's pictures stay here.
+        # Viser's sharing uses an external server: a rig's images stay local.
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
         gui.set_panel_label("Syncline")
         self._overview = gui.add_html("")
         if player is not None:
             self._add_timeline(player)
-        self._flights: dict[str, _FlightPanel] = {}
+        self._uavs: dict[str, _UavPanel] = {}
         self._filled = False
         self._table = gui.add_html("")
         self._note: Any = None
@@ -79,7 +80,7 @@ class Page:
         self._add_options()
 
     def update(self, state: ViewState, now: float) -> None:
-        """Bring the panels up to date."""
+        """Update the panels."""
         self._state, self._now = state, now
         names = tuple(state.cameras) or ("–",)
         if tuple(self._choice.options) != names:
@@ -96,25 +97,25 @@ class Page:
         if self._player is not None:
             self._show_time(self._player)
 
-    def update_flights(self, state: ViewState, now: float) -> None:
-        """Bring the drones' pictures up to date."""
-        for name in [name for name in self._flights if name not in state.flights]:
-            self._flights.pop(name).remove()
-        for name, flight in state.flights.items():
-            if name not in self._flights:
-                self._flights[name] = _FlightPanel(self._server, name, self._overview.order + 0.5)
-            drawn = self._flights[name].update(flight, now)
+    def update_uavs(self, state: ViewState, now: float) -> None:
+        """Update the drones' panels."""
+        for name in [name for name in self._uavs if name not in state.uavs]:
+            self._uavs.pop(name).remove()
+        for name, uav in state.uavs.items():
+            if name not in self._uavs:
+                self._uavs[name] = _UavPanel(self._server, name, self._overview.order + 0.5)
+            drawn = self._uavs[name].update(uav, now)
             if drawn is not None and not state.cameras:
                 self._fill(drawn)
-        if self._filled and (state.cameras or not state.flights):
+        if self._filled and (state.cameras or not state.uavs):
             self._fill(None)
 
     def _fill(self, drawn: Any) -> None:
-        """A drone's picture on the whole page, where no rig is to be seen in 3-D; None takes it away."""
+        """Show a drone's image on the whole page if there is no rig to show in 3-D; None removes it."""
         self._filled = drawn is not None
         for client in self._server.get_clients().values():
-            # A browser stretches it to its window.
-            image = None if drawn is None else padded(drawn, client.camera.aspect)
+            # A browser stretches the background image to its window.
+            image = None if drawn is None else pad_to_aspect(drawn, client.camera.aspect)
             client.scene.set_background_image(image, format="jpeg", jpeg_quality=75)
 
     def _set(self, handle: Any, text: str) -> None:
@@ -127,11 +128,11 @@ class Page:
         if camera.picture is None or key == self._shown:
             self._picture.visible = camera.picture is not None
             return
-        image = decoded(camera.picture.jpeg)
+        image = decode_jpeg(camera.picture.jpeg)
         if image is None:
             return
         self._shown = key
-        self._picture.image = marked(image, camera)
+        self._picture.image = draw_detections(image, camera)
         self._picture.visible = True
 
     def _add_actions(self, allowed: bool, actions: tuple[str, ...]) -> None:
@@ -140,19 +141,19 @@ class Page:
             for action in actions:
                 button = gui.add_button(ACTIONS[action], hint=_HINTS[action], disabled=not allowed)
                 button.on_click(partial(self._clicked, action))
-            text = "" if allowed else "Looking only: start the view without --look-only to act."
+            text = "" if allowed else "Read-only: start the view without --look-only to enable the buttons."
             self._note = gui.add_markdown(text)
 
     def _clicked(self, action: str, event: Any) -> None:
-        self.asked.append(action)
+        self.requested_actions.append(action)
         client = event.client
         if action == "export" and client is not None:
             text = calibration_file(self._state)
             if text:
                 client.send_file_download("calibration.toml", text.encode(), save_immediately=True)
 
-    def told(self, text: str) -> None:
-        """Say what became of a click."""
+    def show_result(self, text: str) -> None:
+        """Show the result of a click."""
         if self._note is not None:
             self._note.content = text
 
@@ -167,8 +168,8 @@ class Page:
             ):
                 box = gui.add_checkbox(label, True)
                 box.on_update(partial(self._switched, name))
-            spread = gui.add_slider("uncertainty ×", 1, 100, 1, int(options.spread))
-            spread.on_update(partial(self._switched, "spread"))
+            uncertainty_scale = gui.add_slider("uncertainty ×", 1, 100, 1, int(options.uncertainty_scale))
+            uncertainty_scale.on_update(partial(self._switched, "uncertainty_scale"))
 
     def _switched(self, name: str, event: Any) -> None:
         setattr(self.options, name, event.target.value)
@@ -176,21 +177,21 @@ class Page:
     def _add_timeline(self, player: Player) -> None:
         gui = self._server.gui
         with gui.add_folder("Replay"):
-            # A hair longer than the log: a slider of no length is none.
+            # At least 0.1 s: a slider of no length is not shown.
             self._time: Any = gui.add_slider("time [s]", 0.0, max(round(player.duration, 1), 0.1), 0.1, 0.0)
             self._play = gui.add_button("Pause" if player.playing else "Play")
             self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "5", "10"), initial_value="1")
 
         @self._time.on_update
         def _(event: Any) -> None:
-            if event.client is not None:  # a person moved it, not the replay
-                player.wanted = float(self._time.value)
+            if event.client is not None:  # moved by the user, not by the replay
+                player.seek_to = float(self._time.value)
 
         @self._play.on_click
         def _(event: Any) -> None:
             player.playing = not player.playing
             if player.playing and player.position >= player.duration:
-                player.wanted = 0.0
+                player.seek_to = 0.0
             self._play.label = "Pause" if player.playing else "Play"
 
         @self._speed.on_update
@@ -202,60 +203,60 @@ class Page:
         if self._play.label != label:
             self._play.label = label
         value = min(round(player.position, 1), self._time.max)
-        if player.wanted is None and abs(self._time.value - value) >= 0.1:
+        if player.seek_to is None and abs(self._time.value - value) >= 0.1:
             self._time.value = value
 
 
-class _FlightPanel:
-    """One drone: its picture with what is believed of its target, and that in words."""
+class _UavPanel:
+    """One drone: its image with the estimated target, and the estimate as text."""
 
     def __init__(self, server: viser.ViserServer, name: str, order: float) -> None:
         gui = server.gui
         self._folder: Any = gui.add_folder(f"Drone {name}", order=order)
         with self._folder:
-            self._picture: Any = gui.add_image(draw(FlightView(name), None), format="jpeg", jpeg_quality=75)
+            self._picture: Any = gui.add_image(draw_uav(UavView(name), None), format="jpeg", jpeg_quality=75)
             self._words: Any = gui.add_html("")
         self._drawn: tuple[int, ...] = ()
-        self._decoded: tuple[int, Any] = (0, None)
+        self._decoded_image: tuple[int, Any] = (0, None)
         self._text = ""
 
-    def update(self, flight: FlightView, now: float) -> Any:
-        """Draw what is new; returns the drawing, None where it is the one before."""
+    def update(self, uav: UavView, now: float) -> Any:
+        """Draw new data; returns the drawing, None if it is unchanged."""
         drawing = None
-        target, cloud, _ = flight.at_picture()
-        # By identity too: after a jump in a replay the counts begin anew.
+        target, particles, _ = uav.at_image()
+        # By identity too: after a seek in a replay the counts restart.
         key = (
-            id(flight),
-            flight.pictures,
+            id(uav),
+            uav.pictures,
             -1 if target is None else target.sequence,
-            -1 if cloud is None else cloud.sequence,
+            -1 if particles is None else particles.sequence,
         )
         if key != self._drawn:
             self._drawn = key
-            if flight.picture is None:
-                self._decoded = (0, None)
-            elif self._decoded[0] != id(flight.picture):
-                self._decoded = (id(flight.picture), decoded(flight.picture.jpeg))
-            drawing = self._picture.image = draw(flight, self._decoded[1])
-        text = words(flight, now)
+            if uav.picture is None:
+                self._decoded_image = (0, None)
+            elif self._decoded_image[0] != id(uav.picture):
+                self._decoded_image = (id(uav.picture), decode_jpeg(uav.picture.jpeg))
+            drawing = self._picture.image = draw_uav(uav, self._decoded_image[1])
+        text = uav_panel_html(uav, now)
         if text != self._text:
             self._text = self._words.content = text
         return drawing
 
     def remove(self) -> None:
-        """Take it away."""
+        """Remove the panel."""
         self._folder.remove()
 
 
-def marked(image: Any, camera: CameraView) -> Any:
-    """A picture (H, W, 3) RGB with rings around what was detected in it."""
+def draw_detections(image: Any, camera: CameraView) -> Any:
+    """An image (H, W, 3) RGB with circles around the detections of its own frame."""
     import cv2
 
     picture = camera.picture
     assert picture is not None
     scale = image.shape[1] / picture.width
     out = image.copy()
-    for u, v, size in camera.in_picture()[:64]:
+    for u, v, size in camera.detections_in_image()[:64]:
         centre = (round((u + 0.5) * scale), round((v + 0.5) * scale))
         radius = max(8, round(0.5 * size * scale) + 5)
         for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
@@ -264,5 +265,5 @@ def marked(image: Any, camera: CameraView) -> Any:
 
 
 def new_id() -> str:
-    """An id for this view: several may look at one site."""
+    """A random id for this view: several views may be open on one site."""
     return f"view-{secrets.token_hex(3)}"

@@ -1,16 +1,16 @@
-"""The panels of the view as HTML: tables of the state, readable without colour."""
+"""HTML of the view's panels: status tables, readable without colour."""
 
 from __future__ import annotations
 
 import html
 import math
 
-from hub.calibration.coverage import ENOUGH
+from hub.calibration.coverage import MIN_COVERAGE
 from hub.report.measures import COLUMNS, ROWS
 from hub.view.state import CameraState, CameraView, ViewState
 
 SIGNS: dict[CameraState, str] = {"solved": "✓", "refused": "✗", "collecting": "…", "silent": "!", "gone": "–"}
-"""What stands before a camera's name, so that no state is told by colour alone."""
+"""Sign before a camera's name, so that its state can be read without colour."""
 
 _STYLE = (
     "<style>.sl{font:12px/1.35 system-ui,sans-serif;padding:0 .75em .5em;overflow-x:auto}"
@@ -25,40 +25,40 @@ _STYLE = (
 
 
 def overview(state: ViewState, now: float) -> str:
-    """The state of the site in a line, and what would help."""
+    """The state of the site in one line, and advice."""
     lines = [f"<p><b data-syncline='headline'>{html.escape(state.headline())}</b></p>"]
-    if state.cameras and wants_guidance(state):
+    if state.cameras and needs_guidance(state):
         lines += [f"<p data-syncline='guide'>☞ {html.escape(one.text)}</p>" for one in state.guidance.advice()]
     for agent in state.of_role("record"):
         stale = " (silent)" if now - agent.at > 5.0 else ""
         sign = "●" if agent.status.gauges.get("recording", 1.0) else "○"
         lines.append(f"<p>{sign} {html.escape(f'{agent.status.agent}: {agent.status.message}{stale}')}</p>")
     for agent in state.of_role("hub"):
-        # What a hub was asked for and what came of it stands last in its message.
+        # The result of a requested action is the last part of the hub's message.
         if any(name.startswith("asked.") for name in agent.status.counters):
-            said = agent.status.message.rpartition("; ")[2]
-            lines.append(f"<p>{html.escape(f'{agent.status.agent}: {said}')}</p>")
+            result = agent.status.message.rpartition("; ")[2]
+            lines.append(f"<p>{html.escape(f'{agent.status.agent}: {result}')}</p>")
     return f"{_STYLE}<div class='sl'>{''.join(lines)}</div>"
 
 
-def wants_guidance(state: ViewState) -> bool:
-    """Whether advice matters: something is not solved, or was not asked of well enough."""
+def needs_guidance(state: ViewState) -> bool:
+    """Whether to show advice: a camera is not solved, or its image coverage is too low."""
     found = state.calibration
     if found is None or found.status != "solved" or found.refused:
         return True
-    return any(state.guidance.coverage(name) < ENOUGH for name in state.cameras)
+    return any(state.guidance.coverage(name) < MIN_COVERAGE for name in state.cameras)
 
 
 def camera_table(state: ViewState, now: float) -> str:
-    """Two lines a camera: rate, last seen, coverage and counts; below them its clock and residual."""
+    """Two rows per camera: frame rate, last detection, coverage and counts; below, its clock and residual."""
     heads = ("camera", "fps", "seen", "view", "lost", "refused")
-    rows = "".join(_row(state, camera, now) for camera in state.cameras.values())
+    rows = "".join(_camera_row(state, camera, now) for camera in state.cameras.values())
     titles = "".join(f"<th>{head}</th>" for head in heads)
     return f"{_STYLE}<div class='sl'><table><tr>{titles}</tr>{rows}</table></div>"
 
 
-def _row(state: ViewState, camera: CameraView, now: float) -> str:
-    how = camera.state(now)
+def _camera_row(state: ViewState, camera: CameraView, now: float) -> str:
+    status = camera.state(now)
     cells = [
         f"{camera.fps(now):.1f}",
         ago(camera.last_seen, now),
@@ -66,15 +66,15 @@ def _row(state: ViewState, camera: CameraView, now: float) -> str:
         str(camera.lost),
         str(camera.refusals) if camera.refusals else "–",
     ]
-    title = html.escape(camera.refused or how, quote=True)
-    name = f"<td title='{title}'>{SIGNS[how]} {html.escape(camera.name)}</td>"
-    kind = "" if how == "solved" else " class='bad'"
+    title = html.escape(camera.refused or status, quote=True)
+    name = f"<td title='{title}'>{SIGNS[status]} {html.escape(camera.name)}</td>"
+    kind = "" if status == "solved" else " class='bad'"
     texts = "".join(f"<td>{cell}</td>" for cell in cells)
-    told = f"data-camera='{html.escape(camera.name)}' data-state='{how}'"
-    return f"<tr{kind} {told}>{name}{texts}</tr>{_clock(camera)}"
+    attributes = f"data-camera='{html.escape(camera.name)}' data-state='{status}'"
+    return f"<tr{kind} {attributes}>{name}{texts}</tr>{_clock_row(camera)}"
 
 
-def _clock(camera: CameraView) -> str:
+def _clock_row(camera: CameraView) -> str:
     found = camera.calibration
     if found is None:
         return f"<tr class='clock'><td colspan=6>{html.escape(camera.refused[:90])}</td></tr>" if camera.refused else ""
@@ -89,25 +89,25 @@ def _clock(camera: CameraView) -> str:
 
 
 def camera_details(state: ViewState, camera: CameraView, now: float) -> str:
-    """Everything about one camera in words, and where in its picture it saw the marker."""
-    how = camera.state(now)
+    """All data of one camera, and the coverage of its image by the marker."""
+    status = camera.state(now)
     info = camera.info
-    lines = [f"<b>{SIGNS[how]} {html.escape(camera.name)}: {how}</b>"]
+    lines = [f"<b>{SIGNS[status]} {html.escape(camera.name)}: {status}</b>"]
     if camera.refused:
         lines.append(f"refused: {html.escape(camera.refused)}")
     if info is not None:
-        lens = "lens known" if len(info.matrix) == 9 else "no lens: timing only"
-        lines.append(f"{info.width}×{info.height}, {info.fps:g} fps told, {html.escape(info.driver)}, {lens}")
+        lens = "intrinsics known" if len(info.matrix) == 9 else "no intrinsics: timing only"
+        lines.append(f"{info.width}×{info.height}, {info.fps:g} fps nominal, {html.escape(info.driver)}, {lens}")
     lines.append(f"{camera.frames} frames, marker in {camera.seen}, {camera.lost} lost, {camera.restarts} restarts")
     pose, found = camera.pose, camera.calibration
     if pose is not None and found is not None:
         x, y, z = pose.position
         std = max(found.position_std, default=math.nan)
         lines.append(f"at {x:.3f}, {y:.3f}, {z:.3f} ± {std:.2g} {_unit(state)}")
-    covered = state.guidance.covered(camera.name)
+    covered = state.guidance.covered_cells(camera.name)
     grid = "\n".join("".join("■" if covered[row, column] else "□" for column in range(COLUMNS)) for row in range(ROWS))
     share = 100 * state.guidance.coverage(camera.name)
-    lines.append(f"marker seen in {share:.0f} % of the picture:<div class='grid'>{grid}</div>")
+    lines.append(f"marker seen in {share:.0f} % of the image:<div class='grid'>{grid}</div>")
     return f"{_STYLE}<div class='sl'>{''.join(f'<p>{line}</p>' for line in lines)}</div>"
 
 
@@ -117,7 +117,7 @@ def _unit(state: ViewState) -> str:
 
 
 def ago(moment: float | None, now: float) -> str:
-    """How long ago, short."""
+    """Time since ``moment`` as a short text."""
     if moment is None:
         return "never"
     seconds = max(0.0, now - moment)

@@ -1,4 +1,4 @@
-"""A recording as the view sees it: a state that can be moved along time."""
+"""Playback of recordings for the view: logs and calibration folders, with play, pause and seek."""
 
 from __future__ import annotations
 
@@ -32,77 +32,77 @@ from protocols.topics import (
     UAV_INFO,
 )
 
-BEFORE_S = 20.0
-"""A jump shows what was seen in the so many seconds before it; what is told once is known from the beginning."""
+CONTEXT_S = 20.0
+"""After a seek, messages of this many seconds before are replayed; latched messages are known from the beginning."""
 
 Timed = tuple[float, Message]
-"""Seconds since the recording began, and a message."""
+"""Seconds since the start of the recording, and a message."""
 
 
-_KEPT = (CAMERA_INFO, CALIBRATION, STATUS, UAV_INFO)
-_TOPICS = [*_KEPT, OBSERVATION, TRACK, TARGET]
-_DRAWN = [PICTURE, FLIGHT_IMAGE, TARGET_CLOUD, ROAD_MAP]
+_LATCHED = (CAMERA_INFO, CALIBRATION, STATUS, UAV_INFO)
+_TOPICS = [*_LATCHED, OBSERVATION, TRACK, TARGET]
+_IMAGE_TOPICS = [PICTURE, FLIGHT_IMAGE, TARGET_CLOUD, ROAD_MAP]
 
 
 class Recording(Protocol):
-    """What can be played. duration: [s]. still: it holds no frames, only a calibration and paths."""
+    """A recording that can be played. duration: [s]. is_static: it holds only a calibration and trajectories."""
 
     duration: float
-    still: bool
+    is_static: bool
 
-    def told(self, before: float) -> Iterable[Timed]:
-        """What stays valid until it is told anew, of the time before ``before``."""
+    def latched_messages(self, before: float) -> Iterable[Timed]:
+        """The latched messages (valid until replaced) that are current at time ``before`` [s]."""
 
     def messages(self, start: float) -> Iterator[Timed]:
-        """Everything from ``start`` on, in order."""
+        """All messages from ``start`` [s] on, in order."""
 
 
 class LogRecording:
     """A log that Syncline recorded. Raises InputError."""
 
-    still = False
+    is_static = False
 
     def __init__(self, path: Path) -> None:
         self._reader = LogReader(path)
-        self._kept: list[Timed] = []
+        self._latched: list[Timed] = []
         first: int | None = None
         last = 0
         for logged in self._reader.messages(_TOPICS):
             first = logged.log_time_ns if first is None else first
             last = max(last, logged.log_time_ns)
-            if logged.topic in _KEPT:
-                self._kept.append(((logged.log_time_ns - first) / NANOSECONDS, logged.message))
+            if logged.topic in _LATCHED:
+                self._latched.append(((logged.log_time_ns - first) / NANOSECONDS, logged.message))
         if first is None:
-            raise InputError("nothing in this log to look at", file=path, remedy="record cameras or a hub")
+            raise InputError("this log holds nothing to show", file=path, remedy="record cameras or a hub")
         self._first = first
         self.duration = (last - first) / NANOSECONDS
-        self._kept.sort(key=lambda timed: timed[0])
-        self._times = [time for time, _ in self._kept]
+        self._latched.sort(key=lambda timed: timed[0])
+        self._times = [time for time, _ in self._latched]
 
-    def told(self, before: float) -> Iterable[Timed]:
-        """The last word of each camera, hub and agent before that time."""
+    def latched_messages(self, before: float) -> Iterable[Timed]:
+        """The last message of each camera, hub and agent before that time."""
         last: dict[tuple[str, str], Timed] = {}
         solved: Timed | None = None
-        for timed in self._kept[: bisect.bisect_left(self._times, before)]:
+        for timed in self._latched[: bisect.bisect_left(self._times, before)]:
             message = timed[1]
             if isinstance(message, pb.Calibration) and message.status == "solved":
                 solved = timed
             name = getattr(message, "camera", "") or getattr(message, "agent", "")
             last[message.DESCRIPTOR.name, name] = timed
-        # A refusal after a solution does not take the poses away.
+        # A refusal after a solution does not remove the poses.
         return sorted([*([solved] if solved else []), *last.values()], key=lambda timed: timed[0])
 
     def messages(self, start: float) -> Iterator[Timed]:
-        """Everything from ``start`` on."""
+        """All messages from ``start`` [s] on."""
         begin = self._first + round(start * NANOSECONDS)
-        for logged in self._reader.messages([*_TOPICS, *_DRAWN], begin):
+        for logged in self._reader.messages([*_TOPICS, *_IMAGE_TOPICS], begin):
             yield (logged.log_time_ns - self._first) / NANOSECONDS, logged.message
 
 
 class CalibrationRecording:
-    """The folder that `calibrate` wrote: cameras that stand still, and the path. Raises InputError."""
+    """The folder that `calibrate` wrote: static cameras and the trajectory. Raises InputError."""
 
-    still = True
+    is_static = True
 
     def __init__(self, folder: Path) -> None:
         file = folder / "calibration.toml" if folder.is_dir() else folder
@@ -121,8 +121,8 @@ class CalibrationRecording:
         )
         path = file.parent / "trajectory.csv"
         tables = read_trajectory(path) if path.exists() else ()
-        self._told: list[Timed] = [(0.0, _info(calibration, name)) for name in cameras]
-        self._told.append((0.0, calibration_message(calibration, 1, {})))
+        self._messages: list[Timed] = [(0.0, _info(calibration, name)) for name in cameras]
+        self._messages.append((0.0, calibration_message(calibration, 1, {})))
         begin = min((float(table.time[0]) for table in tables if len(table.time)), default=0.0)
         timed: list[Timed] = []
         for table in tables:
@@ -131,53 +131,53 @@ class CalibrationRecording:
         self._tracks = sorted(timed, key=lambda one: one[0])
         self.duration = self._tracks[-1][0] if self._tracks else 0.0
 
-    def told(self, before: float) -> Iterable[Timed]:
+    def latched_messages(self, before: float) -> Iterable[Timed]:
         """The calibration."""
-        return self._told
+        return self._messages
 
     def messages(self, start: float) -> Iterator[Timed]:
-        """The path from ``start`` on."""
+        """The trajectory from ``start`` [s] on."""
         return (timed for timed in self._tracks if timed[0] >= start)
 
 
 class Player:
-    """Moves a state along a recording.
+    """Plays a recording into a view state.
 
-    position: where it is [s]; wanted: where a person wants it, None = go on. playing, speed: as the page sets them.
+    position: playback time [s]; seek_to: requested time [s], None = continue. playing, speed: set by the page.
     """
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self.duration = recording.duration
         self.position = 0.0
-        self.wanted: float | None = None
+        self.seek_to: float | None = None
         self.playing = True
         self.speed = 1.0
-        self.state = ViewState(recording.still)
+        self.state = ViewState(recording.is_static)
         self._next: Timed | None = None
         self._rest: Iterator[Timed] = iter(())
         self.seek(0.0)
 
     def seek(self, position: float) -> None:
-        """Jump: a new state, as it was at ``position`` [s]."""
+        """Seek: a new state, as it was at ``position`` [s]."""
         self.position = min(max(position, 0.0), self.duration)
-        self.state = ViewState(self._recording.still)
-        start = max(0.0, self.position - BEFORE_S)
-        for moment, message in self._recording.told(start if start > 0.0 else 1e-9):
+        self.state = ViewState(self._recording.is_static)
+        start = max(0.0, self.position - CONTEXT_S)
+        for moment, message in self._recording.latched_messages(start if start > 0.0 else 1e-9):
             self.state.handle(message, moment)
         self._rest = self._recording.messages(start)
         self._next = next(self._rest, None)
         self._feed()
 
     def advance(self, elapsed: float) -> bool:
-        """Go on by ``elapsed`` seconds of a viewer's time; True if the state is a new one, after a jump."""
-        wanted, self.wanted = self.wanted, None
-        if wanted is not None and abs(wanted - self.position) > 1e-6:
-            if 0.0 <= wanted - self.position < 1.0:
-                self.position = wanted
+        """Advance by ``elapsed`` seconds of real time; True if the state was replaced, after a seek."""
+        seek_to, self.seek_to = self.seek_to, None
+        if seek_to is not None and abs(seek_to - self.position) > 1e-6:
+            if 0.0 <= seek_to - self.position < 1.0:
+                self.position = seek_to
                 self._feed()
                 return False
-            self.seek(wanted)
+            self.seek(seek_to)
             return True
         if self.playing:
             self.position = min(self.position + elapsed * self.speed, self.duration)

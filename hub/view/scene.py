@@ -1,4 +1,4 @@
-"""Draws the state in 3-D: cameras as frusta, rays to what they see now, paths, uncertainty."""
+"""3-D rendering of the view state: cameras as frusta, rays to present detections, trajectories, uncertainty."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ COLOURS: dict[CameraState, tuple[int, int, int]] = {
     "gone": (190, 190, 190),
 }
 _PATHS = ((214, 96, 20), (30, 130, 90), (120, 70, 170), (20, 120, 160), (170, 40, 90))
-_PICTURES_A_SECOND = 24.0  # over all cameras: decoding and encoding one costs 2 ms
-_MOST_PIXELS = 16_000_000  # of a picture; a few bytes of JPEG may claim 4 thousand million
-_PATH_S = 20.0  # so much of a path is drawn
-_ELEVATION = math.radians(35.0)  # of the first look
-_HALF_FIELD = 0.9 * math.tan(math.radians(75.0) / 2)  # of a new browser's camera in viser, less a margin for labels
+_IMAGES_PER_S = 24.0  # over all cameras: decoding and encoding one image costs 2 ms
+_MAX_PIXELS = 16_000_000  # of an image; a few bytes of JPEG may claim 4 thousand million
+_PATH_S = 20.0  # length of the trajectory that is drawn [s]
+_ELEVATION = math.radians(35.0)  # of the initial viewpoint
+_TAN_HALF_FOV = 0.9 * math.tan(math.radians(75.0) / 2)  # of viser's default camera, less a margin for labels
 
 
-class Options:
-    """What a viewer may switch. spread: how many times too large uncertainties are drawn."""
+class DisplayOptions:
+    """Display options of the view. uncertainty_scale: magnification of the drawn uncertainties."""
 
     def __init__(self) -> None:
         self.pictures = True
         self.rays = True
         self.paths = True
         self.uncertainty = True
-        self.spread = 10.0
+        self.uncertainty_scale = 10.0
 
 
-class SceneDrawing:
-    """Keeps viser's scene like the state; sends only what has changed."""
+class SceneRenderer:
+    """Keeps viser's scene up to date with the view state; sends only changes."""
 
-    def __init__(self, server: viser.ViserServer, options: Options) -> None:
+    def __init__(self, server: viser.ViserServer, options: DisplayOptions) -> None:
         self._scene = server.scene
         self._server = server
         self.options = options
         self._frusta: dict[str, Any] = {}
         self._labels: dict[str, Any] = {}
-        self._balls: dict[str, Any] = {}
+        self._ellipsoids: dict[str, Any] = {}
         self._paths: dict[str, Any] = {}
         self._numbers: dict[str, int] = {}
         self._drawn: dict[str, Any] = {}
@@ -63,8 +63,8 @@ class SceneDrawing:
         self.frusta_moved = 0
 
     def clear(self) -> None:
-        """Take everything away, as before a jump in a replay."""
-        for handles in (self._frusta, self._labels, self._balls, self._paths):
+        """Remove everything, as before a seek in a replay."""
+        for handles in (self._frusta, self._labels, self._ellipsoids, self._paths):
             for handle in handles.values():
                 handle.remove()
             handles.clear()
@@ -75,28 +75,28 @@ class SceneDrawing:
         self._numbers.clear()
 
     def update(self, state: ViewState, now: float) -> None:
-        """Draw what is new."""
+        """Draw what has changed."""
         with self._server.atomic():
             poses = {name: camera.pose for name, camera in state.cameras.items()}
             placed = {name: pose for name, pose in poses.items() if pose is not None}
-            self._gone(set(placed))
+            self._remove_cameras(set(placed))
             if placed:
-                self._measure(placed, state)
+                self._fit_scene(placed, state)
                 for name, pose in placed.items():
-                    self._camera(state.cameras[name], pose, now)
+                    self._draw_camera(state.cameras[name], pose, now)
             self._draw_rays(state, placed, now)
             self._draw_paths(state)
         if placed and self.options.pictures:
             self._draw_pictures(state, placed, now)
 
-    def _measure(self, placed: dict[str, Pose], state: ViewState) -> None:
-        """Size of the drawings, the ground and the first look, from where cameras stand and points moved."""
+    def _fit_scene(self, placed: dict[str, Pose], state: ViewState) -> None:
+        """Set symbol size, ground grid and initial viewpoint from the positions of cameras and points."""
         centres = np.array([pose.position for pose in placed.values()])
         points = [path.array()[:, 1:4] for path in state.paths.values() if path.points]
-        told = (tuple(np.round(centres.ravel(), 2)), bool(points))
-        if self._drawn.get("measure") == told:
+        key = (tuple(np.round(centres.ravel(), 2)), bool(points))
+        if self._drawn.get("measure") == key:
             return
-        self._drawn["measure"] = told
+        self._drawn["measure"] = key
         everything = np.concatenate([centres, *points])
         low, high = np.percentile(everything, [2, 98], axis=0)
         extent = max(float(np.linalg.norm(high - low)), 1e-6)
@@ -111,71 +111,71 @@ class SceneDrawing:
             cell_size=_round(extent / 10),
             section_size=5 * _round(extent / 10),
             position=tuple(floor),
-            wxyz=_turn_z_to(up),
+            wxyz=_quaternion_z_to(up),
         )
         path = np.concatenate(points) if points else np.empty((0, 3))
-        # A path's few wild points are not worth standing farther away; every camera is.
+        # The viewpoint includes every camera, but not the outliers of a trajectory.
         near = path[((path >= low) & (path <= high)).all(axis=1)]
-        away, middle = standpoint(np.concatenate([centres, near]), up, 0.1 * extent)
+        eye, middle = fit_viewpoint(np.concatenate([centres, near]), up, 0.1 * extent)
         if self._framed is None or np.linalg.norm(self._framed[0] - middle) > self._framed[1] / 3:
-            # Look again only where the scene is another than the one that was looked at.
+            # Move the viewpoint only if the scene has moved substantially.
             self._framed = (middle, extent)
-            self._server.initial_camera.position = tuple(away)
+            self._server.initial_camera.position = tuple(eye)
             self._server.initial_camera.look_at = tuple(middle)
             self._server.initial_camera.up = tuple(up)
             for client in self._server.get_clients().values():
                 client.camera.up_direction = tuple(up)
-                client.camera.position = tuple(away)
+                client.camera.position = tuple(eye)
                 client.camera.look_at = tuple(middle)
 
-    def _camera(self, camera: CameraView, pose: Pose, now: float) -> None:
-        how = camera.state(now)
+    def _draw_camera(self, camera: CameraView, pose: Pose, now: float) -> None:
+        status = camera.state(now)
         found = camera.calibration
         assert found is not None
         name, scale = camera.name, 0.07 * self._size
-        place = (tuple(pose.position), tuple(_quaternion(pose.rotation.T)), how, round(scale, 3))
+        place = (tuple(pose.position), tuple(_quaternion(pose.rotation.T)), status, round(scale, 3))
         if self._drawn.get(f"camera {name}") != place:
             self._drawn[f"camera {name}"] = place
             frustum = self._frusta.get(name)
             if frustum is None:
-                fov, aspect = _field(camera)
+                fov, aspect = _field_of_view(camera)
                 frustum = self._scene.add_camera_frustum(
                     f"/cameras/{name}", fov=fov, aspect=aspect, scale=scale, thickness=2.0, thickness_units="screen"
                 )
                 self._frusta[name] = frustum
                 self._labels[name] = self._scene.add_label(f"/labels/{name}", "", anchor="bottom-center")
             frustum.wxyz, frustum.position = _quaternion(pose.rotation.T), pose.position
-            frustum.scale, frustum.color = scale, COLOURS[how]
+            frustum.scale, frustum.color = scale, COLOURS[status]
             self._labels[name].position = pose.position + 0.25 * scale * _up({name: pose})
             self.frusta_moved += 1
         std_ms = 1e3 * found.time_offset_std
         sharp = f"± {std_ms:.2g} ms" if std_ms > 0.0 else "reference clock"
-        text = f"{SIGNS[how]} {name}  {sharp if how == 'solved' else how}"
+        text = f"{SIGNS[status]} {name}  {sharp if status == 'solved' else status}"
         if self._drawn.get(f"text {name}") != text:
             self._drawn[f"text {name}"] = text
             self._labels[name].text = text
-        self._ball(f"/uncertainty/{name}", pose.position, np.array(found.position_std), COLOURS[how])
+        self._draw_uncertainty(f"/uncertainty/{name}", pose.position, np.array(found.position_std), COLOURS[status])
 
-    def _ball(self, name: str, centre: Floats, std: Floats, colour: tuple[int, int, int]) -> None:
-        """An ellipsoid of three stds, drawn ``spread`` times too large."""
+    def _draw_uncertainty(self, name: str, centre: Floats, std: Floats, colour: tuple[int, int, int]) -> None:
+        """An ellipsoid of three standard deviations, magnified by ``uncertainty_scale``."""
         wanted = self.options.uncertainty and len(std) == 3 and float(np.max(std)) > 0.0
-        radii = tuple(np.maximum(3.0 * self.options.spread * std, 1e-9)) if wanted else ()
-        told = (tuple(centre), radii)
-        if self._drawn.get(name) == told:
+        radii = tuple(np.maximum(3.0 * self.options.uncertainty_scale * std, 1e-9)) if wanted else ()
+        key = (tuple(centre), radii)
+        if self._drawn.get(name) == key:
             return
-        self._drawn[name] = told
-        ball = self._balls.get(name)
+        self._drawn[name] = key
+        ellipsoid = self._ellipsoids.get(name)
         if not wanted:
-            if ball is not None:
-                ball.visible = False
+            if ellipsoid is not None:
+                ellipsoid.visible = False
             return
-        if ball is None:
-            ball = self._scene.add_icosphere(name, 1.0, colour, subdivisions=2, opacity=0.35)
-            self._balls[name] = ball
-        ball.position, ball.scale, ball.visible = centre, radii, True
+        if ellipsoid is None:
+            ellipsoid = self._scene.add_icosphere(name, 1.0, colour, subdivisions=2, opacity=0.35)
+            self._ellipsoids[name] = ellipsoid
+        ellipsoid.position, ellipsoid.scale, ellipsoid.visible = centre, radii, True
 
     def _draw_rays(self, state: ViewState, placed: dict[str, Pose], now: float) -> None:
-        """A line from each camera towards what it sees now, as far as the path's last point is away."""
+        """A line from each camera towards its present detections, as long as the distance of the last point."""
         starts, ends, colours = [], [], []
         last = [path.points[-1][1:4] for path in state.paths.values() if path.points]
         for name, pose in placed.items() if self.options.rays else ():
@@ -191,15 +191,15 @@ class SceneDrawing:
             starts += [pose.position] * len(rays)
             ends += list(pose.world_from_camera(seen))
             colours += [[COLOURS[camera.state(now)]] * 2] * len(rays)
-        meeting = _meeting(np.array(starts), np.array(ends), 0.05 * self._size)
+        intersection = _nearest_point(np.array(starts), np.array(ends), 0.05 * self._size)
         points = np.array(
-            [[start, end if meeting is None else meeting] for start, end in zip(starts, ends, strict=True)],
+            [[start, end if intersection is None else intersection] for start, end in zip(starts, ends, strict=True)],
             dtype=np.float32,
         ).reshape(-1, 2, 3)
-        told = points.tobytes()
-        if self._drawn.get("rays") == told:
+        key = points.tobytes()
+        if self._drawn.get("rays") == key:
             return
-        self._drawn["rays"] = told
+        self._drawn["rays"] = key
         if not len(points):
             if self._rays is not None:
                 self._rays.visible = False
@@ -220,10 +220,10 @@ class SceneDrawing:
                 free = set(range(len(self._numbers) + 1)) - set(self._numbers.values())
                 self._numbers[label] = min(free)
             index = self._numbers[label]
-            told = (path.count, self.options.paths, self.options.spread, self.options.uncertainty)
-            if self._drawn.get(f"path {label}") == told or not path.points:
+            drawn = (path.count, self.options.paths, self.options.uncertainty_scale, self.options.uncertainty)
+            if self._drawn.get(f"path {label}") == drawn or not path.points:
                 continue
-            self._drawn[f"path {label}"] = told
+            self._drawn[f"path {label}"] = drawn
             table = path.array()
             table = table[table[:, 0] > table[-1, 0] - _PATH_S]
             paint = _PATHS[index % len(_PATHS)]
@@ -244,12 +244,12 @@ class SceneDrawing:
             self._paths[f"{key}/head"] = self._scene.add_icosphere(
                 f"{key}-head", 0.012 * self._size, paint, subdivisions=2, position=head[1:4]
             )
-            self._ball(f"/uncertainty/path-{index}", head[1:4], np.full(3, head[4]), paint)
+            self._draw_uncertainty(f"/uncertainty/path-{index}", head[1:4], np.full(3, head[4]), paint)
 
     def _draw_pictures(self, state: ViewState, placed: dict[str, Pose], now: float) -> None:
-        """The newest pictures into the frusta, those first that wait longest."""
+        """Show the newest images in the frusta, those that have waited longest first."""
         elapsed, self._budget_at = now - self._budget_at, now
-        self._picture_budget = min(self._picture_budget + elapsed * _PICTURES_A_SECOND, _PICTURES_A_SECOND)
+        self._picture_budget = min(self._picture_budget + elapsed * _IMAGES_PER_S, _IMAGES_PER_S)
         waiting = [
             (self._drawn.get(f"picture at {name}", -math.inf), name)
             for name in placed
@@ -263,48 +263,49 @@ class SceneDrawing:
             camera = state.cameras[name]
             assert camera.picture is not None
             self._drawn[f"picture {name}"], self._drawn[f"picture at {name}"] = camera.pictures, now
-            image = decoded(camera.picture.jpeg)
+            image = decode_jpeg(camera.picture.jpeg)
             if image is not None:
                 self._frusta[name].image = image
 
-    def _gone(self, placed: set[str]) -> None:
+    def _remove_cameras(self, placed: set[str]) -> None:
         for name in set(self._frusta) - placed:
             self._frusta.pop(name).remove()
             self._labels.pop(name).remove()
-            ball = self._balls.pop(f"/uncertainty/{name}", None)
-            if ball is not None:
-                ball.remove()
+            ellipsoid = self._ellipsoids.pop(f"/uncertainty/{name}", None)
+            if ellipsoid is not None:
+                ellipsoid.remove()
             for key in [key for key in self._drawn if key.endswith((f" {name}", f"/{name}"))]:
                 del self._drawn[key]
 
 
-def standpoint(points: Floats, up: Floats, radius: float) -> tuple[Floats, Floats]:
-    """Where to stand to see all of points (n, 3), each with ``radius`` about it, and where to look: (3,), (3,).
+def fit_viewpoint(points: Floats, up: Floats, radius: float) -> tuple[Floats, Floats]:
+    """Eye position and look-at point, (3,) each, from which all of ``points`` (n, 3) are in view with a margin.
 
-    From above at 35 degrees, with the broad side of what is to be seen across the picture. A point at depth d is seen
-    within d tan(half the field of view) of the axis, so each asks for a distance of its own.
+    radius: the margin around each point. The elevation is 35 degrees, and the widest horizontal direction of the points
+    is parallel to the image. A point at depth d is in view within d tan(fov / 2) of the axis, so each point gives a
+    lower limit of the distance.
     """
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    about = points - middle
-    level = about - np.outer(about @ up, up)
-    _, _, axes = np.linalg.svd(level)
-    broad = axes[0] - (axes[0] @ up) * up
-    if np.linalg.norm(broad) < 0.1:
-        broad = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    # The axis of a singular vector has no sign of its own: the same scene shall always be seen from the same side.
-    broad = broad / np.linalg.norm(broad)
-    broad = broad * math.copysign(1.0, broad[int(np.argmax(np.abs(broad)))])
-    towards = math.cos(_ELEVATION) * np.cross(broad, up) + math.sin(_ELEVATION) * up
-    depth = about @ towards
-    beside = np.maximum(np.abs(about @ broad), np.abs(about @ np.cross(towards, broad)))
-    distance = float(np.max((beside + radius) / _HALF_FIELD + depth + radius))
+    centred = points - middle
+    horizontal = centred - np.outer(centred @ up, up)
+    _, _, axes = np.linalg.svd(horizontal)
+    widest = axes[0] - (axes[0] @ up) * up
+    if np.linalg.norm(widest) < 0.1:
+        widest = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    # The sign of a singular vector is arbitrary: fix it, so that a scene is always viewed from the same side.
+    widest = widest / np.linalg.norm(widest)
+    widest = widest * math.copysign(1.0, widest[int(np.argmax(np.abs(widest)))])
+    towards = math.cos(_ELEVATION) * np.cross(widest, up) + math.sin(_ELEVATION) * up
+    depth = centred @ towards
+    lateral = np.maximum(np.abs(centred @ widest), np.abs(centred @ np.cross(towards, widest)))
+    distance = float(np.max((lateral + radius) / _TAN_HALF_FOV + depth + radius))
     return middle + distance * towards, middle
 
 
-def _meeting(starts: Floats, ends: Floats, tolerance: float) -> Floats | None:
-    """The point (3,) next to all rays (n, 3) to (n, 3), None where they do not meet within ``tolerance``.
+def _nearest_point(starts: Floats, ends: Floats, tolerance: float) -> Floats | None:
+    """Least-squares intersection (3,) of rays (n, 3) to (n, 3), None if a ray misses it by more than ``tolerance``.
 
-    Rays of one moment only by their arrival: good enough to draw, not to measure.
+    The rays are simultaneous only by their time of arrival: accurate enough for drawing, not for measuring.
     """
     if len(starts) < 2:
         return None
@@ -319,12 +320,12 @@ def _meeting(starts: Floats, ends: Floats, tolerance: float) -> Floats | None:
     return np.asarray(point) if float(off.max()) < tolerance else None
 
 
-def decoded(jpeg: bytes) -> Any:
-    """A JPEG as (H, W, 3) RGB; None where it is none, or one that would fill the memory."""
+def decode_jpeg(jpeg: bytes) -> Any:
+    """A JPEG decoded to (H, W, 3) RGB; None if it is invalid or too large."""
     import cv2
 
     size = jpeg_size(jpeg)
-    if size is None or size[0] * size[1] > _MOST_PIXELS:
+    if size is None or size[0] * size[1] > _MAX_PIXELS:
         return None
     image = cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), cv2.IMREAD_COLOR) if jpeg else None
     return None if image is None else np.ascontiguousarray(image[..., ::-1])
@@ -334,17 +335,17 @@ def _lens(camera: CameraView) -> Intrinsics | None:
     found, info = camera.calibration, camera.info
     if found is None or len(found.matrix) != 9:
         return None
-    size = (info.width, info.height) if info is not None else _size_of(found.matrix)
+    size = (info.width, info.height) if info is not None else _guessed_image_size(found.matrix)
     distortions = np.array(found.distortions) if found.distortions else np.zeros(4 if found.fisheye else 5)
     return Intrinsics(size[0], size[1], np.array(found.matrix).reshape(3, 3), distortions, found.fisheye)
 
 
-def _size_of(matrix: Any) -> tuple[int, int]:
-    """The image's size where nobody told it: the principal point is about its middle."""
+def _guessed_image_size(matrix: Any) -> tuple[int, int]:
+    """The image size where it is unknown, assuming the principal point at the centre."""
     return max(round(2 * matrix[2] + 1), 1), max(round(2 * matrix[5] + 1), 1)
 
 
-def _field(camera: CameraView) -> tuple[float, float]:
+def _field_of_view(camera: CameraView) -> tuple[float, float]:
     """(vertical field of view [rad], aspect) of a frustum."""
     lens = _lens(camera)
     if lens is None:
@@ -353,7 +354,7 @@ def _field(camera: CameraView) -> tuple[float, float]:
 
 
 def _up(placed: dict[str, Pose]) -> Floats:
-    """Up as most cameras are held; z where they don't agree."""
+    """Up as the mean of the cameras' up directions; z if they disagree."""
     mean = np.mean([pose.rotation.T @ np.array([0.0, -1.0, 0.0]) for pose in placed.values()], axis=0)
     norm = float(np.linalg.norm(mean))
     if norm < 0.2:
@@ -361,7 +362,7 @@ def _up(placed: dict[str, Pose]) -> Floats:
     mean = mean / norm
     axis = np.zeros(3)
     axis[int(np.argmax(np.abs(mean)))] = math.copysign(1.0, mean[int(np.argmax(np.abs(mean)))])
-    # A world whose axis is nearly up was meant so.
+    # A world axis that is nearly up is taken as up.
     return axis if float(axis @ mean) > 0.8 else mean
 
 
@@ -371,8 +372,8 @@ def _quaternion(rotation: Floats) -> Floats:
     return np.asarray(viser.transforms.SO3.from_matrix(rotation).wxyz, dtype=np.float64)
 
 
-def _turn_z_to(up: Floats) -> Floats:
-    """Quaternion (w, x, y, z) that turns z to ``up``."""
+def _quaternion_z_to(up: Floats) -> Floats:
+    """Quaternion (w, x, y, z) of the rotation from z to ``up``."""
     w = 1.0 + float(up[2])
     if w < 1e-9:
         return np.array([0.0, 1.0, 0.0, 0.0])
@@ -381,6 +382,6 @@ def _turn_z_to(up: Floats) -> Floats:
 
 
 def _round(length: float) -> float:
-    """The next 1, 2 or 5 times a power of ten."""
+    """The length rounded up to 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(length))
     return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= length)

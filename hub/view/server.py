@@ -1,4 +1,4 @@
-"""Runs the view: a thin loop between the bus, or a recording, and the browser."""
+"""The view server and its loops between the bus, or a recording, and the browser."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from collections.abc import Callable
 
 import viser
 
-from hub.view.access_control import Gate, is_local
-from hub.view.page import ACTIONS, Page, new_id
+from hub.view.access_control import AccessControl, is_local
+from hub.view.page import ACTIONS, ViewPage, new_id
 from hub.view.player import Player, Recording
-from hub.view.scene import Options, SceneDrawing
+from hub.view.scene import DisplayOptions, SceneRenderer
 from hub.view.state import ViewState
 from protocols.bus.base import Bus, Subscription
 from protocols.core.clocks import NANOSECONDS
@@ -41,15 +41,15 @@ from protocols.validation.codec import SCHEMA_VERSION
 ROLE = "view"
 _DRAW_S = 0.2
 _PANEL_S = 0.5
-_ALONE_S = 1.0  # how often it is drawn where nobody looks
-_WHO = {"start_recording": "record", "stop_recording": "record", "recalibrate": "hub", "export": "hub"}
+_UNWATCHED_S = 1.0  # redraw interval without an open browser
+_ROLE_OF_ACTION = {"start_recording": "record", "stop_recording": "record", "recalibrate": "hub", "export": "hub"}
 
 
 class ViewServer:
-    """The browser's side: a port, its gate, and what is drawn.
+    """The web server of the view: port, access control, scene and panels.
 
-    host: beyond loopback a token is asked for; token: "" = a new one there, none on loopback. port: 0 = any free one.
-    look_only: no button acts. Raises InputError where the port cannot be had.
+    host: beyond loopback a token is required; token: "" = a random one there, none on loopback. port: 0 = any free one.
+    look_only: buttons are disabled. Raises InputError if the port is not available.
     """
 
     def __init__(
@@ -64,21 +64,21 @@ class ViewServer:
     ) -> None:
         _check_port(host, port)
         self._closed = False
-        self.gate = Gate(token or ("" if is_local(host) else secrets.token_urlsafe(18)))
-        # It prints a banner whose address lacks the token.
-        with self.gate.before_every_server(), contextlib.redirect_stdout(io.StringIO()):
+        self.access = AccessControl(token or ("" if is_local(host) else secrets.token_urlsafe(18)))
+        # Viser prints a banner whose address lacks the token.
+        with self.access.guard_new_servers(), contextlib.redirect_stdout(io.StringIO()):
             self.server = viser.ViserServer(host, port, label="Syncline", verbose=False)
         self.host, self.port = host, self.server.get_port()
-        self.options = Options()
-        self.scene = SceneDrawing(self.server, self.options)
-        self.page = Page(self.server, self.options, allowed=not look_only, player=player, actions=actions)
+        self.options = DisplayOptions()
+        self.scene = SceneRenderer(self.server, self.options)
+        self.page = ViewPage(self.server, self.options, allowed=not look_only, player=player, actions=actions)
 
     @property
     def address(self) -> str:
-        """What to open in a browser."""
+        """The address to open in a browser."""
         host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
         host = f"[{host}]" if ":" in host else host
-        return f"http://{host}:{self.port}/" + (f"?token={self.gate.token}" if self.gate.token else "")
+        return f"http://{host}:{self.port}/" + (f"?token={self.access.token}" if self.access.token else "")
 
     @property
     def watched(self) -> bool:
@@ -86,7 +86,7 @@ class ViewServer:
         return bool(self.server.get_clients())
 
     def close(self) -> None:
-        """Stop serving; twice is no error."""
+        """Stop serving; may be called twice."""
         if not self._closed:
             self._closed = True
             with contextlib.redirect_stdout(io.StringIO()):
@@ -100,7 +100,7 @@ def run_view(
     *,
     each: Callable[[ViewState], None] = lambda state: None,
 ) -> None:
-    """Show what the bus says until ``stop`` is set; send what is clicked. each: called ten times a second."""
+    """Show the bus until ``stop`` is set; send clicked actions as commands. each: called ten times a second."""
     state = ViewState()
     name, boot = new_id(), uuid.uuid4().hex
     topics = (CAMERA_INFO, OBSERVATION, CALIBRATION, TRACK, STATUS, UAV_INFO, TARGET, TARGET_CLOUD, ROAD_MAP)
@@ -109,14 +109,14 @@ def run_view(
     watch = bus.watch_agents()
     pictures: Subscription | None = None
     sequence = 0
-    pace = _Pace()
+    redraw = _RedrawTimer()
     try:
         with bus.announce(ROLE, name, boot):
             while not stop.wait(0.1):
                 now, wall = time.monotonic(), time.time_ns()
                 for event in watch.drain():
                     state.presence(event.role, event.agent, event.alive, event.boot_id)
-                # Pictures are sent only while somebody looks.
+                # Images are subscribed to only while a browser is open.
                 if (view.watched and view.options.pictures) != (pictures is not None):
                     if pictures is None:
                         pictures = bus.subscribe(PICTURE)
@@ -126,13 +126,13 @@ def run_view(
                 for subscription in (*subscriptions, *([pictures] if pictures else [])):
                     for received in subscription.drain():
                         state.handle(received.message, now - max(0, wall - received.arrival_ns) / NANOSECONDS)
-                while view.page.asked:
-                    action = view.page.asked.popleft()
+                while view.page.requested_actions:
+                    action = view.page.requested_actions.popleft()
                     for command in commands_for(state, action, name, boot, sequence):
                         commands.put(command)
                         sequence += 1
-                    view.page.told(answer_to(state, action))
-                pace.draw(view, state, now)
+                    view.page.show_result(action_result(state, action))
+                redraw.draw(view, state, now)
                 each(state)
     finally:
         commands.close()
@@ -142,10 +142,10 @@ def run_view(
 
 
 def run_replay(recording: Recording, serve: Callable[[Player], ViewServer], stop: threading.Event) -> None:
-    """Play a recording in the browser until ``stop`` is set; the time stands still while nobody looks."""
+    """Play a recording in the browser until ``stop`` is set; playback pauses while no browser is open."""
     player = Player(recording)
     view = serve(player)
-    pace = _Pace()
+    redraw = _RedrawTimer()
     before = time.monotonic()
     try:
         while not stop.wait(0.1):
@@ -153,13 +153,13 @@ def run_replay(recording: Recording, serve: Callable[[Player], ViewServer], stop
             if player.advance(now - before if view.watched else 0.0):
                 view.scene.clear()
             before = now
-            pace.draw(view, player.state, now, at=player.position)
+            redraw.draw(view, player.state, now, at=player.position)
     finally:
         view.close()
 
 
 def commands_for(state: ViewState, action: str, sender: str, boot: str, sequence: int) -> list[pb.Command]:
-    """The messages of one click: one for each agent that can do it, by its present run."""
+    """The commands of one click: one for each agent of the action's role, addressed to its present boot id."""
     return [
         pb.Command(
             schema_version=SCHEMA_VERSION,
@@ -170,39 +170,43 @@ def commands_for(state: ViewState, action: str, sender: str, boot: str, sequence
             agent=agent.status.agent,
             agent_boot=agent.status.boot_id,
         )
-        for number, agent in enumerate(state.of_role(_WHO[action]))
+        for number, agent in enumerate(state.of_role(_ROLE_OF_ACTION[action]))
     ]
 
 
-def answer_to(state: ViewState, action: str) -> str:
-    """What the page says after a click."""
-    names = [agent.status.agent for agent in state.of_role(_WHO[action])]
-    words = action.replace("_", " ")
-    who = {"record": "recorder", "hub": "hub"}[_WHO[action]]
-    return f"asked {', '.join(names)}: {words}" if names else f"no {who} is on this site: {words} went to nobody"
+def action_result(state: ViewState, action: str) -> str:
+    """The text shown after a click."""
+    names = [agent.status.agent for agent in state.of_role(_ROLE_OF_ACTION[action])]
+    action_text = action.replace("_", " ")
+    agent_name = {"record": "recorder", "hub": "hub"}[_ROLE_OF_ACTION[action]]
+    return (
+        f"requested from {', '.join(names)}: {action_text}"
+        if names
+        else f"no {agent_name} on this site: {action_text} was not sent"
+    )
 
 
-class _Pace:
-    """Draws as often as it is worth."""
+class _RedrawTimer:
+    """Limits the redraw rate, with longer intervals while no browser is open."""
 
     def __init__(self) -> None:
         self._draw = self._panel = 0.0
 
     def draw(self, view: ViewServer, state: ViewState, now: float, at: float | None = None) -> None:
-        """now: the machine's time; at: the state's own, where it is another."""
+        """now: monotonic time [s]; at: the state's own time [s], if different."""
         watched = view.watched
         moment = now if at is None else at
         if now >= self._draw:
-            self._draw = now + (_DRAW_S if watched else _ALONE_S)
+            self._draw = now + (_DRAW_S if watched else _UNWATCHED_S)
             view.scene.update(state, moment)
-            view.page.update_flights(state, moment)
+            view.page.update_uavs(state, moment)
         if now >= self._panel:
-            self._panel = now + (_PANEL_S if watched else _ALONE_S)
+            self._panel = now + (_PANEL_S if watched else _UNWATCHED_S)
             view.page.update(state, moment)
 
 
 def _check_port(host: str, port: int) -> None:
-    """Viser would take another port without a word."""
+    """Raise InputError if the port is taken: viser would silently use another one."""
     if not 0 <= port <= 65_535:
         raise InputError(f"--port {port} is out of range", remedy="give 1 to 65535, or 0 for any free one")
     try:

@@ -1,4 +1,4 @@
-"""A drone's picture on a larger canvas: road, particles and the estimate, also where they lie outside it."""
+"""Overlay of a drone's image: road, particles and target estimate on a canvas larger than the image."""
 
 from __future__ import annotations
 
@@ -9,37 +9,38 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from hub.view.uav_state import FlightView
+from hub.view.uav_state import UavView
 from protocols.geometry.types import Floats
 
 Image = npt.NDArray[np.uint8]
 
 _MARGIN = 0.35
-"""Of the picture, on each side: so far outside an estimate is drawn at its place, farther with an arrow at the edge."""
+"""Canvas margin on each side as a fraction of the image: within it an estimate outside the image is drawn at its
+position, beyond it as an arrow at the edge."""
 _WIDTH = 720  # of the canvas [px]
-_GROUND, _FRAME = (40, 44, 50), (255, 255, 255)
-_ROAD, _CLOUD = (120, 160, 210), (240, 150, 220)
+_BACKGROUND, _FRAME = (40, 44, 50), (255, 255, 255)
+_ROAD, _PARTICLES = (120, 160, 210), (240, 150, 220)
 _STATES = {"visible": (90, 220, 90), "coasting": (255, 175, 50), "lost": (235, 70, 60)}
 SIGNS = {"visible": "✓", "coasting": "…", "lost": "✗"}
-"""Before a state's name, so that it is not told by colour alone."""
+"""Sign before a state's name, so that it can be read without colour."""
 
 
-def draw(flight: FlightView, picture: Image | None) -> Image:
-    """(h, w, 3) RGB: the picture in the middle, and what its tracker said of this very frame around and over it.
+def draw_uav(uav: UavView, picture: Image | None) -> Image:
+    """(h, w, 3) RGB: the image in the middle of the canvas, with the tracker's output for the same frame drawn over it.
 
-    picture: the decoded one, None while none has come. The estimate is a box (solid where the car is seen, dashed
-    where it is only predicted) and a circle of two stds.
+    picture: the decoded image, None if none has arrived. The estimate is a box (solid if the car is visible, dashed if
+    predicted) and a circle of two standard deviations.
     """
     import cv2
 
     size = (640, 480) if picture is None else (picture.shape[1], picture.shape[0])
-    if flight.picture is not None and flight.picture.width and flight.picture.height:
-        size = (flight.picture.width, flight.picture.height)
-    elif flight.info is not None and flight.info.width and flight.info.height:
-        size = (flight.info.width, flight.info.height)
+    if uav.picture is not None and uav.picture.width and uav.picture.height:
+        size = (uav.picture.width, uav.picture.height)
+    elif uav.info is not None and uav.info.width and uav.info.height:
+        size = (uav.info.width, uav.info.height)
     scale = min(_WIDTH / size[0], 2 * _WIDTH / size[1]) / (1 + 2 * _MARGIN)
     height = max(2, round(size[1] * (1 + 2 * _MARGIN) * scale))
-    canvas = np.full((height, _WIDTH, 3), _GROUND, np.uint8)
+    canvas = np.full((height, _WIDTH, 3), _BACKGROUND, np.uint8)
     left, top = round(_MARGIN * size[0] * scale), round(_MARGIN * size[1] * scale)
     inner = (max(1, round(size[0] * scale)), max(1, round(size[1] * scale)))
     if picture is not None:
@@ -50,11 +51,11 @@ def draw(flight: FlightView, picture: Image | None) -> Image:
     def placed(pixels: Floats) -> Floats:
         return np.asarray((pixels + 0.5) * scale - 0.5 + (left, top), dtype=np.float64)
 
-    target, cloud, road = flight.at_picture()
+    target, particles, road = uav.at_image()
     if road is not None and len(road.pixels) > 1:
         _dots(canvas, placed(_pairs(road.pixels)), _ROAD, 2)
-    if cloud is not None and target is not None and target.state != "lost" and len(cloud.pixels) > 1:
-        _dots(canvas, placed(_pairs(cloud.pixels)), _CLOUD, 3)
+    if particles is not None and target is not None and target.state != "lost" and len(particles.pixels) > 1:
+        _dots(canvas, placed(_pairs(particles.pixels)), _PARTICLES, 3)
     cv2.rectangle(canvas, (left, top), (left + inner[0] - 1, top + inner[1] - 1), _FRAME, 1)
     if target is not None and len(target.centre) == 2 and target.state != "lost":
         colour = _STATES.get(target.state, _FRAME)
@@ -69,59 +70,59 @@ def draw(flight: FlightView, picture: Image | None) -> Image:
     return canvas
 
 
-def padded(image: Image, aspect: float) -> Image:
-    """The same in the middle of a canvas whose width is ``aspect`` times its height."""
+def pad_to_aspect(image: Image, aspect: float) -> Image:
+    """The image centred on a canvas whose width is ``aspect`` times its height."""
     height, width = image.shape[:2]
     if not (math.isfinite(aspect) and 0.05 < aspect < 20.0):
         return image
     size = (max(width, round(height * aspect)), max(height, round(width / aspect)))
-    canvas = np.full((size[1], size[0], 3), _GROUND, np.uint8)
+    canvas = np.full((size[1], size[0], 3), _BACKGROUND, np.uint8)
     left, top = (size[0] - width) // 2, (size[1] - height) // 2
     canvas[top : top + height, left : left + width] = image
     return canvas
 
 
-def words(flight: FlightView, now: float) -> str:
-    """The drone's panel as HTML: state, where and how sure, and how old that is."""
-    target, _, _ = flight.at_picture()
-    name = html.escape(flight.name)
+def uav_panel_html(uav: UavView, now: float) -> str:
+    """The drone's panel as HTML: target state, position, uncertainty, and age of the data."""
+    target, _, _ = uav.at_image()
+    name = html.escape(uav.name)
     lines = [f"<b>{name}: no target</b>"]
     if target is not None:
         sign = SIGNS.get(target.state, "?")
         text = f"{sign} {html.escape(target.state)}"
-        outside = _outside(flight, (target.centre[0], target.centre[1])) if len(target.centre) == 2 else ""
+        outside = _outside(uav, (target.centre[0], target.centre[1])) if len(target.centre) == 2 else ""
         if outside:
             text += f", {outside}"
         lines = [f"<b>{name}: {text}</b>"]
-        told = []
+        details = []
         if len(target.centre) == 2 and target.state != "lost":
-            told.append(f"± {target.std_px:.0f} px")
+            details.append(f"± {target.std_px:.0f} px")
         if target.std_m > 0.0:
-            told.append(f"± {target.std_m:.1f} m on the ground")
+            details.append(f"± {target.std_m:.1f} m on the ground")
         if len(target.velocity) == 2:
-            told.append(f"{3.6 * math.hypot(*target.velocity):.0f} km/h")
+            details.append(f"{3.6 * math.hypot(*target.velocity):.0f} km/h")
         if len(target.geo) == 3:
-            told.append(f"{target.geo[0]:.6f}°, {target.geo[1]:.6f}°")
-        if told:
-            lines.append(" · ".join(told))
+            details.append(f"{target.geo[0]:.6f}°, {target.geo[1]:.6f}°")
+        if details:
+            lines.append(" · ".join(details))
         if len(target.hypotheses) > 1:
-            lines.append(f"{len(target.hypotheses)} ways it may have gone")
-    if flight.picture is None:
+            lines.append(f"{len(target.hypotheses)} path hypotheses")
+    if uav.picture is None:
         lines.append("no picture yet")
-    elif flight.last_picture is not None and now - flight.last_picture > 3.0:
-        lines.append(f"picture {now - flight.last_picture:.0f} s old")
-    if flight.status is not None and flight.status.message:
-        lines.append(html.escape(f"{flight.status.state}: {flight.status.message}"))
+    elif uav.last_picture is not None and now - uav.last_picture > 3.0:
+        lines.append(f"picture {now - uav.last_picture:.0f} s old")
+    if uav.status is not None and uav.status.message:
+        lines.append(html.escape(f"{uav.status.state}: {uav.status.message}"))
     state = "none" if target is None else html.escape(target.state)
-    where = html.escape(flight.name, quote=True)
+    where = html.escape(uav.name, quote=True)
     paragraphs = "".join(f"<p>{line}</p>" for line in lines)
     style = "font:12px/1.35 system-ui,sans-serif;padding:0 .75em .5em"
     return f"<div style='{style}' data-flight='{where}' data-target='{state}'>{paragraphs}</div>"
 
 
-def _outside(flight: FlightView, centre: tuple[float, float]) -> str:
-    """Which way a place lies outside the picture, "" inside."""
-    shown = flight.picture or flight.info
+def _outside(uav: UavView, centre: tuple[float, float]) -> str:
+    """On which sides a pixel is outside the image, "" inside."""
+    shown = uav.picture or uav.info
     if shown is None or not (shown.width and shown.height):
         return ""
     sides = []
@@ -142,7 +143,7 @@ def _pairs(values: object) -> Floats:
 
 
 def _dots(canvas: Image, points: Floats, colour: tuple[int, int, int], size: int) -> None:
-    """Square dots, those on the canvas."""
+    """Square dots at those points that are on the canvas."""
     height, width = canvas.shape[:2]
     with np.errstate(invalid="ignore"):
         good = np.isfinite(points).all(axis=1) & (points >= 0).all(axis=1)
@@ -169,7 +170,7 @@ def _box(canvas: Image, at: Floats, half: Floats, colour: tuple[int, int, int], 
 
 
 def _arrow(canvas: Image, at: Floats, colour: tuple[int, int, int]) -> None:
-    """At the canvas's edge, towards a place beyond it."""
+    """An arrow at the edge of the canvas towards a point beyond it."""
     import cv2
 
     if not np.isfinite(at).all():

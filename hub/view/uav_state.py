@@ -1,4 +1,4 @@
-"""A drone's camera as the view knows it: its last pictures' worth of target, particles and road, frame by frame."""
+"""View state of a drone: its last image, and the target, particle and road messages by frame."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from typing import TypeVar
 
 from protocols.messages import syncline_pb2 as pb
 
-_Said = TypeVar("_Said", pb.TargetState, pb.TargetCloud, pb.RoadMap)
+_FrameMessage = TypeVar("_FrameMessage", pb.TargetState, pb.TargetCloud, pb.RoadMap)
 
 
 @dataclass(slots=True, eq=False)
-class FlightView:
-    """One UAV agent. pictures: how many came. full: its pictures are those that the tracker saw, from a log."""
+class UavView:
+    """One UAV agent. pictures: count. full_resolution: its images are those of the tracker, from a log."""
 
     name: str
     info: pb.UavInfo | None = None
     boot: str = ""
     picture: pb.Picture | None = None
     pictures: int = 0
-    full: bool = False
+    full_resolution: bool = False
     targets: deque[pb.TargetState] = field(default_factory=lambda: deque(maxlen=300))
-    clouds: deque[pb.TargetCloud] = field(default_factory=lambda: deque(maxlen=50))
+    particle_sets: deque[pb.TargetCloud] = field(default_factory=lambda: deque(maxlen=50))
     roads: deque[pb.RoadMap] = field(default_factory=lambda: deque(maxlen=20))
     last_picture: float | None = None
     last_target: float | None = None
@@ -31,41 +31,41 @@ class FlightView:
     def handle(
         self, message: pb.UavInfo | pb.TargetState | pb.TargetCloud | pb.RoadMap | pb.FlightImage, now: float
     ) -> None:
-        """Take one message of this agent; another boot begins anew."""
+        """Process one message of this agent; a new boot id clears the history."""
         if message.boot_id != self.boot:
             self.boot = message.boot_id
-            for said in (self.targets, self.clouds, self.roads):
-                said.clear()
+            for history in (self.targets, self.particle_sets, self.roads):
+                history.clear()
         if isinstance(message, pb.UavInfo):
             self.info = message
         elif isinstance(message, pb.TargetState):
             self.targets.append(message)
             self.last_target = now
         elif isinstance(message, pb.TargetCloud):
-            self.clouds.append(message)
+            self.particle_sets.append(message)
         elif isinstance(message, pb.RoadMap):
             self.roads.append(message)
         else:
-            self.full = True
+            self.full_resolution = True
             size = {"width": message.width, "height": message.height, "frame": message.frame}
             self._show(pb.Picture(camera=message.agent, boot_id=message.boot_id, jpeg=message.jpeg, **size), now)
 
-    def look(self, picture: pb.Picture, now: float) -> None:
-        """Take a small picture."""
-        if not self.full:
+    def show_thumbnail(self, picture: pb.Picture, now: float) -> None:
+        """Show a thumbnail, unless full-resolution images are available."""
+        if not self.full_resolution:
             self._show(picture, now)
 
-    def at_picture(self) -> tuple[pb.TargetState | None, pb.TargetCloud | None, pb.RoadMap | None]:
-        """What was said of the picture's frame, or last before it: pictures are rarer and later than words."""
+    def at_image(self) -> tuple[pb.TargetState | None, pb.TargetCloud | None, pb.RoadMap | None]:
+        """The messages of the image's frame, or the last before it: images are rarer and arrive later."""
         frame = None if self.picture is None else self.picture.frame
-        return _said(self.targets, frame), _said(self.clouds, frame), _said(self.roads, frame)
+        return _last_up_to(self.targets, frame), _last_up_to(self.particle_sets, frame), _last_up_to(self.roads, frame)
 
     def _show(self, picture: pb.Picture, now: float) -> None:
         self.picture, self.pictures, self.last_picture = picture, self.pictures + 1, now
 
 
-def _said(messages: deque[_Said], frame: int | None) -> _Said | None:
-    """The last message of a frame up to ``frame``; the last of all where there is no picture."""
+def _last_up_to(messages: deque[_FrameMessage], frame: int | None) -> _FrameMessage | None:
+    """The last message of a frame up to ``frame``; the newest if there is no image."""
     for message in reversed(messages):
         if frame is None or message.frame <= frame:
             return message

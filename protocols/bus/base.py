@@ -1,4 +1,4 @@
-"""What agents see of the bus. Two implementations keep this contract: Zenoh and memory."""
+"""The bus interface that agents use. Two implementations: Zenoh and in-memory."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from protocols.topics import Topic
 
 
 class BusDead(Exception):
-    """The bus cannot be used any more (a panic in the transport): exit and be restarted."""
+    """The bus is unusable (a panic in the transport): the process must exit and be restarted."""
 
 
 class BusStopped(Exception):
-    """Opening the bus was given up because the caller asked to stop."""
+    """Opening the bus was cancelled by the caller's stop condition."""
 
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """One message that passed the gate.
+    """One validated message.
 
-    arrival_ns: the receiver's clock (Unix, ns) when it came off the wire, not when it was drained.
-    source: the connection that it came from, as the transport names it; "" where it does not.
+    arrival_ns: the receiver's clock (Unix, ns) when it was received, not when it was drained.
+    source: the connection it came from, as the transport names it; "" where unknown.
     """
 
     topic: Topic
@@ -38,7 +38,7 @@ class Received:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """One message that was not let in. agent: by its key, "" where that names none; detail: for a person."""
+    """One rejected message. agent: by its key, "" where the key has none; detail: for the user."""
 
     reason: str
     agent: str
@@ -49,7 +49,7 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class AgentEvent:
-    """An agent appeared (alive) or is gone. Two boots of one id are two agents here."""
+    """An agent appeared (alive) or disappeared. Two boots of one id count as two agents."""
 
     role: str
     agent: str
@@ -61,47 +61,47 @@ class Publisher(Protocol):
     """Publishes one topic of one agent. Not for use by two threads at once."""
 
     def put(self, message: Message) -> None:
-        """Hand one message over; never waits for a slow receiver unless declared with ``block``.
+        """Publish one message; never waits for a slow receiver unless declared with ``block``.
 
-        Raises TypeError for a message of another topic, Rejected if it is too big, BusDead.
+        Raises TypeError for a message of another topic, Rejected if it is too large, BusDead.
         """
 
     def wait_matched(self, timeout_s: float) -> bool:
-        """Wait until somebody subscribes to this publisher's key; False when the time is up."""
+        """Wait until a subscriber matches this publisher's key; False on timeout."""
 
     def close(self) -> None:
-        """Stop publishing; what late joiners could still have fetched is gone."""
+        """Stop publishing; the cache for late joiners is discarded."""
 
 
 class Subscription(Protocol):
     """Messages of one topic, from one or all agents of the site."""
 
     def drain(self) -> list[Received]:
-        """What arrived since the last call, in order of arrival; bad messages are only counted."""
+        """The messages received since the last call, in order of arrival; invalid ones are only counted."""
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until there is something to drain; False when the time is up."""
+        """Wait until a message can be drained; False on timeout."""
 
     @property
     def counters(self) -> Mapping[str, int]:
         """Counts since the start.
 
-        received: passed the gate. dropped: this queue was full. lost: never came, by the publisher's count.
-        skipped: the same of a topic of which only the newest counts. rejected.<reason>: stopped at the gate.
+        received: valid messages. dropped: this queue was full. lost: never arrived, by the publisher's sequence
+        numbers. skipped: the same for topics with Delivery.LATEST. rejected.<reason>: failed validation.
         """
 
     def refusals(self) -> list[Refusal]:
-        """What was refused since the last call, the first few of it: the counters have all."""
+        """The messages rejected since the last call, a bounded number of them: the counters include all."""
 
     def close(self) -> None:
-        """Stop receiving; what is queued can still be drained."""
+        """Stop receiving; queued messages can still be drained."""
 
 
 class AgentWatch(Protocol):
-    """Who is alive on the site."""
+    """Watches which agents are alive on the site."""
 
     def drain(self) -> list[AgentEvent]:
-        """Changes since the last call; the first call tells of everyone who is there."""
+        """Changes since the last call; the first call reports all agents that are alive."""
 
     def close(self) -> None:
         """Stop watching."""
@@ -117,7 +117,7 @@ class Bus(Protocol):
     def publisher(self, topic: Topic, agent: str, *, rate_hz: float | None = None, block: bool = False) -> Publisher:
         """Declare a publisher.
 
-        rate_hz: messages a second if it differs much from the catalogue's; sizes the cache that heals
+        rate_hz: messages a second if it differs much from the catalogue's; it sets the size of the cache that covers
             an outage of a minute.
         block: wait for a slow link instead of relying on that cache (replay as fast as possible).
         """
@@ -126,10 +126,10 @@ class Bus(Protocol):
         """Subscribe to a topic of one agent, or of all; raises InputError for an unusable id."""
 
     def announce(self, role: str, agent: str, boot_id: str) -> AbstractContextManager[None]:
-        """Be seen as alive while the context is open; the others notice a killed process at once."""
+        """Hold a liveliness token while the context is open; others notice a killed process at once."""
 
     def watch_agents(self) -> AgentWatch:
-        """Watch all agents of the site come and go."""
+        """Watch all agents of the site appear and disappear."""
 
     def close(self) -> None:
         """Close everything that was declared on this bus. May be called twice."""

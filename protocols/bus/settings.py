@@ -1,4 +1,4 @@
-"""How a process reaches the others: the ``[bus]`` table of every agent's configuration."""
+"""Bus configuration: the ``[bus]`` table of every agent's configuration file."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from msgspec import Meta
 from protocols.core.errors import InputError
 
 LOOPBACK_ROUTER = "tcp/127.0.0.1:7447"
-"""Where a router listens, and where others look for one, when nothing else is said."""
+"""Default endpoint on which a router listens and to which others connect."""
 LOOPBACK_ANY_PORT = "tcp/127.0.0.1:0"
-EVERY_INTERFACE = "tcp/[::]:0"
+ANY_INTERFACE = "tcp/[::]:0"
 
 _ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?P<host>\[[0-9a-fA-F:.%]+\]|[A-Za-z0-9._-]+):(?P<port>[0-9]{1,5})\Z")
 
 
 class TlsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``[bus.tls]``: files that `syncline keys` makes. ca: whom to trust; certificate, key: who this process is."""
+    """``[bus.tls]``: files that `syncline keys` makes. ca: trusted authority; certificate, key: own identity."""
 
     ca: Path
     certificate: Path
@@ -30,15 +30,15 @@ class TlsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 class BusConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Mode and endpoints of one Zenoh session.
 
-    mode: "peer" talks to others directly, "client" through a router only, "router" is one.
+    mode: "peer" connects to others directly, "client" through a router only, "router" relays.
     connect, listen: endpoints such as "tcp/192.168.1.5:7447". With neither, a peer or a client looks
         for a router at LOOPBACK_ROUTER, and a router listens there.
     multicast: find other peers on the local network by multicast; then a peer that names no listen
         endpoint listens on every interface.
-    outage_s: the longest cut of a link that loses nothing: publishers keep half as much again.
-    max_sessions: how many others may be connected to this process at once.
+    outage_s: the longest link outage without message loss: publishers cache half as much again.
+    max_sessions: upper bound of simultaneous connections to this process.
     tls: certificates for "tls/" endpoints. access: a router's access rules and TLS settings, as `syncline keys`
-        writes them; who is not named there may do nothing.
+        writes them; agents not named there are denied everything.
     """
 
     mode: Literal["peer", "client", "router"] = "peer"
@@ -65,7 +65,7 @@ class BusConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         if self.access is not None and self.mode != "router":
             raise InputError("bus: access is for a router", remedy='remove it, or set mode = "router"')
         if self.tls is not None and self.mode == "peer":
-            # Who may say what is checked by the router; between two peers nobody would check it.
+            # The router enforces the access rules; between two peers nothing would enforce them.
             raise InputError(
                 "bus: a peer with certificates would go past the router's access rules", remedy='set mode = "client"'
             )
@@ -78,11 +78,11 @@ class BusConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         if self.listen:
             return self.connect, self.listen
         if self.multicast:
-            return self.connect, (EVERY_INTERFACE,)
+            return self.connect, (ANY_INTERFACE,)
         connect = self.connect or (LOOPBACK_ROUTER,)
         if not all(is_loopback(endpoint) for endpoint in connect):
             # Zenoh 1.10 routers do not relay between two peers: without an address of its own this
-            # process would connect, look healthy and hear nothing.
+            # process would connect, look healthy and receive nothing.
             raise InputError(
                 "bus: a peer that connects beyond this machine needs an address that others can reach",
                 remedy='set listen, e.g. ["tcp/192.168.1.20:7447"], or mode = "client"',
@@ -90,7 +90,7 @@ class BusConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         return connect, (LOOPBACK_ANY_PORT,)
 
 
-def parts_of(endpoint: str) -> tuple[str, str, int]:
+def split_endpoint(endpoint: str) -> tuple[str, str, int]:
     """(protocol, host, port) of a checked endpoint; an IPv6 host without its brackets."""
     found = _ENDPOINT.match(endpoint)
     assert found is not None
@@ -105,13 +105,13 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def _check(endpoint: str, *, lowest_port: int) -> None:
-    """Refuse what Zenoh would accept and then retry in silence for ever."""
+    """Reject an endpoint that Zenoh would accept and then retry silently for ever."""
     found = _ENDPOINT.match(endpoint)
     if not found or not lowest_port <= int(found["port"]) <= 65_535:
         raise InputError(f"bus: {endpoint!r} is not an endpoint", remedy='write it like "tcp/127.0.0.1:7447"')
 
 
-def open_to_others(config: BusConfig) -> tuple[str, ...]:
-    """Endpoints beyond this machine that this process would listen on without certificates."""
+def unprotected_listeners(config: BusConfig) -> tuple[str, ...]:
+    """Endpoints reachable from other machines on which this process would listen without certificates."""
     _, listen = config.endpoints()
     return tuple(one for one in listen if not is_loopback(one) and not one.startswith("tls/"))

@@ -1,1 +1,1 @@
-"""Errors, atomic files, clocks, versions: what every other module stands on."""
+"""Foundations that every other package imports: errors, names, atomic files, clock maps, version."""

@@ -1,4 +1,4 @@
-"""Times. A camera's time and the reference time are different types, so that mypy refuses to mix them.
+"""Clock maps and time types. Camera time and reference time are different types, so that mypy rejects mixing them.
 
 ``t_reference = clock_rate * t_camera + time_offset`` (seconds). A camera's epoch is arbitrary: uptime,
 Unix time or 0; only differences on one camera mean anything.

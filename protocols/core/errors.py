@@ -1,8 +1,8 @@
-"""The two things that can go wrong for a user, and how they are told.
+"""The errors that a user sees: bad input and refusal, with their exit statuses.
 
     SynclineError
     ├── InputError   bad use, configuration or input     exit status 2
-    └── Refused      well-formed, but no answer in it    exit status 3
+    └── Refused      well-formed, but not solvable       exit status 3
 
 Anything else that escapes is a bug: exit status 1.
 """
@@ -10,10 +10,8 @@ Anything else that escapes is a bug: exit status 1.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from protocols.session.calibration import PairReport
+from protocols.core.pair_report import PairReport
 
 EXIT_DONE = 0
 EXIT_BUG = 1
@@ -22,7 +20,7 @@ EXIT_REFUSED = 3
 
 
 class SynclineError(Exception):
-    """Base of the errors that are told to a user as one line."""
+    """Base of the errors that are reported to a user as one line."""
 
     exit_status = EXIT_BUG
 
@@ -46,13 +44,14 @@ class InputError(SynclineError):
 
 
 class Refused(SynclineError):
-    """The input is well-formed, but there is no trustworthy answer in it; the reason says why.
+    """The input is well-formed, but no reliable result can be estimated from it; ``reason`` says why.
 
-    cameras: reasons by camera, where single ones can be told. pairs: what is known of pairs of cameras all
-    the same. warnings: what a user should know beside the reason.
+    cameras: reasons by camera, where they concern single cameras. pairs: results of camera pairs that are known
+    nevertheless. warnings: further warnings for the user. cpu_seconds: spent by the solver before it refused.
     """
 
     exit_status = EXIT_REFUSED
+    cpu_seconds: float = 0.0
 
     def __init__(
         self,

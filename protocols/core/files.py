@@ -1,4 +1,4 @@
-"""Files that are whole or not there: written beside, fsynced, renamed; several together or none."""
+"""Atomic file writing: a temporary file beside the target, fsync, rename; several files together or none."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def write_atomically(file: Path, text: str) -> None:
 def write_together(files: Mapping[Path, str]) -> None:
     """Write several files: all are prepared before the first one takes its place.
 
-    A full disk or a folder without rights so leaves none of them. Raises InputError.
+    A full disk or missing permissions therefore leave none of them written. Raises InputError.
     """
     prepared: list[tuple[Path, Path]] = []
     now = Path()
@@ -51,7 +51,7 @@ def write_together(files: Mapping[Path, str]) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise InputError if ``folder`` cannot be one; makes nothing."""
+    """Raise InputError if ``folder`` cannot be created or used as an output folder; creates nothing."""
     try:
         if folder.exists() and not folder.is_dir():
             raise InputError("not a folder", file=folder, remedy="choose another --out")

@@ -1,4 +1,4 @@
-"""The version, as it stands in every output and log."""
+"""The program's version, as it is written to every output and log."""
 
 from __future__ import annotations
 

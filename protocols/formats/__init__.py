@@ -1,4 +1,5 @@
-"""Calibrations and observations in other projects' files: what they mean here, read and written.
+"""Import and export of calibrations and observations in other tools' file formats.
 
-One module a family of formats, with its reader and its writer side by side; nothing here touches the disk but to read.
+One module per family of formats, with its reader and its writer side by side. Writers return texts; only
+readers access the disk.
 """

@@ -1,4 +1,4 @@
-"""What a calibration of another project says of cameras, and rig.toml or calibration.toml made of it."""
+"""Format-independent representation of an imported or exported calibration, and its conversion to rig.toml."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.calibration import CameraCalibration
-from protocols.session.rig import UNITS
+from protocols.session.rig import METRES_PER_UNIT
 
-_LARGEST_REFIT = 1.0  # px: a lens that another model misses by more is another lens
-_SKEW = 1e-9  # px
+_MAX_REFIT_ERROR_PX = 1.0  # px: largest error of a refit with fewer distortion coefficients
+_MAX_SKEW_PX = 1e-9  # px
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForeignCamera:
-    """One camera as another project's file tells it; what the file does not tell is None.
+    """One camera as read from another tool's file; None for what the file does not contain.
 
     pose: camera from world. time_map: reference clock from camera clock.
     """
@@ -36,7 +36,7 @@ class ForeignCamera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForeignRig:
-    """All cameras of a file. units: of its lengths, None where it does not say. scale: "metric" or "arbitrary"."""
+    """All cameras of a file. units: of its lengths, None where not given. scale: "metric" or "arbitrary"."""
 
     cameras: dict[str, ForeignCamera]
     units: str | None = None
@@ -45,15 +45,15 @@ class ForeignRig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Written:
-    """Files of an export by name, and what the format cannot hold."""
+class ExportedFiles:
+    """The texts of an export by file name, and warnings about what the format cannot represent."""
 
     files: dict[str, str]
     warnings: tuple[str, ...] = ()
 
 
 def rig_tables(rig: ForeignRig, units: str) -> dict[str, Any]:
-    """The tables of a rig.toml; where all cameras have poses it is a calibration.toml as well."""
+    """The tables of a rig.toml, which is a valid calibration.toml too if all cameras have poses."""
     metadata: dict[str, Any] = {"units": units}
     if any(camera.time_map is not None for camera in rig.cameras.values()):
         metadata["reference"] = next(iter(rig.cameras))
@@ -80,13 +80,13 @@ def rig_tables(rig: ForeignRig, units: str) -> dict[str, Any]:
     return tables
 
 
-def in_units(
+def convert_units(
     cameras: Mapping[str, CameraCalibration], units: str, wanted: str, scale: str
 ) -> tuple[dict[str, CameraCalibration], tuple[str, ...]]:
     """The cameras with their lengths in ``wanted`` units, and a warning where there is no scale to convert."""
     if scale == "arbitrary":
         return dict(cameras), (f"the calibration has no scale: its lengths are baselines, not {wanted}",)
-    factor = UNITS[units] / UNITS[wanted]
+    factor = METRES_PER_UNIT[units] / METRES_PER_UNIT[wanted]
     if factor == 1.0:
         return dict(cameras), ()
     return {
@@ -96,16 +96,16 @@ def in_units(
 
 
 def check_skew(camera: CameraCalibration, project: str) -> None:
-    """Raise Refused for a matrix with skew, which most formats cannot hold."""
-    if abs(camera.intrinsics.matrix[0, 1]) > _SKEW:
+    """Raise Refused for a camera matrix with skew, which most formats cannot represent."""
+    if abs(camera.intrinsics.matrix[0, 1]) > _MAX_SKEW_PX:
         raise Refused(f"{project} holds no skew, and {camera.name} has {camera.intrinsics.matrix[0, 1]:.3g} px of it")
 
 
-def without_k3(lens: Intrinsics, name: str, project: str) -> tuple[Floats, str]:
-    """k1, k2, p1, p2 (4,) of a pinhole lens that come nearest to it over its picture, and a warning ("" = exact).
+def fit_without_k3(lens: Intrinsics, name: str, project: str) -> tuple[Floats, str]:
+    """The best fit k1, k2, p1, p2 (4,) of a pinhole lens without k3 over its image, and a warning ("" = exact).
 
-    Least squares over a grid of pixels: distortion is linear in its coefficients. Raises Refused where it misses by
-    more than 1 px.
+    Linear least squares over a grid of pixels, since distortion is linear in its coefficients. Raises Refused where
+    the largest error exceeds 1 px.
     """
     if lens.distortions[4] == 0.0:
         return lens.distortions[:4].copy(), ""
@@ -121,12 +121,12 @@ def without_k3(lens: Intrinsics, name: str, project: str) -> tuple[Floats, str]:
     found = np.linalg.lstsq(columns.reshape(-1, 4), bent, rcond=None)[0]
     left = (columns.reshape(-1, 4) @ found - bent).reshape(-1, 2) @ lens.matrix[:2, :2].T
     worst = float(np.linalg.norm(left, axis=1).max(initial=0.0))
-    if worst > _LARGEST_REFIT:
+    if worst > _MAX_REFIT_ERROR_PX:
         raise Refused(f"{project} holds no k3, and {name} without it is up to {worst:.1f} px off")
-    return np.asarray(found), f"{project} holds no k3: {name}'s other coefficients make up for it, to {worst:.2g} px"
+    return np.asarray(found), f"{project} holds no k3: {name}'s others are refitted, largest error {worst:.2g} px"
 
 
-def numbers(value: Any, shape: tuple[int, ...], what: str, file: Path, line: int | None) -> Floats:
+def parse_array(value: Any, shape: tuple[int, ...], what: str, file: Path, line: int | None) -> Floats:
     """An array of finite numbers of this shape. Raises InputError."""
     remedy = f"give {'x'.join(map(str, shape))} numbers"
     try:
@@ -144,11 +144,3 @@ def numbers(value: Any, shape: tuple[int, ...], what: str, file: Path, line: int
 def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> Floats:
     """(3, 3) camera matrix."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def check_name(name: str, file: Path, line: int | None = None) -> str:
-    """A camera's name that rig.toml can hold. Raises InputError."""
-    if not name or name != name.strip() or '"' in name or name == "metadata" or not name.isprintable():
-        remedy = "use letters, digits, - and _"
-        raise InputError(f"{name!r} is no name for a camera", file=file, line=line, remedy=remedy)
-    return name

@@ -1,7 +1,7 @@
 """COLMAP's text model: cameras.txt, images.txt, an empty points3D.txt.
 
-COLMAP counts pixels from the corner of the picture: its centres of pixels are at 0.5. Quaternions w, x, y, z and
-translations are camera from world. It knows no clocks and no units.
+COLMAP counts pixels from the corner of the image: its pixel centres are at 0.5. Quaternions w, x, y, z and
+translations are camera from world. It has no clock maps and no units.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from protocols.core.errors import InputError
+from protocols.core.names import check_name, key_segment, name_of_segment
 from protocols.formats.cameras import (
+    ExportedFiles,
     ForeignCamera,
     ForeignRig,
-    Written,
-    check_name,
     check_skew,
-    numbers,
+    parse_array,
     pinhole_matrix,
 )
 from protocols.geometry import so3
@@ -45,7 +45,9 @@ _CENTRE = 0.5
 
 
 def read(folder: Path) -> ForeignRig:
-    """A text model, one image a camera, each named after its image without the suffix. Raises InputError."""
+    """Read a text model with one image per camera; a camera is named after its image without the suffix.
+
+    Raises InputError: file, line, what, remedy."""
     lenses = _read_cameras(folder / CAMERAS)
     cameras: dict[str, ForeignCamera] = {}
     file = folder / IMAGES
@@ -60,10 +62,10 @@ def read(folder: Path) -> ForeignRig:
             what = f"an image has {len(words)} values"
             raise InputError(what, file=file, line=number, remedy="10 are needed: ID, quaternion, T, CAMERA_ID, NAME")
         skip = True
-        name = check_name(_name(" ".join(words[9:]), cameras), file, number)
+        name = check_name(_name(" ".join(words[9:]), cameras), file=file, line=number)
         if words[8] not in lenses:
             raise InputError(f"camera {words[8]} is not in {CAMERAS}", file=file, line=number, remedy="correct the id")
-        values = numbers(words[1:8], (7,), "the pose", file, number)
+        values = parse_array(words[1:8], (7,), "the pose", file, number)
         size = float(np.linalg.norm(values[:4]))
         if not 0.5 < size < 2.0:
             raise InputError("the quaternion has no direction", file=file, line=number, remedy="correct it")
@@ -74,8 +76,8 @@ def read(folder: Path) -> ForeignRig:
     return ForeignRig(cameras)
 
 
-def write(cameras: Mapping[str, CameraCalibration]) -> Written:
-    """The three files."""
+def write(cameras: Mapping[str, CameraCalibration]) -> ExportedFiles:
+    """The three files of a text model."""
     lenses, images, warnings = [], [], []
     for number, (name, camera) in enumerate(cameras.items(), 1):
         check_skew(camera, "COLMAP")
@@ -86,19 +88,19 @@ def write(cameras: Mapping[str, CameraCalibration]) -> Written:
         else:
             k1, k2, p1, p2, k3 = lens.distortions.tolist()
             model, values = ("OPENCV", [k1, k2, p1, p2]) if k3 == 0 else ("FULL_OPENCV", [k1, k2, p1, p2, k3, 0, 0, 0])
-        told = _numbers([fx, fy, cx + _CENTRE, cy + _CENTRE, *values])
-        lenses.append(f"{number} {model} {lens.width} {lens.height} {told}")
+        parameters = _numbers([fx, fy, cx + _CENTRE, cy + _CENTRE, *values])
+        lenses.append(f"{number} {model} {lens.width} {lens.height} {parameters}")
         quaternion = _quaternion(camera.pose.rotation)
-        images.append(f"{number} {_numbers([*quaternion, *camera.pose.translation])} {number} {name}.png\n")
+        images.append(f"{number} {_numbers([*quaternion, *camera.pose.translation])} {number} {_image(name)}\n")
         if camera.time_map.time_offset != 0.0 or camera.time_map.clock_rate != 1.0:
             warnings.append(name)
-    text = (f"COLMAP knows no clocks: those of {', '.join(warnings)} are left out",) if warnings else ()
+    text = (f"COLMAP has no clock maps: those of {', '.join(warnings)} are left out",) if warnings else ()
     files = {
         CAMERAS: "\n".join(["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", *lenses]) + "\n",
         IMAGES: "\n".join(["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", *images]) + "\n",
         POINTS: "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n",
     }
-    return Written(files, text)
+    return ExportedFiles(files, text)
 
 
 def _read_cameras(file: Path) -> dict[str, Intrinsics]:
@@ -111,8 +113,8 @@ def _read_cameras(file: Path) -> dict[str, Intrinsics]:
             remedy = f"convert it to one of {', '.join(_MODELS)}"
             raise InputError(f"the model {words[1]} is not known here", file=file, line=number, remedy=remedy)
         count, places, fisheye, bent = _MODELS[words[1]]
-        width, height = numbers(words[2:4], (2,), "the size", file, number)
-        values = numbers(words[4:], (count,), f"{words[1]}'s parameters", file, number)
+        width, height = parse_array(words[2:4], (2,), "the size", file, number)
+        values = parse_array(words[4:], (count,), f"{words[1]}'s parameters", file, number)
         fx, fy, cx, cy = values[list(places)]
         if not (fx > 0 and fy > 0 and width > 0 and height > 0):
             raise InputError("a focal length or size <= 0", file=file, line=number, remedy="correct it")
@@ -140,9 +142,15 @@ def _rows(file: Path, keep_empty: bool = False) -> list[tuple[int, list[str]]]:
     return rows if keep_empty else [(number, words) for number, words in rows if words]
 
 
+def _image(name: str) -> str:
+    """The image's name of a camera. COLMAP reads it up to the first space: such a name is percent-encoded."""
+    return f"{key_segment(name) if ' ' in name else name}.png"
+
+
 def _name(image: str, taken: Mapping[str, ForeignCamera]) -> str:
     path = PurePosixPath(image.replace("\\", "/"))
-    return path.stem if path.stem not in taken else "_".join(path.with_suffix("").parts)
+    name = name_of_segment(path.stem) or path.stem
+    return name if name not in taken else "_".join(path.with_suffix("").parts)
 
 
 def _quaternion(rotation: Floats) -> list[float]:

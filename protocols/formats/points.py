@@ -1,7 +1,7 @@
-"""Observations of other trackers: caliscope's point tables, DeepLabCut's CSV, mvus' text.
+"""Import of observations of other trackers: caliscope's point tables, DeepLabCut's CSV, mvus' text.
 
-DeepLabCut and mvus count frames and tell no times, caliscope may: ``times`` turns a camera's frames into its seconds.
-All count pixels from the centre of the top-left one, as OpenCV does.
+DeepLabCut and mvus have frame numbers without times, caliscope may have times: ``times`` converts a camera's frame
+numbers to seconds. In all of them pixel (0, 0) is the centre of the top-left pixel, as in OpenCV.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from protocols.core.errors import InputError
-from protocols.formats.cameras import check_name
+from protocols.core.names import check_name, name_from_file
 from protocols.geometry.types import Floats, Ints
 from protocols.session.observations import Observations, gather_tracks
 
@@ -28,7 +28,7 @@ _CALISCOPE = ("sync_index", "point_id", "img_loc_x", "img_loc_y")
 
 @dataclass(slots=True)
 class _Rows:
-    """Rows of one file as they come."""
+    """Rows of the files in reading order, by column."""
 
     camera: list[str] = field(default_factory=list)
     label: list[str] = field(default_factory=list)
@@ -38,8 +38,8 @@ class _Rows:
     line: list[int] = field(default_factory=list)
 
 
-def kind_of(text: str) -> str | None:
-    """Which table of points a text begins like; None = none of them."""
+def detect_format(text: str) -> str | None:
+    """The format of a point table, from the beginning of its text; None = unknown."""
     lines = [line for line in text.splitlines()[:6] if line.strip()]
     if not lines:
         return None
@@ -58,7 +58,7 @@ def kind_of(text: str) -> str | None:
 def read(kind: str, files: list[Path], times: Times, likelihood: float, camera: str | None) -> Observations:
     """The observations of some files of one kind.
 
-    likelihood: least one of DeepLabCut's points. camera: its name, for one file of one camera; default the file's.
+    likelihood: lower limit for DeepLabCut's points. camera: name for a single file; default: from the file's name.
     Raises InputError: file, line, what, remedy.
     """
     rows = _Rows()
@@ -67,7 +67,7 @@ def read(kind: str, files: list[Path], times: Times, likelihood: float, camera: 
         if kind == "caliscope-points":
             _caliscope(file, rows, times)
         else:
-            name = check_name(camera or camera_of(file), file)
+            name = camera_from_file_name(file) if camera is None else check_name(camera, file=file)
             if name in rows.camera:
                 raise InputError(f"a second file of camera {name!r}", file=file, remedy="rename it after its camera")
             _deeplabcut(file, name, rows, likelihood) if kind == "deeplabcut" else _mvus(file, name, rows)
@@ -87,9 +87,10 @@ def read(kind: str, files: list[Path], times: Times, likelihood: float, camera: 
     )
 
 
-def camera_of(file: Path) -> str:
-    """The camera that a file is named after: without what trackers append."""
-    return re.split(r"DLC_|_detections?$|_filtered$", file.stem)[0].rstrip("_-. ") or file.stem
+def camera_from_file_name(file: Path) -> str:
+    """The camera's name in a file's name, without the suffixes that trackers append. Raises InputError."""
+    stem = re.split(r"DLC_|_detections?$|_filtered$", file.stem)[0].rstrip("_-. ") or file.stem
+    return name_from_file(stem, file)
 
 
 def _caliscope(file: Path, rows: _Rows, times: Times) -> None:
@@ -149,9 +150,13 @@ def _deeplabcut(file: Path, camera: str, rows: _Rows, least: float) -> None:
         for column in starts:
             if not cells[column].strip() or not cells[column + 1].strip():
                 continue
-            told = column + 2 < width and coords[column + 2] == "likelihood"
-            sure = _number(cells[column + 2], "likelihood", file, line) if told and cells[column + 2].strip() else 1.0
-            if not sure >= least:
+            has_likelihood = column + 2 < width and coords[column + 2] == "likelihood"
+            score = (
+                _number(cells[column + 2], "likelihood", file, line)
+                if has_likelihood and cells[column + 2].strip()
+                else 1.0
+            )
+            if not score >= least:
                 continue
             part = parts[column].strip()
             rows.camera.append(camera)
@@ -162,7 +167,7 @@ def _deeplabcut(file: Path, camera: str, rows: _Rows, least: float) -> None:
 
 
 def _mvus(file: Path, camera: str, rows: _Rows) -> None:
-    """mvus reads columns 3, 1, 2: the file holds x, y, frame."""
+    """One camera's mvus file: columns x, y, frame (mvus itself reads them as columns 3, 1, 2)."""
     for line, row in enumerate(_text(file).splitlines(), 1):
         words = row.split("#")[0].replace(",", " ").split()
         if not words:
@@ -171,7 +176,7 @@ def _mvus(file: Path, camera: str, rows: _Rows) -> None:
             raise InputError(f"{len(words)} numbers", file=file, line=line, remedy="give x y frame")
         u, v = _pixel(words[0], "x", file, line), _pixel(words[1], "y", file, line)
         if u == 0.0 and v == 0.0:
-            continue  # its trackers write a frame without a detection so
+            continue  # mvus' trackers write (0, 0) for a frame without a detection
         rows.camera.append(camera)
         rows.label.append("marker")
         rows.frame.append(_whole(words[2], "frame", file, line))
@@ -225,7 +230,7 @@ def _whole(cell: str, what: str, file: Path, line: int) -> int:
 
 
 def _frame(cell: str, file: Path, line: int) -> int:
-    """A frame's index, or the last number in the name of a picture."""
+    """A frame's index, or the last number in the file name of an image."""
     numbers = re.findall(r"\d+", Path(cell.strip()).stem)
     if not re.fullmatch(r"\s*\d+(\.0*)?\s*", cell) and numbers:
         return int(numbers[-1])

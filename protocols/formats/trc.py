@@ -1,4 +1,4 @@
-"""Paths as TRC, the format of OpenSim and of Pose2Sim's results."""
+"""Export of trajectories as TRC, the format of OpenSim and of Pose2Sim's results."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats, Ints
-from protocols.session.rig import UNITS
+from protocols.session.rig import METRES_PER_UNIT
 
 
 def trc_text(file: Path, name: str, units: str) -> str:
-    """A trajectory.csv or track.csv as TRC (OpenSim): constant rate, empty where a label is not known, m or mm.
+    """A trajectory.csv or track.csv as TRC (OpenSim): constant rate, empty where a label has no position, m or mm.
 
     Time 0 is the first row. Raises InputError: file, line, what, remedy.
     """
@@ -24,7 +24,7 @@ def trc_text(file: Path, name: str, units: str) -> str:
     times, frames = _frames(paths)
     count = int(frames[-1]) + 1
     rate = (count - 1) / float(times[-1] - times[0]) if count > 1 else 1.0
-    scale, told = (UNITS[units], "m") if units == "cm" else (1.0, units)
+    scale, written_units = (METRES_PER_UNIT[units], "m") if units == "cm" else (1.0, units)
     cells = np.full((count, 3 * len(paths)), math.nan)
     for column, path in enumerate(paths.values()):
         at = frames[np.clip(np.searchsorted(times, path[:, 0] - 1e-6), 0, len(times) - 1)]
@@ -34,7 +34,7 @@ def trc_text(file: Path, name: str, units: str) -> str:
     lines = [
         f"PathFileType\t4\t(X/Y/Z)\t{name}",
         keys,
-        f"{rate:.9g}\t{rate:.9g}\t{count}\t{len(paths)}\t{told}\t{rate:.9g}\t1\t{count}",
+        f"{rate:.9g}\t{rate:.9g}\t{count}\t{len(paths)}\t{written_units}\t{rate:.9g}\t1\t{count}",
         "Frame#\tTime\t" + "\t\t\t".join(label.replace("\t", " ") for label in paths) + "\t\t",
         "\t\t" + axes,
         "",
@@ -46,9 +46,9 @@ def trc_text(file: Path, name: str, units: str) -> str:
 
 
 def _frames(paths: Mapping[str, Floats]) -> tuple[Floats, Ints]:
-    """All instants (n,) [s] of some paths and the frame (n,) of each on one grid of a constant rate.
+    """All times (n,) [s] of some trajectories and the frame (n,) of each on one grid of constant rate.
 
-    The grid's step is what most steps of single paths are; gaps are whole numbers of it.
+    The grid's step is the 10 % quantile of the trajectories' own steps; gaps are multiples of it.
     """
     joined = np.unique(np.concatenate([path[:, 0] for path in paths.values()]))
     times = joined[np.r_[True, np.diff(joined) > 1e-6]]

@@ -1,7 +1,8 @@
-"""Calibrations in YAML: OpenCV's FileStorage (one file a camera) and Kalibr's camchain.
+"""Calibrations in YAML: OpenCV's FileStorage (one file per camera) and Kalibr's camchain.
 
-Kalibr: ``T_cn_cnm1`` takes points of the camera before into this one's axes, ``T_cam_imu`` those of its body, which
-is the world here; ``t_imu = t_cam + timeshift_cam_imu``. It holds no clock rate, which stands beside as a further key.
+Kalibr: ``T_cn_cnm1`` transforms points from the previous camera's axes into this camera's, ``T_cam_imu`` from the
+body's axes, which are the world here; ``t_imu = t_cam + timeshift_cam_imu``. It has no clock rate, which is written as
+an additional key.
 """
 
 from __future__ import annotations
@@ -15,24 +16,24 @@ import numpy as np
 
 from protocols.core.clocks import TimeMap
 from protocols.core.errors import InputError
+from protocols.core.names import check_name, key_segment, name_from_file
 from protocols.formats.cameras import (
+    ExportedFiles,
     ForeignCamera,
     ForeignRig,
-    Written,
-    check_name,
     check_skew,
-    numbers,
+    fit_without_k3,
+    parse_array,
     pinhole_matrix,
-    without_k3,
 )
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.calibration import CameraCalibration
-from protocols.session.rig import UNITS
+from protocols.session.rig import METRES_PER_UNIT
 
-_CONTRADICTION = 1e-3
+_MAX_CHAIN_ERROR = 1e-3
 _MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "M")
 _DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D")
 _FISHEYE = ("fisheye", "equidistant", "kannala_brandt")
@@ -48,13 +49,20 @@ def load(file: Path) -> tuple[dict[str, Any], str]:
         raise InputError(f"cannot be read: {error}", file=file, remedy="check the file and its rights") from None
 
     class Loader(yaml.SafeLoader):
-        """Safe, and with OpenCV's tag."""
+        """Safe, with OpenCV's tag, and with names as they are written: a camera may be called 007 or true."""
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            mapping = super().construct_mapping(node, deep)
+            for key, value in node.value:
+                if key.value in ("camera_name", "name") and isinstance(value, yaml.ScalarNode):
+                    mapping[key.value] = value.value
+            return mapping
 
     def matrix(loader: Any, node: Any) -> Any:
         return loader.construct_mapping(node, deep=True)
 
     Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", matrix)
-    # OpenCV's first line, %YAML:1.0, is no YAML; an empty one keeps the numbers of the lines.
+    # OpenCV's first line, %YAML:1.0, is not valid YAML; an empty line in its place keeps the line numbers.
     plain = re.sub(r"\A%YAML:\d\.\d[^\n]*", "", text)
     try:
         values = yaml.load(plain, Loader)
@@ -68,15 +76,15 @@ def load(file: Path) -> tuple[dict[str, Any], str]:
     return {str(key): value for key, value in values.items()}, text
 
 
-def kind_of(values: Mapping[str, Any]) -> str | None:
-    """Which calibration a YAML file's content looks like; None = none."""
+def detect_format(values: Mapping[str, Any]) -> str | None:
+    """The calibration format of a YAML file's content; None = unknown."""
     if any(isinstance(value, dict) and "intrinsics" in value for value in values.values()):
         return "kalibr"
     return "opencv" if any(key in values for key in _MATRIX) else None
 
 
 def read_opencv(files: list[Path]) -> ForeignRig:
-    """Files of cv2.FileStorage or ROS' camera_info, one a camera. Raises InputError."""
+    """Read files of cv2.FileStorage or ROS' camera_info, one per camera. Raises InputError."""
     cameras: dict[str, ForeignCamera] = {}
     units: set[str] = set()
     for file in files:
@@ -85,23 +93,23 @@ def read_opencv(files: list[Path]) -> ForeignRig:
         if camera.name in cameras:
             raise InputError(f"a second camera {camera.name!r}", file=file, remedy="give each its own camera_name")
         cameras[camera.name] = camera
-        told = values.get("units")
-        if told is not None:
-            if told not in UNITS:
-                raise InputError(f"units: {told!r}", file=file, line=_line(text, "units"), remedy="use m, cm or mm")
-            units.add(str(told))
+        unit = values.get("units")
+        if unit is not None:
+            if unit not in METRES_PER_UNIT:
+                raise InputError(f"units: {unit!r}", file=file, line=_line(text, "units"), remedy="use m, cm or mm")
+            units.add(str(unit))
     if len(units) > 1:
         raise InputError(f"units differ ({', '.join(sorted(units))})", file=files[0], remedy="bring them to one")
     return ForeignRig(cameras, units.pop() if units else None)
 
 
-def write_opencv(cameras: Mapping[str, CameraCalibration], units: str) -> Written:
-    """CAMERA.yml a camera for cv2.FileStorage."""
-    return Written({f"{name}.yml": _opencv_text(camera, units) for name, camera in cameras.items()})
+def write_opencv(cameras: Mapping[str, CameraCalibration], units: str) -> ExportedFiles:
+    """One CAMERA.yml per camera, for cv2.FileStorage."""
+    return ExportedFiles({f"{name}.yml": _opencv_text(camera, units) for name, camera in cameras.items()})
 
 
 def read_kalibr(file: Path) -> ForeignRig:
-    """A camchain. Time maps are relative to the first camera. Raises InputError."""
+    """Read a Kalibr camchain. Clock maps are relative to the first camera. Raises InputError."""
     values, text = load(file)
     cameras: dict[str, ForeignCamera] = {}
     chain: list[tuple[Floats, Floats]] | None = [(np.eye(3), np.zeros(3))]
@@ -112,7 +120,7 @@ def read_kalibr(file: Path) -> ForeignRig:
     for key, table in values.items():
         if not isinstance(table, dict) or "intrinsics" not in table:
             continue
-        name = check_name(str(table.get("name", key)), file, _line(text, key))
+        name = check_name(str(table.get("name", key)), file=file, line=_line(text, key))
         lenses[name] = _kalibr_lens(table, key, text, file)
         if len(lenses) > 1:
             if "T_cn_cnm1" not in table:
@@ -124,10 +132,14 @@ def read_kalibr(file: Path) -> ForeignRig:
         body.append(_transform(table["T_cam_imu"], f"{key} T_cam_imu", file, line) if "T_cam_imu" in table else None)
         shift_at = _line(text, "timeshift_cam_imu", key)
         given = table.get("timeshift_cam_imu")
-        shifts.append(None if given is None else float(numbers(given, (), f"{key} timeshift_cam_imu", file, shift_at)))
+        shifts.append(
+            None if given is None else float(parse_array(given, (), f"{key} timeshift_cam_imu", file, shift_at))
+        )
         if "time_offset" in table:
             pair = [table.get("clock_rate", 1.0), table["time_offset"]]
-            rate, offset = numbers(pair, (2,), f"{key} time_offset, clock_rate", file, _line(text, "time_offset", key))
+            rate, offset = parse_array(
+                pair, (2,), f"{key} time_offset, clock_rate", file, _line(text, "time_offset", key)
+            )
             own[name] = TimeMap(float(rate), float(offset))
     if not lenses:
         raise InputError("no camera with intrinsics in it", file=file, remedy="give Kalibr's camchain YAML")
@@ -147,8 +159,8 @@ def read_kalibr(file: Path) -> ForeignRig:
     return ForeignRig(cameras, "m", None, tuple(warnings))
 
 
-def write_kalibr(cameras: Mapping[str, CameraCalibration], name: str = "camchain.yaml") -> Written:
-    """A camchain of cameras whose lengths are in metres; the body that Kalibr calls imu is the world."""
+def write_kalibr(cameras: Mapping[str, CameraCalibration], name: str = "camchain.yaml") -> ExportedFiles:
+    """A Kalibr camchain of cameras with lengths in metres; the body that Kalibr calls imu is the world."""
     import yaml
 
     warnings, document = [], {}
@@ -158,13 +170,13 @@ def write_kalibr(cameras: Mapping[str, CameraCalibration], name: str = "camchain
         lens, pose = camera.intrinsics, camera.pose
         coefficients = lens.distortions
         if not lens.fisheye:
-            coefficients, warning = without_k3(lens, key, "Kalibr")
+            coefficients, warning = fit_without_k3(lens, key, "Kalibr")
             warnings += [warning] if warning else []
         a = lens.matrix
         rate, shift = camera.time_map.clock_rate, camera.time_map.time_offset
         if rate != 1.0:
             drift = 1e6 * (rate - 1.0)
-            warnings.append(f"Kalibr holds no clock rate: {key}'s timeshift is that at its time 0 ({drift:+.1f} ppm)")
+            warnings.append(f"Kalibr has no clock rate: {key}'s timeshift is that at its time 0 ({drift:+.1f} ppm)")
         table: dict[str, Any] = {
             "cam_overlaps": [other for other in range(len(cameras)) if other != number],
             "camera_model": "pinhole",
@@ -172,7 +184,7 @@ def write_kalibr(cameras: Mapping[str, CameraCalibration], name: str = "camchain
             "distortion_model": "equidistant" if lens.fisheye else "radtan",
             "intrinsics": [float(value) for value in (a[0, 0], a[1, 1], a[0, 2], a[1, 2])],
             "resolution": [lens.width, lens.height],
-            "rostopic": f"/{key}/image_raw",
+            "rostopic": _ros_topic(key),
             "T_cam_imu": _homogeneous(pose.rotation, pose.translation),
             "timeshift_cam_imu": shift,
             "name": key,
@@ -184,17 +196,20 @@ def write_kalibr(cameras: Mapping[str, CameraCalibration], name: str = "camchain
             table["T_cn_cnm1"] = _homogeneous(turn, pose.rotation @ (before.position - pose.position))
         document[f"cam{number}"] = table
         before = pose
-    return Written(
+    return ExportedFiles(
         {name: yaml.safe_dump(document, default_flow_style=None, sort_keys=True, width=400)}, tuple(warnings)
     )
 
 
 def _opencv_camera(values: Mapping[str, Any], text: str, file: Path) -> ForeignCamera:
-    name = check_name(str(values.get("camera_name", file.stem)), file, _line(text, "camera_name"))
+    if "camera_name" in values:
+        name = check_name(str(values["camera_name"]), file=file, line=_line(text, "camera_name"))
+    else:
+        name = name_from_file(file.stem, file)
     key = next((key for key in _MATRIX if key in values), None)
     if key is None:
         raise InputError("no camera_matrix in it", file=file, line=1, remedy="give a calibration of cv2.FileStorage")
-    matrix = numbers(_rows(values[key]), (9,), key, file, _line(text, key)).reshape(3, 3)
+    matrix = parse_array(_rows(values[key]), (9,), key, file, _line(text, key)).reshape(3, 3)
     if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.allclose(matrix[2], [0, 0, 1])):
         raise InputError(f"{key} is no camera matrix", file=file, line=_line(text, key), remedy="correct it")
     size = [values.get(f"image_{side}", values.get(f"image_{side.title()}")) for side in ("width", "height")]
@@ -207,17 +222,17 @@ def _opencv_camera(values: Mapping[str, Any], text: str, file: Path) -> ForeignC
     flat = [] if place is None else _rows(values[place])
     if not isinstance(flat, list):
         raise InputError(f"{place} is not numbers", file=file, line=_line(text, str(place)), remedy="give 4 or 5")
-    bent = numbers(flat, (len(flat),), str(place), file, _line(text, str(place)))
+    bent = parse_array(flat, (len(flat),), str(place), file, _line(text, str(place)))
     lens = _with_distortion(size, matrix, bent, fisheye, file, _line(text, str(place)))
     pose = None
     if "R" in values and "T" in values and model != "rectified":
-        turn = numbers(_rows(values["R"]), (9,), "R", file, _line(text, "R")).reshape(3, 3)
-        shift = numbers(_rows(values["T"]), (3,), "T", file, _line(text, "T"))
+        turn = parse_array(_rows(values["R"]), (9,), "R", file, _line(text, "R")).reshape(3, 3)
+        shift = parse_array(_rows(values["T"]), (3,), "T", file, _line(text, "T"))
         pose = _pose(turn, shift, "R", file, _line(text, "R"))
     time_map = None
     if "time_offset" in values:
         pair = [values.get("clock_rate", 1.0), values["time_offset"]]
-        rate, offset = numbers(pair, (2,), "clock_rate, time_offset", file, _line(text, "time_offset"))
+        rate, offset = parse_array(pair, (2,), "clock_rate, time_offset", file, _line(text, "time_offset"))
         time_map = TimeMap(float(rate), float(offset))
     return ForeignCamera(name, lens, pose, time_map)
 
@@ -239,6 +254,7 @@ def _with_distortion(
 
 def _opencv_text(camera: CameraCalibration, units: str) -> str:
     import cv2
+    import yaml
 
     lens, pose = camera.intrinsics, camera.pose
     storage = cv2.FileStorage(".yml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY | cv2.FileStorage_FORMAT_YAML)
@@ -253,7 +269,11 @@ def _opencv_text(camera: CameraCalibration, units: str) -> str:
     storage.write("units", units)
     storage.write("time_offset", camera.time_map.time_offset)
     storage.write("clock_rate", camera.time_map.clock_rate)
-    return str(storage.releaseAndGetString())
+    text = str(storage.releaseAndGetString())
+    # OpenCV writes every name without quotes; YAML would read some as a number, a truth value or not at all.
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_-]*", camera.name) or yaml.safe_load(camera.name) != camera.name:
+        text = re.sub(r"(?m)^camera_name: .*$", f'camera_name: "{camera.name}"', text, count=1)
+    return text
 
 
 def _kalibr_lens(table: Mapping[str, Any], key: str, text: str, file: Path) -> Intrinsics:
@@ -261,10 +281,10 @@ def _kalibr_lens(table: Mapping[str, Any], key: str, text: str, file: Path) -> I
     if table.get("camera_model", "pinhole") != "pinhole":
         what = f"{key} has camera_model {table['camera_model']!r}"
         raise InputError(what, file=file, line=_line(text, "camera_model", key), remedy="only pinhole is known here")
-    fx, fy, cx, cy = numbers(table["intrinsics"], (4,), f"{key} intrinsics", file, line)
+    fx, fy, cx, cy = parse_array(table["intrinsics"], (4,), f"{key} intrinsics", file, line)
     if not (fx > 0 and fy > 0):
         raise InputError(f"{key} has a focal length <= 0", file=file, line=line, remedy="correct it")
-    size = numbers(table.get("resolution"), (2,), f"{key} resolution", file, _line(text, "resolution", key))
+    size = parse_array(table.get("resolution"), (2,), f"{key} resolution", file, _line(text, "resolution", key))
     model = str(table.get("distortion_model", "none"))
     at = _line(text, "distortion_model", key)
     if model not in ("radtan", "equidistant", "none"):
@@ -274,7 +294,7 @@ def _kalibr_lens(table: Mapping[str, Any], key: str, text: str, file: Path) -> I
     bent = np.zeros(4)
     if model != "none":
         where = _line(text, "distortion_coeffs", key)
-        bent = numbers(table.get("distortion_coeffs"), (4,), f"{key} distortion_coeffs", file, where)
+        bent = parse_array(table.get("distortion_coeffs"), (4,), f"{key} distortion_coeffs", file, where)
     matrix = pinhole_matrix(float(fx), float(fy), float(cx), float(cy))
     return Intrinsics(int(size[0]), int(size[1]), matrix, bent if fisheye else np.r_[bent, 0.0], fisheye)
 
@@ -286,13 +306,13 @@ def _check_chain(
     for name, (turn, shift), (body_turn, body_shift) in zip(names, chain, bodies, strict=True):
         expected = turn @ bodies[0][0], turn @ bodies[0][1] + shift
         size = max(1.0, float(np.linalg.norm(expected[1])))
-        if max(np.abs(expected[0] - body_turn).max(), np.abs(expected[1] - body_shift).max() / size) > _CONTRADICTION:
+        if max(np.abs(expected[0] - body_turn).max(), np.abs(expected[1] - body_shift).max() / size) > _MAX_CHAIN_ERROR:
             remedy = "remove one of the two"
             raise InputError(f"T_cam_imu of {name} contradicts the chain of T_cn_cnm1", file=file, remedy=remedy)
 
 
 def _transform(value: Any, what: str, file: Path, line: int | None) -> tuple[Floats, Floats]:
-    matrix = numbers(value, (4, 4), what, file, line)
+    matrix = parse_array(value, (4, 4), what, file, line)
     pose = _pose(matrix[:3, :3], matrix[:3, 3], what, file, line)
     return pose.rotation, matrix[:3, 3].copy()
 
@@ -300,7 +320,7 @@ def _transform(value: Any, what: str, file: Path, line: int | None) -> tuple[Flo
 def _pose(turn: Floats, shift: Floats, what: str, file: Path, line: int | None) -> Pose:
     if not (np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) and np.linalg.det(turn) > 0):
         raise InputError(f"{what} is no rotation", file=file, line=line, remedy="give orthonormal rows, determinant 1")
-    # One that is a rotation to the last digits is kept to the last digit.
+    # A matrix that is orthonormal to rounding is kept bit for bit.
     exact = np.abs(turn @ turn.T - np.eye(3)).max() < 1e-12
     rotation = turn.copy() if exact else so3.nearest(turn)
     return Pose(rotation, -rotation.T @ shift)
@@ -312,8 +332,19 @@ def _homogeneous(rotation: Floats, translation: Floats) -> list[list[float]]:
     return [[float(value) for value in row] for row in matrix]
 
 
+def _ros_topic(name: str) -> str:
+    """The topic of a camera's images. ROS allows ASCII letters, digits and ``_`` in it: other bytes become ``_XX_``.
+
+    Such names have a namespace of their own, so that different cameras have different topics.
+    """
+    segment = key_segment(name)
+    if segment == name:
+        return f"/{name}/image_raw"
+    return "/encoded/" + re.sub("%(..)", r"_\1_", segment.replace("_", "%5F").replace("-", "%2D")) + "/image_raw"
+
+
 def _rows(value: Any) -> Any:
-    """The numbers of a matrix: OpenCV's and ROS' mapping with data, or nested lists, as one list."""
+    """The elements of a matrix (OpenCV's and ROS' mapping with data, or nested lists) as one list."""
     if isinstance(value, dict):
         value = value.get("data")
     if isinstance(value, list) and value and all(isinstance(row, list) for row in value):

@@ -14,7 +14,7 @@ from protocols.geometry.types import Floats
 
 _NEWTON_STEPS = 20
 _NEWTON_TOLERANCE = 1e-12
-_WIDEST = 100.0  # normalised coordinates: 89.4 degrees off the axis
+_MAX_NORMALISED = 100.0  # in normalised coordinates: 89.4 degrees off the axis
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +32,9 @@ class Intrinsics:
     distortions: Floats = field(default_factory=lambda: np.zeros(5))
     fisheye: bool = False
     fold: float = field(init=False, default=float("inf"))
-    """Where the radial model turns back: normalised radius, for fisheye the angle [rad]. Beyond is no image."""
+    """Radius up to which the radial distortion is monotonic: normalised radius, for fisheye the angle [rad].
+
+    Points beyond it are not projected."""
 
     def __post_init__(self) -> None:
         if not self.fisheye and len(self.distortions) == 4:  # OpenCV's short form: k3 = 0
@@ -43,7 +45,7 @@ class Intrinsics:
 
     @property
     def focal(self) -> float:
-        """Mean focal length [px]: the size of a small angle in pixels."""
+        """Mean focal length [px]: pixels per radian on the optical axis."""
         return float(0.5 * (self.matrix[0, 0] + self.matrix[1, 1]))
 
     def project(self, points: Floats) -> Floats:
@@ -72,8 +74,8 @@ class Intrinsics:
         y = (pixels[:, 1] - a[1, 2]) / a[1, 1]
         x = (pixels[:, 0] - a[0, 2] - a[0, 1] * y) / a[0, 0]
         distorted = np.column_stack([x, y])
-        # Nothing that far aside is an image; left in, it would only overflow.
-        distorted[~(np.abs(distorted).max(axis=1) < _WIDEST)] = np.nan
+        # Points that far off the axis are outside every image and would only overflow.
+        distorted[~(np.abs(distorted).max(axis=1) < _MAX_NORMALISED)] = np.nan
         if self.fisheye:
             return self._undistort_fisheye(distorted)
         return self._undistort(distorted)
@@ -115,7 +117,7 @@ class Intrinsics:
         return np.asarray(distorted @ self.matrix[:2, :2].T + self.matrix[:2, 2])
 
     def _undistort(self, distorted: Floats) -> Floats:
-        """Newton's method on ``distort``; converges in a handful of steps inside the image."""
+        """Newton's method on ``distort``; converges in a few steps inside the image."""
         estimate = distorted.copy()
         if not np.any(self.distortions):
             return estimate
@@ -131,7 +133,7 @@ class Intrinsics:
             if not np.nanmax(np.abs(step), initial=0.0) > _NEWTON_TOLERANCE:
                 break
         value, _ = self.distort(estimate)
-        # A root behind the fold of the polynomial is no inverse, even where it is well behaved again.
+        # A root beyond the monotonic range of the polynomial is not the inverse.
         with np.errstate(invalid="ignore"):
             good = (np.abs(value - distorted).max(axis=1) < 1e-9) & (np.hypot(*estimate.T) < self.fold)
         return np.where(good[:, None], estimate, np.nan)
@@ -164,9 +166,9 @@ class Intrinsics:
 
 
 def _first_fold(slope: Floats) -> float:
-    """Radius up to which a radial distortion grows: the first zero of its slope.
+    """Radius up to which a radial distortion is monotonic: the first positive zero of its derivative.
 
-    slope: coefficients of 1, r², r⁴, … of the slope. inf where it always grows.
+    slope: coefficients of 1, r², r⁴, … of the derivative. inf where it is always monotonic.
     """
     slope = np.where(np.abs(slope) > 1e-12, slope, 0.0)
     roots = np.roots(np.trim_zeros(slope[::-1], "f"))

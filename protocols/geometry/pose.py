@@ -1,4 +1,4 @@
-"""Where a camera stands: ``X_camera = rotation @ (X_world - position)``."""
+"""Camera poses and similarity transforms: ``X_camera = rotation @ (X_world - position)``."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ class Pose:
 
     @classmethod
     def from_rodrigues(cls, rotation: Floats, translation: Floats) -> Pose:
-        """From OpenCV's and aniposelib's pair: Rodrigues vector and translation, camera from world."""
+        """From a Rodrigues vector and a translation, camera from world, as OpenCV and aniposelib have them."""
         matrix = so3.exp(np.asarray(rotation, dtype=np.float64))
         return cls(matrix, -matrix.T @ np.asarray(translation, dtype=np.float64))
 
     @classmethod
     def identity(cls) -> Pose:
-        """The camera is the world."""
+        """The pose of a camera whose axes are the world's axes."""
         return cls(np.eye(3), np.zeros(3))
 
     @property
@@ -59,11 +59,11 @@ class Similarity:
     shift: Floats
 
     def points(self, points: Floats) -> Floats:
-        """Maps points (n, 3)."""
+        """Transform points (n, 3)."""
         return np.asarray(self.scale * points @ self.rotation.T + self.shift)
 
     def pose(self, pose: Pose) -> Pose:
-        """Maps a camera's pose."""
+        """Transform a camera's pose."""
         return Pose(pose.rotation @ self.rotation.T, self.points(pose.position[None])[0])
 
 

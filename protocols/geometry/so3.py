@@ -39,7 +39,7 @@ def exp(w: Floats) -> Floats:
 def log(rotation: Floats) -> Floats:
     """Rotation vector (3,) [rad], |w| <= pi, of one rotation matrix (3, 3).
 
-    Goes by the quaternion, so it is exact near 0 and near pi alike.
+    Computed through the quaternion, so that it is accurate both near 0 and near pi.
     """
     m = np.asarray(rotation, dtype=np.float64)
     # The largest of the four squared quaternion components keeps the division well conditioned.
@@ -77,12 +77,12 @@ def nearest(matrix: Floats) -> Floats:
 
 
 def angle_between(a: Floats, b: Floats) -> float:
-    """Angle [rad] of the rotation that takes ``a`` to ``b``, both (3, 3)."""
+    """Geodesic distance [rad] between two rotations ``a`` and ``b``, both (3, 3)."""
     return float(np.linalg.norm(log(a @ b.T)))
 
 
-def taking(a: Floats, b: Floats) -> Floats:
-    """The smallest rotation (3, 3) that takes direction ``a`` (3,) to direction ``b`` (3,)."""
+def rotation_between(a: Floats, b: Floats) -> Floats:
+    """The rotation (3, 3) of smallest angle that maps direction ``a`` (3,) to direction ``b`` (3,)."""
     a = a / np.linalg.norm(a)
     b = b / np.linalg.norm(b)
     axis = np.cross(a, b)

@@ -8,6 +8,6 @@ import numpy as np
 import numpy.typing as npt
 
 Floats: TypeAlias = npt.NDArray[np.float64]
-"""float64 array; shapes stand in the docstrings."""
+"""float64 array; shapes are given in the docstrings."""
 Ints: TypeAlias = npt.NDArray[np.int64]
 Bools: TypeAlias = npt.NDArray[np.bool_]

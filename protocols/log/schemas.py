@@ -1,4 +1,4 @@
-"""Which schema a channel of ours has, told from its name alone."""
+"""The protobuf schema of each log channel, by the channel's name."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from google.protobuf.message import Message
 
 from protocols.validation.codec import message_class, parse_key
 
-VIEW_PREFIX = "foxglove/"
-"""Channels below it repeat what ours say in schemas that viewers know; readers of ours pass over them."""
-VIEW_KINDS = {
+FOXGLOVE_PREFIX = "foxglove/"
+"""Prefix of channels that repeat messages in Foxglove's schemas for viewers; this project's readers skip them."""
+FOXGLOVE_SCHEMAS = {
     "calibration": "CameraCalibration",
     "transforms": "FrameTransforms",
     "scene": "SceneUpdate",
@@ -25,28 +25,28 @@ VIEW_KINDS = {
 
 
 class ChannelSchema(NamedTuple):
-    """A protobuf schema as MCAP wants it: full name, and a serialised FileDescriptorSet."""
+    """A protobuf schema in MCAP's form: full name, and a serialised FileDescriptorSet."""
 
     name: str
     data: bytes
 
 
-def is_view(key: str) -> bool:
-    """Whether a channel only repeats others for viewers."""
-    return key.startswith(VIEW_PREFIX)
+def is_foxglove(key: str) -> bool:
+    """Whether a channel only repeats other channels for viewers."""
+    return key.startswith(FOXGLOVE_PREFIX)
 
 
 def schema_of(key: str) -> ChannelSchema | None:
-    """The schema of a channel of ours; None for other channels."""
-    if is_view(key):
-        kind = VIEW_KINDS.get(key.rpartition("/")[2])
-        return None if kind is None else _schema(view_class(kind).DESCRIPTOR)
+    """The schema of a known channel; None for foreign channels."""
+    if is_foxglove(key):
+        kind = FOXGLOVE_SCHEMAS.get(key.rpartition("/")[2])
+        return None if kind is None else _schema(foxglove_class(kind).DESCRIPTOR)
     address = parse_key(key)
     return None if address is None else _schema(message_class(address.topic).DESCRIPTOR)
 
 
 @cache
-def view_class(kind: str) -> type[Message]:
+def foxglove_class(kind: str) -> type[Message]:
     """The class of one of Foxglove's schemas, imported when first asked for."""
     from importlib import import_module
 
@@ -62,7 +62,7 @@ def _schema(descriptor: Descriptor) -> ChannelSchema:
 
 
 def _add(file: FileDescriptor, files: FileDescriptorSet, seen: set[str]) -> None:
-    """Every file after those that it needs, as readers add them one by one."""
+    """Add a file after its dependencies, as readers add them in order."""
     if file.name in seen:
         return
     seen.add(file.name)

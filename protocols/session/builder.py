@@ -1,4 +1,4 @@
-"""A session from messages: what the hub gathers live and what `calibrate` reads from a log are one thing."""
+"""Builds a session (rig and observations) from messages, for the live hub and for `calibrate` on a log alike."""
 
 from __future__ import annotations
 
@@ -18,63 +18,68 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks
 from protocols.session.rig import Rig, RigCamera
 
-_REMEMBERED = 16_384
-"""Sequences of one run that a live hub remembers to know duplicates by: nine minutes at 30 Hz; 2 KiB a camera."""
-SETTLED_ROWS = 90
-"""Detections from which on a restarted camera's new clock is worth solving."""
+_DUPLICATE_WINDOW = 16_384
+"""Sequence numbers of one run that a live hub remembers to detect duplicates: nine minutes at 30 Hz; 2 KiB a camera."""
+MIN_ROWS_AFTER_RESTART = 90
+"""Detections from which on the new clock of a restarted camera is used."""
 
 
 @dataclass(slots=True, eq=False)
-class _Boot:
-    """One run of one camera's agent: one clock. rows: (device time ns, frame, u, v, size, label)."""
+class _BootBuffer:
+    """The observations of one boot of one camera's agent, which has one clock.
+
+    rows: (device time ns, frame, u, v, size, label).
+    """
 
     rows: deque[tuple[int, int, float, float, float, str]] = field(default_factory=deque)
     last_ns: int = -(2**63)
-    """Clocks may count from anywhere, also below zero."""
+    """Clocks may count from any origin, so times may be negative."""
     frames: int = 0
     seen: set[int] = field(default_factory=set)
     highest: int = -1
     ring: bytearray | None = None
-    """Bit ``sequence % _REMEMBERED``: heard, of the last so many sequences up to the highest."""
+    """Bit ``sequence % _REMEMBERED``: received, for the last so many sequence numbers up to the highest."""
 
-    def knows(self, sequence: int) -> bool:
-        """Whether it was heard before; from now on it was. Remembers all."""
+    def is_duplicate(self, sequence: int) -> bool:
+        """Whether the sequence number was received before; marks it as received. Remembers all of them."""
         if sequence in self.seen:
             return True
         self.seen.add(sequence)
         return False
 
-    def knows_lately(self, sequence: int) -> bool:
-        """The same in constant memory, for a hub that runs for months: what is very old is taken for known."""
+    def is_recent_duplicate(self, sequence: int) -> bool:
+        """The same in constant memory, for a hub that runs for months: a very old number counts as a duplicate."""
         if self.ring is None:
-            self.ring = bytearray(_REMEMBERED // 8)  # all of it at once: what grows for an hour looks like a leak
+            self.ring = bytearray(
+                _DUPLICATE_WINDOW // 8
+            )  # allocated at once: memory that grows for an hour looks like a leak
         ahead = sequence - self.highest
-        if -ahead >= _REMEMBERED:
+        if -ahead >= _DUPLICATE_WINDOW:
             return True
-        if ahead >= _REMEMBERED:
-            self.ring[:] = bytes(_REMEMBERED // 8)
+        if ahead >= _DUPLICATE_WINDOW:
+            self.ring[:] = bytes(_DUPLICATE_WINDOW // 8)
         else:
             for between in range(self.highest + 1, sequence):
-                self.ring[between % _REMEMBERED >> 3] &= ~(1 << (between & 7))
+                self.ring[between % _DUPLICATE_WINDOW >> 3] &= ~(1 << (between & 7))
         self.highest = max(self.highest, sequence)
-        byte, bit = sequence % _REMEMBERED >> 3, 1 << (sequence & 7)
+        byte, bit = sequence % _DUPLICATE_WINDOW >> 3, 1 << (sequence & 7)
         known = ahead <= 0 and bool(self.ring[byte] & bit)
         self.ring[byte] |= bit
         return known
 
 
 class SessionBuilder:
-    """Gathers CameraInfo, RigInfo and Observation messages, in any order, duplicates and all.
+    """Collects CameraInfo, RigInfo and Observation messages, in any order and with duplicates.
 
-    A camera that was restarted has a new clock: each boot is kept apart, and the one that saw most is used.
-    window_s: keep only what each boot saw in its last so many seconds; None = everything.
+    A restarted camera has a new clock: each boot is stored separately, and the one with the most detections is used.
+    window_s: keep only the detections of each boot's last so many seconds; None = all.
     """
 
     def __init__(self, window_s: float | None = None) -> None:
         self._window_ns = None if window_s is None else round(window_s * NANOSECONDS)
         self._cameras: dict[str, pb.CameraInfo] = {}
         self._rig: pb.RigInfo | None = None
-        self._boots: dict[str, dict[str, _Boot]] = {}
+        self._boots: dict[str, dict[str, _BootBuffer]] = {}
         self._settled: dict[str, int] = {}
         self.counters: Counter[str] = Counter()
 
@@ -97,42 +102,42 @@ class SessionBuilder:
 
     @property
     def cameras(self) -> list[str]:
-        """Cameras that were heard of, by name."""
+        """Cameras of which a message was received, sorted by name."""
         return sorted({*self._cameras, *self._boots})
 
     def boot(self, camera: str) -> str:
-        """The boot whose clock the session speaks of.
+        """The boot id whose clock and detections the session uses.
 
-        While a window moves on, the newest that has seen enough: an older one would else stay for as long as it saw.
+        With a moving window, the newest boot with enough detections: otherwise an older one would be used too long.
         """
         boots = self._boots.get(camera, {})
         if self._window_ns is not None:
             for boot in reversed(boots):
-                if len(boots[boot].rows) >= self._settled.get(boot, SETTLED_ROWS):
+                if len(boots[boot].rows) >= self._settled.get(boot, MIN_ROWS_AFTER_RESTART):
                     return boot
         return max(sorted(boots), key=lambda boot: len(boots[boot].rows), default="")
 
-    def settle_after(self, boot: str, rows: int) -> None:
-        """A boot is used only from so many detections on, because until then the one before it serves better."""
+    def require_rows(self, boot: str, rows: int) -> None:
+        """Use a boot only once it has so many detections; until then the boot before it is used."""
         self._settled[boot] = rows
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What was left out of the session."""
-        told = []
+        """What was omitted from the session."""
+        warnings = []
         for camera in sorted(self._boots):
             kept = self.boot(camera)
             lost = sum(len(boot.rows) for name, boot in self._boots[camera].items() if name != kept)
             if lost:
-                told.append(
+                warnings.append(
                     f"{camera} was restarted, which begins a new clock: {lost} detections of other boots left out"
                 )
-        return tuple(told)
+        return tuple(warnings)
 
     def build(self) -> tuple[Rig, Observations]:
-        """The session as it stands. Raises Refused where there is no camera or nothing was seen."""
+        """The session so far. Raises Refused where there is no camera or no detection."""
         if not self._cameras:
-            raise Refused("no camera has introduced itself yet" if not self._boots else "no camera told its intrinsics")
+            raise Refused("no camera has introduced itself yet" if not self._boots else "no camera published its info")
         names: list[str] = []
         labels: list[str] = []
         values: list[tuple[int, int, float, float, float]] = []
@@ -159,14 +164,14 @@ class SessionBuilder:
         boots = self._boots.setdefault(message.camera, {})
         boot = boots.get(message.boot_id)
         if boot is None:
-            boot = boots[message.boot_id] = _Boot()
-        known = boot.knows if self._window_ns is None else boot.knows_lately
+            boot = boots[message.boot_id] = _BootBuffer()
+        known = boot.is_duplicate if self._window_ns is None else boot.is_recent_duplicate
         if known(message.sequence):
             self.counters["duplicates"] += 1
             return
         boot.frames += 1
         labels: set[str] = set()
-        # One row a label and frame: of several detections the surest is the point, the rest are doubtful.
+        # One row per label and frame: of several detections the one of the highest score is used.
         for detection in sorted(message.detections, key=lambda found: -found.score):
             label = detection.label or DEFAULT_LABEL
             if label in labels:
@@ -181,7 +186,7 @@ class SessionBuilder:
 
     def _build_rig(self, order: list[str]) -> Rig:
         info = self._rig
-        cameras = {name: rig_camera(self._cameras[name]) for name in order}
+        cameras = {name: rig_camera_from_info(self._cameras[name]) for name in order}
         if info is None:
             return Rig(cameras)
         inside = [d for d in info.distances if d.camera_a in cameras and d.camera_b in cameras]
@@ -203,8 +208,8 @@ class SessionBuilder:
         )
 
 
-def rig_camera(info: pb.CameraInfo) -> RigCamera:
-    """The rig's table of a camera as the camera itself tells it."""
+def rig_camera_from_info(info: pb.CameraInfo) -> RigCamera:
+    """The rig's entry of a camera, from the CameraInfo that the camera published."""
     lens = None
     if len(info.matrix) == 9:
         matrix = np.array(info.matrix).reshape(3, 3)

@@ -1,4 +1,4 @@
-"""A calibration: what `calibrate` and the hub answer, and calibration.toml, trajectory.csv."""
+"""A calibration result, and its files calibration.toml and trajectory.csv."""
 
 from __future__ import annotations
 
@@ -12,24 +12,25 @@ import tomli_w
 from protocols.core.clocks import TimeMap
 from protocols.core.errors import InputError
 from protocols.core.files import write_atomically
+from protocols.core.pair_report import PairReport
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.rig import Rig, read_rig, read_toml
 
-_ANSWERED = ("distances", "wand", "refused", "scale", "solver", "version", "reference")
-"""Metadata of rig.toml that the answer replaces."""
+_REPLACED_METADATA = ("distances", "wand", "refused", "scale", "solver", "version", "reference")
+"""Metadata keys of rig.toml that the result replaces."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCalibration:
-    """One solved camera.
+    """One calibrated camera.
 
     time_map: reference clock from camera clock. time_offset_std: std [s] of that map in the middle of the
     camera's observed span. position_std: (3,) [rig units]. rms_px: root mean square reprojection error.
-    focal_std: relative std of a focal length that the path told; 0 = the lens was given. readout: seconds from the
-    image's first row to its last; 0 = not known. readout_std: its std where the path told it, else 0.
+    focal_std: relative std of a focal length estimated by self-calibration; 0 = the lens was given. readout: seconds
+    from the image's first row to its last; 0 = not known. readout_std: its std where it was estimated, else 0.
     """
 
     name: str
@@ -45,8 +46,8 @@ class CameraCalibration:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Known:
-    """A calibration whose intrinsics and poses are kept. scale: "metric" or "arbitrary", as it says."""
+class FixedCalibration:
+    """A calibration whose intrinsics and poses are held fixed. scale: "metric" or "arbitrary", as its file says."""
 
     cameras: dict[str, CameraCalibration]
     scale: str
@@ -54,32 +55,15 @@ class Known:
 
 @dataclass(frozen=True, slots=True)
 class AdjustmentStep:
-    """One step that the adjustment took, or the start of a round.
+    """One iteration of the bundle adjustment, or the start of a round.
 
-    stage: "first poses" (cameras are added), "robust", "fitting rows" or "free lenses". residual_px: the misfit by
-    which it went, of one pixel coordinate, in pixels: the root of the mean weighted square, times the noise by which it
-    was weighted.
+    stage: "first poses" (cameras are added), "robust", "fitting rows" or "free lenses". residual_px: the cost
+    per pixel coordinate, in pixels: the root mean square of the weighted residuals, times the noise std by which they
+    were weighted.
     """
 
     stage: str
     residual_px: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PairReport:
-    """One pair of cameras, as in result.json.
-
-    lag_s: t_a - t_b of one instant, at mid-overlap [s]. clock_rate: t_a's rate against t_b. fundamental:
-    (3, 3), undistorted pixels, norm 1, ``m_aᵀ F m_b = 0``, None where unknown. inliers: share, 0..1.
-    """
-
-    cameras: tuple[str, str]
-    status: str
-    lag_s: float | None = None
-    clock_rate: float | None = None
-    fundamental: Floats | None = None
-    inliers: float | None = None
-    rms_px: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,12 +78,12 @@ class TrajectoryTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """Everything that `calibrate` writes.
+    """The complete calibration result that `calibrate` writes.
 
     reference: camera whose clock is the reference. scale: "metric" or "arbitrary" (then the first camera is
     the world and the first baseline is 1). refused: reasons by camera. cpu_seconds: of the solver.
-    residuals: per camera (n, 5): camera time, u, v, and the residual du, dv [px] of the rows that count.
-    convergence: the steps of the last adjustment, in order.
+    residuals: per camera (n, 5): camera time, u, v, and the residual du, dv [px] of the rows used (inliers).
+    convergence: the iterations of the last adjustment, in order.
     """
 
     cameras: dict[str, CameraCalibration]
@@ -118,10 +102,10 @@ class Calibration:
 
 
 def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
-    """The content of calibration.toml: rig.toml's tables with the answers added."""
+    """The content of calibration.toml: rig.toml's tables with the estimates added."""
     tables: dict[str, Any] = {}
     # distances are in the scale now, and aniposelib's TOML reader breaks on lists of names and numbers.
-    kept = {key: value for key, value in rig.metadata.items() if key not in _ANSWERED}
+    kept = {key: value for key, value in rig.metadata.items() if key not in _REPLACED_METADATA}
     metadata = {
         **kept,
         "units": calibration.units,
@@ -133,7 +117,7 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
     for name, camera in calibration.cameras.items():
         lens = camera.intrinsics
         table = dict(rig.cameras[name].table) if name in rig.cameras else {}
-        # A surveyed position stays an input: the answer is the translation, and two that differ by the
+        # A surveyed position is an input: the estimate is the translation, and two values that differ by the
         # survey's error would contradict each other.
         for key in ("position", "position_std", "rotation_std", "focal_std", "ball_outline"):
             table.pop(key, None)
@@ -166,7 +150,7 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
 
 
 def calibration_text(calibration: Calibration, rig: Rig) -> str:
-    """calibration.toml; it loads in aniposelib as it is."""
+    """The text of calibration.toml, which aniposelib loads unchanged."""
     return tomli_w.dumps(_plain(calibration_tables(calibration, rig)))
 
 
@@ -197,7 +181,7 @@ def csv_cell(text: str) -> str:
 
 
 def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
-    """Read calibration.toml (also aniposelib's, without clocks): the rig in it and the solved cameras.
+    """Read calibration.toml (also aniposelib's, without clock maps): its rig and its calibrated cameras.
 
     Raises InputError where intrinsics, rotation or translation are missing.
     """
@@ -235,7 +219,7 @@ def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
 
 
 def _plain(value: Any) -> Any:
-    """Only what TOML can hold: numbers of numpy become Python's; -0.0 becomes 0.0."""
+    """Convert to what TOML can hold: numpy numbers become Python's; -0.0 becomes 0.0."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items() if item is not None}
     if isinstance(value, list | tuple):

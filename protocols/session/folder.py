@@ -17,7 +17,7 @@ from protocols.session.rig import Rig, read_rig
 
 RIG_FILE = "rig.toml"
 OBSERVATIONS_FILE = "observations.csv"
-_OUTSIDE = 0.01  # share of rows outside the image above which something is wrong
+_MAX_OUTSIDE_SHARE = 0.01  # share of rows outside the image above which a warning is given
 
 
 def read_folder(folder: Path, observations: Path | None = None) -> tuple[Rig, Observations]:
@@ -34,21 +34,21 @@ def read_folder(folder: Path, observations: Path | None = None) -> tuple[Rig, Ob
         )
     rig = read_rig(folder / RIG_FILE)
     found = read_observations(observations or folder / OBSERVATIONS_FILE, rig.cameras)
-    return rig, replace(found, warnings=found.warnings + outside_image(rig, found))
+    return rig, replace(found, warnings=found.warnings + out_of_image_warnings(rig, found))
 
 
-def outside_image(rig: Rig, observations: Observations) -> tuple[str, ...]:
-    """Warnings of cameras with rows outside their image: a wrong size, or u and v swapped."""
-    told = []
+def out_of_image_warnings(rig: Rig, observations: Observations) -> tuple[str, ...]:
+    """Warnings for cameras with many rows outside their image: a wrong size, or u and v swapped."""
+    warnings = []
     for name, camera in rig.cameras.items():
         pixels = np.concatenate([np.zeros((0, 2)), *(track.pixels for track in observations.of_camera(name))])
         outside = int(((pixels < -1.0) | (pixels > np.array(camera.size))).any(axis=1).sum())
-        if outside > _OUTSIDE * len(pixels):
+        if outside > _MAX_OUTSIDE_SHARE * len(pixels):
             width, height = camera.size
-            told.append(
+            warnings.append(
                 f"{name}: {outside} of {len(pixels)} rows lie outside its {width}x{height} image; check size, u, v"
             )
-    return tuple(told)
+    return tuple(warnings)
 
 
 def write_rig(file: Path, tables: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""The observations of a session: which pixel each camera saw each moving point at, and when by its own clock."""
+"""The observations of a session: pixel tracks of moving points with capture times on each camera's own clock."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from protocols.geometry.types import Floats, Ints
 
 REQUIRED = ("camera", "frame", "time", "u", "v")
 DEFAULT_LABEL = "marker"
-_FARTHEST_TIME = 1e11  # s: 3,000 years; beyond, a float tells no microseconds
-_FARTHEST_PIXEL = 1e6
-_LARGEST_FRAME = 2.0**53  # beyond, a number read as a float is no longer whole
-_REPEATS_ARE_NONSENSE = 0.1  # share of repeated frame numbers from which they are no numbering at all
+_MAX_ABS_TIME_S = 1e11  # s: 3,000 years; beyond it a float does not resolve microseconds
+_MAX_ABS_PIXEL = 1e6
+_MAX_FRAME = 2.0**53  # beyond it a float no longer represents every whole number
+_MAX_REPEATED_SHARE = 0.1  # share of repeated frame numbers above which the column is not a frame numbering
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """One label as one camera saw it, sorted by time.
+    """The detections of one label in one camera, sorted by time.
 
-    frame: (n,) labels. time: (n,) [s] on the camera's clock, strictly increasing.
+    frame: (n,) frame numbers. time: (n,) [s] on the camera's clock, strictly increasing.
     pixels: (n, 2) distorted pixels. size: (n,) [px], NaN where not measured.
     """
 
@@ -106,12 +106,12 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
         raise InputError("no rows", file=file, line=1, remedy="record some observations first")
     _check_width(rows, lines, max(columns[name] for name in columns if name in (*REQUIRED, "size", "label")), file)
     numbers = {name: _column(rows, lines, columns[name], name, file) for name in ("time", "u", "v")}
-    far = np.flatnonzero(np.abs(numbers["time"]) > _FARTHEST_TIME)
+    far = np.flatnonzero(np.abs(numbers["time"]) > _MAX_ABS_TIME_S)
     if len(far):
         what = f"time {numbers['time'][far[0]]:g} is no time in seconds"
         raise InputError(what, file=file, line=lines[far[0]], remedy="give seconds; Unix time is about 1.8e9")
     for name in ("u", "v"):
-        far = np.flatnonzero(np.abs(numbers[name]) > _FARTHEST_PIXEL)
+        far = np.flatnonzero(np.abs(numbers[name]) > _MAX_ABS_PIXEL)
         if len(far):
             what = f"{name} {numbers[name][far[0]]:g} is no pixel"
             raise InputError(what, file=file, line=lines[far[0]], remedy="correct or remove the row")
@@ -197,20 +197,20 @@ def _check_repeats(
             f"two rows of {where} at time {time[i]:.6f} (frames {frame[i]}, {frame[i + 1]})",
             file=file,
             line=None if line is None else int(line[i : i + 2].max()),
-            remedy="keep one a frame, or tell points apart by label",
+            remedy="keep one a frame, or give the points different labels",
         )
     unique, counts = np.unique(frame, return_counts=True)
     repeated = int((counts - 1).sum())
     if not repeated:
         return
-    if repeated <= max(1.0, _REPEATS_ARE_NONSENSE * len(frame)):
+    if repeated <= max(1.0, _MAX_REPEATED_SHARE * len(frame)):
         twice = unique[counts > 1][0]
         at = np.flatnonzero(frame == twice)
         raise InputError(
             f"two rows of {where} in frame {twice}",
             file=file,
             line=None if line is None else int(line[at].max()),
-            remedy="keep one a frame, or tell points apart by label",
+            remedy="keep one a frame, or give the points different labels",
         )
     warnings.append(f"{where}: frame numbers repeat ({repeated} of {len(frame)}); only its times are used")
 
@@ -252,7 +252,7 @@ def _column(
 
 def _frames(rows: list[list[str]], lines: list[int], index: int, file: Path) -> Ints:
     values = _column(rows, lines, index, "frame", file)
-    bad = np.flatnonzero((values != np.round(values)) | (np.abs(values) > _LARGEST_FRAME))
+    bad = np.flatnonzero((values != np.round(values)) | (np.abs(values) > _MAX_FRAME))
     if len(bad):
         raise InputError(
             f"frame {rows[bad[0]][index].strip()} is not a whole number",

@@ -1,4 +1,4 @@
-"""result.json: the whole answer of `calibrate`, or of its refusal, for scripts."""
+"""result.json: the whole result of `calibrate`, or its refusal, for scripts."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from protocols.core.files import write_atomically
+from protocols.core.pair_report import PairReport
 from protocols.core.version import VERSION
-from protocols.session.calibration import Calibration, PairReport, TrajectoryTable, calibration_tables
+from protocols.session.calibration import Calibration, TrajectoryTable, calibration_tables
 from protocols.session.rig import Rig
 
 TRAJECTORY_FILE = "trajectory.csv"
@@ -22,8 +23,8 @@ def result_document(calibration: Calibration, rig: Rig, *, command: str = "") ->
     """The content of result.json of a solved session; keys always come in the same order.
 
     Lengths are in the rig's units, times in seconds. ``cameras`` holds calibration.toml's tables plus
-    position (camera centre in the world), clock_rate_ppm and rows_used; ``trajectory`` sums up
-    trajectory.csv. What has no value, or no finite one, is None.
+    position (camera centre in the world), clock_rate_ppm and rows_used; ``trajectory`` summarises
+    trajectory.csv. A missing or non-finite value is None.
     """
     tables = calibration_tables(calibration, rig)
     metadata = tables.pop("metadata")
@@ -61,7 +62,7 @@ def refusal_document(
     pairs: Iterable[PairReport] = (),
     warnings: Iterable[str] = (),
 ) -> dict[str, Any]:
-    """The content of result.json where nothing could be solved: the same keys, and why.
+    """The content of result.json of a refused session: the same keys, and the reason.
 
     refused: reasons by camera.
     """
@@ -126,7 +127,7 @@ def _summary(table: TrajectoryTable) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Only what JSON can hold: arrays become lists, numbers of numpy Python's, not finite ones None."""
+    """Convert to what JSON can hold: arrays become lists, numpy numbers Python's, non-finite numbers None."""
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):

@@ -1,4 +1,4 @@
-"""The rig: which cameras there are, what is known of them, and what fixes gauge and scale (rig.toml)."""
+"""The rig (rig.toml): cameras, their prior intrinsics and poses, and the data that fix gauge and scale."""
 
 from __future__ import annotations
 
@@ -11,33 +11,34 @@ from typing import Any
 import numpy as np
 
 from protocols.core.errors import InputError
+from protocols.core.names import check_name
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 CLOCKS = ("independent", "shared")
-MEASURED = 0.02
-"""A focal length of no larger relative std counts as measured."""
-LONGEST_READOUT = 0.06
-"""Seconds: no rolling shutter takes longer from an image's first row to its last."""
-_LARGEST = 1e12  # no length, angle or pixel of a rig comes near
-_AGREE = 1e-3  # relative: position and translation may differ by rounding, not by more
+MEASURED_FOCAL_STD = 0.02
+"""A focal length of at most this relative std counts as measured."""
+MAX_READOUT_S = 0.06
+"""Upper bound [s] of a rolling shutter's readout, from an image's first row to its last."""
+_LARGEST = 1e12  # no length, angle or pixel of a rig comes near it
+_POSITION_TOLERANCE = 1e-3  # relative: position and translation may differ by rounding, not by more
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigCamera:
-    """One camera of the rig and what is known of it beforehand.
+    """One camera of the rig and its prior data.
 
-    size: (width, height) [px]. fps: nominal, 0 = not told. intrinsics: None = uncalibrated.
+    size: (width, height) [px]. fps: nominal, 0 = not given. intrinsics: None = uncalibrated.
     position: centre in the world [rig units]. rotation: (3, 3) camera from world.
     position_std: (3,) [rig units]. rotation_std: (3,) [rad]. body_from_camera: (3, 3).
-    focal_std: relative std of the focal length where the lens is a guess (a data sheet's); 0 = it was measured.
+    focal_std: relative std of the focal length where the lens is nominal (a data sheet's); 0 = it was measured.
     up: (3,) unit vector, away from the ground in the camera's own axes, as its accelerometer shows at rest.
-    ball_outline: whether its rows are centres of balls' outlines of diameter ``size``, seen before the lens was known:
-    the projection of a ball's centre is elsewhere (``protocols/geometry/sphere_projection.py``).
-    readout: seconds from the first row of an image to its last (rolling shutter); None = not told.
-    table: the camera's table as it stands in the file, with keys this version does not know.
+    ball_outline: whether its rows are centroids of spheres' contours of diameter ``size``, detected without a known
+    lens and so not yet corrected to the projection of the centre (``protocols/geometry/sphere_projection.py``).
+    readout: seconds from the first row of an image to its last (rolling shutter); None = not given.
+    table: the camera's table as it is in the file, including keys that this version does not know.
     """
 
     name: str
@@ -60,9 +61,9 @@ class RigCamera:
 class Rig:
     """All cameras in the file's order, and the metadata that fixes gauge and scale.
 
-    units: of every length. clock: "independent" or "shared". distances: (camera, camera, length). wands: (label, label,
-    length), two points that keep their distance. up: a world vector (3,), or the name of a camera that knows it
-    (``up_seen_by``), or None.
+    units: of every length. clock: "independent" or "shared". distances: (camera, camera, length). scale_bars: (label,
+    label, length), two points at a fixed distance. up: a world vector (3,), or the name of a camera that knows it
+    (``up_in_camera``), or None.
     """
 
     cameras: dict[str, RigCamera]
@@ -72,17 +73,17 @@ class Rig:
     up: Floats | str | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
     file: Path | None = None
-    wands: tuple[tuple[str, str, float], ...] = ()
+    scale_bars: tuple[tuple[str, str, float], ...] = ()
 
     @property
     def shared_clock(self) -> bool:
-        """Whether rows of the same time correspond."""
+        """Whether all cameras share one clock, so that rows of the same time correspond."""
         return self.clock == "shared"
 
-    def up_seen_by(self, camera: str) -> Floats:
-        """Up (3,) in a camera's axes: what its table tells, else it is levelled."""
-        told = self.cameras[camera].up
-        return np.array([0.0, -1.0, 0.0]) if told is None else told
+    def up_in_camera(self, camera: str) -> Floats:
+        """Up (3,) in a camera's axes: as its table gives it, otherwise the camera is taken as levelled."""
+        up = self.cameras[camera].up
+        return np.array([0.0, -1.0, 0.0]) if up is None else up
 
 
 class _Table:
@@ -92,7 +93,7 @@ class _Table:
         self.values, self.where, self.file, self.text = values, where, file, text
 
     def line(self, key: str | None = None) -> int | None:
-        """The line of the table's header, or of ``key`` in it, as far as a plain scan can tell."""
+        """The line of the table's header, or of ``key`` in it, as far as a plain text scan finds it."""
         found: int | None = None
         header = re.compile(r"\s*\[\s*[\"']?" + re.escape(self.where) + r"[\"']?\s*\]")
         inside, depth = False, 0
@@ -150,7 +151,9 @@ def read_toml(file: Path, what: str = "file") -> tuple[dict[str, Any], str]:
     try:
         return tomllib.loads(text), text
     except (RecursionError, OverflowError):
-        raise InputError("nested or numbered beyond all measure", file=file, remedy="write a plain TOML file") from None
+        raise InputError(
+            "nested too deeply or a number too large", file=file, remedy="write a plain TOML file"
+        ) from None
     except ValueError as error:
         message = str(error)
         place = re.search(r"at line (\d+)", message)
@@ -165,11 +168,16 @@ def read_rig(file: Path) -> Rig:
     Raises InputError: file, line, what is wrong, what to do.
     """
     values, text = read_toml(file, "rig file")
+    return parse_rig(values, file, text)
+
+
+def parse_rig(values: dict[str, Any], file: Path, text: str) -> Rig:
+    """The rig of parsed tables. file, text: where they come from, for errors. Raises InputError as ``read_rig``."""
+    cameras: dict[str, RigCamera] = {}
     metadata = values.pop("metadata", {})
     if not isinstance(metadata, dict):
         raise InputError("metadata is not a table", file=file, remedy="write [metadata] and its keys below it")
     meta = _Table(metadata, "metadata", file, text)
-    cameras: dict[str, RigCamera] = {}
     for name, table in values.items():
         if not isinstance(table, dict):
             raise InputError(
@@ -184,7 +192,7 @@ def read_rig(file: Path) -> Rig:
     if not cameras:
         raise InputError("no camera in it", file=file, remedy="add a table per camera: [cam0] name, size, matrix, …")
     units = metadata.get("units", "m")
-    if not isinstance(units, str) or units not in UNITS:
+    if not isinstance(units, str) or units not in METRES_PER_UNIT:
         raise meta.fail("units", f"units = {units!r}", 'use "m", "cm" or "mm"')
     clock = metadata.get("clock", "independent")
     if clock not in CLOCKS:
@@ -193,21 +201,21 @@ def read_rig(file: Path) -> Rig:
     if reference is not None and (not isinstance(reference, str) or reference not in cameras):
         raise meta.fail("reference", f"reference = {reference!r} is no camera", "use a camera of this file")
     distances, up = _read_distances(meta, cameras), _read_up(meta, cameras)
-    return Rig(cameras, units, clock, distances, up, dict(metadata), file, _read_wands(meta))
+    return Rig(cameras, units, clock, distances, up, dict(metadata), file, _read_scale_bars(meta))
 
 
-def _read_wands(meta: _Table) -> tuple[tuple[str, str, float], ...]:
+def _read_scale_bars(meta: _Table) -> tuple[tuple[str, str, float], ...]:
     remedy = 'give wand = [["tip", "grip", 0.5]]: two labels and the length between them'
     rows = meta.values.get("wand", [])
-    wands = []
+    scale_bars = []
     for row in rows if isinstance(rows, list) else [rows]:
         shape = isinstance(row, list) and len(row) == 3 and all(isinstance(name, str) for name in row[:2])
         if not (shape and isinstance(row[2], int | float) and not isinstance(row[2], bool)):
             raise meta.fail("wand", f"wand {row!r} is not [label, label, length]", remedy)
         if not 0 < row[2] <= _LARGEST or row[0] == row[1]:
             raise meta.fail("wand", f"wand {row!r} is not a length between two labels", remedy)
-        wands.append((row[0], row[1], float(row[2])))
-    return tuple(wands)
+        scale_bars.append((row[0], row[1], float(row[2])))
+    return tuple(scale_bars)
 
 
 def _read_distances(meta: _Table, cameras: dict[str, RigCamera]) -> tuple[tuple[str, str, float], ...]:
@@ -232,8 +240,8 @@ def _read_up(meta: _Table, cameras: dict[str, RigCamera]) -> Floats | str | None
     if up is None:
         knowing = [name for name, camera in cameras.items() if camera.up is not None]
         if len(knowing) > 1:
-            told = ", ".join(knowing)
-            raise meta.fail(None, f"several cameras tell up ({told})", f'say which one counts: up = "{knowing[0]}"')
+            names = ", ".join(knowing)
+            raise meta.fail(None, f"several cameras give up ({names})", f'say which one counts: up = "{knowing[0]}"')
         return knowing[0] if knowing else None
     if isinstance(up, str):
         if up not in cameras:
@@ -247,10 +255,11 @@ def _read_up(meta: _Table, cameras: dict[str, RigCamera]) -> Floats | str | None
 
 def _read_camera(table: _Table) -> RigCamera:
     name = table.values.get("name", table.where)
-    if not isinstance(name, str) or name != name.strip() or not name or '"' in name or name == "metadata":
-        raise table.fail("name", f"{name!r} is no name for a camera", "use letters, digits, - and _")
+    if not isinstance(name, str):
+        raise table.fail("name", f"name = {name!r} is not text", 'give name = "cam0"')
+    check_name(name, file=table.file, line=table.line("name" if "name" in table.values else None))
     # aniposelib's own files call their tables cam_0, cam_1, … and put the camera's name inside.
-    theirs = isinstance(name, str) and re.fullmatch(r"cam_\d+", table.where) is not None
+    theirs = re.fullmatch(r"cam_\d+", table.where) is not None
     if name != table.where and not theirs:
         raise table.fail("name", f"name = {name!r} differs from the table's key", "make them the same")
     size = table.numbers("size", 2, "[width, height]")
@@ -299,23 +308,19 @@ def _read_readout(table: _Table) -> float | None:
     value = table.values.get("readout")
     if value is None:
         return None
-    if (
-        not isinstance(value, int | float)
-        or isinstance(value, bool)
-        or not -LONGEST_READOUT <= value <= LONGEST_READOUT
-    ):
+    if not isinstance(value, int | float) or isinstance(value, bool) or not -MAX_READOUT_S <= value <= MAX_READOUT_S:
         remedy = "give the seconds from the image's first row to its last, as 0.02; below 0 if the last is read first"
         raise table.fail("readout", f"readout = {value!r}", remedy)
     return float(value)
 
 
 def _read_focal_std(table: _Table) -> float:
-    """The guess's std; a lens that is known to a percent counts as measured."""
+    """The relative std of a nominal focal length; 0 for one that counts as measured."""
     value = table.values.get("focal_std", 0.0)
     if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value <= 2.0:
         remedy = "give the focal length's relative std, as 0.1 for 10 %"
         raise table.fail("focal_std", f"focal_std = {value!r}", remedy)
-    return float(value) if value > MEASURED else 0.0
+    return float(value) if value > MEASURED_FOCAL_STD else 0.0
 
 
 def _read_body(table: _Table) -> Floats | None:
@@ -359,11 +364,11 @@ def _read_pose(table: _Table) -> tuple[Floats | None, Floats | None]:
     if rotation is None:
         if position is not None:
             return position, None
-        raise table.fail("translation", "translation without rotation says nothing", "give rotation too, or position")
+        raise table.fail("translation", "translation without rotation is no position", "give rotation too, or position")
     centre = -rotation.T @ translation
     if position is None:
         return np.asarray(centre), rotation
-    if np.linalg.norm(position - centre) > _AGREE * max(float(np.linalg.norm(position)), 1e-3):
+    if np.linalg.norm(position - centre) > _POSITION_TOLERANCE * max(float(np.linalg.norm(position)), 1e-3):
         raise table.fail(
             "position",
             f"position {position.round(4).tolist()} contradicts translation, which puts the camera at "
@@ -373,6 +378,6 @@ def _read_pose(table: _Table) -> tuple[Floats | None, Floats | None]:
     return position, rotation
 
 
-def camera_of_table(values: dict[str, Any], where: str, file: Path, text: str) -> RigCamera:
+def parse_camera_table(values: dict[str, Any], where: str, file: Path, text: str) -> RigCamera:
     """One camera's table of a file that calls it ``where``, checked as rig.toml's are. Raises InputError."""
     return _read_camera(_Table(values, where, file, text))

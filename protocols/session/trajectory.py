@@ -1,4 +1,4 @@
-"""Reads trajectory.csv."""
+"""Reader of trajectory.csv."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _COLUMNS = ("time", "x", "y", "z", "std")
 
 
 def read_trajectory(file: Path) -> tuple[TrajectoryTable, ...]:
-    """The paths in a trajectory.csv, by label in the order of their appearance. Raises InputError."""
+    """The trajectories in a trajectory.csv, by label in order of appearance. Raises InputError."""
     remedy = "calibrate again"
     rows: dict[str, list[list[float]]] = {}
     try:

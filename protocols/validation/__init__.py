@@ -1,1 +1,1 @@
-"""Validation of everything that comes from the bus or a log, before anything else reads it."""
+"""Validation of every message from the bus or a log, before other code reads it."""

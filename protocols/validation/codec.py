@@ -1,7 +1,7 @@
-"""The gate: every payload from the bus or a log passes here, and nothing else does.
+"""Encoding, decoding and validation of messages: every payload from the bus or a log passes here.
 
-``decode`` and ``admit`` return a message whose every field is usable, or raise Rejected with a
-reason that the caller counts. What is usable stands in ``gate_rules``.
+``decode`` and ``admit`` return a message whose fields are all within their limits, or raise Rejected with a reason
+that the caller counts. The limits are in ``protocols.validation.rules``.
 """
 
 from __future__ import annotations
@@ -13,16 +13,17 @@ from functools import lru_cache
 
 from google.protobuf.message import DecodeError, Message
 
+from protocols.core.names import name_of_segment
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import TOPICS, Topic
-from protocols.validation.rules import SCHEMA_VERSION, Reason, Rejected, check
+from protocols.validation.rules import SCHEMA_VERSION, Rejected, RejectionReason, check
 
 __all__ = [
     "MAX_PAYLOAD",
     "SCHEMA_VERSION",
     "Address",
-    "Reason",
     "Rejected",
+    "RejectionReason",
     "admit",
     "decode",
     "encode",
@@ -34,21 +35,21 @@ __all__ = [
 MAX_PAYLOAD = 1024 * 1024
 """Bytes. An observation with the most detections that are allowed is about two thirds of it."""
 
-_ID = r"[a-z0-9][a-z0-9_-]{0,62}"
+_SITE, _SEGMENT = r"[a-z0-9][a-z0-9_-]{0,62}", r"[A-Za-z0-9_%-]+"
 _KEYS: tuple[tuple[Topic, re.Pattern[str]], ...] = tuple(
-    (topic, re.compile(rf"syncline/({_ID})/{re.escape(topic.key).replace(re.escape('{id}'), f'({_ID})')}\Z"))
+    (topic, re.compile(rf"syncline/({_SITE})/{re.escape(topic.key).replace(re.escape('{id}'), f'({_SEGMENT})')}\Z"))
     for topic in TOPICS
 )
-FLIGHT = (
+UAV_MESSAGES = (
     pb.FlightImage | pb.VehicleTelemetry | pb.TargetCommand | pb.TargetState | pb.TargetCloud | pb.RoadMap | pb.UavInfo
 )
-"""What a UAV agent says; all name it as their sender."""
+"""The messages of a UAV agent; all have its name in the field ``agent``."""
 _CLASSES: Mapping[str, type[Message]] = {topic.message: getattr(pb, topic.message) for topic in TOPICS}
 
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """What a key says: the site, the kind of message, and the agent that publishes it."""
+    """The content of a bus key: the site, the topic and the name of the publishing agent."""
 
     site: str
     topic: Topic
@@ -61,7 +62,8 @@ def parse_key(key: str) -> Address | None:
     for topic, pattern in _KEYS:
         found = pattern.match(key)
         if found:
-            return Address(found[1], topic, found[2])
+            agent = name_of_segment(found[2])
+            return None if agent is None else Address(found[1], topic, agent)
     return None
 
 
@@ -71,12 +73,12 @@ def message_class(topic: Topic) -> type[Message]:
 
 
 def sender(message: Message) -> str | None:
-    """The id that a message claims to come from; None for kinds that name no sender."""
+    """The name of the sender in the message itself; None for message types without one."""
     if isinstance(message, pb.Observation | pb.CameraInfo | pb.NodeState | pb.Picture):
         return message.camera
     if isinstance(message, pb.Command):
         return message.sender
-    if isinstance(message, pb.AgentStatus | FLIGHT):
+    if isinstance(message, pb.AgentStatus | UAV_MESSAGES):
         return message.agent
     return None
 
@@ -85,19 +87,19 @@ def encode(message: Message) -> bytes:
     """Serialise; equal messages give equal bytes (maps are sorted). Raises Rejected above MAX_PAYLOAD."""
     payload = message.SerializeToString(deterministic=True)
     if len(payload) > MAX_PAYLOAD:
-        raise Rejected(Reason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD}")
+        raise Rejected(RejectionReason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD}")
     return payload
 
 
 def decode(topic: Topic, payload: bytes) -> Message:
     """Parse and validate one payload of ``topic``; raises Rejected."""
     if len(payload) > MAX_PAYLOAD:
-        raise Rejected(Reason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD}")
+        raise Rejected(RejectionReason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD}")
     message = _CLASSES[topic.message]()
     try:
         message.ParseFromString(payload)
     except DecodeError as error:
-        raise Rejected(Reason.GARBLED, str(error)) from None
+        raise Rejected(RejectionReason.GARBLED, str(error)) from None
     try:
         check(message)
     except Rejected as error:
@@ -109,14 +111,14 @@ def decode(topic: Topic, payload: bytes) -> Message:
 def admit(key: str, payload: bytes) -> tuple[Address, Message]:
     """Parse and validate what arrived under ``key``; raises Rejected.
 
-    A message whose own id differs from the id in its key is rejected: else an agent that may write
-    only below its own key could speak in another's name.
+    A message whose sender differs from the agent in its key is rejected: otherwise an agent that may publish
+    only below its own key could publish in another's name.
     """
     address = parse_key(key)
     if address is None:
-        raise Rejected(Reason.UNKNOWN_KEY, key[:200])
+        raise Rejected(RejectionReason.UNKNOWN_KEY, key[:200])
     message = decode(address.topic, payload)
     claimed = sender(message)
     if claimed is not None and claimed != address.agent:
-        raise Rejected(Reason.WRONG_SENDER, f"{claimed!r} under the key of {address.agent!r}")
+        raise Rejected(RejectionReason.WRONG_SENDER, f"{claimed!r} under the key of {address.agent!r}")
     return address, message

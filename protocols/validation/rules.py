@@ -1,7 +1,7 @@
-"""What a well-formed message of each kind looks like: ranges, counts, lengths, ids.
+"""Validation rules of each message type: ranges, counts, lengths, names.
 
-One function a message. Each raises Rejected at the first thing that is wrong, so that no estimator
-ever sees a number that is not finite or an array of the wrong length.
+One function per message. Each raises Rejected at the first violation, so that no estimator ever receives a number
+that is not finite or an array of the wrong length.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from math import inf, isfinite
 from typing import Any
 
 from protocols.core.errors import InputError
+from protocols.core.names import check_identifier, is_name
 from protocols.messages import syncline_pb2 as pb
-from protocols.topics import valid_id
 
 SCHEMA_VERSION = 1
 
@@ -28,8 +28,8 @@ MAX_LABEL = 64
 MAX_TEXT = 4096
 
 
-class Reason(Enum):
-    """Why a message was not let in; the value is the counter's name after ``rejected.``."""
+class RejectionReason(Enum):
+    """Why a message was rejected; the value is the counter's name after ``rejected.``."""
 
     OVERSIZED = "oversized"
     GARBLED = "garbled"
@@ -43,30 +43,30 @@ class Reason(Enum):
     WRONG_SENDER = "wrong_sender"
     UNKNOWN_KEY = "unknown_key"
     PLAIN_PUBLISHER = "plain_publisher"
-    """It came from no publisher of ours: nothing would tell of its losses."""
+    """Not from an advanced publisher, so it has no sequence number and losses would not be detected."""
     WRONG_SOURCE = "wrong_source"
-    """It claims to be of a run of an agent that speaks from elsewhere."""
+    """Its boot id belongs to an agent that publishes over another connection."""
     SECOND_AGENT = "second_agent"
-    """Two agents have one id; the first of them is heard."""
+    """Two agents have one id; only the first of them is accepted."""
 
 
 class Rejected(Exception):
-    """A message that must not be used. The caller counts ``reason``; ``detail`` is for a person."""
+    """A message that must not be used. The caller counts ``reason``; ``detail`` is for the user."""
 
     sequence: int | None = None
-    """The message's number, where it could be read that far."""
+    """The message's sequence number, if it could be parsed."""
 
-    def __init__(self, reason: Reason, detail: str) -> None:
+    def __init__(self, reason: RejectionReason, detail: str) -> None:
         self.reason = reason
         self.detail = detail
         super().__init__(f"{reason.value}: {detail}")
 
 
 def check(message: Any) -> None:
-    """Raise Rejected unless every field of a catalogue message is usable."""
+    """Raise Rejected unless every field of a catalogue message is valid."""
     if message.schema_version != SCHEMA_VERSION:
         raise Rejected(
-            Reason.SCHEMA_VERSION,
+            RejectionReason.SCHEMA_VERSION,
             f"schema version {message.schema_version}, this build reads {SCHEMA_VERSION}",
         )
     _RULES[message.DESCRIPTOR.name](message)
@@ -74,42 +74,49 @@ def check(message: Any) -> None:
 
 def _number(value: float, name: str, low: float = -inf, high: float = inf) -> None:
     if not isfinite(value):
-        raise Rejected(Reason.NOT_FINITE, f"{name} is {value}")
+        raise Rejected(RejectionReason.NOT_FINITE, f"{name} is {value}")
     if not low <= value <= high:
-        raise Rejected(Reason.OUT_OF_RANGE, f"{name} is {value}")
+        raise Rejected(RejectionReason.OUT_OF_RANGE, f"{name} is {value}")
 
 
 def _positive(value: float, name: str, high: float = inf) -> None:
     _number(value, name, 0.0, high)
     if value == 0.0:
-        raise Rejected(Reason.OUT_OF_RANGE, f"{name} is 0")
+        raise Rejected(RejectionReason.OUT_OF_RANGE, f"{name} is 0")
 
 
 def _vector(values: Sequence[float], name: str, lengths: tuple[int, ...], low: float = -inf, high: float = inf) -> None:
     if len(values) not in lengths:
-        raise Rejected(Reason.BAD_LENGTH, f"{name} has {len(values)} numbers")
+        raise Rejected(RejectionReason.BAD_LENGTH, f"{name} has {len(values)} numbers")
     for value in values:
         _number(value, name, low, high)
 
 
 def _count(things: Sequence[object], name: str, most: int) -> None:
     if len(things) > most:
-        raise Rejected(Reason.TOO_MANY, f"{len(things)} {name}, at most {most}")
+        raise Rejected(RejectionReason.TOO_MANY, f"{len(things)} {name}, at most {most}")
 
 
-def _id(text: str, name: str, *, optional: bool = False) -> None:
+def _name(text: str, field: str, *, optional: bool = False) -> None:
+    """The name of a camera or another agent."""
+    if not (is_name(text) or (optional and not text)):
+        raise Rejected(RejectionReason.BAD_ID, f"{field} {text[:80]!r} is not a valid name")
+
+
+def _id(text: str, field: str, *, optional: bool = False) -> None:
+    """The id of a boot or a role."""
     if optional and not text:
         return
     try:
-        valid_id(text, name)
+        check_identifier(text, field)
     except InputError as error:
-        raise Rejected(Reason.BAD_ID, error.what) from None
+        raise Rejected(RejectionReason.BAD_ID, error.what) from None
 
 
 def _text(text: str, name: str, most: int = MAX_TEXT) -> None:
-    # Labels end in CSV files and terminals, so control characters stay outside.
+    # Labels are written to CSV files and terminals, so control characters are rejected.
     if len(text) > most or not _printable(text):
-        raise Rejected(Reason.BAD_TEXT, f"{name} is longer than {most} or has control characters")
+        raise Rejected(RejectionReason.BAD_TEXT, f"{name} is longer than {most} or has control characters")
 
 
 def _printable(text: str) -> bool:
@@ -118,14 +125,14 @@ def _printable(text: str) -> bool:
 
 def _one_of(text: str, name: str, allowed: frozenset[str]) -> None:
     if text not in allowed:
-        raise Rejected(Reason.BAD_TEXT, f"{name} is {text[:40]!r}")
+        raise Rejected(RejectionReason.BAD_TEXT, f"{name} is {text[:40]!r}")
 
 
 def _distinct(names: Iterable[str], what: str) -> None:
     seen: set[str] = set()
     for name in names:
         if name in seen:
-            raise Rejected(Reason.BAD_ID, f"{what} {name!r} twice")
+            raise Rejected(RejectionReason.BAD_ID, f"{what} {name!r} twice")
         seen.add(name)
 
 
@@ -133,15 +140,15 @@ def _covariance_2d(covariance: Sequence[float], name: str) -> None:
     _vector(covariance, name, (0, 3))
     if covariance:
         uu, uv, vv = covariance
-        # The slack lets a rank-one covariance pass after rounding.
+        # The tolerance lets a rank-one covariance pass after rounding.
         if uu < 0.0 or vv < 0.0 or uv * uv > uu * vv * (1.0 + 1e-9) + 1e-12:
-            raise Rejected(Reason.OUT_OF_RANGE, f"{name} is not a covariance")
+            raise Rejected(RejectionReason.OUT_OF_RANGE, f"{name} is not a covariance")
 
 
 def _intrinsics(message: Any) -> None:
     _vector(message.matrix, "matrix", (0, 9))
     if message.matrix and not (message.matrix[0] > 0.0 and message.matrix[4] > 0.0):
-        raise Rejected(Reason.OUT_OF_RANGE, "a focal length is not positive")
+        raise Rejected(RejectionReason.OUT_OF_RANGE, "a focal length is not positive")
     _vector(message.distortions, "distortions", (0, 4) if message.fisheye else (0, 4, 5))
 
 
@@ -150,12 +157,12 @@ _KINDS = frozenset({"marker", "person", "vehicle"})
 
 def _colour(colour: pb.Colour) -> None:
     if max(colour.red, colour.green, colour.blue) > 255:
-        raise Rejected(Reason.OUT_OF_RANGE, "a colour is above 255")
+        raise Rejected(RejectionReason.OUT_OF_RANGE, "a colour is above 255")
 
 
 def _detection(detection: pb.Detection) -> None:
-    # The commonest message there is: one comparison for all four, and what is wrong only where something is.
-    # No number that is not finite passes it.
+    # The most frequent message: one comparison for all four numbers; details only on failure.
+    # Non-finite numbers fail the comparison.
     if not (
         -MAX_PIXEL <= detection.u <= MAX_PIXEL
         and -MAX_PIXEL <= detection.v <= MAX_PIXEL
@@ -181,27 +188,27 @@ def _detection(detection: pb.Detection) -> None:
     if detection.box:
         _vector(detection.box, "box", (4,), -MAX_PIXEL, MAX_PIXEL)
         if min(detection.box[2:]) < 0.0:
-            raise Rejected(Reason.OUT_OF_RANGE, "a box has a negative side")
+            raise Rejected(RejectionReason.OUT_OF_RANGE, "a box has a negative side")
     if detection.target:
         _text(detection.target, "target", MAX_LABEL)
 
 
 def _observation(message: pb.Observation) -> None:
-    _id(message.camera, "camera")
+    _name(message.camera, "camera")
     _id(message.boot_id, "boot id")
     if message.exposure_ns < 0:
-        raise Rejected(Reason.OUT_OF_RANGE, "exposure is negative")
+        raise Rejected(RejectionReason.OUT_OF_RANGE, "exposure is negative")
     _count(message.detections, "detections", MAX_DETECTIONS)
     for detection in message.detections:
         _detection(detection)
 
 
 def _camera_info(message: pb.CameraInfo) -> None:
-    _id(message.camera, "camera")
+    _name(message.camera, "camera")
     _id(message.boot_id, "boot id")
     _number(message.width, "width", 1, MAX_IMAGE_SIDE)
     _number(message.height, "height", 1, MAX_IMAGE_SIDE)
-    _number(message.fps, "fps", 0.0, MAX_FPS)  # 0: the device does not say
+    _number(message.fps, "fps", 0.0, MAX_FPS)  # 0: not reported by the device
     _intrinsics(message)
     _text(message.driver, "driver", MAX_LABEL)
     _text(message.clock, "clock", MAX_LABEL)
@@ -221,19 +228,19 @@ def _rig_info(message: pb.RigInfo) -> None:
     _one_of(message.clock, "clock", _CLOCKS)
     _count(message.distances, "distances", MAX_CAMERAS)
     for distance in message.distances:
-        _id(distance.camera_a, "camera")
-        _id(distance.camera_b, "camera")
+        _name(distance.camera_a, "camera")
+        _name(distance.camera_b, "camera")
         _distinct((distance.camera_a, distance.camera_b), "distance names")
         _positive(distance.distance, "distance")
     _vector(message.up, "up", (0, 3))
     if message.up and not any(message.up):
-        raise Rejected(Reason.OUT_OF_RANGE, "up has no direction")
-    _id(message.up_camera, "up camera", optional=True)
-    _id(message.reference_camera, "reference camera", optional=True)
+        raise Rejected(RejectionReason.OUT_OF_RANGE, "up has no direction")
+    _name(message.up_camera, "up camera", optional=True)
+    _name(message.reference_camera, "reference camera", optional=True)
 
 
 def _camera_calibration(camera: pb.CameraCalibration) -> None:
-    _id(camera.camera, "camera")
+    _name(camera.camera, "camera")
     _vector(camera.rotation, "rotation", (3,))
     _vector(camera.translation, "translation", (3,))
     _number(camera.time_offset, "time_offset")
@@ -257,14 +264,14 @@ def _calibration(message: pb.Calibration) -> None:
         _one_of(message.scale, "scale", _SCALES)
     if solved or message.units:
         _one_of(message.units, "units", _UNITS)
-    _id(message.reference_camera, "reference camera", optional=not solved)
+    _name(message.reference_camera, "reference camera", optional=not solved)
     _text(message.solver, "solver", MAX_LABEL)
     _count(message.cameras, "cameras", MAX_CAMERAS)
     _count(message.refused, "refused cameras", MAX_CAMERAS)
     for camera in message.cameras:
         _camera_calibration(camera)
     for refusal in message.refused:
-        _id(refusal.camera, "camera")
+        _name(refusal.camera, "camera")
         _text(refusal.reason, "reason")
     _distinct([c.camera for c in message.cameras] + [r.camera for r in message.refused], "camera")
 
@@ -280,7 +287,7 @@ def _track(message: pb.Track) -> None:
     for covariance, name in ((message.position_covariance, "position"), (message.velocity_covariance, "velocity")):
         _vector(covariance, f"{name}_covariance", (0, 9))
         if covariance and min(covariance[::4]) < 0.0:
-            raise Rejected(Reason.OUT_OF_RANGE, f"a variance of the {name} is negative")
+            raise Rejected(RejectionReason.OUT_OF_RANGE, f"a variance of the {name} is negative")
     if message.kind:
         _one_of(message.kind, "kind", _KINDS)
     if message.HasField("heading"):
@@ -310,7 +317,7 @@ def _predicted_target(target: pb.PredictedTarget) -> None:
     _vector(target.foot, "foot", (0, 2), -MAX_PIXEL, MAX_PIXEL)
     _vector(target.face, "face", (0, 4), -MAX_PIXEL, MAX_PIXEL)
     if target.face and min(target.face[2:]) < 0.0:
-        raise Rejected(Reason.OUT_OF_RANGE, "a face has a negative side")
+        raise Rejected(RejectionReason.OUT_OF_RANGE, "a face has a negative side")
     _one_of(target.view, "view", _VIEWS)
     if target.HasField("colour"):
         _colour(target.colour)
@@ -319,7 +326,7 @@ def _predicted_target(target: pb.PredictedTarget) -> None:
 def _prediction(message: pb.Prediction) -> None:
     _count(message.cameras, "cameras", MAX_CAMERAS)
     for camera in message.cameras:
-        _id(camera.camera, "camera")
+        _name(camera.camera, "camera")
         _id(camera.boot_id, "boot id", optional=True)
         _count(camera.targets, "targets", MAX_DETECTIONS)
         for target in camera.targets:
@@ -331,7 +338,7 @@ _AGENT_STATES = frozenset({"starting", "running", "degraded", "stopping"})
 
 
 def _agent_status(message: pb.AgentStatus) -> None:
-    _id(message.agent, "agent")
+    _name(message.agent, "agent")
     _id(message.role, "role")
     _id(message.boot_id, "boot id")
     _one_of(message.state, "state", _AGENT_STATES)
@@ -339,14 +346,14 @@ def _agent_status(message: pb.AgentStatus) -> None:
     _text(message.version, "version", MAX_LABEL)
     for numbers in (message.counters, message.gauges):
         if len(numbers) > MAX_NUMBERS:
-            raise Rejected(Reason.TOO_MANY, f"{len(numbers)} numbers, at most {MAX_NUMBERS}")
+            raise Rejected(RejectionReason.TOO_MANY, f"{len(numbers)} numbers, at most {MAX_NUMBERS}")
         for name, value in numbers.items():
             _text(name, "a number's name", MAX_LABEL)
             _number(value, "a counter or gauge")
 
 
 def _node_edge(edge: pb.NodeEdge) -> None:
-    _id(edge.neighbour, "neighbour")
+    _name(edge.neighbour, "neighbour")
     for values, name, length in (
         (edge.rotation, "rotation", 3),
         (edge.centre, "centre", 3),
@@ -359,7 +366,7 @@ def _node_edge(edge: pb.NodeEdge) -> None:
 
 
 def _node_anchor(anchor: pb.NodeAnchor) -> None:
-    _id(anchor.camera, "anchor")
+    _name(anchor.camera, "anchor")
     for values, name, lengths in (
         (anchor.rotation, "rotation", (3,)),
         (anchor.position, "position", (3,)),
@@ -372,10 +379,10 @@ def _node_anchor(anchor: pb.NodeAnchor) -> None:
 
 
 def _node_state(message: pb.NodeState) -> None:
-    _id(message.camera, "camera")
-    _id(message.host, "host")
-    _id(message.frame, "frame")
-    _id(message.partner, "partner", optional=True)
+    _name(message.camera, "camera")
+    _name(message.host, "host")
+    _name(message.frame, "frame")
+    _name(message.partner, "partner", optional=True)
     _vector(message.rotation, "rotation", (0, 3))
     _vector(message.position, "position", (len(message.rotation),))
     _count(message.edges, "edges", MAX_CAMERAS)
@@ -393,15 +400,15 @@ MAX_PICTURE = 512 * 1024
 
 
 def _command(message: pb.Command) -> None:
-    _id(message.sender, "sender")
+    _name(message.sender, "sender")
     _id(message.boot_id, "boot id")
     _one_of(message.action, "action", ACTIONS)
-    _id(message.agent, "agent")
+    _name(message.agent, "agent")
     _id(message.agent_boot, "agent boot")
 
 
 def _picture(message: pb.Picture) -> None:
-    _id(message.camera, "camera")
+    _name(message.camera, "camera")
     _id(message.boot_id, "boot id")
     _number(message.width, "width", 1, MAX_IMAGE_SIDE)
     _number(message.height, "height", 1, MAX_IMAGE_SIDE)
@@ -409,105 +416,105 @@ def _picture(message: pb.Picture) -> None:
 
 
 MAX_IMAGE = 1_000_000
-"""Bytes of a compressed picture; with the rest of its message it stays below the largest payload."""
+"""Bytes of a compressed image; with the rest of its message it stays below MAX_PAYLOAD."""
 MAX_POINTS = 4096
 MAX_FAR_PIXEL = 1e7
 MAX_METRES = 1e7
 _TARGET_STATES = frozenset({"visible", "coasting", "lost"})
 
 
-def _flight(message: Any) -> None:
-    """What all messages of a UAV agent have."""
-    _id(message.agent, "agent")
+def _uav_header(message: Any) -> None:
+    """The fields that all messages of a UAV agent have."""
+    _name(message.agent, "agent")
     _id(message.boot_id, "boot id")
 
 
 def _points(values: Sequence[float], name: str, most: float) -> None:
-    """Pairs of coordinates."""
+    """Pairs of coordinates, each within ±``most``."""
     if len(values) % 2:
-        raise Rejected(Reason.BAD_LENGTH, f"{name} has {len(values)} numbers")
+        raise Rejected(RejectionReason.BAD_LENGTH, f"{name} has {len(values)} numbers")
     if len(values) > 2 * MAX_POINTS:
-        raise Rejected(Reason.TOO_MANY, f"{len(values) // 2} {name}, at most {MAX_POINTS}")
+        raise Rejected(RejectionReason.TOO_MANY, f"{len(values) // 2} {name}, at most {MAX_POINTS}")
     for value in values:
         _number(value, name, -most, most)
 
 
-def _some(values: Sequence[float], name: str, lengths: tuple[int, ...], most: float) -> None:
+def _bounded(values: Sequence[float], name: str, lengths: tuple[int, ...], most: float) -> None:
     _vector(values, name, lengths)
     for value in values:
         _number(value, name, -most, most)
 
 
-def _place(geo: Sequence[float], name: str) -> None:
+def _geodetic(geo: Sequence[float], name: str) -> None:
     """Latitude, longitude, altitude, or nothing."""
     _vector(geo, name, (0, 3))
     if geo and not (abs(geo[0]) <= 90.0 and abs(geo[1]) <= 180.0 and abs(geo[2]) <= 1e5):
-        raise Rejected(Reason.OUT_OF_RANGE, f"{name} is not on this earth")
+        raise Rejected(RejectionReason.OUT_OF_RANGE, f"{name} is not a geographic position")
 
 
 def _flight_image(message: pb.FlightImage) -> None:
-    _flight(message)
+    _uav_header(message)
     _number(message.width, "width", 1, MAX_IMAGE_SIDE)
     _number(message.height, "height", 1, MAX_IMAGE_SIDE)
     _count(message.jpeg, "bytes of picture", MAX_IMAGE)
 
 
 def _vehicle_telemetry(message: pb.VehicleTelemetry) -> None:
-    _flight(message)
+    _uav_header(message)
     _number(message.time_std_s, "time_std_s", 0.0)
     _vector(message.ned_from_body, "ned_from_body", (4,))
     if abs(sum(part * part for part in message.ned_from_body) - 1.0) > 1e-6:
-        raise Rejected(Reason.OUT_OF_RANGE, "ned_from_body is no rotation")
-    _some(message.position, "position", (0, 3), MAX_METRES)
-    _place(message.origin, "origin")
+        raise Rejected(RejectionReason.OUT_OF_RANGE, "ned_from_body is no rotation")
+    _bounded(message.position, "position", (0, 3), MAX_METRES)
+    _geodetic(message.origin, "origin")
 
 
 def _target_command(message: pb.TargetCommand) -> None:
-    _flight(message)
+    _uav_header(message)
     _one_of(message.kind, "kind", frozenset({"select", "stop"}))
-    _some(message.box, "box", (4,) if message.kind == "select" else (0,), MAX_PIXEL)
+    _bounded(message.box, "box", (4,) if message.kind == "select" else (0,), MAX_PIXEL)
     if message.box and not (message.box[2] > 0.0 and message.box[3] > 0.0):
-        raise Rejected(Reason.OUT_OF_RANGE, "the box has no width or height")
+        raise Rejected(RejectionReason.OUT_OF_RANGE, "the box has no width or height")
     _number(message.by, "by", 0, 255)
 
 
 def _target_state(message: pb.TargetState) -> None:
-    _flight(message)
+    _uav_header(message)
     _one_of(message.state, "state", _TARGET_STATES)
-    _some(message.centre, "centre", (0,) if message.state == "lost" else (2,), MAX_FAR_PIXEL)
-    _some(message.size, "size", (0, 2), MAX_FAR_PIXEL)
-    _some(message.heading, "heading", (0, 1), 7.0)
+    _bounded(message.centre, "centre", (0,) if message.state == "lost" else (2,), MAX_FAR_PIXEL)
+    _bounded(message.size, "size", (0, 2), MAX_FAR_PIXEL)
+    _bounded(message.heading, "heading", (0, 1), 7.0)
     _number(message.std_px, "std_px", 0.0)
-    _some(message.ground, "ground", (0, 2), MAX_METRES)
-    _some(message.velocity, "velocity", (0, 2), 1e4)
+    _bounded(message.ground, "ground", (0, 2), MAX_METRES)
+    _bounded(message.velocity, "velocity", (0, 2), 1e4)
     _number(message.std_m, "std_m", 0.0)
-    _place(message.geo, "geo")
+    _geodetic(message.geo, "geo")
     _count(message.hypotheses, "hypotheses", MAX_NUMBERS)
     for hypothesis in message.hypotheses:
         _number(hypothesis.weight, "weight", 0.0, 1.0)
-        _some((hypothesis.x, hypothesis.y), "hypothesis", (2,), MAX_FAR_PIXEL)
+        _bounded((hypothesis.x, hypothesis.y), "hypothesis", (2,), MAX_FAR_PIXEL)
 
 
 def _target_cloud(message: pb.TargetCloud) -> None:
-    _flight(message)
+    _uav_header(message)
     _points(message.pixels, "pixels", MAX_FAR_PIXEL)
 
 
 def _road_map(message: pb.RoadMap) -> None:
-    _flight(message)
+    _uav_header(message)
     _points(message.pixels, "pixels", MAX_FAR_PIXEL)
     _points(message.ground, "ground", MAX_METRES)
     if message.ground and len(message.ground) != len(message.pixels):
-        raise Rejected(Reason.BAD_LENGTH, "ground and pixels are not the same points")
+        raise Rejected(RejectionReason.BAD_LENGTH, "ground and pixels are not the same points")
 
 
 def _uav_info(message: pb.UavInfo) -> None:
-    _flight(message)
+    _uav_header(message)
     _number(message.width, "width", 1, MAX_IMAGE_SIDE)
     _number(message.height, "height", 1, MAX_IMAGE_SIDE)
     _number(message.fps, "fps", 0.0, MAX_FPS)
     _intrinsics(message)
-    _some(message.body_from_camera, "body_from_camera", (0, 9), 1.001)
+    _bounded(message.body_from_camera, "body_from_camera", (0, 9), 1.001)
     _text(message.model, "model", MAX_LABEL)
 
 

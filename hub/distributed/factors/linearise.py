@@ -1,7 +1,7 @@
-"""What two cameras' shared observations say of their relative pose, every target point eliminated (METHODS C, step 3).
+"""Two-view measurement model with eliminated target points, linearised about a relative pose.
 
-Relative pose of camera l as camera k sees it: ``X_l = rotation @ (X_k - centre)``; ``rotation`` (3, 3) is l from k,
-``centre`` (3,) is l's centre in k's axes, in the unit in which the target's size is 1. A step (6,) is
+Distributed pose paper, step 3. Camera l relative to camera k: ``X_l = rotation @ (X_k - centre)``; ``rotation`` (3, 3)
+is l from k, ``centre`` (3,) is l's centre in k's axes, in the unit in which the target's size is 1. A step (6,) is
 ``rotation <- exp(step[:3]) @ rotation, centre <- centre + step[3:]``.
 
 Observations are rows (n, 6): x, y, log size in k, then in l. x, y are normalised and undistorted; the size is
@@ -19,13 +19,13 @@ import numpy as np
 from protocols.geometry import so3
 from protocols.geometry.types import Bools, Floats
 
-_NEAREST = 1e-3
+_MIN_DEPTH_SHARE = 1e-3
 """Least depth of a triangulated point, as a share of its distance."""
 _POINT_STEPS = 1
 
 
 def small_log(rotation: Floats) -> Floats:
-    """Rotation vector (3,) [rad] of a matrix (3, 3), fast for turns below a radian."""
+    """Rotation vector (3,) [rad] of a matrix (3, 3), fast for angles below one radian."""
     (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
     if a + e + i < 2.0:
         return so3.log(rotation)
@@ -36,53 +36,53 @@ def small_log(rotation: Floats) -> Floats:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Relative:
-    """Camera l from camera k. rotation: (3, 3). centre: (3,). `linearise` also takes one a row."""
+class RelativeTransform:
+    """Camera l from camera k. rotation: (3, 3). centre: (3,). `linearise_observations` also takes one per row."""
 
     rotation: Floats
     centre: Floats
 
-    def moved(self, step: Floats) -> Relative:
-        """After a step (6,)."""
-        return Relative(so3.exp(step[:3]) @ self.rotation, self.centre + step[3:])
+    def retract(self, step: Floats) -> RelativeTransform:
+        """The pose after a step (6,)."""
+        return RelativeTransform(so3.exp(step[:3]) @ self.rotation, self.centre + step[3:])
 
-    def step_to(self, other: Relative) -> Floats:
-        """The step (6,) that leads to ``other``."""
+    def local_coordinates(self, other: RelativeTransform) -> Floats:
+        """The step (6,) from this pose to ``other``."""
         return np.concatenate([small_log(other.rotation @ self.rotation.T), other.centre - self.centre])
 
-    def inverse(self) -> Relative:
+    def inverse(self) -> RelativeTransform:
         """Camera k from camera l."""
-        return Relative(self.rotation.T, -self.rotation @ self.centre)
+        return RelativeTransform(self.rotation.T, -self.rotation @ self.centre)
 
-    def scaled(self, factor: float) -> Relative:
-        """With lengths in another unit."""
-        return Relative(self.rotation, self.centre * factor)
+    def scaled(self, factor: float) -> RelativeTransform:
+        """The same with lengths times ``factor``."""
+        return RelativeTransform(self.rotation, self.centre * factor)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Terms:
+class LinearisedObservations:
     """Second-order model of the negative log-likelihood of each observation about one relative pose.
 
-    hessian: (n, 6, 6). gradient: (n, 6). chi2: (n,) at that pose. ahead: (n,) the point lies before both cameras.
+    hessian: (n, 6, 6). gradient: (n, 6). chi2: (n,) at that pose. in_front: (n,) the point is in front of both cameras.
     """
 
     hessian: Floats
     gradient: Floats
     chi2: Floats
-    ahead: Bools
+    in_front: Bools
 
 
-def triangulate(pose: Relative, rows: Floats, weights: Floats) -> Floats:
-    """Points (n, 3) in k's axes nearest to both rays, and to the depths that the sizes tell."""
+def triangulate(pose: RelativeTransform, rows: Floats, weights: Floats) -> Floats:
+    """Points (n, 3) in k's axes by least squares from both rays and the depths given by the sizes."""
     ray_k = np.ones((len(rows), 3))
     ray_k[:, :2] = rows[:, 0:2]
     ray_l = np.ones((len(rows), 3))
     ray_l[:, :2] = rows[:, 3:5]
-    ray_l = _turned(ray_l, pose.rotation)
-    # depth_k ray_k - depth_l ray_l = centre, least squares in angle; a depth of 0 is told by the size with weight.
+    ray_l = _rotate_rows(ray_l, pose.rotation)
+    # depth_k ray_k - depth_l ray_l = centre, least squares in angle; the sizes add weighted depth terms.
     long_k, long_l = (ray_k * ray_k).sum(axis=1), (ray_l * ray_l).sum(axis=1)
     across = (ray_k * ray_l).sum(axis=1)
-    # A size with relative std s leaves depth * s along the ray; the rays leave depth / weight across it.
+    # A size with relative std s has std depth * s along the ray; the rays have std depth / weight across it.
     pull = (weights[:, 1::2] / weights[:, 0::2]) ** 2
     pull_k, pull_l = pull[:, 0] * long_k, pull[:, 1] * long_l
     size = np.exp(-rows[:, 2::3])
@@ -94,88 +94,90 @@ def triangulate(pose: Relative, rows: Floats, weights: Floats) -> Floats:
     return np.asarray(ray_k * depth[:, None])
 
 
-def _turned(vectors: Floats, rotation: Floats) -> Floats:
-    """``vector @ rotation`` of each (n, 3), by one rotation or by its own."""
+def _rotate_rows(vectors: Floats, rotation: Floats) -> Floats:
+    """``vector @ rotation`` for each row (n, 3), by one common rotation or one per row."""
     if rotation.ndim == 2:
         return np.asarray(vectors @ rotation)
     return np.asarray((vectors[:, None, :] @ rotation)[:, 0])
 
 
-def stacked(poses: list[Relative], counts: list[int]) -> Relative:
-    """One relative pose a row: the first ``counts[0]`` times, and so on."""
+def stack_transforms(poses: list[RelativeTransform], counts: list[int]) -> RelativeTransform:
+    """One relative pose per row: the first one ``counts[0]`` times, and so on."""
     which = np.repeat(np.arange(len(poses)), counts)
-    return Relative(np.array([p.rotation for p in poses])[which], np.array([p.centre for p in poses])[which])
+    return RelativeTransform(np.array([p.rotation for p in poses])[which], np.array([p.centre for p in poses])[which])
 
 
-def linearise(pose: Relative, rows: Floats, weights: Floats) -> Terms:
-    """Residuals of both cameras, the point eliminated by its Schur complement (METHODS C, step 3).
+def linearise_observations(pose: RelativeTransform, rows: Floats, weights: Floats) -> LinearisedObservations:
+    """Quadratic model of each observation with its point eliminated (Schur complement; distributed pose paper, step 3).
 
-    A point that would lie behind a camera has ``ahead`` False and no meaning. All in k's axes: with N = K + L the
-    point's information as the two cameras tell it, the relative pose feels M = L - L N⁻¹ L.
+    Where the point is behind a camera ``in_front`` is False and the other values are meaningless. All in k's axes: with
+    N = K + L the point's information from both cameras, that of the relative pose is M = L - L N⁻¹ L.
     """
     turn = pose.rotation
-    back = np.swapaxes(turn, -1, -2)
+    rotation_t = np.swapaxes(turn, -1, -2)
     point = triangulate(pose, rows, weights)
     seen = rows.reshape(-1, 2, 3)
     pixel, size = np.ascontiguousarray(weights[:, 0::2]), np.ascontiguousarray(weights[:, 1::2])
     for _ in range(_POINT_STEPS):
-        by_l, normal, pull, _, _, _ = _both_cameras(pose, back, point, seen, pixel, size)
-        step = -(_inverse(normal) @ pull[:, :, None])[:, :, 0]
-        # A far point may leap behind the camera; half its depth a step is enough.
+        by_l, normal, pull, _, _, _ = _point_information(pose, rotation_t, point, seen, pixel, size)
+        step = -(_inverse_symmetric(normal) @ pull[:, :, None])[:, :, 0]
+        # A far point could step behind the camera: limit the step to half its depth.
         limit = 0.5 * np.abs(point[:, 2]) / np.maximum(np.abs(step[:, 2]), 1e-300)
         point = point + step * np.minimum(1.0, limit)[:, None]
-    by_l, normal, pull, pull_l, chi2, ahead = _both_cameras(pose, back, point, seen, pixel, size)
-    gain = by_l @ _inverse(normal)
+    by_l, normal, pull, pull_l, chi2, in_front = _point_information(pose, rotation_t, point, seen, pixel, size)
+    gain = by_l @ _inverse_symmetric(normal)
     information = by_l - gain @ by_l
     gradient = pull_l - (gain @ pull[:, :, None])[:, :, 0]
-    # A step moves the point against l, in k's axes, by -hat(point - centre) rotationᵀ turn - shift.
+    # A step moves the point relative to l, in k's axes, by -hat(point - centre) rotationᵀ turn - shift.
     by_pose = np.empty((len(rows), 3, 6))
-    by_pose[:, :, :3] = so3.hat(pose.centre - point) @ back
+    by_pose[:, :, :3] = so3.hat(pose.centre - point) @ rotation_t
     by_pose[:, :, 3:] = -_EYE
     turned = by_pose.transpose(0, 2, 1)
-    return Terms(turned @ information @ by_pose, (turned @ gradient[:, :, None])[:, :, 0], chi2, ahead)
+    return LinearisedObservations(
+        turned @ information @ by_pose, (turned @ gradient[:, :, None])[:, :, 0], chi2, in_front
+    )
 
 
 _EYE = np.eye(3)
 
 
-def _both_cameras(
-    pose: Relative, back: Floats, point: Floats, seen: Floats, pixel: Floats, size: Floats
+def _point_information(
+    pose: RelativeTransform, rotation_t: Floats, point: Floats, seen: Floats, pixel: Floats, size: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Bools]:
-    """l's information (n, 3, 3) about the points, both cameras' together; the pull (n, 3) of both and of l alone; chi2.
+    """Information (n, 3, 3) of the points from l and from both, gradients (n, 3) from both and from l, chi2, in_front.
 
     All in k's axes. seen: (n, 2, 3); pixel, size: weights (n, 2).
     """
     n = len(point)
     local = np.empty((n, 2, 3))
     local[:, 0] = point
-    local[:, 1] = _turned(point - pose.centre, back)
+    local[:, 1] = _rotate_rows(point - pose.centre, rotation_t)
     depth = local[:, :, 2]
-    floor = _NEAREST * np.abs(local).max(axis=2) + 1e-12
-    ahead = (depth > floor).all(axis=1)
+    floor = _MIN_DEPTH_SHARE * np.abs(local).max(axis=2) + 1e-12
+    in_front = (depth > floor).all(axis=1)
     safe = np.maximum(depth, floor)
     over = 1.0 / safe
-    flat = local[:, :, :2] * over[:, :, None]
+    normalised = local[:, :, :2] * over[:, :, None]
     a, b = over * pixel, over * size
-    off = (flat - seen[:, :, :2]) * pixel[:, :, None]
+    off = (normalised - seen[:, :, :2]) * pixel[:, :, None]
     far = (np.log(safe) + seen[:, :, 2]) * -size
     pull = np.empty((n, 2, 3))
     pull[:, :, :2] = off * a[:, :, None]
-    pull[:, :, 2] = -(pull[:, :, :2] * flat).sum(axis=2) - b * far
+    pull[:, :, 2] = -(pull[:, :, :2] * normalised).sum(axis=2) - b * far
     information = np.zeros((n, 2, 3, 3))
     square = a * a
     information[:, :, 0, 0] = information[:, :, 1, 1] = square
-    aslant = flat * -square[:, :, None]
+    aslant = normalised * -square[:, :, None]
     information[:, :, :2, 2] = information[:, :, 2, :2] = aslant
-    information[:, :, 2, 2] = b * b - (aslant * flat).sum(axis=2)
-    by_l = back @ information[:, 1] @ pose.rotation
-    pull_l = _turned(pull[:, 1], pose.rotation)
+    information[:, :, 2, 2] = b * b - (aslant * normalised).sum(axis=2)
+    by_l = rotation_t @ information[:, 1] @ pose.rotation
+    pull_l = _rotate_rows(pull[:, 1], pose.rotation)
     chi2 = (off * off).sum(axis=(1, 2)) + (far * far).sum(axis=1)
-    return by_l, information[:, 0] + by_l, pull[:, 0] + pull_l, pull_l, chi2, np.asarray(ahead)
+    return by_l, information[:, 0] + by_l, pull[:, 0] + pull_l, pull_l, chi2, np.asarray(in_front)
 
 
-def _inverse(m: Floats) -> Floats:
-    """Inverses (n, 3, 3) of symmetric matrices (n, 3, 3) by cofactors; a floor keeps singular ones finite."""
+def _inverse_symmetric(m: Floats) -> Floats:
+    """Inverses (n, 3, 3) of symmetric matrices (n, 3, 3) by cofactors; the determinant is bounded from below."""
     a, b, c = m[:, 0, 0], m[:, 0, 1], m[:, 0, 2]
     d, e, f = m[:, 1, 1], m[:, 1, 2], m[:, 2, 2]
     out = np.empty_like(m)

@@ -1,40 +1,42 @@
-"""Where the network stands in the world: the gauge, fixed at read-out only (METHODS C, steps 5 and 7).
+"""Datum of the network: the gauge, fixed only at read-out, and control points (distributed pose paper, steps 5 and 7).
 
-References are flooded as `Anchor`: where the network has the camera, and where the world has it. Seven dof (one pose,
-one distance) are the gauge; what a second reference says beyond that is a measurement between the two cameras, and
-enters as an edge like any other.
+Control points are flooded through the network as `Anchor`: the camera's pose in the network and its surveyed pose in
+the world. Seven dof (one pose, one distance) fix the gauge; further control points are relative measurements between
+two cameras and enter as factors.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from hub.datum import control_outliers
-from hub.distributed.factors.factor import Summary
-from hub.distributed.factors.linearise import Relative
+from hub.bundle.datum import control_outliers
+from hub.distributed.factors.factor import QuadraticFactor
+from hub.distributed.factors.linearise import RelativeTransform
 from hub.distributed.network.messages import Anchor
 from protocols.geometry import so3
 from protocols.geometry.pose import Similarity
 from protocols.geometry.types import Floats
 from protocols.session.rig import Rig, RigCamera
 
-LEAST_STD = 5e-5
-"""Least std of a reference [rad, or share of the distance]: a stiffer one would only slow the network down."""
-_STEPS = 12
+MIN_STD = 5e-5
+"""Smallest std of a control point [rad, or share of the distance]: a stiffer one only slows convergence."""
+_MAX_ITERATIONS = 12
 
 
-def usable(anchors: dict[int, Anchor]) -> list[Anchor]:
-    """Anchors by camera, without those set aside."""
-    return [anchor for _, anchor in sorted(anchors.items()) if not anchor.aside]
+def accepted_anchors(anchors: dict[int, Anchor]) -> list[Anchor]:
+    """Anchors in the order of their cameras, without rejected ones."""
+    return [anchor for _, anchor in sorted(anchors.items()) if not anchor.rejected]
 
 
 def world_from_network(anchors: list[Anchor]) -> Similarity | None:
-    """The similarity that fits the references best, weighted; None while they fix no pose or no scale.
+    """The weighted similarity that fits the control points; None while they fix no pose or no scale.
 
-    Begins from one attitude, or three positions; needs two positions for the scale.
+    Initialised from one attitude, or three positions; needs two positions for the scale.
     """
-    positions = [(a.pose.position, a.reference.position, a) for a in anchors if a.reference.position is not None]
-    turns = [a for a in anchors if a.reference.rotation is not None]
+    positions = [
+        (a.pose.position, a.control_point.position, a) for a in anchors if a.control_point.position is not None
+    ]
+    turns = [a for a in anchors if a.control_point.rotation is not None]
     if len(positions) < 2 or not (turns or len(positions) >= 3):
         return None
     source = np.array([p for p, _, _ in positions])
@@ -46,60 +48,60 @@ def world_from_network(anchors: list[Anchor]) -> Similarity | None:
     scale = float(apart_target.sum() / apart_source.sum())
     if turns:
         first = turns[0]
-        assert first.reference.rotation is not None
-        rotation = first.reference.rotation.T @ first.pose.rotation
+        assert first.control_point.rotation is not None
+        rotation = first.control_point.rotation.T @ first.pose.rotation
         base = next((i for i, item in enumerate(positions) if item[2].camera == first.camera), 0)
     else:
-        rotation, base = _turn(source, target), 0
+        rotation, base = _best_rotation(source, target), 0
     now = Similarity(scale, rotation, target[base] - scale * rotation @ source[base])
     minimal = (
         len(positions) == 2 and len(turns) == 1 and turns[0].camera in (positions[0][2].camera, positions[1][2].camera)
     )
     if minimal:  # camera 1's pose and |t2 - t1|, exactly
         return now
-    return _refined(now, positions, turns)
+    return _gauss_newton(now, positions, turns)
 
 
-def contradicted(anchors: list[Anchor]) -> dict[int, str]:
-    """Cameras whose reference all the others agree against, and how, in words."""
+def find_outliers(anchors: list[Anchor]) -> dict[int, str]:
+    """Cameras whose control points are inconsistent with all the others, with a description of each."""
     names = [str(anchor.camera) for anchor in anchors]
     cameras = {
         str(a.camera): RigCamera(
             str(a.camera),
             (1, 1),
-            position=a.reference.position,
-            rotation=a.reference.rotation,
-            position_std=np.full(3, a.reference.position_std),
-            rotation_std=np.full(3, a.reference.rotation_std),
+            position=a.control_point.position,
+            rotation=a.control_point.rotation,
+            position_std=np.full(3, a.control_point.position_std),
+            rotation_std=np.full(3, a.control_point.rotation_std),
         )
         for a in anchors
     }
-    found = control_outliers.contradicted(Rig(cameras), names, [anchor.pose for anchor in anchors])
-    return {int(name): told for name, told in found.items() if isinstance(name, str)}
+    found = control_outliers.find_outliers(Rig(cameras), names, [anchor.pose for anchor in anchors])
+    return {int(name): text for name, text in found.items() if isinstance(name, str)}
 
 
-def _turn(source: Floats, target: Floats) -> Floats:
+def _best_rotation(source: Floats, target: Floats) -> Floats:
     u, _, vt = np.linalg.svd((target - target.mean(0)).T @ (source - source.mean(0)))
     return np.asarray((u * np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])) @ vt)
 
 
-def _refined(start: Similarity, positions: list[tuple[Floats, Floats, Anchor]], turns: list[Anchor]) -> Similarity:
+def _gauss_newton(start: Similarity, positions: list[tuple[Floats, Floats, Anchor]], turns: list[Anchor]) -> Similarity:
     now = start
     extent = max(float(np.linalg.norm(np.ptp(np.array([q for _, q, _ in positions]), axis=0))), 1e-12)
-    for _ in range(_STEPS):
+    for _ in range(_MAX_ITERATIONS):
         hessian, gradient = np.zeros((7, 7)), np.zeros(7)
         for source, target, anchor in positions:
-            std = max(anchor.reference.position_std, LEAST_STD * extent)
+            std = max(anchor.control_point.position_std, MIN_STD * extent)
             spot = now.scale * now.rotation @ source
             residual = spot + now.shift - target
             by = np.concatenate([-so3.hat(spot), np.eye(3), spot[:, None]], axis=1)
             hessian += by.T @ by / std**2
             gradient += by.T @ residual / std**2
         for anchor in turns:
-            assert anchor.reference.rotation is not None
-            std = max(anchor.reference.rotation_std, LEAST_STD)
-            # world_from_network as this camera's attitude has it, against the fit.
-            residual = so3.log(now.rotation @ anchor.pose.rotation.T @ anchor.reference.rotation)
+            assert anchor.control_point.rotation is not None
+            std = max(anchor.control_point.rotation_std, MIN_STD)
+            # The rotation of world_from_network by this camera's attitude, relative to the fit.
+            residual = so3.log(now.rotation @ anchor.pose.rotation.T @ anchor.control_point.rotation)
             hessian[:3, :3] += np.eye(3) / std**2
             gradient[:3] += residual / std**2
         step = -np.linalg.solve(hessian + 1e-12 * np.trace(hessian) * np.eye(7), gradient)
@@ -111,26 +113,26 @@ def _refined(start: Similarity, positions: list[tuple[Floats, Floats, Anchor]], 
     return now
 
 
-def reference_edge(own: Anchor, other: Anchor, *, attitude: bool) -> Summary | None:
-    """What two references say of where ``own`` sees ``other``: the direction, and with ``attitude`` the turn too.
+def control_point_factor(own: Anchor, other: Anchor, *, attitude: bool) -> QuadraticFactor | None:
+    """Factor of ``other`` relative to ``own`` from two control points: direction, and with ``attitude`` the rotation.
 
-    None if they say neither: a direction needs both positions and ``own``'s attitude, a turn needs both attitudes.
+    None without either: a direction needs both positions and ``own``'s attitude, a rotation needs both attitudes.
     """
-    a, b = own.reference, other.reference
+    a, b = own.control_point, other.control_point
     hessian = np.zeros((6, 6))
     rotation, centre = np.eye(3), np.array([0.0, 0.0, 1.0])
-    told = False
+    determined = False
     if attitude and a.rotation is not None and b.rotation is not None:
         rotation = b.rotation @ a.rotation.T
-        hessian[:3, :3] = np.eye(3) / (max(a.rotation_std, LEAST_STD) ** 2 + max(b.rotation_std, LEAST_STD) ** 2)
-        told = True
+        hessian[:3, :3] = np.eye(3) / (max(a.rotation_std, MIN_STD) ** 2 + max(b.rotation_std, MIN_STD) ** 2)
+        determined = True
     if a.position is not None and b.position is not None and a.rotation is not None:
         apart = b.position - a.position
         length = float(np.linalg.norm(apart))
         if length > 0.0:
             centre = a.rotation @ apart / length
             spread = np.hypot(a.position_std, b.position_std) / length
-            std2 = max(spread, LEAST_STD) ** 2 + max(a.rotation_std, LEAST_STD) ** 2
+            std2 = max(spread, MIN_STD) ** 2 + max(a.rotation_std, MIN_STD) ** 2
             hessian[3:, 3:] = (np.eye(3) - np.outer(centre, centre)) / std2
-            told = True
-    return Summary(Relative(rotation, centre), hessian, np.zeros(6), 0.0, True) if told else None
+            determined = True
+    return QuadraticFactor(RelativeTransform(rotation, centre), hessian, np.zeros(6), 0.0, True) if determined else None

@@ -1,4 +1,4 @@
-"""How a camera finds its first pose in a frame that its neighbours are in (METHODS C, step 4)."""
+"""Localisation of a camera in its neighbours' frame: its initial pose (distributed pose paper, step 4)."""
 
 from __future__ import annotations
 
@@ -8,56 +8,58 @@ import numpy as np
 
 from hub.distributed.factors.factor import Edge
 from hub.distributed.factors.initialise import resect
-from hub.distributed.network.block_solver import placed_by, ray_meeting
+from hub.distributed.network.block_solver import intersect_rays, pose_from_relative
 from hub.distributed.network.messages import StateMessage
 from protocols.geometry.pose import Pose
 
-Offer: TypeAlias = tuple[StateMessage, Edge]
-"""A neighbour that is placed, and the edge to it."""
+LocalisedNeighbour: TypeAlias = tuple[StateMessage, Edge]
+"""A localised neighbour's state, and the edge to it."""
 
 
-def placed(camera: int, offers: list[Offer], frame: int) -> Pose | None:
-    """Where ``camera`` stands in ``frame`` by the edge that tells most; with bearings only, where its lines meet.
+def localise(camera: int, neighbours: list[LocalisedNeighbour], frame: int) -> Pose | None:
+    """Pose of ``camera`` in ``frame`` by the most informative edge; with bearings only, by intersection of rays.
 
-    offers: neighbours in that frame with edges that have begun. None while they don't tell a place.
+    neighbours: those in that frame with initialised edges. None while they do not determine a position.
     """
 
-    def strength(edge: Edge) -> float:
-        assert edge.summary is not None
-        return float(np.linalg.slogdet(edge.summary.hessian + 1e-9 * np.eye(6))[1])
+    def log_information(edge: Edge) -> float:
+        assert edge.factor is not None
+        return float(np.linalg.slogdet(edge.factor.hessian + 1e-9 * np.eye(6))[1])
 
-    state, edge = max(offers, key=lambda offer: strength(offer[1]))
-    assert edge.summary is not None
+    state, edge = max(neighbours, key=lambda neighbour: log_information(neighbour[1]))
+    assert edge.factor is not None
     assert state.pose is not None
-    best = edge.from_here(edge.summary.anchor.moved(edge.summary.best_step()))
-    if not edge.summary.bearings:
-        return placed_by(state.pose, best)
-    partner = next((offer for offer in offers if offer[0].camera == frame and offer[0].partner == camera), None)
+    best = edge.neighbour_from_own(edge.factor.anchor.retract(edge.factor.newton_step()))
+    if not edge.factor.bearings:
+        return pose_from_relative(state.pose, best)
+    partner = next(
+        (neighbour for neighbour in neighbours if neighbour[0].camera == frame and neighbour[0].partner == camera), None
+    )
     if partner is not None:
-        assert partner[1].summary is not None
+        assert partner[1].factor is not None
         assert partner[0].pose is not None
-        seen = partner[1].from_here(partner[1].summary.anchor)
-        return placed_by(partner[0].pose, seen.scaled(1.0 / float(np.linalg.norm(seen.centre))))
-    if len(offers) < 2:
+        seen = partner[1].neighbour_from_own(partner[1].factor.anchor)
+        return pose_from_relative(partner[0].pose, seen.scaled(1.0 / float(np.linalg.norm(seen.centre))))
+    if len(neighbours) < 2:
         return None
     rotation = best.rotation.T @ state.pose.rotation
     rays = []
-    for other, its in offers:
-        assert its.summary is not None
+    for other, its in neighbours:
+        assert its.factor is not None
         assert other.pose is not None
-        centre = its.from_here(its.summary.anchor).centre
+        centre = its.neighbour_from_own(its.factor.anchor).centre
         rays.append((other.pose, centre / np.linalg.norm(centre)))
-    met = ray_meeting(rays, rotation)
-    return None if met is None else Pose(rotation, met[0])
+    intersection = intersect_rays(rays, rotation)
+    return None if intersection is None else Pose(rotation, intersection[0])
 
 
-def placed_by_many(offers: list[Offer], rng: np.random.Generator) -> Pose | None:
-    """Where a camera stands that shares too little with any one neighbour, by what it shares with all; None if unknown.
+def localise_by_resection(neighbours: list[LocalisedNeighbour], rng: np.random.Generator) -> Pose | None:
+    """Pose by resection from the observations shared with all neighbours; None if it is not determined.
 
-    offers: neighbours of one frame, whether or not their edges have begun.
+    For a camera that shares too few with any single one. neighbours: those of one frame, with edges initialised or not.
     """
     mine, there, spread = [], [], []
-    for state, edge in offers:
+    for state, edge in neighbours:
         if state.pose is not None:
             own, other, std = edge.points()
             mine.append(own)

@@ -1,4 +1,4 @@
-"""What pose nodes tell each other. Everything is immutable; arrays are not to be written to."""
+"""Messages between pose nodes. All are immutable; arrays must not be modified."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from protocols.session.rig import RigCamera
 
 @dataclass(frozen=True, slots=True)
 class SharedObservation:
-    """One target seen by one camera.
+    """One observation of a target by one camera.
 
-    camera: who saw it. boot: changes when its agent restarts. sequence: counts its observations; with camera and
-    boot, duplicates are dropped by it. time: reference clock [s]; time_std [s]: of the clock map of that camera.
+    camera: its number. boot: boot id, changes when its agent restarts. sequence: observation counter; with camera and
+    boot it identifies duplicates. time: reference clock [s]; time_std [s]: of the clock map of that camera.
     x, y: normalised, undistorted. std: of x and of y. size: normalised (pixels over focal length), 0 = not known;
-    size_std: relative. label: which target; only observations of one label are brought together.
+    size_std: relative. label: target id; only observations of the same label are associated.
     """
 
     camera: int
@@ -36,8 +36,8 @@ class SharedObservation:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reference:
-    """What is known of one camera in the world. Pose: X_camera = rotation @ (X_world - position).
+class ControlPoint:
+    """Surveyed pose of one camera in the world, or a part of it: X_camera = rotation @ (X_world - position).
 
     position: (3,) with its std. rotation: (3, 3), camera from world, with its std [rad].
     """
@@ -48,8 +48,8 @@ class Reference:
     rotation_std: float = 0.0
 
     @classmethod
-    def of(cls, camera: RigCamera) -> Reference | None:
-        """What the rig knows of a camera; None if nothing."""
+    def of(cls, camera: RigCamera) -> ControlPoint | None:
+        """The control point of a rig camera; None without position and attitude."""
         if camera.position is None and camera.rotation is None:
             return None
         stds = [0.0 if std is None else float(np.max(std)) for std in (camera.position_std, camera.rotation_std)]
@@ -58,9 +58,10 @@ class Reference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Anchor:
-    """Where a reference camera stands in the network's own frame; flooded through the network (METHODS C, step 7).
+    """A control point with its camera's pose in the network's frame; flooded through the network.
 
-    epoch, sequence: later wins. aside: the camera was found to have moved from its reference.
+    Distributed pose paper, step 7. epoch, sequence: the later one wins. rejected: the camera was found not to be at its
+    control point.
     """
 
     camera: int
@@ -68,19 +69,19 @@ class Anchor:
     sequence: int
     frame: int
     pose: Pose
-    reference: Reference
-    aside: bool = False
+    control_point: ControlPoint
+    rejected: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateMessage:
-    """One camera's state for its neighbours (METHODS C, step 6): the latest sequence wins.
+    """One camera's state for its neighbours (distributed pose paper, step 6): the latest sequence wins.
 
-    epoch: grows when the camera was bumped; what was learnt with an earlier epoch is void. frame: whose axes and unit
-    ``pose`` is in; hops: to that camera. pose: None while not localised. settled: updates since it joined.
-    depth: the network's size in hops, as far as heard.
-    leaving: the camera goes; its edges are dropped. partner: with bearings only, the camera whose distance from the
-    frame's owner is the unit. anchors: references heard of.
+    epoch: incremented when the camera has moved; factors of an earlier epoch are void. frame: the camera whose axes and
+    unit ``pose`` uses; hops: graph distance to that camera. pose: None while not localised. frame_age: updates since it
+    joined the frame. depth: the network's size in hops, as far as known. leaving: the camera leaves the network and its
+    edges are dropped. partner: with bearings only, the camera whose distance from the frame's owner is the unit.
+    anchors: known control points.
     """
 
     camera: int
@@ -90,15 +91,15 @@ class StateMessage:
     frame: int
     hops: int
     pose: Pose | None
-    settled: int = 0
+    frame_age: int = 0
     depth: int = 0
     leaving: bool = False
     partner: int = -1
     anchors: tuple[Anchor, ...] = ()
 
     @property
-    def sound(self) -> bool:
-        """Whether the pose is finite, with a rotation in it."""
+    def is_valid(self) -> bool:
+        """Whether the pose is finite and its rotation orthonormal."""
         if self.pose is None:
             return True
         rotation = self.pose.rotation
@@ -109,7 +110,7 @@ class StateMessage:
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """Something that a person should know. kind: "bumped", "edge begun again", "reference set aside", "joined"."""
+    """An event for the operator. kind: "bumped", "edge begun again", "reference set aside", "joined"."""
 
     camera: int
     kind: str
@@ -117,4 +118,4 @@ class Notice:
 
 
 Message: TypeAlias = SharedObservation | StateMessage
-Out: TypeAlias = StateMessage | Notice
+Output: TypeAlias = StateMessage | Notice

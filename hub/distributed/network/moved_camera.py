@@ -1,8 +1,8 @@
-"""Whether a camera was bumped: a likelihood-ratio test over the latest observations of all its edges (step 8).
+"""Moved-camera test: a likelihood-ratio test over the latest observations of all edges of a camera.
 
-Each edge keeps robust sums of its latest observations about where the network predicted them. "This camera moved by
-one step" must explain them far better than "nothing moved", and must do so without the edge that speaks loudest: what
-one edge says alone is that neighbour's affair.
+Distributed pose paper, step 8. Each edge keeps robust sums of its latest observations about the network's prediction.
+The hypothesis "this camera moved by one step" must explain them significantly better than "nothing moved", and must
+still do so without any single edge: evidence from one edge alone means that the neighbour moved.
 """
 
 from __future__ import annotations
@@ -14,68 +14,72 @@ import numpy as np
 from hub.distributed.factors.factor import Edge, Window
 from protocols.geometry.types import Floats
 
-RAISED = 55.0
-"""Chi2 (6 dof) of the motion that is an alarm; by chance less than once in 1e9 tests."""
-CONFIRMED = 22.0
-"""The same without the loudest edge."""
-_SHORT, _LONG = 48, 400
-"""Observations of all edges after which a window begins anew."""
-_ARMED = 4.0
-"""Times that an edge's past must outweigh its window."""
+CHI2_ALARM = 55.0
+"""Chi2 (6 dof) of the motion that raises an alarm; false-alarm probability below 1e-9 per test."""
+CHI2_CONFIRM = 22.0
+"""The same with any single edge left out."""
+_SHORT_WINDOW, _LONG_WINDOW = 48, 400
+"""Observations of all edges after which a window is restarted."""
+_MIN_HISTORY_RATIO = 4.0
+"""Smallest ratio of an edge's observations to those in its window."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
-    """An edge and the derivative (6, 6) of its step by the camera's."""
+class EdgeJacobian:
+    """An edge and the Jacobian (6, 6) of its step by the camera's."""
 
     edge: Edge
     by_step: Floats
 
 
-def camera_moved(motions: list[Motion]) -> Floats | None:
-    """The camera's step (6,), or None while nothing says that it moved. Renews windows that are full."""
+def detect_motion(edges: list[EdgeJacobian]) -> Floats | None:
+    """The camera's step (6,), or None without a significant motion. Restarts full windows."""
     found = None
     for short in (True, False):
-        windows = [(m, m.edge.short if short else m.edge.long) for m in motions]
+        windows = [(m, m.edge.short_window if short else m.edge.long_window) for m in edges]
         count = sum(window.count for _, window in windows)
         if count == 0:
             continue
-        armed = [(m, w) for m, w in windows if m.edge.seen > _ARMED * w.count and w.count > 0]
-        step = _test(armed)
+        testable = [
+            (m, w) for m, w in windows if m.edge.observation_count > _MIN_HISTORY_RATIO * w.count and w.count > 0
+        ]
+        step = _likelihood_ratio_test(testable)
         if step is not None:
             found = step
-        if count > (_SHORT if short else _LONG):
+        if count > (_SHORT_WINDOW if short else _LONG_WINDOW):
             for m, _ in windows:
                 if short:
-                    m.edge.short = Window.empty()
+                    m.edge.short_window = Window.empty()
                 else:
-                    m.edge.long = Window.empty()
+                    m.edge.long_window = Window.empty()
     return found
 
 
-def _test(windows: list[tuple[Motion, Window]]) -> Floats | None:
+def _likelihood_ratio_test(windows: list[tuple[EdgeJacobian, Window]]) -> Floats | None:
     if len(windows) < 2:
         return None
     by_step = np.array([motion.by_step for motion, _ in windows])
     turned = by_step.transpose(0, 2, 1)
-    # The past is uncertain too, by its share.
-    share = np.array([1.0 / (1.0 + 2.0 * window.count / max(motion.edge.seen, 1)) for motion, window in windows])
+    # The prediction is uncertain too: discount by the window's share of the observations.
+    share = np.array(
+        [1.0 / (1.0 + 2.0 * window.count / max(motion.edge.observation_count, 1)) for motion, window in windows]
+    )
     hessians = turned @ np.array([window.hessian for _, window in windows]) @ by_step * share[:, None, None]
     gradients = (turned @ np.array([window.gradient for _, window in windows])[:, :, None])[:, :, 0] * share[:, None]
-    whole, together = gradients.sum(axis=0), hessians.sum(axis=0)
-    if _most(together, whole) < 0.99 * RAISED:
+    gradient_sum, hessian_sum = gradients.sum(axis=0), hessians.sum(axis=0)
+    if _chi2_upper_bound(hessian_sum, gradient_sum) < 0.99 * CHI2_ALARM:
         return None
-    chi2, step = _evidence(together, whole)
-    if chi2 < RAISED:
+    chi2, step = _chi2_and_step(hessian_sum, gradient_sum)
+    if chi2 < CHI2_ALARM:
         return None
     for hessian, gradient in zip(hessians, gradients, strict=True):
-        if _evidence(together - hessian, whole - gradient)[0] < CONFIRMED:
+        if _chi2_and_step(hessian_sum - hessian, gradient_sum - gradient)[0] < CHI2_CONFIRM:
             return None
     return step
 
 
-def _most(hessian: Floats, gradient: Floats) -> float:
-    """Chi2 of the best step to 1 %, or more where a direction has no information. Cheap, for calm times."""
+def _chi2_upper_bound(hessian: Floats, gradient: Floats) -> float:
+    """Upper bound on chi2 of the best step, within 1 % where all directions have information: a cheap first test."""
     scale = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-300))
     normalised = hessian * scale * scale[:, None]
     normalised.flat[::7] += 1e-9
@@ -83,7 +87,7 @@ def _most(hessian: Floats, gradient: Floats) -> float:
     return float(pull @ np.linalg.solve(normalised, pull))
 
 
-def _evidence(hessian: Floats, gradient: Floats) -> tuple[float, Floats]:
+def _chi2_and_step(hessian: Floats, gradient: Floats) -> tuple[float, Floats]:
     """Chi2 of the best step, and the step (6,)."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
     values, vectors = np.linalg.eigh(hessian * scale * scale[:, None])

@@ -1,4 +1,4 @@
-"""One neighbour of a pose node: its edge, its state, and which of its observations have been heard."""
+"""One neighbour of a pose node: its edge, its state, and the observations received from it."""
 
 from __future__ import annotations
 
@@ -7,37 +7,39 @@ from dataclasses import dataclass
 from hub.distributed.factors.factor import Edge
 from hub.distributed.network.messages import SharedObservation, StateMessage
 
-_SEQUENCES = 256
-"""Messages of one camera that may overtake each other."""
+_REORDER_WINDOW = 256
+"""Largest reordering of one camera's messages."""
 
 
 @dataclass(slots=True, eq=False)
 class Neighbour:
-    """What a pose node holds of one neighbour. state: the last one heard; highest, bits: observations heard so far."""
+    """Data of one neighbour. state: the last received. highest_sequence, received_mask: observations received."""
 
     edge: Edge
     boot: int = -1
-    highest: int = -1
-    bits: int = 0
+    highest_sequence: int = -1
+    received_mask: int = 0
     state: StateMessage | None = None
-    stale: int = 0
-    """Own updates since the last state came."""
+    state_age: int = 0
+    """Own updates since the last state was received."""
 
-    def refuses(self, seen: SharedObservation) -> str:
-        """Why an observation is not taken: heard before, or too late to tell (METHODS C, step 1); ""."""
+    def rejection_reason(self, seen: SharedObservation) -> str:
+        """Why an observation is rejected: a duplicate, or too late (distributed pose paper, step 1); "" if accepted."""
         if seen.boot != self.boot:
             if seen.boot < self.boot:
                 return "earlier boot"
-            self.boot, self.highest, self.bits = seen.boot, -1, 0
-        ahead = seen.sequence - self.highest
+            self.boot, self.highest_sequence, self.received_mask = seen.boot, -1, 0
+        ahead = seen.sequence - self.highest_sequence
         if ahead > 0:
-            self.bits = ((self.bits << ahead) | 1) & ((1 << _SEQUENCES) - 1) if ahead < _SEQUENCES else 1
-            self.highest = seen.sequence
+            self.received_mask = (
+                ((self.received_mask << ahead) | 1) & ((1 << _REORDER_WINDOW) - 1) if ahead < _REORDER_WINDOW else 1
+            )
+            self.highest_sequence = seen.sequence
             return ""
-        if -ahead >= _SEQUENCES:
+        if -ahead >= _REORDER_WINDOW:
             return "too late"
         bit = 1 << -ahead
-        if self.bits & bit:
+        if self.received_mask & bit:
             return "duplicate"
-        self.bits |= bit
+        self.received_mask |= bit
         return ""

@@ -1,4 +1,4 @@
-"""Pose nodes' states as messages, and back: what neighbours hear, and what another host goes on with."""
+"""Conversion of pose nodes' states and factors to and from protobuf messages."""
 
 from __future__ import annotations
 
@@ -6,30 +6,30 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hub.distributed.factors.factor import Summary
-from hub.distributed.factors.linearise import Relative
-from hub.distributed.network.messages import Anchor, Reference, StateMessage
+from hub.distributed.factors.factor import QuadraticFactor
+from hub.distributed.factors.linearise import RelativeTransform
+from hub.distributed.network.messages import Anchor, ControlPoint, StateMessage
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
 
 _UPPER = np.triu_indices(6)
 _LONGEST = 63
-"""Letters of a camera's id."""
+"""Maximum length of a camera's id."""
 
 
 def number_of(camera: str) -> int:
-    """A number for a camera's name; they sort as the names do, and every host makes the same ones."""
+    """A number for a camera's name: in the same order as the names, and the same on every host."""
     return int.from_bytes(camera.encode("ascii").ljust(_LONGEST, b"\0"), "big")
 
 
 def name_of(number: int) -> str:
-    """The camera's name; "" for none."""
+    """The camera's name of a number; "" for a negative one."""
     return "" if number < 0 else number.to_bytes(_LONGEST, "big").rstrip(b"\0").decode("ascii")
 
 
 def state_to_wire(state: StateMessage, host: str, takeover: int) -> pb.NodeState:
-    """The state as a message, without edges."""
+    """The state as a message, without factors."""
     message = pb.NodeState(
         schema_version=1,
         camera=name_of(state.camera),
@@ -40,7 +40,7 @@ def state_to_wire(state: StateMessage, host: str, takeover: int) -> pb.NodeState
         frame=name_of(state.frame),
         hops=state.hops,
         depth=state.depth,
-        settled=state.settled,
+        settled=state.frame_age,
         partner=name_of(state.partner),
         leaving=state.leaving,
     )
@@ -52,7 +52,7 @@ def state_to_wire(state: StateMessage, host: str, takeover: int) -> pb.NodeState
 
 
 def state_from_wire(message: pb.NodeState) -> StateMessage:
-    """The state. A later host's messages come after all of an earlier one's."""
+    """The state of a message. Sequence numbers of a later host are above all of an earlier one's."""
     pose = None
     if len(message.rotation) == 3:
         pose = Pose(so3.exp(np.array(message.rotation)), np.array(message.position))
@@ -64,7 +64,7 @@ def state_from_wire(message: pb.NodeState) -> StateMessage:
         frame=number_of(message.frame),
         hops=message.hops,
         pose=pose,
-        settled=message.settled,
+        frame_age=message.settled,
         depth=message.depth,
         leaving=message.leaving,
         partner=number_of(message.partner) if message.partner else -1,
@@ -73,7 +73,7 @@ def state_from_wire(message: pb.NodeState) -> StateMessage:
 
 
 def _anchor_to_wire(anchor: Anchor) -> pb.NodeAnchor:
-    known = anchor.reference
+    known = anchor.control_point
     return pb.NodeAnchor(
         camera=name_of(anchor.camera),
         epoch=anchor.epoch,
@@ -84,12 +84,12 @@ def _anchor_to_wire(anchor: Anchor) -> pb.NodeAnchor:
         world_position=[] if known.position is None else known.position.tolist(),
         rotation_std=known.rotation_std,
         position_std=known.position_std,
-        aside=anchor.aside,
+        aside=anchor.rejected,
     )
 
 
 def _anchor_from_wire(message: pb.NodeAnchor, frame: int) -> Anchor:
-    known = Reference(
+    known = ControlPoint(
         np.array(message.world_position) if message.world_position else None,
         so3.exp(np.array(message.world_rotation)) if message.world_rotation else None,
         message.position_std,
@@ -99,33 +99,33 @@ def _anchor_from_wire(message: pb.NodeAnchor, frame: int) -> Anchor:
     return Anchor(number_of(message.camera), message.epoch, message.sequence, frame, pose, known, message.aside)
 
 
-def edges_to_wire(summaries: Mapping[int, Summary]) -> list[pb.NodeEdge]:
-    """What a node has learnt of its neighbours."""
+def edges_to_wire(factors: Mapping[int, QuadraticFactor]) -> list[pb.NodeEdge]:
+    """A node's factors by neighbour, as messages."""
     return [
         pb.NodeEdge(
             neighbour=name_of(neighbour),
-            rotation=so3.log(summary.anchor.rotation).tolist(),
-            centre=summary.anchor.centre.tolist(),
-            hessian=summary.hessian[_UPPER].tolist(),
-            gradient=summary.gradient.tolist(),
-            count=summary.count,
-            bearings=summary.bearings,
-            chi2=summary.chi2,
+            rotation=so3.log(factor.anchor.rotation).tolist(),
+            centre=factor.anchor.centre.tolist(),
+            hessian=factor.hessian[_UPPER].tolist(),
+            gradient=factor.gradient.tolist(),
+            count=factor.count,
+            bearings=factor.bearings,
+            chi2=factor.chi2,
         )
-        for neighbour, summary in summaries.items()
+        for neighbour, factor in factors.items()
     ]
 
 
-def edges_from_wire(edges: list[pb.NodeEdge]) -> dict[int, Summary]:
-    """The same, by neighbour; what is no information matrix is left out."""
+def edges_from_wire(edges: list[pb.NodeEdge]) -> dict[int, QuadraticFactor]:
+    """Factors by neighbour from messages; ones with a negative diagonal are left out."""
     out = {}
     for edge in edges:
         hessian = np.zeros((6, 6))
         hessian[_UPPER] = np.array(edge.hessian)
         hessian = hessian + np.triu(hessian, 1).T
-        anchor = Relative(so3.exp(np.array(edge.rotation)), np.array(edge.centre))
+        anchor = RelativeTransform(so3.exp(np.array(edge.rotation)), np.array(edge.centre))
         if (hessian.diagonal() >= 0.0).all():
-            out[number_of(edge.neighbour)] = Summary(
+            out[number_of(edge.neighbour)] = QuadraticFactor(
                 anchor, hessian, np.array(edge.gradient), edge.count, edge.bearings, edge.chi2
             )
     return out

@@ -1,1 +1,1 @@
-"""Data association: assignment, track initiation, re-identification."""
+"""Data association: detection-to-track assignment, track initiation, re-identification of lost tracks."""

@@ -1,1 +1,1 @@
-"""The multi-target Kalman filter: target models, measurement model, update, manoeuvres."""
+"""Multi-target Kalman filter: target models, measurement model, manoeuvre model, per-frame update."""

@@ -1,7 +1,7 @@
-"""What a camera should see of targets, with its derivatives: the measurement model of the filter.
+"""Measurement model of the filter: predicted detections of targets in a camera, with Jacobians and noise.
 
-Rows of a measurement: 0, 1 the representative point, 2, 3 the head's top, 4, 5 the foot point, all in normalised
-coordinates; 6 the logarithm of the size seen, normalised.
+Rows of a measurement: 0, 1 the representative point, 2, 3 the top of the head, 4, 5 the foot point, all in normalised
+image coordinates; 6 the logarithm of the image size in normalised units.
 """
 
 from __future__ import annotations
@@ -10,62 +10,62 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hub.tracking.camera_frame import Frame, TrackingCamera
-from hub.tracking.filter.kalman import LOG_SIZE, POSITION, SIZE, VELOCITY
-from hub.tracking.filter.target_models import BODIES, PERSON
+from hub.tracking.camera_frame import FrameDetections, TrackingCamera
+from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM, VELOCITY
+from hub.tracking.filter.target_models import PERSON, TARGET_MODELS
 from protocols.geometry.types import Bools, Floats, Ints
 
-ROWS = 7
-POINT, HEAD, FOOT, SEEN_SIZE = slice(0, 2), slice(2, 4), slice(4, 6), 6
-PARTS = (POINT, HEAD, FOOT, slice(SEEN_SIZE, ROWS))
-_SIZE_STD = 0.08
-"""Of the logarithm of a size seen: sizes of silhouettes breathe."""
-_LEAST_DEPTH = 1e-3
-_HEAVY = 4.0
-"""Degrees of freedom of Student's t that heads and feet keep: a silhouette that is cut or joined errs far."""
+MEASUREMENT_DIM = 7
+POINT, HEAD, FOOT, LOG_IMAGE_SIZE = slice(0, 2), slice(2, 4), slice(4, 6), 6
+BLOCKS = (POINT, HEAD, FOOT, slice(LOG_IMAGE_SIZE, MEASUREMENT_DIM))
+_LOG_SIZE_STD = 0.08
+"""Of the measured log image size: silhouette sizes fluctuate."""
+_MIN_DEPTH = 1e-3
+_STUDENT_T_DOF = 4.0
+"""Degrees of freedom of the Student's t noise of heads and feet: truncated or merged silhouettes cause outliers."""
 
-_UPRIGHT = np.array([body.upright for body in BODIES])
-_ABOVE = np.array([body.point_above for body in BODIES])
-_POINT_NOISE = np.array([body.point_noise for body in BODIES])
-_HEAD_NOISE = np.array([body.head_noise for body in BODIES])
-_FOOT_NOISE = np.array([body.foot_noise for body in BODIES])
+_UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
+_POINT_OFFSET = np.array([model.point_offset for model in TARGET_MODELS])
+_POINT_STD = np.array([model.point_std for model in TARGET_MODELS])
+_HEAD_STD = np.array([model.head_std for model in TARGET_MODELS])
+_FOOT_STD = np.array([model.foot_std for model in TARGET_MODELS])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Expected:
-    """What one camera should see of n targets.
+class PredictedMeasurement:
+    """The predicted measurements of n targets in one camera.
 
-    value: (n, 7), NaN in rows that a target has not (head and foot of what does not stand upright). slope: (n, 7, 7).
-    body_noise: (n, 7, 7), of where on the body the points lie and of when the camera fired. depth: (n,), along the
-    axis. part_std: (n, 3) stds of point, head and foot on the body, in shares of the size; part_noise: (n, 3, 2, 2)
-    what a std of 1 would give.
+    value: (n, 7), NaN in rows that do not apply (head and foot of targets that are not upright). jacobian: (n, 7, 7).
+    model_noise: (n, 7, 7), from the spread of the points on the target and from the uncertainty of the capture time.
+    depth: (n,), along the optical axis. part_std: (n, 3) standard deviations of point, head and foot on the target, as
+    fractions of its size; part_noise: (n, 3, 2, 2) the image covariance for a std of one size.
     """
 
     value: Floats
-    slope: Floats
-    body_noise: Floats
+    jacobian: Floats
+    model_noise: Floats
     depth: Floats
     part_std: Floats
     part_noise: Floats
 
-    def blurred(self, extra: Floats) -> Expected:
-        """The same where others stand in the way: (n,) shares of the size that are added to the points' stds."""
-        noise = self.body_noise.copy()
+    def with_occlusion_noise(self, extra: Floats) -> PredictedMeasurement:
+        """The same with more noise under occlusion. extra: (n,) fractions of the size added to the points' stds."""
+        noise = self.model_noise.copy()
         more = ((self.part_std + extra[:, None]) ** 2 - self.part_std**2)[:, :, None, None] * self.part_noise
         for part, rows in enumerate((POINT, HEAD, FOOT)):
             noise[:, rows, rows] += more[:, part]
-        noise[:, SEEN_SIZE, SEEN_SIZE] = (_SIZE_STD + extra) ** 2
-        return replace(self, body_noise=noise)
+        noise[:, LOG_IMAGE_SIZE, LOG_IMAGE_SIZE] = (_LOG_SIZE_STD + extra) ** 2
+        return replace(self, model_noise=noise)
 
-    def kept(self, which: Ints) -> Expected:
-        """Only of some targets."""
-        return Expected(*(getattr(self, name)[which] for name in self.__slots__))
+    def select(self, which: Ints) -> PredictedMeasurement:
+        """The rows of some targets."""
+        return PredictedMeasurement(*(getattr(self, name)[which] for name in self.__slots__))
 
 
-def expect(camera: TrackingCamera, mean: Floats, kind: Ints, up: Floats | None) -> Expected:
-    """What ``camera`` should see of targets (n, 7) of ``kind`` (n,) at this moment.
+def predict_measurement(camera: TrackingCamera, mean: Floats, kind: Ints, up: Floats | None) -> PredictedMeasurement:
+    """Predict the measurements of targets with states ``mean`` (n, 7) and ``kind`` (n,) in ``camera``.
 
-    up: (3,) unit vector of the world, None = not known: then nothing is known to stand upright.
+    up: (3,) unit vector in world coordinates, None = unknown: then no target is treated as upright.
     """
     n = len(mean)
     rotation = camera.pose.rotation
@@ -76,82 +76,91 @@ def expect(camera: TrackingCamera, mean: Floats, kind: Ints, up: Floats | None) 
     depth = centre[:, 2]
     velocity = mean[:, VELOCITY] @ rotation.T
     # The three points of every target at once: (n, 3, ...) of point, head, foot.
-    along = size[:, None] * np.stack([np.where(upright, _ABOVE[kind], 0.0), np.full(n, 0.5), np.full(n, -0.5)], axis=1)
+    along = size[:, None] * np.stack(
+        [np.where(upright, _POINT_OFFSET[kind], 0.0), np.full(n, 0.5), np.full(n, -0.5)], axis=1
+    )
     where = centre[:, None] + along[:, :, None] * axis
-    good = (where[:, :, 2] > _LEAST_DEPTH * size[:, None]) & np.isfinite(where[:, :, 2])
+    good = (where[:, :, 2] > _MIN_DEPTH * size[:, None]) & np.isfinite(where[:, :, 2])
     good[:, 1:] &= upright[:, None]
     safe = np.where(good, where[:, :, 2], 1.0)
     seen = where[:, :, :2] / safe[:, :, None]
-    by_camera = np.zeros((n, 3, 2, 3))  # derivative by the place in camera axes
+    by_camera = np.zeros((n, 3, 2, 3))  # derivative by the position in camera axes
     by_camera[:, :, 0, 0] = by_camera[:, :, 1, 1] = 1.0 / safe
     by_camera[:, :, :, 2] = -seen / safe[:, :, None]
-    value, slope, noise = np.full((n, ROWS), np.nan), np.zeros((n, ROWS, SIZE)), np.zeros((n, ROWS, ROWS))
-    value[:, :SEEN_SIZE] = np.where(good[:, :, None], seen, np.nan).reshape(n, 6)
-    slope[:, :SEEN_SIZE, POSITION] = (by_camera @ rotation).reshape(n, 6, 3)
-    slope[:, :SEEN_SIZE, LOG_SIZE] = ((by_camera @ axis) * along[:, :, None]).reshape(n, 6)
-    std = np.stack([_POINT_NOISE[kind], _HEAD_NOISE[kind], _FOOT_NOISE[kind]], axis=1)
+    value, jacobian, noise = (
+        np.full((n, MEASUREMENT_DIM), np.nan),
+        np.zeros((n, MEASUREMENT_DIM, STATE_DIM)),
+        np.zeros((n, MEASUREMENT_DIM, MEASUREMENT_DIM)),
+    )
+    value[:, :LOG_IMAGE_SIZE] = np.where(good[:, :, None], seen, np.nan).reshape(n, 6)
+    jacobian[:, :LOG_IMAGE_SIZE, POSITION] = (by_camera @ rotation).reshape(n, 6, 3)
+    jacobian[:, :LOG_IMAGE_SIZE, LOG_SIZE] = ((by_camera @ axis) * along[:, :, None]).reshape(n, 6)
+    std = np.stack([_POINT_STD[kind], _HEAD_STD[kind], _FOOT_STD[kind]], axis=1)
     unit = (size**2)[:, None, None, None] * (by_camera @ by_camera.swapaxes(2, 3))
     moving = (by_camera @ velocity[:, None, :, None])[..., 0] * camera.time_std
     both = (std**2)[:, :, None, None] * unit + moving[:, :, :, None] * moving[:, :, None, :]
     for part, rows in enumerate((POINT, HEAD, FOOT)):
         noise[:, rows, rows] = both[:, part]
-    _expect_size(value, slope, mean, depth, upright, rotation)
-    noise[:, SEEN_SIZE, SEEN_SIZE] = _SIZE_STD**2
-    return Expected(value, slope, noise, depth, std, unit)
+    _predict_log_image_size(value, jacobian, mean, depth, upright, rotation)
+    noise[:, LOG_IMAGE_SIZE, LOG_IMAGE_SIZE] = _LOG_SIZE_STD**2
+    return PredictedMeasurement(value, jacobian, noise, depth, std, unit)
 
 
-def _expect_size(value: Floats, slope: Floats, mean: Floats, depth: Floats, upright: Bools, rotation: Floats) -> None:
-    """Row 6: head to foot of what stands upright, else the size over the depth."""
+def _predict_log_image_size(
+    value: Floats, jacobian: Floats, mean: Floats, depth: Floats, upright: Bools, rotation: Floats
+) -> None:
+    """Row 6: log distance from head to foot of upright targets, else log of size over depth."""
     safe = np.where(depth > 0.0, depth, np.nan)
-    value[:, SEEN_SIZE] = mean[:, LOG_SIZE] - np.log(safe)
-    slope[:, SEEN_SIZE, POSITION] = -np.nan_to_num(1.0 / safe)[:, None] * rotation[2]
-    slope[:, SEEN_SIZE, LOG_SIZE] = 1.0
+    value[:, LOG_IMAGE_SIZE] = mean[:, LOG_SIZE] - np.log(safe)
+    jacobian[:, LOG_IMAGE_SIZE, POSITION] = -np.nan_to_num(1.0 / safe)[:, None] * rotation[2]
+    jacobian[:, LOG_IMAGE_SIZE, LOG_SIZE] = 1.0
     across = value[:, HEAD] - value[:, FOOT]
     length2 = (across**2).sum(axis=1)
     tall = upright & (length2 > 0.0)
     if tall.any():
         by_difference = (across / np.where(tall, length2, 1.0)[:, None])[:, None, :]
-        chained = (by_difference @ (slope[:, HEAD] - slope[:, FOOT]))[:, 0]
-        value[:, SEEN_SIZE] = np.where(tall, 0.5 * np.log(np.where(tall, length2, 1.0)), value[:, SEEN_SIZE])
-        slope[:, SEEN_SIZE] = np.where(tall[:, None], chained, slope[:, SEEN_SIZE])
+        chained = (by_difference @ (jacobian[:, HEAD] - jacobian[:, FOOT]))[:, 0]
+        value[:, LOG_IMAGE_SIZE] = np.where(tall, 0.5 * np.log(np.where(tall, length2, 1.0)), value[:, LOG_IMAGE_SIZE])
+        jacobian[:, LOG_IMAGE_SIZE] = np.where(tall[:, None], chained, jacobian[:, LOG_IMAGE_SIZE])
 
 
-def doubt(squared: Floats) -> Floats:
-    """How many times larger the variance of a head or foot is, by its squared Mahalanobis distance (...), NaN = 1.
+def student_t_inflation(squared: Floats) -> Floats:
+    """Variance inflation factor of a head or foot point, from its squared Mahalanobis distance (...); 1 where NaN.
 
-    The weight of Student's t in iterated least squares, never above 1 (Lange, Little and Taylor 1989).
+    The inverse of the Student's t weight in iteratively reweighted least squares, limited to weights of at most 1
+    (Lange, Little and Taylor 1989).
     """
-    return np.maximum(np.nan_to_num((_HEAVY + squared) / (_HEAVY + 2.0), nan=1.0), 1.0)
+    return np.maximum(np.nan_to_num((_STUDENT_T_DOF + squared) / (_STUDENT_T_DOF + 2.0), nan=1.0), 1.0)
 
 
-def heavy(squared: Floats) -> Floats:
-    """The misfit that ``doubt`` minimises, where a Gaussian's is the squared Mahalanobis distance (...) itself."""
-    beyond = 2.0 + (_HEAVY + 2.0) * np.log(doubt(squared))
+def student_t_cost(squared: Floats) -> Floats:
+    """Robust cost of a squared Mahalanobis distance (...); its derivative is 1 / `student_t_inflation`."""
+    beyond = 2.0 + (_STUDENT_T_DOF + 2.0) * np.log(student_t_inflation(squared))
     return np.where(squared > 2.0, beyond, squared)
 
 
-def measured(frame: Frame, detection: Ints) -> tuple[Floats, Floats]:
-    """Measurements (m, 7) of some detections (m,), NaN where not told, and their noise (m, 7, 7).
+def measurements_of(frame: FrameDetections, detection: Ints) -> tuple[Floats, Floats]:
+    """Measurements (m, 7) of some detections (m,), NaN where missing, and their noise (m, 7, 7).
 
-    The size row is left out where head and foot are told: it is made of them.
+    The size row is omitted where head and foot are both measured, because it is computed from them.
     """
     m = len(detection)
-    value = np.full((m, ROWS), np.nan)
-    noise = np.zeros((m, ROWS, ROWS))
+    value = np.full((m, MEASUREMENT_DIM), np.nan)
+    noise = np.zeros((m, MEASUREMENT_DIM, MEASUREMENT_DIM))
     value[:, POINT], value[:, HEAD], value[:, FOOT] = (
         frame.point[detection],
         frame.head[detection],
         frame.foot[detection],
     )
-    whole = np.isfinite(value[:, 2:6]).all(axis=1)
-    value[:, SEEN_SIZE] = np.where(whole, np.nan, np.log(frame.size[detection]))
+    complete = np.isfinite(value[:, 2:6]).all(axis=1)
+    value[:, LOG_IMAGE_SIZE] = np.where(complete, np.nan, np.log(frame.size[detection]))
     noise[:, POINT, POINT] = frame.noise[detection]
-    pixel2 = frame.per[detection] ** 2
+    pixel2 = frame.units_per_px[detection] ** 2
     for row in range(2, 6):
         noise[:, row, row] = 2.0 * pixel2
     return value, noise
 
 
-def length_of(kind: str, metre: float) -> float:
-    """The size a target of a kind is expected to have [world units]."""
-    return metre * next((body.size_m for body in BODIES if body.kind == kind), PERSON.size_m)
+def expected_size(kind: str, units_per_m: float) -> float:
+    """The typical size of a target of a kind [world units]."""
+    return units_per_m * next((model.size_m for model in TARGET_MODELS if model.kind == kind), PERSON.size_m)

@@ -1,1 +1,1 @@
-"""A Zenoh router in this process, and the watch over its data path."""
+"""A Zenoh router in this process, the monitoring of its data path, and the test of its access rules."""

@@ -1,7 +1,7 @@
-"""Watches a router's data path from outside: a process that is alive may have stopped to route.
+"""Monitors a router's data path with a canary: a process that is alive may have stopped routing.
 
-Two sessions go through the router as agents do; one puts on a key that was never declared, so that the
-router has to find the way anew, the other hears it through a wildcard.
+Two sessions connect to the router as agents do; one publishes on a key that was never declared, so that the router
+must resolve the route anew, the other receives it through a wildcard subscription.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import zenoh
 
 from protocols.bus.base import BusDead
 from protocols.bus.settings import BusConfig
-from protocols.bus.transport.session import close_session, open_session, release, zenoh_call
+from protocols.bus.transport.session import close_session, open_session, undeclare_all, zenoh_call
 
 PERIOD_S = 0.25
 DEAD_AFTER_S = 0.9
@@ -26,7 +26,7 @@ _LATE_S = 0.4
 class Canary:
     """Two sessions through one router. config: how a client reaches it; prefix: keys to use, ``…/canary/<router>``.
 
-    Raises BusDead or InputError where the router does not let them in.
+    Raises BusDead or InputError where the router refuses them.
     """
 
     def __init__(self, config: BusConfig, prefix: str, clock: Callable[[], float] = time.monotonic) -> None:
@@ -40,21 +40,21 @@ class Canary:
         try:
             self._sessions.append(open_session(config, timeout_s=5.0))
             with zenoh_call("canary"):
-                self._ear: zenoh.Subscriber[None] = self._sessions[0].declare_subscriber(
-                    f"{self._prefix}/*", self._hear
+                self._subscriber: zenoh.Subscriber[None] = self._sessions[0].declare_subscriber(
+                    f"{self._prefix}/*", self._receive
                 )
         except BaseException:
             for session in self._sessions:
                 close_session(session)
             raise
         self._last = self._looked = clock()
-        # Its own thread: into a router that hangs a put may hang too.
-        self._thread = threading.Thread(target=self._sing, name="canary", daemon=True)
+        # Its own thread: a put to a router that hangs may hang too.
+        self._thread = threading.Thread(target=self._publish, name="canary", daemon=True)
         self._thread.start()
 
-    def _sing(self) -> None:
+    def _publish(self) -> None:
         number = 0
-        # Quickly until it is first heard: at the start a subscription takes a moment to be known.
+        # Fast until the first message arrives: a new subscription takes a moment to become effective.
         while not self._stop.wait(PERIOD_S if self.heard else 0.05):
             key = f"{self._prefix}/{number}"
             self._sent = {**self._sent, key: self._clock()} if len(self._sent) < 16 else {key: self._clock()}
@@ -62,15 +62,15 @@ class Canary:
                 self._sessions[1].put(key, b"")
             number += 1
 
-    def _hear(self, sample: zenoh.Sample) -> None:
+    def _receive(self, sample: zenoh.Sample) -> None:
         self._last = self._clock()
         self.heard += 1
         self.delay_s = self._last - self._sent.get(str(sample.key_expr), self._last)
 
     def silent_s(self) -> float:
-        """For how long nothing has come through; ask it several times a second.
+        """Seconds since the last message came through; call it several times a second.
 
-        When the asker itself was held up (the machine slept, the process was stopped) the count begins again.
+        If the caller itself was delayed (the machine slept, the process was stopped) the count restarts.
         """
         now = self._clock()
         if now - self._looked > _LATE_S:
@@ -81,6 +81,6 @@ class Canary:
     def close(self) -> None:
         """End both sessions."""
         self._stop.set()
-        release(self._ear)
+        undeclare_all(self._subscriber)
         for session in self._sessions:
             close_session(session)

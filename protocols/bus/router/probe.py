@@ -1,4 +1,4 @@
-"""Tries a router's data path from where an agent stands: does a message come through, of which size, and whose."""
+"""Probes a router's data path as an agent: round-trip time by message size, and received traffic of others."""
 
 from __future__ import annotations
 
@@ -9,27 +9,28 @@ import uuid
 import zenoh
 
 from protocols.bus.settings import BusConfig
-from protocols.bus.transport.session import close_session, open_session, release, zenoh_call
+from protocols.bus.transport.session import close_session, open_session, undeclare_all, zenoh_call
 
-_AGAIN_S = 0.2
+_FIRST_RETRY_S = 0.2
 
 
 def round_trip(config: BusConfig, prefix: str, size: int = 0, timeout_s: float = 3.0) -> float | None:
-    """Seconds that ``size`` bytes take from one session to another; None where none come through whole.
+    """Seconds that ``size`` bytes take from one session to another; None if nothing arrives complete.
 
-    prefix: a key below which this identity may speak and hear. The first message of two sessions may be lost before
-    the way is known, so it is sent until it is heard. Raises InputError where no session can be opened, BusDead.
+    prefix: a key below which this identity may publish and subscribe. The first message of two sessions may be lost
+    before the route is known, so it is repeated until it arrives. Raises InputError where no session can be opened,
+    BusDead.
     """
     key = f"{prefix}/{uuid.uuid4().hex[:12]}"
     payload = uuid.uuid4().bytes * (size // 16)
-    heard = threading.Event()
+    arrived_event = threading.Event()
     sent = arrived = 0.0
 
     def take(sample: zenoh.Sample) -> None:
         nonlocal arrived
         if bytes(sample.payload) == payload:
             arrived = time.monotonic()
-            heard.set()
+            arrived_event.set()
 
     sessions = [open_session(config, timeout_s=timeout_s)]
     try:
@@ -37,23 +38,23 @@ def round_trip(config: BusConfig, prefix: str, size: int = 0, timeout_s: float =
         with zenoh_call("probe"):
             ear = sessions[0].declare_subscriber(key, take)
         began = time.monotonic()
-        # What is slow must not be mistaken for lost: the pause grows.
-        pause = _AGAIN_S
-        while not heard.is_set() and time.monotonic() - began < timeout_s:
+        # A slow message must not be taken for a lost one: the pause doubles.
+        pause = _FIRST_RETRY_S
+        while not arrived_event.is_set() and time.monotonic() - began < timeout_s:
             sent = time.monotonic()
             with zenoh_call("probe"):
                 sessions[1].put(key, payload)
-            heard.wait(pause)
+            arrived_event.wait(pause)
             pause *= 2.0
-        release(ear)
+        undeclare_all(ear)
     finally:
         for session in sessions:
             close_session(session)
-    return max(arrived - sent, 0.0) if heard.is_set() else None
+    return max(arrived - sent, 0.0) if arrived_event.is_set() else None
 
 
-def hears(config: BusConfig, expression: str, seconds: float, own: str = "\0") -> int:
-    """How many messages of others reach this identity within ``seconds``; own: a part of keys that don't count.
+def count_received(config: BusConfig, expression: str, seconds: float, own: str = "\0") -> int:
+    """Number of others' messages that reach this identity within ``seconds``; own: keys with this part are not counted.
 
     Raises InputError where no session can be opened, BusDead.
     """
@@ -70,7 +71,7 @@ def hears(config: BusConfig, expression: str, seconds: float, own: str = "\0") -
         deadline = time.monotonic() + seconds
         while count == 0 and time.monotonic() < deadline:
             time.sleep(0.05)
-        release(ear)
+        undeclare_all(ear)
     finally:
         close_session(session)
     return count

@@ -1,4 +1,4 @@
-"""A Zenoh router inside this process, so that a demo or a rig needs no other program."""
+"""A Zenoh router inside this process, so that a demo or a rig needs no separate program."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from typing import NoReturn, Self
 import msgspec
 
 from protocols.bus.router.canary import DEAD_AFTER_S, Canary
-from protocols.bus.settings import LOOPBACK_ROUTER, BusConfig, parts_of
+from protocols.bus.settings import LOOPBACK_ROUTER, BusConfig, split_endpoint
 from protocols.bus.transport.session import close_session, open_session, zenoh_call
 from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.core.names import key_segment
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import STATUS
@@ -28,14 +29,14 @@ _STATUS_S = 1.0
 
 
 class RulesChanged(Exception):
-    """The router's access rules are new: it must be opened again to know them."""
+    """The router's access rules have changed: it must be reopened to apply them."""
 
 
 class Router:
-    """Relays between the clients that connect to it while the context is open.
+    """Relays between connected clients while the context is open.
 
-    listen: endpoints; more routers to join in connect. config: everything instead, also certificates and access
-    rules. Raises InputError if an address is taken.
+    listen: endpoints; more routers to join in connect. config: a complete configuration instead, with certificates and
+    access rules. Raises InputError if an address is taken.
     """
 
     def __init__(self, *listen: str, connect: tuple[str, ...] = (), config: BusConfig | None = None) -> None:
@@ -73,30 +74,30 @@ def run_router(
     beat: Callable[[], None] = lambda: None,
     seen: Callable[[pb.AgentStatus], None] = lambda status: None,
 ) -> None:
-    """Relay until ``stop`` is set, with a canary through the router itself, and publish its status.
+    """Relay until ``stop`` is set, monitor the data path with a canary, and publish the router's status.
 
-    restarts: how often this router had to be started anew, for its status. ready: called with the endpoints once
-    messages pass; beat: in every round from then on; seen: with
-    every status. died: called when nothing has passed for 0.9 s although the process lives; it must replace the
-    process and not return, because closing a router in that state may hang. Raises RulesChanged: open it again.
+    restarts: number of restarts so far, for the status. ready: called with the endpoints once messages pass; beat:
+    called in every round from then on; seen: called with every status. died: called when no message has passed for
+    DEAD_AFTER_S although the process is alive; it must replace the process and not return, because closing a router in
+    that state may hang. Raises RulesChanged where the router must be reopened.
     """
     boot = uuid.uuid4().hex
     config = msgspec.structs.replace(config, listen=tuple(map(_with_port, config.endpoints()[1])))
     router = Router(config=config)
     inside = BusConfig(mode="client", connect=(own_endpoint(router.listen),), tls=config.tls)
     written = _changed(config.access)
-    canary = Canary(inside, f"syncline/{site}/canary/{agent}")
+    canary = Canary(inside, f"syncline/{site}/canary/{key_segment(agent)}")
     with open_bus(site, inside, timeout_s=5.0) as bus, bus.announce(ROLE, agent, boot):
         publisher = bus.publisher(STATUS, agent)
-        told, next_status = False, 0.0
+        passing, next_status = False, 0.0
         while not stop.wait(_TICK_S):
             silent = canary.silent_s()
             if silent > DEAD_AFTER_S:
                 died(f"nothing has passed through this router for {silent:.1f} s, although it is alive")
-            if canary.heard and not told:
-                told = True
+            if canary.heard and not passing:
+                passing = True
                 ready(router.listen)
-            if told:
+            if passing:
                 beat()
             if _changed(config.access) != written:
                 break
@@ -108,7 +109,7 @@ def run_router(
                     agent=agent,
                     role=ROLE,
                     boot_id=boot,
-                    state="running" if told else "starting",
+                    state="running" if passing else "starting",
                     message=f"relays, {canary.delay_s * 1e3:.1f} ms",
                     counters={"restarts": restarts, "canary": canary.heard},
                     gauges={"canary_s": canary.delay_s, "sessions": router.sessions()},
@@ -131,8 +132,8 @@ def _changed(file: Path | None) -> int:
 
 
 def _with_port(endpoint: str) -> str:
-    """The endpoint with a free port for port 0: the canary must know where to go."""
-    _, host, port = parts_of(endpoint)
+    """The endpoint with a free port in place of port 0, which the canary could not connect to."""
+    _, host, port = split_endpoint(endpoint)
     if port:
         return endpoint
     with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
@@ -141,15 +142,15 @@ def _with_port(endpoint: str) -> str:
 
 
 def own_endpoint(listen: tuple[str, ...]) -> str:
-    """How this machine itself reaches a router that listens there."""
-    protocol, host, port = parts_of(listen[0])
+    """The endpoint by which this machine reaches a router that listens on ``listen``."""
+    protocol, host, port = split_endpoint(listen[0])
     if host in ("0.0.0.0", "::"):
         host = "127.0.0.1"
     return f"{protocol}/[{host}]:{port}" if ":" in host else f"{protocol}/{host}:{port}"
 
 
 def free_endpoint() -> str:
-    """A loopback endpoint that nobody listens on at this moment, for demos and tests."""
+    """A loopback endpoint that is free at this moment, for demos and tests."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

@@ -1,7 +1,7 @@
-"""Who may say and hear what: the access rules of a router, by the name in each agent's certificate.
+"""Access rules of a router (publish and subscribe rights), by the common name of each agent's certificate.
 
-Denied is what is not allowed, and who is not named may do nothing. A rule names a key twice, plain and with
-``@adv``: Zenoh's advanced publishers and subscribers keep their own traffic there, and ``**`` does not reach it.
+Default deny: what is not allowed is denied, and so is every agent that is not named. A rule has each key twice, plain
+and with ``@adv``: Zenoh's advanced publishers and subscribers use such keys internally, and ``**`` does not match them.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ from typing import Any
 
 from protocols.bus.settings import TlsConfig
 from protocols.core.errors import InputError
-from protocols.topics import valid_id
+from protocols.core.names import check_identifier, key_segment
 
 ROLES = ("camera", "uav", "hub", "record", "view", "router")
-"""What a certificate can be for."""
+"""The roles for which certificates are issued."""
 
-# What an agent of a role may publish, below syncline/<site>/; every agent also has agent/<id>/** and its tokens.
-_SAYS: Mapping[str, tuple[str, ...]] = {
+# Keys on which an agent of a role may publish, below syncline/<site>/; every agent also has
+# agent/<id>/** and its liveliness tokens.
+_PUBLISH_KEYS: Mapping[str, tuple[str, ...]] = {
     "camera": ("camera/{id}/**",),
     "uav": ("uav/{id}/**", "camera/{id}/**"),
     # Pose nodes of any camera may run on any hub.
@@ -28,12 +29,12 @@ _SAYS: Mapping[str, tuple[str, ...]] = {
     "view": ("view/{id}/**",),
     "router": ("canary/**",),
 }
-_HEARS_ALL = frozenset({"hub", "record", "view", "uav"})
+_SUBSCRIBE_ALL = frozenset({"hub", "record", "view", "uav"})
 
-_SPEAK = ["put", "delete", "reply", "declare_queryable", "liveliness_token", "query", "declare_subscriber"]
-_BE_ASKED = ["declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber"]
-_ASK = ["query", "declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"]
-_BE_TOLD = ["put", "delete", "reply", "liveliness_token", "declare_queryable"]
+_PUBLISH_IN = ["put", "delete", "reply", "declare_queryable", "liveliness_token", "query", "declare_subscriber"]
+_PUBLISH_OUT = ["declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber"]
+_RECEIVE_IN = ["query", "declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"]
+_RECEIVE_OUT = ["put", "delete", "reply", "liveliness_token", "declare_queryable"]
 
 
 def _keys(*patterns: str) -> list[str]:
@@ -42,21 +43,24 @@ def _keys(*patterns: str) -> list[str]:
 
 
 def certificate_name(role: str, agent: str, generation: int = 1) -> str:
-    """The common name of an agent's certificate; raises InputError where it cannot be one.
+    """The common name of an agent's certificate, ``<role>.<key segment of the id>[.<generation>]``; raises InputError.
 
-    generation: one more than how often certificates of this agent were revoked. Zenoh 1.10.2 reads no list of revoked
-    certificates, but its rules go by this name: so whoever was revoked gets a new one, and the rules forget the old.
+    generation: 1 + the number of revocations of this agent's certificates. Zenoh 1.10.2 reads no revocation list, but
+    its rules use this name: a revoked agent gets a new name, and the rules no longer contain the old one.
     """
     if role not in ROLES:
         raise InputError(f"there is no role {role!r}", remedy=f"use one of {', '.join(ROLES)}")
-    name = f"{role}.{valid_id(agent)}" + (f".{generation}" if generation > 1 else "")
+    name = f"{role}.{key_segment(agent)}" + (f".{generation}" if generation > 1 else "")
     if len(name) > 64:
-        raise InputError(f"id {agent!r} is too long for a certificate", remedy="use at most 55 characters")
+        raise InputError(
+            f"id {agent!r} is too long for a certificate",
+            remedy="use at most 55 letters a-z, digits, '-' and '_'; every byte of another character counts as three",
+        )
     return name
 
 
-def owner_of(name: str) -> str:
-    """``<role>.<id>`` of a certificate's common name, whatever its generation."""
+def certificate_owner(name: str) -> str:
+    """``<role>.<key segment>`` of a certificate's common name, without the generation."""
     return ".".join(name.split(".")[:2])
 
 
@@ -65,44 +69,63 @@ def access_rules(
 ) -> dict[str, Any]:
     """Zenoh's ``access_control`` for a site's agents, each (role, id). generations: where it is not the first."""
     generations = generations or {}
-    base = f"syncline/{valid_id(site, 'site')}"
-    everything = _keys(f"{base}/**")
+    base = f"syncline/{check_identifier(site, 'site')}"
+    all_keys = _keys(f"{base}/**")
     rules: list[dict[str, Any]] = [
-        {"id": "be-asked", "permission": "allow", "flows": ["egress"], "messages": _BE_ASKED, "key_exprs": everything},
-        {"id": "ask-all", "permission": "allow", "flows": ["ingress"], "messages": _ASK, "key_exprs": everything},
+        {
+            "id": "be-asked",
+            "permission": "allow",
+            "flows": ["egress"],
+            "messages": _PUBLISH_OUT,
+            "key_exprs": all_keys,
+        },
+        {
+            "id": "ask-all",
+            "permission": "allow",
+            "flows": ["ingress"],
+            "messages": _RECEIVE_IN,
+            "key_exprs": all_keys,
+        },
         {
             "id": "be-told-all",
             "permission": "allow",
             "flows": ["egress"],
-            "messages": _BE_TOLD,
-            "key_exprs": everything,
+            "messages": _RECEIVE_OUT,
+            "key_exprs": all_keys,
         },
     ]
     subjects, policies = [], []
     for role, agent in sorted(set(agents)):
         name = certificate_name(role, agent, generations.get((role, agent), 1))
-        own = [f"{base}/{key.format(id=agent)}" for key in _SAYS[role]]
-        own += [f"{base}/agent/{agent}/**", f"{base}/alive/{role}/{agent}/*"]
+        segment = key_segment(agent)
+        own = [f"{base}/{key.format(id=segment)}" for key in _PUBLISH_KEYS[role]]
+        own += [f"{base}/agent/{segment}/**", f"{base}/alive/{role}/{segment}/*"]
         rules.append(
             {
                 "id": f"own-{name}",
                 "permission": "allow",
                 "flows": ["ingress"],
-                "messages": _SPEAK,
+                "messages": _PUBLISH_IN,
                 "key_exprs": _keys(*own),
             }
         )
         allowed = [f"own-{name}", "be-asked"]
         if role == "router":
-            # The canary hears itself; other routers pass on what their own rules have let in.
+            # The canary receives its own messages; other routers relay what their own rules admitted.
             allowed += ["ask-all", "be-told-all", "relay"]
-        elif role in _HEARS_ALL:
+        elif role in _SUBSCRIBE_ALL:
             allowed += ["ask-all", "be-told-all"]
         subjects.append({"id": name, "cert_common_names": [name]})
         policies.append({"subjects": [name], "rules": allowed})
     if any("relay" in policy["rules"] for policy in policies):
         rules.append(
-            {"id": "relay", "permission": "allow", "flows": ["ingress"], "messages": _SPEAK, "key_exprs": everything}
+            {
+                "id": "relay",
+                "permission": "allow",
+                "flows": ["ingress"],
+                "messages": _PUBLISH_IN,
+                "key_exprs": all_keys,
+            }
         )
     return {
         "enabled": True,
@@ -114,7 +137,7 @@ def access_rules(
 
 
 def tls_settings(tls: TlsConfig) -> dict[str, Any]:
-    """Zenoh's ``transport/link/tls``: both sides show certificates, and a link ends with them."""
+    """Zenoh's ``transport/link/tls``: mutual authentication; a link is closed when its certificate expires."""
     return {
         "root_ca_certificate": str(tls.ca),
         "listen_private_key": str(tls.key),
@@ -128,7 +151,7 @@ def tls_settings(tls: TlsConfig) -> dict[str, Any]:
 
 
 def read_access(file: Path) -> dict[str, Any]:
-    """The ``access_control`` in a generated router file. Raises InputError where it would let everybody in."""
+    """The ``access_control`` in a generated router file. Raises InputError if they do not deny by default."""
     remedy = "make it again with `syncline keys issue`"
     try:
         document = json.loads(file.read_text(encoding="utf-8"))

@@ -1,11 +1,12 @@
-"""Who is believed: one agent an id, one connection a run; refusals are counted by reason and source.
+"""Sender checks at the receiver: one agent per id and one connection per boot; rejections counted by reason and source.
 
-Two processes with one id interleave without a word, and whoever knows a camera's key can speak on it. Without
-certificates nothing stops them at the router, so every receiver keeps these rules:
+Messages of two processes with one id would interleave undetected, and anyone who knows a camera's key can publish on
+it. Without certificates the router does not prevent this, so every receiver enforces these rules:
 
-* of two agents of one role and id the one that was there first is heard, until it is gone;
-* while an agent is alive, only its own runs (boot ids) are heard under its id;
-* a run speaks through the connection on which it was first heard, until that has been silent for a while.
+* of two agents of one role and id the first one is accepted, until it is gone;
+* while an agent is alive, only its own boot ids are accepted under its id;
+* a boot's messages are accepted only over the connection of its first message, until that has been silent for
+  SOURCE_TIMEOUT_S.
 """
 
 from __future__ import annotations
@@ -22,33 +23,33 @@ from google.protobuf.message import Message
 from protocols.bus.base import AgentEvent, AgentWatch, Bus, Publisher, Received, Refusal, Subscription
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import STATUS, Topic
-from protocols.validation.rules import MAX_NUMBERS, Reason
+from protocols.validation.rules import MAX_NUMBERS, RejectionReason
 
-SILENT_S = 10.0
-"""After this another connection may speak for a run: a log that is replayed twice has the same boot ids."""
-_SOURCES = 4096
-_TOLD_SOURCES = 48
-_NAME = 64
+SOURCE_TIMEOUT_S = 10.0
+"""Silence after which a boot may use another connection: a log that is replayed twice has the same boot ids."""
+_MAX_SOURCES = 4096
+_PUBLISHED_SOURCES = 48
+_MAX_COUNTER_NAME = 64
 
 
 @dataclass(slots=True)
-class _Agent:
-    """One (role, id): boots alive, in the order of arrival, and every boot that was ever the first."""
+class _AgentBoots:
+    """One (role, id): boots alive in order of arrival (alive), and every boot that was ever the first (heard)."""
 
     alive: list[str] = field(default_factory=list)
     heard: set[str] = field(default_factory=set)
 
 
-class Guard:
-    """The rules, without a bus. Roles of pose nodes and the like do not publish under an id of their own."""
+class SenderValidator:
+    """The rules, without a bus. Roles such as pose nodes do not publish under an id of their own."""
 
     def __init__(self) -> None:
-        self._agents: dict[tuple[str, str], _Agent] = {}
+        self._agents: dict[tuple[str, str], _AgentBoots] = {}
         self._sources: dict[str, tuple[str, float]] = {}
 
     def handle(self, event: AgentEvent) -> None:
-        """An agent came or went."""
-        agent = self._agents.setdefault((event.role, event.agent), _Agent())
+        """Process the appearance or disappearance of an agent."""
+        agent = self._agents.setdefault((event.role, event.agent), _AgentBoots())
         if event.alive and event.boot_id not in agent.alive:
             agent.alive.append(event.boot_id)
         elif not event.alive and event.boot_id in agent.alive:
@@ -56,29 +57,29 @@ class Guard:
         if agent.alive:
             agent.heard.add(agent.alive[0])
 
-    def refuse(self, received: Received, now: float) -> tuple[Reason, str] | None:
-        """Why a message is not believed; None if it is. now: any monotonic clock [s]."""
+    def refuse(self, received: Received, now: float) -> tuple[RejectionReason, str] | None:
+        """The reason and details why a message is rejected; None if it is accepted. now: any monotonic clock [s]."""
         boot: str = getattr(received.message, "boot_id", "")
         if not boot:
             return None
         agent = self._agents.get((_role(received), received.agent))
         if agent is not None and agent.alive and boot not in agent.heard:
             if boot in agent.alive:
-                return Reason.SECOND_AGENT, f"boot {boot[:12]} beside {agent.alive[0][:12]}"
-            return Reason.WRONG_SOURCE, f"boot {boot[:12]} is not that of the agent that is alive"
+                return RejectionReason.SECOND_AGENT, f"boot {boot[:12]} beside {agent.alive[0][:12]}"
+            return RejectionReason.WRONG_SOURCE, f"boot {boot[:12]} is not that of the agent that is alive"
         if not received.source:
             return None
         known = self._sources.get(boot)
-        if known is not None and known[0] != received.source and now - known[1] < SILENT_S:
-            return Reason.WRONG_SOURCE, f"boot {boot[:12]} speaks from {known[0]}, not from {received.source}"
-        if known is None and len(self._sources) >= _SOURCES:
-            self._sources = {b: s for b, s in self._sources.items() if now - s[1] < SILENT_S}
-        if known is not None or len(self._sources) < _SOURCES:
+        if known is not None and known[0] != received.source and now - known[1] < SOURCE_TIMEOUT_S:
+            return RejectionReason.WRONG_SOURCE, f"boot {boot[:12]} speaks from {known[0]}, not from {received.source}"
+        if known is None and len(self._sources) >= _MAX_SOURCES:
+            self._sources = {b: s for b, s in self._sources.items() if now - s[1] < SOURCE_TIMEOUT_S}
+        if known is not None or len(self._sources) < _MAX_SOURCES:
             self._sources[boot] = (received.source, now)
         return None
 
     def alarms(self) -> list[str]:
-        """What an operator must see to: ids that are there twice."""
+        """Conditions that need an operator: ids that are in use twice."""
         return [
             f"{role} {name} runs {len(agent.alive)} times; only the first is heard"
             for (role, name), agent in sorted(self._agents.items())
@@ -92,29 +93,29 @@ def _role(received: Received) -> str:
     return received.topic.key.partition("/")[0]
 
 
-class GuardedSubscription:
-    """See ``protocols.bus.base.Subscription``; what the guard refuses is counted like what the gate refuses."""
+class SenderCheckedSubscription:
+    """See ``protocols.bus.base.Subscription``; rejections by sender are counted like failed validations."""
 
-    def __init__(self, bus: GuardedBus, inner: Subscription) -> None:
+    def __init__(self, bus: SenderCheckedBus, inner: Subscription) -> None:
         self._bus, self._inner = bus, inner
         self._refused: Counter[str] = Counter()
 
     def drain(self) -> list[Received]:
-        """Everything since the last call that is believed."""
-        self._bus.look()
-        believed = []
+        """The accepted messages since the last call."""
+        self._bus.update_agents()
+        accepted = []
         for received in self._inner.drain():
             why = self._bus.guard.refuse(received, self._bus.now())
             if why is None:
-                believed.append(received)
+                accepted.append(received)
                 continue
             reason, detail = why
             self._refused[f"rejected.{reason.value}"] += 1
             sequence = getattr(received.message, "sequence", None)
-            self._bus.note(Refusal(reason.value, received.agent, received.topic.name, detail, sequence))
+            self._bus.record_refusal(Refusal(reason.value, received.agent, received.topic.name, detail, sequence))
         for refusal in self._inner.refusals():
-            self._bus.note(refusal)
-        return believed
+            self._bus.record_refusal(refusal)
+        return accepted
 
     def wait(self, timeout_s: float) -> bool:
         """Wait for something to drain."""
@@ -129,7 +130,7 @@ class GuardedSubscription:
         return counts
 
     def refusals(self) -> list[Refusal]:
-        """None: the bus has been told of them."""
+        """Always empty: rejections are passed on to the bus."""
         return []
 
     def close(self) -> None:
@@ -138,15 +139,15 @@ class GuardedSubscription:
 
 
 class _StatusPublisher:
-    """Completes an agent's status with what its agent does not know, and shows it to ``seen``."""
+    """Adds the bus's diagnostics to an agent's status before it is published."""
 
-    def __init__(self, bus: GuardedBus, inner: Publisher) -> None:
+    def __init__(self, bus: SenderCheckedBus, inner: Publisher) -> None:
         self._bus, self._inner = bus, inner
 
     def put(self, message: Message) -> None:
         """Publish the status."""
         if isinstance(message, pb.AgentStatus):
-            message = self._bus.completed(message)
+            message = self._bus.with_diagnostics(message)
         self._inner.put(message)
 
     def wait_matched(self, timeout_s: float) -> bool:
@@ -158,11 +159,11 @@ class _StatusPublisher:
         self._inner.close()
 
 
-class GuardedBus:
-    """A bus whose subscriptions believe only whom the guard believes. See ``protocols.bus.base.Bus``.
+class SenderCheckedBus:
+    """A bus whose subscriptions accept only messages of verified senders. See ``protocols.bus.base.Bus``.
 
-    now: a monotonic clock [s]. seen: told of every status that this process publishes. refused: told of every
-    refusal, as far as they are kept for telling.
+    now: a monotonic clock [s]. seen: called with every status that this process publishes. refused: called with every
+    rejection that is reported (their number is bounded).
     """
 
     def __init__(
@@ -176,7 +177,7 @@ class GuardedBus:
         self._bus = bus
         self.now = now
         self._seen, self._refused = seen, refused
-        self.guard = Guard()
+        self.guard = SenderValidator()
         self._watch: AgentWatch | None = None
         self._by_source: Counter[tuple[str, str]] = Counter()
 
@@ -194,14 +195,14 @@ class GuardedBus:
         """Subscribe to one agent or to all."""
         if self._watch is None:
             self._watch = self._bus.watch_agents()
-        return GuardedSubscription(self, self._bus.subscribe(topic, agent))
+        return SenderCheckedSubscription(self, self._bus.subscribe(topic, agent))
 
     def announce(self, role: str, agent: str, boot_id: str) -> AbstractContextManager[None]:
-        """Be seen as alive while the context is open."""
+        """Hold a liveliness token while the context is open."""
         return self._bus.announce(role, agent, boot_id)
 
     def watch_agents(self) -> AgentWatch:
-        """Watch all agents of the site come and go."""
+        """Watch all agents of the site appear and disappear."""
         return self._bus.watch_agents()
 
     def close(self) -> None:
@@ -218,32 +219,32 @@ class GuardedBus:
     ) -> None:
         self.close()
 
-    def look(self) -> None:
-        """Take note of who came and went."""
+    def update_agents(self) -> None:
+        """Process appearances and disappearances of agents."""
         if self._watch is not None:
             for event in self._watch.drain():
                 self.guard.handle(event)
 
-    def note(self, refusal: Refusal) -> None:
-        """Count one refusal by reason and source, and tell of it."""
+    def record_refusal(self, refusal: Refusal) -> None:
+        """Count one rejection by reason and source, and report it."""
         source = refusal.agent or "unknown"
-        if (refusal.reason, source) not in self._by_source and len(self._by_source) >= _SOURCES:
+        if (refusal.reason, source) not in self._by_source and len(self._by_source) >= _MAX_SOURCES:
             source = "others"
         self._by_source[refusal.reason, source] += 1
         self._refused(refusal)
 
     def refusals_by_source(self) -> dict[tuple[str, str], int]:
-        """Counts by (reason, agent id in the key)."""
+        """Counts by (reason, agent in the key)."""
         return dict(self._by_source)
 
-    def completed(self, status: pb.AgentStatus) -> pb.AgentStatus:
+    def with_diagnostics(self, status: pb.AgentStatus) -> pb.AgentStatus:
         """The status with refusals by source (``rejected.<reason>@<id>``) and alarms."""
-        self.look()
+        self.update_agents()
         whole = pb.AgentStatus()
         whole.CopyFrom(status)
-        for (reason, source), count in self._by_source.most_common(_TOLD_SOURCES):
+        for (reason, source), count in self._by_source.most_common(_PUBLISHED_SOURCES):
             if len(whole.counters) < MAX_NUMBERS:
-                whole.counters[f"rejected.{reason}@{source}"[:_NAME]] = count
+                whole.counters[f"rejected.{reason}@{source}"[:_MAX_COUNTER_NAME]] = count
         alarms = self.guard.alarms()
         if alarms:
             whole.counters["alarms"] = len(alarms)

@@ -1,7 +1,7 @@
-"""Why a connection with certificates is refused, told before Zenoh is asked and after it has failed.
+"""Diagnosis of TLS problems: checks of certificate files, and the reason why a router refuses a connection.
 
-Zenoh says only that it could not connect. The standard library's TLS makes the same handshake with the same
-files, and gives the reason.
+Zenoh reports only that it could not connect. The standard library's TLS makes the same handshake with the same
+files and gives the reason.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from protocols.bus.security.access import owner_of
-from protocols.bus.settings import TlsConfig, parts_of
+from protocols.bus.security.access import certificate_owner
+from protocols.bus.settings import TlsConfig, split_endpoint
 from protocols.core.errors import InputError
+from protocols.core.names import key_segment
 
-_PATIENCE_S = 0.6
+_TIMEOUT_S = 0.6
 _PLAIN = "it speaks plain TCP, and this connection wants TLS: write tcp/, or give the router certificates"
 
 
@@ -42,7 +43,7 @@ def check_files(tls: TlsConfig) -> None:
         ssl.create_default_context(cafile=tls.ca).load_cert_chain(tls.certificate, tls.key)
     except (ssl.SSLError, ValueError) as error:
         raise InputError(
-            f"bus.tls: certificate and key do not fit: {_told(error)}",
+            f"bus.tls: certificate and key do not match: {_message_of(error)}",
             file=tls.certificate,
             remedy="issue them again with `syncline keys issue`",
         ) from None
@@ -56,13 +57,13 @@ def check_files(tls: TlsConfig) -> None:
 
 
 def _decoded(certificate: Path) -> dict[str, Any]:
-    # The only reader of a certificate's fields in the standard library; a board need not have `cryptography`.
+    # The only reader of certificate fields in the standard library; a board need not have `cryptography`.
     decode = getattr(ssl, "_ssl")._test_decode_cert  # noqa: B009 - not in the stubs
     return dict(decode(str(certificate)))
 
 
 def days_left(certificate: Path) -> float:
-    """Days until a PEM certificate expires; negative once it has, or by how much it is not valid yet."""
+    """Days until a PEM certificate expires; negative if it has expired or is not valid yet."""
     fields = _decoded(certificate)
     now = datetime.now(UTC).timestamp()
     begins, ends = (ssl.cert_time_to_seconds(fields[name]) for name in ("notBefore", "notAfter"))
@@ -79,9 +80,9 @@ def common_name(certificate: Path) -> str:
 
 
 def check_owner(tls: TlsConfig, role: str, agent: str) -> None:
-    """Raise InputError where the certificate is another agent's: the router would drop all it says, in silence."""
+    """Raise InputError where the certificate is another agent's: the router would silently drop all its messages."""
     name = common_name(tls.certificate)
-    if owner_of(name) != f"{role}.{agent}":
+    if certificate_owner(name) != f"{role}.{key_segment(agent)}":
         raise InputError(
             f"bus.tls: the certificate is {name!r}'s, this is {role} {agent!r}",
             file=tls.certificate,
@@ -89,22 +90,22 @@ def check_owner(tls: TlsConfig, role: str, agent: str) -> None:
         )
 
 
-def why_refused(endpoint: str, tls: TlsConfig | None, patience_s: float = _PATIENCE_S) -> str:
-    """Why a router that can be reached does not let this process in; "" where nothing can be told.
+def refusal_reason(endpoint: str, tls: TlsConfig | None, timeout_s: float = _TIMEOUT_S) -> str:
+    """Why a reachable router refuses this process; "" where the reason is unknown.
 
-    endpoint: as in ``connect``. Takes up to ``patience_s``.
+    endpoint: as in ``connect``. Takes up to ``timeout_s``.
     """
-    protocol, host, port = parts_of(endpoint)
-    deadline = time.monotonic() + patience_s
+    protocol, host, port = split_endpoint(endpoint)
+    deadline = time.monotonic() + timeout_s
     try:
-        with socket.create_connection((host, port), timeout=patience_s) as raw:
+        with socket.create_connection((host, port), timeout=timeout_s) as raw:
             if protocol == "tcp":
                 return _plain(raw, deadline)
             assert tls is not None
             context = ssl.create_default_context(cafile=tls.ca)
             context.load_cert_chain(tls.certificate, tls.key)
             with context.wrap_socket(raw, server_hostname=host) as secure:
-                # In TLS 1.3 the server's verdict on our certificate comes after the handshake.
+                # In TLS 1.3 the server accepts or rejects the client's certificate after the handshake.
                 secure.settimeout(max(0.05, min(0.3, deadline - time.monotonic())))
                 secure.recv(1)
     except ssl.SSLCertVerificationError as error:
@@ -117,7 +118,7 @@ def why_refused(endpoint: str, tls: TlsConfig | None, patience_s: float = _PATIE
 
 
 def _plain(raw: socket.socket, deadline: float) -> str:
-    """Whether what answers a plain connection in fact speaks TLS."""
+    """The reason if the server that answers a plain connection expects TLS; otherwise ""."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     raw.settimeout(max(0.05, deadline - time.monotonic()))
@@ -133,7 +134,7 @@ def _plain(raw: socket.socket, deadline: float) -> str:
 
 def _alert(error: ssl.SSLError) -> str:
     reason = str(error.reason or "")
-    told = {
+    reasons = {
         "CERTIFICATE_REQUIRED": "it wants a certificate",
         "CERTIFICATE_EXPIRED": "it says that this certificate has expired",
         "UNKNOWN_CA": "it does not know who signed this certificate",
@@ -144,9 +145,9 @@ def _alert(error: ssl.SSLError) -> str:
         "WRONG_VERSION_NUMBER": _PLAIN,
         "RECORD_LAYER_FAILURE": _PLAIN,
     }
-    return next((text for word, text in told.items() if word in reason), "" if not reason else _told(error))
+    return next((text for word, text in reasons.items() if word in reason), "" if not reason else _message_of(error))
 
 
-def _told(error: Exception) -> str:
+def _message_of(error: Exception) -> str:
     text = str(getattr(error, "reason", None) or error)
     return re.sub(r"\s+", " ", text.replace("_", " ").lower())[:120]

@@ -1,1 +1,1 @@
-"""The bus itself: Zenoh and in-process sessions, queues, loss recovery."""
+"""Bus implementations (Zenoh and in-memory): sessions, queues, recovery of lost messages."""

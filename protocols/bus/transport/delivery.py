@@ -1,4 +1,4 @@
-"""How much a publisher keeps for those who come late or were cut off."""
+"""Size of a publisher's cache for late joiners and for recovery after an outage."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import math
 from protocols.topics import Delivery, Topic
 
 OUTAGE_S = 60.0
-"""The longest cut of a link that loses nothing, unless the configuration says another."""
+"""The longest link outage without message loss, unless configured otherwise."""
 _MARGIN = 1.5
 
 
 def cache_size(topic: Topic, rate_hz: float | None = None, outage_s: float = OUTAGE_S) -> int:
-    """Messages that a publisher of ``topic`` caches: the last one, or an outage's worth and a margin."""
+    """Messages that a publisher of ``topic`` caches: the last one, or those of an outage plus a margin."""
     if topic.delivery is Delivery.LATEST:
         return 1
     return max(1, math.ceil(max(topic.rate_hz, rate_hz or 0.0) * outage_s * _MARGIN))

@@ -1,4 +1,4 @@
-"""The bounded queue between a transport's threads and the agent's loop, with its counters."""
+"""Bounded receive queue between the transport's threads and the agent's loop, and tracking of live agents."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 
 from protocols.bus.base import AgentEvent, Received, Refusal
-from protocols.topics import Topic, valid_id
-from protocols.validation.codec import MAX_PAYLOAD, Reason, Rejected, admit, parse_key
+from protocols.core.names import name_of_segment
+from protocols.topics import Topic
+from protocols.validation.codec import MAX_PAYLOAD, Rejected, RejectionReason, admit, parse_key
 
-MOST_BYTES = 64 * 1024 * 1024
-"""What one inbox holds at most, however few messages that is: a reader that stands still fills no machine."""
-_TOLD = 256
-"""Refusals that are kept for telling; all of them are counted."""
+MAX_BYTES = 64 * 1024 * 1024
+"""Upper bound of one inbox in bytes, so that a reader that has stopped does not exhaust the memory."""
+_MAX_REFUSALS = 256
+"""Rejections that are kept for reports; all of them are counted."""
 
 
 class Inbox:
-    """Raw samples in, gated messages out. push and lose may be called from any thread.
+    """Queues raw samples and returns validated messages. push and count_lost may be called from any thread.
 
     Decoding happens in ``drain``, on the consumer's thread: a transport's callback must only enqueue,
     since a slow one starves every subscription of the session.
@@ -36,44 +37,44 @@ class Inbox:
     def push(self, key: str, payload: bytes, source: str = "") -> None:
         """Queue one sample; the oldest is dropped and counted when the queue is full."""
         if len(payload) > MAX_PAYLOAD:
-            self.refuse(Rejected(Reason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD}"), key)
+            self.refuse(Rejected(RejectionReason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD}"), key)
             return
         now = self._clock_ns()
         with self._ready:
             self._bytes += len(payload)
-            while self._queue and (len(self._queue) >= self._capacity or self._bytes > MOST_BYTES):
+            while self._queue and (len(self._queue) >= self._capacity or self._bytes > MAX_BYTES):
                 self._bytes -= len(self._queue.popleft()[1])
                 self._counts["dropped"] += 1
             self._queue.append((key, payload, now, source))
             self._ready.notify_all()
 
     def refuse(self, error: Rejected, key: str, sequence: int | None = None) -> None:
-        """Count, and keep for telling, one message that is not let in."""
+        """Count one rejected message, and keep it for ``refusals``."""
         address = parse_key(key)
         refusal = Refusal(error.reason.value, address.agent if address else "", key[:200], error.detail, sequence)
         with self._ready:
             self._counts[f"rejected.{refusal.reason}"] += 1
-            if len(self._refusals) < _TOLD:
+            if len(self._refusals) < _MAX_REFUSALS:
                 self._refusals.append(refusal)
 
     def refusals(self) -> list[Refusal]:
-        """What was refused since the last call."""
+        """The messages rejected since the last call."""
         with self._ready:
-            told, self._refusals = self._refusals, []
-        return told
+            refusals, self._refusals = self._refusals, []
+        return refusals
 
-    def lose(self, count: int) -> None:
-        """Count messages that the transport knows will never come."""
+    def count_lost(self, count: int) -> None:
+        """Count messages that the transport knows to be lost."""
         with self._ready:
             self._counts["lost"] += count
 
-    def skip(self, count: int) -> None:
-        """Count messages that never came of a topic of which the newest is enough."""
+    def count_skipped(self, count: int) -> None:
+        """Count lost messages of a topic with Delivery.LATEST."""
         with self._ready:
             self._counts["skipped"] += count
 
     def drain(self) -> list[Received]:
-        """Take everything that is queued and let it through the gate."""
+        """Decode and validate everything that is queued."""
         with self._ready:
             queue, self._queue, self._bytes = self._queue, deque(), 0
         messages: list[Received] = []
@@ -100,8 +101,8 @@ class Inbox:
             return dict(self._counts)
 
 
-class Roll:
-    """Who is alive, as changes. A token seen twice, as after a reconnect, is one change."""
+class LivenessTracker:
+    """Tracks which agents are alive, as a list of changes. A token seen twice, as after a reconnect, is one change."""
 
     def __init__(self) -> None:
         self._alive: set[tuple[str, str, str]] = set()
@@ -109,11 +110,14 @@ class Roll:
         self._lock = threading.Lock()
 
     def mark(self, key: str, alive: bool) -> None:
-        """Take note of a key ``syncline/<site>/alive/<role>/<agent>/<boot>``; others are ignored."""
+        """Process a liveliness token's key ``syncline/<site>/alive/<role>/<agent>/<boot>``; others are ignored."""
         parts = key.split("/")
         if len(parts) != 6 or parts[2] != "alive":
             return
-        who = (parts[3], parts[4], parts[5])
+        agent = name_of_segment(parts[4])
+        if agent is None:
+            return
+        who = (parts[3], agent, parts[5])
         with self._lock:
             if alive == (who in self._alive):
                 return
@@ -132,4 +136,4 @@ class Roll:
 
 def subscription_key(topic: Topic, site: str, agent: str) -> str:
     """The key expression of a subscription to one agent, or to all with ``*``."""
-    return topic.key_expression(site) if agent == "*" else topic.key_for(site, valid_id(agent, "id"))
+    return topic.key_expression(site) if agent == "*" else topic.key_for(site, agent)

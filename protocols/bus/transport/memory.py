@@ -1,7 +1,7 @@
-"""The bus inside one process: the same promises as over Zenoh, without sockets.
+"""The bus inside one process: the same guarantees as over Zenoh, without sockets.
 
 A MemoryHub stands for the network; every MemoryBus made on it is one process's connection. Messages
-are encoded and decoded on the way, so nothing passes here that would not pass on the wire.
+are encoded and decoded on the way, so only messages that would pass over Zenoh pass here.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from google.protobuf.message import Message
 
 from protocols.bus.base import AgentEvent, BusDead, Received, Refusal
 from protocols.bus.transport.delivery import cache_size
-from protocols.bus.transport.inbox import Inbox, Roll, subscription_key
-from protocols.topics import Topic, liveliness_key, valid_id
+from protocols.bus.transport.inbox import Inbox, LivenessTracker, subscription_key
+from protocols.core.names import check_identifier
+from protocols.topics import Topic, liveliness_key
 from protocols.validation.codec import encode, parse_key
 
 
@@ -39,7 +40,7 @@ class MemoryHub:
         self.tokens: list[str] = []
 
     def mark(self, key: str, alive: bool) -> None:
-        """Add or remove one liveliness token and tell the watches of its site."""
+        """Add or remove one liveliness token and notify the watches of its site."""
         with self.lock:
             if alive:
                 self.tokens.append(key)
@@ -62,7 +63,7 @@ class MemoryPublisher:
             hub.publishers.append(self)
 
     def put(self, message: Message) -> None:
-        """Deliver to every matching subscription at once, and keep it for late ones."""
+        """Deliver to every matching subscription at once, and cache it for late ones."""
         if message.DESCRIPTOR.name != self._message:
             raise TypeError(f"{message.DESCRIPTOR.name} on a topic of {self._message}")
         payload = encode(message)
@@ -94,7 +95,7 @@ class MemorySubscription:
     """See ``protocols.bus.base.Subscription``."""
 
     def __init__(self, hub: MemoryHub, topic: Topic, site: str, agent: str) -> None:
-        subscription_key(topic, site, agent)  # refuses an id that Zenoh would refuse too
+        subscription_key(topic, site, agent)  # raises for a name that Zenoh would reject too
         self._hub = hub
         self._topic = topic
         self._site = site
@@ -109,7 +110,7 @@ class MemorySubscription:
             hub.changed.notify_all()
 
     def matches(self, key: str) -> bool:
-        """Whether messages of this key come here."""
+        """Whether this subscription receives messages of this key."""
         address = parse_key(key)
         return (
             address is not None
@@ -132,7 +133,7 @@ class MemorySubscription:
         return self.inbox.counters
 
     def refusals(self) -> list[Refusal]:
-        """What was refused since the last call."""
+        """The messages rejected since the last call."""
         return self.inbox.refusals()
 
     def close(self) -> None:
@@ -148,20 +149,20 @@ class MemoryWatch:
     def __init__(self, hub: MemoryHub, site: str) -> None:
         self._hub = hub
         self._prefix = f"syncline/{site}/alive/"
-        self._roll = Roll()
+        self._liveness = LivenessTracker()
         with hub.lock:
             hub.watches.append(self)
             for key in hub.tokens:
                 self.mark(key, True)
 
     def mark(self, key: str, alive: bool) -> None:
-        """Take note of a token of this site."""
+        """Process a liveliness token of this site."""
         if key.startswith(self._prefix):
-            self._roll.mark(key, alive)
+            self._liveness.mark(key, alive)
 
     def drain(self) -> list[AgentEvent]:
         """Changes since the last call."""
-        return self._roll.drain()
+        return self._liveness.drain()
 
     def close(self) -> None:
         """Stop watching."""
@@ -175,7 +176,7 @@ class MemoryBus:
 
     def __init__(self, hub: MemoryHub, site: str = "local") -> None:
         self._hub = hub
-        self._site = valid_id(site, "site")
+        self._site = check_identifier(site, "site")
         self._declared: list[MemoryPublisher | MemorySubscription | MemoryWatch] = []
         self._tokens: list[str] = []
         self._closed = False
@@ -203,7 +204,7 @@ class MemoryBus:
 
     @contextmanager
     def announce(self, role: str, agent: str, boot_id: str) -> Iterator[None]:
-        """Be seen as alive while the context is open, or until the bus is closed."""
+        """Hold a liveliness token while the context is open, or until the bus is closed."""
         self._check_open()
         key = liveliness_key(self._site, role, agent, boot_id)
         self._tokens.append(key)
@@ -216,14 +217,14 @@ class MemoryBus:
                 self._hub.mark(key, False)
 
     def watch_agents(self) -> MemoryWatch:
-        """Watch all agents of the site come and go."""
+        """Watch all agents of the site appear and disappear."""
         self._check_open()
         watch = MemoryWatch(self._hub, self._site)
         self._declared.append(watch)
         return watch
 
     def close(self) -> None:
-        """What a process's end does: everything it declared is gone."""
+        """Remove everything that was declared, as at the end of a process."""
         self._closed = True
         while self._declared:
             self._declared.pop().close()

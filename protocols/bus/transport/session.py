@@ -1,4 +1,4 @@
-"""Opens Zenoh sessions: every setting that the measurements asked for, and one-line errors."""
+"""Opens Zenoh sessions, with the measured transport settings and one-line errors."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ import zenoh
 
 from protocols.bus.base import BusDead, BusStopped
 from protocols.bus.security.access import read_access, tls_settings
-from protocols.bus.security.tls import check_files, why_refused
+from protocols.bus.security.tls import check_files, refusal_reason
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import InputError
 
 MAX_MESSAGE_SIZE = 4 * 1024 * 1024
 LEASE_MS = 1900
-"""A frozen process counts as gone after this, and is told of within 2 s; a killed one at once."""
+"""A frozen process counts as gone after this and is reported within 2 s; a killed one at once."""
 _ATTEMPTS_MS = (100, 1000, 2000)
-"""A client's attempts to reach its router. The first is short, so that who is refused is told of it at once; the later
-ones are long enough for a link of 300 ms, over which a handshake takes four times that."""
-_OPEN_MS = 4000
-"""Of one attempt to connect. TCP doubles its pauses where a first packet is lost, so that an attempt that began while a
-link was bad sleeps for seconds after it is good again; a new one does not. Long enough for a link of 800 ms."""
+"""Timeouts of a client's attempts to reach its router. The first is short, so that a refusal is reported at once; the
+later ones are long enough for a link of 300 ms, over which a handshake takes four times that."""
+_OPEN_TIMEOUT_MS = 4000
+"""Timeout of one connection attempt. TCP doubles its retransmission pause where a first packet is lost, so an attempt
+that began on a bad link waits for seconds after the link has recovered; a new one does not. Long enough for 800 ms."""
 _PAUSE_S = 0.1
 
 
@@ -34,7 +34,7 @@ def zenoh_call(what: str) -> Iterator[None]:
     """Turn Zenoh's failures into BusDead.
 
     A panic in its Rust code arrives as PanicException, which is no Exception and whose class cannot be
-    imported; the session is of no use after it.
+    imported; the session is unusable after it.
     """
     try:
         yield
@@ -47,16 +47,16 @@ def zenoh_call(what: str) -> Iterator[None]:
 
 
 def one_line(error: BaseException) -> str:
-    """A Zenoh error without the places in its source code, at most 200 characters."""
+    """A Zenoh error without source code locations, at most 200 characters."""
     text = re.sub(r"\s*at \S+\.rs:\d+\.?", "", str(error))
     return " ".join(text.split())[:200]
 
 
-def release(*declared: Any) -> None:
-    """Undeclare what was declared; None, or what is gone already, is no error."""
+def undeclare_all(*declared: Any) -> None:
+    """Undeclare publishers, subscribers or tokens; None, or one that is already undeclared, is no error."""
     for thing in declared:
         if thing is not None:
-            # RuntimeError: a thread that was given up on still sends on it ("Already borrowed").
+            # RuntimeError: an abandoned thread still sends on it ("Already borrowed").
             with suppress(BusDead, RuntimeError), zenoh_call("undeclare"):
                 thing.undeclare()
 
@@ -95,7 +95,7 @@ def open_session(
                     f"bus: {reason}", remedy=f"check connect = {list(connect)} and listen = {list(listen)}"
                 ) from None
         for endpoint in connect:
-            refusal = why_refused(endpoint, config.tls)
+            refusal = refusal_reason(endpoint, config.tls)
             if refusal:
                 raise InputError(f"bus: the router at {endpoint} refuses: {refusal}", remedy="see `syncline keys`")
         if timeout_s is not None and time.monotonic() - began >= timeout_s:
@@ -103,7 +103,7 @@ def open_session(
                 f"bus: no router answers at {', '.join(connect)} ({reason})",
                 remedy="start one there, or correct connect",
             )
-        # Zenoh's own endless wait ignores signals: so short attempts, and the stop condition between.
+        # Zenoh's own endless wait ignores signals: hence short attempts, with the stop condition between them.
         time.sleep(_PAUSE_S)
 
 
@@ -117,20 +117,20 @@ def _settings(config: BusConfig, connect: tuple[str, ...], listen: tuple[str, ..
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
         "listen/endpoints": list(listen),
         "scouting/multicast/enabled": config.multicast,
-        # How long opening waits for others to be found: of use only where they are searched for.
+        # How long opening waits for peers to be discovered: useful only with discovery.
         "scouting/delay": 500 if config.multicast else 0,
         "timestamping/enabled": True,  # the advanced publisher needs it
         "transport/shared_memory/enabled": False,
         "transport/link/rx/max_message_size": MAX_MESSAGE_SIZE,
         "transport/link/tx/lease": LEASE_MS,
-        # Batches of 64 KiB that wait for the link before anything is dropped: a machine that is busy for a moment loses
-        # nothing, and a slow link is not a second behind.
+        # Batches of 64 KiB that are queued for the link before messages are dropped: a machine that is busy for a
+        # moment loses nothing, and a slow link is less than a second behind.
         "transport/link/tx/queue/size/data": 4,
         "transport/link/tx/queue/size/data_low": 8,
-        # Else idle sockets lock out others for ten seconds.
+        # Otherwise idle sockets block new connections for ten seconds.
         "transport/unicast/accept_pending": 2000,
         "transport/unicast/accept_timeout": 2000,
-        "transport/unicast/open_timeout": _OPEN_MS,
+        "transport/unicast/open_timeout": _OPEN_TIMEOUT_MS,
         "transport/unicast/max_sessions": config.max_sessions,
     }
     if config.tls is not None:

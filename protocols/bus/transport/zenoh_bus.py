@@ -1,4 +1,4 @@
-"""The bus over Zenoh. See ``protocols.bus.base`` for the contract and the README for the reasons."""
+"""The bus over Zenoh. See ``protocols.bus.base`` for the interface and the README for the design."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from google.protobuf.message import Message
 
 from protocols.bus.base import AgentEvent, BusDead, Received, Refusal
 from protocols.bus.settings import BusConfig
-from protocols.bus.transport.backfill import Backfill, Question
+from protocols.bus.transport.backfill import Backfill, RecoveryQuery
 from protocols.bus.transport.delivery import cache_size
-from protocols.bus.transport.inbox import Inbox, Roll, subscription_key
-from protocols.bus.transport.session import close_session, open_session, release, zenoh_call
-from protocols.topics import Delivery, Topic, liveliness_key, valid_id
-from protocols.validation.codec import Reason, Rejected, encode, parse_key
+from protocols.bus.transport.inbox import Inbox, LivenessTracker, subscription_key
+from protocols.bus.transport.session import close_session, open_session, undeclare_all, zenoh_call
+from protocols.core.names import check_identifier
+from protocols.topics import Delivery, Topic, liveliness_key
+from protocols.validation.codec import Rejected, RejectionReason, encode, parse_key
 
 HEARTBEAT_S = 0.5
-"""How soon a subscriber learns that the last message before a silence is missing."""
+"""Period after which a subscriber detects that the last message before a pause is missing."""
 _POLL_S = 0.005
-_FETCH_S = 2.0
-_GAP_S = 10.0
-_MOST_KEYS, _KEYS_AT_ONCE = 8192, 64
+_HISTORY_QUERY_S = 2.0
+_GAP_QUERY_S = 10.0
+_MAX_KEYS, _KEYS_PER_CALL = 8192, 64
 
 _Source: TypeAlias = tuple[str, int]
-"""A publisher as Zenoh names it: session and entity."""
+"""A publisher's identity in Zenoh: session id and entity id."""
 
 
 class ZenohPublisher:
@@ -53,7 +54,7 @@ class ZenohPublisher:
                 congestion_control=congestion,
                 priority=zenoh.Priority.DATA_LOW if topic.bulky else zenoh.Priority.DATA,
                 cache=zenoh.ext.CacheConfig(max_samples=cache),
-                # Also where nothing is recovered: it numbers the messages, which a plain publisher does not.
+                # Also without recovery: it adds sequence numbers, which a plain publisher does not.
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(
                     heartbeat=HEARTBEAT_S if reliable else None, sporadic_heartbeat=None
                 ),
@@ -73,7 +74,7 @@ class ZenohPublisher:
         deadline = time.monotonic() + timeout_s
         with zenoh_call(f"match {self._key}"):
             if self._matcher is None:
-                # An advanced publisher cannot tell; a plain one beside it can.
+                # An advanced publisher does not report matching subscribers; a plain one on the same key does.
                 self._matcher = self._session.declare_publisher(self._key)
             while not self._matcher.matching_status.matching:
                 if time.monotonic() >= deadline:
@@ -83,14 +84,14 @@ class ZenohPublisher:
 
     def close(self) -> None:
         """Undeclare; closing twice, or after the session, is no error."""
-        release(self._matcher, self._publisher)
+        undeclare_all(self._matcher, self._publisher)
 
 
-class _Keys:
-    """Declares the keys that messages arrive under.
+class _DeclaredKeys:
+    """Declares the keys of received messages.
 
-    Zenoh 1.10.2 remembers where a message goes for declared keys only. For all others it compares the key with every
-    one that it knows of, for each message: with 1,000 cameras that is 110 us of CPU, more than all the rest.
+    Zenoh 1.10.2 caches routes for declared keys only. For all others it compares the key with every known key for each
+    message: with 1,000 cameras that is 110 us of CPU, more than all other work per message.
     """
 
     def __init__(self, session: zenoh.Session) -> None:
@@ -100,16 +101,16 @@ class _Keys:
         self._declared: list[zenoh.KeyExpr] = []
 
     def meet(self, key: str) -> None:
-        """Take note of a message's key; from a callback, so nothing is declared here."""
-        if key not in self._met and len(self._met) < _MOST_KEYS:
+        """Note a message's key; called from a callback, so nothing is declared here."""
+        if key not in self._met and len(self._met) < _MAX_KEYS:
             self._met.add(key)
             self._new.append(key)
 
     def declare(self) -> None:
         """Declare some of the new ones."""
-        for _ in range(min(len(self._new), _KEYS_AT_ONCE)):
+        for _ in range(min(len(self._new), _KEYS_PER_CALL)):
             key = self._new.popleft()
-            if parse_key(key) is None:  # it came through a wildcard: the gate refuses it
+            if parse_key(key) is None:  # received through a wildcard: validation rejects it
                 continue
             with zenoh_call(f"declare {key}"):
                 self._declared.append(self._session.declare_keyexpr(key))
@@ -128,9 +129,9 @@ class ZenohSubscription:
         self._session = session
         self._inbox = Inbox(topic, clock_ns)
         self._reliable = topic.delivery is Delivery.RELIABLE
-        self._backfill: Backfill[_Source] = Backfill(self._push, self._ask, self._inbox.lose)
+        self._backfill: Backfill[_Source] = Backfill(self._push, self._ask, self._inbox.count_lost)
         self._newest: dict[_Source, int] = {}
-        self._keys = _Keys(session)
+        self._keys = _DeclaredKeys(session)
         recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
         with zenoh_call(f"subscribe {key}"):
             self._subscriber: zenoh.ext.AdvancedSubscriber[None] = zenoh.ext.declare_advanced_subscriber(
@@ -142,14 +143,14 @@ class ZenohSubscription:
                 recovery=recovery if self._reliable else None,
             )
 
-    # All callbacks run on threads of Zenoh's: an exception there is printed and swallowed, and a slow
-    # one starves the whole session. So they only enqueue.
+    # All callbacks run on Zenoh's threads: an exception there is printed and discarded, and a slow
+    # callback blocks the whole session. So they only enqueue.
     def _take(self, sample: zenoh.Sample) -> None:
         if sample.kind != zenoh.SampleKind.PUT:
             return
         source, key = sample.source_info, str(sample.key_expr)
         if source is None:
-            self._inbox.refuse(Rejected(Reason.PLAIN_PUBLISHER, "not from an advanced publisher"), key)
+            self._inbox.refuse(Rejected(RejectionReason.PLAIN_PUBLISHER, "not from an advanced publisher"), key)
             return
         self._keys.meet(key)
         name = (str(source.source_id.zid), source.source_id.eid)
@@ -160,20 +161,20 @@ class ZenohSubscription:
             self._push(name, key, sample.payload.to_bytes())
 
     def _count_gap(self, source: _Source, number: int) -> None:
-        """Of a topic that is not recovered: what never came is counted all the same."""
+        """Count the losses of a topic that is not recovered."""
         newest = self._newest.get(source)
-        if newest is None and len(self._newest) >= _MOST_KEYS:
+        if newest is None and len(self._newest) >= _MAX_KEYS:
             self._newest.clear()
         if newest is None or newest < number:
             if newest is not None and number > newest + 1:
-                self._inbox.skip(number - newest - 1)
+                self._inbox.count_skipped(number - newest - 1)
             self._newest[source] = number
 
     def _push(self, source: _Source, key: str, payload: bytes) -> None:
         self._inbox.push(key, payload, source[0])
 
-    def _ask(self, question: Question[_Source]) -> None:
-        """Ask one publisher's cache; its answers come on a thread of Zenoh's."""
+    def _ask(self, question: RecoveryQuery[_Source]) -> None:
+        """Query one publisher's cache; its replies arrive on a Zenoh thread."""
         source, lock, served = question.source, threading.Lock(), False
         still_open = 1 if question.witness is None else 2
 
@@ -202,13 +203,13 @@ class ZenohSubscription:
                     zenoh.handlers.Callback(take, drop=done),
                     consolidation=zenoh.ConsolidationMode.NONE,
                     accept_replies=zenoh.ReplyKeyExpr.ANY,
-                    timeout=_FETCH_S if question.witness is None else _GAP_S,
+                    timeout=_HISTORY_QUERY_S if question.witness is None else _GAP_QUERY_S,
                 )
 
         try:
             get(question.low, question.high, answer)
             if question.witness is not None:
-                # After the other on the same way: where this one is answered, that one has been.
+                # Sent after the other query on the same route: if this one is answered, so was that one.
                 get(question.witness, question.witness, witnessed)
         except BusDead:
             self._backfill.finish(source, question.number, served=False)
@@ -216,7 +217,7 @@ class ZenohSubscription:
     def drain(self) -> list[Received]:
         """Everything since the last call."""
         self._keys.declare()
-        self._backfill.tend()
+        self._backfill.poll()
         return self._inbox.drain()
 
     def wait(self, timeout_s: float) -> bool:
@@ -229,12 +230,12 @@ class ZenohSubscription:
         return self._inbox.counters
 
     def refusals(self) -> list[Refusal]:
-        """What was refused since the last call."""
+        """The messages rejected since the last call."""
         return self._inbox.refusals()
 
     def close(self) -> None:
         """Undeclare: a process with an open callback never exits."""
-        release(self._subscriber)
+        undeclare_all(self._subscriber)
         self._keys.close()
 
 
@@ -242,7 +243,7 @@ class ZenohWatch:
     """See ``protocols.bus.base.AgentWatch``."""
 
     def __init__(self, session: zenoh.Session, site: str) -> None:
-        self._roll = Roll()
+        self._liveness = LivenessTracker()
         key = f"syncline/{site}/alive/**"
         with zenoh_call(f"watch {key}"):
             self._subscriber: zenoh.Subscriber[None] = session.liveliness().declare_subscriber(
@@ -250,15 +251,15 @@ class ZenohWatch:
             )
 
     def _take(self, sample: zenoh.Sample) -> None:
-        self._roll.mark(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+        self._liveness.mark(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
     def drain(self) -> list[AgentEvent]:
         """Changes since the last call."""
-        return self._roll.drain()
+        return self._liveness.drain()
 
     def close(self) -> None:
         """Undeclare."""
-        release(self._subscriber)
+        undeclare_all(self._subscriber)
 
 
 class ZenohBus:
@@ -266,7 +267,7 @@ class ZenohBus:
 
     def __init__(self, session: zenoh.Session, site: str, clock_ns: Callable[[], int], outage_s: float) -> None:
         self._session = session
-        self._site = valid_id(site, "site")
+        self._site = check_identifier(site, "site")
         self._clock_ns = clock_ns
         self._outage_s = outage_s
         self._declared: list[ZenohPublisher | ZenohSubscription | ZenohWatch] = []
@@ -301,10 +302,10 @@ class ZenohBus:
         try:
             yield
         finally:
-            release(token)
+            undeclare_all(token)
 
     def watch_agents(self) -> ZenohWatch:
-        """Watch all agents of the site come and go."""
+        """Watch all agents of the site appear and disappear."""
         watch = ZenohWatch(self._session, self._site)
         self._declared.append(watch)
         return watch
@@ -334,11 +335,11 @@ def open_bus(
 ) -> ZenohBus:
     """Connect to the others of ``site``.
 
-    stop: asked while a client waits for its router; True raises BusStopped.
+    stop: called while a client waits for its router; True raises BusStopped.
     timeout_s: how long a client waits for its router before InputError; None waits for ever.
     clock_ns: stamps arrivals (Unix, ns).
     Raises InputError, in one line, for a site or an endpoint that cannot be used.
     """
-    valid_id(site, "site")
+    check_identifier(site, "site")
     config = config or BusConfig()
     return ZenohBus(open_session(config, stop=stop, timeout_s=timeout_s), site, clock_ns, config.outage_s)

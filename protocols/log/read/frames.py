@@ -1,8 +1,7 @@
-"""The frames of an MCAP file in file order, as far as they are whole.
+"""Damage-tolerant reading of the records of an MCAP file in file order.
 
-The library's readers stop at the first flaw with an exception that names something else, pass over a
-cut-off record, and do not check attachments. Here each record is taken whole or not at all, and a
-flaw is a sentence for a person.
+The library's readers stop at the first error with a misleading exception, ignore a truncated record, and do not check
+attachments. Here each record is read completely or not at all, and every error is described in a sentence.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from protocols.core.errors import InputError
 
 MAGIC = b"\x89MCAP0\r\n"
 MAX_CHUNK = 256 * 1024 * 1024
-"""Bytes, unpacked. More is no chunk that anybody wrote."""
+"""Bytes, uncompressed. No writer makes larger chunks."""
 
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
@@ -36,18 +35,18 @@ _CHUNK = struct.Struct("<QQQII")
 """Start time, end time, unpacked size, checksum, length of the compression's name; then that name, u64 size, data."""
 _KNOWN = frozenset(int(opcode) for opcode in Opcode)
 _FIRST_PRIVATE_OPCODE = 0x80
-_LONGEST = 1 << 40
+_MAX_RECORD = 1 << 40
 """Bytes. A longer record is a damaged length."""
-_LONGEST_METADATA = 1 << 24
-_SMALLEST_METADATA, _SMALLEST_ATTACHMENT = 8, 36
+_MAX_METADATA = 1 << 24
+_MIN_METADATA, _MIN_ATTACHMENT = 8, 36
 _FOOTER_LENGTH = 20
 _WINDOW = 1 << 20
-# Chunk, attachment, metadata, message index, end of data or footer, shorter than 4 GiB: a cheap sieve for heads.
+# Chunk, attachment, metadata, message index, end of data or footer, shorter than 4 GiB: a prefilter for headers.
 _CANDIDATE = re.compile(rb"(?=[\x06\x09\x0c\x07\x0f\x02][\x00-\xff]{4}\x00{4})")
 
 
-class Frame(NamedTuple):
-    """One record: where it begins, its kind, its bytes."""
+class McapRecord(NamedTuple):
+    """One MCAP record: offset, opcode, content."""
 
     offset: int
     opcode: int
@@ -66,24 +65,24 @@ class RawMessage(NamedTuple):
 
 @dataclass(slots=True)
 class Damage:
-    """What is wrong with a file: the first flaw as a sentence, how many there were, bytes passed over."""
+    """Damage of a file: description of the first error, number of errors, bytes skipped."""
 
     text: str = ""
     flaws: int = 0
     skipped: int = 0
     cut: bool = False
-    """Whether a file ends before its end."""
+    """Whether a file is truncated."""
     place: str = ""
     """The file, where there are several."""
 
-    def found(self, text: str) -> None:
-        """Take note of a flaw."""
+    def record(self, text: str) -> None:
+        """Record one error."""
         self.text = self.text or f"{self.place}{text}"
         self.flaws += 1
 
 
 def open_log(path: Path) -> BinaryIO:
-    """Open an MCAP file and read its magic; InputError if it is none."""
+    """Open an MCAP file and check its magic; raises InputError."""
     try:
         stream = path.open("rb")
     except OSError as error:
@@ -102,10 +101,10 @@ def open_log(path: Path) -> BinaryIO:
     return stream
 
 
-def frames(stream: BinaryIO, damage: Damage, begin: int = len(MAGIC)) -> Iterator[Frame]:
-    """Every whole record from ``begin`` (default: after the magic) up to the footer; flaws go to ``damage``.
+def read_records(stream: BinaryIO, damage: Damage, begin: int = len(MAGIC)) -> Iterator[McapRecord]:
+    """Every complete record from ``begin`` (default: after the magic) up to the footer; errors go to ``damage``.
 
-    After a flaw the walk goes on at the next record that proves itself. The checksum of the data section is
+    After an error reading resumes at the next self-consistent record. The checksum of the data section is
     verified where the file has one.
     """
     size = stream.seek(0, 2)
@@ -120,11 +119,11 @@ def frames(stream: BinaryIO, damage: Damage, begin: int = len(MAGIC)) -> Iterato
         if whole:
             block = stream.read(length + _HEAD.size)
             content, following = block[:length], block[length:]
-            # A length that leads to no record is not its length, unless the inside says the same.
-            whole = _is_next(following) or _proves_itself(opcode, content)
+            # A length that does not lead to another record is wrong, unless the content confirms it.
+            whole = _is_next(following) or _is_self_consistent(opcode, content)
         if not whole:
             found = resync(stream, offset + 1, size) if offset < size else None
-            damage.found(_flaw(offset, head, opcode, length, found))
+            damage.record(_flaw(offset, head, opcode, length, found))
             if found is None:
                 damage.cut = True
                 return
@@ -135,22 +134,22 @@ def frames(stream: BinaryIO, damage: Damage, begin: int = len(MAGIC)) -> Iterato
         if opcode == Opcode.DATA_END and length >= 4:
             (expected,) = struct.unpack_from("<I", content)
             if unbroken and expected not in (0, crc):
-                damage.found("the checksum of the data does not match: some bytes have changed")
+                damage.record("the checksum of the data does not match: some bytes have changed")
         if opcode == Opcode.FOOTER and length == _FOOTER_LENGTH:
             (expected,) = struct.unpack_from("<I", content, length - 4)
             if unbroken and expected not in (0, zlib.crc32(head + content[:-4], crc)):
-                damage.found("the checksum of the index does not match: some bytes have changed")
+                damage.record("the checksum of the index does not match: some bytes have changed")
         crc = 0 if opcode == Opcode.DATA_END else zlib.crc32(content, zlib.crc32(head, crc))
-        yield Frame(offset, opcode, content)
+        yield McapRecord(offset, opcode, content)
         if opcode == Opcode.FOOTER:
             if following[: len(MAGIC)] != MAGIC:
-                damage.found("the end mark is missing")
+                damage.record("the end mark is missing")
             return
         offset, head = end, following
 
 
 def _flaw(offset: int, head: bytes, opcode: int, length: int, found: int | None) -> str:
-    """What is wrong at ``offset``; found: where the walk goes on."""
+    """Description of the error at ``offset``; found: where reading resumes."""
     if found is not None:
         return f"{found - offset} bytes from byte {offset} on are damaged and were left out"
     if len(head) < _HEAD.size:
@@ -162,26 +161,26 @@ def _flaw(offset: int, head: bytes, opcode: int, length: int, found: int | None)
 
 
 def _is_head(opcode: int, length: int) -> bool:
-    return (opcode in _KNOWN or opcode >= _FIRST_PRIVATE_OPCODE) and length < _LONGEST
+    return (opcode in _KNOWN or opcode >= _FIRST_PRIVATE_OPCODE) and length < _MAX_RECORD
 
 
 def _is_next(head: bytes) -> bool:
-    """Whether these bytes begin a record, or are the end of what was written."""
+    """Whether these bytes begin a record, or are the end of the file."""
     return len(head) < _HEAD.size or _is_head(*_HEAD.unpack(head))
 
 
-def _proves_itself(opcode: int, content: bytes) -> bool:
-    """Whether a record's inside fits its length so closely that chance is out of the question."""
+def _is_self_consistent(opcode: int, content: bytes) -> bool:
+    """Whether a record's content is consistent with its length, so that a false positive is practically excluded."""
     if opcode == Opcode.CHUNK:
-        return chunk_is_in_shape(content)
+        return chunk_lengths_agree(content)
     if opcode == Opcode.ATTACHMENT:
-        return len(content) > _SMALLEST_ATTACHMENT and attachment_is_whole(content)
+        return len(content) > _MIN_ATTACHMENT and attachment_checksum_matches(content)
     if opcode == Opcode.METADATA:
         try:
             MetadataRecord.read(ReadDataStream(BytesIO(content)))
         except (McapError, ValueError, struct.error):
             return False
-        return len(content) > _SMALLEST_METADATA
+        return len(content) > _MIN_METADATA
     if opcode not in _KNOWN:
         return False
     if opcode == Opcode.MESSAGE_INDEX:
@@ -189,8 +188,8 @@ def _proves_itself(opcode: int, content: bytes) -> bool:
     return len(content) == {Opcode.FOOTER: _FOOTER_LENGTH, Opcode.DATA_END: 4}.get(Opcode(opcode), -1)
 
 
-def chunk_is_in_shape(content: bytes) -> bool:
-    """Whether the lengths inside a chunk add up; says nothing about its data."""
+def chunk_lengths_agree(content: bytes) -> bool:
+    """Whether the lengths inside a chunk add up; its data are not checked."""
     if len(content) < _CHUNK.size:
         return False
     name = int(_CHUNK.unpack_from(content)[4])
@@ -203,7 +202,7 @@ def chunk_is_in_shape(content: bytes) -> bool:
 
 
 def resync(stream: BinaryIO, start: int, size: int) -> int | None:
-    """The offset of the next record at or after ``start`` that proves itself; None if there is none."""
+    """The offset of the next self-consistent record at or after ``start``; None if there is none."""
     begin = start
     while begin < size:
         stream.seek(begin)
@@ -214,15 +213,15 @@ def resync(stream: BinaryIO, start: int, size: int) -> int | None:
             if length > size - offset - _HEAD.size:
                 continue
             stream.seek(offset + _HEAD.size)
-            # A look at the first bytes spares reading megabytes for each chance likeness of a head.
+            # Checking the first bytes avoids reading megabytes for each false header candidate.
             if opcode == Opcode.CHUNK:
                 start_of_chunk = stream.read(_CHUNK.size + 12)
                 if not _begins_chunk(start_of_chunk, length):
                     continue
-            elif opcode == Opcode.METADATA and length > _LONGEST_METADATA:
+            elif opcode == Opcode.METADATA and length > _MAX_METADATA:
                 continue
             stream.seek(offset + _HEAD.size)
-            if _proves_itself(opcode, stream.read(length)) and _is_next(stream.read(_HEAD.size)):
+            if _is_self_consistent(opcode, stream.read(length)) and _is_next(stream.read(_HEAD.size)):
                 return offset
         begin += _WINDOW
     return None
@@ -238,8 +237,8 @@ def _begins_chunk(start: bytes, length: int) -> bool:
     return int.from_bytes(start[place : place + 8], "little") == length - place - 8
 
 
-def chunk_records(frame: Frame, damage: Damage) -> Iterator[tuple[int, bytes]]:
-    """(opcode, content) of the records in a chunk; none if its checksum does not match."""
+def chunk_records(frame: McapRecord, damage: Damage) -> Iterator[tuple[int, bytes]]:
+    """(opcode, content) of each record in a chunk; none if its checksum does not match."""
     try:
         chunk: Chunk = Chunk.read(ReadDataStream(BytesIO(frame.content)))
         if chunk.uncompressed_size > MAX_CHUNK:
@@ -247,14 +246,14 @@ def chunk_records(frame: Frame, damage: Damage) -> Iterator[tuple[int, bytes]]:
         stream, size = get_chunk_data_stream(chunk, validate_crc=True)
         data = stream.read(size)
     except (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError):
-        damage.found(f"the chunk at byte {frame.offset} is damaged and was left out")
+        damage.record(f"the chunk at byte {frame.offset} is damaged and was left out")
         return
     offset = 0
     while offset + _HEAD.size <= len(data):
         opcode, length = _HEAD.unpack_from(data, offset)
         offset += _HEAD.size
         if length > len(data) - offset:
-            damage.found(f"the chunk at byte {frame.offset} has a record that is cut off")
+            damage.record(f"the chunk at byte {frame.offset} has a record that is cut off")
             return
         yield opcode, data[offset : offset + length]
         offset += length
@@ -268,7 +267,7 @@ def message_record(content: bytes) -> RawMessage | None:
     return RawMessage(channel, sequence, log_time_ns, publish_time_ns, content[_MESSAGE.size :])
 
 
-def attachment_is_whole(content: bytes) -> bool:
+def attachment_checksum_matches(content: bytes) -> bool:
     """Whether an attachment's own checksum matches (0: it has none)."""
     if len(content) < 4:
         return False

@@ -1,4 +1,4 @@
-"""The pictures of one camera in a log, with the capture times that the camera gave them."""
+"""The images of one camera in a log, with their capture times on the camera's clock."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _TOPICS = (PICTURE, FLIGHT_IMAGE)
 
 
 @dataclass(frozen=True, slots=True)
-class PictureRun:
-    """The pictures of one run (boot) of a camera: within it, its clock is one.
+class ImageRun:
+    """The images of one boot of a camera, within which its clock is continuous.
 
-    times_ns: capture times on that clock, in file order. info: what the camera told of itself in this run, if it did.
+    times_ns: capture times on that clock, in file order. info: the CameraInfo of this boot, if there is one.
     """
 
     camera: str
@@ -26,8 +26,8 @@ class PictureRun:
     info: pb.CameraInfo | None
 
 
-def picture_runs(reader: LogReader) -> list[PictureRun]:
-    """All runs of all cameras (UAV agents too) that have pictures in the log, in the order of their first."""
+def image_runs(reader: LogReader) -> list[ImageRun]:
+    """All boots of all cameras (and UAV agents) that have images in the log, in order of the first image."""
     times: dict[tuple[str, str], list[int]] = {}
     infos: dict[tuple[str, str], pb.CameraInfo] = {}
     for logged in reader.messages([*_TOPICS, CAMERA_INFO]):
@@ -36,13 +36,13 @@ def picture_runs(reader: LogReader) -> list[PictureRun]:
             infos[message.camera, message.boot_id] = message
         else:
             times.setdefault((logged.agent, message.boot_id), []).append(message.device_time_ns)
-    return [PictureRun(*name, tuple(stamps), infos.get(name)) for name, stamps in times.items()]
+    return [ImageRun(*name, tuple(stamps), infos.get(name)) for name, stamps in times.items()]
 
 
-def pictures(reader: LogReader, run: PictureRun) -> Iterator[pb.Picture | pb.FlightImage]:
-    """The pictures of one run in file order, as JPEG.
+def read_images(reader: LogReader, run: ImageRun) -> Iterator[pb.Picture | pb.FlightImage]:
+    """The images of one boot in file order, as JPEG.
 
-    ``width`` and ``height`` are of the image in which the camera told its observations; the JPEG may be smaller.
+    ``width`` and ``height`` are of the image to whose pixels observations refer; the JPEG may be smaller.
     """
     for logged in reader.messages(_TOPICS):
         message: Any = logged.message

@@ -1,4 +1,4 @@
-"""The closing index of an MCAP file, where it has a sound one: where to begin reading, without reading all before."""
+"""The summary index of an MCAP file, to start reading at a time without reading what is before."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class Index:
     channels: dict[int, str]
 
     def offset_of(self, start_ns: int) -> int | None:
-        """Where the first chunk with something at or after a log time begins; None if there is none."""
+        """Offset of the first chunk with a message at or after a log time; None if there is none."""
         return next((offset for _, last, offset in self.chunks if last >= start_ns), None)
 
 
 def read_index(stream: BinaryIO) -> Index | None:
-    """The index of a file that was closed and whose index has its checksum; else None."""
+    """The index of a closed file whose index checksum matches; otherwise None."""
     size = stream.seek(0, 2)
     tail = _FOOTER.size + len(MAGIC)
     if size < tail + len(MAGIC):

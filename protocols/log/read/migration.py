@@ -1,7 +1,7 @@
-"""Reads logs of earlier versions: one small declared function from each version to the next.
+"""Migration of logs of earlier schema versions: one declared function from each version to the next.
 
-A released version's tiny log stays in tests/replay/logs, and a test reads it for ever. When SCHEMA_VERSION is
-raised, UPGRADES gets a function under the old number.
+A small log of each released version is kept in tests/replay/logs, and a test reads it. When SCHEMA_VERSION is raised,
+UPGRADES gets a function under the old number.
 """
 
 from __future__ import annotations
@@ -10,21 +10,21 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from protocols.core.errors import InputError
-from protocols.log.write.writer import LOG_VERSION
+from protocols.log.layout import LOG_VERSION
 from protocols.topics import Topic
 from protocols.validation.codec import SCHEMA_VERSION
 
 Upgrade = Callable[[Topic, bytes], bytes]
-"""Gives a payload of one version as a payload of the next, its schema_version included."""
+"""Converts a payload of one version to the next, including its schema_version."""
 
 UPGRADES: Mapping[int, Upgrade] = {}
 """By the version that they start from."""
 
 
 def upgrades_for(path: Path, form: Mapping[str, str]) -> tuple[Upgrade, ...]:
-    """What turns this log's payloads into today's, in order. form: what the log says about itself.
+    """The upgrades from this log's schema to the current one, in order. form: the log's format record.
 
-    Raises InputError for a log of a newer Syncline, which cannot be understood.
+    Raises InputError for a log of a newer Syncline, which cannot be read.
     """
     schema, layout = _number(form.get("schema")), _number(form.get("log"))
     if schema > SCHEMA_VERSION or layout > LOG_VERSION:

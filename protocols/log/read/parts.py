@@ -1,4 +1,4 @@
-"""A log in several files: name-000.mcap, name-001.mcap, …; each is a whole log, together they are one."""
+"""Logs in several files: name-000.mcap, name-001.mcap, …; each part is a complete MCAP file."""
 
 from __future__ import annotations
 
@@ -13,26 +13,21 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from protocols.core.errors import InputError
-from protocols.log.read.frames import Damage, frames, open_log
-from protocols.log.write.writer import FORMAT_RECORD, checked
+from protocols.log.layout import FORMAT_RECORD, part_path, with_checksum
+from protocols.log.read.frames import Damage, open_log, read_records
 
 _PART = re.compile(r"(?P<stem>.+)-(?P<number>\d{3,6})\Z")
 
 
 class Parts(NamedTuple):
-    """The files of one log in order, and what is missing among them ("" if nothing)."""
+    """The files of one log in order, and a description of missing parts ("" if none)."""
 
     paths: tuple[Path, ...]
     missing: str
 
 
-def part_path(path: Path, number: int) -> Path:
-    """The name of one part of the log ``path``."""
-    return path.with_name(f"{path.stem}-{number:03d}{path.suffix}")
-
-
 def find_parts(path: Path) -> Parts:
-    """The log that ``path`` names: a folder that holds one, its first part, or one file alone. Raises InputError."""
+    """The files of the log ``path``: a folder with one log, its first part, or a single file. Raises InputError."""
     if path.is_dir():
         return _in_folder(path)
     open_log(path).close()
@@ -54,9 +49,9 @@ def find_parts(path: Path) -> Parts:
 
 
 def log_format(path: Path) -> dict[str, str]:
-    """What a log says about its own form at its beginning; {} if it says nothing."""
+    """The format record at a log's beginning; {} if there is none."""
     with open_log(path) as stream:
-        for frame in frames(stream, Damage()):
+        for frame in read_records(stream, Damage()):
             if frame.opcode == Opcode.CHUNK:
                 break
             if frame.opcode == Opcode.METADATA:
@@ -64,13 +59,13 @@ def log_format(path: Path) -> dict[str, str]:
                     record = Metadata.read(ReadDataStream(BytesIO(frame.content)))
                 except (McapError, ValueError):
                     continue
-                if record.name == FORMAT_RECORD and record.metadata == checked(record.metadata):
+                if record.name == FORMAT_RECORD and record.metadata == with_checksum(record.metadata):
                     return dict(record.metadata)
     return {}
 
 
 def _belongs(path: Path, session: str) -> bool:
-    """Whether a file with a fitting name is of the session; one whose beginning is damaged is taken at its name."""
+    """Whether a file with a matching name belongs to the session; assumed if its beginning is damaged."""
     try:
         return log_format(path).get("session", session) == session
     except InputError:

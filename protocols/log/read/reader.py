@@ -1,4 +1,4 @@
-"""Reads a log: the good part of a damaged one too, and says what is wrong with it."""
+"""Reader of logs, which also reads the undamaged part of a damaged log and describes the damage."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from mcap.records import Channel
 from mcap.records import Metadata as MetadataRecord
 
 from protocols.core.errors import InputError
+from protocols.log.layout import CHANNEL_RECORD, channel_record
 from protocols.log.read.frames import (
     Damage,
-    Frame,
+    McapRecord,
     RawMessage,
-    attachment_is_whole,
+    attachment_checksum_matches,
     chunk_records,
-    frames,
     message_record,
     open_log,
+    read_records,
 )
 from protocols.log.read.index import read_index
 from protocols.log.read.migration import upgrades_for
 from protocols.log.read.parts import find_parts, log_format
-from protocols.log.schemas import is_view
-from protocols.log.write.writer import CHANNEL_RECORD, channel_record
-from protocols.topics import BY_NAME, Topic
+from protocols.log.schemas import is_foxglove
+from protocols.topics import TOPICS_BY_NAME, Topic
 from protocols.validation.codec import Address, Rejected, admit, parse_key
 
 _Record = TypeVar("_Record", AttachmentRecord, Channel, MetadataRecord)
 
 
-class Logged(NamedTuple):
-    """One message of a log, through the gate. log_time_ns: the recorder's clock (Unix, ns)."""
+class LogMessage(NamedTuple):
+    """One validated message of a log. log_time_ns: the recorder's clock (Unix, ns)."""
 
     topic: Topic
     agent: str
@@ -63,7 +63,7 @@ class Attachment:
 
 @dataclass(frozen=True, slots=True)
 class TopicSummary:
-    """What a log holds of one key. address is None for a channel that is not of the catalogue."""
+    """Message count and time span of one key. address is None for a channel outside the catalogue."""
 
     key: str
     address: Address | None
@@ -74,7 +74,7 @@ class TopicSummary:
 
 @dataclass(frozen=True, slots=True)
 class LogSummary:
-    """What a whole log holds, by key in the order of first appearance; times as in Logged, 0 if empty.
+    """Content of a whole log, by key in the order of first appearance; times as in Logged, 0 if empty.
 
     What only repeats it for viewers is left out.
 
@@ -89,8 +89,8 @@ class LogSummary:
     reason: str
 
 
-class RawLogged(NamedTuple):
-    """One message as it stands in a file: undecoded, under its channel's name; times in ns (Unix)."""
+class RawLogMessage(NamedTuple):
+    """One message as stored: undecoded, with its channel's name; times in ns (Unix)."""
 
     part: Path
     key: str
@@ -103,7 +103,7 @@ class LogReader:
     Raises InputError if it cannot be read, is no MCAP file at all, or is of a newer Syncline.
 
     Every scan is in file order and verifies the checksums. A log that was not closed, is cut off or
-    has changed bytes gives what is whole; ``damage`` then says what is wrong.
+    has changed bytes gives its complete records; ``damage`` then describes the error.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -113,23 +113,23 @@ class LogReader:
         self._counts: Counter[str] = Counter()
         self._part = self.paths[0]
         self.format = log_format(self._part)
-        """What the log says about its form: log, schema, syncline (versions); session and part if it has parts."""
+        """The log's format record: log, schema, syncline (versions); session and part if it has parts."""
         self._upgrades = upgrades_for(self._part, self.format)
 
     @property
     def damage(self) -> str:
-        """What the last scan found wrong, as far as it came; "" if nothing."""
+        """The damage found by the last scan, as far as it got; "" if none."""
         more = f" (and {self._damage.flaws - 1} more)" if self._damage.flaws > 1 else ""
         return self._damage.text + more
 
     @property
     def skipped_bytes(self) -> int:
-        """Bytes that the last scan passed over because no record could be made out in them."""
+        """Bytes that the last scan skipped because they contain no record."""
         return self._damage.skipped
 
     @property
     def cut(self) -> bool:
-        """Whether the last scan found a file to end before its end."""
+        """Whether the last scan found a truncated file."""
         return self._damage.cut
 
     @property
@@ -147,11 +147,11 @@ class LogReader:
         topics: Iterable[Topic | str] | None = None,
         start_ns: int | None = None,
         end_ns: int | None = None,
-    ) -> Iterator[Logged]:
+    ) -> Iterator[LogMessage]:
         """The messages in file order.
 
         topics: only these, by name or entry of the catalogue; start_ns, end_ns: log times, the end
-        excluded. With a start, what stands before it in a file with a sound index is neither read nor
+        excluded. With a start, earlier chunks of a file with a valid index are neither read nor
         verified. Raises InputError for a name that the catalogue does not have.
         """
         wanted = None if topics is None else {_topic(topic).name for topic in topics}
@@ -167,19 +167,19 @@ class LogReader:
                     found[record.name] = dict(record.metadata)
         return found
 
-    def raw(self) -> Iterator[RawLogged]:
-        """Every whole message in file order, not through the gate, those for viewers too."""
+    def raw(self) -> Iterator[RawLogMessage]:
+        """Every complete message in file order, without validation, including those for viewers."""
         for key, raw in self._raw_messages():
-            yield RawLogged(self._part, key, raw)
+            yield RawLogMessage(self._part, key, raw)
 
     def attachments(self) -> list[Attachment]:
-        """The stored files in file order; one whose checksum does not match is left out, as damage."""
+        """The stored files in file order; one whose checksum does not match is omitted and counts as damage."""
         found: list[Attachment] = []
         for frame in self._frames():
             if frame.opcode != Opcode.ATTACHMENT:
                 continue
-            if not attachment_is_whole(frame.content):
-                self._damage.found(f"the attachment at byte {frame.offset} is damaged and was left out")
+            if not attachment_checksum_matches(frame.content):
+                self._damage.record(f"the attachment at byte {frame.offset} is damaged and was left out")
                 continue
             record = self._parse(AttachmentRecord, frame)
             if record is not None:
@@ -194,7 +194,7 @@ class LogReader:
         first: dict[str, int] = {}
         last: dict[str, int] = {}
         for key, raw in self._raw_messages():
-            if is_view(key):
+            if is_foxglove(key):
                 continue
             count[key] += 1
             first[key] = min(first.get(key, raw.log_time_ns), raw.log_time_ns)
@@ -216,7 +216,7 @@ class LogReader:
     ) -> None:
         """Nothing stays open between scans."""
 
-    def _messages(self, wanted: set[str] | None, start_ns: int | None, end_ns: int | None) -> Iterator[Logged]:
+    def _messages(self, wanted: set[str] | None, start_ns: int | None, end_ns: int | None) -> Iterator[LogMessage]:
         counts: Counter[str] = Counter()
         self._counts = counts
         for key, raw in self._raw_messages(start_ns):
@@ -225,7 +225,7 @@ class LogReader:
             if end_ns is not None and raw.log_time_ns >= end_ns:
                 continue
             address = parse_key(key)
-            if address is None and is_view(key):
+            if address is None and is_foxglove(key):
                 continue
             if address is None:
                 counts["foreign"] += 1
@@ -240,7 +240,7 @@ class LogReader:
             except Rejected as error:
                 counts[f"rejected.{error.reason.value}"] += 1
                 continue
-            yield Logged(address.topic, address.agent, address.site, message, raw.log_time_ns)
+            yield LogMessage(address.topic, address.agent, address.site, message, raw.log_time_ns)
 
     def _raw_messages(self, start_ns: int | None = None) -> Iterator[tuple[str, RawMessage]]:
         """(key, message) of every message whose channel is known."""
@@ -250,21 +250,21 @@ class LogReader:
             if self._part != part:
                 channels, part, searched = {}, self._part, False
             if opcode == Opcode.CHANNEL:
-                channel = self._parse(Channel, Frame(frame.offset, opcode, content))
+                channel = self._parse(Channel, McapRecord(frame.offset, opcode, content))
                 if channel is not None:
                     channels[channel.id] = channel.topic
             elif opcode == Opcode.METADATA:
-                noted = _noted_channel(frame)
+                noted = _channel_of_record(frame)
                 if noted is not None:
                     channels.setdefault(*noted)
             elif opcode == Opcode.MESSAGE:
                 raw = message_record(content)
                 if raw is not None and raw.channel not in channels and not searched:
-                    # The chunk that introduced the channel is damaged; the index at the end repeats it.
+                    # The chunk that defined the channel is damaged; the index at the end repeats its definition.
                     searched = True
                     channels = self._indexed_channels() | channels
                 if raw is None or raw.channel not in channels:
-                    self._damage.found(f"a message near byte {frame.offset} belongs to no known channel")
+                    self._damage.record(f"a message near byte {frame.offset} belongs to no known channel")
                     continue
                 yield channels[raw.channel], raw
 
@@ -274,15 +274,15 @@ class LogReader:
             index = read_index(stream)
             if index is not None:
                 return index.channels
-            for frame in frames(stream, Damage()):
+            for frame in read_records(stream, Damage()):
                 if frame.opcode == Opcode.CHANNEL:
                     channel = self._parse(Channel, frame)
                     if channel is not None:
                         channels[channel.id] = channel.topic
         return channels
 
-    def _records(self, start_ns: int | None = None) -> Iterator[tuple[int, bytes, Frame]]:
-        """(opcode, content, the frame it stands in), with chunks opened."""
+    def _records(self, start_ns: int | None = None) -> Iterator[tuple[int, bytes, McapRecord]]:
+        """(opcode, content, enclosing record), with chunks decompressed."""
         for frame in self._frames(start_ns):
             if frame.opcode == Opcode.CHUNK:
                 for opcode, content in chunk_records(frame, self._damage):
@@ -290,10 +290,10 @@ class LogReader:
             else:
                 yield frame.opcode, frame.content, frame
 
-    def _frames(self, start_ns: int | None = None) -> Iterator[Frame]:
+    def _frames(self, start_ns: int | None = None) -> Iterator[McapRecord]:
         self._damage = damage = Damage()
         if self._missing:
-            damage.found(self._missing)
+            damage.record(self._missing)
         for path in self.paths:
             self._part = path
             damage.place = f"{path.name}: " if len(self.paths) > 1 else ""
@@ -301,28 +301,28 @@ class LogReader:
                 with open_log(path) as stream:
                     index = None if start_ns is None else read_index(stream)
                     if index is None or start_ns is None:
-                        yield from frames(stream, damage)
+                        yield from read_records(stream, damage)
                         continue
                     begin = index.offset_of(start_ns)
                     if begin is not None:
-                        yield from frames(stream, damage, begin)
+                        yield from read_records(stream, damage, begin)
             except InputError as error:
-                damage.found(error.what)
+                damage.record(error.what)
             except OSError as error:
-                damage.found(f"the disk cannot read it to the end: {error.strerror or error}")
+                damage.record(f"the disk cannot read it to the end: {error.strerror or error}")
 
-    def _parse(self, kind: type[_Record], frame: Frame) -> _Record | None:
-        """One record as the library's class; None, and damage, if its inside is garbled."""
+    def _parse(self, kind: type[_Record], frame: McapRecord) -> _Record | None:
+        """Parse one record to the library's class; None, counted as damage, if it is malformed."""
         read: Callable[[ReadDataStream], _Record] = cast(Any, kind).read
         try:
             return read(ReadDataStream(BytesIO(frame.content)))
         except (McapError, ValueError, struct.error):
-            self._damage.found(f"the record at byte {frame.offset} is garbled and was left out")
+            self._damage.record(f"the record at byte {frame.offset} is garbled and was left out")
             return None
 
 
-def _noted_channel(frame: Frame) -> tuple[int, str] | None:
-    """(id, key) of a note that names a channel outside its chunk; None for other metadata."""
+def _channel_of_record(frame: McapRecord) -> tuple[int, str] | None:
+    """(id, key) of a metadata record that names a channel; None for other metadata."""
     try:
         record = MetadataRecord.read(ReadDataStream(BytesIO(frame.content)))
         if record.name != CHANNEL_RECORD:
@@ -336,7 +336,7 @@ def _noted_channel(frame: Frame) -> tuple[int, str] | None:
 def _topic(topic: Topic | str) -> Topic:
     if isinstance(topic, Topic):
         return topic
-    found = BY_NAME.get(topic)
+    found = TOPICS_BY_NAME.get(topic)
     if found is None:
-        raise InputError(f"there is no topic {topic!r}", remedy=f"use one of {', '.join(BY_NAME)}")
+        raise InputError(f"there is no topic {topic!r}", remedy=f"use one of {', '.join(TOPICS_BY_NAME)}")
     return found

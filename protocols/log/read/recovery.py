@@ -1,4 +1,4 @@
-"""Makes a whole log of a damaged one, of one that was never closed, or of the parts of one."""
+"""Recovers a complete log from a damaged one, one that was never closed, or the parts of one."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from mcap.reader import make_reader
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
 from protocols.log.read.reader import LogReader
-from protocols.log.schemas import is_view, schema_of
+from protocols.log.schemas import is_foxglove, schema_of
 from protocols.log.write.writer import LogWriter
 
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """What was saved and what was lost.
+    """What was recovered and what was lost.
 
-    messages: saved ones, without those for viewers; duration_s: between the first and the last of them.
-    missing: lost messages by key, as the numbering of those around them tells; foreign: messages of channels that
-    are not Syncline's, left out. skipped_bytes: where no record could be made out. damage: "" if nothing was wrong.
-    cut: the end is missing too, with what its writer had not brought to the disk.
+    messages: recovered ones, without those for viewers; duration_s: between the first and the last of them.
+    missing: lost messages by key, from gaps in the sequence numbers; foreign: messages of channels that are not
+    Syncline's, omitted. skipped_bytes: bytes in which no record was found. damage: "" if nothing was wrong.
+    cut: the end is missing too, with what its writer had not synced.
     """
 
     path: str
@@ -43,8 +43,8 @@ class Recovery:
     cut: bool
 
 
-class _Proof:
-    """Count and checksum over all messages in order: equal on both sides, or the copy is none."""
+class _MessageDigest:
+    """Count and checksum over all messages in order, to verify the copy."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -56,10 +56,10 @@ class _Proof:
 
 
 def recover(path: Path, out: Path) -> Recovery:
-    """Write what is whole in the log ``path`` to ``out``, verified; ``out`` is whole or not there.
+    """Write the undamaged content of the log ``path`` to ``out`` and verify it; ``out`` is written atomically.
 
     path: a log, or the folder or the first of its parts, which become one file. Every message keeps its bytes,
-    times and numbers. Raises InputError (no log, ``out`` exists, no room) and Refused (no whole message in it).
+    times and numbers. Raises InputError (no log, ``out`` exists, disk full) and Refused (no complete message).
     """
     reader = LogReader(path)
     if out.exists():
@@ -83,7 +83,7 @@ def _copy(reader: LogReader, temporary: Path, out: Path) -> Recovery:
     schema = int(reader.format.get("schema", "1"))
     numbers: dict[tuple[Path, str], int] = {}
     missing: Counter[str] = Counter()
-    written, times, messages, foreign = _Proof(), [0, 0], 0, 0
+    written, times, messages, foreign = _MessageDigest(), [0, 0], 0, 0
     try:
         with LogWriter(temporary, metadata, schema=schema) as log:
             for attachment in attachments:
@@ -94,7 +94,7 @@ def _copy(reader: LogReader, temporary: Path, out: Path) -> Recovery:
                     continue
                 log.copy(key, raw.payload, raw.log_time_ns, raw.publish_time_ns, raw.sequence)
                 written.add(key, raw.log_time_ns, raw.payload)
-                if is_view(key):
+                if is_foxglove(key):
                     continue
                 expected = numbers.get((part, key), -1) + 1
                 # A smaller number than the last: a log that was joined of parts, each of which counts from 0.
@@ -125,9 +125,9 @@ def _copy(reader: LogReader, temporary: Path, out: Path) -> Recovery:
     )
 
 
-def _verify(file: Path, out: Path, written: _Proof) -> None:
-    """Read the result as others do, by its index and with every checksum; InputError if it is not what was written."""
-    read = _Proof()
+def _verify(file: Path, out: Path, written: _MessageDigest) -> None:
+    """Read the result through its index with every checksum; InputError if it differs from what was written."""
+    read = _MessageDigest()
     try:
         with file.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True)

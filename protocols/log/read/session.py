@@ -1,4 +1,4 @@
-"""A recorded log as a session: its cameras and what they saw."""
+"""A session from what a user calls one: a session folder, or a recorded log."""
 
 from __future__ import annotations
 
@@ -7,9 +7,32 @@ from pathlib import Path
 from protocols.core.errors import InputError, Refused
 from protocols.log.read.reader import LogReader
 from protocols.session.builder import SessionBuilder
+from protocols.session.folder import read_folder
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
+from protocols.session.session import Session
 from protocols.topics import CAMERA_INFO, OBSERVATION, RIG_INFO
+
+
+def load_session(path: str | Path, observations: str | Path | None = None) -> Session:
+    """The session of a folder (rig.toml, observations.csv) or of a recorded log (.mcap, or a folder of its parts).
+
+    observations: another observations file in place of the folder's own. Raises InputError: file, line, what, remedy.
+    """
+    path = Path(path)
+    if is_log(path):
+        if observations is not None:
+            raise InputError("--observations goes with a session folder", file=path, remedy="leave it out for a log")
+        return Session(*session_from_log(path), path.stem)
+    rig, found = read_folder(path, None if observations is None else Path(observations))
+    return Session(rig, found, found.warnings, path.name)
+
+
+def is_log(path: Path) -> bool:
+    """Whether a path means a log: a .mcap file, or a folder that holds the parts of one and is no session folder."""
+    if path.suffix == ".mcap" and not path.is_dir():
+        return True
+    return path.is_dir() and not (path / "rig.toml").exists() and any(path.glob("*.mcap"))
 
 
 def session_from_log(file: Path) -> tuple[Rig, Observations, tuple[str, ...]]:

@@ -1,1 +1,1 @@
-"""Writing MCAP logs: crash-safe, rotated, with Foxglove channels."""
+"""Writing MCAP logs: crash-safe, with rotation and Foxglove channels."""

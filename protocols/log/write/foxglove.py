@@ -1,10 +1,10 @@
-"""Our messages once more in Foxglove's well-known schemas, so that viewers show a log with no set-up.
+"""Converts messages to Foxglove's well-known schemas, so that viewers show a log without configuration.
 
-Lengths become metres as viewers expect them; frames are "world" and the cameras' names; time stamps are the
+Lengths are converted to metres, as viewers expect; frames are "world" and the cameras' names; time stamps are the
 recorder's clock, the only one that all cameras of a log share.
 
-Pictures are smaller than the images in which observations are told. Viewers take the pixels of picture, lens and
-annotations of one camera for the same, so from the first picture on all three are told in the picture's.
+Thumbnails are smaller than the images to whose pixels observations refer. Viewers use one pixel frame for image, lens
+and annotations of a camera, so from the first thumbnail on all three are converted to the thumbnail's pixels.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
-from foxglove_schemas_protobuf.Pose_pb2 import Pose as ViewPose
+from foxglove_schemas_protobuf.Pose_pb2 import Pose as FoxglovePose
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
@@ -34,53 +34,53 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
-from protocols.log.schemas import VIEW_PREFIX
-from protocols.log.write.thumbnails import Scale, scale_of
+from protocols.log.schemas import FOXGLOVE_PREFIX
+from protocols.log.write.thumbnails import ThumbnailScale, thumbnail_scale
 from protocols.messages import syncline_pb2 as pb
 
 WORLD = "world"
-_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-_MARK_M = 0.05
+_METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_MARKER_DIAMETER_M = 0.05
 """Diameter of a tracked point in a viewer [m]; with arbitrary scale, in baselines."""
 _SMALLEST_CIRCLE_PX = 6.0
 _ORANGE = Color(r=1.0, g=0.55, b=0.0, a=1.0)
 _POINT_FIELDS = [
     PackedElementField(name=name, offset=4 * place, type=PackedElementField.FLOAT32) for place, name in enumerate("xyz")
 ]
-_FADE_S = 2
-"""A track of which nothing more is heard goes out of the picture after it."""
+_TRACK_LIFETIME_S = 2
+"""A track without further messages disappears from the scene after this time."""
 
 
-_FLIGHT_APART_NS = NANOSECONDS // 2
-"""Pictures of a flight are large and there are 30 a second: viewers get two of them."""
+_FLIGHT_IMAGE_PERIOD_NS = NANOSECONDS // 2
+"""Images of a flight are large and come at 30 Hz: viewers get two per second."""
 _STATE_COLOURS = {"visible": Color(r=0.3, g=0.85, b=0.3, a=1.0), "coasting": _ORANGE}
 
 
-class View(NamedTuple):
-    """One message for viewers and the channel it goes to."""
+class FoxgloveMessage(NamedTuple):
+    """One message for viewers and its channel."""
 
     key: str
     message: Message
 
 
-class Views:
-    """Makes the views of one log; remembers the rig's unit and the images' sizes between messages."""
+class FoxgloveConverter:
+    """Converts the messages of one log; keeps the rig's unit and the images' sizes between messages."""
 
     def __init__(self) -> None:
         self._metres = 1.0
         self._sizes: dict[str, tuple[int, int]] = {}
         self._own_lens: set[str] = set()
-        self._scales: dict[str, Scale] = {}
+        self._scales: dict[str, ThumbnailScale] = {}
         self._last_flight_ns: dict[str, int] = {}
         self._points: dict[str, dict[str, tuple[int, Floats]]] = {}  # of a site, by label: log time, position [m]
 
-    def of(self, site: str, message: Message, log_time_ns: int) -> list[View]:
-        """What a viewer shall see of one message that passed the gate; log_time_ns: Unix, ns."""
+    def of(self, site: str, message: Message, log_time_ns: int) -> list[FoxgloveMessage]:
+        """The messages for viewers of one validated message; log_time_ns: Unix, ns."""
         stamp = Timestamp(seconds=log_time_ns // NANOSECONDS, nanos=log_time_ns % NANOSECONDS)
-        where = f"{VIEW_PREFIX}{site}"
+        where = f"{FOXGLOVE_PREFIX}{site}"
         if isinstance(message, pb.Observation):
             scale = self._scales.get(message.camera)
-            return [View(f"{where}/{message.camera}/annotations", _annotations(message, stamp, scale))]
+            return [FoxgloveMessage(f"{where}/{message.camera}/annotations", _annotations(message, stamp, scale))]
         if isinstance(message, pb.Picture):
             return self._picture(where, message, stamp)
         if isinstance(message, pb.CameraInfo):
@@ -90,17 +90,22 @@ class Views:
             self._own_lens.add(message.camera)
             return [self._lens(where, message.camera, message, stamp)]
         if isinstance(message, pb.RigInfo):
-            self._metres = _METRES.get(message.units, 1.0)
+            self._metres = _METRES_PER_UNIT.get(message.units, 1.0)
         elif isinstance(message, pb.Calibration) and message.cameras:
-            self._metres = _METRES.get(message.units, 1.0) if message.scale == "metric" else 1.0
+            self._metres = _METRES_PER_UNIT.get(message.units, 1.0) if message.scale == "metric" else 1.0
             return self._calibration(where, message, stamp)
         elif isinstance(message, pb.Track):
-            # rerun's loader knows no scenes, but points.
+            # rerun's loader supports point clouds, but not scenes.
             points = self._cloud(site, message, stamp, log_time_ns)
-            return [View(f"{where}/scene", self._scene(message, stamp)), View(f"{where}/points", points)]
+            return [
+                FoxgloveMessage(f"{where}/scene", self._scene(message, stamp)),
+                FoxgloveMessage(f"{where}/points", points),
+            ]
         elif isinstance(message, pb.Prediction):
             return [
-                View(f"{where}/{part.camera}/expected", _expected(part, stamp, self._scales.get(part.camera)))
+                FoxgloveMessage(
+                    f"{where}/{part.camera}/expected", _expected(part, stamp, self._scales.get(part.camera))
+                )
                 for part in message.cameras
             ]
         elif isinstance(message, pb.FlightImage):
@@ -109,27 +114,27 @@ class Views:
             self._sizes[message.agent] = (message.width, message.height)
             return [self._lens(where, message.agent, message, stamp)]
         elif isinstance(message, pb.TargetState):
-            return [View(f"{where}/{message.agent}/annotations", _target(message, stamp))]
+            return [FoxgloveMessage(f"{where}/{message.agent}/annotations", _target(message, stamp))]
         return []
 
-    def _picture(self, where: str, picture: pb.Picture, stamp: Timestamp) -> list[View]:
-        scale = scale_of(picture)
+    def _picture(self, where: str, picture: pb.Picture, stamp: Timestamp) -> list[FoxgloveMessage]:
+        scale = thumbnail_scale(picture)
         if scale is None:
-            return []  # a viewer would stumble over it
+            return []  # viewers cannot decode it
         self._sizes.setdefault(picture.camera, (picture.width, picture.height))
         self._scales[picture.camera] = scale
         image = CompressedImage(timestamp=stamp, frame_id=picture.camera, data=picture.jpeg, format="jpeg")
-        return [View(f"{where}/{picture.camera}/image", image)]
+        return [FoxgloveMessage(f"{where}/{picture.camera}/image", image)]
 
-    def _flight(self, where: str, flight: pb.FlightImage, stamp: Timestamp, log_time_ns: int) -> list[View]:
+    def _flight(self, where: str, flight: pb.FlightImage, stamp: Timestamp, log_time_ns: int) -> list[FoxgloveMessage]:
         last = self._last_flight_ns.get(flight.agent)
-        if not flight.jpeg or (last is not None and 0 <= log_time_ns - last < _FLIGHT_APART_NS):
+        if not flight.jpeg or (last is not None and 0 <= log_time_ns - last < _FLIGHT_IMAGE_PERIOD_NS):
             return []
         self._last_flight_ns[flight.agent] = log_time_ns
         image = CompressedImage(timestamp=stamp, frame_id=flight.agent, data=flight.jpeg, format="jpeg")
-        return [View(f"{where}/{flight.agent}/image", image)]
+        return [FoxgloveMessage(f"{where}/{flight.agent}/image", image)]
 
-    def _lens(self, where: str, camera: str, lens: Any, stamp: Timestamp) -> View:
+    def _lens(self, where: str, camera: str, lens: Any, stamp: Timestamp) -> FoxgloveMessage:
         matrix, scale = np.array(lens.matrix).reshape(3, 3), self._scales.get(camera)
         if scale is None:
             unknown = (round(2 * matrix[0, 2] + 1), round(2 * matrix[1, 2] + 1))
@@ -147,11 +152,11 @@ class Views:
             R=np.eye(3).ravel().tolist(),
             P=np.column_stack([matrix, np.zeros(3)]).ravel().tolist(),
         )
-        return View(f"{where}/{camera}/calibration", message)
+        return FoxgloveMessage(f"{where}/{camera}/calibration", message)
 
-    def _calibration(self, where: str, message: pb.Calibration, stamp: Timestamp) -> list[View]:
+    def _calibration(self, where: str, message: pb.Calibration, stamp: Timestamp) -> list[FoxgloveMessage]:
         transforms = FrameTransforms()
-        views = [View(f"{where}/transforms", transforms)]
+        views = [FoxgloveMessage(f"{where}/transforms", transforms)]
         for camera in message.cameras:
             pose = Pose.from_rodrigues(np.array(camera.rotation), np.array(camera.translation))
             x, y, z = (float(value) * self._metres for value in pose.position)
@@ -170,18 +175,18 @@ class Views:
         return views
 
     def _cloud(self, site: str, track: pb.Track, stamp: Timestamp, now_ns: int) -> PointCloud:
-        """Every point of a site that was heard of within the last seconds."""
+        """All points of a site that were updated within _TRACK_LIFETIME_S."""
         points = self._points.setdefault(site, {})
         points.pop(track.label, None)
         if track.state != "lost" and len(track.position) == 3:
             points[track.label] = (now_ns, self._metres * np.array(track.position))
-        for label in [label for label, (at, _) in points.items() if abs(now_ns - at) > _FADE_S * NANOSECONDS]:
+        for label in [label for label, (at, _) in points.items() if abs(now_ns - at) > _TRACK_LIFETIME_S * NANOSECONDS]:
             del points[label]
         places = np.array([place for _, place in points.values()], dtype="<f4")
         return PointCloud(
             timestamp=stamp,
             frame_id=WORLD,
-            pose=ViewPose(position=Vector3(), orientation=Quaternion(w=1.0)),
+            pose=FoxglovePose(position=Vector3(), orientation=Quaternion(w=1.0)),
             point_stride=12,
             fields=_POINT_FIELDS,
             data=places.tobytes(),
@@ -196,23 +201,23 @@ class Views:
         paint = track.colour
         rgb = (paint.red / 255, paint.green / 255, paint.blue / 255) if track.HasField("colour") else (1.0, 0.55, 0.0)
         sphere = SpherePrimitive(
-            pose=ViewPose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(w=1.0)),
-            size=Vector3(x=_MARK_M, y=_MARK_M, z=_MARK_M),
+            pose=FoxglovePose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(w=1.0)),
+            size=Vector3(x=_MARKER_DIAMETER_M, y=_MARKER_DIAMETER_M, z=_MARKER_DIAMETER_M),
             color=Color(r=rgb[0], g=rgb[1], b=rgb[2], a=1.0 if solid else 0.4),
         )
         entity = SceneEntity(timestamp=stamp, frame_id=WORLD, id=track.label, spheres=[sphere])
-        entity.lifetime.seconds = _FADE_S
+        entity.lifetime.seconds = _TRACK_LIFETIME_S
         return SceneUpdate(entities=[entity])
 
 
-def _annotations(observation: pb.Observation, stamp: Timestamp, scale: Scale | None) -> ImageAnnotations:
+def _annotations(observation: pb.Observation, stamp: Timestamp, scale: ThumbnailScale | None) -> ImageAnnotations:
     """The detections as circles with their labels, in the distorted image as they were detected."""
     annotations = ImageAnnotations()
     for detection in observation.detections:
         u, v, size = detection.u, detection.v, detection.size
         if scale is not None:
-            (u, v), size = scale.place(u, v), size * scale.across
-        circle = annotations.circles.add()  # in place: built apart and copied it takes twice as long
+            (u, v), size = scale.place(u, v), size * scale.scale_x
+        circle = annotations.circles.add()  # built in place: a copy takes twice as long
         circle.timestamp.CopyFrom(stamp)
         circle.position.x, circle.position.y = u, v
         circle.diameter = max(size, _SMALLEST_CIRCLE_PX)
@@ -228,7 +233,7 @@ def _annotations(observation: pb.Observation, stamp: Timestamp, scale: Scale | N
     return annotations
 
 
-def _expected(part: pb.CameraPrediction, stamp: Timestamp, scale: Scale | None) -> ImageAnnotations:
+def _expected(part: pb.CameraPrediction, stamp: Timestamp, scale: ThumbnailScale | None) -> ImageAnnotations:
     """Where targets are expected in one image: the region of head and face, and the name."""
     annotations = ImageAnnotations()
     for target in part.targets:
@@ -267,8 +272,8 @@ def _target(target: pb.TargetState, stamp: Timestamp) -> ImageAnnotations:
         half_width, half_height = 0.5 * target.size[0], 0.5 * target.size[1]
         box = annotations.points.add(type=PointsAnnotation.LINE_LOOP, outline_color=colour, thickness=2.0)
         box.timestamp.CopyFrom(stamp)
-        for right, down in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
-            box.points.add(x=x + right * half_width, y=y + down * half_height)
+        for right, scale_y in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+            box.points.add(x=x + right * half_width, y=y + scale_y * half_height)
     text = annotations.texts.add(text=target.state, font_size=12.0, text_color=colour)
     text.timestamp.CopyFrom(stamp)
     text.position.x, text.position.y = x, y

@@ -11,7 +11,7 @@ from google.protobuf.message import Message
 
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
-from protocols.log.read.parts import part_path
+from protocols.log.layout import part_path
 from protocols.log.write.writer import LogWriter
 from protocols.topics import Topic
 
@@ -20,7 +20,7 @@ class RotatingWriter:
     """A LogWriter that begins a new file when the present one is large or old enough. For use by one thread.
 
     path: name.mcap gives name-000.mcap, name-001.mcap, …; session: an id that all parts carry.
-    max_bytes, max_s: None = no bound. Age is told by log times, so that equal input gives equal files.
+    max_bytes, max_s: None = no bound. Age is measured by log times, so that equal input gives equal files.
     Raises InputError as LogWriter does; no existing part is overwritten.
     """
 

@@ -1,9 +1,8 @@
-"""Writes a live MCAP log that survives the death of its writer."""
+"""Crash-safe writer of MCAP logs: what was synced stays readable if the process dies."""
 
 from __future__ import annotations
 
 import os
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,24 +15,21 @@ from mcap.writer import CompressionType, Writer
 
 from protocols.core.errors import InputError
 from protocols.core.version import VERSION
+from protocols.log.layout import CHANNEL_RECORD, FORMAT_RECORD, LOG_VERSION, channel_record, with_checksum
 from protocols.log.schemas import schema_of
 from protocols.topics import Topic
 from protocols.validation.codec import SCHEMA_VERSION, encode, parse_key
 
 if TYPE_CHECKING:
-    from protocols.log.write.foxglove import Views
+    from protocols.log.write.foxglove import FoxgloveConverter
 
 PROFILE = "syncline"
 LIBRARY = "syncline"
 CHUNK_SIZE = 60 * 1024
 """Bytes after which a chunk is finished, so that one of small messages stays below 64 KiB.
 
-A chunk that was not finished is lost with its writer; 1 MiB of small messages is 12 s.
+An unfinished chunk is lost if the process dies; 1 MiB of small messages is 12 s.
 """
-LOG_VERSION = 1
-"""Counts changes of how a log is laid out that an old reader must know of."""
-FORMAT_RECORD = "syncline.format"
-CHANNEL_RECORD = "syncline.channel"
 
 
 class LogWriter:
@@ -42,9 +38,9 @@ class LogWriter:
     path: the file; its folders are made. An existing file is never overwritten (InputError).
     metadata: written at the start, by name; readers get it back as it is.
     part: of a log in several files: (session, number from 0).
-    views: also write what viewers show without set-up, in Foxglove's schemas.
+    views: also write channels in Foxglove's schemas, which viewers show without configuration.
     schema: the version of the messages, where those of an old log are copied.
-    Any failure of the disk is InputError; what was written until then stays readable.
+    A disk failure raises InputError; what was written until then stays readable.
     """
 
     def __init__(
@@ -61,11 +57,11 @@ class LogWriter:
         self._channels: dict[str, int] = {}
         self._keys: dict[tuple[str, str, str], str] = {}
         self._schemas: dict[str, int] = {}
-        self._views: Views | None = None
+        self._views: FoxgloveConverter | None = None
         if views:
-            from protocols.log.write.foxglove import Views
+            from protocols.log.write.foxglove import FoxgloveConverter
 
-            self._views = Views()
+            self._views = FoxgloveConverter()
         with self._disk():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = _DirectFile(self.path)
@@ -110,7 +106,7 @@ class LogWriter:
             self._failed(error)
 
     def copy(self, key: str, payload: bytes, log_time_ns: int, publish_time_ns: int, sequence: int) -> None:
-        """Append a message of another log as it is. Its channel must be one of ours."""
+        """Append a message of another log unchanged. Its channel must be known."""
         try:
             self._put(key, payload, log_time_ns, publish_time_ns, sequence)
         except OSError as error:
@@ -128,7 +124,7 @@ class LogWriter:
         if sequence is None:
             sequence = self._sequences.get(channel, 0)
             self._sequences[channel] = sequence + 1
-        # By place: keywords cost a tenth of the rate.
+        # Positional arguments: keywords cost a tenth of the write rate.
         self._writer.add_message(
             channel,
             log_time_ns,
@@ -170,7 +166,7 @@ class LogWriter:
     def _new_channel(self, key: str) -> int:
         schema = schema_of(key)
         if schema is None:
-            raise ValueError(f"{key!r} is no channel of ours")
+            raise ValueError(f"{key!r} is not a known channel")
         if schema.name not in self._schemas:
             self._schemas[schema.name] = self._writer.register_schema(
                 name=schema.name, encoding=SchemaEncoding.Protobuf, data=schema.data
@@ -184,7 +180,7 @@ class LogWriter:
         )
         self._channels[key] = channel
         # MCAP names a channel only inside the chunk that uses it first, and at the very end: one damaged chunk
-        # would make all that follow in an unclosed log nameless. This copy stands outside.
+        # would leave all later messages of an unclosed log without a channel name. This copy is outside the chunks.
         self._writer.add_metadata(CHANNEL_RECORD, channel_record(channel, key))
         return channel
 
@@ -213,7 +209,7 @@ class LogWriter:
 
 
 class _DirectFile:
-    """A new file without a buffer of its own, so that every finished chunk reaches the kernel.
+    """A new unbuffered file, so that every finished chunk reaches the kernel.
 
     Not an io.RawIOBase on purpose: the MCAP writer would put a buffer before one.
     """
@@ -234,7 +230,7 @@ class _DirectFile:
         return self._position
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Nothing is buffered."""
 
     def sync(self) -> None:
         os.fsync(self._raw.fileno())
@@ -244,7 +240,7 @@ class _DirectFile:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Bring a new name to the disk: without it a power cut leaves synced data that no name leads to."""
+    """Sync a folder after creating a file: without it a power cut may lose the file's directory entry."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -254,17 +250,6 @@ def _sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def channel_record(channel: int, key: str) -> dict[str, str]:
-    """What is noted of a channel outside its chunk."""
-    return checked({"id": str(channel), "key": key})
-
-
-def checked(values: Mapping[str, str]) -> dict[str, str]:
-    """Metadata with a checksum of its own, which MCAP does not give it; the same again for what has one already."""
-    plain = {name: value for name, value in values.items() if name != "crc"}
-    return {**plain, "crc": str(zlib.crc32(repr(sorted(plain.items())).encode()))}
-
-
 def _format(part: tuple[str, int] | None, schema: int) -> dict[str, str]:
     values = {"log": str(LOG_VERSION), "schema": str(schema), "syncline": VERSION}
-    return checked(values if part is None else {**values, "session": part[0], "part": str(part[1])})
+    return with_checksum(values if part is None else {**values, "session": part[0], "part": str(part[1])})

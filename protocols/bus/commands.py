@@ -1,4 +1,4 @@
-"""What a person asks an agent for through the bus, each thing once."""
+"""Receives operator commands for one agent from the bus, without duplicates."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from protocols.bus.base import Bus
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import COMMAND
 
-_REMEMBERED = 1024
+_DUPLICATE_WINDOW = 1024
 
 
-class Orders:
-    """The commands that are meant for one run of one agent.
+class CommandSubscription:
+    """The commands addressed to one run of one agent.
 
-    agent, boot: its id and boot id: what was asked of an earlier run is not obeyed by a later one. actions: those that
-    it can do; others are ignored.
+    agent, boot: its id and boot id; commands to an earlier run are ignored by a later one. actions: the actions that
+    it supports; others are ignored.
     """
 
     def __init__(self, bus: Bus, agent: str, boot: str, actions: Collection[str]) -> None:
         self._subscription = bus.subscribe(COMMAND)
         self._agent, self._boot, self._actions = agent, boot, frozenset(actions)
-        self._known: deque[tuple[str, str, int]] = deque(maxlen=_REMEMBERED)
+        self._known: deque[tuple[str, str, int]] = deque(maxlen=_DUPLICATE_WINDOW)
 
     def take(self) -> list[str]:
-        """The actions that were asked for since the last call, in order."""
-        asked = []
+        """The actions requested since the last call, in order."""
+        actions = []
         for received in self._subscription.drain():
             command = received.message
             assert isinstance(command, pb.Command)
@@ -35,8 +35,8 @@ class Orders:
                 continue
             self._known.append(identity)
             if command.action in self._actions:
-                asked.append(command.action)
-        return asked
+                actions.append(command.action)
+        return actions
 
     def close(self) -> None:
         """Stop listening."""

@@ -1,4 +1,4 @@
-"""The graph of camera pairs: one time map per camera from pairwise ones, contradicting pairs set aside."""
+"""Time synchronisation over the graph of camera pairs: one time map per camera, with outlier pairs rejected."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hub.sync.pair_solver import PairSolution, evidence
-from hub.trajectory.image_tracks import Track
+from hub.sync.hypothesis import PairSolution, evidence
+from hub.trajectory.image_tracks import ImageTrack
 from protocols.geometry.types import Floats
 
-_CONTRADICTION = 0.15  # s: a pair whose lag is that far from what the others say is set aside
-_LAG_STD, _RATE_STD = 0.01, 5e-4  # s; how a pair's lag and a clock's nominal rate are weighed
-_RATE_LEVER = 30.0  # s over which a rate difference is weighed as a time difference
+_MAX_LAG_RESIDUAL = 0.15  # s: a pair whose lag differs that much from the network's solution is an outlier
+_LAG_STD, _RATE_STD = 0.01, 5e-4  # s; weights of a pair's lag and of a clock's nominal rate
+_RATE_BASELINE = 30.0  # s: time span by which a rate difference is weighed as a time difference
 
 
 @dataclass(frozen=True, slots=True)
-class ClockGuess:
-    """First time map of one camera: ``t = rate * (t_camera - centre) + offset``, times less the epoch."""
+class TimeMapEstimate:
+    """Initial time map of one camera: ``t = rate * (t_camera - centre) + offset``, times from the session's origins."""
 
     rate: float
     offset: float
@@ -27,15 +27,15 @@ class ClockGuess:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClockGraph:
-    """Clocks of the cameras that hang together, the pairs that agree, and those that don't."""
+    """Time maps of one connected component, the pairs consistent with them, and the rejected outlier pairs."""
 
-    clocks: dict[str, ClockGuess]
-    agreeing: tuple[PairSolution, ...]
-    contradicting: tuple[PairSolution, ...]
+    clocks: dict[str, TimeMapEstimate]
+    inlier_pairs: tuple[PairSolution, ...]
+    outlier_pairs: tuple[PairSolution, ...]
 
 
-def components(names: list[str], pairs: list[PairSolution]) -> list[list[str]]:
-    """Connected components over solved pairs, largest first, ties by order of names."""
+def connected_components(names: list[str], pairs: list[PairSolution]) -> list[list[str]]:
+    """Connected components over solved pairs, largest first; equal sizes by the order of names."""
     parent = {name: name for name in names}
 
     def root(name: str) -> str:
@@ -51,38 +51,40 @@ def components(names: list[str], pairs: list[PairSolution]) -> list[list[str]]:
     return sorted(groups.values(), key=lambda group: (-len(group), names.index(group[0])))
 
 
-def average_clocks(
-    names: list[str], pairs: list[PairSolution], tracks: Mapping[str, Mapping[str, Track]]
+def synchronise_clocks(
+    names: list[str], pairs: list[PairSolution], tracks: Mapping[str, Mapping[str, ImageTrack]]
 ) -> ClockGraph:
-    """L1 average of the pairs' time maps over one connected component (reweighted least squares).
+    """L1 average of the pairs' time maps over one connected component (iteratively reweighted least squares).
 
-    names: cameras of the component. A pair that contradicts the average is set aside, worst first, as long
-    as it isn't a bridge: the cycles of the graph are the check.
+    names: cameras of the component. Pairs that contradict the average are rejected as outliers, worst first, unless
+    they are bridges: only the cycles of the graph are redundant.
     """
-    centres = {name: _middle(tracks[name]) for name in names}
-    kept, out = list(pairs), []
+    centres = {name: _time_centre(tracks[name]) for name in names}
+    kept, outliers = list(pairs), []
     while True:
-        offsets, rates, errors = _solve(names, kept, centres)
+        offsets, rates, errors = _solve_time_maps(names, kept, centres)
         worst = int(np.argmax(errors)) if len(errors) else -1
-        if worst < 0 or errors[worst] < _CONTRADICTION:
+        if worst < 0 or errors[worst] < _MAX_LAG_RESIDUAL:
             break
         without = kept[:worst] + kept[worst + 1 :]
-        if len(components(names, without)[0]) < len(names):
+        if len(connected_components(names, without)[0]) < len(names):
             break  # a bridge cannot contradict anything
-        out.append(kept[worst])
+        outliers.append(kept[worst])
         kept = without
-    clocks = {name: ClockGuess(rates[i], offsets[i], centres[name]) for i, name in enumerate(names)}
-    return ClockGraph(clocks, tuple(kept), tuple(out))
+    clocks = {name: TimeMapEstimate(rates[i], offsets[i], centres[name]) for i, name in enumerate(names)}
+    return ClockGraph(clocks, tuple(kept), tuple(outliers))
 
 
-def _middle(tracks: Mapping[str, Track]) -> float:
+def _time_centre(tracks: Mapping[str, ImageTrack]) -> float:
     begin = min(float(track.time[0]) for track in tracks.values())
     end = max(float(track.time[-1]) for track in tracks.values())
     return 0.5 * (begin + end)
 
 
-def _solve(names: list[str], pairs: list[PairSolution], centres: dict[str, float]) -> tuple[Floats, Floats, Floats]:
-    """Offsets and rates (n,), and how far each pair is off (m,) [s]."""
+def _solve_time_maps(
+    names: list[str], pairs: list[PairSolution], centres: dict[str, float]
+) -> tuple[Floats, Floats, Floats]:
+    """Offsets and rates (n,), and the residual of each pair (m,) [s]."""
     count = len(names)
     index = {name: i for i, name in enumerate(names)}
     # Unknowns: offset and rate less 1 per camera. Rows: time agreement at two times around the overlap.
@@ -92,8 +94,8 @@ def _solve(names: list[str], pairs: list[PairSolution], centres: dict[str, float
         if fit is None:
             continue
         a, b = index[pair.a], index[pair.b]
-        middle = fit.middle
-        for time_a in (middle - _RATE_LEVER / 2, middle + _RATE_LEVER / 2):
+        middle = fit.mid_time
+        for time_a in (middle - _RATE_BASELINE / 2, middle + _RATE_BASELINE / 2):
             time_b = (time_a - fit.offset) / fit.rate
             row = np.zeros(2 * count)
             row[2 * a], row[2 * a + 1] = 1.0, time_a - centres[pair.a]

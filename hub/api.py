@@ -1,0 +1,305 @@
+"""Calibration and triangulation for notebooks and for the commands: a session in, a result that can be saved out.
+
+The estimators themselves are ``hub.calibration.pipeline`` and ``hub.calibration.triangulation``; here are only their
+options, the reading of what a path means, and the files of a result.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import numpy as np
+
+from protocols.core.errors import InputError, Refused
+from protocols.core.files import check_folder, write_atomically, write_together
+from protocols.core.tables import dataframe
+from protocols.geometry import so3
+from protocols.log.read.session import load_session
+from protocols.session.calibration import (
+    Calibration,
+    CameraCalibration,
+    FixedCalibration,
+    TrajectoryTable,
+    calibration_text,
+    csv_cell,
+    read_calibration,
+    trajectory_text,
+)
+from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
+from protocols.session.observations import Observations, read_observations
+from protocols.session.result import refusal_document, result_document, result_text
+from protocols.session.rig import Rig, read_rig
+from protocols.session.session import Session
+
+if TYPE_CHECKING:
+    import pandas
+
+CALIBRATION, TRAJECTORY, RESULT, REPORT = "calibration.toml", "trajectory.csv", "result.json", "report.html"
+Progress: TypeAlias = Callable[[str, float], None]
+"""Called with what is being done and the share that is done, 0..1."""
+Solver = Literal["joint", "distributed", "paper"]
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationOptions:
+    """How a session is calibrated.
+
+    solver: "joint" (one bundle adjustment), "distributed" (pose nodes in one process), or "paper" (the papers' own
+    methods, for comparison). from_known: a calibration.toml whose intrinsics and poses are kept; only timing and
+    trajectories are estimated then, by "joint". thorough: search clock rates of wrong nominal frame rates, and
+    interrupted tracks, for cameras that a first search leaves unconnected. seed: of the distributed solver's samples.
+    """
+
+    solver: Solver = "joint"
+    from_known: str | Path | None = None
+    thorough: bool = True
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationResult:
+    """A solved session. calibration: clocks, poses, trajectories and pair reports. session: what it was made from."""
+
+    calibration: Calibration
+    session: Session
+
+    @property
+    def cameras(self) -> dict[str, CameraCalibration]:
+        """The solved cameras by name."""
+        return self.calibration.cameras
+
+    @property
+    def refused(self) -> dict[str, str]:
+        """Why a camera is not among them, by name."""
+        return self.calibration.refused
+
+    def save(self, out: str | Path, command: str = "") -> dict[str, Any]:
+        """Write calibration.toml, trajectory.csv, result.json and report.html to a folder: all of them, or none.
+
+        command: how the result was made, for the report. Returns the content of result.json. Raises InputError.
+        """
+        from hub.report import build_report
+
+        folder = Path(out)
+        check_folder(folder)
+        rig, found = self.session.rig, self.calibration
+        document = result_document(found, rig, command=command)
+        write_together(
+            {
+                folder / CALIBRATION: calibration_text(found, rig),
+                folder / TRAJECTORY: trajectory_text(found),
+                folder / RESULT: result_text(document),
+                folder / REPORT: build_report(found, rig, self.session.observations, command),
+            }
+        )
+        return document
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """One row a solved camera: clock, pose and their stds. Needs pandas.
+
+        time_offset, clock_rate: t_reference = clock_rate * t_camera + time_offset [s]. x, y, z: its centre in the
+        world, with the std of each [rig units]. rx, ry, rz: Rodrigues vector, camera from world [rad]. rms_px: of its
+        reprojection errors.
+        """
+        cameras = list(self.cameras.values())
+        rotation = np.array([so3.log(camera.pose.rotation) for camera in cameras]).reshape(-1, 3)
+        position = np.array([camera.pose.position for camera in cameras]).reshape(-1, 3)
+        std = np.array([camera.position_std for camera in cameras]).reshape(-1, 3)
+        return dataframe(
+            {
+                "camera": [camera.name for camera in cameras],
+                "time_offset": [camera.time_map.time_offset for camera in cameras],
+                "time_offset_std": [camera.time_offset_std for camera in cameras],
+                "clock_rate": [camera.time_map.clock_rate for camera in cameras],
+                **{axis: position[:, i] for i, axis in enumerate("xyz")},
+                **{f"{axis}_std": std[:, i] for i, axis in enumerate("xyz")},
+                **{f"r{axis}": rotation[:, i] for i, axis in enumerate("xyz")},
+                "rms_px": [camera.rms_px for camera in cameras],
+            }
+        )
+
+    def trajectory_dataframe(self) -> pandas.DataFrame:
+        """One row a sample: time [s, reference clock], x, y, z, std [rig units], label. Needs pandas."""
+        return _trajectories(self.calibration.trajectories)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TriangulationResult:
+    """Trajectories of labelled points on the reference clock of a given calibration, in its world and units.
+
+    sigma_px: noise of one pixel coordinate, by camera. unused: why a camera was not used, by name. unplaced: labels
+    without a trajectory.
+    """
+
+    rig: Rig
+    tables: tuple[TrajectoryTable, ...]
+    sigma_px: dict[str, float]
+    unused: dict[str, str]
+    unplaced: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    def save(self, file: str | Path) -> None:
+        """Write time,x,y,z,std,label as CSV, floats with 17 significant digits. Raises InputError."""
+        rows = [
+            f"{t:.17g},{x:.17g},{y:.17g},{z:.17g},{std:.17g},{csv_cell(table.label)}"
+            for table in self.tables
+            for t, (x, y, z), std in zip(table.time, table.position, table.std, strict=True)
+        ]
+        write_atomically(Path(file), "\n".join(["time,x,y,z,std,label", *rows]) + "\n")
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """One row a sample: time [s, reference clock], x, y, z, std [rig units], label. Needs pandas."""
+        return _trajectories(self.tables)
+
+
+def calibrate(
+    session: Session | str | Path, options: CalibrationOptions | None = None, progress: Progress | None = None
+) -> CalibrationResult:
+    """Estimate when each camera of a session fired, where it stands, and the trajectories of what moved.
+
+    session: as `load_session` returns it, or a path that it reads. Raises InputError for what cannot be read, and
+    Refused, with reasons by camera, where the data do not determine an answer for at least two cameras.
+    """
+    from hub.calibration.pipeline import calibrate as estimate_calibration
+
+    options = options or CalibrationOptions()
+    if options.from_known is not None and options.solver != "joint":
+        raise InputError("--from-known goes with --solver joint", remedy="leave one of the two out")
+    session = session if isinstance(session, Session) else load_session(session)
+    known = None
+    if options.from_known is not None:
+        known, rig = _fixed(Path(options.from_known), session.rig)
+        session = replace(session, rig=rig)
+    began = time.process_time()
+    try:
+        found = estimate_calibration(
+            session.rig,
+            session.observations,
+            progress,
+            solver=options.solver,
+            known=known,
+            thorough=options.thorough,
+            seed=options.seed,
+        )
+    except Refused as refused:
+        refused.warnings = (*session.warnings, *refused.warnings)
+        refused.cpu_seconds = time.process_time() - began
+        raise
+    spent = time.process_time() - began
+    return CalibrationResult(replace(found, cpu_seconds=spent, warnings=session.warnings + found.warnings), session)
+
+
+def save_refusal(
+    out: str | Path, refusal: Refused, session: Session, command: str = "", solver: str = "joint"
+) -> dict[str, Any]:
+    """Write result.json and report.html of a session that was refused; an earlier answer is removed.
+
+    Returns the content of result.json. Raises InputError.
+    """
+    from hub.report import build_report
+
+    folder = Path(out)
+    remove_outputs(folder)
+    document = refusal_document(
+        refusal.reason,
+        refusal.cameras,
+        session.rig,
+        command=command,
+        solver=solver,
+        cpu_seconds=refusal.cpu_seconds,
+        pairs=refusal.pairs,
+        warnings=refusal.warnings,
+    )
+    report = build_report(refusal, session.rig, session.observations, command)
+    write_together({folder / RESULT: result_text(document), folder / REPORT: report})
+    return document
+
+
+def remove_outputs(out: Path) -> None:
+    """Remove an earlier answer: beside a refusal it would look like the present one. Raises InputError."""
+    for name in (CALIBRATION, TRAJECTORY):
+        try:
+            (out / name).unlink(missing_ok=True)
+        except OSError as error:
+            what = f"cannot be removed: {error.strerror}"
+            raise InputError(what, file=out / name, remedy="choose another --out") from None
+
+
+def triangulate(
+    session: Session | str | Path,
+    calibration: CalibrationResult | str | Path,
+    progress: Progress | None = None,
+    *,
+    observations: str | Path | None = None,
+) -> TriangulationResult:
+    """3-D trajectories of labelled points with a given calibration; poses, lenses and clocks are kept.
+
+    session: a Session, or a path: a session folder, an observations.csv by itself, or a log. calibration: a result of
+    ``calibrate``, or a calibration.toml. observations: a file to use instead of the session's own. Cameras that the
+    calibration does not know are left out with a warning. Raises InputError, and Refused where no point is seen by two
+    cameras or the observations contradict the calibration.
+    """
+    from hub.calibration.triangulation import triangulate as estimate_trajectories
+
+    if isinstance(calibration, CalibrationResult):
+        rig, known = calibration.session.rig, calibration.cameras
+    else:
+        rig, known = read_calibration(Path(calibration))
+    if isinstance(session, Session):
+        seen, warnings = session.observations, session.warnings
+    else:
+        seen, warnings = _read_rows(Path(session), None if observations is None else Path(observations), rig)
+    left = [name for name in seen.cameras if name not in known]
+    if left:
+        warnings = (*warnings, f"not in the calibration, left out: {', '.join(left)}")
+    tracks = {key: track for key, track in seen.tracks.items() if key[0] in known}
+    found = estimate_trajectories(rig, known, Observations(tracks), progress)
+    return TriangulationResult(
+        rig, found.tables, found.sigma_px, found.unused, found.unplaced, (*warnings, *found.warnings)
+    )
+
+
+def _read_rows(session: Path, observations: Path | None, rig: Rig) -> tuple[Observations, tuple[str, ...]]:
+    """The observations that a path holds, and warnings. The calibration knows the cameras: no rig.toml is needed."""
+    if session.suffix == ".mcap":
+        read = load_session(session, observations)
+        return read.observations, read.warnings
+    if not session.exists():
+        raise InputError("this session does not exist", file=session, remedy="give a session folder or a .mcap log")
+    # A rig.toml, and the calibration's refused cameras, only name what the calibration has left out.
+    names = dict.fromkeys(rig.cameras)
+    if session.is_dir() and (session / RIG_FILE).exists():
+        names |= dict.fromkeys(read_rig(session / RIG_FILE).cameras)
+    names |= dict.fromkeys(rig.metadata.get("refused", {}))
+    seen = read_observations(observations or (session / OBSERVATIONS_FILE if session.is_dir() else session), names)
+    return seen, seen.warnings
+
+
+def _fixed(file: Path, rig: Rig) -> tuple[FixedCalibration, Rig]:
+    """The given poses, and the rig in their units: the result's world is theirs."""
+    given, cameras = read_calibration(file)
+    both = {name: camera for name, camera in cameras.items() if name in rig.cameras}
+    if len(both) < 2:
+        raise InputError(
+            f"knows only {len(both)} of the session's cameras ({', '.join(rig.cameras)})",
+            file=file,
+            remedy="use a calibration of this rig",
+        )
+    return FixedCalibration(both, str(given.metadata.get("scale", "metric"))), replace(rig, units=given.units)
+
+
+def _trajectories(tables: tuple[TrajectoryTable, ...]) -> pandas.DataFrame:
+    columns: Mapping[str, Any] = {
+        "time": np.concatenate([np.zeros(0), *(table.time for table in tables)]),
+        **{
+            axis: np.concatenate([np.zeros(0), *(table.position[:, i] for table in tables)])
+            for i, axis in enumerate("xyz")
+        },
+        "std": np.concatenate([np.zeros(0), *(table.std for table in tables)]),
+        "label": [table.label for table in tables for _ in range(len(table.time))],
+    }
+    return dataframe(columns)

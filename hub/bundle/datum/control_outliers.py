@@ -1,0 +1,146 @@
+"""Outlier test of control points: a camera moved since it was surveyed, or a wrong entry."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+from scipy.special import fdtri
+
+from hub.bundle.datum.gauge import (
+    CONTRADICTION_SIGMA,
+    control_point_residuals,
+    control_points_of,
+    fit_to_control_points,
+)
+from protocols.geometry import so3
+from protocols.geometry.pose import Pose, Similarity
+from protocols.session.rig import Rig
+
+ControlItem = str | tuple[str, str, float]
+"""A camera (its position and attitude), or a distance between two cameras."""
+_MIN_REDUNDANCY = 2
+"""Redundancy beyond the seven gauge freedoms that the remaining control points need for a meaningful test."""
+_GAUGE_FREEDOM = 7
+_FALSE_ALARM_PROBABILITY = 1e-4
+"""Probability that a control point of a correct survey is rejected."""
+_MIN_SCATTER_RATIO = 3.0
+"""Factor by which the scatter of the second-best outlier set must be larger."""
+_MAX_OUTLIERS = 2
+"""Most control points rejected together; with more outliers among few points they cannot be identified."""
+_EXHAUSTIVE_LIMIT = 10
+"""Control points up to which all pairs are tried; with more, the search is greedy: the worst, then the next worst."""
+
+
+def reject_outliers(rig: Rig, names: list[str], poses: list[Pose]) -> tuple[Rig, tuple[str, ...]]:
+    """The rig without the outliers that `find_outliers` finds, and a description of each."""
+    found = find_outliers(rig, names, poses)
+    return (_without(rig, tuple(found)), tuple(found.values())) if found else (rig, ())
+
+
+def find_outliers(rig: Rig, names: list[str], poses: list[Pose]) -> dict[ControlItem, str]:
+    """Control points of the rig that are inconsistent with all the others, with a description of each.
+
+    names, poses: the solved cameras, in any world and unit. An outlier that cannot be identified uniquely is kept, for
+    the caller to refuse or report.
+    """
+    control = control_points_of(rig, names)
+    if not control.fixes_scale:
+        return {}
+    _, residual = fit_to_control_points(rig, names, poses)
+    if float(np.abs(residual).max(initial=0.0)) <= CONTRADICTION_SIGMA:
+        return {}
+    control_items, first = list(_control_items(rig, names)), list[ControlItem]()
+    for count in range(1, _MAX_OUTLIERS + 1):
+        fixed = first if len(control_items) > _EXHAUSTIVE_LIMIT else []
+        sets = [
+            (*fixed, *more) for more in combinations([i for i in control_items if i not in fixed], count - len(fixed))
+        ]
+        tried = []
+        for left_out in sets:
+            remaining = _without(rig, left_out)
+            if _is_redundant(remaining, names):
+                world, residual = fit_to_control_points(remaining, names, poses)
+                redundancy = max(len(residual) - _GAUGE_FREEDOM, 1)
+                tried.append((max(float(np.sqrt((residual**2).sum() / redundancy)), 1.0), left_out, world, redundancy))
+        if not tried:
+            return {}
+        tried.sort(key=lambda item: item[0])
+        scatter, left_out, world, redundancy = tried[0]
+        outliers = all(
+            _is_outlier(rig, names, poses, item, world, scatter, redundancy, len(control_items)) for item in left_out
+        )
+        if outliers and len(tried) > 1 and tried[1][0] > _MIN_SCATTER_RATIO * scatter:
+            return {item: _describe(rig, names, poses, item, world) for item in left_out}
+        first = list(left_out)
+    return {}
+
+
+def _control_items(rig: Rig, names: list[str]) -> Iterator[ControlItem]:
+    for name in names:
+        if rig.cameras[name].position is not None or rig.cameras[name].rotation is not None:
+            yield name
+    yield from (distance for distance in rig.distances if distance[0] in names and distance[1] in names)
+
+
+def _without(rig: Rig, control_items: tuple[ControlItem, ...]) -> Rig:
+    cleared = {
+        name: replace(rig.cameras[name], position=None, rotation=None)
+        for name in control_items
+        if isinstance(name, str)
+    }
+    return replace(
+        rig, cameras=rig.cameras | cleared, distances=tuple(d for d in rig.distances if d not in control_items)
+    )
+
+
+def _is_redundant(rig: Rig, names: list[str]) -> bool:
+    control = control_points_of(rig, names)
+    count = 3 * len(control.positions) + 3 * len(control.rotations) + len(control.distances)
+    fixes_pose = bool(control.rotations and control.positions) or len(control.positions) >= 3
+    if not fixes_pose:  # distances alone determine only the scale
+        return control.fixes_scale and not control.positions and not control.rotations and len(control.distances) >= 3
+    return control.fixes_scale and count >= _GAUGE_FREEDOM + _MIN_REDUNDANCY
+
+
+def _is_outlier(
+    rig: Rig,
+    names: list[str],
+    poses: list[Pose],
+    item: ControlItem,
+    world: Similarity,
+    scatter: float,
+    redundancy: int,
+    count: int,
+) -> bool:
+    """F-test: whether a control point deviates from the fit to the others by more than their scatter explains.
+
+    Where stds are given and consistent with the scatter, the denominator has (nearly) infinite degrees of freedom.
+    """
+    others = {n: c if n == item else replace(c, position=None, rotation=None) for n, c in rig.cameras.items()}
+    only = replace(rig, up=None, cameras=others, distances=() if isinstance(item, str) else (item,))
+    residual_vector = control_point_residuals(only, names, poses)(world)
+    has_stds = all(c.position_std is not None or c.position is None for c in rig.cameras.values()) and scatter < 2.0
+    limit = float(fdtri(len(residual_vector), 1e6 if has_stds else redundancy, 1.0 - _FALSE_ALARM_PROBABILITY / count))
+    return bool((residual_vector**2).mean() > max(limit, CONTRADICTION_SIGMA**2 / len(residual_vector)) * scatter**2)
+
+
+def _describe(rig: Rig, names: list[str], poses: list[Pose], item: ControlItem, world: Similarity) -> str:
+    if not isinstance(item, str):
+        a, b, length = item
+        far = world.scale * float(np.linalg.norm(poses[names.index(a)].position - poses[names.index(b)].position))
+        return (
+            f"the distance {a}–{b} was rejected as an outlier: {length:g} given, {far:.4g} by the other control points"
+        )
+    camera, pose = rig.cameras[item], world.pose(poses[names.index(item)])
+    errors = []
+    if camera.position is not None:
+        errors.append(f"{float(np.linalg.norm(pose.position - camera.position)):.3g} {rig.units} off")
+    if camera.rotation is not None:
+        errors.append(f"rotated by {np.degrees(so3.angle_between(pose.rotation, camera.rotation)):.2g}°")
+    return (
+        f"the control point of {item} was rejected as an outlier: {' and '.join(errors)} "
+        "relative to the others; was the camera moved?"
+    )

@@ -1,0 +1,426 @@
+"""Incremental reconstruction: seed pair, triangulation, resection of the next camera, and so on.
+
+Asynchronous calibration paper, step 6. Each step is followed by a short bundle adjustment, so that the next camera is
+resected against a consistent reconstruction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from hub.bundle.adjustment import adjust, mark_inliers, residual_norms
+from hub.bundle.problem import (
+    AdjustmentState,
+    CameraState,
+    FreeParameters,
+    LensPrior,
+    Problem,
+    TrackObservations,
+    Trajectory,
+)
+from hub.clocks.clock_graph import ClockGraph
+from hub.sync.hypothesis import PairSolution, evidence
+from hub.trajectory.discrete import PointBasis, SampledTrack, merged_instants
+from hub.trajectory.image_tracks import ImageTrack
+from hub.trajectory.splines import SplineBasis, fit_spline, split_at_gaps
+from protocols.core.errors import Refused
+from protocols.geometry import so3
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.pose import Pose
+from protocols.geometry.types import Bools, Floats
+
+_MIN_PARALLAX = 0.02  # rad between rays; less does not triangulate
+_MIN_BEARING_ANGLE = 0.05  # rad between two directions that intersect
+_MAX_PNP_POINTS = 400
+_PNP_THRESHOLD_PX = 8.0
+_MIN_PNP_POINTS = 12
+_MIN_FRAMES_PER_KNOT = 1.5
+_MAX_INITIAL_ROWS, _MIN_ROWS_PER_KNOT = 20_000, 2.0  # of more rows, early adjustments use a share
+_SMALL_NETWORK, _ADJUST_GROWTH = 6, 1.33  # cameras; growth
+_TRIANGULATION_STEP = 0.05  # s between triangulated points
+_MAX_GAP = 1.0  # s: the trajectory is split where no camera saw the point for longer
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraInput:
+    """Input of the reconstruction for one camera. tracks: by label. lens_prior: prior of a lens that was not measured.
+    readout_given: whether its readout was given, so that its times are already corrected."""
+
+    name: str
+    intrinsics: Intrinsics
+    tracks: Mapping[str, ImageTrack]
+    lens_prior: LensPrior | None = None
+    readout_given: bool = False
+
+
+@dataclass(slots=True, eq=False)
+class Reconstruction:
+    """Placed cameras and labels with a trajectory, by name, and the adjustment problem and state over them."""
+
+    names: list[str]
+    labels: list[str]
+    problem: Problem
+    state: AdjustmentState
+
+
+def reconstruct_incrementally(
+    cameras: dict[str, CameraInput],
+    graph: ClockGraph,
+    rows: dict[str, list[TrackObservations]],
+    labels: list[str],
+    progress: Callable[[str], None] | None = None,
+    free_parameters: FreeParameters | None = FreeParameters(),  # noqa: B008 - frozen
+) -> tuple[Reconstruction, dict[str, str]]:
+    """Place all cameras of one connected graph; returns the reconstruction and the refused cameras with reasons.
+
+    rows: raw observations by camera, label indices into ``labels``. free_parameters: of the adjustment
+    after each step; None = no adjustment (solver "paper").
+    """
+    placed: dict[str, CameraState] = {}
+    refused: dict[str, str] = {}
+    seed = max(graph.inlier_pairs, key=_seed_score)
+    placed |= _seed_cameras(cameras, graph, seed)
+    anchors = (seed.a, seed.b)
+    reconstruction = triangulate_and_adjust(cameras, placed, rows, labels, anchors, free_parameters)
+    adjusted = len(placed)
+    unplaced = [name for name in graph.clocks if name not in placed]
+    while unplaced:
+        spreads = {name: _resection_score(cameras[name], graph, reconstruction) for name in unplaced}
+        name = max(unplaced, key=spreads.__getitem__)
+        unplaced.remove(name)
+        if progress is not None:
+            progress(f"placing {name}")
+        state = _resect(cameras[name], graph, reconstruction) or _intersect_bearings(
+            cameras[name], graph, reconstruction
+        )
+        if state is None:
+            refused[name] = (
+                "its view of the trajectory agrees with no position (too little seen together with the other cameras)"
+            )
+            continue
+        current = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
+        current[name] = state
+        # The cost grows with the network: a large one is adjusted only when it has grown by a third.
+        adjust_now = len(current) <= _SMALL_NETWORK or len(current) >= _ADJUST_GROWTH * adjusted or not unplaced
+        reconstruction = triangulate_and_adjust(
+            cameras, current, rows, labels, anchors, free_parameters if adjust_now else None
+        )
+        adjusted = len(current) if adjust_now else adjusted
+    if adjusted < len(reconstruction.names):
+        placed = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
+        reconstruction = triangulate_and_adjust(cameras, placed, rows, labels, anchors, free_parameters)
+    return reconstruction, refused
+
+
+def _seed_score(pair: PairSolution) -> float:
+    fit = pair.fit
+    return 0.0 if fit is None else evidence(fit) * min(np.sin(fit.parallax), 0.5)
+
+
+def _camera_state(camera: CameraInput, graph: ClockGraph, pose: Pose) -> CameraState:
+    clock = graph.clocks[camera.name]
+    return CameraState(camera.intrinsics, pose, clock.rate, clock.offset, clock.centre)
+
+
+def _seed_cameras(cameras: dict[str, CameraInput], graph: ClockGraph, pair: PairSolution) -> dict[str, CameraState]:
+    if pair.fit is None:
+        raise ValueError("the seed pair has no fit")
+    relative = pair.fit.pose
+    second = Pose(relative.rotation, -relative.rotation.T @ relative.direction)
+    return {
+        pair.a: _camera_state(cameras[pair.a], graph, Pose.identity()),
+        pair.b: _camera_state(cameras[pair.b], graph, second),
+    }
+
+
+def reconstruct_with_known_poses(
+    cameras: dict[str, CameraInput],
+    graph: ClockGraph,
+    rows: dict[str, list[TrackObservations]],
+    labels: list[str],
+    poses: dict[str, Pose],
+    clock: bool = True,
+) -> Reconstruction:
+    """The cameras of a graph at given poses; only time maps and trajectories are adjusted."""
+    placed = {name: _camera_state(cameras[name], graph, poses[name]) for name in graph.clocks}
+    names = list(placed)
+    return triangulate_and_adjust(
+        cameras, placed, rows, labels, (names[0], names[1]), FreeParameters(pose=False, clock=clock)
+    )
+
+
+def triangulate_and_adjust(
+    cameras: dict[str, CameraInput],
+    placed: dict[str, CameraState],
+    rows: dict[str, list[TrackObservations]],
+    labels: list[str],
+    anchors: tuple[str, str],
+    free_parameters: FreeParameters | None,
+) -> Reconstruction:
+    """Triangulate trajectories from the placed cameras and adjust briefly. Raises Refused without any trajectory."""
+    names = [name for name in cameras if name in placed]
+    states = [placed[name] for name in names]
+    trajectories, used = [], []
+    for label in range(len(labels)):
+        path = triangulate_label(names, states, cameras, labels[label])
+        if path is not None:
+            trajectories.append(path)
+            used.append(label)
+    new_label = {label: i for i, label in enumerate(used)}
+    used_rows = tuple(
+        replace(part, camera=names.index(name), label=new_label[part.label])
+        for name in names
+        for part in rows[name]
+        if part.label in new_label
+    )
+    problem = Problem(
+        rows=used_rows,
+        nominal=tuple(cameras[name].intrinsics for name in names),
+        clock_reference=names.index(anchors[0]),
+        anchors=(names.index(anchors[0]), names.index(anchors[1])),
+        free_parameters=free_parameters or FreeParameters(),
+        lens_priors=tuple(cameras[name].lens_prior for name in names),
+        readout_given=tuple(cameras[name].readout_given for name in names),
+    )
+    state = AdjustmentState(tuple(states), tuple(trajectories), np.full(len(names), 2.0))
+    if not used:
+        raise Refused("no part of the trajectory is seen by two cameras with enough parallax")
+    if free_parameters is not None:
+        subsampled = _subsampled(problem, state)
+        adjusted, state, _ = adjust(subsampled, state, iterations=12, rounds=2, coarse=True)
+        problem = adjusted if subsampled is problem else mark_inliers(problem, state)
+    return Reconstruction(names, [labels[label] for label in used], problem, state)
+
+
+def _subsampled(problem: Problem, state: AdjustmentState) -> Problem:
+    """The problem with fewer rows: a share of very many, but some of each camera in every knot interval."""
+    share = sum(len(rows.time) for rows in problem.rows) / _MAX_INITIAL_ROWS
+    if share < 2.0 or any(isinstance(path.basis, PointBasis) for path in state.trajectories):
+        return problem
+    out = []
+    for rows in problem.rows:
+        interval = float(np.median(np.diff(rows.time))) * state.cameras[rows.camera].rate if len(rows.time) > 1 else 1.0
+        rows_per_knot = state.trajectories[rows.label].basis.spacing / interval
+        every = max(1, int(min(rows_per_knot / _MIN_ROWS_PER_KNOT, share)))
+        stamp = None if rows.stamp is None else rows.stamp[::every]
+        subsampled = replace(
+            rows, time=rows.time[::every], pixels=rows.pixels[::every], use=rows.use[::every], stamp=stamp
+        )
+        out.append(subsampled)
+    return replace(problem, rows=tuple(out))
+
+
+def knot_spacing(cameras: list[CameraInput], label: str) -> float:
+    """Knot spacing [s] of a label's trajectory: the finest of those chosen by the tracks' cross-validation.
+
+    It is bounded below by the frame interval of the fastest camera, so that the trajectory does not fit noise.
+    """
+    tracks = [camera.tracks[label] for camera in cameras if label in camera.tracks]
+    frames = min(float(np.median(np.diff(track.time))) for track in tracks)
+    return float(np.clip(min(track.basis.spacing for track in tracks), max(0.05, _MIN_FRAMES_PER_KNOT * frames), 0.3))
+
+
+def triangulate_label(
+    names: list[str], states: list[CameraState], cameras: dict[str, CameraInput], label: str
+) -> Trajectory | None:
+    """Trajectory of one label by linear triangulation of the smoothed tracks where at least two cameras see it."""
+    seeing = [
+        (state, cameras[name].tracks[label])
+        for name, state in zip(names, states, strict=True)
+        if label in cameras[name].tracks
+    ]
+    if len(seeing) < 2:
+        return None
+    if all(isinstance(track, SampledTrack) for _, track in seeing):
+        return _triangulate_instants(seeing)
+    begin = min(float(state.reference_time(track.time[:1])[0]) for state, track in seeing)
+    end = max(float(state.reference_time(track.time[-1:])[0]) for state, track in seeing)
+    time = np.arange(begin, end, _TRIANGULATION_STEP)
+    points, good = linear_triangulation(seeing, time)
+    if good.sum() < _MIN_PNP_POINTS:
+        return None
+    # Rows of a single camera far from two-camera stretches are not covered: they do not constrain the adjustment.
+    begins, ends = split_at_gaps(time[good], _MAX_GAP)
+    spacing = knot_spacing([cameras[name] for name in names], label)
+    basis = SplineBasis.covering(begins - 0.5 * spacing, ends + 0.5 * spacing, spacing)
+    weight = np.ones(int(good.sum()))
+    control = fit_spline(basis, time[good], points[good], weight, stiffness=1e-2)
+    for _ in range(3):
+        distance = np.linalg.norm(basis.evaluate(control, time[good]) - points[good], axis=1)
+        scale = max(1.4826 * float(np.median(distance)), 1e-9)
+        weight = 1.0 / (1.0 + (distance / (3.0 * scale)) ** 2)
+        control = fit_spline(basis, time[good], points[good], weight, stiffness=1e-2)
+    return Trajectory(basis, control)
+
+
+def _triangulate_instants(seeing: list[tuple[CameraState, ImageTrack]]) -> Trajectory | None:
+    """The trajectory of a shared clock: one point for every instant that two cameras triangulate."""
+    instants = merged_instants([state.reference_time(track.time) for state, track in seeing])
+    points, good = linear_triangulation(seeing, instants)
+    if good.sum() < _MIN_PNP_POINTS:
+        return None
+    basis = PointBasis(instants[good])
+    return Trajectory(
+        basis, np.vstack([points[good], np.repeat(points[good][-1:], basis.size - int(good.sum()), axis=0)])
+    )
+
+
+def linear_triangulation(seeing: list[tuple[CameraState, ImageTrack]], time: Floats) -> tuple[Floats, Bools]:
+    """Points (n, 3) at reference times, and which of them are triangulated in front of all their cameras.
+
+    Least squares over the distances to the rays, which needs no initial values.
+    """
+    # Sums over the cameras of P = 1 - r rᵀ, r a ray, and of P times the camera's position; coordinate by coordinate.
+    sums, target = np.zeros((3, 3, len(time))), np.zeros((3, len(time)))
+    count = np.zeros(len(time), dtype=np.int64)
+    rays = []
+    for state, track in seeing:
+        seen = track.at(state.camera_time(time)).T
+        visible = np.asarray(np.isfinite(seen).all(axis=0))
+        ray = state.pose.rotation.T @ np.stack([*np.where(visible, seen, 0.0), np.ones(len(time))])
+        ray *= visible / np.sqrt((ray**2).sum(axis=0))
+        position = state.pose.position[:, None]
+        sums -= ray[:, None] * ray
+        sums[range(3), range(3)] += visible
+        target += visible * position - ray * (ray * position).sum(axis=0)
+        count += visible
+        rays.append((position, ray))
+    matrix, right = np.ascontiguousarray(sums.transpose(2, 0, 1)), target.T
+    eigenvalues = np.linalg.eigvalsh(matrix)
+    # Smallest eigenvalue of two rays at angle t: 1 - cos t.
+    good = (count >= 2) & (eigenvalues[:, 0] > 1.0 - np.cos(_MIN_PARALLAX))
+    points = np.zeros((len(time), 3))
+    points[good] = np.linalg.solve(matrix[good], right[good][:, :, None])[:, :, 0]
+    for position, ray in rays:  # a ray of length 0 marks a camera that does not see the point
+        good &= (((points.T - position) * ray).sum(axis=0) > 0) | ~ray.any(axis=0)
+    return points, good
+
+
+def _resection_points(camera: CameraInput, clock: CameraState, reconstruction: Reconstruction) -> tuple[Floats, Floats]:
+    """3D-2D correspondences of a camera with the trajectories: positions (n, 3) and normalised points (n, 2)."""
+    positions, seen = [], []
+    for number, path in enumerate(reconstruction.state.trajectories):
+        track = camera.tracks.get(reconstruction.labels[number])
+        if track is None:
+            continue
+        time = clock.reference_time(track.time)
+        where = path.at(time)
+        both = np.isfinite(where).all(axis=1) & _seen_by_two(reconstruction, number, time)
+        positions.append(where[both])
+        seen.append(track.points[both])
+    if not positions:
+        return np.zeros((0, 3)), np.zeros((0, 2))
+    return np.concatenate(positions), np.concatenate(seen)
+
+
+def _seen_by_two(reconstruction: Reconstruction, number: int, time: Floats) -> Bools:
+    """Times (n,) within 0.2 s of observations of at least two placed cameras."""
+    count = np.zeros(len(time), dtype=np.int64)
+    for camera, state in enumerate(reconstruction.state.cameras):
+        seen = [r.time[r.use] for r in reconstruction.problem.rows if r.camera == camera and r.label == number]
+        if not seen or not len(seen[0]):
+            continue
+        reference = np.sort(state.reference_time(np.concatenate(seen)))
+        after = np.clip(np.searchsorted(reference, time), 1, len(reference) - 1)
+        nearest = np.minimum(np.abs(reference[after] - time), np.abs(reference[after - 1] - time))
+        count += nearest < 0.2
+    return count >= 2
+
+
+def _resection_score(camera: CameraInput, graph: ClockGraph, reconstruction: Reconstruction) -> float:
+    """Score of a camera for resection: number of common points times their deviation from a plane."""
+    clock = _camera_state(camera, graph, Pose.identity())
+    moved = _on_reconstruction_clock(clock, graph, reconstruction)
+    positions, _ = _resection_points(camera, moved, reconstruction)
+    if len(positions) < _MIN_PNP_POINTS:
+        return float(len(positions))
+    spread = np.linalg.svd(positions - positions.mean(0), compute_uv=False)
+    return float(len(positions) * spread[2] / max(spread[0], 1e-12) + 1e-3 * len(positions))
+
+
+def _on_reconstruction_clock(clock: CameraState, graph: ClockGraph, reconstruction: Reconstruction) -> CameraState:
+    """A time map of the graph on the reconstruction's internal time, which the adjustments have changed slightly."""
+    name = reconstruction.names[reconstruction.problem.clock_reference]
+    now, then = reconstruction.state.cameras[reconstruction.problem.clock_reference], graph.clocks[name]
+    rate = now.rate / then.rate
+    return replace(clock, rate=clock.rate * rate, offset=(clock.offset - then.offset) * rate + now.offset)
+
+
+def _resect(camera: CameraInput, graph: ClockGraph, reconstruction: Reconstruction) -> CameraState | None:
+    """Pose of one more camera by resection against the trajectories (PnP with RANSAC, OpenCV)."""
+    clock = _on_reconstruction_clock(_camera_state(camera, graph, Pose.identity()), graph, reconstruction)
+    positions, seen = _resection_points(camera, clock, reconstruction)
+    if len(positions) < _MIN_PNP_POINTS:
+        return None
+    sample = np.linspace(0, len(positions) - 1, min(len(positions), _MAX_PNP_POINTS)).round().astype(np.int64)
+    positions, seen = positions[sample], seen[sample]
+    cv2.setRNGSeed(0)
+    found, rotation, translation, inliers = cv2.solvePnPRansac(
+        np.ascontiguousarray(positions),
+        np.ascontiguousarray(seen),
+        np.eye(3),
+        np.zeros(5),
+        iterationsCount=500,
+        reprojectionError=_PNP_THRESHOLD_PX / camera.intrinsics.focal,
+        confidence=0.9999,
+        flags=cv2.SOLVEPNP_SQPNP,
+    )
+    if not found or inliers is None or len(inliers) < max(_MIN_PNP_POINTS, 0.4 * len(sample)):
+        return None
+    rodrigues, shift = (np.asarray(vector, np.float64).ravel() for vector in (rotation, translation))
+    return replace(clock, pose=Pose.from_rodrigues(rodrigues, shift))
+
+
+def _intersect_bearings(camera: CameraInput, graph: ClockGraph, reconstruction: Reconstruction) -> CameraState | None:
+    """Pose of one more camera from its pairs alone, where no point is seen by three cameras.
+
+    Each pair with a placed camera gives the rotation and the bearing of the new camera; the intersection of two
+    bearings gives its position, and with it the scale.
+    """
+    matrix, right, rotations, weights = np.zeros((3, 3)), np.zeros(3), [], []
+    for pair in graph.inlier_pairs:
+        if pair.fit is None or camera.name not in (pair.a, pair.b):
+            continue
+        other = pair.b if pair.a == camera.name else pair.a
+        if other not in reconstruction.names:
+            continue
+        base = reconstruction.state.cameras[reconstruction.names.index(other)].pose
+        relative = pair.fit.pose if pair.a == other else pair.fit.pose.inverse()
+        ahead = -base.rotation.T @ relative.rotation.T @ relative.direction
+        weight = evidence(pair.fit)
+        projector = weight * (np.eye(3) - np.outer(ahead, ahead))
+        matrix += projector
+        right += projector @ base.position
+        rotations.append(weight * relative.rotation @ base.rotation)
+        weights.append(weight)
+    if len(rotations) < 2 or np.linalg.eigvalsh(matrix)[0] < (1.0 - np.cos(_MIN_BEARING_ANGLE)) * min(weights):
+        return None
+    clock = _on_reconstruction_clock(_camera_state(camera, graph, Pose.identity()), graph, reconstruction)
+    return replace(
+        clock, pose=Pose(so3.nearest(np.sum(rotations, axis=0)), np.asarray(np.linalg.solve(matrix, right), np.float64))
+    )
+
+
+def inlier_share(reconstruction: Reconstruction, name: str) -> tuple[float, int]:
+    """Share of a placed camera's rows that fit the trajectories within 5 sigma or 3 px, and how many rows there are.
+
+    The sigma of a camera that saw something else is inflated by its own residuals: it is limited to three times the
+    median of the other cameras'.
+    """
+    number = reconstruction.names.index(name)
+    others = np.delete(reconstruction.state.sigma, number)
+    sigma = min(float(reconstruction.state.sigma[number]), 3.0 * float(np.median(others)))
+    norms = [
+        residual_norms(rows, reconstruction.state.cameras[number], reconstruction.state.trajectories[rows.label])
+        for rows in reconstruction.problem.rows
+        if rows.camera == number
+    ]
+    values = np.concatenate(norms) if norms else np.zeros(0)
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return 0.0, 0
+    return float((values < max(3.0, 5.0 * sigma)).mean()), len(values)

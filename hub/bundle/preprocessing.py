@@ -1,0 +1,175 @@
+"""Preprocessing of a session: undistorted, smoothed tracks and raw rows; cameras that cannot be used, with reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hub.bundle.initialisation import CameraInput
+from hub.bundle.problem import TrackObservations
+from hub.trajectory.discrete import sampled_track
+from hub.trajectory.image_tracks import ImageTrack, SmoothTrack, smooth_track, without_clock_steps
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.sphere_projection import outline_to_centre
+from protocols.geometry.types import Floats
+from protocols.session.observations import Observations
+from protocols.session.rig import Rig, RigCamera
+
+NO_INTRINSICS = "no intrinsics (matrix and distortions in rig.toml): run `syncline intrinsics`"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedSession:
+    """Input of the solvers: usable cameras with smoothed tracks and raw rows, and refused cameras with reasons.
+
+    uncalibrated: cameras without measured intrinsics, of which only the timing can be estimated without
+    self-calibration; their normalised coordinates are those of nominal intrinsics, and they are among the refused.
+    time_origins: by camera, subtracted from its times [s]. time_scales: by camera, correction of a wrong frame rate.
+    outlines: by camera and label index, observed pixels (n, 2) and sizes (n,) of cameras whose rows are centres of
+    balls' outlines; ``rows`` holds them corrected to the balls' centres as far as the lens is known. All times in here
+    are ``time_scale * (t_camera - time_origin)``.
+    """
+
+    cameras: dict[str, CameraInput]
+    rows: dict[str, list[TrackObservations]]
+    time_origins: dict[str, float]
+    labels: list[str]
+    refused: dict[str, str]
+    camera_order: tuple[str, ...]
+    shared_clock: bool = False
+    warnings: tuple[str, ...] = ()
+    uncalibrated: dict[str, CameraInput] = field(default_factory=dict)
+    time_scales: dict[str, float] = field(default_factory=dict)
+    outlines: dict[str, dict[int, tuple[Floats, Floats]]] = field(default_factory=dict)
+
+    @property
+    def names(self) -> list[str]:
+        """All cameras whose timing can be estimated, in the rig's order."""
+        return [name for name in self.camera_order if name in self.cameras or name in self.uncalibrated]
+
+    def camera(self, name: str) -> CameraInput:
+        """A camera of `names`."""
+        return self.cameras[name] if name in self.cameras else self.uncalibrated[name]
+
+    def time_scale(self, name: str) -> float:
+        """Seconds in here per second of the camera's clock."""
+        return self.time_scales.get(name, 1.0)
+
+    def rows_through(self, name: str, lens: Intrinsics) -> list[TrackObservations]:
+        """The camera's rows for the intrinsics ``lens``: ball outlines are corrected to the balls' centres."""
+        seen = self.outlines.get(name)
+        if not seen:
+            return self.rows[name]
+        return [replace(part, pixels=outline_to_centre(*seen[part.label], lens)) for part in self.rows[name]]
+
+    def with_time_scale(self, names: list[str], factor: float) -> PreparedSession:
+        """The same with the times of ``names`` multiplied by ``factor``."""
+        cameras, uncalibrated, rows, time_scales = (
+            dict(self.cameras),
+            dict(self.uncalibrated),
+            dict(self.rows),
+            dict(self.time_scales),
+        )
+        for name in names:
+            camera = self.camera(name)
+            scaled = replace(camera, tracks=_scaled(camera.tracks, factor))
+            (cameras if name in cameras else uncalibrated)[name] = scaled
+            if name in rows:
+                rows[name] = [replace(part, time=part.time * factor, stamp=part.stamps * factor) for part in rows[name]]
+            time_scales[name] = self.time_scale(name) * factor
+        return replace(self, cameras=cameras, uncalibrated=uncalibrated, rows=rows, time_scales=time_scales)
+
+
+def prepare(rig: Rig, observations: Observations) -> PreparedSession:
+    """Undistort and smooth every track; cameras that cannot be used are refused with a reason."""
+    refused: dict[str, str] = {}
+    cameras: dict[str, CameraInput] = {}
+    uncalibrated: dict[str, CameraInput] = {}
+    rows: dict[str, list[TrackObservations]] = {}
+    time_origins: dict[str, float] = {}
+    outlines: dict[str, dict[int, tuple[Floats, Floats]]] = {}
+    labels = observations.labels
+    start = min((float(track.time[0]) for track in observations.tracks.values()), default=0.0)
+    warnings: list[str] = []
+    for name, rig_camera in rig.cameras.items():
+        tracks, clock_step = without_clock_steps(observations.of_camera(name))
+        if clock_step:
+            warnings.append(f"{name}: {clock_step}")
+        if not tracks:
+            refused[name] = "no observations"
+            continue
+        is_uncalibrated = rig_camera.intrinsics is None or rig_camera.focal_std > 0.0
+        if is_uncalibrated:
+            refused[name] = NO_INTRINSICS
+            if rig.shared_clock:
+                continue
+        lens = rig_camera.intrinsics or nominal_intrinsics(rig_camera)
+        time_origin = start if rig.shared_clock else min(float(track.time[0]) for track in tracks)
+        smooth: dict[str, ImageTrack] = {}
+        mine = []
+        # Given rolling-shutter readout: every image row has its own time; the frame's time is that of the middle row.
+        # With a shared clock, observations correspond by equal times, which are kept.
+        readout = 0.0 if rig.shared_clock else rig_camera.readout or 0.0
+        last_row = max(rig_camera.size[1] - 1, 1)
+        for track in tracks:
+            pixels = track.pixels
+            if rig_camera.ball_outline:
+                outlines.setdefault(name, {})[labels.index(track.label)] = pixels, track.size
+                if not is_uncalibrated:
+                    pixels = outline_to_centre(pixels, track.size, lens)
+            time = track.time + readout * (np.clip(track.pixels[:, 1], 0, last_row) / last_row - 0.5)
+            normalised = lens.unproject(pixels)
+            cleaned: ImageTrack | None
+            if rig.shared_clock:
+                cleaned = sampled_track(track.time, normalised, lens.focal, time_origin)
+            else:
+                # With a rolling shutter a false detection low in the image may get a later time than the next frame's.
+                rising = time if bool((np.diff(time) > 0).all()) else track.time
+                cleaned = smooth_track(rising, normalised, lens.focal, time_origin)
+            if cleaned is None:
+                continue
+            smooth[track.label] = cleaned
+            use = np.ones(len(track), dtype=np.bool_)
+            mine.append(
+                TrackObservations(
+                    -1, labels.index(track.label), time - time_origin, pixels, use, stamp=track.time - time_origin
+                )
+            )
+        if not smooth:
+            few = f"too few connected observations ({sum(len(track) for track in tracks)} rows)"
+            refused[name] = f"{NO_INTRINSICS}; and {few}" if is_uncalibrated else few
+            continue
+        time_origins[name] = time_origin
+        rows[name] = mine
+        (uncalibrated if is_uncalibrated else cameras)[name] = CameraInput(
+            name, lens, smooth, readout_given=rig_camera.readout is not None
+        )
+    return PreparedSession(
+        cameras,
+        rows,
+        time_origins,
+        labels,
+        refused,
+        tuple(rig.cameras),
+        rig.shared_clock,
+        tuple(warnings),
+        uncalibrated,
+        outlines=outlines,
+    )
+
+
+def nominal_intrinsics(camera: RigCamera) -> Intrinsics:
+    """Nominal intrinsics (focal length = the larger image side): sufficient where only timing is estimated."""
+    width, height = camera.size
+    focal = float(max(camera.size))
+    matrix = np.array([[focal, 0.0, 0.5 * (width - 1)], [0.0, focal, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
+    return Intrinsics(width, height, matrix)
+
+
+def _scaled(tracks: Mapping[str, ImageTrack], factor: float) -> dict[str, ImageTrack]:
+    return {label: track.scaled(factor) if isinstance(track, SmoothTrack) else track for label, track in tracks.items()}
+
+
+__all__ = ["NO_INTRINSICS", "PreparedSession", "nominal_intrinsics", "prepare"]

@@ -1,0 +1,141 @@
+"""Smoothness prior of trajectories: squared third differences of the spline's control points.
+
+Where a path is hardly observed its third differences are expected to be as large as where it is well observed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hub.bundle.bordered_system import third_difference_band, third_difference_gradient, third_differences
+from hub.bundle.problem import AdjustmentState, Problem, Trajectory
+from hub.trajectory.splines import SUPPORT
+from protocols.geometry.types import Bools, Floats
+
+_MIN_SCATTER_SHARE = 1e-3 / 3.0
+"""Smallest share of a path's scatter in any direction: a planar path has none across its plane."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SmoothnessPrior:
+    """Weights (m,) of the squared third differences, one array a label.
+
+    scatters: by label, the scatter by which the prior is normalised so that it neither shrinks nor flattens the path;
+    () = no normalisation.
+    """
+
+    weights: tuple[Floats, ...]
+    scatters: tuple[PathScatter | None, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathScatter:
+    """Extent of a path in all directions, by which the strength of its prior is normalised.
+
+    seen_by_two: (m,) knot intervals that two cameras see. control_mask: (size,) control points of these. floor: added
+    to the diagonal of their scatter matrix S. scale: of the metric ``scale * S⁻¹``, in which the prior has the
+    strength that was estimated.
+    """
+
+    seen_by_two: Bools
+    control_mask: Bools
+    floor: float
+    scale: float
+
+
+def estimate_smoothness(problem: Problem, state: AdjustmentState, weak: bool = False) -> SmoothnessPrior:
+    """Strength of the smoothness prior from the third differences of the path where at least two cameras see it.
+
+    weak: a thousandth of the strength, which only bridges gaps, for a path that is not yet reliable.
+    """
+    weights: list[Floats] = []
+    scatters: list[PathScatter | None] = []
+    for label, path in enumerate(state.trajectories):
+        size = path.basis.size
+        count = len(path.basis.interval_starts())
+        differences = third_differences(path.basis, path.control)
+        seen = np.zeros((len(state.cameras), size), dtype=np.bool_)
+        for rows in problem.rows:
+            if rows.label == label:
+                index, _, inside = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[rows.use]))[:3]
+                seen[rows.camera, index[inside]] = True
+        seen_by_two = seen.sum(axis=0)[path.basis.interval_starts()] >= 2
+        chosen = differences[seen_by_two] if seen_by_two.sum() >= 4 else differences
+        variance = float(np.mean(chosen**2)) if len(chosen) else 1.0
+        scale = float(np.median(np.ptp(path.control, axis=0))) or 1.0
+        variance = max(variance, (1e-6 * scale) ** 2)
+        weights.append(np.full(count, (1e-3 if weak else 1.0) / variance))
+        scatters.append(None if weak else _path_scatter(path, seen_by_two, weights[-1]))
+    return SmoothnessPrior(tuple(weights), tuple(scatters))
+
+
+def _path_scatter(path: Trajectory, seen_by_two: Bools, weight: Floats) -> PathScatter | None:
+    """The scatter that normalises the prior's strength; None for a path of which two cameras see hardly anything.
+
+    A smaller or flatter path has smaller third differences: a prior of fixed strength prefers both, and cameras follow
+    by turning and, where lenses are free, by zooming (with noise correlated over seconds by metres). So where two
+    cameras see the path its third differences d are measured in the metric of the scatter S of its control points:
+    sum w dᵀ S⁻¹ d is invariant under affine maps of the path.
+    """
+    if seen_by_two.sum() < 4:
+        return None
+    control_mask = np.zeros(path.basis.size, dtype=np.bool_)
+    control_mask[(path.basis.interval_starts()[seen_by_two, None] + np.arange(SUPPORT)).ravel()] = True
+    scatter = _scatter(path.control[control_mask], 0.0)
+    floor = _MIN_SCATTER_SHARE * float(np.trace(scatter))
+    if not floor > 0.0:
+        return None
+    differences = third_differences(path.basis, path.control)[seen_by_two]
+    inverse = np.linalg.inv(_scatter(path.control[control_mask], floor))
+    plain = float((weight[seen_by_two, None] * differences**2).sum())
+    metric = float((weight[seen_by_two, None] * (differences @ inverse) * differences).sum())
+    return PathScatter(seen_by_two, control_mask, floor, plain / metric) if metric > 0.0 else None
+
+
+def _centred(control: Floats) -> Floats:
+    return np.asarray(control - control.mean(axis=0))
+
+
+def _scatter(control: Floats, floor: float) -> Floats:
+    centred = _centred(control)
+    return np.asarray(centred.T @ centred / len(centred) + floor * np.eye(3))
+
+
+def smoothness_cost(path: Trajectory, weight: Floats, scatter: PathScatter | None) -> float:
+    """Value of the prior's cost at a path."""
+    differences = third_differences(path.basis, path.control)
+    return float((_half_gradient(path, differences, weight, scatter)[0] * differences).sum())
+
+
+def smoothness_terms(path: Trajectory, weight: Floats, scatter: PathScatter | None) -> tuple[Floats, Floats, float]:
+    """Band, gradient (3 n,) and value of the prior's cost at a path."""
+    differences = third_differences(path.basis, path.control)
+    half_gradients, inverse = _half_gradient(path, differences, weight, scatter)
+    gradient, value = third_difference_gradient(path.basis, half_gradients), float((half_gradients * differences).sum())
+    if scatter is None:
+        return third_difference_band(path.basis, weight, np.eye(3)), gradient, value
+    control = path.control[scatter.control_mask]
+    inside, outside = np.where(scatter.seen_by_two, weight, 0.0), np.where(scatter.seen_by_two, 0.0, weight)
+    moment = (inside[:, None] * differences).T @ differences
+    gradient.reshape(-1, 3)[scatter.control_mask] -= (
+        scatter.scale / len(control) * _centred(control) @ inverse @ moment @ inverse
+    )
+    band = third_difference_band(path.basis, inside, np.asarray(scatter.scale * inverse))
+    if outside.any():
+        band += third_difference_band(path.basis, outside, np.eye(3))
+    return band, gradient, value
+
+
+def _half_gradient(
+    path: Trajectory, differences: Floats, weight: Floats, scatter: PathScatter | None
+) -> tuple[Floats, Floats]:
+    """Half the gradient of the cost by the third differences (m, 3) at fixed metric, and the inverse scatter (3, 3)."""
+    if scatter is None:
+        return weight[:, None] * differences, np.eye(3)
+    inverse: Floats = np.asarray(
+        np.linalg.inv(_scatter(path.control[scatter.control_mask], scatter.floor)), dtype=np.float64
+    )
+    half_gradients = np.where(scatter.seen_by_two[:, None], differences @ (scatter.scale * inverse), differences)
+    return weight[:, None] * half_gradients, inverse

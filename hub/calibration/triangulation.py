@@ -1,0 +1,162 @@
+"""Triangulation of labelled points with a given calibration: poses, intrinsics and clocks are fixed.
+
+It uses the trajectory model and adjustment of `calibrate` (a spline fitted to the raw rows, each at its own time), so
+that cameras need not be synchronised and the std has the same meaning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hub.bundle.adjustment import adjust
+from hub.bundle.initialisation import Reconstruction, inlier_share, reconstruct_with_known_poses
+from hub.bundle.preprocessing import PreparedSession, prepare
+from hub.calibration.pair_network import Progress
+from hub.calibration.result import trajectory_tables
+from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
+from protocols.core.clocks import CameraTime
+from protocols.core.errors import Refused
+from protocols.geometry.types import Floats
+from protocols.session.calibration import CameraCalibration, TrajectoryTable
+from protocols.session.observations import Observations
+from protocols.session.rig import Rig
+
+_MIN_INLIER_SHARE = 0.5  # share of a camera's rows that must fit the trajectories
+_MAX_RELATIVE_RESIDUAL = 0.015  # of the image width: with larger residuals the calibration is not that of the recording
+_RMS_WARNING_FACTOR, _MIN_WARNING_PX = 4.0, 2.0  # times the calibration's rms; px: above both a warning is given
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Triangulation:
+    """Trajectories on the reference clock, in the calibration's world and units.
+
+    sigma_px: noise of one pixel coordinate by camera. unused: reasons by camera. unplaced: labels without trajectory.
+    """
+
+    tables: tuple[TrajectoryTable, ...]
+    sigma_px: dict[str, float]
+    unused: dict[str, str]
+    unplaced: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def triangulate(
+    rig: Rig, known: Mapping[str, CameraCalibration], observations: Observations, progress: Progress | None = None
+) -> Triangulation:
+    """Trajectories of all labels that at least two cameras see.
+
+    rig: of the calibration. known: its cameras. The std of a trajectory covers the noise of the observations, as
+    estimated from the residuals, not the calibration's own errors. Raises Refused where there is no trajectory, or
+    where the rows contradict the calibration.
+    """
+    report = progress or (lambda text, share: None)
+    report("smoothing the tracks", 0.1)
+    lenses = {name: replace(rig.cameras[name], intrinsics=camera.intrinsics) for name, camera in known.items()}
+    prepared = prepare(replace(rig, cameras=lenses), observations)
+    unused = dict(prepared.refused)
+    names = list(prepared.cameras)
+    while True:
+        if len(names) < 2:
+            raise Refused(_too_few_cameras(names, unused), unused)
+        report("adjusting the trajectories", 0.4)
+        reconstruction = _reconstruct(prepared, known, names)
+        worst = min(reconstruction.names, key=lambda name: inlier_share(reconstruction, name)[0])
+        share, count = inlier_share(reconstruction, worst)
+        misfits = [
+            name
+            for name, sigma in _sigmas(reconstruction).items()
+            if sigma > _MAX_RELATIVE_RESIDUAL * known[name].intrinsics.width
+        ]
+        if share >= _MIN_INLIER_SHARE and not misfits:
+            break
+        if len(reconstruction.names) == 2:
+            residuals = ", ".join(f"{name} {sigma:.1f} px" for name, sigma in _sigmas(reconstruction).items())
+            what = f"the rows contradict the calibration (typical residual: {residuals})"
+            raise Refused(f"{what}: a camera was moved, or its clock was set; calibrate this session", unused)
+        # Of three and more, the camera that fits worst is removed, and the trajectories are estimated without it.
+        unused[worst] = (
+            f"only {100 * share:.0f} % of its {count} rows fit the trajectories of the other cameras: was it moved?"
+        )
+        names = [name for name in names if name != worst]
+    report("covariances", 0.8)
+    tables = _on_reference_clock(rig, prepared, known, reconstruction)
+    if not any(len(table.time) for table in tables):
+        raise Refused("no label is seen by two cameras within 0.2 s of each other", unused)
+    sigmas = _sigmas(reconstruction)
+    warnings = list(prepared.warnings)
+    for name, sigma in sigmas.items():
+        calibrated_rms = known[name].rms_px
+        if calibrated_rms > 0 and sigma > max(_RMS_WARNING_FACTOR * calibrated_rms, _MIN_WARNING_PX):
+            warnings.append(f"{name}: residuals of {sigma:.1f} px, {calibrated_rms:.1f} px when it was calibrated")
+    triangulated = {table.label for table in tables if len(table.time)}
+    return Triangulation(
+        tuple(table for table in tables if len(table.time)),
+        sigmas,
+        unused,
+        tuple(label for label in observations.labels if label not in triangulated),
+        tuple(warnings),
+    )
+
+
+def _reconstruct(prepared: PreparedSession, known: Mapping[str, CameraCalibration], names: list[str]) -> Reconstruction:
+    """All trajectories from the given cameras, adjusted. Raises Refused without any."""
+    cameras = {name: prepared.cameras[name] for name in names}
+    poses = {name: known[name].pose for name in names}
+    graph = ClockGraph(_time_maps(prepared, known, names), (), ())
+    reconstruction = reconstruct_with_known_poses(cameras, graph, prepared.rows, prepared.labels, poses, clock=False)
+    problem, state, _ = adjust(reconstruction.problem, reconstruction.state)
+    return Reconstruction(reconstruction.names, reconstruction.labels, problem, state)
+
+
+def _time_maps(
+    prepared: PreparedSession, known: Mapping[str, CameraCalibration], names: list[str]
+) -> dict[str, TimeMapEstimate]:
+    """The given time maps, from each camera's time since its origin to the reference time since the first row.
+
+    Reference times may be Unix times: relative to a common start, floats resolve far less than a microsecond.
+    """
+    if prepared.shared_clock:
+        return {name: TimeMapEstimate(1.0, 0.0, 0.0) for name in names}
+    starts = {
+        name: known[name].time_map.reference_from_camera(CameraTime(prepared.time_origins[name])) for name in names
+    }
+    common_start = min(starts.values())
+    clocks = {}
+    for name in names:
+        times = np.concatenate([part.time for part in prepared.rows[name]])
+        centre = float(0.5 * (times.min() + times.max()))
+        rate = known[name].time_map.clock_rate
+        clocks[name] = TimeMapEstimate(rate, starts[name] - common_start + rate * centre, centre)
+    return clocks
+
+
+def _on_reference_clock(
+    rig: Rig, prepared: PreparedSession, known: Mapping[str, CameraCalibration], reconstruction: Reconstruction
+) -> tuple[TrajectoryTable, ...]:
+    """Trajectory tables as of `calibrate`, sampled on the reference camera's clock or, without it, another camera's."""
+    requested = rig.metadata.get("reference")
+    clock_camera = requested if requested in reconstruction.names else reconstruction.names[0]
+    tables = trajectory_tables(rig, prepared, reconstruction, clock_camera)
+    if prepared.shared_clock:
+        return tables
+    time_map = known[clock_camera].time_map
+    return tuple(
+        replace(table, time=np.asarray(time_map.clock_rate * table.time + time_map.time_offset)) for table in tables
+    )
+
+
+def _sigmas(reconstruction: Reconstruction) -> dict[str, float]:
+    sigma: Floats = reconstruction.state.sigma
+    return {name: float(value) for name, value in zip(reconstruction.names, sigma, strict=True)}
+
+
+def _too_few_cameras(names: list[str], unused: dict[str, str]) -> str:
+    residuals = "; ".join(f"{name}: {reason}" for name, reason in unused.items())
+    return (
+        f"fewer than two cameras can be used ({residuals})"
+        if residuals
+        else f"only {', '.join(names) or 'no camera'} has rows"
+    )

@@ -1,0 +1,180 @@
+"""Corresponding points of two tracks under a time map, and the quality figures of an alignment of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+
+import numpy as np
+
+from hub.sync.hypothesis import PairFit
+from hub.sync.settings import PairSettings
+from hub.trajectory.image_tracks import SmoothTrack
+from hub.two_view import relative_pose
+from hub.two_view.refinement import PointPairs, RefinementResult
+from hub.two_view.relative_pose import TwoViewGeometry
+from protocols.geometry.types import Bools, Floats, Ints
+
+_MAX_INTERVAL_RATIO = 5.0  # times the median interval: longer ones are pauses
+_CLIP = 3.0  # robust sigma at which residuals are clipped: outliers carry no correlation
+_MIN_SIGNIFICANCE = 2.0  # sigma from which a correlation coefficient is significant
+
+
+class Samples:
+    """Samples of one alignment, all labels together: a's detections at their own times, b interpolated by its splines.
+
+    a, b: tracks of the same labels in the same order. offset: approximate one [s], ``t_a = t_b + offset``. max_count:
+    largest number of samples. label, time [s], points: (n,), (n,), (n, 2) of a. centre: median time [s].
+    seconds_per_sample: support that a sample stands for; several labels count as the root of their number.
+    A callable (`refinement.Sampler`): point pairs at a time map.
+    """
+
+    def __init__(
+        self, a: Sequence[SmoothTrack], b: Sequence[SmoothTrack], offset: float, settings: PairSettings, max_count: int
+    ) -> None:
+        self.a, self.b, self.settings = a, b, settings
+        rows_per_label = [self._moving_rows(one, other, offset) for one, other in zip(a, b, strict=True)]
+        fraction = min(1.0, max_count / max(sum(len(rows) for rows in rows_per_label), 1))
+        # The same fraction of every label, spread over its time.
+        thinned = [
+            rows[np.linspace(0, len(rows) - 1, round(fraction * len(rows))).round().astype(np.int64)]
+            for rows in rows_per_label
+        ]
+        self.label = np.concatenate([np.full(len(rows), k) for k, rows in enumerate(thinned)])
+        self.time = np.concatenate([one.time[rows] for one, rows in zip(a, thinned, strict=True)])
+        self.points = np.concatenate([one.points[rows] for one, rows in zip(a, thinned, strict=True)])
+        intervals = [_mean_interval(one.time) for one in a]
+        seconds = sum(len(rows) * t for rows, t in zip(rows_per_label, intervals, strict=True))
+        self.seconds_per_sample = len(a) ** -0.5 * seconds / max(len(self.time), 1)
+        self._recount()
+
+    def keep_inliers(self, matrix: Floats, rate: float, offset: float, pixels: float) -> None:
+        """Drop samples whose Sampson distance to ``s_bᵀ M s_a = 0`` (3, 3) exceeds ``pixels`` at this time map."""
+        a, b = self.points_at(rate, offset)
+        sigma_a, sigma_b = 1.0 / self.a[0].focal, 1.0 / self.b[0].focal
+        with np.errstate(invalid="ignore"):
+            inlier = np.abs(relative_pose.sampson(matrix, a, b, sigma_a, sigma_b)) < pixels
+        self.label, self.time, self.points = self.label[inlier], self.time[inlier], self.points[inlier]
+        self._recount()
+
+    def thinned(self, max_count: int) -> Samples:
+        """A copy with at most ``max_count`` of these samples, spread evenly."""
+        out = copy(self)
+        rows = np.unique(np.linspace(0, self.count - 1, min(max_count, self.count)).round().astype(np.int64))
+        out.label, out.time, out.points = self.label[rows], self.time[rows], self.points[rows]
+        out.seconds_per_sample = self.seconds_per_sample * self.count / max(len(rows), 1)
+        out._recount()
+        return out
+
+    def _recount(self) -> None:
+        self.count = len(self.time)
+        self.centre = float(np.median(self.time)) if self.count else 0.0
+
+    def _moving_rows(self, a: SmoothTrack, b: SmoothTrack, offset: float) -> Ints:
+        margin = 0.5
+        inside = (a.time - offset > b.basis.begin - margin) & (a.time - offset < b.basis.end + margin)
+        speed = np.linalg.norm(a.at(a.time, 1), axis=1) * a.focal
+        return np.flatnonzero(inside & (speed > 0.5 * self.settings.min_speed_px))
+
+    def interpolate_b(self, time: Floats) -> tuple[Floats, Floats]:
+        """Points and velocities [1/s] of b, (n, 2) each, at b's times (n,) of the samples; NaN in gaps."""
+        if len(self.b) == 1:
+            return self.b[0].point_and_velocity(time)
+        points, velocities = np.full((len(time), 2), np.nan), np.full((len(time), 2), np.nan)
+        for k, track in enumerate(self.b):
+            mine = self.label == k
+            points[mine], velocities[mine] = track.point_and_velocity(time[mine])
+        return points, velocities
+
+    def points_at(self, rate: float, offset: float) -> tuple[Floats, Floats]:
+        """Points of a (n, 2) and of b (n, 2; NaN in its gaps) under ``t_a = rate t_b + offset``."""
+        return self.points, self.interpolate_b((self.time - offset) / rate)[0]
+
+    def __call__(self, inverse_rate: float, intercept: float) -> PointPairs:
+        centred_time = self.time - self.centre
+        b, speed = self.interpolate_b(inverse_rate * centred_time + intercept)
+        present = np.isfinite(b[:, 0])
+        if present.all():
+            return PointPairs(self.points, b, speed, centred_time)
+        return PointPairs(self.points[present], b[present], speed[present], centred_time[present])
+
+    def autocorrelation_time(self, result: RefinementResult) -> float:
+        """Integrated autocorrelation time of the residuals [samples]: the number of samples per effective sample."""
+        rate = 1.0 / result.inverse_rate
+        a, b = self.points_at(rate, self.centre - rate * result.intercept)
+        present = np.isfinite(b[:, 0])
+        residual = relative_pose.sampson(
+            result.geometry.matrix, a[present], b[present], 1.0 / self.a[0].focal, 1.0 / self.b[0].focal
+        )
+        return 2.0 * float(autocorrelation(residual).sum()) - 1.0
+
+    def evaluate(self, cost: float, rate: float, offset: float, geometry: TwoViewGeometry) -> PairFit:
+        """The alignment ``t_a = rate * t_b + offset`` with quality figures, over the samples where both tracks move."""
+        a = self.points
+        b, speed = self.interpolate_b((self.time - offset) / rate)
+        present = np.isfinite(b).all(axis=1)
+        focal_a, focal_b = self.a[0].focal, self.b[0].focal
+        speed_b = np.linalg.norm(speed, axis=1) * focal_b
+        speed_a = np.concatenate(
+            [
+                np.linalg.norm(track.at(self.time[self.label == k], 1), axis=1) * focal_a
+                for k, track in enumerate(self.a)
+            ]
+        )
+        with np.errstate(invalid="ignore"):
+            moving: Bools = present & (speed_a > self.settings.min_speed_px) & (speed_b > self.settings.min_speed_px)
+        count = int(moving.sum())
+        if count < 8:
+            return PairFit(rate, offset, geometry, cost, np.inf, 0.0, 0.0, 0.0, 0.0, self.centre, 0.0)
+        sigma_a, sigma_b = self.settings.sigma_px / focal_a, self.settings.sigma_px / focal_b
+        distance = np.abs(relative_pose.sampson(geometry.matrix, a[moving], b[moving], sigma_a, sigma_b))
+        smooth = np.concatenate([track.at(self.time[self.label == k]) for k, track in enumerate(self.a)])
+        smoothed = np.abs(relative_pose.sampson(geometry.matrix, smooth[moving], b[moving], sigma_a, sigma_b))
+        # The inlier limit follows the tracks' noise, not the fit's residual: a wrong geometry must not widen it.
+        track_noise = max(float(np.median([track.sigma_px for track in tracks])) for tracks in (self.a, self.b))
+        limit = max(3.0 * track_noise, 3.0) / self.settings.sigma_px
+        inlier = distance < limit
+        front = relative_pose.in_front(geometry, a[moving][inlier], b[moving][inlier])
+        seconds = float(count) * self.seconds_per_sample
+        inliers = float(inlier.mean())
+        return PairFit(
+            rate=rate,
+            offset=offset,
+            geometry=geometry,
+            cost=cost,
+            residual_px=float(np.median(distance)) / 0.6745 * self.settings.sigma_px,
+            inliers=inliers,
+            in_front=float(front.mean()) if len(front) else 0.0,
+            support=seconds * inliers,
+            moving_overlap=seconds,
+            mid_time=float(np.median(self.time[moving])),
+            parallax=relative_pose.parallax(geometry, a[moving], b[moving]),
+            track_noise_px=track_noise,
+            misfit=float((smoothed[inlier] ** 2).mean()) if inlier.any() else np.inf,
+            planar_residual_px=_planar_residual_px(a[moving][inlier] * focal_a, b[moving][inlier] * focal_b),
+        )
+
+
+def autocorrelation(residual: Floats) -> Floats:
+    """Autocorrelation (k,) of residuals (n,) by lag in samples, from lag 0 up to the last significant one."""
+    limit = _CLIP * float(np.median(np.abs(residual))) / 0.6745
+    residual = np.clip(residual, -limit, limit)
+    variance = max(float(np.mean(residual**2)), 1e-300)
+    out = [1.0]
+    for lag in range(1, len(residual) // 4):
+        correlation = float(np.mean(residual[lag:] * residual[:-lag])) / variance
+        if correlation < _MIN_SIGNIFICANCE / np.sqrt(len(residual)):
+            break
+        out.append(correlation)
+    return np.array(out)
+
+
+def _mean_interval(time: Floats) -> float:
+    """Mean interval [s] of a track's times (n,) without pauses; dropped frames lengthen it."""
+    steps = np.diff(time)
+    return float(steps[steps <= _MAX_INTERVAL_RATIO * np.median(steps)].mean())
+
+
+def _planar_residual_px(a: Floats, b: Floats) -> float:
+    """Residual of the best homography [px], from a to b or back, whichever is less: edge-on planes magnify noise."""
+    return min(relative_pose.homography_residual(a, b), relative_pose.homography_residual(b, a))
