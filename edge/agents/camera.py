@@ -1,7 +1,6 @@
-"""The camera agent: frames in, observations out.
+"""The camera agent: reads frames from a device, detects in them, publishes observations and status on the bus.
 
-A thin loop around a device and a detector. Frames are taken and looked at in the caller's thread; messages go out by
-a thread of their own, so that nothing the bus does can hold up a capture.
+Capture and detection run in the caller's thread. A separate thread publishes, so that a slow bus cannot delay them.
 """
 
 from __future__ import annotations
@@ -15,13 +14,13 @@ from collections.abc import Callable, Iterator, Sequence
 
 from google.protobuf.message import Message
 
-from edge.agents.clock_quality import ClockWatcher
-from edge.agents.image_health import PictureWatch
-from edge.agents.predictions import Predictions
-from edge.agents.publish_queue import Outbox
-from edge.agents.thumbnails import WIDTH, picture_message
+from edge.agents.clock_quality import ClockMonitor
+from edge.agents.image_health import ImageHealth
+from edge.agents.predictions import PredictionSubscriber
+from edge.agents.publish_queue import PublishQueue
+from edge.agents.thumbnails import THUMBNAIL_WIDTH, thumbnail_message
 from edge.detectors.base import Detection, Detector
-from edge.devices.base import Device, Frame, Returning, Warm
+from edge.devices.base import Device, Frame, HasTemperature, Reconnecting
 from protocols.bus.base import Bus
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
@@ -32,22 +31,22 @@ from protocols.topics import CAMERA_INFO, OBSERVATION, PICTURE, PREDICTION, STAT
 from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "camera"
-_READ_TIMEOUT_S = 0.1  # how long a stop may wait for a silent camera
+_READ_TIMEOUT_S = 0.1  # upper bound of the stop latency while no frame comes
 _INFO_PERIOD_S = 2.0
 _STATUS_PERIOD_S = 1.0
-# Drivers of real devices, which do not end of themselves.
-_UNPLUGGABLE = frozenset({"video", "usb", "picamera2", "rtsp", "oak"})
-_OUTBOX = 1024
+# Drivers of real cameras: such a source has no end of its own, so an end means that the camera was lost.
+_LIVE_DRIVERS = frozenset({"video", "usb", "picamera2", "rtsp", "oak"})
+_QUEUE_CAPACITY = 1024
 
 
 class CameraAgent:
-    """One camera on the bus.
+    """Publishes the observations, the description and the status of one camera.
 
-    device: is opened by ``run`` and closed after it. camera: its id. now_ns: a monotonic clock for rates and latencies;
-    it never stamps an observation. known: what the rig file knows of this camera beforehand. boot_id: a new one
-    each time the process starts, by default. pictures_hz, picture_width: small pictures a second while somebody wants
-    them, and their width [px]; 0 = never.
-    predictions: whether the detector is told what the hub's tracking expects.
+    device: opened by ``run`` and closed when it returns. camera: the camera's id. now_ns: a monotonic clock for rates
+    and latencies; observations are never stamped with it. known: the camera's entry in the rig file (intrinsics, pose).
+    boot_id: by default a new one for each process start. pictures_hz, picture_width: rate and width [px] of the
+    thumbnails, which are published only while somebody subscribes; a rate of 0 disables them.
+    predictions: whether the hub's predicted detections are passed to the detector.
     """
 
     def __init__(
@@ -61,11 +60,11 @@ class CameraAgent:
         known: RigCamera | None = None,
         boot_id: str | None = None,
         pictures_hz: float = 2.0,
-        picture_width: int = WIDTH,
+        picture_width: int = THUMBNAIL_WIDTH,
         predictions: bool = False,
     ) -> None:
-        self._follows = predictions
-        self._predictions: Predictions | None = None
+        self._uses_predictions = predictions
+        self._predictions: PredictionSubscriber | None = None
         self._device = device
         self._detector = detector
         self._bus = bus
@@ -82,89 +81,91 @@ class CameraAgent:
         self.dropped = 0
         self.detections = 0
         self.empty = 0
-        self._watch = PictureWatch(live=False)
+        self._health = ImageHealth(live=False)
         self._status_lock = threading.Lock()
         self._status_sequence = 0
         self._next_status = 0
-        self._told = ""
+        self._reported_problem = ""
         self._stopping = False
         self._exposure_ns = 0
-        self._clock = ClockWatcher()
+        self._clock = ClockMonitor()
 
     def run(self, stop: threading.Event) -> None:
-        """Publish until ``stop`` is set or the device has ended.
+        """Read, detect and publish until ``stop`` is set or the device has ended.
 
         Raises InputError where the device cannot be opened, BusDead where the bus has died.
         """
         self._device.open()
         info = self._device.info
-        self._watch = PictureWatch(live=info.clock != "stream", period_s=1.0 / info.fps if info.fps > 0.0 else 0.0)
+        self._health = ImageHealth(live=info.clock != "stream", period_s=1.0 / info.fps if info.fps > 0.0 else 0.0)
         topics = (OBSERVATION, CAMERA_INFO, STATUS, PICTURE)
-        outbox: Outbox = Outbox(self._bus, self._camera, topics, _OUTBOX, beat=lambda: self._due_status(outbox))
-        if self._follows:
-            self._predictions = Predictions(self._bus.subscribe(PREDICTION), self._camera, self.boot_id)
+        out_queue: PublishQueue = PublishQueue(
+            self._bus, self._camera, topics, _QUEUE_CAPACITY, due_messages=lambda: self._due_status(out_queue)
+        )
+        if self._uses_predictions:
+            self._predictions = PredictionSubscriber(self._bus.subscribe(PREDICTION), self._camera, self.boot_id)
         try:
-            with self._clock, self._bus.announce(ROLE, self._camera, self.boot_id), outbox:
-                self._loop(stop, outbox)
+            with self._clock, self._bus.announce(ROLE, self._camera, self.boot_id), out_queue:
+                self._loop(stop, out_queue)
         finally:
             if self._predictions is not None:
                 self._predictions.close()
             self._device.close()
 
-    def _loop(self, stop: threading.Event, outbox: Outbox) -> None:
+    def _loop(self, stop: threading.Event, out_queue: PublishQueue) -> None:
         next_info = next_picture = self._now_ns()
-        self._watch.start(next_info / NANOSECONDS)
+        self._health.start(next_info / NANOSECONDS)
         while not (stop.is_set() or self._device.ended):
             frame = self._device.read(_READ_TIMEOUT_S)
             now = self._now_ns()
-            if frame is not None and self._watch.fresh(frame, now / NANOSECONDS):
-                outbox.put(OBSERVATION, self._observe(frame))
+            if frame is not None and self._health.accept(frame, now / NANOSECONDS):
+                out_queue.put(OBSERVATION, self._observe(frame))
                 self._recent.append((now, (self._now_ns() - now) / NANOSECONDS))
                 self._exposure_ns = frame.exposure_ns
-                self._watch.look(frame, now / NANOSECONDS)
-                if self._picture_ns and now >= next_picture and outbox.wants(PICTURE):
-                    outbox.put(PICTURE, picture_message(frame, self._camera, self.boot_id, self._picture_width))
+                self._health.measure_sharpness(frame, now / NANOSECONDS)
+                if self._picture_ns and now >= next_picture and out_queue.has_subscriber(PICTURE):
+                    out_queue.put(PICTURE, thumbnail_message(frame, self._camera, self.boot_id, self._picture_width))
                     next_picture = now + self._picture_ns
             if now >= next_info:
-                outbox.put(CAMERA_INFO, self._info())
+                out_queue.put(CAMERA_INFO, self._info())
                 next_info = now + round(_INFO_PERIOD_S * NANOSECONDS)
-            outbox.check()
-        gone = self._device.ended and not stop.is_set()
-        unplugged = gone and self._watch.live and self._device.info.driver in _UNPLUGGABLE
-        text = "the camera is gone" if unplugged else "the recording has ended" if gone else "stopped"
+            out_queue.check()
+        ended = self._device.ended and not stop.is_set()
+        unplugged = ended and self._health.live and self._device.info.driver in _LIVE_DRIVERS
+        text = "the camera is gone" if unplugged else "the recording has ended" if ended else "stopped"
         with self._status_lock:
             self._stopping = True
-            outbox.put(STATUS, self._status("stopping", text, self._status_sequence, outbox))
+            out_queue.put(STATUS, self._status("stopping", text, self._status_sequence, out_queue))
         if unplugged:
             raise InputError(f"camera {self._camera} is gone", remedy="plug it in, and start its agent again")
 
-    def _due_status(self, outbox: Outbox) -> Iterator[tuple[Topic, Message]]:
-        """The status where one is due: each second, and at once when a complaint begins or ends.
+    def _due_status(self, out_queue: PublishQueue) -> Iterator[tuple[Topic, Message]]:
+        """Yield the status if it is due: every second, and at once when a fault begins or ends.
 
-        Called by the outbox's thread, because a device that hangs holds up the agent's own.
+        Called by the publishing thread, because a device that hangs blocks the agent's own thread.
         """
         now = self._now_ns()
-        complaint = self._watch.complaint(now / NANOSECONDS)
-        told = complaint.partition(" for ")[0]
-        if self._stopping or (now < self._next_status and told == self._told):
+        problem = self._health.problem(now / NANOSECONDS)
+        problem_kind = problem.partition(" for ")[0]
+        if self._stopping or (now < self._next_status and problem_kind == self._reported_problem):
             return
         with self._status_lock:
-            self._told, self._next_status = told, now + round(_STATUS_PERIOD_S * NANOSECONDS)
-            status = self._status("degraded" if complaint else "running", complaint, self._status_sequence, outbox)
+            self._reported_problem, self._next_status = problem_kind, now + round(_STATUS_PERIOD_S * NANOSECONDS)
+            status = self._status("degraded" if problem else "running", problem, self._status_sequence, out_queue)
             self._status_sequence += 1
         yield STATUS, status
 
     def _observe(self, frame: Frame) -> pb.Observation:
-        """The message of one frame, also when nothing is seen in it."""
+        """The observation message of one frame; it is published even without detections."""
         if self._last_frame is not None and frame.frame > self._last_frame + 1:
             self.dropped += frame.frame - self._last_frame - 1
         self._last_frame = frame.frame
         self.frames += 1
         expected = [] if self._predictions is None else self._predictions.at(frame.device_time_ns)
-        seen: Sequence[Detection] | None = frame.found
+        seen: Sequence[Detection] | None = frame.detections
         if seen is None:
             seen = self._detector.detect(frame.image, frame.device_time_ns / NANOSECONDS, expected)
-        found = [detection for detection in seen if _usable(detection)]
+        found = [detection for detection in seen if _is_finite(detection)]
         self.detections += len(found)
         self.empty += not found
         message = pb.Observation(
@@ -175,7 +176,7 @@ class CameraAgent:
             frame=frame.frame,
             device_time_ns=frame.device_time_ns,
             exposure_ns=frame.exposure_ns,
-            detections=[_detection(detection) for detection in found],
+            detections=[_detection_message(detection) for detection in found],
         )
         self._sequence += 1
         return message
@@ -196,38 +197,38 @@ class CameraAgent:
         known = self._known
         lens = info.intrinsics if known is None or known.intrinsics is None else known.intrinsics
         if lens is not None and (lens.width, lens.height) != (info.width, info.height) and info.intrinsics is not None:
-            lens = info.intrinsics  # of smaller pictures than the rig file is about
+            lens = info.intrinsics  # the images are smaller than those the rig file was calibrated for
         if lens is not None:
             message.matrix.extend(lens.matrix.ravel().tolist())
             message.distortions.extend(lens.distortions.tolist())
             message.fisheye = lens.fisheye
         if known is not None:
-            add_known(message, known)
+            add_rig_pose(message, known)
         return message
 
-    def _status(self, state: str, text: str, sequence: int, outbox: Outbox) -> pb.AgentStatus:
+    def _status(self, state: str, text: str, sequence: int, out_queue: PublishQueue) -> pb.AgentStatus:
         counters = {
             "frames": self.frames,
             "dropped": self.dropped,
-            "published": outbox.sent[OBSERVATION],
-            "unpublished": outbox.lost[OBSERVATION],
+            "published": out_queue.sent[OBSERVATION],
+            "unpublished": out_queue.unsent[OBSERVATION],
             "detections": self.detections,
             "empty": self.empty,
-            "repeated": self._watch.repeated,
-            "stale": self._watch.late,
+            "repeated": self._health.repeated,
+            "stale": self._health.stale,
         }
-        if isinstance(self._device, Returning):
+        if isinstance(self._device, Reconnecting):
             counters["reconnections"] = self._device.reconnections
         gauges = {"fps": 0.0, "latency_s": 0.0, **self._clock.gauges(self._device.info.clock)}
         if self._exposure_ns > 0:
             gauges["exposure_s"] = self._exposure_ns / NANOSECONDS
-        if isinstance(self._device, Warm) and (temperature := self._device.temperature) is not None:
+        if isinstance(self._device, HasTemperature) and (temperature := self._device.temperature) is not None:
             gauges["temperature_c"] = temperature
-        if outbox.wanted is not None:
-            gauges["heard"] = float(outbox.wants(OBSERVATION))
+        if out_queue.subscribed_topics is not None:
+            gauges["heard"] = float(out_queue.has_subscriber(OBSERVATION))
         if gauges.get("heard") == 0.0 and not text:
-            # A put that the router's rules deny returns as if all were well.
-            text = "nobody hears this camera: no hub is there, or the router's access rules do not let it speak"
+            # A put that the router's access rules deny raises no error.
+            text = "no subscriber: no hub is running, or the router's access rules do not let this camera publish"
         recent = self._recent.copy()
         if len(recent) > 1:
             span = (recent[-1][0] - recent[0][0]) / NANOSECONDS
@@ -258,10 +259,10 @@ def run_camera_agent(
     known: RigCamera | None = None,
     boot_id: str | None = None,
     pictures_hz: float = 2.0,
-    picture_width: int = WIDTH,
+    picture_width: int = THUMBNAIL_WIDTH,
     predictions: bool = False,
 ) -> CameraAgent:
-    """Run an agent to its end and return it with its counts; see ``CameraAgent`` for the arguments."""
+    """Run a camera agent until it ends and return it with its counters; arguments as for ``CameraAgent``."""
     agent = CameraAgent(
         device,
         detector,
@@ -278,8 +279,8 @@ def run_camera_agent(
     return agent
 
 
-def add_known(message: pb.CameraInfo, known: RigCamera) -> None:
-    """Enter what a rig file knows of a camera's pose; lengths are in the rig's units."""
+def add_rig_pose(message: pb.CameraInfo, known: RigCamera) -> None:
+    """Copy a camera's pose and its uncertainty from the rig file into the message; lengths in the rig's units."""
     for field, values in (
         (message.position, known.position),
         (message.position_std, known.position_std),
@@ -293,12 +294,12 @@ def add_known(message: pb.CameraInfo, known: RigCamera) -> None:
         message.rotation.extend(so3.log(known.rotation).tolist())
 
 
-def _usable(detection: Detection) -> bool:
-    """A detector's slip must not reach the bus, where it would cost the whole frame."""
+def _is_finite(detection: Detection) -> bool:
+    """Whether all coordinates are finite: validation on the bus would reject the whole frame otherwise."""
     return math.isfinite(detection.u) and math.isfinite(detection.v) and math.isfinite(detection.size)
 
 
-def _detection(detection: Detection) -> pb.Detection:
+def _detection_message(detection: Detection) -> pb.Detection:
     message = pb.Detection(
         u=detection.u,
         v=detection.v,

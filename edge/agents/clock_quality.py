@@ -1,8 +1,8 @@
-"""What the machine says of its own clock: chrony, the kernel, PTP. Told beside the estimate, and never trusted.
+"""Quality of the host clock as reported by chrony, PTP or the kernel.
 
-A time service keeps the Unix time; cameras are stamped by other clocks, which it does not touch but in their rate. What
-is told here is how well the host's Unix time is known, so that a person can see whether the estimate found from the
-pictures and the network's agree. The hub asks it only to choose among lags that the pictures leave open.
+A time service disciplines the Unix time. Cameras are stamped by other clocks, of which it affects only the rate. The
+reported error bound of the host's Unix time is published so that a person can compare the time offsets estimated from
+the images with those of the network. The hub uses it only to choose among lags that the images leave ambiguous.
 """
 
 from __future__ import annotations
@@ -16,44 +16,47 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-Run = Callable[[Sequence[str]], tuple[int, str]]
+CommandRunner = Callable[[Sequence[str]], tuple[int, str]]
 _STA_UNSYNC = 0x0040
-_PATIENCE_S = 2.0
+_COMMAND_TIMEOUT_S = 2.0
 _PERIOD_S = 30.0
 _CHRONY_FIELDS = 14
 
 
 @dataclass(frozen=True, slots=True)
 class ClockQuality:
-    """source: "chrony", "ptp", "kernel" (somebody disciplines it) or "none". error_s: largest error of Unix time as
-    that source sees it; inf = not known."""
+    """Synchronisation state of the host clock.
+
+    source: "chrony", "ptp", "kernel" (disciplined by some other service) or "none". error_s: upper bound of the error
+    of Unix time according to that source; inf = not known.
+    """
 
     source: str
     error_s: float
 
     def gauges(self) -> dict[str, float]:
-        """For a status: whether the clock is disciplined, and within what."""
+        """Gauges for the status message: whether the clock is disciplined, and its error bound [s]."""
         found = {"clock_synchronised": float(self.source != "none")}
         if math.isfinite(self.error_s):
             found["clock_error_s"] = self.error_s
         return found
 
 
-def clock_quality(
-    run: Run | None = None,
+def query_clock_quality(
+    run: CommandRunner | None = None,
     kernel: Callable[[], tuple[bool, float]] | None = None,
     root: Path = Path("/"),
 ) -> ClockQuality:
-    """Ask chrony, PTP where the machine has such a clock, and the kernel; the first that knows is believed.
+    """Query chrony, then PTP if the machine has a PTP clock, then the kernel; the first valid reply is returned.
 
-    run: (exit status, output) of a command. kernel: (synchronised, largest error [s]). root: where /dev is.
+    run: gives (exit status, output) of a command. kernel: gives (synchronised, error bound [s]). root: parent of /dev.
     """
-    ask = run or _run
-    status, text = ask(("chronyc", "-c", "tracking"))
+    query = run or _run_command
+    status, text = query(("chronyc", "-c", "tracking"))
     if status == 0 and (error := chrony_error(text)) is not None:
         return ClockQuality("chrony", error)
     if any((root / "dev").glob("ptp*")):
-        status, text = ask(("pmc", "-u", "-b", "0", "GET TIME_STATUS_NP"))
+        status, text = query(("pmc", "-u", "-b", "0", "GET TIME_STATUS_NP"))
         if status == 0 and (error := ptp_error(text)) is not None:
             return ClockQuality("ptp", error)
     synchronised, largest = (kernel or kernel_clock)()
@@ -61,9 +64,9 @@ def clock_quality(
 
 
 def chrony_error(text: str) -> float | None:
-    """Largest error [s] by ``chronyc -c tracking``; None where chrony follows nobody.
+    """Error bound [s] from ``chronyc -c tracking``; None where chrony is not synchronised.
 
-    |correction still to come| + root dispersion + half the root delay, as chrony's own bound is.
+    |remaining correction| + root dispersion + half the root delay, which is the bound that chrony itself reports.
     """
     fields = text.strip().split(",")
     if len(fields) < _CHRONY_FIELDS or fields[13].lower().startswith("not"):
@@ -77,7 +80,7 @@ def chrony_error(text: str) -> float | None:
 
 
 def ptp_error(text: str) -> float | None:
-    """Offset [s] from the grandmaster by linuxptp's ``pmc``; None where there is none."""
+    """Offset [s] from the grandmaster as reported by linuxptp's ``pmc``; None where there is no grandmaster."""
     words = dict(line.split(None, 1) for line in text.splitlines() if len(line.split(None, 1)) == 2)
     if words.get("gmPresent", "").strip() != "true":
         return None
@@ -88,7 +91,7 @@ def ptp_error(text: str) -> float | None:
 
 
 class _Timex(ctypes.Structure):
-    """The beginning of the kernel's struct timex (adjtimex(2)); the rest is room."""
+    """The leading fields of the kernel's struct timex (adjtimex(2)); the rest is padding."""
 
     _fields_ = [
         ("modes", ctypes.c_uint),
@@ -97,30 +100,30 @@ class _Timex(ctypes.Structure):
         ("maxerror", ctypes.c_long),
         ("esterror", ctypes.c_long),
         ("status", ctypes.c_int),
-        ("room", ctypes.c_char * 512),
+        ("padding", ctypes.c_char * 512),
     ]
 
 
 def kernel_clock() -> tuple[bool, float]:
-    """(synchronised, largest error [s]) as the kernel sees its clock, whoever disciplines it."""
+    """(synchronised, error bound [s]) of the kernel clock, whichever service disciplines it."""
     timex = _Timex()
     try:
         ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))
-    except (AttributeError, OSError):  # no Linux
+    except (AttributeError, OSError):  # not Linux
         return False, math.inf
     return not timex.status & _STA_UNSYNC, timex.maxerror / 1e6
 
 
-class ClockWatcher:
-    """Asks every 30 s, in a thread of its own: a time service that hangs must not hold up a status."""
+class ClockMonitor:
+    """Queries the clock quality every 30 s in its own thread, so that a time service that hangs delays no status."""
 
-    def __init__(self, ask: Callable[[], ClockQuality] = clock_quality, period_s: float = _PERIOD_S) -> None:
-        self._ask, self._period_s = ask, period_s
+    def __init__(self, query: Callable[[], ClockQuality] = query_clock_quality, period_s: float = _PERIOD_S) -> None:
+        self._query, self._period_s = query, period_s
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="clock quality", daemon=True)
         self.quality: ClockQuality | None = None
 
-    def __enter__(self) -> ClockWatcher:
+    def __enter__(self) -> ClockMonitor:
         self._thread.start()
         return self
 
@@ -128,9 +131,9 @@ class ClockWatcher:
         self._stop.set()
 
     def gauges(self, clock: str) -> dict[str, float]:
-        """For the status of a camera whose times are of this clock; empty until it is known.
+        """Gauges for the status of a camera that is stamped by ``clock``; empty until the first query has returned.
 
-        unix_minus_camera_s: what to add to the host's monotonic clock, where that stamps the camera, for Unix time.
+        unix_minus_camera_s: Unix time minus the host's monotonic clock [s], given where that clock stamps the camera.
         """
         quality = self.quality
         if quality is None:
@@ -142,14 +145,14 @@ class ClockWatcher:
 
     def _run(self) -> None:
         while True:
-            self.quality = self._ask()
+            self.quality = self._query()
             if self._stop.wait(self._period_s):
                 return
 
 
-def _run(command: Sequence[str]) -> tuple[int, str]:
+def _run_command(command: Sequence[str]) -> tuple[int, str]:
     try:
-        ended = subprocess.run(list(command), capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
+        result = subprocess.run(list(command), capture_output=True, text=True, timeout=_COMMAND_TIMEOUT_S, check=False)
     except (OSError, subprocess.TimeoutExpired, UnicodeDecodeError):
         return 127, ""
-    return ended.returncode, ended.stdout
+    return result.returncode, result.stdout

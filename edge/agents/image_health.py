@@ -1,6 +1,6 @@
-"""Whether a camera still sees: stalled, frozen, black, blurred. No clock: moments are passed in.
+"""Image health of a camera: detects stalled, frozen, black and blurred streams. All times are arguments.
 
-A frozen camera is worse than a dead one: the same picture with ever new times is a marker that stands still.
+A frozen camera does more harm than one without frames: the same image with new time stamps looks like a static marker.
 """
 
 from __future__ import annotations
@@ -12,99 +12,99 @@ import numpy as np
 
 from edge.devices.base import Frame, Image
 
-TOLD_AFTER_S = 1.0
-"""How long it must last before it is told; half of what a status may take to say so."""
-_DARK = 12
-"""Grey levels below which a whole picture is black: sensors with a lens cap show 0 to 8."""
-_STEP = 8
-_PERIODS = 3.0
-_LOOK_S = 0.2  # between two looks at how sharp it is
-_BLURRED = 0.3  # of the sharpness that this camera has had
-_LEARN = 0.02  # a look: how fast its usual sharpness falls, with a scene that has less to see; it rises at once
-_EDGES = 0.15  # sharpness below which a camera has no edges that could be lost: grass, water, noise
-_PLAIN = 1.5  # grey levels: a picture with less structure than that says nothing
+REPORT_DELAY_S = 1.0
+"""Duration of a fault [s] before it is reported; half the allowed latency of a status."""
+_DARK_LEVEL = 12
+"""Grey level up to which an image counts as black: sensors with a lens cap give 0 to 8."""
+_STRIDE = 8
+_TIMEOUT_PERIODS = 3.0
+_SHARPNESS_PERIOD_S = 0.2  # between two measurements of the sharpness
+_BLUR_RATIO = 0.3  # of the reference sharpness of this camera
+_REFERENCE_DECAY = 0.02  # per measurement: decay of the reference when the scene has less detail; it rises at once
+_MIN_REFERENCE = 0.15  # reference below which there are no edges to lose (grass, water, noise): no blur test
+_MIN_CONTRAST = 1.5  # grey levels: with less large-scale structure the sharpness is undefined
 
 
 @dataclass(slots=True)
-class PictureWatch:
-    """Judges every frame of one camera.
+class ImageHealth:
+    """Checks every frame of one camera.
 
-    live: False for recordings, which may hold what they like. period_s: nominal; 0 = not known.
-    repeated, late: frames that must not be published: the same picture again; a time that does not increase.
+    live: False for recordings, which are only tested for stalls. period_s: nominal frame period; 0 = not known.
+    repeated, stale: counts of frames that must not be published: identical image; time stamp that does not advance.
     """
 
     live: bool
     period_s: float = 0.0
     repeated: int = 0
-    late: int = 0
+    stale: int = 0
     _last: Image | None = None
     _last_ns: int | None = None
-    _arrived: float | None = None
-    _changed: float | None = None
-    _light: float | None = None
-    _sharp: float | None = None
-    _usual: float = 0.0
-    _looked: float | None = None
+    _arrived_s: float | None = None
+    _changed_s: float | None = None
+    _bright_s: float | None = None
+    _sharp_s: float | None = None
+    _reference: float = 0.0
+    _measured_s: float | None = None
 
     def start(self, now: float) -> None:
-        """The camera is open; the first frame is due."""
-        self._arrived = self._changed = self._light = self._sharp = now
+        """Start the timeouts: the camera is open and the first frame is due."""
+        self._arrived_s = self._changed_s = self._bright_s = self._sharp_s = now
 
-    def fresh(self, frame: Frame, now: float) -> bool:
-        """Take a frame that came at ``now`` [s]; False: it is stale and must not be published."""
-        self._arrived = now
+    def accept(self, frame: Frame, now: float) -> bool:
+        """Check a frame that arrived at ``now`` [s]; False if it is repeated or stale and must not be published."""
+        self._arrived_s = now
         if not self.live:
             return True
         if self._last_ns is not None and frame.device_time_ns == self._last_ns:
-            self.late += 1
+            self.stale += 1
             return False
         self._last_ns = frame.device_time_ns
-        if self._last is not None and _same(self._last, frame.image):
+        if self._last is not None and _is_identical(self._last, frame.image):
             self.repeated += 1
             return False
         self._last = frame.image
-        self._changed = now
-        if int(frame.image[::_STEP, ::_STEP].max(initial=0)) > _DARK:
-            self._light = now
+        self._changed_s = now
+        if int(frame.image[::_STRIDE, ::_STRIDE].max(initial=0)) > _DARK_LEVEL:
+            self._bright_s = now
         return True
 
-    def look(self, frame: Frame, now: float) -> None:
-        """How sharp a fresh frame is, five times a second; after it was published, as it takes a millisecond."""
-        if not self.live or (self._looked is not None and now - self._looked < _LOOK_S):
+    def measure_sharpness(self, frame: Frame, now: float) -> None:
+        """Measure the sharpness of an accepted frame, five times a second; takes 1 ms, so call it after publishing."""
+        if not self.live or (self._measured_s is not None and now - self._measured_s < _SHARPNESS_PERIOD_S):
             return
-        self._looked = now
+        self._measured_s = now
         sharp = sharpness(frame.image)
         if sharp is None:
-            self._sharp = now
+            self._sharp_s = now
             return
-        if self._usual < _EDGES or sharp >= _BLURRED * self._usual:
-            self._sharp = now
-            self._usual = max(sharp, (1.0 - _LEARN) * self._usual)
+        if self._reference < _MIN_REFERENCE or sharp >= _BLUR_RATIO * self._reference:
+            self._sharp_s = now
+            self._reference = max(sharp, (1.0 - _REFERENCE_DECAY) * self._reference)
 
-    def complaint(self, now: float) -> str:
-        """What is wrong at ``now`` [s], for a person; "" while all is well."""
-        if self._arrived is None or self._changed is None or self._light is None:
+    def problem(self, now: float) -> str:
+        """Description of the present fault at ``now`` [s]; "" while there is none."""
+        if self._arrived_s is None or self._changed_s is None or self._bright_s is None:
             return ""
-        patience = max(TOLD_AFTER_S, _PERIODS * self.period_s)
-        silent = now - self._arrived
-        if silent >= patience:
+        limit = max(REPORT_DELAY_S, _TIMEOUT_PERIODS * self.period_s)
+        silent = now - self._arrived_s
+        if silent >= limit:
             return f"no frame for {silent:.1f} s"
         if not self.live:
             return ""
-        if now - self._changed >= patience:
-            return f"frozen: the same picture for {now - self._changed:.1f} s, not published"
-        if now - self._light >= patience:
-            return f"black picture for {now - self._light:.1f} s"
-        if self._sharp is not None and now - self._sharp >= patience:
-            return f"blurred for {now - self._sharp:.1f} s: out of focus, wet, or covered"
+        if now - self._changed_s >= limit:
+            return f"frozen: the same picture for {now - self._changed_s:.1f} s, not published"
+        if now - self._bright_s >= limit:
+            return f"black picture for {now - self._bright_s:.1f} s"
+        if self._sharp_s is not None and now - self._sharp_s >= limit:
+            return f"blurred for {now - self._sharp_s:.1f} s: out of focus, wet, or covered"
         return ""
 
 
 def sharpness(image: Image) -> float | None:
-    """Fine structure of a picture (H, W, 3) relative to its coarse one; None where there is hardly any.
+    """Ratio of fine to coarse structure of an image (H, W, 3); None where there is hardly any coarse structure.
 
-    Strong edges two pixels wide against the differences of their surroundings: light and contrast cancel, and noise,
-    which is everywhere and no edge, counts little.
+    The 99.5th percentile of the absolute Laplacian at half resolution, less six times its median (the noise floor),
+    over the standard deviation at 1/16 of the resolution: brightness and contrast cancel.
     """
     if min(image.shape[:2]) < 32:
         return None
@@ -114,15 +114,15 @@ def sharpness(image: Image) -> float | None:
     strongest = float(np.percentile(np.abs(fine[::2, ::2]), 99.5))
     weak = float(np.percentile(np.abs(fine[::2, ::2]), 50.0))
     structure = float(coarse.astype(np.float64).std())
-    return None if structure < _PLAIN else max(strongest - 6.0 * weak, 0.0) / structure
+    return None if structure < _MIN_CONTRAST else max(strongest - 6.0 * weak, 0.0) / structure
 
 
-def _same(a: Image, b: Image) -> bool:
-    """Equal to the last bit, which noise forbids to a sensor that sees anything at all.
+def _is_identical(a: Image, b: Image) -> bool:
+    """Whether two images are bitwise equal, which sensor noise excludes for any live image.
 
-    Pictures of one single colour tell nothing: a lens cap can look like that for ever.
+    Images of a single colour never count as identical: a sensor behind a lens cap can give them continually.
     """
-    # A few rows tell almost every pair apart; the whole is compared only where they agree.
+    # A few rows distinguish almost every pair; the whole images are compared only where those agree.
     if a.shape != b.shape or not np.array_equal(a[::64], b[::64]) or not np.array_equal(a, b):
         return False
     return bool((a != a[0, 0]).any())

@@ -1,4 +1,4 @@
-"""What the tracking expects this camera to see, from the bus to its detector."""
+"""Predicted detections from the hub's multi-target tracker, received for one camera's detector."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from protocols.bus.base import Subscription
 from protocols.core.clocks import NANOSECONDS
 from protocols.messages import syncline_pb2 as pb
 
-_FRESH_S = 0.5  # an older prediction says nothing of this frame
-_WANDER = 60.0  # px/s by which one turns aside from the way that was told
+_MAX_AGE_S = 0.5  # a prediction farther away in time is not used for a frame
+_VELOCITY_STD = 60.0  # px/s, std of a target's deviation from the predicted image velocity
 
 
-class Predictions:
-    """The newest prediction of each hub for one camera in its present boot."""
+class PredictionSubscriber:
+    """Keeps the newest prediction of each hub for one camera in its current boot."""
 
     def __init__(self, subscription: Subscription, camera: str, boot_id: str) -> None:
         self._subscription = subscription
@@ -21,7 +21,7 @@ class Predictions:
         self._newest: dict[str, pb.CameraPrediction] = {}
 
     def at(self, device_time_ns: int) -> list[Prediction]:
-        """What is expected in a frame of this time on the camera's clock."""
+        """Predictions extrapolated to a frame at ``device_time_ns`` on the camera's clock."""
         for received in self._subscription.drain():
             message = received.message
             if isinstance(message, pb.Prediction):
@@ -31,18 +31,18 @@ class Predictions:
         expected = []
         for one in self._newest.values():
             ahead = (device_time_ns - one.device_time_ns) / NANOSECONDS
-            if abs(ahead) <= _FRESH_S:
+            if abs(ahead) <= _MAX_AGE_S:
                 expected += [_prediction(target, ahead) for target in one.targets if target.target]
         return expected
 
     def close(self) -> None:
-        """Stop listening."""
+        """Close the subscription."""
         self._subscription.close()
 
 
 def _prediction(target: pb.PredictedTarget, ahead: float) -> Prediction:
     uu, uv, vv = target.covariance or (400.0, 0.0, 400.0)
-    more = (_WANDER * ahead) ** 2
+    more = (_VELOCITY_STD * ahead) ** 2
     colour = target.colour
     return Prediction(
         u=target.u + ahead * target.u_velocity,

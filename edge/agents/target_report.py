@@ -1,4 +1,4 @@
-"""What the UAV agent tells an operator of its target: for the camera component, and as a line on the picture."""
+"""The target estimate as the operator gets it: tracking status for the camera component, and a line of text."""
 
 from __future__ import annotations
 
@@ -6,47 +6,49 @@ import math
 
 import numpy as np
 
-from edge.mavlink.roles.camera import Shown
+from edge.mavlink.roles.camera import TrackingStatus
 from edge.mavlink.roles.vehicle import Vehicle
-from edge.uav.navigation import to_quaternion
-from edge.uav.tracker import Estimate, State
+from edge.uav.navigation import quaternion_from_rotation
+from edge.uav.tracker import Estimate, TrackState
 
 
-def show(shown: Shown, estimate: Estimate | None, vehicle: Vehicle, size: tuple[int, int]) -> None:
-    """Put what is known of target and vehicle where the camera component tells it. size: (width, height) [px]."""
+def update_tracking_status(
+    status: TrackingStatus, estimate: Estimate | None, vehicle: Vehicle, size: tuple[int, int]
+) -> None:
+    """Fill ``status`` from the target estimate and the vehicle's pose. size: (width, height) of the image [px]."""
     width, height = size
-    origin, place = vehicle.origin, vehicle.position
-    shown.camera = None
-    if origin is not None and place is not None:
-        shown.camera = origin.world(float(place[0]), float(place[1]), float(place[2]))
+    origin, position = vehicle.origin, vehicle.position
+    status.camera = None
+    if origin is not None and position is not None:
+        status.camera = origin.to_geodetic(float(position[0]), float(position[1]), float(position[2]))
     if vehicle.attitude is not None:
-        shown.quaternion = to_quaternion(vehicle.attitude.ned_from_body)
-    shown.centre = shown.half = shown.geo = shown.velocity = None
-    shown.h_acc = shown.distance = shown.course = math.nan
-    shown.state = "idle" if estimate is None else estimate.state.value
-    if estimate is None or estimate.state is State.LOST:
+        status.quaternion = quaternion_from_rotation(vehicle.attitude.ned_from_body)
+    status.centre = status.half_size = status.geo = status.velocity = None
+    status.h_acc = status.distance = status.course = math.nan
+    status.state = "idle" if estimate is None else estimate.state.value
+    if estimate is None or estimate.state is TrackState.LOST:
         return
     if math.isfinite(estimate.x) and math.isfinite(estimate.width) and math.isfinite(estimate.height):
-        shown.centre = ((estimate.x + 0.5) / width, (estimate.y + 0.5) / height)
-        shown.half = (0.5 * estimate.width / width, 0.5 * estimate.height / height)
+        status.centre = ((estimate.x + 0.5) / width, (estimate.y + 0.5) / height)
+        status.half_size = (0.5 * estimate.width / width, 0.5 * estimate.height / height)
     if not (math.isfinite(estimate.north) and math.isfinite(estimate.east)):
         return
-    shown.h_acc = math.sqrt(2.0) * estimate.std_m  # of the distance; std_m is of one coordinate
+    status.h_acc = math.sqrt(2.0) * estimate.std_m  # radial; std_m is per coordinate
     if origin is not None:
-        shown.geo = origin.world(estimate.north, estimate.east, 0.0)
+        status.geo = origin.to_geodetic(estimate.north, estimate.east, 0.0)
     if math.isfinite(estimate.course):
-        shown.course = estimate.course
+        status.course = estimate.course
         north, east = estimate.speed * math.cos(estimate.course), estimate.speed * math.sin(estimate.course)
-        shown.velocity = (north, east)
-    if place is not None:
-        shown.distance = float(np.linalg.norm(np.array([estimate.north, estimate.east, 0.0]) - place))
+        status.velocity = (north, east)
+    if position is not None:
+        status.distance = float(np.linalg.norm(np.array([estimate.north, estimate.east, 0.0]) - position))
 
 
-def line(estimate: Estimate | None) -> str:
-    """One line for the operator's picture."""
+def status_line(estimate: Estimate | None) -> str:
+    """The target's state, speed and position std as one line of text for the video overlay."""
     if estimate is None:
         return "no target"
     text = estimate.state.value
-    if math.isfinite(estimate.speed) and estimate.state is not State.LOST:
+    if math.isfinite(estimate.speed) and estimate.state is not TrackState.LOST:
         text += f"  {3.6 * estimate.speed:.0f} km/h  +-{estimate.std_m:.1f} m"
     return text

@@ -1,4 +1,4 @@
-"""The UAV agent: one thin loop between a camera, a MAVLink link, the estimator and the bus."""
+"""The UAV agent: connects a camera, a MAVLink link, the target estimator and the bus in one loop."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ import cv2
 import numpy as np
 from google.protobuf.message import Message
 
-from edge.agents.publish_queue import Outbox
-from edge.agents.target_report import line, show
-from edge.agents.thumbnails import WIDTH, picture_message
+from edge.agents.publish_queue import PublishQueue
+from edge.agents.target_report import status_line, update_tracking_status
+from edge.agents.thumbnails import THUMBNAIL_WIDTH, thumbnail_message
 from edge.devices.base import Device, Frame, Image
-from edge.mavlink.link.connection import Heard, Link
-from edge.mavlink.link.receiver import Ear
-from edge.mavlink.roles.camera import CameraComponent, Select, Stop
-from edge.mavlink.roles.guidance import Aim, Control
-from edge.mavlink.roles.vehicle import Sample, Vehicle
-from edge.uav.estimator import Follower, decoded
-from edge.uav.navigation import to_quaternion
-from edge.uav.timing.clock_alignment import Aligner, CameraHostClock
-from edge.uav.tracker import Box, Estimate, State, Telemetry
+from edge.mavlink.link.connection import Link, ReceivedMessage
+from edge.mavlink.link.receiver import Receiver
+from edge.mavlink.roles.camera import CameraComponent, SelectTarget, StopTracking
+from edge.mavlink.roles.guidance import Guidance, GuidanceTarget
+from edge.mavlink.roles.vehicle import MountSample, Vehicle
+from edge.uav.estimator import TargetEstimator, decode_image
+from edge.uav.navigation import quaternion_from_rotation
+from edge.uav.timing.clock_alignment import CameraHostClock, ClockAligner
+from edge.uav.tracker import Box, Estimate, Telemetry, TrackState
 from protocols.bus.base import Bus
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.version import VERSION
@@ -49,12 +49,12 @@ from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "uav"
 _READ_S = 0.02
-_OUTBOX = 2048
+_QUEUE_CAPACITY = 2048
 _INFO_S, _STATUS_S = 2.0, 1.0
-_SILENT_S = 2.0  # without a frame the agent is degraded
-_LINK_STALE_S = 1.5  # without the vehicle nothing is commanded
+_FRAME_TIMEOUT_S = 2.0  # without a frame the agent is degraded
+_LINK_STALE_S = 1.5  # without messages from the vehicle no command is sent
 _STEP_BACK_S = 0.2
-_UNTOLD_DELAY_S = 0.03  # std of what a frame and an attitude are late by, until the pictures have told
+_DELAY_STD_S = 0.03  # std of the unknown delays of frames and attitudes, until the offset is estimated from the images
 TOPICS = {
     topic.message: topic
     for topic in (FLIGHT_IMAGE, TELEMETRY, TARGET_COMMAND, TARGET, TARGET_CLOUD, ROAD_MAP, UAV_INFO, STATUS, PICTURE)
@@ -62,11 +62,12 @@ TOPICS = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Looking:
-    """The camera and how it works. lens, body_from_camera: None where not known.
+class UavSettings:
+    """The camera of a UAV agent and the settings of its estimator. lens, body_from_camera: None where not known.
 
-    jpeg_quality: of the pictures on the bus, which are then also what the tracker sees; None: none are sent.
-    pictures_hz, picture_width: small pictures a second while somebody wants them, and their width [px]; 0 = never.
+    size: (width, height) [px]. jpeg_quality: of the images published on the bus, which are then also the tracker's
+    input; None: no images are published. pictures_hz, picture_width: rate and width [px] of the thumbnails, which are
+    published only while somebody subscribes; a rate of 0 disables them.
     """
 
     size: tuple[int, int]
@@ -77,14 +78,14 @@ class Looking:
     model: str = "ground"
     jpeg_quality: int | None = None
     pictures_hz: float = 2.0
-    picture_width: int = WIDTH
+    picture_width: int = THUMBNAIL_WIDTH
 
 
 class UavAgent:
-    """One camera on one vehicle. Parts come in ready; ``run`` puts threads and the bus around ``step``.
+    """Tracks a target with the camera of one vehicle. ``step`` does the work; ``run`` adds threads and the bus.
 
-    component: makes the camera component once there is somebody to obey. shown: is told of every picture and estimate.
-    now_ns: the host's monotonic clock.
+    component: makes the camera component from the handler of operator commands. shown: called with every image, the
+    estimate and a line of text. now_ns: the host's monotonic clock.
     """
 
     def __init__(
@@ -92,32 +93,32 @@ class UavAgent:
         device: Device,
         link: Link,
         vehicle: Vehicle,
-        component: Callable[[Callable[[Select | Stop], bool]], CameraComponent],
-        control: Control,
+        component: Callable[[Callable[[SelectTarget | StopTracking], bool]], CameraComponent],
+        guidance: Guidance,
         agent: str,
-        looking: Looking,
+        settings: UavSettings,
         *,
         shown: Callable[[Image, Estimate | None, str], None] | None = None,
         now_ns: Callable[[], int] = time.monotonic_ns,
         boot_id: str | None = None,
     ) -> None:
-        self._device, self._link, self._vehicle, self._control = device, link, vehicle, control
-        self._agent, self._looking, self._shown, self._now_ns = agent, looking, shown, now_ns
+        self._device, self._link, self._vehicle, self._guidance = device, link, vehicle, guidance
+        self._agent, self._settings, self._show, self._now_ns = agent, settings, shown, now_ns
         self.boot_id = uuid.uuid4().hex if boot_id is None else boot_id
-        self.camera = component(self._obey)
-        self.follower = Follower(
+        self.camera = component(self._execute)
+        self.estimator = TargetEstimator(
             agent,
             self.boot_id,
-            looking.size,
-            looking.lens,
-            looking.body_from_camera,
-            fps=looking.fps,
-            seed=looking.seed,
-            model=looking.model,
+            settings.size,
+            settings.lens,
+            settings.body_from_camera,
+            fps=settings.fps,
+            seed=settings.seed,
+            model=settings.model,
         )
-        usable = looking.lens is not None and looking.body_from_camera is not None
+        usable = settings.lens is not None and settings.body_from_camera is not None
         self.aligner = (
-            Aligner(looking.size, looking.lens, looking.body_from_camera)  # type: ignore[arg-type]
+            ClockAligner(settings.size, settings.lens, settings.body_from_camera)  # type: ignore[arg-type]
             if usable
             else None
         )
@@ -126,16 +127,16 @@ class UavAgent:
         self._order = 0
         self._last_sample_s = -math.inf
         self._telemetry_ns = 0
-        self._seen_s = -math.inf
-        self._frame_s = -math.inf
+        self._last_visible_s = -math.inf
+        self._last_frame_s = -math.inf
         self._last_frame: int | None = None
         self._reboots = self._steps = 0
         self.counters: Counter[str] = Counter()
         self.latencies: deque[float] = deque(maxlen=900)
-        """From a frame's arrival to its status on the link [s]."""
+        """Latencies from a frame's arrival until its status was sent on the link [s]."""
 
     def run(self, bus: Bus, stop: threading.Event) -> None:
-        """Work until ``stop`` is set or the device has ended.
+        """Run until ``stop`` is set or the device has ended.
 
         Raises InputError where the device cannot be opened, BusDead where the bus has died.
         """
@@ -143,90 +144,94 @@ class UavAgent:
         try:
             with (
                 bus.announce(ROLE, self._agent, self.boot_id),
-                Outbox(bus, self._agent, TOPICS.values(), _OUTBOX) as outbox,
-                Ear(self._link) as ear,
+                PublishQueue(bus, self._agent, TOPICS.values(), _QUEUE_CAPACITY) as out_queue,
+                Receiver(self._link) as receiver,
             ):
-                self._publish = lambda message: outbox.put(TOPICS[message.DESCRIPTOR.name], message)
-                self._loop(stop, ear, outbox)
+                self._publish = lambda message: out_queue.put(TOPICS[message.DESCRIPTOR.name], message)
+                self._loop(stop, receiver, out_queue)
         finally:
             self._device.close()
             self._link.close()
 
-    def step(self, heard: list[Heard], frame: Frame | None) -> None:
-        """Take what came over the link, then a frame if there is one, and say what is due."""
+    def step(self, received: list[ReceivedMessage], frame: Frame | None) -> None:
+        """Process received messages, then a frame if there is one, and send what is due."""
         now = self._now_ns()
         self._vehicle.tick(now)
-        for message in heard:
+        for message in received:
             if message.system == self._link.vehicle:
                 for sample in self._vehicle.handle(message):
                     self._take_sample(sample)
             self.camera.handle(message, now / NANOSECONDS)
-        self._watch_clocks()
+        self._check_clock_resets()
         if frame is not None:
             self._take_frame(frame, now)
         now = self._now_ns()
         self.camera.tick(now / NANOSECONDS, frame=frame is not None)
-        if frame is not None and self.follower.following:
-            self.latencies.append((self._now_ns() - now_of(frame, self.camera_clock, now)) / NANOSECONDS)
-        self._steer(now)
+        if frame is not None and self.estimator.has_target:
+            self.latencies.append((self._now_ns() - earliest_arrival_ns(frame, self.camera_clock, now)) / NANOSECONDS)
+        self._send_guidance(now)
 
     def info(self) -> pb.UavInfo:
-        """What a replay has to know."""
-        looking = self._looking
+        """The message with the settings that a replay of the estimator needs."""
+        settings = self._settings
         message = pb.UavInfo(
             schema_version=SCHEMA_VERSION,
             agent=self._agent,
             boot_id=self.boot_id,
-            width=looking.size[0],
-            height=looking.size[1],
-            fps=looking.fps,
-            seed=looking.seed,
-            model=looking.model,
+            width=settings.size[0],
+            height=settings.size[1],
+            fps=settings.fps,
+            seed=settings.seed,
+            model=settings.model,
         )
-        if looking.lens is not None:
-            message.matrix.extend(looking.lens.matrix.ravel().tolist())
-            message.distortions.extend(looking.lens.distortions.tolist())
-            message.fisheye = looking.lens.fisheye
-        if looking.body_from_camera is not None:
-            message.body_from_camera.extend(np.asarray(looking.body_from_camera).ravel().tolist())
+        if settings.lens is not None:
+            message.matrix.extend(settings.lens.matrix.ravel().tolist())
+            message.distortions.extend(settings.lens.distortions.tolist())
+            message.fisheye = settings.lens.fisheye
+        if settings.body_from_camera is not None:
+            message.body_from_camera.extend(np.asarray(settings.body_from_camera).ravel().tolist())
         return message
 
     def status(self, sequence: int, ended: str = "", unpublished: int = 0) -> pb.AgentStatus:
-        """How it is."""
+        """The agent's status. ended: the reason if it is stopping. unpublished: messages dropped by the queue."""
         now_s = self._now_ns() / NANOSECONDS
         link, clock = self._link, self._vehicle.clock
         message = ended
         state = "stopping" if ended else "running"
-        silent, unheard = now_s - self._frame_s, (self._now_ns() - link.heard_ns) / NANOSECONDS
-        if not ended and silent > _SILENT_S:
-            state, message = "degraded", "no frame yet" if math.isinf(silent) else f"no frame for {silent:.0f} s"
+        frame_silent_s = now_s - self._last_frame_s
+        link_silent_s = (self._now_ns() - link.last_received_ns) / NANOSECONDS
+        if not ended and frame_silent_s > _FRAME_TIMEOUT_S:
+            state, message = (
+                "degraded",
+                "no frame yet" if math.isinf(frame_silent_s) else f"no frame for {frame_silent_s:.0f} s",
+            )
         elif not ended and link.vehicle is None:
             state = "degraded"
-            message = f"no vehicle heard: {link.problem}" if link.problem else "no vehicle heard yet"
-        elif not ended and unheard > _LINK_STALE_S:
-            state, message = "degraded", f"the vehicle is silent for {unheard:.0f} s {link.problem}".rstrip()
+            message = f"no heartbeat received: {link.problem}" if link.problem else "no heartbeat received yet"
+        elif not ended and link_silent_s > _LINK_STALE_S:
+            state, message = "degraded", f"the vehicle is silent for {link_silent_s:.0f} s {link.problem}".rstrip()
         elif not ended:
-            message = self._control.why or "commands are sent"
+            message = self._guidance.hold_reason or "commands are sent"
         counters: Counter[str] = Counter(self.counters)
         for prefix, part in (
             ("link", link.counters),
             ("camera", self.camera.counters),
-            ("sent", self._control.counters),
+            ("sent", self._guidance.counters),
         ):
             counters.update({f"{prefix}.{name}": count for name, count in part.items()})
         counters.update(
             {
                 "vehicle.reboots": clock.reboots,
                 "vehicle.clock_steps": clock.steps,
-                "target.refused": self.follower.refused,
-                "undecodable": self.follower.undecodable,
+                "target.refused": self.estimator.refused,
+                "undecodable": self.estimator.undecodable,
                 "unpublished": unpublished,
             }
         )
         gauges = {"time_std_s": min(clock.std_s, 1e6)}
-        if self.aligner is not None and self.aligner.found is not None:
-            gauges["time_offset_s"] = self.aligner.found.offset
-            gauges["time_offset_std_s"] = self.aligner.found.std
+        if self.aligner is not None and self.aligner.estimate is not None:
+            gauges["time_offset_s"] = self.aligner.estimate.offset
+            gauges["time_offset_std_s"] = self.aligner.estimate.std
         if self.latencies:
             gauges["latency_s"] = float(np.median(self.latencies))
             gauges["latency_p99_s"] = float(np.quantile(self.latencies, 0.99))
@@ -243,52 +248,57 @@ class UavAgent:
             version=VERSION,
         )
 
-    def _loop(self, stop: threading.Event, ear: Ear, outbox: Outbox) -> None:
-        sequence, looking = 0, self._looking
+    def _loop(self, stop: threading.Event, receiver: Receiver, out_queue: PublishQueue) -> None:
+        sequence, settings = 0, self._settings
         next_info = next_status = next_picture = -math.inf
         while not (stop.is_set() or self._device.ended):
             frame = self._device.read(_READ_S)
-            self.step(ear.drain(), frame)
+            self.step(receiver.drain(), frame)
             now = self._now_ns() / NANOSECONDS
-            if frame is not None and now >= next_picture and outbox.wants(PICTURE) and looking.pictures_hz > 0.0:
-                next_picture = now + 1.0 / looking.pictures_hz
-                self._publish(picture_message(frame, self._agent, self.boot_id, looking.picture_width))
+            if (
+                frame is not None
+                and now >= next_picture
+                and out_queue.has_subscriber(PICTURE)
+                and settings.pictures_hz > 0.0
+            ):
+                next_picture = now + 1.0 / settings.pictures_hz
+                self._publish(thumbnail_message(frame, self._agent, self.boot_id, settings.picture_width))
             if now >= next_info:
                 next_info = now + _INFO_S
                 self._publish(self.info())
             if now >= next_status:
                 next_status = now + _STATUS_S
-                self._publish(self.status(sequence, unpublished=outbox.lost.total()))
+                self._publish(self.status(sequence, unpublished=out_queue.unsent.total()))
                 sequence += 1
         ended = "the recording has ended" if self._device.ended and not stop.is_set() else "stopped"
-        self._publish(self.status(sequence, ended, outbox.lost.total()))
+        self._publish(self.status(sequence, ended, out_queue.unsent.total()))
 
-    def _take_sample(self, sample: Sample) -> None:
+    def _take_sample(self, sample: MountSample) -> None:
         camera_ns = self.camera_clock.camera_ns(sample.host_ns)
         self.counters["telemetry"] += 1
         if camera_ns is None:
-            return  # without a picture yet there is no clock to put it on
+            return  # before the first frame there is no camera clock to map to
         time_s = camera_ns / NANOSECONDS
         offset = 0.0
         if self.aligner is not None:
             self.aligner.handle_sample(Telemetry(time_s, sample.ned_from_mount, sample.position))
             offset = self.aligner.offset_s
-        # Said by the vehicle at t is true of the camera's t - offset.
+        # A sample received at camera time t was measured at t - offset.
         mapped = camera_ns - round(offset * NANOSECONDS)
         if mapped <= self._telemetry_ns and self._telemetry_ns - mapped < _STEP_BACK_S * NANOSECONDS:
             self.counters["telemetry.out_of_order"] += 1
             return
         self._telemetry_ns = mapped
         self._last_sample_s = self._now_ns() / NANOSECONDS
-        std = math.hypot(sample.std_s, _UNTOLD_DELAY_S)
-        if self.aligner is not None and self.aligner.found is not None:
-            std = self.aligner.found.std
+        std = math.hypot(sample.std_s, _DELAY_STD_S)
+        if self.aligner is not None and self.aligner.estimate is not None:
+            std = self.aligner.estimate.std
         message = pb.VehicleTelemetry(
-            **self._head(),
+            **self._message_header(),
             device_time_ns=mapped,
             vehicle_time_ns=sample.vehicle_ns,
             time_std_s=std if math.isfinite(std) else 1e3,
-            ned_from_body=to_quaternion(sample.ned_from_mount),
+            ned_from_body=quaternion_from_rotation(sample.ned_from_mount),
         )
         if sample.position is not None:
             message.position.extend(sample.position.tolist())
@@ -296,7 +306,7 @@ class UavAgent:
         if origin is not None:
             message.origin.extend((origin.latitude, origin.longitude, float(np.clip(origin.altitude, -1e4, 1e5))))
         self._publish(message)
-        self.follower.handle(message)
+        self.estimator.handle(message)
 
     def _take_frame(self, frame: Frame, now: int) -> None:
         self.camera_clock.handle_frame(frame.device_time_ns, now)
@@ -304,14 +314,14 @@ class UavAgent:
         if self._last_frame is not None and frame.frame > self._last_frame + 1:
             self.counters["dropped"] += frame.frame - self._last_frame - 1
         self._last_frame = frame.frame
-        self._frame_s = now / NANOSECONDS
+        self._last_frame_s = now / NANOSECONDS
         image: Image | None = frame.image
-        quality = self._looking.jpeg_quality
+        quality = self._settings.jpeg_quality
         if quality is not None:
             _, data = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, quality])
             height, width = frame.image.shape[:2]
             message = pb.FlightImage(
-                **self._head(),
+                **self._message_header(),
                 frame=frame.frame,
                 device_time_ns=frame.device_time_ns,
                 width=width,
@@ -319,93 +329,100 @@ class UavAgent:
                 jpeg=data.tobytes(),
             )
             self._publish(message)
-            image = decoded(message)
-        for out in self.follower.handle_frame(image, frame.frame, frame.device_time_ns):
+            image = decode_image(message)
+        for out in self.estimator.handle_frame(image, frame.frame, frame.device_time_ns):
             self._publish(out)
-        self._update_shown()
+        self._update_tracking_status()
         if self.aligner is not None:
-            self.aligner.handle_frame(image, frame.device_time_ns / NANOSECONDS, self.follower.following)
-        if self._shown is not None:
-            self._shown(frame.image, self.follower.estimate, line(self.follower.estimate))
+            self.aligner.handle_frame(image, frame.device_time_ns / NANOSECONDS, self.estimator.has_target)
+        if self._show is not None:
+            self._show(frame.image, self.estimator.estimate, status_line(self.estimator.estimate))
 
-    def _obey(self, order: Select | Stop) -> bool:
-        """What the operator asks for; whether it could be done."""
-        width, height = self._looking.size
-        message = pb.TargetCommand(**self._head(), kind="stop", by=order.by)
-        if isinstance(order, Select):
+    def _execute(self, command: SelectTarget | StopTracking) -> bool:
+        """Execute an operator's command; whether the estimator accepted it."""
+        width, height = self._settings.size
+        message = pb.TargetCommand(**self._message_header(), kind="stop", by=command.by)
+        if isinstance(command, SelectTarget):
             message.kind = "select"
-            x, y = order.left * width - 0.5, order.top * height - 0.5
-            box = Box(x, y, (order.right - order.left) * width, (order.bottom - order.top) * height)
-            if order.is_point:
-                box = self.follower.box_about(x, y)
+            x, y = command.left * width - 0.5, command.top * height - 0.5
+            box = Box(x, y, (command.right - command.left) * width, (command.bottom - command.top) * height)
+            if command.is_point:
+                box = self.estimator.box_around(x, y)
             message.box.extend((box.x, box.y, box.width, box.height))
-        refused = self.follower.refused
+        refused = self.estimator.refused
         self._publish(message)
-        for out in self.follower.handle(message):
+        for out in self.estimator.handle(message):
             self._publish(out)
-        good = self.follower.refused == refused
-        if isinstance(order, Stop):
-            self._control.hold("stopped by the operator")
-        elif good:
-            self._control.begin(self._vehicle.position)
-            self._seen_s = self._now_ns() / NANOSECONDS
-        self._update_shown()
-        return good
+        accepted = self.estimator.refused == refused
+        if isinstance(command, StopTracking):
+            self._guidance.hold("stopped by the operator")
+        elif accepted:
+            self._guidance.begin(self._vehicle.position)
+            self._last_visible_s = self._now_ns() / NANOSECONDS
+        self._update_tracking_status()
+        return accepted
 
-    def _watch_clocks(self) -> None:
-        """A clock that began anew makes what was compared worthless."""
+    def _check_clock_resets(self) -> None:
+        """Reset the time alignment when the vehicle's or the camera's clock was reset or stepped."""
         clock = self._vehicle.clock
         if (clock.reboots, clock.steps + self.camera_clock.steps) != (self._reboots, self._steps):
             self._reboots, self._steps = clock.reboots, clock.steps + self.camera_clock.steps
             self._telemetry_ns = 0
             if self.aligner is not None:
-                self.aligner.clear()
+                self.aligner.reset()
 
-    def _steer(self, now: int) -> None:
-        """Send what may be sent; see ``Control``."""
+    def _send_guidance(self, now: int) -> None:
+        """Send gimbal and follow commands, or hold them with a reason; see ``Guidance``."""
         now_s = now / NANOSECONDS
-        estimate, vehicle = self.follower.estimate, self._vehicle
+        estimate, vehicle = self.estimator.estimate, self._vehicle
         if estimate is None:
-            if self._control.why != "stopped by the operator":
-                self._control.hold("no target")
+            if self._guidance.hold_reason != "stopped by the operator":
+                self._guidance.hold("no target")
             return
-        if estimate.state is State.VISIBLE:
-            self._seen_s = now_s
-        place, velocity = vehicle.position, vehicle.velocity
-        if estimate.state is State.LOST:
-            self._control.hold("the target is lost")
-        elif now - self._link.heard_ns > _LINK_STALE_S * NANOSECONDS or now_s - self._last_sample_s > _LINK_STALE_S:
-            self._control.hold("the link is stale")
-        elif now_s - self._frame_s > _SILENT_S:
-            self._control.hold("no frames")
-        elif place is None or velocity is None or not (math.isfinite(estimate.north) and math.isfinite(estimate.std_m)):
-            self._control.hold("no metric ground")
+        if estimate.state is TrackState.VISIBLE:
+            self._last_visible_s = now_s
+        position, velocity = vehicle.position, vehicle.velocity
+        if estimate.state is TrackState.LOST:
+            self._guidance.hold("the target is lost")
+        elif (
+            now - self._link.last_received_ns > _LINK_STALE_S * NANOSECONDS
+            or now_s - self._last_sample_s > _LINK_STALE_S
+        ):
+            self._guidance.hold("the link is stale")
+        elif now_s - self._last_frame_s > _FRAME_TIMEOUT_S:
+            self._guidance.hold("no frames")
+        elif (
+            position is None
+            or velocity is None
+            or not (math.isfinite(estimate.north) and math.isfinite(estimate.std_m))
+        ):
+            self._guidance.hold("no metric ground")
         else:
             speed = estimate.speed if math.isfinite(estimate.speed) and math.isfinite(estimate.course) else 0.0
             course = estimate.course if math.isfinite(estimate.course) else 0.0
-            aim = Aim(
-                self._frame_s,
+            target = GuidanceTarget(
+                self._last_frame_s,
                 np.array([estimate.north, estimate.east]),
                 speed * np.array([math.cos(course), math.sin(course)]),
                 estimate.std_m,
-                now_s - self._seen_s,
+                now_s - self._last_visible_s,
             )
-            self._control.tick(now_s, aim, place, velocity, vehicle.origin)
+            self._guidance.tick(now_s, target, position, velocity, vehicle.origin)
 
-    def _update_shown(self) -> None:
-        """What the camera component tells."""
+    def _update_tracking_status(self) -> None:
+        """Update the status that the camera component reports."""
         vehicle = self._vehicle
         boot_ns = self._now_ns() + vehicle.clock.offset_ns if vehicle.clock.known else 0
-        self.camera.shown.boot_ms = (boot_ns // 1_000_000) & 0xFFFFFFFF
-        show(self.camera.shown, self.follower.estimate, vehicle, self._looking.size)
+        self.camera.status.boot_ms = (boot_ns // 1_000_000) & 0xFFFFFFFF
+        update_tracking_status(self.camera.status, self.estimator.estimate, vehicle, self._settings.size)
 
-    def _head(self) -> dict[str, Any]:
-        """What every input message begins with; counts the inputs."""
+    def _message_header(self) -> dict[str, Any]:
+        """The common fields of all input messages; ``order`` numbers the inputs for replay."""
         order, self._order = self._order, self._order + 1
         return {"schema_version": SCHEMA_VERSION, "agent": self._agent, "boot_id": self.boot_id, "order": order}
 
 
-def now_of(frame: Frame, clock: CameraHostClock, fallback: int) -> int:
-    """The host's time at which a frame could first have been had [ns]: its stamp and the least delay."""
+def earliest_arrival_ns(frame: Frame, clock: CameraHostClock, fallback: int) -> int:
+    """Host time [ns] at which a frame could have arrived at the earliest: its stamp plus the minimum delay."""
     camera = clock.camera_ns(0)
     return fallback if camera is None else frame.device_time_ns - camera

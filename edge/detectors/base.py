@@ -1,4 +1,4 @@
-"""What every detector gives: where it saw something, how large, and how sure it is."""
+"""Detections, predictions of targets in the image, and the protocol that every detector implements."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ import numpy.typing as npt
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """One thing in one picture.
+    """One detected object in one image.
 
-    u, v: its centre, distorted pixels, (0, 0) = centre of the top-left pixel. size: diameter or height [px],
-    0 = not measured. score: 0..1. label: which moving point. colour: mean sRGB (red, green, blue) 0..255.
-    covariance: (uu, uv, vv) [px²] of (u, v); None = not known. kind: what it is, "" = not told.
+    u, v: its centre in distorted pixels, (0, 0) = centre of the top-left pixel. size: diameter or height [px], 0 = not
+    measured. score: 0..1. label: which moving point it belongs to. colour: mean sRGB (red, green, blue) 0..255.
+    covariance: (uu, uv, vv) [px²] of (u, v); None = not known. kind: class of the object, "" = not given.
+
     Of a person: (u, v) is the representative point (the maximum of the silhouette's distance transform), size the
-    distance from head, the (u, v) of the head's top, to foot, that of the foot point; None = not seen. colour: the
-    torso's. box: (x, y, width, height) [px] of what is seen of it, x and y of the top left.
-    target: id of the track it was matched to, "" = unmatched.
+    distance from head to foot, head the (u, v) of the top of the head, foot that of the foot point; None = not visible.
+    colour: the torso's. box: (x, y, width, height) [px] of the visible part, x and y of the top left. target: id of the
+    track that it was matched to, "" = unmatched.
     """
 
     u: float
@@ -39,10 +40,10 @@ class Detection:
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Where the tracking expects one of its targets in a camera's next picture.
+    """A target's predicted measurement in a camera's next image.
 
-    u, v: of the representative point [px]; covariance: (uu, uv, vv) [px²]. target: the track's id.
-    size: head to foot [px], 0 = not told. colour: of the torso, sRGB 0..255; None = not told.
+    u, v: predicted representative point [px]. covariance: (uu, uv, vv) [px²] of it. target: id of the track. size:
+    predicted distance from head to foot [px], 0 = not known. colour: of the torso, sRGB 0..255; None = not known.
     """
 
     u: float
@@ -54,16 +55,17 @@ class Prediction:
 
 
 class Detector(Protocol):
-    """Finds things in a camera's pictures, which are handed in one after the other.
+    """Detects objects in the images of one camera, which are passed one after the other.
 
-    One for a marker keeps no state; one of what moves before a background learns that background.
+    Detectors of light spots and tags keep no state. The ball detector remembers the background behind the ball;
+    detectors of people and vehicles learn a background model and track from image to image.
     """
 
     def detect(
         self, image: npt.NDArray[np.uint8], time_s: float | None = None, predictions: Sequence[Prediction] = ()
     ) -> list[Detection]:
-        """Detections in an image (H, W, 3) uint8 BGR, best first; empty where there is none.
+        """Detections in an image (H, W, 3) uint8 BGR, best first; empty where there are none.
 
-        time_s: of the picture, on the camera's clock; None = one frame after the last.
-        predictions: what is expected in it; only detectors of people and vehicles use them.
+        time_s: time of the image [s] on the camera's clock; None = one frame period after the last one. predictions: of
+        targets in this image; only detectors of people and vehicles use them.
         """

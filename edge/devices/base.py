@@ -1,4 +1,4 @@
-"""What every camera driver is to the rest: opened, asked for frames, closed."""
+"""The interface of all camera drivers: ``Device``, its frames and its description."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ Image: TypeAlias = npt.NDArray[np.uint8]
 """(H, W, 3) uint8, channels in OpenCV's order: blue, green, red."""
 
 ClockKind = Literal["device", "monotonic", "unix", "stream"]
-"""What a device time is read from: the camera's own oscillator, the host's uptime, the host's Unix time,
+"""The clock of the device times: the camera's own oscillator, the host's monotonic clock, the host's Unix time,
 or the time stamps inside a file or stream."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One picture and when it was taken.
+    """One image and its time stamp.
 
     image: (H, W, 3) uint8 BGR; the reader may keep it, the driver does not write to it again.
     device_time_ns: mid-exposure of the middle row, on the device's own clock of arbitrary epoch.
-    frame: the device's frame number; a gap is a dropped frame.
+    frame: the device's frame number; a gap means dropped frames.
     exposure_ns: 0 = not known.
-    found: what the device itself detected in it; None = it does not look.
+    detections: those of a network on the device itself; None = the device does not detect.
     """
 
     image: Image
     device_time_ns: int
     frame: int
     exposure_ns: int = 0
-    found: tuple[Detection, ...] | None = None
+    detections: tuple[Detection, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """What a driver can say of its camera once it is open.
+    """Description of an open camera.
 
     width, height: image size [px]. fps: nominal, 0 = not known. driver: its name.
-    clock: what the device times are read from. intrinsics: None = uncalibrated.
+    clock: the clock of the device times. intrinsics: None = uncalibrated.
     readout_s: first to last row; 0 = global shutter or not known.
-    unknown: what this driver cannot tell, in words for a person ("exposure", "time of capture").
+    unknown: quantities that this driver cannot provide, as text ("exposure", "time of capture").
     """
 
     width: int
@@ -59,7 +59,7 @@ class DeviceInfo:
 
 
 class Device(Protocol):
-    """A source of frames. One thread uses it."""
+    """A source of frames, used by one thread at a time."""
 
     @property
     def info(self) -> DeviceInfo:
@@ -67,42 +67,42 @@ class Device(Protocol):
 
     @property
     def ended(self) -> bool:
-        """True once no frame will ever come again: the end of a recording, or the camera is gone."""
+        """True once no further frame will come: the end of a recording, or a camera lost for good."""
 
     def open(self) -> None:
         """Start delivering. Raises InputError where the source cannot be opened."""
 
     def read(self, timeout_s: float) -> Frame | None:
-        """The next frame; None where none came within ``timeout_s`` or the source has ended."""
+        """The next frame; None if none came within ``timeout_s`` or the source has ended."""
 
     def close(self) -> None:
         """Release the source; may be called twice."""
 
 
 @runtime_checkable
-class Returning(Protocol):
-    """What a device that comes back by itself after it was unplugged can say besides."""
+class Reconnecting(Protocol):
+    """Additional properties of a device that reconnects by itself after it was unplugged."""
 
     @property
-    def away(self) -> bool:
-        """Whether it is gone, and is tried again with every ``read``."""
+    def disconnected(self) -> bool:
+        """Whether the connection is lost; every ``read`` then tries to reconnect."""
 
     @property
     def reconnections(self) -> int:
-        """How often it came back."""
+        """Number of successful reconnections."""
 
 
 @runtime_checkable
-class Warm(Protocol):
-    """What a device that measures its own heat can say besides."""
+class HasTemperature(Protocol):
+    """Additional property of a device with a temperature sensor."""
 
     @property
     def temperature(self) -> float | None:
-        """[°C]; None where it does not tell."""
+        """[°C]; None where it is not available."""
 
 
 def check_size(intrinsics: Intrinsics | None, width: int, height: int, what: str) -> None:
-    """Raise InputError where intrinsics are for another image size than the source ``what`` has."""
+    """Raise InputError if the intrinsics are for another image size than that of the source ``what``."""
     if intrinsics is not None and (intrinsics.width, intrinsics.height) != (width, height):
         raise InputError(
             f"{what} is {width}x{height}, its intrinsics are for {intrinsics.width}x{intrinsics.height}",

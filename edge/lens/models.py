@@ -1,10 +1,9 @@
-"""What data sheets say of lenses: the field of view of common cameras, as a start where there is no board.
+"""Fields of view of common cameras from their data sheets, as nominal intrinsics where no board is available.
 
-For the full sensor or the mode named, without stabilisation (which crops: film with it off). ``across``: degrees
-across the longer side of the picture at 16:9 unless the maker tells another. What a unit really has differs by focus,
-crop and version: the stated std is wide on purpose, and the focal length is then found from the marker's path.
-Where no source stands beside a row, it is what the maker is known to advertise and was not looked up again: its std
-is 0.12 or more.
+For the full sensor or the mode named, without stabilisation (which crops: record with it off). ``field_of_view_deg``:
+across the longer side of the image at 16:9 unless the maker states another. A particular unit differs by focus, crop
+and version: the stated std is wide on purpose, and the focal length is then estimated from the marker's motion.
+Rows without a source give what the maker is known to advertise and were not looked up again: their std is 0.12 or more.
 """
 
 from __future__ import annotations
@@ -21,17 +20,17 @@ from protocols.core.errors import InputError
 class LensModel:
     """One camera or one of its modes.
 
-    across: degrees. diagonal: whether the maker tells those of the diagonal. std: relative, of the focal length.
+    field_of_view_deg: degrees. diagonal: whether it is stated for the diagonal. std: relative, of the focal length.
     """
 
     name: str
-    across: float
+    field_of_view_deg: float
     diagonal: bool = False
     fisheye: bool = False
     std: float = 0.08
 
 
-# across or, where True, diagonal; fisheye
+# name, field of view, diagonal, fisheye, std
 _TABLE: tuple[tuple[str, float, bool, bool, float], ...] = (
     # Wide: one unit of a HERO3 was measured at 114 (equidistant) to 121 degrees by its owner, R. Cunniff, in 2012.
     ("gopro-wide", 118.0, False, True, 0.10),
@@ -39,8 +38,8 @@ _TABLE: tuple[tuple[str, float, bool, bool, float], ...] = (
     ("gopro-narrow", 67.0, False, False, 0.15),
     ("gopro-superview", 121.0, False, True, 0.15),
     ("dji-action-wide", 155.0, True, True, 0.15),
-    # Phones tell the focal length that has the same diagonal on film: 24 to 28 mm, 72 to 63 degrees across; video is
-    # cropped a little more.
+    # Phone makers state the focal length that has the same diagonal on 35 mm film: 24 to 28 mm, 72 to 63 degrees
+    # across; video is cropped a little more.
     ("iphone-main", 65.0, False, False, 0.12),
     ("iphone-ultrawide", 120.0, True, False, 0.15),
     ("pixel-main", 82.0, True, False, 0.12),
@@ -76,26 +75,26 @@ _TABLE: tuple[tuple[str, float, bool, bool, float], ...] = (
     ("raspberry-pi-camera-3", 66.0, False, False, 0.06),
     ("raspberry-pi-camera-3-wide", 102.0, False, False, 0.08),
 )
-MODELS = {row[0]: LensModel(*row) for row in _TABLE}
-UNKNOWN_STD = 0.1
-"""Relative std of a focal length from a field of view that somebody told."""
+LENS_MODELS = {row[0]: LensModel(*row) for row in _TABLE}
+FIELD_OF_VIEW_STD = 0.1
+"""Relative std of a focal length from a field of view given by the user."""
 
 
-def find_model(name: str) -> LensModel:
-    """The model of this name, however it is written. Raises InputError."""
+def find_lens_model(name: str) -> LensModel:
+    """The model of this name, in any spelling. Raises InputError."""
     wanted = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
-    if wanted in MODELS:
-        return MODELS[wanted]
-    close = difflib.get_close_matches(wanted, MODELS, 3, 0.5)
-    remedy = f"did you mean {', '.join(close)}?" if close else f"one of {', '.join(MODELS)}"
+    if wanted in LENS_MODELS:
+        return LENS_MODELS[wanted]
+    close = difflib.get_close_matches(wanted, LENS_MODELS, 3, 0.5)
+    remedy = f"did you mean {', '.join(close)}?" if close else f"one of {', '.join(LENS_MODELS)}"
     raise InputError(f"no camera {name!r} is known", remedy=f"{remedy}; or give --field-of-view from its data sheet")
 
 
-def angle_across(model: LensModel, size: tuple[int, int]) -> float:
-    """Degrees across the width of a picture (width, height): of a portrait picture its shorter side."""
+def horizontal_field_of_view(model: LensModel, size: tuple[int, int]) -> float:
+    """Horizontal field of view [degrees] of an image of ``size`` (width, height); in portrait the shorter side's."""
     width, height = size
-    half = math.radians(0.5 * model.across)
-    told = math.hypot(width, height) if model.diagonal else max(width, height)
-    if model.fisheye:  # equidistant: angles go with pixels
-        return math.degrees(2.0 * half * width / told)
-    return math.degrees(2.0 * math.atan(math.tan(half) * width / told))
+    half = math.radians(0.5 * model.field_of_view_deg)
+    reference_px = math.hypot(width, height) if model.diagonal else max(width, height)
+    if model.fisheye:  # equidistant: angles are proportional to pixels
+        return math.degrees(2.0 * half * width / reference_px)
+    return math.degrees(2.0 * math.atan(math.tan(half) * width / reference_px))

@@ -1,1 +1,1 @@
-"""The only place that speaks MAVLink bytes: links, signing, and what a camera, an autopilot and a station say."""
+"""MAVLink: the link (transports, framing, signing) and the roles of camera, autopilot and ground station."""

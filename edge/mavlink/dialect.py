@@ -1,4 +1,4 @@
-"""The dialect, chosen before pymavlink is loaded: without these it would speak MAVLink 1."""
+"""The MAVLink dialect. The environment is set before pymavlink is loaded, which would otherwise use MAVLink 1."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ except ImportError:
     ) from None
 
 mavlink: Any = _common
-"""pymavlink's module of the common dialect: one class a message, one constant an enumeration's entry."""
+"""pymavlink's module of the common dialect: one class per message, one constant per enumeration entry."""
 
 AUTOPILOT = 1
 """Component id of an autopilot."""

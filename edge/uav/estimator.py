@@ -1,7 +1,7 @@
-"""The UAV agent's estimator: pictures, telemetry and the operator's orders in, what is known of the target out.
+"""The UAV agent's target estimator: images, telemetry and operator commands in, target state messages out.
 
-Messages in, messages out, no clock and no link: live, the agent feeds it; a replay feeds it from a log, in the same
-order, and gets the same bytes.
+It has no clock and no connection: live, the agent feeds it; a replay feeds it from a log in the same order and gets the
+same bytes.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from google.protobuf.message import Message
 
 from edge.uav import models
 from edge.uav.georeference import Georeference
-from edge.uav.navigation import Origin, from_quaternion
-from edge.uav.tracker import Box, Estimate, Image, State, Telemetry, Tracker
+from edge.uav.navigation import Origin, rotation_from_quaternion
+from edge.uav.tracker import Box, Estimate, Image, Telemetry, Tracker, TrackState
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
@@ -26,19 +26,20 @@ from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.validation.codec import SCHEMA_VERSION
 
-_REMEMBERED = 200  # samples of telemetry from before a target is chosen
-_CLOUD_EVERY, _ROAD_EVERY = 6, 15  # frames
-_CLOUD_POINTS, _ROAD_POINTS = 100, 600
-_FARTHEST_PX = 1e6
-_CAR_M = 5.5  # side of the box that a point stands for, where the ground's scale is known
-_POINT_PX = 40.0
+_TELEMETRY_BUFFER = 200  # telemetry samples kept from before a target is selected
+_PARTICLES_EVERY, _ROAD_EVERY = 6, 15  # frames
+_MAX_PARTICLES, _MAX_ROAD_POINTS = 100, 600
+_MAX_PIXEL = 1e6
+_DEFAULT_BOX_M = 5.5  # side of the box placed around a selected point where the height above ground is known
+_DEFAULT_BOX_PX = 40.0
 
 
-class Follower:
-    """One agent's. size: (width, height) [px]. seed: of every tracker's random numbers; the n-th target's is seed + n.
+class TargetEstimator:
+    """The estimator of one agent. size: (width, height) [px]. seed: of the trackers' random numbers.
 
-    model: one of ``models.NAMES``. lens, body_from_camera: as far as known; where the camera hangs on a gimbal, body
-    is the gimbal. estimate: the newest; None while nothing is followed. counters: what was refused.
+    The n-th target's tracker uses seed + n. model: one of ``models.NAMES``. lens, body_from_camera: as far as known;
+    where the camera hangs on a gimbal, body is the gimbal. estimate: the newest; None while no target is tracked.
+    refused, undecodable: counts of rejected commands and of images that could not be decoded.
     """
 
     def __init__(
@@ -56,9 +57,9 @@ class Follower:
         self._agent, self._boot = agent, boot_id
         self._size, self._fps, self._seed, self._model = size, fps, seed, model
         self._lens, self._mounting = lens, body_from_camera
-        usable = lens is not None and body_from_camera is not None
-        self._georeference = Georeference(lens, body_from_camera) if usable else None  # type: ignore[arg-type]
-        self._samples: deque[Telemetry] = deque(maxlen=_REMEMBERED)
+        calibrated = lens is not None and body_from_camera is not None
+        self._georeference = Georeference(lens, body_from_camera) if calibrated else None  # type: ignore[arg-type]
+        self._samples: deque[Telemetry] = deque(maxlen=_TELEMETRY_BUFFER)
         self._tracker: Tracker | None = None
         self._image: Image | None = None
         self._frame, self._time_ns = 0, 0
@@ -70,57 +71,59 @@ class Follower:
         self.undecodable = 0
 
     @property
-    def following(self) -> bool:
-        """Whether there is a target."""
+    def has_target(self) -> bool:
+        """Whether a target is tracked."""
         return self._tracker is not None
 
     def handle(self, message: Message) -> list[Message]:
-        """Take one input message; what is to be published because of it."""
+        """Process one input message; returns the messages to publish."""
         if isinstance(message, pb.FlightImage):
-            return self.handle_frame(decoded(message), message.frame, message.device_time_ns)
+            return self.handle_frame(decode_image(message), message.frame, message.device_time_ns)
         if isinstance(message, pb.VehicleTelemetry):
-            self._take_sample(message)
+            self._handle_telemetry(message)
         elif isinstance(message, pb.TargetCommand):
-            return self._obey(message)
+            return self._handle_command(message)
         return []
 
     def handle_frame(self, image: Image | None, frame: int, device_time_ns: int) -> list[Message]:
-        """Take a picture; None: one that could not be decoded."""
+        """Process one image; None for one that could not be decoded."""
         if image is None or image.shape[:2] != (self._size[1], self._size[0]):
             image = None
             self.undecodable += 1
         self._image, self._frame, self._time_ns = image, frame, device_time_ns
         if self._tracker is None:
             return []
-        self.estimate = self._in_vehicles_frame(self._tracker.handle_frame(image, device_time_ns / NANOSECONDS))
-        return self._say()
+        self.estimate = self._in_vehicle_frame(self._tracker.handle_frame(image, device_time_ns / NANOSECONDS))
+        return self._target_messages()
 
-    def box_about(self, x: float, y: float) -> Box:
-        """The box that a point (x, y) [px] stands for: a car's size, where the height above the ground is known."""
-        side = _POINT_PX
+    def box_around(self, x: float, y: float) -> Box:
+        """The box for a selected point (x, y) [px]: the size of a car where the height above ground is known."""
+        side = _DEFAULT_BOX_PX
         sample = self._samples[-1] if self._samples else None
         if sample is not None and sample.position is not None and self._lens is not None and self._mounting is not None:
             ray = np.append(self._lens.unproject(np.array([[x, y]]))[0], 1.0)
             down = float((sample.ned_from_body @ self._mounting @ ray)[2])
             if np.isfinite(down) and down > 1e-3 and sample.position[2] < -2.0:
-                side = float(np.clip(_CAR_M * self._lens.focal * down / -sample.position[2], 8.0, 0.5 * self._size[1]))
+                side = float(
+                    np.clip(_DEFAULT_BOX_M * self._lens.focal * down / -sample.position[2], 8.0, 0.5 * self._size[1])
+                )
         return Box(x - 0.5 * side, y - 0.5 * side, side, side)
 
-    def _take_sample(self, message: pb.VehicleTelemetry) -> None:
-        turned = from_quaternion(list(message.ned_from_body))
-        if turned is None:
+    def _handle_telemetry(self, message: pb.VehicleTelemetry) -> None:
+        rotation = rotation_from_quaternion(list(message.ned_from_body))
+        if rotation is None:
             return
         position = np.array(message.position) if message.position else None
         if message.origin:
             self.origin = Origin(*message.origin)
-        sample = Telemetry(message.device_time_ns / NANOSECONDS, turned, position)
+        sample = Telemetry(message.device_time_ns / NANOSECONDS, rotation, position)
         self._samples.append(sample)
         if self._georeference is not None:
             self._georeference.add(sample)
         if self._tracker is not None:
             self._tracker.handle_telemetry(sample)
 
-    def _obey(self, message: pb.TargetCommand) -> list[Message]:
+    def _handle_command(self, message: pb.TargetCommand) -> list[Message]:
         if message.kind == "stop":
             self._tracker = self.estimate = None
             return []
@@ -133,34 +136,36 @@ class Follower:
         try:
             estimate = tracker.begin(self._image, self._time_ns / NANOSECONDS, Box(*message.box))
         except InputError:
-            self.refused += 1  # what was followed goes on being followed
+            self.refused += 1  # the previous target stays tracked
             return []
         self._targets += 1
         if self._georeference is not None:
-            self._georeference.clear()
-        self._tracker, self.estimate = tracker, self._in_vehicles_frame(estimate)
-        return self._say()
+            self._georeference.reset()
+        self._tracker, self.estimate = tracker, self._in_vehicle_frame(estimate)
+        return self._target_messages()
 
-    def _in_vehicles_frame(self, estimate: Estimate) -> Estimate:
+    def _in_vehicle_frame(self, estimate: Estimate) -> Estimate:
         if self._georeference is None:
             return estimate
         return self._georeference.corrected(estimate, self._time_ns / NANOSECONDS)
 
-    def _say(self) -> list[Message]:
+    def _target_messages(self) -> list[Message]:
         estimate = self.estimate
         assert estimate is not None
-        out: list[Message] = [self._state(estimate)]
-        if self._sequence % _CLOUD_EVERY == 0 and estimate.particles is not None:
-            pixels = _near(estimate.particles)
+        out: list[Message] = [self._state_message(estimate)]
+        if self._sequence % _PARTICLES_EVERY == 0 and estimate.particles is not None:
+            pixels = _finite_pixels(estimate.particles)
             out.append(
-                pb.TargetCloud(**self._head(), particles=len(pixels), pixels=_thinned(pixels, _CLOUD_POINTS).ravel())
+                pb.TargetCloud(
+                    **self._header(), particles=len(pixels), pixels=_subsampled(pixels, _MAX_PARTICLES).ravel()
+                )
             )
         if self._sequence % _ROAD_EVERY == 0:
-            out.append(self._road(estimate))
+            out.append(self._road_message(estimate))
         self._sequence += 1
         return out
 
-    def _head(self) -> dict[str, Any]:
+    def _header(self) -> dict[str, Any]:
         return {
             "schema_version": SCHEMA_VERSION,
             "agent": self._agent,
@@ -170,36 +175,36 @@ class Follower:
             "device_time_ns": self._time_ns,
         }
 
-    def _state(self, e: Estimate) -> pb.TargetState:
-        message = pb.TargetState(**self._head(), state=e.state.value)
-        if e.state is not State.LOST:
-            message.centre.extend((_bounded(e.x), _bounded(e.y)))
-            message.std_px = min(e.std, _FARTHEST_PX) if math.isfinite(e.std) else 0.0
+    def _state_message(self, e: Estimate) -> pb.TargetState:
+        message = pb.TargetState(**self._header(), state=e.state.value)
+        if e.state is not TrackState.LOST:
+            message.centre.extend((_clipped(e.x), _clipped(e.y)))
+            message.std_px = min(e.std, _MAX_PIXEL) if math.isfinite(e.std) else 0.0
         if math.isfinite(e.width) and math.isfinite(e.height):
-            message.size.extend((_bounded(e.width), _bounded(e.height)))
+            message.size.extend((_clipped(e.width), _clipped(e.height)))
         if math.isfinite(e.heading):
             message.heading.append(e.heading)
-        if e.state is not State.LOST and math.isfinite(e.north) and math.isfinite(e.east):
+        if e.state is not TrackState.LOST and math.isfinite(e.north) and math.isfinite(e.east):
             message.ground.extend((e.north, e.east))
             message.std_m = e.std_m if math.isfinite(e.std_m) else 0.0
             if math.isfinite(e.speed) and math.isfinite(e.course):
                 message.velocity.extend((e.speed * math.cos(e.course), e.speed * math.sin(e.course)))
             if self.origin is not None:
-                message.geo.extend(float(part) for part in self.origin.world(e.north, e.east, 0.0))
+                message.geo.extend(float(part) for part in self.origin.to_geodetic(e.north, e.east, 0.0))
         for hypothesis in e.hypotheses:
             if math.isfinite(hypothesis.x) and math.isfinite(hypothesis.y):
-                message.hypotheses.add(weight=hypothesis.weight, x=_bounded(hypothesis.x), y=_bounded(hypothesis.y))
+                message.hypotheses.add(weight=hypothesis.weight, x=_clipped(hypothesis.x), y=_clipped(hypothesis.y))
         return message
 
-    def _road(self, estimate: Estimate) -> pb.RoadMap:
-        message = pb.RoadMap(**self._head())
+    def _road_message(self, estimate: Estimate) -> pb.RoadMap:
+        message = pb.RoadMap(**self._header())
         outline: Callable[[], tuple[Floats, Floats | None]] | None = getattr(self._tracker, "road_outline", None)
         if outline is None:
             return message
         pixels, ground = outline()
-        good = np.isfinite(pixels).all(axis=1) & (np.abs(pixels).max(axis=1, initial=0.0) < _FARTHEST_PX)
-        chosen = np.flatnonzero(good)
-        chosen = chosen[:: max(1, -(-len(chosen) // _ROAD_POINTS))]
+        valid = np.isfinite(pixels).all(axis=1) & (np.abs(pixels).max(axis=1, initial=0.0) < _MAX_PIXEL)
+        chosen = np.flatnonzero(valid)
+        chosen = chosen[:: max(1, -(-len(chosen) // _MAX_ROAD_POINTS))]
         message.pixels.extend(pixels[chosen].ravel())
         if ground is not None:
             if self._georeference is not None and self._georeference.offset is not None:
@@ -208,8 +213,8 @@ class Follower:
         return message
 
 
-def decoded(message: pb.FlightImage) -> Image | None:
-    """The picture (h, w, 3) BGR of a message; None where it is none."""
+def decode_image(message: pb.FlightImage) -> Image | None:
+    """The image (h, w, 3) BGR of a message; None if it is missing or damaged."""
     if not message.jpeg:
         return None
     try:
@@ -221,16 +226,16 @@ def decoded(message: pb.FlightImage) -> Image | None:
     return np.asarray(image, np.uint8)
 
 
-def _bounded(value: float) -> float:
-    return float(np.clip(value, -_FARTHEST_PX, _FARTHEST_PX))
+def _clipped(value: float) -> float:
+    return float(np.clip(value, -_MAX_PIXEL, _MAX_PIXEL))
 
 
-def _near(pixels: Floats) -> Floats:
-    """Those (n, 2) that are finite and can be told."""
+def _finite_pixels(pixels: Floats) -> Floats:
+    """Those of the pixels (n, 2) that are finite and within the representable range."""
     with np.errstate(invalid="ignore"):
-        good = np.isfinite(pixels).all(axis=1) & np.asarray((np.abs(pixels) < _FARTHEST_PX).all(axis=1))
-    return pixels[good]
+        valid = np.isfinite(pixels).all(axis=1) & np.asarray((np.abs(pixels) < _MAX_PIXEL).all(axis=1))
+    return pixels[valid]
 
 
-def _thinned(points: Floats, most: int) -> Floats:
-    return points[:: max(1, -(-len(points) // most))]
+def _subsampled(points: Floats, limit: int) -> Floats:
+    return points[:: max(1, -(-len(points) // limit))]

@@ -1,7 +1,7 @@
-"""Where on the earth a target is: its pixel, and the vehicle's own attitude and place.
+"""Georeferencing of the target: its pixel is intersected with the ground by the vehicle's attitude and position.
 
-A tracker's ground frame is one piece in itself, but wanders against the receiver's: by metres within half a minute of
-a lively flight. What is told to others, or flown to, must not.
+A tracker's ground frame is consistent in itself but drifts against the receiver's frame, by metres within half a minute
+of agile flight. What is published or flown to must not drift, so it is corrected to the vehicle's frame.
 """
 
 from __future__ import annotations
@@ -11,68 +11,69 @@ from dataclasses import replace
 
 import numpy as np
 
-from edge.uav.timing.telemetry_track import TelemetryClock
+from edge.uav.timing.telemetry_track import TelemetryTrack
 from edge.uav.tracker import Estimate, Telemetry
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
-_SMOOTH_S = 0.5
-_STEEPEST = 0.6  # least cosine between the ray and straight down: flatter, and a small tilt is metres
-_LEVEL_STD_RAD = 0.005  # of an autopilot's roll and pitch
-_LOWEST_M = 2.0
-_CAR_MIDDLE_M = 0.7
+_TIME_CONSTANT_S = 0.5
+_MIN_COSINE = 0.6  # between the ray and straight down: for flatter rays a small tilt error is metres
+_ROLL_PITCH_STD_RAD = 0.005  # of an autopilot's roll and pitch
+_MIN_HEIGHT_M = 2.0
+_CAR_CENTRE_HEIGHT_M = 0.7
 
 
 class Georeference:
-    """Fed with telemetry on the camera's clock. lens, body_from_camera: the camera's.
+    """Corrects target positions to the vehicle's frame; fed with telemetry on the camera's clock.
 
-    offset: (2,) north, east [m] from the tracker's ground frame to the vehicle's; None while not known.
+    lens, body_from_camera: the camera's intrinsics and mounting.
+    offset: (2,) north, east [m] from the tracker's ground frame to the vehicle's, smoothed; None while unknown.
     """
 
     def __init__(self, lens: Intrinsics, body_from_camera: Floats) -> None:
         self._lens = lens
-        self._telemetry = TelemetryClock(np.asarray(body_from_camera))
+        self._telemetry = TelemetryTrack(np.asarray(body_from_camera))
         self._last_s = -math.inf
         self.offset: Floats | None = None
 
     def add(self, sample: Telemetry) -> None:
-        """Take a sample."""
+        """Add a telemetry sample."""
         self._telemetry.add(sample)
 
-    def clear(self) -> None:
-        """Another target: its ground frame begins anew."""
+    def reset(self) -> None:
+        """Start over for another target, whose ground frame is new."""
         self.offset = None
         self._last_s = -math.inf
 
-    def place(self, x: float, y: float, time: float) -> tuple[Floats, float] | None:
-        """Ground (2,) north, east [m] of the target's middle at a pixel, and its std [m]; None: it can't be told."""
+    def locate(self, x: float, y: float, time: float) -> tuple[Floats, float] | None:
+        """Ground position (2,) north, east [m] of the target at a pixel, and its std [m]; None if not observable."""
         camera_from_ned, centre = self._telemetry.rotation_at(time), self._telemetry.position_at(time)
         if camera_from_ned is None or centre is None or not (math.isfinite(x) and math.isfinite(y)):
             return None
         bound = 2.0 * max(self._lens.width, self._lens.height)
-        if max(abs(x), abs(y)) > bound or -centre[2] < _LOWEST_M:
+        if max(abs(x), abs(y)) > bound or -centre[2] < _MIN_HEIGHT_M:
             return None
         ray = camera_from_ned.T @ np.append(self._lens.unproject(np.array([[x, y]]))[0], 1.0)
         ray = ray / np.linalg.norm(ray)
-        if not ray[2] > _STEEPEST:
+        if not ray[2] > _MIN_COSINE:
             return None
-        height = -float(centre[2]) - _CAR_MIDDLE_M
+        height = -float(centre[2]) - _CAR_CENTRE_HEIGHT_M
         ground: Floats = centre[:2] + height / ray[2] * ray[:2]
-        return ground, _LEVEL_STD_RAD * height / float(ray[2]) ** 2
+        return ground, _ROLL_PITCH_STD_RAD * height / float(ray[2]) ** 2
 
     def corrected(self, estimate: Estimate, time: float) -> Estimate:
-        """The estimate with its place in the vehicle's frame; unchanged where its ground is not metric."""
+        """The estimate with its position in the vehicle's frame; unchanged where its ground frame is not metric."""
         if not (math.isfinite(estimate.north) and math.isfinite(estimate.east)):
             return estimate
-        told = self.place(estimate.x, estimate.y, time)
-        own = np.array([estimate.north, estimate.east])
-        if told is not None:
-            gap = told[0] - own
-            share = 1.0 if self.offset is None else -math.expm1(-max(time - self._last_s, 0.0) / _SMOOTH_S)
-            self.offset = gap if self.offset is None else self.offset + share * (gap - self.offset)
+        measured = self.locate(estimate.x, estimate.y, time)
+        in_tracker_frame = np.array([estimate.north, estimate.east])
+        if measured is not None:
+            difference = measured[0] - in_tracker_frame
+            gain = 1.0 if self.offset is None else -math.expm1(-max(time - self._last_s, 0.0) / _TIME_CONSTANT_S)
+            self.offset = difference if self.offset is None else self.offset + gain * (difference - self.offset)
         self._last_s = time
         if self.offset is None:
             return estimate
-        north, east = own + self.offset
-        level = told[1] if told is not None else 0.0
-        return replace(estimate, north=float(north), east=float(east), std_m=math.hypot(estimate.std_m, level))
+        north, east = in_tracker_frame + self.offset
+        tilt_std = measured[1] if measured is not None else 0.0
+        return replace(estimate, north=float(north), east=float(east), std_m=math.hypot(estimate.std_m, tilt_std))

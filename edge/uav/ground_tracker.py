@@ -1,7 +1,8 @@
-"""The default tracker: one car followed on the ground plane, also while it is out of the picture.
+"""The default tracker: one car tracked on the ground plane, also while it is outside the image.
 
-Each frame: place the camera over the ground (``Placing``), look for the target where the cloud of particles expects
-it (``Target``), weigh the cloud by what was found and what was not (``evidence``), learn the road, say what is known.
+Each frame: localise the camera over the ground (``CameraLocaliser``), search for the target where the particle set
+predicts it (``Target``), weight the particles by detections and missed detections (``evaluate_candidates``), update the
+road map, and estimate the target state (``estimate_target``).
 """
 
 from __future__ import annotations
@@ -11,57 +12,60 @@ from functools import partial
 
 import numpy as np
 
-from edge.uav.ground.image_plane import transfer
-from edge.uav.ground.layers import Layers
-from edge.uav.ground.localisation import Placing
+from edge.uav.ground.image_plane import apply_homography
+from edge.uav.ground.layers import LazyLayers
+from edge.uav.ground.localisation import CameraLocaliser
 from edge.uav.ground.road_map import RoadMap
-from edge.uav.prediction import particle_set as clouds
+from edge.uav.prediction import particle_set
 from edge.uav.prediction import particles as pf
-from edge.uav.prediction.driver_model import Driving
-from edge.uav.prediction.occlusion import Outlook
-from edge.uav.prediction.particle_set import Cloud
+from edge.uav.prediction.driver_model import DriverModel
+from edge.uav.prediction.occlusion import OcclusionPredictor
+from edge.uav.prediction.particle_set import ParticleSet
 from edge.uav.target import footprint
 from edge.uav.target.appearance import Candidate
-from edge.uav.target.box import check_target
-from edge.uav.target.likelihood import Verdict, allow, judge
-from edge.uav.target.motion_history import MotionFit, Sightings
-from edge.uav.target.redetection import Survey
-from edge.uav.target.state_estimate import answer
+from edge.uav.target.box import check_target_box
+from edge.uav.target.likelihood import MeasurementLikelihood, evaluate_candidates, raise_odds_limit
+from edge.uav.target.motion_history import MotionFit, MotionHistory
+from edge.uav.target.redetection import Redetector
+from edge.uav.target.state_estimate import estimate_target
 from edge.uav.target.target import Target
 from edge.uav.target.tracklets import Tracklet, Tracklets
-from edge.uav.tracker import Box, Estimate, Image, State, Telemetry
+from edge.uav.tracker import Box, Estimate, Image, Telemetry, TrackState
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Ints
 
-_NUMBER = pf.AdaptiveNumber(cell=(0.6, 0.6), error=0.05, confidence=0.99, fewest=150, most=500)
-_FIRST_NUMBER = 400
-_PULL = 0.35  # of the motion towards the fit, a frame
-_PULL_PLACE = 0.2  # of the place, the same
-_ALIGN_AFTER = 0.6  # way travelled before the direction of motion counts, in target lengths
-_UNCLEAR = 10.0  # times the noise of a place that counts towards the motion, where a part of the target is hidden
-_FREE_FOR = 12  # frames for which a car whose motion was never seen may have gone anywhere
-_STEADY = 8  # frames seen in a row after which the ground frame may begin anew
-_AGAIN = 3  # frames unseen after which finding the target is finding it again
-_ALIKE = 0.65  # mean score of a look-alike that is worth a thought
-_TURNS = (0.15, 0.3, 0.5, 0.8)  # by how much what is found is tried turned [rad]
-_MOST_TURNS = 3  # of them in a frame
-_TURNED_OF = 2  # of the best candidates in turn
-_SAME_TURN = 0.997  # cosine
-_TURNED_STD = 0.06  # of the heading that a template tells [rad]
-_SURVEY_AFTER = 12  # frames unseen after which all of the picture is looked over
-_WRONG_A_SECOND, _WRONG_AT_MOST = 0.002, 0.02  # chance that it took a way that nobody thought of
-_HIDING_CHANCE = (0.03, 0.03, 0.1, 0.3)  # to be found in a frame where none, one, two or three of its points are open
-_ENDS = 0.35  # of the length: where those points are, from the middle
-_LOST_WEIGHT = 0.1  # the same once it counts as lost
-_RECONSIDER = 0.02  # weight of the particles that it gets
-_ROAD_EVERY = 3  # frames between updates of the road map
-_ROAD_SHOWN = 45.0  # about the target [ground units]
-_ROAD_RATE = 0.15  # of what is learnt of road each time
-_TEACH_EVERY = 12
+_SAMPLE_SIZE = pf.KldSampleSize(cell=(0.6, 0.6), error=0.05, confidence=0.99, min_count=150, max_count=500)
+_INITIAL_COUNT = 400
+_VELOCITY_GAIN = 0.35  # of the nudging towards the motion fit, per frame
+_POSITION_GAIN = 0.2  # the same for the position
+_MIN_ALIGN_DISTANCE = 0.6  # distance travelled before the heading is used, in target lengths
+_OCCLUDED_STD_FACTOR = 10.0  # on the std of a position in the motion fit when the target is partly occluded
+_MAX_SLACK_FRAMES = 12  # over which the search tolerance of a car of unknown motion grows
+_STABLE_FRAMES = 8  # consecutive detections before the ground frame may be changed
+_REACQUIRE_AFTER = 3  # missed frames after which a detection is a re-acquisition
+_MIN_TRACKLET_SCORE = 0.65  # mean score of a candidate at which particles are injected
+_ROTATION_STEPS = (0.15, 0.3, 0.5, 0.8)  # by which candidates are matched rotated [rad]
+_MAX_ROTATIONS = 3  # per frame
+_ROTATED_CANDIDATES = 2  # number of best candidates matched rotated, in turn
+_SAME_ANGLE_COSINE = 0.997  # above which two angles are the same
+_HEADING_STD = 0.06  # of a heading from the template [rad]
+_REDETECT_AFTER = 12  # missed frames after which the full frame is searched
+_INJECTION_RATE, _MAX_INJECTED_WEIGHT = (  # injected weight per second, and its limit, in case all paths are wrong
+    0.002,
+    0.02,
+)  # weight of injected particles per second, and its limit: the target took an unknown path
+_DETECTION_PROBABILITIES = (0.03, 0.03, 0.1, 0.3)  # per frame, with 0 to 3 of the car's test points on open road
+_END_OFFSET = 0.35  # of the outer test points from the centre, over the length
+_LOST_INJECTED_WEIGHT = 0.1  # the same limit once the target is lost
+_TRACKLET_WEIGHT = 0.02  # of the particles injected at a tracklet
+_ROAD_UPDATE_EVERY = 3  # frames
+_ROAD_OVERLAY_REACH = 45.0  # about the target [ground units]
+_ROAD_LEARNING_RATE = 0.15  # of the road's colour model
+_ROAD_LEARN_EVERY = 12  # frames
 
 
 class GroundTracker:
-    """One target. size: (width, height) [px]. lens, body_from_camera: the camera; without them telemetry is unused."""
+    """Tracker of one target. size: (width, height) [px]. lens, body_from_camera: without them telemetry is unused."""
 
     def __init__(
         self,
@@ -74,370 +78,406 @@ class GroundTracker:
         self._size = size
         self._fps = fps
         self._rng = np.random.default_rng(seed)
-        self._placing = Placing(size, lens, body_from_camera)
-        self._began = False
+        self._localiser = CameraLocaliser(size, lens, body_from_camera)
+        self._initialised = False
 
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
-        """Learn the target from its first frame. Raises InputError for a box that can't be one."""
-        check_target(image, self._size, target)
-        placing = self._placing
-        small = placing.shrink(image)
-        placing.begin(small, time, target)
-        self._target = Target(image, placing, target)
-        place = self._target.place
+        """Initialise the target from its first frame. Raises InputError for an invalid box."""
+        check_target_box(image, self._size, target)
+        localiser = self._localiser
+        working = localiser.working_image(image)
+        localiser.begin(working, time, target)
+        self._target = Target(image, localiser, target)
+        position = self._target.position
         self._time, self._frame = time, 0
-        self._road = RoadMap(place)
-        self._sightings = Sightings()
-        self._sightings.add(time, place, self._target.noise(1.0))
+        self._road = RoadMap(position)
+        self._history = MotionHistory()
+        self._history.add(time, position, self._target.position_std(1.0))
         self._fit: MotionFit | None = None
-        self._driving = Driving()
-        self._outlook: Outlook | None = None
-        self._cloud = clouds.scattered(place, 0.03 * self._target.length, _FIRST_NUMBER, self._rng)
-        self._missed, self._found = 0, 1  # frames in a row without and with the target
+        self._driver = DriverModel()
+        self._occlusion: OcclusionPredictor | None = None
+        self._particles = particle_set.initialise(position, 0.03 * self._target.length, _INITIAL_COUNT, self._rng)
+        self._missed_frames, self._detected_frames = 0, 1  # consecutive frames without and with a detection
         self._tracklets = Tracklets()
-        self._survey = Survey()
-        self._seen_last = time
-        self._state = State.VISIBLE
-        self._trail: list[Floats] = [place]
-        self._began = True
-        self._relearn = True  # what road looks like
-        self._learn_road(small, teach=True)
+        self._redetector = Redetector()
+        self._last_seen = time
+        self._state = TrackState.VISIBLE
+        self._trail: list[Floats] = [position]
+        self._initialised = True
+        self._relearn_road = True  # the colour model of the road
+        self._learn_road(working, learn=True)
         return self._estimate(time)
 
     def handle_telemetry(self, sample: Telemetry) -> None:
-        """Take one sample; without lens and mounting it can't be used. Bad samples are left out."""
-        if self._placing.clock is not None:
-            self._placing.clock.add(sample)
+        """Add one sample; without lens and mounting it is not used. Invalid samples are rejected."""
+        if self._localiser.telemetry is not None:
+            self._localiser.telemetry.add(sample)
 
     def handle_frame(self, image: Image | None, time: float) -> Estimate:
-        """Follow into the next frame; ``None`` for a frame that could not be decoded."""
-        if not self._began:
+        """Track the target into the next frame; ``None`` for a frame that could not be decoded."""
+        if not self._initialised:
             raise RuntimeError("begin first")
         dt = float(np.clip(time - self._time, 1e-3, 2.0)) if np.isfinite(time) else 1.0 / self._fps
         self._time += dt
         self._frame += 1
-        ways = self._outlook.ways if self._outlook is not None else []
-        self._cloud = clouds.driven(self._cloud, dt, ways, self._missed == 0, self._rng)
+        paths = self._occlusion.paths if self._occlusion is not None else []
+        self._particles = particle_set.propagate(self._particles, dt, paths, self._missed_frames == 0, self._rng)
         if image is None or image.shape[:2] != (self._size[1], self._size[0]):
-            self._placing.skip(dt)
-            self._not_seen(dt)
+            self._localiser.skip(dt)
+            self._handle_miss(dt)
             return self._estimate(time)
-        small = self._placing.shrink(image)
-        keep_out = None
-        if self._missed == 0:
-            keep_out = self._placing.body_pixels(self._target.outline(self._target.place, self._heading, 1.4))
-        self._placing.update(small, self._time, dt, keep_out)
-        verdict = self._look(image, small)
-        best = verdict.best
+        working = self._localiser.working_image(image)
+        excluded = None
+        if self._missed_frames == 0:
+            excluded = self._localiser.target_pixels(self._target.outline(self._target.position, self._heading, 1.4))
+        self._localiser.update(working, self._time, dt, excluded)
+        measurement = self._measure(image, working)
+        best = measurement.best
         if best is not None:
-            self._seen(image, best, verdict)
+            self._handle_detection(image, best, measurement)
         else:
-            self._not_seen(dt)
-        if self._placing.blind == 0 and (self._relearn or self._frame % _ROAD_EVERY == 0):
-            teach = self._relearn or self._frame % _TEACH_EVERY == 0
-            self._learn_road(small, teach=teach and self._missed == 0)
+            self._handle_miss(dt)
+        if self._localiser.frames_without_pose == 0 and (self._relearn_road or self._frame % _ROAD_UPDATE_EVERY == 0):
+            learn = self._relearn_road or self._frame % _ROAD_LEARN_EVERY == 0
+            self._learn_road(working, learn=learn and self._missed_frames == 0)
         estimate = self._estimate(time)
-        if self._found > _STEADY and self._placing.clock is not None:
-            self._reroot(estimate)
+        if self._detected_frames > _STABLE_FRAMES and self._localiser.telemetry is not None:
+            self._change_ground_frame(estimate)
         return estimate
 
     def road_outline(self) -> tuple[Floats, Floats | None]:
-        """The road near the target as it was seen: image pixels (n, 2), and north, east (n, 2) [m] where known."""
-        ground = self._road.outline(self._cloud.weights @ self._cloud.place, _ROAD_SHOWN)
-        return self._placing.pixels(ground), ground if self._placing.metric else None
+        """The observed road near the target: image pixels (n, 2), and north, east (n, 2) [m] where metric."""
+        ground = self._road.road_cells(self._particles.weights @ self._particles.position, _ROAD_OVERLAY_REACH)
+        return self._localiser.pixels(ground), ground if self._localiser.metric else None
 
     @property
     def _heading(self) -> float:
-        return pf.circular_mean(self._cloud.heading, self._cloud.weights)
+        return pf.circular_mean(self._particles.heading, self._particles.weights)
 
-    def _look(self, image: Image, small: Image) -> Verdict:
-        """Search where the cloud lies within the picture, and weigh the cloud by it."""
-        target, placing = self._target, self._placing
-        surveyed = self._survey_all(image, small) if self._missed > _SURVEY_AFTER else []
-        cloud = self._cloud
-        pixels = placing.body_pixels(cloud.place)
-        near = placing.plane.inside(pixels, -0.3 * target.length * target.scale)
-        share = float(cloud.weights[near].sum())
+    def _measure(self, image: Image, working: Image) -> MeasurementLikelihood:
+        """Search the target where the particles lie inside the image, and reweight them."""
+        target, localiser = self._target, self._localiser
+        redetected = self._redetect(image, working) if self._missed_frames > _REDETECT_AFTER else []
+        particles = self._particles
+        pixels = localiser.target_pixels(particles.position)
+        near = localiser.plane.inside(pixels, -0.3 * target.length * target.scale)
+        share = float(particles.weights[near].sum())
         if share < 2e-3:
-            return Verdict.nothing()
-        here = np.flatnonzero(near)
-        weights = cloud.weights[here] / share
-        members, together = here, 1.0
-        if self._missed:
-            cluster = pf.densest_cluster(cloud.place[here], weights, 2.0 * target.length)
-            members, together = here[cluster.members], cluster.weight
-        candidates = self._search(image, members, wide=True)
-        rest = np.setdiff1d(here, members)
-        if len(rest) and together < 0.97:
-            # What lies scattered is searched piece by piece, another piece each frame.
-            middle = self._rng.choice(rest)
-            aside = np.square(cloud.place[rest] - cloud.place[middle]).sum(axis=1) < (1.5 * target.length) ** 2
-            for found in self._search(image, rest[aside], wide=False):
+            return MeasurementLikelihood.empty()
+        near_particles = np.flatnonzero(near)
+        weights = particles.weights[near_particles] / share
+        main, main_weight = near_particles, 1.0
+        if self._missed_frames:
+            cluster = pf.densest_cluster(particles.position[near_particles], weights, 2.0 * target.length)
+            main, main_weight = near_particles[cluster.members], cluster.weight
+        candidates = self._search(image, main, wide=True)
+        others = np.setdiff1d(near_particles, main)
+        if len(others) and main_weight < 0.97:
+            # Particles outside the main cluster are searched in groups, another group each frame.
+            centre = self._rng.choice(others)
+            in_group = (
+                np.square(particles.position[others] - particles.position[centre]).sum(axis=1)
+                < (1.5 * target.length) ** 2
+            )
+            for found in self._search(image, others[in_group], wide=False):
                 if all(np.linalg.norm(found.ground - c.ground) > 0.4 * target.length for c in candidates):
                     candidates.append(found)
-        if target.aligned and candidates and not any(target.looks.is_shaped(found) for found in candidates):
-            candidates = self._look_turned(image, candidates)
-        apart = 0.4 * target.length
-        for found in surveyed:
-            if all(np.linalg.norm(found.ground - c.ground) > apart for c in candidates):
+        if target.aligned and candidates and not any(target.appearance.shape_matches(found) for found in candidates):
+            candidates = self._search_rotated(image, candidates)
+        min_distance = 0.4 * target.length
+        for found in redetected:
+            if all(np.linalg.norm(found.ground - c.ground) > min_distance for c in candidates):
                 candidates.append(found)
-        # Until its motion is known, anywhere it can have gone since it was seen will do.
+        # While the motion is unknown, the tolerance covers wherever the target can have moved since its last detection.
         slack = (
             0.0
             if target.aligned
-            else (0.2 if self._fit is None else 0.1) * target.length * (1 + min(self._missed, _FREE_FOR))
+            else (0.2 if self._fit is None else 0.1) * target.length * (1 + min(self._missed_frames, _MAX_SLACK_FRAMES))
         )
-        again = self._missed > _AGAIN
+        reacquiring = self._missed_frames > _REACQUIRE_AFTER
         tracklets = self._tracklets.update(self._time, candidates)
-        if again and share > 0.5:
-            cloud = self._reconsider(cloud, tracklets)
-            pixels = placing.body_pixels(cloud.place)
-        verdict = judge(
-            cloud,
+        if reacquiring and share > 0.5:
+            particles = self._inject_at_tracklets(particles, tracklets)
+            pixels = localiser.target_pixels(particles.position)
+        measurement = evaluate_candidates(
+            particles,
             candidates,
             tracklets,
-            self._chance(small, cloud, pixels),
-            lambda found: (target.noise(found.seen) + slack, target.noise(found.seen, found.score) + slack),
+            self._detection_probability(working, particles, pixels),
+            lambda found: (
+                target.position_std(found.visible_share) + slack,
+                target.position_std(found.visible_share, found.score) + slack,
+            ),
             target.length,
-            again,
-            lambda found: target.aligned and target.looks.is_shaped(found),
+            reacquiring,
+            lambda found: target.aligned and target.appearance.shape_matches(found),
         )
-        if verdict.likelihood is not None:
-            self._cloud = cloud.weighted(verdict.likelihood)
-        return verdict
+        if measurement.likelihood is not None:
+            self._particles = particles.reweighted(measurement.likelihood)
+        return measurement
 
-    def _reconsider(self, cloud: Cloud, tracklets: list[Tracklet]) -> Cloud:
-        """A few particles go where something like the target drives as it did, though the cloud is not there.
+    def _inject_at_tracklets(self, particles: ParticleSet, tracklets: list[Tracklet]) -> ParticleSet:
+        """Inject a few particles at tracklets that look and move like the target where the particle set has none.
 
-        Only where the cloud should be seen and is not: then it is wrong, and a better place is worth a thought.
+        Only where most particles should be visible and are not detected: then the particle set is probably wrong.
         """
         fit = self._fit
         if fit is None or fit.speed < 1.0:
-            return cloud
+            return particles
         for tracklet in tracklets:
             motion = tracklet.velocity()
-            if motion is None or tracklet.age < 4 or tracklet.score < _ALIKE:
+            if motion is None or tracklet.age < 4 or tracklet.score < _MIN_TRACKLET_SCORE:
                 continue
             speed = float(np.hypot(*motion[0]))
-            reach = 2.0 * self._target.length + 0.6 * fit.speed * (self._time - self._seen_last)
-            away = float(np.hypot(*(cloud.place - tracklet.places[-1]).T).min())
-            if not 0.4 * fit.speed < speed < 1.6 * fit.speed or away > reach:
+            reach = 2.0 * self._target.length + 0.6 * fit.speed * (self._time - self._last_seen)
+            distance = float(np.hypot(*(particles.position - tracklet.positions[-1]).T).min())
+            if not 0.4 * fit.speed < speed < 1.6 * fit.speed or distance > reach:
                 continue
-            # Along the road there, or at least not back where it came from.
-            headings = cloud.heading[np.hypot(*(cloud.place - tracklet.places[-1]).T) < away + self._target.length]
+            # In the direction of the particles there, or at least not back where the target came from.
+            headings = particles.heading[
+                np.hypot(*(particles.position - tracklet.positions[-1]).T) < distance + self._target.length
+            ]
             course = np.arctan2(motion[0][1], motion[0][0])
             if np.cos(headings - course).max() < 0.7:
                 continue
-            cloud = clouds.joined(cloud, tracklet.places[-1], motion, _RECONSIDER, self._rng)
-            allow(tracklet, _RECONSIDER)
-        return cloud
+            particles = particle_set.inject_particles(
+                particles, tracklet.positions[-1], motion, _TRACKLET_WEIGHT, self._rng
+            )
+            raise_odds_limit(tracklet, _TRACKLET_WEIGHT)
+        return particles
 
     def _search(self, image: Image, members: Ints, wide: bool) -> list[Candidate]:
         """Candidates about some of the particles."""
-        weights = self._cloud.weights[members] + 1e-12
+        weights = self._particles.weights[members] + 1e-12
         weights = weights / weights.sum()
-        places = self._cloud.place[members]
-        middle = weights @ places
-        away = np.hypot(*(places - middle).T)
-        reach = float(np.quantile(away, 0.97)) if wide else 1.5 * self._target.length
-        angle = pf.circular_mean(self._cloud.heading[members], weights) if self._target.aligned else None
+        positions = self._particles.position[members]
+        centre = weights @ positions
+        distance = np.hypot(*(positions - centre).T)
+        reach = float(np.quantile(distance, 0.97)) if wide else 1.5 * self._target.length
+        angle = pf.circular_mean(self._particles.heading[members], weights) if self._target.aligned else None
         if wide:
-            self._target.follow_scale(middle)
+            self._target.update_resolution(centre)
             if angle is not None:
                 self._target.angle = angle
-        return self._target.search(image, middle, 1.1 + reach / self._target.length, angle)
+        return self._target.search(image, centre, 1.1 + reach / self._target.length, angle)
 
-    def _look_turned(self, image: Image, candidates: list[Candidate]) -> list[Candidate]:
-        """The candidates, with one looked at again as if it headed another way: nobody saw the bend that it took."""
-        first = candidates[self._frame % min(len(candidates), _TURNED_OF)]
-        near = self._tracklets.near(self._time, first.ground, 0.5 * self._target.length)
+    def _search_rotated(self, image: Image, candidates: list[Candidate]) -> list[Candidate]:
+        """The candidates, one of them matched again at other headings: the target may have turned while out of view."""
+        first = candidates[self._frame % min(len(candidates), _ROTATED_CANDIDATES)]
+        near = self._tracklets.nearest(self._time, first.ground, 0.5 * self._target.length)
         angles = []
         if near is not None and near.age > 1:
             course = near.course()
             angles = [near.angle] if course is None else [near.angle, course]
-        about = np.flatnonzero(np.square(self._cloud.place - first.ground).sum(axis=1) < self._target.length**2)
-        if len(about):
-            angles.append(float(self._cloud.heading[self._rng.choice(about)]))
-        step = _TURNS[self._frame // _TURNED_OF % len(_TURNS)]
+        nearby = np.flatnonzero(np.square(self._particles.position - first.ground).sum(axis=1) < self._target.length**2)
+        if len(nearby):
+            angles.append(float(self._particles.heading[self._rng.choice(nearby)]))
+        step = _ROTATION_STEPS[self._frame // _ROTATED_CANDIDATES % len(_ROTATION_STEPS)]
         angles += [first.angle + step, first.angle - step]
-        tried = [angle for angle in angles if np.cos(angle - first.angle) < _SAME_TURN][:_MOST_TURNS]
+        trial_angles = [angle for angle in angles if np.cos(angle - first.angle) < _SAME_ANGLE_COSINE][:_MAX_ROTATIONS]
         best = first
-        for angle in tried:
+        for angle in trial_angles:
             found = self._target.search(image, first.ground, 1.1, angle)
             best = max([best, *found[:1]], key=lambda candidate: candidate.score)
         if best.score < first.score + 0.05:
             return candidates
         reach = 0.5 * self._target.length
-        rest = [c for c in candidates if c is not first and np.linalg.norm(c.ground - best.ground) > reach]
-        return sorted([best, *rest], key=lambda candidate: -candidate.score)
+        others = [c for c in candidates if c is not first and np.linalg.norm(c.ground - best.ground) > reach]
+        return sorted([best, *others], key=lambda candidate: -candidate.score)
 
-    def _survey_all(self, image: Image, small: Image) -> list[Candidate]:
-        """What drives anywhere in the picture as the target may: a few particles go there, more the longer it is gone.
+    def _redetect(self, image: Image, working: Image) -> list[Candidate]:
+        """Candidates of the full-frame re-detection; particles are injected there, more the longer the target is lost.
 
-        The ways that are thought of may all be wrong. What is found is weighed together with what is expected.
+        All predicted paths may be wrong. The candidates are evaluated together with those near the particles.
         """
         fit, target = self._fit, self._target
-        if fit is None or not target.aligned or self._placing.blind:
+        if fit is None or not target.aligned or self._localiser.frames_without_pose:
             return []
-        gone = self._time - self._seen_last
-        weight = _LOST_WEIGHT if self._state is State.LOST else min(_WRONG_A_SECOND * gone, _WRONG_AT_MOST)
+        lost_for = self._time - self._last_seen
+        weight = (
+            _LOST_INJECTED_WEIGHT
+            if self._state is TrackState.LOST
+            else min(_INJECTION_RATE * lost_for, _MAX_INJECTED_WEIGHT)
+        )
         out = []
-        for spot, found, fits in self._survey.look(image, small, self._placing, target, fit, self._time):
-            if found.score < _ALIKE or not target.looks.is_shaped(found):
+        for blob, found, plausibility in self._redetector.detect(
+            image, working, self._localiser, target, fit, self._time
+        ):
+            if found.score < _MIN_TRACKLET_SCORE or not target.appearance.shape_matches(found):
                 continue
             out.append(found)
-            motion = spot.velocity()
-            away = np.square(self._cloud.place - found.ground).sum(axis=1)
-            here = float(self._cloud.weights[away < (0.5 * target.length) ** 2].sum())
-            if motion is not None and here < weight * fits:
-                self._cloud = clouds.joined(self._cloud, found.ground, motion, weight * fits, self._rng)
+            motion = blob.velocity()
+            distance = np.square(self._particles.position - found.ground).sum(axis=1)
+            local_weight = float(self._particles.weights[distance < (0.5 * target.length) ** 2].sum())
+            if motion is not None and local_weight < weight * plausibility:
+                self._particles = particle_set.inject_particles(
+                    self._particles, found.ground, motion, weight * plausibility, self._rng
+                )
         return out
 
-    def _chance(self, small: Image, cloud: Cloud, pixels: Floats) -> Floats:
-        """(n,) chance that the target would be found where the particles are: 0 outside, little where it may hide.
+    def _detection_probability(self, working: Image, particles: ParticleSet, pixels: Floats) -> Floats:
+        """(n,) probability of detecting the target at the particles: 0 outside the image, small where occluded.
 
-        pixels: (n, 2) image points of the particles. A car shows where all of it lies on open road.
+        pixels: (n, 2) image points of the particles. A car is detectable where all of it is on open road.
         """
-        inside = self._placing.plane.inside(pixels, 2.0)
+        inside = self._localiser.plane.inside(pixels, 2.0)
         out = np.zeros(len(pixels))
-        if not inside.any() or self._placing.blind or not self._road.ready:
-            return np.where(inside & (self._placing.blind == 0), _HIDING_CHANCE[0], 0.0)
-        half = _ENDS * self._target.length * np.column_stack([np.cos(cloud.heading), np.sin(cloud.heading)])[inside]
-        places = cloud.place[inside]
-        points = np.concatenate([places, places - half, places + half])
-        top = np.array([small.shape[1] - 1, small.shape[0] - 1])
-        ground = np.nan_to_num(self._placing.pixels(points), nan=-1.0)
-        at = np.clip((ground / self._placing.factor).astype(int), 0, top)
-        colours = self._placing.light.undone(small[at[:, 1], at[:, 0]][None])[0]
-        open_road = (self._road.ratios(colours) > -0.3).reshape(3, -1)
-        out[inside] = np.array(_HIDING_CHANCE)[open_road.sum(axis=0)]
+        if not inside.any() or self._localiser.frames_without_pose or not self._road.has_colour_model:
+            return np.where(inside & (self._localiser.frames_without_pose == 0), _DETECTION_PROBABILITIES[0], 0.0)
+        half_length = (
+            _END_OFFSET
+            * self._target.length
+            * np.column_stack([np.cos(particles.heading), np.sin(particles.heading)])[inside]
+        )
+        positions = particles.position[inside]
+        points = np.concatenate([positions, positions - half_length, positions + half_length])
+        last_pixel = np.array([working.shape[1] - 1, working.shape[0] - 1])
+        ground = np.nan_to_num(self._localiser.pixels(points), nan=-1.0)
+        at = np.clip((ground / self._localiser.downscale).astype(int), 0, last_pixel)
+        colours = self._localiser.photometric.corrected(working[at[:, 1], at[:, 0]][None])[0]
+        open_road = (self._road.log_likelihood_ratios(colours) > -0.3).reshape(3, -1)
+        out[inside] = np.array(_DETECTION_PROBABILITIES)[open_road.sum(axis=0)]
         return out
 
-    def _seen(self, image: Image, best: Candidate, verdict: Verdict) -> None:
-        """The target is there: motion, place and looks follow it."""
+    def _handle_detection(self, image: Image, best: Candidate, measurement: MeasurementLikelihood) -> None:
+        """Update motion, position and appearance from a detection."""
         target = self._target
-        again = self._missed > _AGAIN
-        if again or self._fit is None:
-            self._cloud = clouds.gathered(self._cloud, best.ground, target.noise(best.seen), self._rng)
-            if target.aligned and target.looks.is_shaped(best):
-                self._cloud = clouds.turned(self._cloud, best.angle, _TURNED_STD, self._rng)
-        if again:
-            self._sightings.begin_anew(*self._cloud.velocity())
-        self._missed, self._found = 0, self._found + 1
-        self._seen_last = self._time
-        self._outlook = None
-        self._survey.clear()
-        self._cloud = self._cloud.free()
-        if best.seen > 0.7:
-            # What hides a part of it holds it back, in every frame to the same side: that is no change of speed.
-            unclear = 1.0 if target.is_clear(best.score) else _UNCLEAR
-            self._sightings.add(self._time, best.ground, unclear * target.noise(best.seen, best.score))
-            self._fit = self._sightings.fit() or self._fit
-            if self._fit is not None and self._found > _STEADY:
-                self._driving.saw(self._fit)
-        if self._fit is not None and not again:
-            old = self._time - self._fit.time
-            to_place = _PULL_PLACE if old < 1e-6 and self._found > _AGAIN else 0.0
-            self._cloud = clouds.pulled(self._cloud, self._fit, min(old, 0.5), _PULL, to_place, self._rng)
-        self._cloud = self._cloud.resampled(self._rng, _NUMBER)
-        target.place = self._cloud.weights @ self._cloud.place
-        if best.seen > 0.9 and np.linalg.norm(target.place - self._trail[-1]) > 0.5:
-            self._trail = [*self._trail[-60:], target.place]
+        reacquiring = self._missed_frames > _REACQUIRE_AFTER
+        if reacquiring or self._fit is None:
+            self._particles = particle_set.reinitialise_at(
+                self._particles, best.ground, target.position_std(best.visible_share), self._rng
+            )
+            if target.aligned and target.appearance.shape_matches(best):
+                self._particles = particle_set.reset_heading(self._particles, best.angle, _HEADING_STD, self._rng)
+        if reacquiring:
+            self._history.restart(*self._particles.mean_velocity())
+        self._missed_frames, self._detected_frames = 0, self._detected_frames + 1
+        self._last_seen = self._time
+        self._occlusion = None
+        self._redetector.reset()
+        self._particles = self._particles.without_paths()
+        if best.visible_share > 0.7:
+            # An occluder shifts the match to the same side in every frame, which is no change of speed.
+            std_factor = 1.0 if target.is_unoccluded(best.score) else _OCCLUDED_STD_FACTOR
+            self._history.add(self._time, best.ground, std_factor * target.position_std(best.visible_share, best.score))
+            self._fit = self._history.fit() or self._fit
+            if self._fit is not None and self._detected_frames > _STABLE_FRAMES:
+                self._driver.update(self._fit)
+        if self._fit is not None and not reacquiring:
+            fit_age = self._time - self._fit.time
+            position_gain = _POSITION_GAIN if fit_age < 1e-6 and self._detected_frames > _REACQUIRE_AFTER else 0.0
+            self._particles = particle_set.nudge_to_fit(
+                self._particles, self._fit, min(fit_age, 0.5), _VELOCITY_GAIN, position_gain, self._rng
+            )
+        self._particles = self._particles.resampled(self._rng, _SAMPLE_SIZE)
+        target.position = self._particles.weights @ self._particles.position
+        if best.visible_share > 0.9 and np.linalg.norm(target.position - self._trail[-1]) > 0.5:
+            self._trail = [*self._trail[-60:], target.position]
         if not target.aligned:
-            target.complete(image, best)
+            target.relearn_if_more_visible(image, best)
             fit = self._fit
-            far = self._sightings.travelled() > _ALIGN_AFTER * target.length
-            if fit is not None and far and best.seen > 0.97 and fit.velocity_std < 0.15 * fit.speed:
+            moved_enough = self._history.distance_travelled() > _MIN_ALIGN_DISTANCE * target.length
+            if fit is not None and moved_enough and best.visible_share > 0.97 and fit.velocity_std < 0.15 * fit.speed:
                 target.align(image, fit)
-                # What was beside an upright box may have been anything.
-                self._road.forget()
-                self._relearn = True
-        elif self._found > 3:
-            if verdict.sureness > 0.9 and best.seen > 0.98:
-                target.grow_used(best.score)
-            if verdict.sureness > 0.9 and not verdict.crowded:
-                target.feel_light(image, best)
-            if self._frame % 4 == 0 and _is_sure(verdict):
-                target.study(image, best)
+                # The surroundings of an upright box need not have been road.
+                self._road.reset()
+                self._relearn_road = True
+        elif self._detected_frames > 3:
+            if measurement.posterior > 0.9 and best.visible_share > 0.98:
+                target.update_typical_score(best.score)
+            if measurement.posterior > 0.9 and not measurement.ambiguous:
+                target.update_local_gain(image, best)
+            if self._frame % 4 == 0 and _is_unambiguous(measurement):
+                target.update_appearance(image, best)
 
-    def _not_seen(self, dt: float) -> None:
-        """It is not there: the cloud drives on, along the ways that the road offers."""
-        self._missed, self._found = self._missed + 1, 0
-        self._target.shade.fade(dt)
-        if self._outlook is None:
+    def _handle_miss(self, dt: float) -> None:
+        """Predict: without a detection the particles move on, along the road paths."""
+        self._missed_frames, self._detected_frames = self._missed_frames + 1, 0
+        self._target.local_gain.decay(dt)
+        if self._occlusion is None:
             trail = np.array(self._trail[-25:])
-            self._outlook = Outlook(self._cloud, self._fit, self._time, self._road, trail)
-            self._cloud = self._outlook.begin(self._cloud, self._fit, self._time, self._road, self._driving, self._rng)
+            self._occlusion = OcclusionPredictor(self._particles, self._fit, self._time, self._road, trail)
+            self._particles = self._occlusion.begin(
+                self._particles, self._fit, self._time, self._road, self._driver, self._rng
+            )
         else:
-            self._cloud = self._outlook.again(self._cloud, self._time, self._road, self._rng)
-        self._cloud = self._cloud.resampled(self._rng, _NUMBER)
+            self._particles = self._occlusion.update(self._particles, self._time, self._road, self._rng)
+        self._particles = self._particles.resampled(self._rng, _SAMPLE_SIZE)
 
-    def _learn_road(self, small: Image, teach: bool) -> None:
-        """Add the picture to the road map; ``teach``: first learn what road looks like beside the target."""
-        target, placing = self._target, self._placing
-        lit = placing.light.undone(small)
-        outline = target.outline(target.place, self._heading, 1.35)
-        if teach:
-            ring = [target.outline(target.place, self._heading, grown) for grown in (1.5, 1.8)]
-            edge = np.concatenate([footprint.between(corners) for corners in ring])
-            behind = [p for p in self._trail[:-1] if np.linalg.norm(p - target.place) > 1.2 * target.length]
-            places = np.concatenate([edge, np.array(behind).reshape(-1, 2)])
-            pixels = placing.pixels(places)
-            pixels = pixels[placing.plane.inside(pixels, 2.0)]
-            at = np.clip((pixels / placing.factor).astype(int), 0, [small.shape[1] - 1, small.shape[0] - 1])
-            rate = 1.0 if self._relearn else _ROAD_RATE
-            self._road.learn(lit[at[:, 1], at[:, 0]], lit[::4, ::4].reshape(-1, 3), rate)
-            self._relearn = False
-        self._road.update(lit, placing.factor, placing.plane, placing.matrix, outline if self._missed == 0 else None)
+    def _learn_road(self, working: Image, learn: bool) -> None:
+        """Add the image to the road map; ``learn``: first update the colour model from the road beside the target."""
+        target, localiser = self._target, self._localiser
+        corrected = localiser.photometric.corrected(working)
+        outline = target.outline(target.position, self._heading, 1.35)
+        if learn:
+            ring = [target.outline(target.position, self._heading, enlarged) for enlarged in (1.5, 1.8)]
+            beside = np.concatenate([footprint.edge_points(corners) for corners in ring])
+            behind = [p for p in self._trail[:-1] if np.linalg.norm(p - target.position) > 1.2 * target.length]
+            positions = np.concatenate([beside, np.array(behind).reshape(-1, 2)])
+            pixels = localiser.pixels(positions)
+            pixels = pixels[localiser.plane.inside(pixels, 2.0)]
+            at = np.clip((pixels / localiser.downscale).astype(int), 0, [working.shape[1] - 1, working.shape[0] - 1])
+            rate = 1.0 if self._relearn_road else _ROAD_LEARNING_RATE
+            self._road.learn_colours(corrected[at[:, 1], at[:, 0]], corrected[::4, ::4].reshape(-1, 3), rate)
+            self._relearn_road = False
+        self._road.update(
+            corrected,
+            localiser.downscale,
+            localiser.plane,
+            localiser.matrix,
+            outline if self._missed_frames == 0 else None,
+        )
 
-    def _reroot(self, estimate: Estimate) -> None:
-        """Begin the ground frame anew where telemetry now gives a better one."""
+    def _change_ground_frame(self, estimate: Estimate) -> None:
+        """Change to another ground frame where telemetry now gives a better one."""
         box = Box(
             estimate.x - 0.5 * estimate.width, estimate.y - 0.5 * estimate.height, estimate.width, estimate.height
         )
-        root = self._placing.better_root(self._time, box)
-        if root is None:
+        frame = self._localiser.better_frame(self._time, box)
+        if frame is None:
             return
-        change = np.linalg.inv(root.motion.matrix) @ self._placing.matrix
+        change = np.linalg.inv(frame.pose.matrix) @ self._localiser.matrix
         step = 0.5
-        near = transfer(change, self._target.place + step * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+        near = apply_homography(change, self._target.position + step * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
         if not np.isfinite(near).all():
             return
-        self._placing.take(root)
+        self._localiser.switch_frame(frame)
         jacobian = np.column_stack([near[1] - near[0], near[2] - near[0]]) / step
-        self._target.moved(near[0], jacobian)
-        self._sightings.moved(change)
-        self._fit = self._sightings.fit()
-        self._cloud = self._cloud.moved(change)
-        self._driving.rescaled(float(np.sqrt(abs(np.linalg.det(jacobian)))))
-        self._tracklets.clear()
-        self._survey.clear()
-        self._trail = [p for p in transfer(change, np.array(self._trail)) if np.isfinite(p).all()]
-        old, self._road = self._road, RoadMap(near[0])
-        self._road.take(old, change)
+        self._target.change_frame(near[0], jacobian)
+        self._history.transform(change)
+        self._fit = self._history.fit()
+        self._particles = self._particles.transformed(change)
+        self._driver.rescale(float(np.sqrt(abs(np.linalg.det(jacobian)))))
+        self._tracklets.reset()
+        self._redetector.reset()
+        self._trail = [p for p in apply_homography(change, np.array(self._trail)) if np.isfinite(p).all()]
+        previous_map, self._road = self._road, RoadMap(near[0])
+        self._road.transfer_from(previous_map, change)
 
     def _estimate(self, time: float) -> Estimate:
-        """What is known now."""
-        found = answer(self._cloud, self._target, self._placing, self._missed, time, self._time - self._seen_last)
+        """The state estimate with its overlay layers."""
+        found = estimate_target(
+            self._particles, self._target, self._localiser, self._missed_frames, time, self._time - self._last_seen
+        )
         self._state = found.state
         return replace(found, layers=self._layers())
 
-    def _layers(self) -> Layers:
-        placing, road, place = self._placing, self._road, self._cloud.weights @ self._cloud.place
-        ways = self._outlook.ways if self._outlook is not None else []
-        named = {f"way {k}": partial(placing.pixels, way.points) for k, way in enumerate(ways)}
-        return Layers(
+    def _layers(self) -> LazyLayers:
+        localiser, road, position = self._localiser, self._road, self._particles.weights @ self._particles.position
+        paths = self._occlusion.paths if self._occlusion is not None else []
+        named = {f"path {k}": partial(localiser.pixels, path.points) for k, path in enumerate(paths)}
+        return LazyLayers(
             {
-                "tracks": lambda: placing.tracks,
-                "road": lambda: placing.pixels(road.outline(place, _ROAD_SHOWN)),
+                "tracks": lambda: localiser.tracks,
+                "road": lambda: localiser.pixels(road.road_cells(position, _ROAD_OVERLAY_REACH)),
                 **named,
             }
         )
 
 
-def _is_sure(verdict: Verdict) -> bool:
-    """Whether the target is wholly and surely seen, alone and as it always looks: then it may be learnt from."""
-    best = verdict.best
-    if best is None or verdict.crowded:
+def _is_unambiguous(measurement: MeasurementLikelihood) -> bool:
+    """Whether a detection is certain, complete, unique and of typical score, so that the appearance may adapt to it."""
+    best = measurement.best
+    if best is None or measurement.ambiguous:
         return False
-    return verdict.sureness > 0.9 and best.score > 0.75 and best.seen > 0.98
+    return measurement.posterior > 0.9 and best.score > 0.75 and best.visible_share > 0.98

@@ -1,4 +1,4 @@
-"""The models of the UAV tracker by name; each is imported only when it is asked for."""
+"""Factory of the UAV trackers by name; each is imported only when it is requested."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ def get(
     fps: float = 30.0,
     seed: int = 0,
 ) -> Tracker:
-    """A tracker that still has to ``begin``.
+    """A tracker, to be started with ``begin``.
 
-    name: "ground", "paper" or "plain". size: (width, height) of the pictures [px]. lens, body_from_camera (3, 3):
-    the camera, as far as known. fps: nominal frame rate. seed: of everything random in it.
+    name: "ground", "paper" or "plain". size: (width, height) of the images [px]. lens, body_from_camera (3, 3):
+    intrinsics and mounting, as far as known. fps: nominal frame rate. seed: of all its random numbers.
     Raises InputError for an unknown name.
     """
     if name == "ground":

@@ -1,4 +1,4 @@
-"""Attitudes and places in the terms of a flight: angles, quaternions, latitude and longitude, north-east-down."""
+"""Conversions of attitude and position: Euler angles, quaternions, latitude and longitude, local north-east-down."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from protocols.geometry import so3
 from protocols.geometry.types import Floats
 
 _EARTH_RADIUS_M = 6_378_137.0
-_ECCENTRICITY2 = 6.694379990141317e-3  # of the WGS 84 ellipsoid
+_ECCENTRICITY2 = 6.694379990141317e-3  # squared, of the WGS 84 ellipsoid
 
 
-def from_angles(roll: float, pitch: float, yaw: float) -> Floats:
-    """(3, 3) Rz(yaw) Ry(pitch) Rx(roll)."""
+def rotation_from_euler(roll: float, pitch: float, yaw: float) -> Floats:
+    """Rotation matrix (3, 3) Rz(yaw) Ry(pitch) Rx(roll); angles [rad]."""
     x, y, z = np.eye(3)
     return np.asarray(so3.exp(yaw * z) @ so3.exp(pitch * y) @ so3.exp(roll * x))
 
 
-def from_quaternion(q: Any) -> Floats | None:
-    """(3, 3) of w, x, y, z; None where that is no rotation."""
+def rotation_from_quaternion(q: Any) -> Floats | None:
+    """Rotation matrix (3, 3) of a quaternion w, x, y, z; None where its norm is not close to 1."""
     parts = np.array(q, np.float64)
     size = float(np.linalg.norm(parts))
     if not (np.isfinite(parts).all() and 0.9 < size < 1.1):
@@ -37,8 +37,8 @@ def from_quaternion(q: Any) -> Floats | None:
     )
 
 
-def to_quaternion(rotation: Floats) -> list[float]:
-    """w, x, y, z of a rotation (3, 3), w ≥ 0."""
+def quaternion_from_rotation(rotation: Floats) -> list[float]:
+    """Quaternion w, x, y, z of a rotation (3, 3), w ≥ 0."""
     vector = so3.log(rotation)
     angle = float(np.linalg.norm(vector))
     axis = vector / angle if angle > 1e-12 else np.zeros(3)
@@ -46,21 +46,21 @@ def to_quaternion(rotation: Floats) -> list[float]:
 
 
 def curvature_radii(latitude: float) -> tuple[float, float]:
-    """Metres a radian north and a radian east (that one still times cos latitude) on the WGS 84 ellipsoid."""
+    """Metres per radian of latitude, and of longitude (still to be multiplied by cos latitude); WGS 84 ellipsoid."""
     w = 1.0 - _ECCENTRICITY2 * math.sin(math.radians(latitude)) ** 2
     return _EARTH_RADIUS_M * (1.0 - _ECCENTRICITY2) / w**1.5, _EARTH_RADIUS_M / math.sqrt(w)
 
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where a local NED frame stands [degrees, m above the sea]; flat-earth, good for some kilometres."""
+    """Geodetic origin of a local NED frame [degrees, m above sea level]; flat-earth, valid within some kilometres."""
 
     latitude: float
     longitude: float
     altitude: float
 
-    def local(self, latitude: float, longitude: float, altitude: float) -> Floats:
-        """(3,) north, east, down [m]."""
+    def to_ned(self, latitude: float, longitude: float, altitude: float) -> Floats:
+        """Position (3,) north, east, down [m] of geodetic coordinates."""
         north, east = curvature_radii(self.latitude)
         across = (longitude - self.longitude + 180.0) % 360.0 - 180.0
         return np.array(
@@ -71,8 +71,8 @@ class Origin:
             ]
         )
 
-    def world(self, north: float, east: float, down: float) -> tuple[float, float, float]:
-        """Latitude, longitude [degrees], altitude [m]."""
+    def to_geodetic(self, north: float, east: float, down: float) -> tuple[float, float, float]:
+        """Latitude, longitude [degrees] and altitude [m] of a local position [m]."""
         a, b = curvature_radii(self.latitude)
         longitude = self.longitude + math.degrees(east / (b * math.cos(math.radians(self.latitude))))
         return (

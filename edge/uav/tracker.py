@@ -1,7 +1,7 @@
-"""What every model of the UAV tracker takes and gives; the models themselves are in their own files.
+"""The interface of the UAV target trackers: inputs, outputs and protocol. Each tracker has its own module.
 
-A tracker knows no files, sockets, threads or clocks: ``begin`` with a frame and the target's box, then one
-``handle_frame`` a frame and ``handle_telemetry`` for each sample, in the order in which they arrive.
+A tracker uses no files, sockets, threads or clocks. It is started by ``begin`` with a frame and the target's bounding
+box, then receives one ``handle_frame`` per frame and one ``handle_telemetry`` per sample, in order of arrival.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from protocols.geometry.types import Floats
 Image = npt.NDArray[np.uint8]
 
 
-class State(StrEnum):
-    """What is known of the target."""
+class TrackState(StrEnum):
+    """Track state of the target in one frame."""
 
     VISIBLE = "visible"
-    """It is seen in this frame."""
+    """The target is detected in this frame."""
     COASTING = "coasting"
-    """It is not seen (outside the picture, hidden); the estimate is a prediction with a std that means it."""
+    """Not detected (outside the image or occluded); estimate and std are predictions."""
     LOST = "lost"
-    """The cloud no longer says anything useful."""
+    """The particle set is too dispersed to give a useful estimate."""
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A box in image pixels: x, y are its top left, as in ``--target x,y,w,h``."""
+    """A bounding box in image pixels: x, y are its top left corner, as in ``--target x,y,w,h``."""
 
     x: float
     y: float
@@ -42,9 +42,9 @@ class Box:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Telemetry:
-    """One sample on the telemetry's own clock [s].
+    """One telemetry sample, stamped by the telemetry's own clock [s].
 
-    ned_from_body: (3, 3), v_ned = R v_body, body forward-right-down. position: (3,) north, east, down [m],
+    ned_from_body: (3, 3), v_ned = R v_body, body axes forward-right-down. position: (3,) north, east, down [m],
     or None.
     """
 
@@ -55,7 +55,7 @@ class Telemetry:
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """One of several places where the target may be: image pixels, weights of one frame add up to 1."""
+    """One of several modes of the position estimate: image pixels; the weights of one frame add up to 1."""
 
     weight: float
     x: float
@@ -64,17 +64,17 @@ class Hypothesis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """The target in one frame.
+    """The target state estimated for one frame.
 
     x, y: centre in image pixels, also outside the image; nan when lost. heading: atan2(dy, dx) in the image
     [rad], y down; nan where unknown. std: of the centre, one coordinate [px].
-    north, east, speed, course, std_m: on the ground, nan where no metric ground frame is known;
+    north, east, speed, course, std_m: on the ground [m, m/s, rad]; nan where no metric ground frame is available;
     course = atan2(east, north). particles: (n, 2) image pixels, for overlays. layers: further named
     geometry in image pixels for overlays (road, regions, tracks), (n, 2) each.
     """
 
     time: float
-    state: State
+    state: TrackState
     x: float
     y: float
     width: float
@@ -92,16 +92,16 @@ class Estimate:
 
 
 class Tracker(Protocol):
-    """One model. Constructed with the camera's size and, if known, lens and mounting, and a seed."""
+    """One tracking method. Constructed with the image size, a seed and, if known, the intrinsics and the mounting."""
 
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
-        """Learn the target from its first frame. Raises InputError for a box that can't be one."""
+        """Initialise the target from its first frame. Raises InputError for an invalid box."""
         ...
 
     def handle_telemetry(self, sample: Telemetry) -> None:
-        """Take one sample; the offset between its clock and the camera's is unknown (up to ±0.5 s)."""
+        """Add one sample; the offset between its clock and the camera's is unknown (up to ±0.5 s)."""
         ...
 
     def handle_frame(self, image: Image | None, time: float) -> Estimate:
-        """Follow into the next frame; ``None`` for a frame that could not be decoded."""
+        """Track the target into the next frame; ``None`` for a frame that could not be decoded."""
         ...

@@ -1,6 +1,6 @@
-"""Pictures over HTTP to whoever asks, as motion JPEG: what every browser and GStreamer, VLC and FFmpeg can show.
+"""Motion JPEG over HTTP, as browsers, GStreamer, VLC and FFmpeg play it.
 
-Only the newest picture counts, and it is compressed only while somebody watches.
+Only the newest image is served, and it is compressed only while there are viewers.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from protocols.core.errors import InputError
 
 PATH = "/stream.mjpg"
 _BOUNDARY = "frame"
-_MOST_VIEWERS = 4
+_MAX_VIEWERS = 4
 _SEND_TIMEOUT_S = 5.0
 _PAGE = (
     b"<!doctype html><title>Syncline</title><style>body{margin:0;background:#111}img{width:100%}</style>"
@@ -23,14 +23,15 @@ _PAGE = (
 )
 
 
-class VideoServer:
-    """Serves ``PATH``, a page with it at /, and /snapshot.jpg. host, port: where it listens; port 0: any free one.
+class MjpegServer:
+    """Serves ``PATH``, an HTML page with it at /, and /snapshot.jpg.
 
-    compress: the newest picture as JPEG, called on a viewer's thread; None while there is none.
+    host, port: listening address; port 0: any free one. compress: gives the newest image as JPEG, called in a viewer's
+    thread; None while there is none.
     """
 
     def __init__(self, host: str, port: int, compress: Callable[[], bytes | None]) -> None:
-        self._changed = threading.Condition()
+        self._new_frame = threading.Condition()
         self._number = 0
         self._closed = False
         self._viewers = 0
@@ -48,19 +49,19 @@ class VideoServer:
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """The listening port."""
         return int(self._server.server_address[1])
 
     @property
     def viewers(self) -> int:
-        """How many watch now."""
+        """Number of present viewers."""
         return self._viewers
 
-    def changed(self) -> None:
-        """There is a new picture."""
-        with self._changed:
+    def notify_frame(self) -> None:
+        """Notify the viewers of a new image."""
+        with self._new_frame:
             self._number += 1
-            self._changed.notify_all()
+            self._new_frame.notify_all()
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -69,16 +70,16 @@ class VideoServer:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with self._changed:
+        with self._new_frame:
             self._closed = True
-            self._changed.notify_all()
+            self._new_frame.notify_all()
         self._server.shutdown()
         self._server.server_close()
 
-    def _next(self, seen: int) -> tuple[int, bytes | None]:
-        """The first picture after number ``seen``; waits for it, up to a second."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._number != seen or self._closed, 1.0)
+    def _next_jpeg(self, seen: int) -> tuple[int, bytes | None]:
+        """The first image after number ``seen``; waits for it for up to a second."""
+        with self._new_frame:
+            self._new_frame.wait_for(lambda: self._number != seen or self._closed, 1.0)
             number = self._number
             if self._closed or number == seen:
                 return seen, None
@@ -96,21 +97,21 @@ class VideoServer:
                 try:
                     self._serve()
                 except OSError:
-                    self.close_connection = True  # the viewer has gone
+                    self.close_connection = True  # the viewer has disconnected
 
             def _serve(self) -> None:
                 path = self.path.partition("?")[0]
                 if path == "/":
-                    self._whole("text/html", _PAGE)
+                    self._send_body("text/html", _PAGE)
                 elif path == "/snapshot.jpg":
-                    _, data = server._next(-1)
-                    self._whole("image/jpeg", data) if data else self.send_error(503, "no picture yet")
+                    _, data = server._next_jpeg(-1)
+                    self._send_body("image/jpeg", data) if data else self.send_error(503, "no image yet")
                 elif path == PATH:
                     self._stream()
                 else:
                     self.send_error(404)
 
-            def _whole(self, kind: str, data: bytes) -> None:
+            def _send_body(self, kind: str, data: bytes) -> None:
                 self.send_response(200)
                 self.send_header("Content-Type", kind)
                 self.send_header("Content-Length", str(len(data)))
@@ -118,11 +119,11 @@ class VideoServer:
                 self.wfile.write(data)
 
             def _stream(self) -> None:
-                with server._changed:
-                    full = server._viewers >= _MOST_VIEWERS
+                with server._new_frame:
+                    full = server._viewers >= _MAX_VIEWERS
                     server._viewers += not full
                 if full:
-                    self.send_error(503, f"{_MOST_VIEWERS} are watching already")
+                    self.send_error(503, f"{_MAX_VIEWERS} viewers are the limit")
                     return
                 try:
                     self.send_response(200)
@@ -131,13 +132,13 @@ class VideoServer:
                     self.end_headers()
                     seen = -1
                     while not server._closed:
-                        seen, data = server._next(seen)
+                        seen, data = server._next_jpeg(seen)
                         if data is None:
                             continue
                         head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
                         self.wfile.write(head.encode() + data + b"\r\n")
                 finally:
-                    with server._changed:
+                    with server._new_frame:
                         server._viewers -= 1
 
             def log_message(self, format: str, *args: object) -> None:

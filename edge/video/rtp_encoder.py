@@ -1,4 +1,4 @@
-"""Pictures as H.264 in RTP packets (RFC 6184), by libav: PyAV's wheels bring x264 for x86-64 and arm64."""
+"""H.264 encoding into RTP packets (RFC 6184) through libav; PyAV's wheels include x264 for x86-64 and arm64."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _KEY_FRAME_S = 1.0
 
 
 class RtpEncoder:
-    """One stream. size: (width, height) [px] of the pictures; fps: about how many a second; kbps: at most.
+    """Encoder of one stream. size: (width, height) [px] of the images; fps: nominal rate; kbps: maximum bit rate.
 
-    parameter_sets: H.264's SPS and PPS, as a session description tells them. Raises InputError without PyAV.
+    parameter_sets: H.264's SPS and PPS for the session description. Raises InputError without PyAV.
     """
 
     def __init__(self, size: tuple[int, int], fps: float, kbps: int) -> None:
@@ -31,9 +31,9 @@ class RtpEncoder:
                 remedy='pip install "syncline[video]", or set stream = "mjpeg" in [video_out]',
             ) from None
         self._av = av
-        # x264 halves the colours' resolution: an odd last row or column is left out.
+        # Chroma is subsampled by two: an odd last row or column is cropped.
         self._width, self._height = size[0] & ~1, size[1] & ~1
-        self._sink = _Packets()
+        self._sink = _PacketSink()
         self._settings = {
             "preset": "ultrafast",
             "tune": "zerolatency",
@@ -53,16 +53,16 @@ class RtpEncoder:
         )
         self._stream: Any = self._container.add_stream("libx264", rate=self._rate, options=self._settings)
         self._set_up(self._stream.codec_context)
-        self._newest = -1
+        self._last_pts = -1
 
-    def encode(self, image: Image, time_s: float, *, key: bool = False) -> list[bytes]:
-        """The RTP and RTCP packets of a picture (h, w, 3) BGR at a time [s] of any epoch. key: begin anew with it."""
+    def encode(self, image: Image, time_s: float, *, key_frame: bool = False) -> list[bytes]:
+        """RTP and RTCP packets of an image (h, w, 3) BGR at a time [s] of any epoch. key_frame: force one."""
         frame = self._av.VideoFrame.from_ndarray(
             np.ascontiguousarray(image[: self._height, : self._width]), format="bgr24"
         )
-        self._newest = max(round(CLOCK_HZ * time_s), self._newest + 1)
-        frame.pts, frame.time_base = self._newest, Fraction(1, CLOCK_HZ)
-        if key:
+        self._last_pts = max(round(CLOCK_HZ * time_s), self._last_pts + 1)
+        frame.pts, frame.time_base = self._last_pts, Fraction(1, CLOCK_HZ)
+        if key_frame:
             frame.pict_type = self._av.video.frame.PictureType.I
         for packet in self._stream.encode(frame):
             self._container.mux(packet)
@@ -86,12 +86,12 @@ class RtpEncoder:
 
 
 def is_rtcp(packet: bytes) -> bool:
-    """Whether a packet is RTCP's and no picture's (RFC 5761, section 4)."""
+    """Whether a packet is RTCP rather than RTP (RFC 5761, section 4)."""
     return 64 <= packet[1] & 127 < 96
 
 
-class _Packets(io.RawIOBase):
-    """What libav writes: one packet a call, as its buffer is one packet long."""
+class _PacketSink(io.RawIOBase):
+    """Output file of libav: one packet per write, as its buffer is one packet long."""
 
     def __init__(self) -> None:
         self._held: list[bytes] = []
@@ -104,6 +104,6 @@ class _Packets(io.RawIOBase):
         return len(self._held[-1])
 
     def take(self) -> list[bytes]:
-        """All that was written since the last call."""
+        """The packets written since the last call."""
         out, self._held = self._held, []
         return out

@@ -1,7 +1,7 @@
-"""The operator's picture as an RTSP stream (RFC 2326), as QGroundControl, Mission Planner and VLC open it.
+"""An RTSP server (RFC 2326) for the operator's video, as QGroundControl, Mission Planner and VLC open it.
 
-libav codes and packs (``RtpEncoder``); here is the dialogue, and who gets the packets: over UDP, or over the RTSP
-connection itself where a station asks for that. Pictures are drawn and coded only while somebody watches.
+``RtpEncoder`` encodes and packetises; this module holds the RTSP dialogue and distributes the packets: over UDP, or
+interleaved in the RTSP connection where a client asks for that. Images are drawn and encoded only while somebody plays.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from edge.video.rtp_encoder import RtpEncoder, is_rtcp
 from protocols.core.errors import InputError
 
 PATH = "/overlay"
-_MOST_VIEWERS = 4
-_MOST_CONNECTIONS = 16
-_REQUEST_BYTES = 8192
-_SESSION_S = 60  # a viewer that says nothing for so long has gone
-_UNSENT_BYTES = 262_144  # waiting for a slow viewer: more, and it gets nothing until the next whole picture
-_STALLED_S = 10.0
-_AGAIN_S = 0.2  # after which the coding is tried anew
+_MAX_VIEWERS = 4
+_MAX_CONNECTIONS = 16
+_MAX_REQUEST_BYTES = 8192
+_SESSION_TIMEOUT_S = 60  # without a request for this long the client is dropped
+_MAX_UNSENT_BYTES = 262_144  # queued for a slow client: beyond this it is skipped until the next key frame
+_STALL_TIMEOUT_S = 10.0
+_ENCODER_RETRY_S = 0.2  # pause before the encoder is recreated after a failure
 _METHODS = "OPTIONS, DESCRIBE, SETUP, PLAY, PAUSE, TEARDOWN, GET_PARAMETER, SET_PARAMETER"
 _REASONS = {
     200: "OK",
@@ -46,29 +46,30 @@ _REASONS = {
 
 
 class RtspServer:
-    """Serves ``PATH``. host, port: where it listens; port 0: any free one.
+    """Serves ``PATH``. host, port: listening address; port 0: any free one.
 
-    picture: the newest (h, w, 3) BGR, called on a thread of this server; None while there is none. size: (width,
-    height) [px]; fps: about how many a second; kbps: at most. Raises InputError where it cannot listen, or no PyAV is.
+    latest_image: gives the newest (h, w, 3) BGR, called in a thread of this server; None while there is none. size:
+    (width, height) [px]; fps: nominal rate; kbps: maximum bit rate. Raises InputError where it cannot listen or PyAV is
+    missing.
     """
 
     def __init__(
         self,
         host: str,
         port: int,
-        picture: Callable[[], Image | None],
+        latest_image: Callable[[], Image | None],
         size: tuple[int, int],
         fps: float,
         kbps: int = 2000,
     ) -> None:
-        self._picture = picture
-        self._begin_stream = partial(RtpEncoder, size, fps, kbps)
-        self._encoder = self._begin_stream()
-        self._changed = threading.Event()
-        self._want_key = threading.Event()
+        self._latest_image = latest_image
+        self._make_encoder = partial(RtpEncoder, size, fps, kbps)
+        self._encoder = self._make_encoder()
+        self._new_frame = threading.Event()
+        self._key_frame_wanted = threading.Event()
         self._closed = False
         self.failures = 0
-        """Pictures at which the coding broke down."""
+        """Number of images at which the encoder failed."""
         self._sessions: set[_Session] = set()
         self._connections = 0
         self._loop = asyncio.new_event_loop()
@@ -80,68 +81,68 @@ class RtspServer:
                 f"the video cannot be served at {host}:{port}: {error.strerror}",
                 remedy="choose another [video_out] listen",
             ) from None
-        self._server = threading.Thread(target=self._serve, name="rtsp", daemon=True)
-        self._coder = threading.Thread(target=self._code, name="rtsp pictures", daemon=True)
+        self._server_thread = threading.Thread(target=self._serve, name="rtsp", daemon=True)
+        self._encoder_thread = threading.Thread(target=self._encode_frames, name="rtsp encoder", daemon=True)
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """The listening port."""
         return int(self._socket.getsockname()[1])
 
     @property
     def viewers(self) -> int:
-        """How many watch now."""
+        """Number of present viewers."""
         return sum(session.playing for session in tuple(self._sessions))
 
-    def changed(self) -> None:
-        """There is a new picture."""
-        self._changed.set()
+    def notify_frame(self) -> None:
+        """Notify the encoder of a new image."""
+        self._new_frame.set()
 
     def __enter__(self) -> Self:
-        self._server.start()
-        self._coder.start()
+        self._server_thread.start()
+        self._encoder_thread.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._closed = True
-        self._changed.set()
-        self._coder.join(5.0)
+        self._new_frame.set()
+        self._encoder_thread.join(5.0)
         self._loop.call_soon_threadsafe(self._loop.stop)
-        self._server.join(5.0)
+        self._server_thread.join(5.0)
 
-    def _code(self) -> None:
+    def _encode_frames(self) -> None:
         while not self._closed:
-            if not self._changed.wait(1.0):
+            if not self._new_frame.wait(1.0):
                 continue
-            self._changed.clear()
+            self._new_frame.clear()
             if self._closed or not self.viewers:
                 continue
-            image = self._picture()
+            image = self._latest_image()
             if image is None:
                 continue
-            key = self._want_key.is_set()
-            self._want_key.clear()
+            key_frame = self._key_frame_wanted.is_set()
+            self._key_frame_wanted.clear()
             try:
-                packets = self._encoder.encode(image, time.monotonic(), key=key)
-            except Exception:  # noqa: BLE001 - whatever libav has met: the flight goes on, and the video anew
+                packets = self._encoder.encode(image, time.monotonic(), key_frame=key_frame)
+            except Exception:  # noqa: BLE001 - any libav error: restart the encoder, never stop the agent
                 self.failures += 1
-                time.sleep(_AGAIN_S)
-                self._encoder = self._begin_stream()
-                self._want_key.set()
+                time.sleep(_ENCODER_RETRY_S)
+                self._encoder = self._make_encoder()
+                self._key_frame_wanted.set()
                 continue
-            self._loop.call_soon_threadsafe(self._hand_out, packets, key)
+            self._loop.call_soon_threadsafe(self._distribute, packets, key_frame)
 
-    def _hand_out(self, packets: list[bytes], key: bool) -> None:
+    def _distribute(self, packets: list[bytes], key_frame: bool) -> None:
         for session in tuple(self._sessions):
-            if session.playing and not session.send(packets, key):
-                self._want_key.set()
+            if session.playing and not session.send(packets, key_frame):
+                self._key_frame_wanted.set()
 
     def _serve(self) -> None:
         asyncio.set_event_loop(self._loop)
         server = self._loop.run_until_complete(
-            asyncio.start_server(self._talk, sock=self._socket, limit=_REQUEST_BYTES)
+            asyncio.start_server(self._handle_connection, sock=self._socket, limit=_MAX_REQUEST_BYTES)
         )
         try:
             self._loop.run_forever()
@@ -153,74 +154,76 @@ class RtspServer:
             self._loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
             self._loop.close()
 
-    async def _talk(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """One connection, which is one session at most."""
+    async def _handle_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Handle one connection, which has at most one session."""
         session = _Session(writer)
         self._connections += 1
         try:
-            while self._connections <= _MOST_CONNECTIONS:
-                request = await asyncio.wait_for(_read(reader), None if session.rides_along else _SESSION_S)
+            while self._connections <= _MAX_CONNECTIONS:
+                request = await asyncio.wait_for(
+                    _read_request(reader), None if session.interleaved else _SESSION_TIMEOUT_S
+                )
                 if request is None:
                     continue
                 if isinstance(request, int):
-                    session.answer("0", request)
+                    session.respond("0", request)
                     return
-                self._obey(session, *request)
-                await asyncio.wait_for(writer.drain(), _STALLED_S)
+                self._handle_request(session, *request)
+                await asyncio.wait_for(writer.drain(), _STALL_TIMEOUT_S)
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, UnicodeError):
-            pass  # it has gone, or speaks something else
+            pass  # disconnected, or not RTSP
         finally:
             self._connections -= 1
             self._sessions.discard(session)
             session.close()
 
-    def _obey(self, session: _Session, method: str, uri: str, headers: dict[str, str]) -> None:
+    def _handle_request(self, session: _Session, method: str, uri: str, headers: dict[str, str]) -> None:
         number = headers.get("cseq", "0")
         path = urlsplit(uri).path.rstrip("/")
         if method != "OPTIONS" and path not in (PATH, f"{PATH}/video"):
-            session.answer(number, 404)
+            session.respond(number, 404)
         elif method == "OPTIONS":
-            session.answer(number, 200, {"Public": _METHODS})
+            session.respond(number, 200, {"Public": _METHODS})
         elif method == "DESCRIBE":
             base = uri.split("?")[0].rstrip("/") + "/"
-            session.answer(
+            session.respond(
                 number, 200, {"Content-Base": base, "Content-Type": "application/sdp"}, self._description(session)
             )
         elif method == "SETUP":
             self._set_up(session, number, headers.get("transport", ""))
         elif method not in ("PLAY", "PAUSE", "TEARDOWN", "GET_PARAMETER", "SET_PARAMETER"):
-            session.answer(number, 501, {"Public": _METHODS})
+            session.respond(number, 501, {"Public": _METHODS})
         elif method in ("GET_PARAMETER", "SET_PARAMETER") and "session" not in headers:
-            session.answer(number, 200)  # only asks whether anybody is there
+            session.respond(number, 200)  # keep-alive
         elif headers.get("session", "").partition(";")[0].strip() != session.id or session not in self._sessions:
-            session.answer(number, 454 if "session" in headers else 455)
+            session.respond(number, 454 if "session" in headers else 455)
         else:
             if method == "PLAY":
-                session.play()  # the answer goes out first: pictures are handed out in another round of the loop
-                self._want_key.set()
+                session.play()  # the response goes out first: packets are distributed later in the event loop
+                self._key_frame_wanted.set()
             elif method in ("PAUSE", "TEARDOWN"):
                 session.playing = False
             if method == "TEARDOWN":
                 self._sessions.discard(session)
-            session.answer(number, 200, {"Session": session.id, **({"Range": "npt=now-"} if method == "PLAY" else {})})
+            session.respond(number, 200, {"Session": session.id, **({"Range": "npt=now-"} if method == "PLAY" else {})})
 
     def _set_up(self, session: _Session, number: str, transports: str) -> None:
-        if session not in self._sessions and len(self._sessions) >= _MOST_VIEWERS:
-            session.answer(number, 453)
+        if session not in self._sessions and len(self._sessions) >= _MAX_VIEWERS:
+            session.respond(number, 453)
             return
-        chosen = next((told for told in (session.choose(way) for way in transports.split(",")) if told), None)
+        chosen = next((header for offer in transports.split(",") if (header := session.select_transport(offer))), None)
         if chosen is None:
-            session.answer(number, 461)
+            session.respond(number, 461)
             return
         self._sessions.add(session)
-        session.answer(number, 200, {"Transport": chosen, "Session": f"{session.id};timeout={_SESSION_S}"})
+        session.respond(number, 200, {"Transport": chosen, "Session": f"{session.id};timeout={_SESSION_TIMEOUT_S}"})
 
     def _description(self, session: _Session) -> bytes:
         """The stream as a session description (RFC 4566, RFC 6184 section 8.2.1)."""
-        sequence, pictures = self._encoder.parameter_sets
-        sets = ",".join(base64.b64encode(unit).decode() for unit in (sequence, pictures))
+        sequence_set, picture_set = self._encoder.parameter_sets
+        sets = ",".join(base64.b64encode(unit).decode() for unit in (sequence_set, picture_set))
         kind = "IP6" if ":" in session.own_host else "IP4"
-        nowhere = "::" if kind == "IP6" else "0.0.0.0"  # told by SETUP
+        nowhere = "::" if kind == "IP6" else "0.0.0.0"  # the address is negotiated by SETUP
         lines = (
             "v=0",
             f"o=- 1 1 IN {kind} {session.own_host}",
@@ -230,74 +233,74 @@ class RtspServer:
             "a=range:npt=now-",
             "m=video 0 RTP/AVP 96",
             "a=rtpmap:96 H264/90000",
-            f"a=fmtp:96 packetization-mode=1;profile-level-id={sequence[1:4].hex()};sprop-parameter-sets={sets}",
+            f"a=fmtp:96 packetization-mode=1;profile-level-id={sequence_set[1:4].hex()};sprop-parameter-sets={sets}",
             "a=control:video",
         )
         return "".join(f"{line}\r\n" for line in lines).encode()
 
 
 class _Session:
-    """One viewer, on the server's loop. rides_along: its pictures go over the connection itself."""
+    """One client, used on the server's event loop. interleaved: its packets go over the RTSP connection itself."""
 
     def __init__(self, writer: asyncio.StreamWriter) -> None:
         self._writer = writer
         self.id = secrets.token_hex(8)
         self.playing = False
-        self.rides_along = False
+        self.interleaved = False
         self._channels = (0, 1)
         self._sockets: tuple[socket.socket, ...] = ()
         self._ports = (0, 0)
-        self._waits = True
+        self._awaiting_key_frame = True
         self._sent_s = 0.0
         self.own_host = str(writer.get_extra_info("sockname")[0])
-        # Only to where the request came from: nobody can have pictures thrown at somebody else.
+        # Only to the client's own address, so that the server cannot be used to flood a third party.
         self._host = str(writer.get_extra_info("peername")[0])
 
-    def answer(self, number: str, status: int, headers: dict[str, str] | None = None, body: bytes = b"") -> None:
-        """Answer the request of a number."""
+    def respond(self, number: str, status: int, headers: dict[str, str] | None = None, body: bytes = b"") -> None:
+        """Respond to the request with CSeq ``number``."""
         lines = [f"RTSP/1.0 {status} {_REASONS[status]}", f"CSeq: {number}", "Server: Syncline"]
         lines += [f"{name}: {value}" for name, value in (headers or {}).items()]
         if body:
             lines.append(f"Content-Length: {len(body)}")
         self._writer.write("\r\n".join([*lines, "", ""]).encode() + body)
 
-    def choose(self, transport: str) -> str | None:
-        """Take one of the transports that were offered; how it is answered, None for one that is not to be had."""
+    def select_transport(self, transport: str) -> str | None:
+        """Select an offered transport; its Transport header, None if it is not supported."""
         protocol, *options = (part.strip() for part in transport.split(";"))
-        told = dict(option.partition("=")[::2] for option in options)
-        if "multicast" in told:
+        fields = dict(option.partition("=")[::2] for option in options)
+        if "multicast" in fields:
             return None
         if protocol == "RTP/AVP/TCP":
-            channels = _pair(told.get("interleaved", "0-1"), 255)
+            channels = _parse_pair(fields.get("interleaved", "0-1"), 255)
             if channels is None:
                 return None
             self._drop_sockets()
-            self._channels, self.rides_along = channels, True
+            self._channels, self.interleaved = channels, True
             return f"RTP/AVP/TCP;unicast;interleaved={channels[0]}-{channels[1]}"
-        ports = _pair(told.get("client_port", ""), 65_535)
+        ports = _parse_pair(fields.get("client_port", ""), 65_535)
         if protocol not in ("RTP/AVP", "RTP/AVP/UDP") or ports is None or min(ports) < 1024:
             return None
         self._drop_sockets()
-        self._sockets = _two_sockets(self.own_host)
+        self._sockets = _rtp_socket_pair(self.own_host)
         if not self._sockets:
             return None
-        self._ports, self.rides_along = ports, False
+        self._ports, self.interleaved = ports, False
         own = [one.getsockname()[1] for one in self._sockets]
         return f"RTP/AVP;unicast;client_port={ports[0]}-{ports[1]};server_port={own[0]}-{own[1]}"
 
     def play(self) -> None:
-        """From the next whole picture on."""
-        self.playing = self._waits = True
+        """Start sending, from the next key frame on."""
+        self.playing = self._awaiting_key_frame = True
         self._sent_s = time.monotonic()
 
-    def send(self, packets: list[bytes], key: bool) -> bool:
-        """The packets of one picture; False: this viewer waits for a whole one."""
-        if self._waits and not key:
+    def send(self, packets: list[bytes], key_frame: bool) -> bool:
+        """Send the packets of one image; False: this client waits for a key frame."""
+        if self._awaiting_key_frame and not key_frame:
             return False
-        if self.rides_along:
-            if self._writer.transport.get_write_buffer_size() > _UNSENT_BYTES:
-                self._waits = True
-                if time.monotonic() - self._sent_s > _STALLED_S:
+        if self.interleaved:
+            if self._writer.transport.get_write_buffer_size() > _MAX_UNSENT_BYTES:
+                self._awaiting_key_frame = True
+                if time.monotonic() - self._sent_s > _STALL_TIMEOUT_S:
                     self._writer.transport.abort()
                 return False
             self._sent_s = time.monotonic()
@@ -307,14 +310,14 @@ class _Session:
         else:
             for packet in packets:
                 side = int(is_rtcp(packet))
-                # A full buffer, or nobody there any more: UDP loses.
+                # The buffer is full or the client is gone: the packet is lost.
                 with contextlib.suppress(OSError):
                     self._sockets[side].sendto(packet, (self._host, self._ports[side]))
-        self._waits = False
+        self._awaiting_key_frame = False
         return True
 
     def close(self) -> None:
-        """Let go of connection and ports."""
+        """Close the connection and the UDP sockets."""
         self.playing = False
         self._drop_sockets()
         self._writer.close()
@@ -325,11 +328,11 @@ class _Session:
         self._sockets = ()
 
 
-async def _read(reader: asyncio.StreamReader) -> tuple[str, str, dict[str, str]] | int | None:
-    """The next request as method, uri, headers; a status where it is none; None for a packet in between."""
+async def _read_request(reader: asyncio.StreamReader) -> tuple[str, str, dict[str, str]] | int | None:
+    """The next request as method, uri, headers; an RTSP status for an invalid one; None for an interleaved packet."""
     first = await reader.readexactly(1)
     if first == b"$":
-        await reader.readexactly(int.from_bytes((await reader.readexactly(3))[1:], "big"))  # a receiver's report
+        await reader.readexactly(int.from_bytes((await reader.readexactly(3))[1:], "big"))  # an RTCP receiver report
         return None
     if first in b"\r\n":
         return None
@@ -339,16 +342,16 @@ async def _read(reader: asyncio.StreamReader) -> tuple[str, str, dict[str, str]]
         return 400
     if parts[2] != "RTSP/1.0":
         return 505
-    headers = {name.strip().lower(): value.strip() for name, _, value in (told.partition(":") for told in lines)}
+    headers = {name.strip().lower(): value.strip() for name, _, value in (text.partition(":") for text in lines)}
     length = headers.get("content-length", "0")
-    if not length.isdigit() or int(length) > _REQUEST_BYTES or not headers.get("cseq", "").isdigit():
+    if not length.isdigit() or int(length) > _MAX_REQUEST_BYTES or not headers.get("cseq", "").isdigit():
         return 400
     await reader.readexactly(int(length))
     return parts[0], parts[1], headers
 
 
-def _pair(text: str, most: int) -> tuple[int, int] | None:
-    """Two numbers of "8000-8001", or of "8000" alone."""
+def _parse_pair(text: str, most: int) -> tuple[int, int] | None:
+    """Parse "8000-8001", or "8000" alone as a pair."""
     low, _, high = text.partition("-")
     if not (low.isascii() and low.isdigit() and len(low) < 6) or (high and not (high.isascii() and high.isdigit())):
         return None
@@ -356,8 +359,8 @@ def _pair(text: str, most: int) -> tuple[int, int] | None:
     return pair if max(pair) <= most else None
 
 
-def _two_sockets(host: str) -> tuple[socket.socket, ...]:
-    """UDP sockets on an even port and the one after it (RFC 3550, section 11); () where there are none."""
+def _rtp_socket_pair(host: str) -> tuple[socket.socket, ...]:
+    """UDP sockets on an even port and the next one (RFC 3550, section 11); () if none are free."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     for _ in range(30):
         pair = (socket.socket(family, socket.SOCK_DGRAM), socket.socket(family, socket.SOCK_DGRAM))

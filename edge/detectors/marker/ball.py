@@ -1,10 +1,9 @@
-"""Finds one ball of a known colour and measures its centre to a small part of a pixel.
+"""Detection of one ball of a known colour, with sub-pixel centre and covariance.
 
-A coarse pass classifies every second pixel by colour; each blob is then measured at full resolution. There the
-question is no longer which pixels are the target's but how much of each is: its coverage, from the local colours of
-target and background (``outline``), the latter as it was before the target came where the camera stands still
-(``scenery``). That is unbiased under motion blur (a smeared ball is where it was on average) and
-does not follow the shading, as a centroid of brightness would.
+A coarse pass classifies every second pixel by colour; each blob is then measured at full resolution. There the coverage
+of each pixel by the ball is estimated from the local colours of ball and background (``subpixel_outline``), the latter
+as seen before the ball came where the camera is static (``static_background``). Coverage is unbiased under motion blur
+(a smeared ball is measured at its mean position) and independent of shading, unlike a centroid of brightness.
 """
 
 from __future__ import annotations
@@ -19,39 +18,43 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.detectors.base import Detection, Prediction
-from edge.detectors.marker.colour import ColourModel, codes, taught
+from edge.detectors.marker.colour import ColourModel, colour_indices, learn_colour_model
 from edge.detectors.marker.subpixel_outline import Outline, measure_outline
-from edge.detectors.moving.static_background import Scenery
+from edge.detectors.moving.static_background import StaticBackground
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.sphere_projection import outline_to_centre
 from protocols.geometry.types import Bools, Floats
 
 REVISION = 4
-"""Of what is measured: kept detections of another revision are not this detector's."""
+"""Revision of the measurement: stored detections of another revision are not reused."""
 _STEP = 2  # of the coarse pass [px]
 _CANDIDATES = 6  # blobs that are measured, largest first
-_MIN_AREA = 6.0  # px²: below, colour noise looks like that
-_MAX_SHARE = 0.2  # of the image: above, it is a wall
+_MIN_AREA = 6.0  # px²: smaller blobs may be colour noise
+_MAX_SHARE = 0.2  # share of the image: larger blobs are walls
 _MIN_SCORE = 0.35
-_APART, _APART_SMEARED = 0.6, 0.04  # px between a blob's centroid and its outline's centre: not more, and of its smear
-_BLOB_STD, _BLOB_SHARE = 0.25, 0.2  # px: of a blob's centroid where they contradict each other, and of their distance
-_BORDER = 1  # px: nearer to the image's border a blob is cut
-_BESIDE = 8  # px beside a blob in which it may still be
-_NEAR = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * _BESIDE // _STEP + 1, 2 * _BESIDE // _STEP + 1))
-_BOX = cv2.getStructuringElement(cv2.MORPH_RECT, (3, 3))
+# px: largest distance of a blob's centroid from its outline's centre, plus this share of its smear
+_MAX_DISTANCE, _MAX_DISTANCE_SMEAR = 0.6, 0.04
+# px: std of a blob's centroid where the two contradict, plus this share of their distance
+_BLOB_STD, _BLOB_SHARE = 0.25, 0.2
+_BORDER = 1  # px: a blob nearer to the image border is truncated
+_MARKER_MARGIN = 8  # px around a blob that may still belong to it
+_MARGIN_KERNEL = cv2.getStructuringElement(
+    cv2.MORPH_RECT, (2 * _MARKER_MARGIN // _STEP + 1, 2 * _MARKER_MARGIN // _STEP + 1)
+)
+_LINK_KERNEL = cv2.getStructuringElement(cv2.MORPH_RECT, (3, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerModel:
-    """What the marker looks like: its colour model, and the label its detections carry."""
+    """Appearance of the marker: its colour model, and the label of its detections."""
 
     colours: ColourModel
     label: str = "marker"
 
     @classmethod
     def default(cls) -> MarkerModel:
-        """The orange ball of the shipped scenes; a matt orange table-tennis ball is near it."""
+        """The orange ball of the shipped scenes; a matt orange table-tennis ball is similar."""
         return cls.of_colour(246, 112, 22)
 
     @classmethod
@@ -69,12 +72,14 @@ class MarkerModel:
         return cls(ColourModel.from_table(table), str(table.get("label", "marker")))
 
 
-def teach(image: npt.NDArray[np.uint8], box: tuple[float, float, float, float], label: str = "marker") -> MarkerModel:
-    """A model from one picture and a box around the marker in it.
+def learn_marker_model(
+    image: npt.NDArray[np.uint8], box: tuple[float, float, float, float], label: str = "marker"
+) -> MarkerModel:
+    """Learn a model from one image and a box around the marker in it.
 
-    image: (H, W, 3) BGR. box: x, y (top left), width, height [px]; it may include some background. Pixels inside
-    are examples of the target, pixels outside of everything else; colours inside that are common outside
-    too are background. Raises InputError where the box leaves the image or holds nothing of its own colour.
+    image: (H, W, 3) BGR. box: x, y (top left), width, height [px]; it may include some background. Pixels inside are
+    examples of the target, pixels outside of everything else; colours inside that are also common outside are
+    background. Raises InputError where the box leaves the image or contains no colour of its own.
     """
     height, width = image.shape[:2]
     x, y, w, h = box
@@ -89,17 +94,16 @@ def teach(image: npt.NDArray[np.uint8], box: tuple[float, float, float, float], 
         across = np.abs(columns - (x + 0.5 * w - 0.5)) < 0.5 * w + grow
         return np.asarray(across & (np.abs(rows - (y + 0.5 * h - 0.5)) < 0.5 * h + grow))
 
-    # A gap between inside and outside: a box is rarely drawn to the pixel.
-    return MarkerModel(taught(image, within(0.0), ~within(2.0 + 0.1 * max(w, h))), label)
+    # A gap between inside and outside, because boxes are drawn inaccurately.
+    return MarkerModel(learn_colour_model(image, within(0.0), ~within(2.0 + 0.1 * max(w, h))), label)
 
 
 class MarkerDetector:
-    """Finds the marker in the pictures of one camera; of earlier ones it remembers what stands behind the marker.
+    """Detects the marker in the images of one camera; of earlier images it keeps the background behind the marker.
 
-    model: what it looks like. intrinsics: where given, the centre is corrected from that of the ball's
-    outline to the projection of its centre, which differ by perspective and distortion (``outline_to_centre``).
-    most: how many blobs at the most are reported, best first; one marker is one.
-    min_size, max_size: diameters [px] outside of which a blob is not the marker.
+    model: appearance of the marker. intrinsics: where given, the centre of the ball's outline is corrected to the
+    projection of the ball's centre; they differ by perspective and distortion (``outline_to_centre``). max_detections:
+    best ones reported at most; one marker is one. min_size, max_size: limits of the diameter [px].
     """
 
     def __init__(
@@ -107,25 +111,25 @@ class MarkerDetector:
         model: MarkerModel | None = None,
         intrinsics: Intrinsics | None = None,
         *,
-        most: int = 1,
+        max_detections: int = 1,
         min_size: float = 0.0,
         max_size: float = math.inf,
     ) -> None:
         self._model = MarkerModel.default() if model is None else model
         self._table = self._model.colours.table()
         self._intrinsics = intrinsics
-        self._most = most
+        self._max_detections = max_detections
         self._sizes = min_size, max_size
-        self._scenery = Scenery()
+        self._background = StaticBackground()
 
     def detect(
         self, image: npt.NDArray[np.uint8], time_s: float | None = None, predictions: Sequence[Prediction] = ()
     ) -> list[Detection]:
-        coarse = self._table[codes(image[::_STEP, ::_STEP])]
+        coarse = self._table[colour_indices(image[::_STEP, ::_STEP])]
         if not coarse.any():
-            self._learn(image, coarse, [])
+            self._update_background(image, coarse, [])
             return []
-        linked = cv2.dilate(coarse, _BOX)
+        linked = cv2.dilate(coarse, _LINK_KERNEL)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(linked, connectivity=8)
         pixels = np.bincount(labels[coarse > 0], minlength=count)
         pixels[0] = 0
@@ -138,32 +142,32 @@ class MarkerDetector:
             detection = self._measure(image, left, top, width, height)
             if detection is not None:
                 found.append(detection)
-        self._learn(image, coarse, boxes)
+        self._update_background(image, coarse, boxes)
         found.sort(key=lambda one: one.score * one.size, reverse=True)
-        return found[: self._most]
+        return found[: self._max_detections]
 
-    def _learn(
+    def _update_background(
         self, image: npt.NDArray[np.uint8], coarse: npt.NDArray[np.uint8], boxes: list[tuple[int, int, int, int]]
     ) -> None:
-        """Learn the scenery, but not what is of the marker's colour or near a blob of it."""
-        first, end = self._scenery.rows(image)
-        top = max((first - _BESIDE) // _STEP, 0)
-        near = coarse[top : (end + _BESIDE) // _STEP + 1]
+        """Learn the background, except pixels of the marker's colour or near a blob of it."""
+        first, end = self._background.next_rows(image)
+        top = max((first - _MARKER_MARGIN) // _STEP, 0)
+        near = coarse[top : (end + _MARKER_MARGIN) // _STEP + 1]
         if near.any():
-            near = np.asarray(cv2.dilate(near, _NEAR), dtype=np.uint8)
+            near = np.asarray(cv2.dilate(near, _MARGIN_KERNEL), dtype=np.uint8)
         free = near[np.arange(first, end) // _STEP - top].repeat(_STEP, axis=1)[:, : image.shape[1]] == 0
         for left, upper, width, height in boxes:
-            margin = _BESIDE + (width + height) // 4
+            margin = _MARKER_MARGIN + (width + height) // 4
             above, below = max(upper - margin - first, 0), max(upper + height + margin - first, 0)
             free[above:below, max(left - margin, 0) : left + width + margin] = False
-        self._scenery.learn(image, free)
+        self._background.update(image, free)
 
     def _measure(self, image: npt.NDArray[np.uint8], left: int, top: int, width: int, height: int) -> Detection | None:
-        """Measure the blob whose coarse bounding box is given [px]; None where it is no ball."""
+        """Measure the blob in a coarse bounding box [px]; None where it is no ball."""
         margin = 2 * _STEP
         x0, y0 = max(left - margin, 0), max(top - margin, 0)
         patch = image[y0 : top + height + margin, x0 : left + width + margin]
-        mask = _main_blob(self._table[codes(patch)])
+        mask = _main_blob(self._table[colour_indices(patch)])
         if mask is None:
             return None
         moments = cv2.moments(mask, binaryImage=True)
@@ -171,17 +175,17 @@ class MarkerDetector:
         if area < _MIN_AREA or _at_border(mask, x0, y0, image.shape):
             return None
         first = np.array([x0 + moments["m10"] / area, y0 + moments["m01"] / area])
-        outline = measure_outline(image, first, np.sqrt(area / np.pi), self._scenery.of(image))
+        outline = measure_outline(image, first, np.sqrt(area / np.pi), self._background.lookup(image))
         if outline is None or not self._sizes[0] <= outline.diameter <= self._sizes[1]:
             return None
         reach = 0.5 * outline.diameter
         size = np.array([image.shape[1], image.shape[0]])
         if (outline.centre < reach).any() or (outline.centre > size - 1 - reach).any():
-            return None  # cut by the image's border, it has lost its centre
+            return None  # truncated by the image border, its centre is unknown
         score = outline.agreement * _solidity(moments)
         if score < _MIN_SCORE or not 0.5 < area / (np.pi * reach * reach) < 2.0:
             return None
-        outline = _unless_contradicted(outline, first, area)
+        outline = _checked_by_centroid(outline, first, area)
         centre, covariance = outline.centre, outline.covariance
         if self._intrinsics is not None:
             sizes = np.array([outline.diameter])
@@ -200,7 +204,7 @@ class MarkerDetector:
 
 
 def _main_blob(mask: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8] | None:
-    """The largest connected part of a mask (h, w), its holes filled (a glint is part of the ball)."""
+    """The largest connected component of a mask (h, w) with holes filled (a highlight is part of the ball)."""
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
         return None
@@ -210,14 +214,14 @@ def _main_blob(mask: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8] | None:
     return filled
 
 
-def _unless_contradicted(outline: Outline, first: Floats, area: float) -> Outline:
-    """The outline, or, where the blob's centroid ``first`` (2,) contradicts it, the blob's centre and size.
+def _checked_by_centroid(outline: Outline, first: Floats, area: float) -> Outline:
+    """The outline, or, where it is far from the blob's centroid ``first`` (2,), the blob's centre and size.
 
-    The two err differently: a centroid of pixels of the marker's colour is coarse, but does not take a red ball that
-    touches an orange one for a part of it. Where they are far apart, the outline followed something else.
+    Their errors have different causes: a centroid of pixels of the marker's colour is coarse, but does not include a
+    red ball that touches an orange one. Where they are far apart, the outline followed another object.
     """
     away = float(np.hypot(*(outline.centre - first)))
-    if away < _APART + _APART_SMEARED * outline.smear:
+    if away < _MAX_DISTANCE + _MAX_DISTANCE_SMEAR * outline.smear:
         return outline
     variance = _BLOB_STD**2 + (_BLOB_SHARE * away) ** 2
     return replace(
@@ -229,15 +233,16 @@ def _unless_contradicted(outline: Outline, first: Floats, area: float) -> Outlin
 
 
 def _at_border(mask: npt.NDArray[np.uint8], left: int, top: int, shape: tuple[int, ...]) -> bool:
-    """Whether a blob (h, w) at (left, top) of an image reaches its border: what is left of a ball there can look like
-    a smaller, whole one."""
+    """Whether a blob (h, w) at (left, top) reaches the image border: a truncated ball can look like a smaller whole
+    one.
+    """
     x, y, width, height = cv2.boundingRect(mask)
     x, y = x + left, y + top
     return x < _BORDER or y < _BORDER or x + width > shape[1] - _BORDER or y + height > shape[0] - _BORDER
 
 
 def _solidity(moments: dict[str, float]) -> float:
-    """How well a blob fills the ellipse of its own second moments, 0..1; 1 for discs and smeared discs."""
+    """Area of a blob over that of the ellipse of its second moments, 0..1; 1 for discs and smeared discs."""
     area = moments["m00"]
     spread = np.array([[moments["mu20"], moments["mu11"]], [moments["mu11"], moments["mu02"]]]) / area
     ellipse = 4.0 * np.pi * np.sqrt(np.linalg.det(spread + np.eye(2) / 12.0))

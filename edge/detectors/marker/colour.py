@@ -1,8 +1,8 @@
-"""Nearest-neighbour colour classification: is this pixel the target's colour?
+"""Nearest-neighbour colour classification of the marker's pixels.
 
 A pixel belongs to the class of the labelled example colour nearest to it, and to neither where the nearest target
-example is too far away (the classifier of the marker paper's reference [7]). All answers are worked out once into
-a table over quantised colours, so that a picture is classified by one look-up a pixel.
+example is too far away (the classifier of the marker paper's reference [7]). All results are precomputed in a table
+over quantised colours, so that an image is classified by one look-up per pixel.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ import numpy.typing as npt
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 
-_BITS = 5  # of each channel in the table: 32³ entries, which a board's cache holds
+_BITS = 5  # of each channel in the table: 32³ entries, which fit into the cache of a single-board computer
 _CELLS = 1 << _BITS
-_MAX_EXAMPLES = 600  # a class
-# BGR to luma and two colour differences. Luma counts little: a ball is bright above and dark below.
+_MAX_EXAMPLES = 600  # per class
+# BGR to luma and two colour differences. Luma has a small weight: a ball is bright above and dark below.
 _LUMA_WEIGHT = 0.35
 _TO_METRIC = np.array([[0.114, 0.587, 0.299], [0.5, -0.331, -0.169], [-0.081, -0.419, 0.5]]) * np.array(
     [[_LUMA_WEIGHT], [1.6], [1.6]]
 )
 _REJECT = 30.0
-# A palette that stands for everything that is not the target: hues [°], saturations, values.
-_TURNS = tuple(float(turn) for turn in range(0, 360, 14))
-_STRENGTHS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-_VALUES = (0.08, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
-_APART = 28.0  # from the target's examples, in the metric: what is farther away may be called something else
-_COMMON = 0.25  # a colour is no target if it is this common outside the box against inside
+# Palette of everything that is not the target: hues [°], saturations, values.
+_PALETTE_HUES = tuple(float(turn) for turn in range(0, 360, 14))
+_PALETTE_SATURATIONS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+_PALETTE_VALUES = (0.08, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
+_PALETTE_DISTANCE = 28.0  # from the target's examples, in the metric: farther palette colours are other
+_MAX_BACKGROUND_RATIO = 0.25  # a colour is background where it is this frequent outside the box relative to inside
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColourModel:
-    """Labelled example colours and the table made from them.
+    """Labelled example colours and the look-up table made from them.
 
     target, other: example colours (n, 3), (m, 3) BGR 0..255. reject: largest distance to a target example, in the
     classifier's metric (colour differences count about 4.5 times as much as luma).
@@ -80,9 +80,9 @@ class ColourModel:
 
     @classmethod
     def of_hue(cls, bgr: tuple[float, float, float]) -> ColourModel:
-        """A model of an evenly coloured target (blue, green, red) in light and shade, against everything else.
+        """A model of a uniformly coloured target (blue, green, red) in light and shade, against everything else.
 
-        The other examples are a palette: greys, and hues from 14° away on, at all strengths; and the target's own hue
+        The other examples are a palette: greys, and hues from 14° away on, at all saturations; and the target's own hue
         at less than 60 % of its saturation (wood, cardboard, skin). Raises InputError for a colour without a hue.
         """
         base = np.array(bgr, dtype=np.float64)
@@ -96,16 +96,16 @@ class ColourModel:
             )
         grid = [
             ((float(hue) + turn) % 360.0, strength, value)
-            for turn in _TURNS
-            for strength in _STRENGTHS
-            for value in _VALUES
+            for turn in _PALETTE_HUES
+            for strength in _PALETTE_SATURATIONS
+            for value in _PALETTE_VALUES
             if turn or strength < 0.6 * saturation
         ]
         other = _from_hsv(grid)
         return cls(np.clip(np.concatenate([shades, glints]), 0, 255), other)
 
 
-def codes(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint16]:
+def colour_indices(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint16]:
     """Indices (H, W) of the pixels of an image (H, W, 3) BGR into ``ColourModel.table``."""
     shift = 8 - _BITS
     code = (image[..., 0] >> shift).astype(np.uint16)
@@ -115,20 +115,24 @@ def codes(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint16]:
     return code
 
 
-def taught(image: npt.NDArray[np.uint8], inside: npt.NDArray[np.bool_], outside: npt.NDArray[np.bool_]) -> ColourModel:
-    """A model from labelled pixels of an image (H, W, 3) BGR.
+def learn_colour_model(
+    image: npt.NDArray[np.uint8], inside: npt.NDArray[np.bool_], outside: npt.NDArray[np.bool_]
+) -> ColourModel:
+    """Learn a model from labelled pixels of an image (H, W, 3) BGR.
 
-    inside, outside: masks (H, W). Colours inside that are also common outside are background that the box
-    included, and count as such. Raises InputError where nothing inside differs from the outside.
+    inside, outside: masks (H, W). Colours inside that are also common outside are background that the box included, and
+    are labelled so. Raises InputError where no colour inside differs from the outside.
     """
-    code = codes(np.asarray(cv2.GaussianBlur(image, (3, 3), 0), dtype=np.uint8))
+    code = colour_indices(np.asarray(cv2.GaussianBlur(image, (3, 3), 0), dtype=np.uint8))
     shape = (_CELLS,) * 3
     within = _smooth(np.bincount(code[inside], minlength=_CELLS**3).reshape(shape) / max(int(inside.sum()), 1))
     beyond = _smooth(np.bincount(code[outside], minlength=_CELLS**3).reshape(shape) / max(int(outside.sum()), 1))
     # Compare counts of pixels, not shares: a box of 400 px beside 300,000 px of background.
     share = max(int(outside.sum()), 1) / max(int(inside.sum()), 1)
-    is_target = (within > 0) & (beyond * share < _COMMON * within) & (beyond < _COMMON * within)
-    # The rim's pixels mix target and background; only what lies inside of it is an example of the target.
+    is_target = (
+        (within > 0) & (beyond * share < _MAX_BACKGROUND_RATIO * within) & (beyond < _MAX_BACKGROUND_RATIO * within)
+    )
+    # Pixels of the rim are mixtures; only pixels within it are examples of the target.
     blob = inside & is_target.ravel()[code]
     core = cv2.erode(blob.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     pure = core if core.sum() >= 9 else blob
@@ -140,9 +144,9 @@ def taught(image: npt.NDArray[np.uint8], inside: npt.NDArray[np.bool_], outside:
             remedy="draw the box closely around the target, and choose a target whose colour is rare in the scene",
         )
     seen = _examples(np.where(is_target, 0.0, beyond))
-    # One picture does not show all that other cameras will see: a palette stands for the rest.
-    palette = _from_hsv([(h, s, v) for h in _TURNS for s in _STRENGTHS for v in _VALUES])
-    return ColourModel(target, np.concatenate([seen, palette[_nearest(palette, target) > _APART]]))
+    # One image does not show all that other cameras will see: a palette represents the rest.
+    palette = _from_hsv([(h, s, v) for h in _PALETTE_HUES for s in _PALETTE_SATURATIONS for v in _PALETTE_VALUES])
+    return ColourModel(target, np.concatenate([seen, palette[_nearest(palette, target) > _PALETTE_DISTANCE]]))
 
 
 def _from_hsv(colours: list[tuple[float, float, float]]) -> Floats:
@@ -166,7 +170,7 @@ def _nearest(colours: Floats, examples: Floats) -> Floats:
 
 
 def _smooth(histogram: Floats) -> Floats:
-    """Spread a colour histogram (32, 32, 32) by one cell: noise carries a colour that far."""
+    """Spread a colour histogram (32, 32, 32) by one cell, the reach of noise."""
     out = histogram
     for axis in range(3):
         padded = np.pad(out, [(1, 1) if a == axis else (0, 0) for a in range(3)])

@@ -1,10 +1,10 @@
-"""Measures the outline of a ball to a small part of a pixel, and from it centre, size and their uncertainty.
+"""Sub-pixel measurement of a ball's outline: centre, diameter and their uncertainty.
 
-Rays run outward from the centre. On each, the colour just inside and the colour just outside are known, and every
-sample between is a mixture of the two; the length of ray that is covered tells where the rim is. This needs no
-threshold, so it is not drawn towards the light, and a rim smeared by motion still has its middle where the
-rim was at mid-exposure. An ellipse-like curve is then fitted robustly to the rims of all rays: where something of a
-similar colour touches the ball, those rays are outvoted.
+Rays are sampled outward from the centre. On each, the colour just inside and the colour just outside are known, and
+every sample between them is a mixture of the two; the covered length of the ray gives the position of the rim. This
+needs no threshold, so there is no bias towards the light, and the middle of a rim smeared by motion is where the rim
+was at mid-exposure. An ellipse-like curve is then fitted robustly to the rims of all rays: where an object of a similar
+colour touches the ball, those rays are outliers.
 """
 
 from __future__ import annotations
@@ -15,49 +15,51 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.detectors.moving.static_background import known_at
+from edge.detectors.moving.static_background import is_known
 from protocols.geometry.types import Bools, Floats
 
 Image = npt.NDArray[np.uint8]
 
 _RAYS = 48
-_FEWEST = 20  # samples of the ball alone
+_MIN_SAMPLES = 20  # samples of the ball alone
 _STEP = 0.5  # px between samples of a ray
 _PASSES = 3
-_PIXEL_STD = 6.0  # of a colour about the mixture of its two ends, by noise and texture [8-bit steps]
-_SHADE_STD = 0.04  # relative: how much shading and texture brighten or darken either end along a ray
+_PIXEL_STD = 6.0  # std of a colour about the mixture of its two ends, by noise and texture [8-bit steps]
+_SHADE_STD = 0.04  # relative variation of either end's brightness along a ray, by shading and texture
 _SHADE_RIDGE = 2.5
 _CURVED_RIDGE = 2.5
-_LARGE = 13.0  # px of radius from which a ball tells its shading that well; a smaller one less
-_INNER_BAND, _INNER_RIDGE = 1.0, 2.0  # px inside of the rim where the ball's model is put right, and px² of ridge
+_SHADING_RADIUS = 13.0  # px: radius from which a ball's shading is well determined
+_INNER_BAND, _INNER_RIDGE = 1.0, 2.0  # px inside the rim where the shading model is corrected, and px² of its ridge
 _OUTER_BAND = 3.0  # px beyond the rim from which the background's colour is taken
-_AS_KNOWN = 8.0  # 8-bit steps by which a background may have changed since it was seen without the ball
-_FLOOR_PX = 0.01  # std of the centre that remains without noise or texture,
-_FLOOR_SHADE = 0.002  # and its share of the radius: shading that the model of a matt ball does not tell,
-_FLOOR_SMEAR = 0.005  # and its share of what motion adds to a rim's width
-_SHARP = 2.2  # px that noise and sampling make of a sharp rim
-_CORRELATION = 3.5  # px along a sharp rim within which rays err together,
+_BACKGROUND_CHANGE = 8.0  # 8-bit steps: largest change of the background since it was seen without the ball
+_FLOOR_PX = 0.01  # px: std of the centre without noise or texture,
+_FLOOR_SHADE = 0.002  # plus this share of the radius: shading beyond the model of a matt ball,
+_FLOOR_SMEAR = 0.005  # plus this share of the rim width added by motion
+_SHARP = 2.2  # px: width of a sharp rim after noise and sampling
+_CORRELATION = 3.5  # px: correlation length of rays along a sharp rim,
 _CORRELATION_GROWS = 1.5  # and the power of the rim's width with which it grows
-_LEAST_SMEARED = 4  # of the rays, one part in so many: motion along the rim leaves it as sharp as lens and encoder do
-_CHROMA = 0.6  # how much colour differences count against luma: cameras and encoders tell them at half the resolution
+_SHARPEST_SHARE = 4  # one part in so many of the rays: motion along the rim leaves it as sharp as lens and encoder do
+_CHROMA = 0.6  # weight of colour differences against luma: cameras and encoders subsample them by two
 
-_COLOUR_STD = 0.7  # of ball's and background's colours at a sharp rim, over a part of it [8-bit steps]
-_DOUBT_SHADE = 0.2  # as _SHADE_STD, of the colours of which that is the error
-_ALIKE_ANGLE = 0.6  # rad along the rim over which such errors are alike
+_COLOUR_STD = 0.7  # std of the colours of ball and background at a sharp rim, over a part of it [8-bit steps]
+_COLOUR_ERROR_SHADE = 0.2  # as _SHADE_STD, of the colours with that error
+_CORRELATION_ANGLE = 0.6  # rad: correlation angle of such errors along the rim
 
 _ANGLE = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
 _DIRECTION = np.column_stack([np.cos(_ANGLE), np.sin(_ANGLE)])
 _LUMA = np.array([[0.114, 0.587, 0.299], [0.5, -0.331, -0.169], [-0.081, -0.419, 0.5]])  # Y, Cb, Cr of BGR
 _METRIC = (_LUMA / np.linalg.norm(_LUMA, axis=1)[:, None] * np.array([[1.0], [_CHROMA], [_CHROMA]])).T
 _DESIGN = np.column_stack([np.ones(_RAYS), np.cos(_ANGLE), np.sin(_ANGLE), np.cos(2.0 * _ANGLE), np.sin(2.0 * _ANGLE)])
-_ALIKE = np.exp((np.cos(_ANGLE[:, None] - _ANGLE) - 1.0) / _ALIKE_ANGLE**2)
+_RAY_CORRELATION = np.exp((np.cos(_ANGLE[:, None] - _ANGLE) - 1.0) / _CORRELATION_ANGLE**2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outline:
-    """centre: (2,) [px of the image]. diameter: of the disc of equal area [px]. covariance: (2, 2) of the centre
-    [px²]. agreement: share of rays that agree with the fitted curve, 0..1. eccentricity: largest deviation of
-    the curve from a circle, relative to its radius. smear: width of the rim where it is widest [px].
+    """Fitted outline of a ball.
+
+    centre: (2,) [px of the image]. diameter: of the disc of equal area [px]. covariance: (2, 2) of the centre [px²].
+    agreement: share of rays that agree with the fitted curve, 0..1. eccentricity: largest deviation of the curve from a
+    circle, relative to its radius. smear: width of the rim where it is widest [px].
     """
 
     centre: Floats
@@ -69,28 +71,28 @@ class Outline:
 
 
 def measure_outline(
-    image: Image, centre: Floats, radius: float, scenery: tuple[Image, Image] | None = None
+    image: Image, centre: Floats, radius: float, background: tuple[Image, Image] | None = None
 ) -> Outline | None:
     """Fit the outline of a blob in an image (H, W, 3) BGR.
 
-    centre (2,), radius: of the blob, to about a third of its radius [px]. scenery: what is behind it (H, W, 3) and how
-    often that was seen (H, W), if known; on rays where the image beyond the rim is another, it is not used. None where
-    the fit runs away or leaves the image.
+    centre (2,), radius: of the blob, to about a third of its radius [px]. background: the image without the ball (H, W,
+    3) and its sample counts (H, W), if known; it is not used on rays where the image beyond the rim differs from it.
+    None where the fit diverges or leaves the image.
     """
     centre = np.asarray(centre, dtype=np.float64).copy()
     shape = np.array([radius, 0.0, 0.0])  # mean radius and its second harmonic
-    width = np.full(_RAYS, 1.0 + 0.5 * radius)  # of the rim; generous until it has been seen
-    doubt = np.zeros(_RAYS)
+    width = np.full(_RAYS, 1.0 + 0.5 * radius)  # of the rim; generous before the first measurement
+    systematic_std = np.zeros(_RAYS)
     weight = np.ones(_RAYS)
     residual = np.zeros(_RAYS)
     spread = 0.0
     for index in range(_PASSES):
         rim = _DESIGN[:, [0, 3, 4]] @ shape
         half = np.minimum(1.25 + 0.6 * width, 0.75 * rim + 1.0)
-        offset, seen, doubt = _rims(image, centre, rim, half, scenery)
+        offset, measured_width, systematic_std = _rim_offsets(image, centre, rim, half, background)
         if offset is None:
             return None
-        correction, weight, residual, spread = _fit(offset, np.maximum(seen, 1.5))
+        correction, weight, residual, spread = _fit(offset, np.maximum(measured_width, 1.5))
         limit = 0.5 * shape[0]
         if index == 0 and np.abs(correction).max() > limit + 1.0:
             return None
@@ -98,9 +100,9 @@ def measure_outline(
         shape += np.clip(correction[[0, 3, 4]], -limit, limit)
         if not (1.0 < shape[0] < 3.0 * radius + 3.0) or np.hypot(*(centre)) > 1e6:
             return None
-        width = _opposite_mean(seen)
+        width = _opposite_mean(measured_width)
     rim = _DESIGN[:, [0, 3, 4]] @ shape
-    covariance = _covariance(weight, spread, width, float(shape[0]), doubt)
+    covariance = _covariance(weight, spread, width, float(shape[0]), systematic_std)
     return Outline(
         centre=centre,
         diameter=float(2.0 * np.sqrt(np.mean(rim * rim))),
@@ -111,10 +113,11 @@ def measure_outline(
     )
 
 
-def _rims(
-    image: Image, centre: Floats, rim: Floats, half: Floats, scenery: tuple[Image, Image] | None
+def _rim_offsets(
+    image: Image, centre: Floats, rim: Floats, half: Floats, background: tuple[Image, Image] | None
 ) -> tuple[Floats | None, Floats, Floats]:
-    """Where the rim is on each ray, relative to ``rim`` (n,) [px], how wide (n,) [px], and how doubtful (n,) [px].
+    """Position of the rim on each ray, relative to ``rim`` (n,) [px], its width (n,) [px], and its systematic std (n,)
+    [px].
 
     half: (n,) half-width of the part of a ray that may be mixed [px].
     """
@@ -133,107 +136,114 @@ def _rims(
     samples = cv2.remap(crop, x - left, y - top, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     colour = samples.astype(np.float64)
     pure = along <= -half[:, None]
-    pure |= radius < 0.4 * rim[:, None]  # of a ball smeared by its own diameter the middle is the best there is
+    # of a ball smeared by its own diameter the middle is the best that is available
+    pure |= radius < 0.4 * rim[:, None]
     pure &= radius > 0.0
-    if pure.sum() < _FEWEST:
+    if pure.sum() < _MIN_SAMPLES:
         return None, half, half
-    told = min(float(rim.mean()) / _LARGE, 1.0) ** 3  # how well so large a ball tells its own shading
-    front = _shaded(colour, radius / rim[:, None], pure, _CURVED_RIDGE / told**2)
+    # how well the shading of a ball of this size is determined
+    reliability = min(float(rim.mean()) / _SHADING_RADIUS, 1.0) ** 3
+    ball_colour = _shading_model(colour, radius / rim[:, None], pure, _CURVED_RIDGE / reliability**2)
     just_inside = pure & (along >= -half[:, None] - _INNER_BAND) & (along <= -half[:, None])
-    front = front + told**4 * _stray(colour - front, just_inside * np.maximum(radius, 0.0) * _STEP * _ANGLE[1])
+    ball_colour = ball_colour + reliability**4 * _shading_correction(
+        colour - ball_colour, just_inside * np.maximum(radius, 0.0) * _STEP * _ANGLE[1]
+    )
     beyond = (along >= half[:, None]) & (along <= half[:, None] + _OUTER_BAND)
-    behind = np.broadcast_to(_band_mean(colour, beyond, 1)[:, None], colour.shape)
-    if scenery is not None:
-        picture, looks = (one[top:bottom, left:right] for one in scenery)
-        seen = cv2.remap(picture, x - left, y - top, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        often = cv2.remap(looks, x - left, y - top, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-        asked = (np.abs(along) <= half[:, None]) | beyond
-        behind = _known_or(
-            behind, seen.astype(np.float64), known_at(np.asarray(often, dtype=np.uint8)) | ~asked, beyond
+    background_colour = np.broadcast_to(_band_mean(colour, beyond, 1)[:, None], colour.shape)
+    if background is not None:
+        known_image, known_counts = (one[top:bottom, left:right] for one in background)
+        unoccluded = cv2.remap(known_image, x - left, y - top, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        counts = cv2.remap(known_counts, x - left, y - top, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        needed = (np.abs(along) <= half[:, None]) | beyond
+        background_colour = _background_along_rays(
+            background_colour,
+            unoccluded.astype(np.float64),
+            is_known(np.asarray(counts, dtype=np.uint8)) | ~needed,
+            beyond,
         )
-    cover = np.clip(_mixture(colour, front, behind, _SHADE_STD / told), -0.25, 1.25)
-    # The end samples count by the part of their step that lies within the mixed stretch.
+    cover = np.clip(_mixture(colour, ball_colour, background_colour, _SHADE_STD / reliability), -0.25, 1.25)
+    # The end samples count by the part of their step that lies within the mixed part.
     share = np.clip((half[:, None] - np.abs(along)) / _STEP + 0.5, 0.0, 1.0) * _STEP
     covered = (cover * share).sum(axis=1)
     mixed = (np.clip(cover * (1.0 - cover), 0.0, None) * share).sum(axis=1)
     middle = np.searchsorted(along, 0.0)
-    doubt = _doubt(front[:, middle], behind[:, middle]) * half
-    return covered - 0.5 * share.sum(axis=1), 6.0 * mixed, doubt  # a ramp of width w holds w / 6
+    systematic_std = _share_std(ball_colour[:, middle], background_colour[:, middle]) * half
+    return covered - 0.5 * share.sum(axis=1), 6.0 * mixed, systematic_std  # a ramp of width w integrates to w / 6
 
 
-def _known_or(beside: Floats, seen: Floats, known: Bools, beyond: Bools) -> Floats:
-    """What is behind the ball at each sample (n, m, 3): as seen without it, made as bright as it is beside it now.
+def _background_along_rays(beside: Floats, unoccluded: Floats, known: Bools, beyond: Bools) -> Floats:
+    """Background colour at each sample (n, m, 3): as seen without the ball, offset by the present change beside it.
 
-    beside: (n, m, 3) each ray's colour beyond the rim, which stays where the scenery ``seen`` (n, m, 3) is not
-    ``known`` (n, m) all along the ray or differs there: the camera moved, or something else did.
+    beside: (n, m, 3) each ray's colour beyond the rim, which is kept where the background ``unoccluded`` (n, m, 3) is
+    not ``known`` (n, m) all along the ray or differs there: the camera or an object has moved.
     """
-    change = beside[:, :1] - _band_mean(seen, beyond, 1)[:, None]
-    holds = known.all(axis=1) & (np.abs(change).max(axis=(1, 2)) < _AS_KNOWN)
-    return np.where(holds[:, None, None], seen + change, beside)
+    change = beside[:, :1] - _band_mean(unoccluded, beyond, 1)[:, None]
+    holds = known.all(axis=1) & (np.abs(change).max(axis=(1, 2)) < _BACKGROUND_CHANGE)
+    return np.where(holds[:, None, None], unoccluded + change, beside)
 
 
-def _doubt(front: Floats, behind: Floats) -> Floats:
-    """Std (n,) of the share by colours (n, 3) that are wrong by `_COLOUR_STD`: large where the two are alike."""
-    front, behind = front @ _METRIC, behind @ _METRIC
-    loose = (_PIXEL_STD / _DOUBT_SHADE) ** 2
-    ff = (front * front).sum(axis=-1) + loose
-    bb = (behind * behind).sum(axis=-1) + loose
-    fb = (front * behind).sum(axis=-1) + loose
+def _share_std(ball_colour: Floats, background_colour: Floats) -> Floats:
+    """Std (n,) of the share by errors ``_COLOUR_STD`` of the colours (n, 3): large where the two are similar."""
+    ball_colour, background_colour = ball_colour @ _METRIC, background_colour @ _METRIC
+    tolerance = (_PIXEL_STD / _COLOUR_ERROR_SHADE) ** 2
+    ff = (ball_colour * ball_colour).sum(axis=-1) + tolerance
+    bb = (background_colour * background_colour).sum(axis=-1) + tolerance
+    fb = (ball_colour * background_colour).sum(axis=-1) + tolerance
     return np.asarray(_COLOUR_STD * np.sqrt((ff + bb + 2.0 * fb) / np.maximum(4.0 * (ff * bb - fb * fb), 1e-6)))
 
 
-def _mixture(colour: Floats, front: Floats, behind: Floats, shade: float) -> Floats:
-    """Share of ``front`` in colours (…, 3) mixed of front and behind.
+def _mixture(colour: Floats, ball_colour: Floats, background_colour: Floats, shade: float) -> Floats:
+    """Share of the ball's colour in colours (…, 3) mixed of ball and background.
 
-    Least squares for ``colour = p front + q behind`` with p + q near 1, share = p / (p + q): brightness of the
-    ball (shading) and of the background (texture) may stray along the ray without moving the rim. Luma counts more than
-    chroma: a Bayer sensor and every video tell colours at half the resolution, and encoders blur their edges.
+    Least squares for ``colour = p ball + q background`` with p + q near 1, share = p / (p + q): the brightness of the
+    ball (shading) and of the background (texture) may vary along the ray without moving the rim. Luma counts more than
+    chroma: Bayer sensors and video subsample colours by two, and encoders blur their edges.
     """
-    colour, front, behind = colour @ _METRIC, front @ _METRIC, behind @ _METRIC
-    loose = (_PIXEL_STD / shade) ** 2
-    ff = (front * front).sum(axis=-1) + loose
-    bb = (behind * behind).sum(axis=-1) + loose
-    fb = (front * behind).sum(axis=-1) + loose
-    fc = (front * colour).sum(axis=-1) + loose
-    bc = (behind * colour).sum(axis=-1) + loose
+    colour, ball_colour, background_colour = colour @ _METRIC, ball_colour @ _METRIC, background_colour @ _METRIC
+    tolerance = (_PIXEL_STD / shade) ** 2
+    ff = (ball_colour * ball_colour).sum(axis=-1) + tolerance
+    bb = (background_colour * background_colour).sum(axis=-1) + tolerance
+    fb = (ball_colour * background_colour).sum(axis=-1) + tolerance
+    fc = (ball_colour * colour).sum(axis=-1) + tolerance
+    bc = (background_colour * colour).sum(axis=-1) + tolerance
     p, q = bb * fc - fb * bc, ff * bc - fb * fc
     return np.asarray(p / np.maximum(p + q, 0.2 * (ff * bb - fb * fb) + 1e-6))
 
 
-def _shaded(colour: Floats, depth: Floats, pure: Bools, curved: float) -> Floats:
-    """The ball's own colour (n, m, 3) at all samples, from those that show nothing else.
+def _shading_model(colour: Floats, depth: Floats, pure: Bools, curved: float) -> Floats:
+    """The ball's own colour (n, m, 3) at all samples, extrapolated from those that show nothing else.
 
     colour: (n, m, 3). depth: (n, m) distance from the centre in radii. pure: (n, m). curved: ridge of the second order.
-    A matt sphere is, in any light, as bright as a function of its normal (x, y, z = sqrt(1 - x² - y²)) of the second
-    order within some percent, for it averages over half of all directions; that is fitted to each channel, robustly,
-    because a glint is not matt.
+    The brightness of a matt sphere in any light is, within some percent, a second-order function of its normal (x, y, z
+    = sqrt(1 - x² - y²)), because it averages over half of all directions. That function is fitted robustly to each
+    channel, because a specular highlight is not matt.
     """
     inside = np.clip(depth, 0.0, 1.0)
     x, y = inside * _DIRECTION[:, :1], inside * _DIRECTION[:, 1:]
     z = np.sqrt(np.maximum(1.0 - inside * inside, 0.0))
     basis = np.stack([np.ones_like(x), x, y, z, x * y, x * z, y * z, x * x - y * y], axis=-1)
     known, values = basis[pure], colour[pure]
-    # Samples crowd towards the centre of the fan of rays: each counts by the area that it stands for.
+    # Samples are denser towards the centre: each is weighted by the area that it represents.
     area = depth[pure]
     weight = area
-    # Without much of the ball to see, the tilts stay small: 2.5 px² of samples for each of them.
+    # With few pixels the gradients stay small: a ridge of 2.5 px² of samples for each of them.
     ridge = np.diag([1e-6, *[_SHADE_RIDGE] * 3, *[curved] * 4])
     model = np.zeros((8, 3))
     for _ in range(3):
         weighted = known * weight[:, None]
         model = np.linalg.solve(weighted.T @ known + ridge, weighted.T @ values)
-        stray = np.abs(values - known @ model).max(axis=1)
-        scale = 2.0 * float(np.median(stray)) + 1.0
-        weight = area / (1.0 + (stray / scale) ** 2) ** 2
+        residual = np.abs(values - known @ model).max(axis=1)
+        scale = 2.0 * float(np.median(residual)) + 1.0
+        weight = area / (1.0 + (residual / scale) ** 2) ** 2
     return np.asarray(basis @ model)
 
 
-def _stray(off: Floats, area: Floats) -> Floats:
-    """By how much a ray's ball (n, 1, 3) strays from the model just inside its rim, of ``off`` (n, m, 3).
+def _shading_correction(off: Floats, area: Floats) -> Floats:
+    """Deviation of a ray's ball colour (n, 1, 3) from the model just inside its rim, from ``off`` (n, m, 3).
 
-    area: (n, m) [px²] that each sample stands for there. A model within some percent of the ball's colour still moves
-    the rim where the background is nearly as bright: at the dark lower side of a ball over a wooden floor, always the
-    same way. Of few pixels it would be their noise.
+    area: (n, m) [px²] that each sample represents. A model within some percent of the ball's colour still biases the
+    rim where the background is nearly as bright: at the dark lower side of a ball over a wooden floor, always in the
+    same direction. With few pixels the correction would be their noise.
     """
     count = _around(area.sum(axis=1)[:, None], 1)
     return np.asarray((_around(np.einsum("nmk,nm->nk", off, area), 1) / (count + _INNER_RIDGE))[:, None])
@@ -256,16 +266,16 @@ def _around(values: Floats, rays: int) -> Floats:
 
 
 def _opposite_mean(width: Floats) -> Floats:
-    """Rim widths (n,) smoothed, and made equal on opposite sides: motion smears both alike."""
+    """Rim widths (n,) smoothed and averaged over opposite sides: motion smears both equally."""
     both = 0.5 * (width + np.roll(width, _RAYS // 2))
     return np.asarray(_around(both[:, None], 2)[:, 0] / 5.0)
 
 
 def _fit(offset: Floats, width: Floats) -> tuple[Floats, Floats, Floats, float]:
-    """Robust fit of mean, first and second harmonic to rim offsets (n,) [px]; wide rims are less certain.
+    """Robust fit of mean, first and second harmonic to rim offsets (n,) [px]; wide rims have a lower weight.
 
-    Returns the five coefficients, the weights (n,), the residuals (n,) [px] and their robust std for a rim of
-    mean width.
+    Returns the five coefficients, the weights (n,), the residuals (n,) [px] and their robust std for a rim of mean
+    width.
     """
     prior = width.mean() / width
     weight = prior
@@ -277,27 +287,31 @@ def _fit(offset: Floats, width: Floats) -> tuple[Floats, Floats, Floats, float]:
         coefficients = np.linalg.solve(weighted.T @ _DESIGN + 1e-9 * np.eye(5), weighted.T @ offset)
         residual = offset - _DESIGN @ coefficients
         scaled = residual * np.sqrt(prior)
-        # 5 of the 48 residuals are fitted away.
+        # Five degrees of freedom are lost to the fit of 48 residuals.
         spread = 1.4826 * float(np.median(np.abs(scaled))) * np.sqrt(_RAYS / (_RAYS - 5.0)) + 1e-4
         weight = prior / (1.0 + (scaled / (2.0 * spread)) ** 2) ** 2
     return coefficients, weight, residual, spread
 
 
-def _covariance(weight: Floats, spread: float, width: Floats, radius: float, doubt: Floats) -> Floats:
-    """Covariance (2, 2) of the centre [px²] from the scatter of the rims about the curve, and from what neighbouring
-    rays may err alike: ``doubt`` (n,) [px].
+def _covariance(weight: Floats, spread: float, width: Floats, radius: float, systematic_std: Floats) -> Floats:
+    """Covariance (2, 2) of the centre [px²] from the scatter of the rims about the curve, and from the errors
+    correlated between neighbouring rays: ``systematic_std`` (n,) [px].
 
-    How far rays err together, and how wrong colours are, depends on what made the picture. The rim tells it where
-    motion does not smear it: its width there is that of lens, sampling and encoder. Both grow with that width, as
-    measured on raw pictures, JPEG and H.264 alike (films in `tests/bench/marker_detector.py`).
+    The correlation of rays and the error of colours depend on lens, sampling and encoder, which the width of the rim
+    shows where motion does not smear it. Both grow with that width, as measured on raw images, JPEG and H.264 (films in
+    `tests/bench/marker_detector.py`).
     """
     prior = width.mean() / np.maximum(width, 1.5)
-    blur = float(np.sort(width)[: _RAYS // _LEAST_SMEARED].mean())
+    blur = float(np.sort(width)[: _RAYS // _SHARPEST_SHARE].mean())
     wider = blur / _SHARP
-    together = max(1.0, _CORRELATION * wider**_CORRELATION_GROWS * _RAYS / (2.0 * np.pi * radius))
+    correlated_rays = max(1.0, _CORRELATION * wider**_CORRELATION_GROWS * _RAYS / (2.0 * np.pi * radius))
     effective = np.minimum(weight, prior)
     information = (_DESIGN * effective[:, None]).T @ _DESIGN
     inverse = np.linalg.inv(information + 1e-9 * np.eye(5))
-    alike = ((inverse @ (_DESIGN * effective[:, None]).T)[1:3]) * doubt * wider
+    correlated = ((inverse @ (_DESIGN * effective[:, None]).T)[1:3]) * systematic_std * wider
     floor = _FLOOR_PX**2 + (_FLOOR_SHADE * radius) ** 2 + (_FLOOR_SMEAR * (float(width.max()) - blur)) ** 2
-    return np.asarray(spread**2 * together * inverse[1:3, 1:3] + alike @ _ALIKE @ alike.T + floor * np.eye(2))
+    return np.asarray(
+        spread**2 * correlated_rays * inverse[1:3, 1:3]
+        + correlated @ _RAY_CORRELATION @ correlated.T
+        + floor * np.eye(2)
+    )

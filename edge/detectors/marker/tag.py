@@ -1,9 +1,9 @@
-"""Finds AprilTag and ArUco tags through OpenCV and measures their centres to a small part of a pixel.
+"""Detection of AprilTag and ArUco tags by OpenCV, with sub-pixel centre and covariance.
 
-OpenCV finds and reads them. Each of the four sides is then measured anew: across the black border, at many places along
-it, the length that is dark tells where the border is, without a threshold and unmoved by even motion blur. A line is
-fitted to each side; the diagonals of the four corners meet in the projection of the tag's centre, also seen aslant, as
-the mean of the corners does not. The scatter about the lines gives the covariance.
+OpenCV detects and decodes them. Each of the four sides is then measured again: across the black border, at many places
+along it, the dark length gives the edge without a threshold and without bias by uniform motion blur. A line is fitted
+to each side; the diagonals of the four corners intersect in the projection of the tag's centre, also at oblique view,
+which the mean of the corners does not. The scatter about the lines gives the covariance.
 """
 
 from __future__ import annotations
@@ -25,40 +25,41 @@ DICTIONARIES = (
     "4x4_50", "4x4_100", "4x4_250", "4x4_1000", "5x5_50", "5x5_100", "5x5_250", "5x5_1000",
     "6x6_50", "6x6_100", "6x6_250", "6x6_1000", "7x7_50", "7x7_100", "7x7_250", "7x7_1000",
 )  # fmt: skip
-"""Families of tags, by the names that OpenCV gives them."""
-_FROM, _TO = 0.12, 0.88  # part of a side that is measured: corners are mixtures of two sides
+"""Families of tags, by OpenCV's names."""
+_SIDE_START, _SIDE_END = 0.12, 0.88  # part of a side that is measured: corners are mixtures of two sides
 _PASSES = 3
-_REACH = 0.07  # of the tag, on both sides of its border: what lies beyond a cell's middle smears into it from elsewhere
+_REACH = 0.07  # over the tag's size, on both sides of its border: beyond the middle of a cell other cells smear in
 _STEP = 0.5  # px across a side
-_LEAST_CONTRAST = 20.0  # grey levels between the border and what surrounds it
+_LEAST_CONTRAST = 20.0  # grey levels between the border and the margin
 _MIN_SIDE = 8.0  # px
-_ROUGH = 0.12  # of a side: a side that strays farther from its line is none
-_FLOOR_PX = 0.004  # std of the centre that remains without noise,
-_FLOOR_SIDE = 0.3  # and px² over the side: of a small tag neither black nor white is seen pure,
-_FLOOR_SMEAR = 0.003  # and its share of a smeared border's width;
-_FULL, _FULLER = 0.68, 0.05  # a border over more than that part of its profile leaves neither black nor white pure
-_FLOOR_FULL = 0.1  # and adds, a step of that, this share of its width;
-_FLOOR_PALE = 0.12  # so does, of its profile's half, the contrast that a side lacks against the best of the four
-_SHARP = 2.0  # px that lens and sampling make of a sharp border
-_INDEPENDENT = 1.5  # px along a side within which samples err together
+_MAX_SCATTER = 0.12  # over the side: largest scatter about its line
+_FLOOR_PX = 0.004  # px: std of the centre without noise,
+_FLOOR_SIDE = 0.3  # plus this [px²] over the side: of a small tag neither black nor white is seen pure,
+_FLOOR_SMEAR = 0.003  # plus this share of a smeared border's width;
+# share of the profile that a border fills, above which neither black nor white is seen pure;
+_PROFILE_FILL, _PROFILE_FILL_STEP = 0.68, 0.05
+_FLOOR_FULL = 0.1  # each step adds this share of its width to the std;
+_FLOOR_CONTRAST = 0.12  # std over the half profile, per relative loss of a side's contrast against the best of the four
+_SHARP = 2.0  # px: width of a sharp border after lens and sampling
+_CORRELATION_PX = 1.5  # px: correlation length of samples along a side
 
 
 @dataclass(frozen=True, slots=True)
 class TagModel:
-    """Which tags are looked for.
+    """Which tags are detected.
 
-    dictionary: one of DICTIONARIES. prefix: detections are labelled by it and the tag's number, as in tag7.
-    min_size: px of a side. most: how many are reported, largest first.
+    dictionary: one of DICTIONARIES. prefix: detections are labelled by it and the tag's number, as in tag7. min_size:
+    px of a side. max_detections: largest ones reported at most.
     """
 
     dictionary: str = "apriltag_36h11"
     prefix: str = "tag"
     min_size: float = _MIN_SIDE
-    most: int = 64
+    max_detections: int = 64
 
 
 class TagDetector:
-    """Tags in single pictures; keeps no state. Raises InputError for a dictionary that OpenCV does not know."""
+    """Detects tags in single images; keeps no state. Raises InputError for an unknown dictionary."""
 
     def __init__(self, model: TagModel | None = None) -> None:
         self._model = TagModel() if model is None else model
@@ -78,21 +79,21 @@ class TagDetector:
             if one is not None:
                 found.append(one)
         found.sort(key=lambda one: one.size, reverse=True)
-        return found[: self._model.most]
+        return found[: self._model.max_detections]
 
     def _measure(self, grey: npt.NDArray[np.uint8], quad: Floats, number: int) -> Detection | None:
-        sides = _sides(grey, quad)
+        sides = _measure_sides(grey, quad)
         if sides is None:
             return None
-        lines, covariances, contrast, stray, width, unclear = sides
+        lines, covariances, contrast, scatter, width, blur_std = sides
         corners = _corners(lines)
         if corners is None or np.abs(corners - quad).max() > 3.0 + 0.1 * _side(quad):
             return None
         centre, size = _centre(corners)
-        if size < self._model.min_size or stray > _ROUGH * size:
+        if size < self._model.min_size or scatter > _MAX_SCATTER * size:
             return None
-        floor = _FLOOR_PX**2 + (_FLOOR_SIDE / size) ** 2 + (_FLOOR_SMEAR * max(width - _SHARP, 0.0)) ** 2 + unclear**2
-        covariance = _propagated(lines, covariances) + floor * np.eye(2)
+        floor = _FLOOR_PX**2 + (_FLOOR_SIDE / size) ** 2 + (_FLOOR_SMEAR * max(width - _SHARP, 0.0)) ** 2 + blur_std**2
+        covariance = _centre_covariance(lines, covariances) + floor * np.eye(2)
         left, top = corners.min(axis=0)
         right, bottom = corners.max(axis=0)
         return Detection(
@@ -120,20 +121,22 @@ def _side(quad: Floats) -> float:
     return float(np.linalg.norm(quad - np.roll(quad, -1, axis=0), axis=1).mean())
 
 
-def _sides(grey: npt.NDArray[np.uint8], quad: Floats) -> tuple[Floats, Floats, float, float, float, float] | None:
+def _measure_sides(
+    grey: npt.NDArray[np.uint8], quad: Floats
+) -> tuple[Floats, Floats, float, float, float, float] | None:
     """Lines of the four sides, their covariances, contrast and scatter; None where a side cannot be measured.
 
     lines: (4, 2, 2): a point on each and its unit direction. covariances: (4, 2, 2) of the offset at that point [px²]
-    and of the turn [rad²]. contrast: of the weakest side. scatter: of the worst, in px.
-    The last are how wide the widest border is, and the std that remains where one is smeared over a whole cell, in px.
+    and of the angle [rad²]. contrast: of the weakest side. scatter: of the worst, in px. The last two are the width of
+    the widest border and the std caused by a border smeared over a whole cell, in px.
     """
     lines = np.zeros((4, 2, 2))
     covariances = np.zeros((4, 2, 2))
-    contrast, worst, widest, unclear = np.inf, 0.0, 0.0, 0.0
+    contrast, worst, widest, blur_std = np.inf, 0.0, 0.0, 0.0
     corners = quad
     for _ in range(_PASSES):
         middle = corners.mean(axis=0)
-        contrast, worst, widest, unclear = np.inf, 0.0, 0.0, 0.0
+        contrast, worst, widest, blur_std = np.inf, 0.0, 0.0, 0.0
         contrasts, halves = np.zeros(4), np.zeros(4)
         for index in range(4):
             start, end = corners[index], corners[(index + 1) % 4]
@@ -144,18 +147,18 @@ def _sides(grey: npt.NDArray[np.uint8], quad: Floats) -> tuple[Floats, Floats, f
             outward = np.array([along[1], -along[0]])
             point = 0.5 * (start + end)
             outward *= 1.0 if outward @ (point - middle) > 0.0 else -1.0
-            # Border and margin are one cell wide, a ninth to a sixth of what this side is away from the opposite one.
+            # Border and margin are one cell wide, a ninth to a sixth of the distance between opposite sides.
             across = 2.0 * float(outward @ (point - middle))
             half = float(np.clip(_REACH * across, 1.0, 6.0))
-            count = max(int((_TO - _FROM) * length), 6)
-            places = (np.linspace(_FROM, _TO, count) - 0.5) * length
-            rim = _rim(grey, point + places[:, None] * along, outward, half)
+            count = max(int((_SIDE_END - _SIDE_START) * length), 6)
+            places = (np.linspace(_SIDE_START, _SIDE_END, count) - 0.5) * length
+            rim = _edge_offsets(grey, point + places[:, None] * along, outward, half)
             if rim is None:
                 return None
             offset, weakest, width = rim
-            full = max(width / (2.0 * half) - _FULL, 0.0) / _FULLER
-            unclear = max(unclear, _FLOOR_FULL * full * max(width - _SHARP, 0.0))
-            line, covariance, scatter = _line(places, offset, length / count)
+            full = max(width / (2.0 * half) - _PROFILE_FILL, 0.0) / _PROFILE_FILL_STEP
+            blur_std = max(blur_std, _FLOOR_FULL * full * max(width - _SHARP, 0.0))
+            line, covariance, scatter = _fit_line(places, offset, length / count)
             contrasts[index], halves[index] = weakest, half
             contrast, worst, widest = min(contrast, weakest), max(worst, scatter), max(widest, width)
             lines[index] = point + line[0] * outward, along + line[1] * outward
@@ -165,15 +168,17 @@ def _sides(grey: npt.NDArray[np.uint8], quad: Floats) -> tuple[Floats, Floats, f
         if found is None:
             return None
         corners = found
-    pale = _FLOOR_PALE * float((halves * (1.0 - contrasts / contrasts.max())).max())
-    unclear = float(np.hypot(unclear, pale))
-    return (lines, covariances, contrast, worst, widest, unclear) if contrast >= _LEAST_CONTRAST else None
+    contrast_std = _FLOOR_CONTRAST * float((halves * (1.0 - contrasts / contrasts.max())).max())
+    blur_std = float(np.hypot(blur_std, contrast_std))
+    return (lines, covariances, contrast, worst, widest, blur_std) if contrast >= _LEAST_CONTRAST else None
 
 
-def _rim(
+def _edge_offsets(
     grey: npt.NDArray[np.uint8], points: Floats, outward: Floats, half: float
 ) -> tuple[Floats, float, float] | None:
-    """Where dark turns to light (n,), along ``outward`` from points (n, 2) [px], its contrast, and its width [px]."""
+    """Offsets (n,) of the transition from dark to light along ``outward`` from points (n, 2) [px], its contrast, and
+    its width [px].
+    """
     steps = np.arange(-half, half + 1e-9, _STEP)
     places = points[:, None] + steps[:, None] * outward
     low = np.floor(places.min(axis=(0, 1))).astype(int) - 1
@@ -184,7 +189,7 @@ def _rim(
     local = (places - low).astype(np.float32)
     profile = cv2.remap(crop, local[..., 0], local[..., 1], cv2.INTER_LINEAR).astype(np.float64)
     ends = max(len(steps) // 5, 1)
-    # Border and paper are even along a side: one level for each, but for light that changes slowly.
+    # Border and paper are uniform along a side: one level for each, because illumination varies slowly.
     dark, light = np.median(profile[:, :ends]), np.median(profile[:, -ends:])
     if light - dark < _LEAST_CONTRAST:
         return None
@@ -192,10 +197,11 @@ def _rim(
     weight = np.full(len(steps), _STEP)
     weight[[0, -1]] = 0.5 * _STEP
     mixed = np.clip(share * (1.0 - share), 0.0, None) @ weight
-    return share @ weight - half, float(light - dark), 6.0 * float(np.median(mixed))  # a ramp of width w holds w / 6
+    # a ramp of width w integrates to w / 6
+    return share @ weight - half, float(light - dark), 6.0 * float(np.median(mixed))
 
 
-def _line(places: Floats, offset: Floats, spacing: float) -> tuple[Floats, Floats, float]:
+def _fit_line(places: Floats, offset: Floats, spacing: float) -> tuple[Floats, Floats, float]:
     """Robust line (offset, slope) through offsets (n,) at places (n,), its covariance (2, 2), the scatter [px]."""
     design = np.column_stack([np.ones_like(places), places])
     weight = np.ones_like(places)
@@ -207,14 +213,14 @@ def _line(places: Floats, offset: Floats, spacing: float) -> tuple[Floats, Float
         residual = offset - design @ line
         scatter = 1.4826 * float(np.median(np.abs(residual))) * np.sqrt(len(places) / (len(places) - 2.0)) + 1e-3
         weight = 1.0 / (1.0 + (residual / (2.5 * scatter)) ** 2) ** 2
-    together = max(1.0, _INDEPENDENT / spacing)
+    correlated_samples = max(1.0, _CORRELATION_PX / spacing)
     information = (design * weight[:, None]).T @ design
-    covariance = np.asarray(scatter**2 * together * np.linalg.inv(information), dtype=np.float64)
+    covariance = np.asarray(scatter**2 * correlated_samples * np.linalg.inv(information), dtype=np.float64)
     return line, covariance, scatter
 
 
 def _corners(lines: Floats) -> Floats | None:
-    """Corners (4, 2) where each side meets the one before it; None where two are parallel."""
+    """Corners (4, 2), the intersections of each side with the one before it; None where two are parallel."""
     corners = np.zeros((4, 2))
     for index in range(4):
         (p, d), (q, e) = lines[index - 1], lines[index]
@@ -227,10 +233,10 @@ def _corners(lines: Floats) -> Floats | None:
 
 
 def _centre(corners: Floats) -> tuple[Floats, float]:
-    """Where the diagonals meet (2,), and the side [px] that the tag would have if it were not seen aslant.
+    """Intersection (2,) of the diagonals, and the side [px] that the tag would have in fronto-parallel view.
 
-    About its centre the picture of the tag is nearly affine; the direction in which it is not foreshortened is the
-    longer axis of the ellipse that a circle on it becomes.
+    About its centre the image of the tag is nearly affine; the direction without foreshortening is the longer axis of
+    the ellipse that a circle on it projects to.
     """
     square = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]], dtype=np.float32)
     h = np.asarray(cv2.getPerspectiveTransform(square, corners.astype(np.float32)), dtype=np.float64)
@@ -243,8 +249,8 @@ def _centre(corners: Floats) -> tuple[Floats, float]:
     return np.asarray(centre), float(np.linalg.svd(affine, compute_uv=False)[0])
 
 
-def _propagated(lines: Floats, covariances: Floats) -> Floats:
-    """Covariance (2, 2) of the centre [px²] from those of the sides."""
+def _centre_covariance(lines: Floats, covariances: Floats) -> Floats:
+    """Covariance (2, 2) of the centre [px²], propagated from those of the sides by finite differences."""
     reference = _corners(lines)
     assert reference is not None
     middle, _ = _centre(reference)

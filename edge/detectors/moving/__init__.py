@@ -1,1 +1,1 @@
-"""Detection of moving objects: background subtraction, shadows, gating, vehicles."""
+"""Detection of moving objects: background subtraction, shadows, short-term tracking, vehicles."""

@@ -1,8 +1,8 @@
-"""What is not background: a model of every pixel's values, light that changes, ghosts and jolts.
+"""Background subtraction for a fixed camera: changes of light, ghosts, and moves of the camera.
 
-The model is OpenCV's mixture of Gaussians (MOG2) or its k nearest neighbours (KNN). It is asked with every frame and
-taught with every few, from a picture in which what is being followed is replaced by what is behind it: so somebody who
-stands still does not sink into the background.
+The model is OpenCV's mixture of Gaussians (MOG2) or its k nearest neighbours (KNN). It is evaluated at every frame and
+updated every few frames, with an image in which tracked objects are replaced by the background: a person who stands
+still is not absorbed into the background.
 """
 
 from __future__ import annotations
@@ -17,66 +17,69 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.detectors.moving.bootstrap import Album, usual
-from edge.detectors.moving.shadows import Shadows
+from edge.detectors.moving.bootstrap import BackgroundBootstrap, background_mode
+from edge.detectors.moving.shadows import ShadowDetector
 from protocols.geometry.types import Bools, Floats
 
 Image = npt.NDArray[np.uint8]
 Box = tuple[float, float, float, float]
-ModelName = Literal["mog2", "knn"]
+SubtractorName = Literal["mog2", "knn"]
 
-_TEACH_S = 0.4  # the model learns this often
-_MEMORY_S = 30.0  # and forgets over that time
-_BEGIN_S = 0.7  # in which a new model learns fast, and after which it begins again from what stood still
-_REVIEWS_S = (_BEGIN_S, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0, 24.0)
-"""When that is done, each time better."""
-_PAUSE_S = 2.0  # a longer time between two pictures is a pause, and tells nothing of their rate
-_RENEWAL = 0.05  # share of the latest step in the period
-_LESSONS = 8  # pictures of a review that the model is taught
-_TAUGHT, _RATES = 0.8, (0.03, 0.2)  # as how much all pictures count together; limits of one
-_PASSING = 40  # 8-bit steps
-_JOLT = 0.4  # of the picture being foreground at once: the camera was pushed, or the light went on
+_UPDATE_S = 0.4  # time between updates of the model
+_MEMORY_S = 30.0  # time constant of its updates
+_INITIAL_S = 0.7  # time in which a new model learns fast, until the first bootstrap
+_BOOTSTRAP_S = (_INITIAL_S, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0, 24.0)
+"""Times at which the background is bootstrapped, each time from more images."""
+_PAUSE_S = 2.0  # a longer time between two images is a pause and does not count for the frame period
+_PERIOD_GAIN = 0.05  # gain of the estimate of the frame period
+_BOOTSTRAP_UPDATES = 8  # images of a bootstrap that the model is updated with
+_BOOTSTRAP_WEIGHT, _BOOTSTRAP_RATES = 0.8, (0.03, 0.2)  # total weight of these images; limits of the rate of one
+_PASSING_STEP = 40  # 8-bit steps
+_SCENE_CHANGE_SHARE = 0.4  # share of foreground pixels at which the camera has moved or the light has changed
 _SUBSAMPLE = 8
 _GAIN = (0.3, 3.3)
-_EVEN_FIELD = 0.08  # a gain this far from 1 is not the same everywhere
-_DIM_STEP = 11  # 8-bit steps, times the gain: a dim picture's noise is raised with it
+_UNIFORM_GAIN = 0.08  # deviation of a gain from 1 above which it varies over the image
+_NOISE_STEP = 11  # 8-bit steps, times the gain, which amplifies the noise of a dim image
 _GHOST_STEP = 22  # 8-bit steps
-_BESIDE, _LEAST_RIM = 0.04, 10  # of the height: how far beside a rim is looked; pixels of it
-_FLUSHED_S, _CALM_S = 16.0, 0.4  # time in which those who were here at first are sought; in which nothing changed
-_VOTES, _RIM_REACH, _LEFT = 0.12, 7, 1.6  # share of the picture's height in which rims tell; pixels; as _GHOSTLY
-_GHOSTLY, _PLAIN = 1.4, 12.0  # times that it must stand out more in the background; 8-bit steps that it must there
+# over the height: distance from a rim that is compared; smallest number of its pixels
+_RIM_REACH_SHARE, _MIN_RIM_PIXELS = 0.04, 10
+# time after the start in which ghosts of the first objects are searched; time without change
+_INITIAL_GHOSTS_S, _STILL_S = 16.0, 0.4
+# window over the image height; reach of a rim [px]; contrast ratio, as _GHOST_RATIO
+_VOTE_WINDOW, _RIM_REACH, _UNCOVERED_RATIO = 0.12, 7, 1.6
+# factor between the contrasts of background and image; smallest contrast of the background [8-bit steps]
+_GHOST_RATIO, _MIN_GHOST_CONTRAST = 1.4, 12.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Layers:
-    """One frame's pixels. figure: 255 where something stands before the background, 0 elsewhere, (H, W).
+class ForegroundMasks:
+    """Segmentation of one frame. foreground: 255 where an object is before the background, 0 elsewhere, (H, W).
 
-    shadow: the same where only light is missing. background: what stands behind, (H, W, 3), under today's light.
-    fresh: the model has begun anew with this frame, or is still learning: nothing can be told.
+    shadow: the same where only light is missing. background: (H, W, 3), under the current light. initialising: the
+    model has been reset at this frame or is still learning: the masks are not valid.
     """
 
-    figure: Image
+    foreground: Image
     shadow: Image
     background: Image
-    fresh: bool
+    initialising: bool
 
 
-class Foreground:
-    """The background of one fixed camera.
+class BackgroundSubtractor:
+    """Background model of one fixed camera.
 
-    model: mog2 or knn. fps: of the pictures that come, as far as known.
-    ``jolts`` counts how often everything had to be learnt anew.
+    model: mog2 or knn. fps: nominal frame rate. ``resets`` counts how often the model was reset.
     """
 
-    def __init__(self, model: ModelName = "mog2", fps: float = 25.0) -> None:
+    def __init__(self, model: SubtractorName = "mog2", fps: float = 25.0) -> None:
         self._name = model
         self._period = 1.0 / fps if fps > 0 and math.isfinite(fps) else 0.04
-        self._steps = 0  # between pictures of known times
+        self._steps = 0  # number of frame periods measured
         self._time: float | None = None
-        self.jolts = 0
-        self._begin()
+        self.resets = 0
+        self._reset()
 
-    def _begin(self) -> None:
+    def _reset(self) -> None:
         if self._name == "mog2":
             mixture = cv2.createBackgroundSubtractorMOG2(500, 16.0, False)
             mixture.setBackgroundRatio(0.75)
@@ -85,156 +88,162 @@ class Foreground:
             self._model: cv2.BackgroundSubtractor = mixture
         else:
             self._model = cv2.createBackgroundSubtractorKNN(500, 300.0, False)
-        self._shadows = Shadows()
-        self._seen = 0
-        self._age = 0.0  # s since the first picture
-        self._since = 0
-        self._high = 0
-        self._dimming = 1.0
-        self._ghosts: Image | None = None
-        self._ghostly: Image | None = None  # 255 where a ghost stands
+        self._shadows = ShadowDetector()
+        self._frames = 0
+        self._age = 0.0  # s since the first image
+        self._frames_since_update = 0
+        self._changed_frames = 0
+        self._gain = 1.0
+        self._ghost_image: Image | None = None
+        self._ghost_mask: Image | None = None  # 255 where there is a ghost
         self._background: Image | None = None
-        self._slow: npt.NDArray[np.float32] | None = None  # the background, in parts of a step
-        self._album = Album()
-        self._reviews = list(_REVIEWS_S)
-        self._lately: deque[tuple[float, Image]] = deque()  # the pictures of the last moment, and when they were
-        self._flushed_at = 0.0
+        self._background_mean: npt.NDArray[np.float32] | None = None  # the background with fractions of 8-bit steps
+        self._bootstrap = BackgroundBootstrap()
+        self._pending_bootstraps = list(_BOOTSTRAP_S)
+        self._recent: deque[tuple[float, Image]] = deque()  # recent images and their times
+        self._ghosts_checked_at = 0.0
 
     @property
-    def young(self) -> bool:
-        """Whether the background may still show who was here at first."""
-        return bool(self._reviews)
+    def bootstrapping(self) -> bool:
+        """Whether the background may still contain objects of the first images."""
+        return bool(self._pending_bootstraps)
 
-    def prime(self, pictures: Sequence[Image]) -> None:
-        """Learn from pictures spread over a longer time, so that what was here and there for a moment is not in it."""
-        self._begin()
-        if pictures:
-            self._learn(pictures, usual(pictures))
-            self._seen, self._age = 10**6, math.inf
-            self._reviews = []
+    def initialise(self, images: Sequence[Image]) -> None:
+        """Learn from images spread over a longer time, so that passing objects are not in the background."""
+        self._reset()
+        if images:
+            self._train(images, background_mode(images))
+            self._frames, self._age = 10**6, math.inf
+            self._pending_bootstraps = []
 
-    def _learn(self, pictures: Sequence[Image], middle: Image) -> None:
-        """Teach a new model with pictures of which ``middle`` is the background."""
+    def _train(self, images: Sequence[Image], middle: Image) -> None:
+        """Train a new model with images of which ``middle`` is the background."""
         self._model.apply(middle, learningRate=1.0)
-        rate = float(np.clip(_TAUGHT / len(pictures), *_RATES))
-        for picture in pictures:
-            # Whatever differs much from what is usual is passing.
-            alike = cv2.inRange(cv2.absdiff(picture, middle), (0, 0, 0), (_PASSING,) * 3)
-            self._model.apply(cv2.copyTo(picture, alike, middle.copy()), learningRate=rate)
+        rate = float(np.clip(_BOOTSTRAP_WEIGHT / len(images), *_BOOTSTRAP_RATES))
+        for image in images:
+            # Large differences from the background are passing objects.
+            background_pixels = cv2.inRange(cv2.absdiff(image, middle), (0, 0, 0), (_PASSING_STEP,) * 3)
+            self._model.apply(cv2.copyTo(image, background_pixels, middle.copy()), learningRate=rate)
         self._set_background(middle)
 
-    def _set_background(self, picture: Image) -> None:
-        self._background = picture
-        self._slow = picture.astype(np.float32)
+    def _set_background(self, image: Image) -> None:
+        self._background = image
+        self._background_mean = image.astype(np.float32)
 
-    def _review(self, even: Image) -> None:
-        """A young model's picture has everybody in it who was there at first: keep some pictures, and start over."""
-        self._album.add(even, self._period)
-        if self._age < self._reviews[0]:
-            return
-        album, left, seen, age = self._album, self._reviews[1:], self._seen, self._age
-        lately, flushed_at, shadows = self._lately, self._flushed_at, self._shadows
-        self._begin()
-        self._shadows = shadows
-        self._learn(album.some(_LESSONS), album.background())
-        self._seen, self._age, self._reviews = seen, age, left
-        self._lately, self._flushed_at = lately, flushed_at
-        self._album = album if left else Album()
-
-    def look(self, image: Image, protected: Sequence[Box] = (), time_s: float | None = None) -> Layers:
-        """Split a picture (H, W, 3) BGR. protected: x, y, w, h [px] of what must not be learnt.
-
-        time_s: of the picture; None = one period after the last.
+    def _bootstrap_step(self, compensated: Image) -> None:
+        """Store some images, and at fixed times train a new model from them: the first one contains objects of the
+        first image.
         """
-        self._pass_time(time_s)
-        return self._look(image, protected)
+        self._bootstrap.add(compensated, self._period)
+        if self._age < self._pending_bootstraps[0]:
+            return
+        bootstrap, left, seen, age = self._bootstrap, self._pending_bootstraps[1:], self._frames, self._age
+        recent, ghosts_checked_at, shadows = self._recent, self._ghosts_checked_at, self._shadows
+        self._reset()
+        self._shadows = shadows
+        self._train(bootstrap.sample(_BOOTSTRAP_UPDATES), bootstrap.background())
+        self._frames, self._age, self._pending_bootstraps = seen, age, left
+        self._recent, self._ghosts_checked_at = recent, ghosts_checked_at
+        self._bootstrap = bootstrap if left else BackgroundBootstrap()
 
-    def _pass_time(self, time_s: float | None) -> None:
+    def segment(self, image: Image, protected: Sequence[Box] = (), time_s: float | None = None) -> ForegroundMasks:
+        """Segment an image (H, W, 3) BGR. protected: x, y, w, h [px] of objects that must not be learnt.
+
+        time_s: time of the image [s]; None = one frame period after the last one.
+        """
+        self._advance_time(time_s)
+        return self._segment(image, protected)
+
+    def _advance_time(self, time_s: float | None) -> None:
         step = self._period
         if time_s is not None:
             if self._time is not None and 0.0 < time_s - self._time < _PAUSE_S:
                 step = time_s - self._time
                 self._steps += 1
-                self._period += max(1.0 / self._steps, _RENEWAL) * (step - self._period)
+                self._period += max(1.0 / self._steps, _PERIOD_GAIN) * (step - self._period)
             self._time = time_s
         self._age += step
 
-    def _look(self, image: Image, protected: Sequence[Box]) -> Layers:
+    def _segment(self, image: Image, protected: Sequence[Box]) -> ForegroundMasks:
         if self._background is not None and self._background.shape != image.shape:
-            self._begin()
+            self._reset()
         if self._background is None:
             self._model.apply(image, learningRate=1.0)
             self._set_background(image.copy())
             assert self._background is not None
-            self._seen, self._age = 1, 0.0
+            self._frames, self._age = 1, 0.0
             nothing = np.zeros(image.shape[:2], np.uint8)
-            return Layers(nothing, nothing, self._background, True)
-        even = self._even(image)
-        figure = np.asarray(self._model.apply(even, learningRate=0.0), dtype=np.uint8)
-        if self._dimming > 1.0 + _EVEN_FIELD:
-            step = _DIM_STEP * self._dimming
-            quiet = cv2.inRange(cv2.absdiff(even, self._background), (0, 0, 0), (step, step, step))
-            figure = np.asarray(cv2.subtract(figure, quiet), dtype=np.uint8)
-        self._seen += 1
-        learning = self._age < _BEGIN_S
-        if self._jolted(figure):
-            self._begin()
-            self.jolts += 1
-            return self._look(image, ())
-        figure = self._without_ghosts(even, figure)
-        if self._reviews and self._age < _FLUSHED_S:
-            figure = self._flushed(even, figure)
+            return ForegroundMasks(nothing, nothing, self._background, True)
+        compensated = self._compensate_gain(image)
+        foreground = np.asarray(self._model.apply(compensated, learningRate=0.0), dtype=np.uint8)
+        if self._gain > 1.0 + _UNIFORM_GAIN:
+            step = _NOISE_STEP * self._gain
+            quiet = cv2.inRange(cv2.absdiff(compensated, self._background), (0, 0, 0), (step, step, step))
+            foreground = np.asarray(cv2.subtract(foreground, quiet), dtype=np.uint8)
+        self._frames += 1
+        learning = self._age < _INITIAL_S
+        if self._scene_changed(foreground):
+            self._reset()
+            self.resets += 1
+            return self._segment(image, ())
+        foreground = self._without_ghosts(compensated, foreground)
+        if self._pending_bootstraps and self._age < _INITIAL_GHOSTS_S:
+            foreground = self._without_initial_ghosts(compensated, foreground)
         else:
-            self._lately.clear()
-        shadow = np.zeros_like(figure) if learning else self._shadows.find(even, self._background, figure)
-        self._teach(even, figure, protected, learning)
-        young = len(self._reviews) == len(_REVIEWS_S)
-        if self._reviews:
-            self._review(even)
-        return Layers(np.asarray(cv2.subtract(figure, shadow), dtype=np.uint8), shadow, self._background, young)
+            self._recent.clear()
+        shadow = (
+            np.zeros_like(foreground) if learning else self._shadows.detect(compensated, self._background, foreground)
+        )
+        self._update_model(compensated, foreground, protected, learning)
+        bootstrapping = len(self._pending_bootstraps) == len(_BOOTSTRAP_S)
+        if self._pending_bootstraps:
+            self._bootstrap_step(compensated)
+        return ForegroundMasks(
+            np.asarray(cv2.subtract(foreground, shadow), dtype=np.uint8), shadow, self._background, bootstrapping
+        )
 
-    def _flushed(self, even: Image, figure: Image) -> Image:
-        """The silhouettes without the places that those who were here at first have left; they are background now.
+    def _without_initial_ghosts(self, compensated: Image, foreground: Image) -> Image:
+        """Remove ghosts of objects of the first images from the mask; from now on they are background.
 
-        A silhouette may be both, somebody and the place that he came from: every part of it is judged by the rim near
-        it, and is a place that was left where nothing has changed lately.
+        One silhouette may be both an object and its ghost: every part of it is classified by the rim near it, and is a
+        ghost only where the image has not changed recently.
         """
         assert self._background is not None
-        self._lately.append((self._age, even.copy()))
-        while len(self._lately) > 2 and self._lately[1][0] <= self._age - _CALM_S:
-            self._lately.popleft()
-        if self._age - self._lately[0][0] < _CALM_S or self._age - self._flushed_at < 0.5 * _CALM_S:
-            return figure
-        self._flushed_at = self._age
-        calm = cv2.inRange(cv2.absdiff(even, self._lately[0][1]), (0, 0, 0), (_GHOST_STEP,) * 3)
-        places = cv2.bitwise_and(places_left(even, self._background, figure), figure)
-        left = np.asarray(cv2.bitwise_and(places, calm), dtype=np.uint8)
+        self._recent.append((self._age, compensated.copy()))
+        while len(self._recent) > 2 and self._recent[1][0] <= self._age - _STILL_S:
+            self._recent.popleft()
+        if self._age - self._recent[0][0] < _STILL_S or self._age - self._ghosts_checked_at < 0.5 * _STILL_S:
+            return foreground
+        self._ghosts_checked_at = self._age
+        still = cv2.inRange(cv2.absdiff(compensated, self._recent[0][1]), (0, 0, 0), (_GHOST_STEP,) * 3)
+        places = cv2.bitwise_and(uncovered_background(compensated, self._background, foreground), foreground)
+        left = np.asarray(cv2.bitwise_and(places, still), dtype=np.uint8)
         if not cv2.countNonZero(left):
-            return figure
-        if self._ghosts is None or self._ghostly is None:
-            self._ghosts, self._ghostly = even.copy(), np.zeros(figure.shape, np.uint8)
-        self._ghosts = np.asarray(cv2.copyTo(even, left, self._ghosts), dtype=np.uint8)
-        self._ghostly = np.asarray(cv2.bitwise_or(self._ghostly, left), dtype=np.uint8)
-        # The next review must not bring them back.
-        self._album.paint(even, left)
-        return np.asarray(cv2.subtract(figure, left), dtype=np.uint8)
+            return foreground
+        if self._ghost_image is None or self._ghost_mask is None:
+            self._ghost_image, self._ghost_mask = compensated.copy(), np.zeros(foreground.shape, np.uint8)
+        self._ghost_image = np.asarray(cv2.copyTo(compensated, left, self._ghost_image), dtype=np.uint8)
+        self._ghost_mask = np.asarray(cv2.bitwise_or(self._ghost_mask, left), dtype=np.uint8)
+        # The next bootstrap must not bring them back.
+        self._bootstrap.overwrite(compensated, left)
+        return np.asarray(cv2.subtract(foreground, left), dtype=np.uint8)
 
-    def haunt(self, image: Image, box: Box) -> None:
-        """Take what stands in a box for background from now on: it is a place from which something has gone."""
+    def absorb_ghost(self, image: Image, box: Box) -> None:
+        """Treat the content of a box as background from now on: it is a ghost."""
         rows, columns = _slices(box, image.shape)
-        if self._ghosts is None or self._ghostly is None:
-            self._ghosts, self._ghostly = image.copy(), np.zeros(image.shape[:2], np.uint8)
-        self._ghosts[rows, columns] = self._even(image)[rows, columns]
-        self._ghostly[rows, columns] = 255
+        if self._ghost_image is None or self._ghost_mask is None:
+            self._ghost_image, self._ghost_mask = image.copy(), np.zeros(image.shape[:2], np.uint8)
+        self._ghost_image[rows, columns] = self._compensate_gain(image)[rows, columns]
+        self._ghost_mask[rows, columns] = 255
 
-    def _even(self, image: Image) -> Image:
-        """The picture in the background's light, from what most of the picture says.
+    def _compensate_gain(self, image: Image) -> Image:
+        """The image in the light of the background, from the robust gain between them.
 
-        One gain a channel; where it is far from 1, also its slow change over the picture: cameras that change their
-        exposure do not treat bright and dark parts, or middle and corners, alike.
+        One gain per channel; where it is far from 1, also a smooth variation over the image: cameras that change their
+        exposure do not treat bright and dark parts, or centre and corners, equally.
         """
         assert self._background is not None
-        self._dimming = 1.0
+        self._gain = 1.0
         now = image[::_SUBSAMPLE, ::_SUBSAMPLE].astype(np.float32)
         then = self._background[::_SUBSAMPLE, ::_SUBSAMPLE].astype(np.float32)
         usable = np.asarray(((now > 8) & (now < 245) & (then > 8) & (then < 245)).all(axis=2), dtype=np.bool_)
@@ -245,60 +254,60 @@ class Foreground:
         if np.abs(gain - 1.0).max() < 0.012:
             return image
         table = np.clip(np.rint(np.arange(256)[:, None] * gain), 0, 255).astype(np.uint8)[None]
-        even = np.asarray(cv2.LUT(image, table), dtype=np.uint8)
-        self._dimming = max(float(gain.max()), 1.0)
-        if np.abs(gain - 1.0).max() < _EVEN_FIELD:
-            return even
+        compensated = np.asarray(cv2.LUT(image, table), dtype=np.uint8)
+        self._gain = max(float(gain.max()), 1.0)
+        if np.abs(gain - 1.0).max() < _UNIFORM_GAIN:
+            return compensated
         left = np.log(ratio.mean(axis=1)) - math.log(float(gain.mean()))
-        field = _slow_field(usable, left, (image.shape[1], image.shape[0]))
-        return np.asarray(cv2.multiply(even, cv2.merge([field] * 3), dtype=cv2.CV_8U), dtype=np.uint8)
+        field = _gain_field(usable, left, (image.shape[1], image.shape[0]))
+        return np.asarray(cv2.multiply(compensated, cv2.merge([field] * 3), dtype=cv2.CV_8U), dtype=np.uint8)
 
-    def _jolted(self, figure: Image) -> bool:
-        if cv2.countNonZero(figure[::4, ::4]) * 16 <= _JOLT * figure.size:
-            self._high = 0
+    def _scene_changed(self, foreground: Image) -> bool:
+        if cv2.countNonZero(foreground[::4, ::4]) * 16 <= _SCENE_CHANGE_SHARE * foreground.size:
+            self._changed_frames = 0
             return False
-        self._high += 1
-        return self._high >= 2  # one frame may be a flash
+        self._changed_frames += 1
+        return self._changed_frames >= 2  # one frame may be a flash
 
-    def _without_ghosts(self, even: Image, figure: Image) -> Image:
-        if self._ghosts is None or self._ghostly is None:
-            return figure
-        return without_like(figure, even, self._ghosts, self._ghostly)
+    def _without_ghosts(self, compensated: Image, foreground: Image) -> Image:
+        if self._ghost_image is None or self._ghost_mask is None:
+            return foreground
+        return remove_ghosts(foreground, compensated, self._ghost_image, self._ghost_mask)
 
-    def _teach(self, even: Image, figure: Image, protected: Sequence[Box], learning: bool) -> None:
+    def _update_model(self, compensated: Image, foreground: Image, protected: Sequence[Box], learning: bool) -> None:
         assert self._background is not None
-        assert self._slow is not None
-        self._since += 1
-        every = max(round(_TEACH_S / self._period), 1)
-        if not learning and self._since < every:
+        assert self._background_mean is not None
+        self._frames_since_update += 1
+        every = max(round(_UPDATE_S / self._period), 1)
+        if not learning and self._frames_since_update < every:
             return
-        lesson = even
+        update_image = compensated
         if protected and not learning:
-            lesson = even.copy()
+            update_image = compensated.copy()
             for box in protected:
-                rows, columns = _slices(box, even.shape)
-                lesson[rows, columns] = self._background[rows, columns]
-        rate = max(1.0 / self._seen, 0.02) if learning else self._since * self._period / _MEMORY_S
-        self._model.apply(lesson, learningRate=min(rate, 0.5))
-        # The model's own picture mixes what it has seen; this one only takes what the model calls background.
-        kept = np.full(figure.shape, 255, np.uint8) if self._age < _BEGIN_S else cv2.bitwise_not(figure)
-        cv2.accumulateWeighted(lesson, self._slow, min(max(rate, 0.02), 0.5), kept)
-        self._background = np.asarray(cv2.convertScaleAbs(self._slow), dtype=np.uint8)
-        self._since = 0
+                rows, columns = _slices(box, compensated.shape)
+                update_image[rows, columns] = self._background[rows, columns]
+        rate = max(1.0 / self._frames, 0.02) if learning else self._frames_since_update * self._period / _MEMORY_S
+        self._model.apply(update_image, learningRate=min(rate, 0.5))
+        # OpenCV's background image mixes all modes; this one is updated by background pixels only.
+        kept = np.full(foreground.shape, 255, np.uint8) if self._age < _INITIAL_S else cv2.bitwise_not(foreground)
+        cv2.accumulateWeighted(update_image, self._background_mean, min(max(rate, 0.02), 0.5), kept)
+        self._background = np.asarray(cv2.convertScaleAbs(self._background_mean), dtype=np.uint8)
+        self._frames_since_update = 0
 
 
-def without_like(figure: Image, now: Image, then: Image, where: Image) -> Image:
-    """A silhouette picture (H, W) 0/255 with 0 wherever ``where`` is 255 and two pictures (H, W, 3) are alike."""
+def remove_ghosts(foreground: Image, now: Image, then: Image, where: Image) -> Image:
+    """A mask (H, W) 0/255 with 0 wherever ``where`` is 255 and two images (H, W, 3) are equal within noise."""
     step = _GHOST_STEP - 1
     like = cv2.inRange(cv2.absdiff(now, then), (0, 0, 0), (step, step, step))
-    return np.asarray(cv2.bitwise_and(figure, cv2.bitwise_not(cv2.bitwise_and(like, where))), dtype=np.uint8)
+    return np.asarray(cv2.bitwise_and(foreground, cv2.bitwise_not(cv2.bitwise_and(like, where))), dtype=np.uint8)
 
 
-def _slow_field(usable: Bools, left: Floats, size: tuple[int, int]) -> npt.NDArray[np.float32]:
-    """A gain for every pixel of a picture (width, height), of second order in the place.
+def _gain_field(usable: Bools, left: Floats, size: tuple[int, int]) -> npt.NDArray[np.float32]:
+    """A gain for every pixel of an image (width, height), of second order in position.
 
-    left: (n,) logarithms of the gains that are left at the pixels of a coarse grid which are ``usable``. What stands
-    before the background is outvoted.
+    left: (n,) logarithms of the residual gains at the ``usable`` pixels of a coarse grid. Foreground pixels are
+    outliers of the robust fit.
     """
     y, x = np.nonzero(usable)
     across, down = 2.0 * x / usable.shape[1] - 1.0, 2.0 * y / usable.shape[0] - 1.0
@@ -321,55 +330,57 @@ def _slices(box: Box, shape: tuple[int, ...]) -> tuple[slice, slice]:
     return slice(top, min(math.ceil(y + h), shape[0])), slice(left, min(math.ceil(x + w), shape[1]))
 
 
-def is_ghost(image: Image, background: Image, box: Box, figure: Image) -> bool:
-    """Whether a silhouette is the place of something that has gone: it stands out from what is beside it in the
-    background's picture, and less in this one."""
+def is_ghost(image: Image, background: Image, box: Box, foreground: Image) -> bool:
+    """Whether a silhouette is a ghost: its rim has a higher contrast in the background than in the image.
+
+    A ghost is the former place of an object that was learnt as background and has left.
+    """
     x, y, w, h = box
-    reach = 2 * int(np.clip(round(_BESIDE * h), 2, 15)) + 1
+    reach = 2 * int(np.clip(round(_RIM_REACH_SHARE * h), 2, 15)) + 1
     rows, columns = _slices((x - reach, y - reach, w + 2 * reach, h + 2 * reach), image.shape)
-    mask = figure[rows, columns]
+    mask = foreground[rows, columns]
     if mask.size == 0:
         return False
     rim = cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
-    # Other silhouettes near have rims of their own.
+    # Exclude the rims of other silhouettes.
     inner = np.zeros(mask.shape, dtype=np.bool_)
     top, left = max(math.floor(y), 0) - rows.start, max(math.floor(x), 0) - columns.start
     inner[top : top + math.ceil(h) + 1, left : left + math.ceil(w) + 1] = True
     rim &= inner
-    if rim.sum() < _LEAST_RIM:
+    if rim.sum() < _MIN_RIM_PIXELS:
         return False
-    before, now = (_stands_out(one[rows, columns], mask, reach)[rim] for one in (background, image))
-    return bool(np.median(before) > _GHOSTLY * np.median(now) and np.median(before) > _PLAIN)
+    before, now = (_rim_contrast(one[rows, columns], mask, reach)[rim] for one in (background, image))
+    return bool(np.median(before) > _GHOST_RATIO * np.median(now) and np.median(before) > _MIN_GHOST_CONTRAST)
 
 
-def places_left(image: Image, background: Image, figure: Image) -> Image:
-    """Where (H, W) 0/255 a silhouette picture shows what was in the background's picture, not what is in this one.
+def uncovered_background(image: Image, background: Image, foreground: Image) -> Image:
+    """Where (H, W) 0/255 a mask shows ghosts: objects of the background image that are not in this one.
 
     As ``is_ghost``, of every part by the rims near it. At half the resolution.
     """
-    found = np.zeros_like(figure)
-    x, y, w, h = cv2.boundingRect(figure)
+    found = np.zeros_like(foreground)
+    x, y, w, h = cv2.boundingRect(foreground)
     if w < _RIM_REACH or h < _RIM_REACH:
         return found
-    wide = (2 * max(round(_VOTES * figure.shape[0] / 4), 2) + 1,) * 2
-    rows, columns = _slices((x - _RIM_REACH, y - _RIM_REACH, w + 2 * _RIM_REACH, h + 2 * _RIM_REACH), figure.shape)
-    figure, image, background = figure[rows, columns], image[rows, columns], background[rows, columns]
-    height, width = figure.shape
+    wide = (2 * max(round(_VOTE_WINDOW * foreground.shape[0] / 4), 2) + 1,) * 2
+    rows, columns = _slices((x - _RIM_REACH, y - _RIM_REACH, w + 2 * _RIM_REACH, h + 2 * _RIM_REACH), foreground.shape)
+    foreground, image, background = foreground[rows, columns], image[rows, columns], background[rows, columns]
+    height, width = foreground.shape
     size = (width + 1) // 2, (height + 1) // 2
-    mask = np.asarray(cv2.medianBlur(cv2.resize(figure, size, interpolation=cv2.INTER_NEAREST), 5), dtype=np.uint8)
+    mask = np.asarray(cv2.medianBlur(cv2.resize(foreground, size, interpolation=cv2.INTER_NEAREST), 5), dtype=np.uint8)
     rim = cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)).astype(np.float32) / 255.0
     smaller = (
         np.asarray(cv2.resize(one, size, interpolation=cv2.INTER_AREA), dtype=np.uint8) for one in (background, image)
     )
-    before, now = (cv2.boxFilter(rim * _stands_out(one, mask, _RIM_REACH), -1, wide) for one in smaller)
-    plain = _PLAIN * cv2.boxFilter(rim, -1, wide)
-    left = np.where((before > _LEFT * now) & (before > plain), mask, 0).astype(np.uint8)
+    before, now = (cv2.boxFilter(rim * _rim_contrast(one, mask, _RIM_REACH), -1, wide) for one in smaller)
+    plain = _MIN_GHOST_CONTRAST * cv2.boxFilter(rim, -1, wide)
+    left = np.where((before > _UNCOVERED_RATIO * now) & (before > plain), mask, 0).astype(np.uint8)
     found[rows, columns] = cv2.resize(left, (width, height), interpolation=cv2.INTER_NEAREST)
     return found
 
 
-def _stands_out(part: Image, mask: Image, reach: int) -> npt.NDArray[np.float32]:
-    """By how much (h, w) colours (h, w, 3) near each pixel differ inside and outside a mask (h, w) 0/255."""
+def _rim_contrast(part: Image, mask: Image, reach: int) -> npt.NDArray[np.float32]:
+    """Difference (h, w) of the mean colours (h, w, 3) near each pixel inside and outside a mask (h, w) 0/255."""
     size = (reach, reach)
 
     def mean(where: Image) -> npt.NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""Which of what is raised from the background is only in shadow: the same colour and texture, less light."""
+"""Detection of cast shadows in a foreground mask: the same colour and texture as the background, less light."""
 
 from __future__ import annotations
 
@@ -11,23 +11,25 @@ import numpy.typing as npt
 from protocols.geometry.types import Bools, Floats
 
 Image = npt.NDArray[np.uint8]
-_Picture = npt.NDArray[np.float32]
-_LIGHT = (0.42, 0.95)  # that a shadow may leave
-_TEXTURE = 7.0  # 8-bit steps that are noise
-_CHROMA = 9.0  # 8-bit steps by which a shadow changes colours
-_PIXEL = 14.0  # the same of one pixel, with its noise
-_NEAR, _WINDOW = 5, 9  # pixels of half the picture: in which a shadow must show the texture of what it falls on
-_SHOWN, _HIDDEN = 0.4, 2.5  # share of the texture that a shadow shows at least; standard deviations
+_FloatImage = npt.NDArray[np.float32]
+_ATTENUATION = (0.42, 0.95)  # range of the share of light in a shadow
+_TEXTURE_STEP = 7.0  # 8-bit steps of texture difference that are noise
+_COLOUR_STEP = 9.0  # 8-bit steps by which a shadow changes colours
+_PIXEL_COLOUR_STEP = 14.0  # the same for a single pixel, with its noise
+_NEAR, _WINDOW = 5, 9  # px at half the resolution: windows of the local mean and of the texture test
+# smallest share of the background's texture in a shadow; standard deviations
+_MIN_TEXTURE_SHARE, _HIDDEN_SIGMAS = 0.4, 2.5
 _LEAST_NOISE = 2.0  # 8-bit steps
-_BINS, _ENOUGH, _FADE = 53, 2000, 0.99  # of light; pixels that must have shown their texture; share kept each time
-_DARKEST, _MARGIN = 0.04, 0.03  # share of those that may be darker than the place's shadows; of the light
+# histogram bins of the attenuation; pixels of certain shadows; forgetting factor per frame
+_BINS, _MIN_PIXELS, _FORGETTING = 53, 2000, 0.99
+_DARK_QUANTILE, _MARGIN = 0.04, 0.03  # quantile of the attenuation of certain shadows, and a margin below it
 
 
-class Shadows:
-    """The shadows of one place, which learns how dark they are.
+class ShadowDetector:
+    """Shadow detector of one camera, which learns how dark shadows are.
 
-    A shadow that shows the texture of what it falls on is surely one. Nothing that is much darker than nearly all of
-    those is taken for a shadow: trousers of the floor's colour mostly are.
+    A shadow that shows the texture of its background is certain. Pixels much darker than nearly all of these are not
+    classified as shadow: they are mostly trousers of the floor's colour.
     """
 
     def __init__(self) -> None:
@@ -35,24 +37,24 @@ class Shadows:
 
     @property
     def darkest(self) -> float:
-        """The least share of the light that this place's shadows leave, as far as known."""
+        """The smallest share of light that shadows leave here, as learnt so far."""
         total = self._seen.sum()
-        if total < _ENOUGH:
-            return _LIGHT[0]
-        at = int(np.searchsorted(np.cumsum(self._seen), _DARKEST * total))
-        return max(_LIGHT[0] + (_LIGHT[1] - _LIGHT[0]) * at / _BINS - _MARGIN, _LIGHT[0])
+        if total < _MIN_PIXELS:
+            return _ATTENUATION[0]
+        at = int(np.searchsorted(np.cumsum(self._seen), _DARK_QUANTILE * total))
+        return max(_ATTENUATION[0] + (_ATTENUATION[1] - _ATTENUATION[0]) * at / _BINS - _MARGIN, _ATTENUATION[0])
 
-    def find(self, image: Image, background: Image, figure: Image) -> Image:
-        """Which pixels (H, W) 0/255 of the raised ones, ``figure`` (H, W) 0/255, are shadow.
+    def detect(self, image: Image, background: Image, foreground: Image) -> Image:
+        """Shadow pixels (H, W) 0/255 of the ``foreground`` mask (H, W) 0/255.
 
         image, background: (H, W, 3) BGR under the same light.
         """
-        shadow = np.zeros_like(figure)
-        x, y, w, h = cv2.boundingRect(figure)
+        shadow = np.zeros_like(foreground)
+        x, y, w, h = cv2.boundingRect(foreground)
         if w < 4 or h < 4:
             return shadow
-        # Half the resolution does: what is asked is asked of a neighbourhood anyhow. From even pixels on: that is fast.
-        bottom, right = min(y + h + (y + h) % 2, figure.shape[0]), min(x + w + (x + w) % 2, figure.shape[1])
+        # Half the resolution suffices, because all tests are over windows. Resizing from even pixels on is fast.
+        bottom, right = min(y + h + (y + h) % 2, foreground.shape[0]), min(x + w + (x + w) % 2, foreground.shape[1])
         x, y = x - x % 2, y - y % 2
         w, h = right - x, bottom - y
         part = slice(y, bottom), slice(x, right)
@@ -61,56 +63,58 @@ class Shadows:
         then = cv2.resize(background[part], half, interpolation=cv2.INTER_AREA)
         bright_now = cv2.cvtColor(now, cv2.COLOR_BGR2GRAY).astype(np.float32)
         bright_then = cv2.cvtColor(then, cv2.COLOR_BGR2GRAY).astype(np.float32)
-        left = (cv2.blur(bright_now, (3, 3)) + 2.0) / (cv2.blur(bright_then, (3, 3)) + 2.0)
-        dark = cv2.inRange(left, self.darkest, _LIGHT[1])
+        attenuation = (cv2.blur(bright_now, (3, 3)) + 2.0) / (cv2.blur(bright_then, (3, 3)) + 2.0)
+        dark = cv2.inRange(attenuation, self.darkest, _ATTENUATION[1])
         if not cv2.countNonZero(dark):
             return shadow
-        # What is left after the background was dimmed by the local light must be noise, in brightness and in colour.
-        dimmed = cv2.multiply(then, cv2.merge([left] * 3), dtype=cv2.CV_8U)
-        texture = cv2.blur(cv2.absdiff(bright_now, bright_then * left), (3, 3))
+        # The residual to the background dimmed by the local light must be noise, in brightness and in colour.
+        dimmed = cv2.multiply(then, cv2.merge([attenuation] * 3), dtype=cv2.CV_8U)
+        texture = cv2.blur(cv2.absdiff(bright_now, bright_then * attenuation), (3, 3))
         colour = cv2.blur(cv2.absdiff(now, dimmed), (3, 3))
-        same = cv2.inRange(texture, -1.0, _TEXTURE)
-        grey = cv2.inRange(colour, (0, 0, 0), (_CHROMA,) * 3)
+        same = cv2.inRange(texture, -1.0, _TEXTURE_STEP)
+        grey = cv2.inRange(colour, (0, 0, 0), (_COLOUR_STEP,) * 3)
         all_three = cv2.bitwise_and(dark, cv2.bitwise_and(same, grey))
-        raised = np.asarray(cv2.resize(figure[part], half, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
-        seems = np.asarray(all_three, dtype=np.uint8)
-        light = np.asarray(left, dtype=np.float32)
-        hidden, shown = _texture(bright_now, bright_then, light, seems, raised == 0)
+        raised = np.asarray(cv2.resize(foreground[part], half, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
+        candidates = np.asarray(all_three, dtype=np.uint8)
+        light = np.asarray(attenuation, dtype=np.float32)
+        hidden, shown = _texture_test(bright_now, bright_then, light, candidates, raised == 0)
         self._learn(light[(shown & raised) > 0])
-        sure = cv2.subtract(seems, hidden)
-        # At the rim of a body the neighbourhood is half the body's: there every pixel speaks for itself.
-        alike = cv2.subtract(cv2.inRange(cv2.absdiff(now, dimmed), (0, 0, 0), (_PIXEL,) * 3), hidden)
-        rim = cv2.bitwise_and(cv2.dilate(sure, np.ones((3, 3), np.uint8)), cv2.bitwise_and(alike, dark))
-        full = cv2.resize(cv2.bitwise_or(sure, rim), (w, h), interpolation=cv2.INTER_NEAREST)
-        shadow[part] = cv2.bitwise_and(full, figure[part])
+        certain = cv2.subtract(candidates, hidden)
+        # At the rim of a body its pixels are in the window: there every pixel is tested by itself.
+        similar = cv2.subtract(cv2.inRange(cv2.absdiff(now, dimmed), (0, 0, 0), (_PIXEL_COLOUR_STEP,) * 3), hidden)
+        rim = cv2.bitwise_and(cv2.dilate(certain, np.ones((3, 3), np.uint8)), cv2.bitwise_and(similar, dark))
+        full = cv2.resize(cv2.bitwise_or(certain, rim), (w, h), interpolation=cv2.INTER_NEAREST)
+        shadow[part] = cv2.bitwise_and(full, foreground[part])
         return shadow
 
     def _learn(self, light: npt.NDArray[np.float32]) -> None:
-        self._seen = _FADE * self._seen + np.histogram(light, _BINS, _LIGHT)[0]
+        self._seen = _FORGETTING * self._seen + np.histogram(light, _BINS, _ATTENUATION)[0]
 
 
-def _texture(now: _Picture, then: _Picture, left: _Picture, candidate: Image, quiet: Bools) -> tuple[Image, Image]:
-    """Where what seems a shadow surely does not show the background's texture, and where it surely does.
+def _texture_test(
+    now: _FloatImage, then: _FloatImage, attenuation: _FloatImage, candidate: Image, quiet: Bools
+) -> tuple[Image, Image]:
+    """Where a shadow candidate certainly lacks the background's texture, and where it certainly shows it, (h, w) 0/255.
 
-    The first is trousers of the floor's colour.
-    now, then: (h, w) brightness and the background's; left: share of its light; candidate: 255 where a shadow may lie;
-    quiet: where nothing stands. A shadow's picture is the background's times ``left``, cloth has nothing of it:
-    over a window their correlation, sum(n t) / sum(t t), is 1 or 0, where n is the brightness and t the background's
-    times ``left``, both less their means nearby: of a shadow's soft rim, which has slopes of its own, little is left.
-    Where a film was compressed a shadow shows less: _SHOWN. It must be seen to show less than that, beyond the noise.
+    The first are clothes of the floor's colour. now, then: (h, w) brightness of the image and of the background; left:
+    share of light; candidate: 255 where a shadow may be; quiet: pixels without foreground. The image of a shadow is the
+    background times ``left``; cloth is independent of it. Over a window their correlation, sum(n t) / sum(t t), is 1 or
+    0, where n is the brightness and t the background's times ``left``, both less their local means: little remains of a
+    shadow's soft rim, which has gradients of its own. In compressed video a shadow shows less: _MIN_TEXTURE_SHARE. It
+    must show significantly less than that, relative to the noise.
     """
-    inside: _Picture = (candidate > 0).astype(np.float32)
+    inside: _FloatImage = (candidate > 0).astype(np.float32)
 
-    def total(values: npt.NDArray[Any], size: int) -> _Picture:
+    def total(values: npt.NDArray[Any], size: int) -> _FloatImage:
         return np.asarray(cv2.boxFilter(values, cv2.CV_32F, (size, size), normalize=False), dtype=np.float32)
 
     near = np.maximum(total(inside, _NEAR), np.float32(1.0))
     fine_now = (now - total(now * inside, _NEAR) / near) * inside
-    fine_then = left * (then - total(then * inside, _NEAR) / near) * inside
+    fine_then = attenuation * (then - total(then * inside, _NEAR) / near) * inside
     noise = 1.48 * float(np.median(np.abs(now[quiet] - then[quiet]))) if quiet.any() else 3.0
     texture = np.maximum(total(fine_then * fine_then, _WINDOW), np.float32(1e-3))
     share = total(fine_then * fine_now, _WINDOW) / texture
-    beyond = (_SHOWN - share) * np.sqrt(texture) / np.float32(max(noise, _LEAST_NOISE))
-    hidden = (beyond > _HIDDEN) & (share < 0.4 * _SHOWN)
-    shown = (beyond < -_HIDDEN) & (share > 1.5 * _SHOWN) & (candidate > 0)
+    beyond = (_MIN_TEXTURE_SHARE - share) * np.sqrt(texture) / np.float32(max(noise, _LEAST_NOISE))
+    hidden = (beyond > _HIDDEN_SIGMAS) & (share < 0.4 * _MIN_TEXTURE_SHARE)
+    shown = (beyond < -_HIDDEN_SIGMAS) & (share > 1.5 * _MIN_TEXTURE_SHARE) & (candidate > 0)
     return np.where(hidden, 255, 0).astype(np.uint8), np.where(shown, 255, 0).astype(np.uint8)

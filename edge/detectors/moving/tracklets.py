@@ -1,4 +1,4 @@
-"""Follows what a detector sees from picture to picture for a short time: expectations, and who is new."""
+"""Short-term tracking of detections in the image: prediction of boxes, association, track initiation and deletion."""
 
 from __future__ import annotations
 
@@ -10,19 +10,21 @@ from scipy.optimize import linear_sum_assignment
 from protocols.geometry.types import Floats
 
 Box = tuple[float, float, float, float]
-_SURE = 3  # sightings after which somebody is believed
-_FORGET_S = 1.2
-_GETS_ON = 0.35  # of the way that is gone, as the crow flies
-_TENTATIVE_S = 0.25
-_MEASURED, _DOUBT = 20, 2.0  # sightings of a height that count; what is usual counts as so many
+_CONFIRM_HITS = 3  # detections after which a tracklet is confirmed
+_COAST_S = 1.2
+_MIN_DIRECTNESS = 0.35  # displacement over the path length
+_TENTATIVE_COAST_S = 0.25
+# largest number of height samples that count; weight of the prior in samples
+_MAX_HEIGHT_SAMPLES, _PRIOR_HEIGHT_SAMPLES = 20, 2.0
 
 
 @dataclass(slots=True)
-class Follower:
-    """One thing that is followed.
+class ImageTracklet:
+    """One tracked object in the image.
 
-    box: x, y, w, h [px]. velocity: of its foot [px/s]. must_move: by how much of its lesser side before it counts as
-    something that moves. ghost: whether it seemed to be only the place of something that has gone.
+    box: x, y, w, h [px]. velocity: of its foot point [px/s]. min_displacement: over its shorter side, before it counts
+    as moving. ghost: whether it seems to be the former place of an object that has left. relative_height: its height
+    over that of the height model. path_length: [px].
     """
 
     name: str
@@ -32,120 +34,130 @@ class Follower:
     hits: int = 1
     born: float = 0.0
     birthplace: tuple[float, float] = (0.0, 0.0)
-    must_move: float = 0.35
+    min_displacement: float = 0.35
     moved: bool = False
     ghost: bool = False
-    way: float = 0.0
+    path_length: float = 0.0
     missed_since: float | None = None
     colour: Floats | None = None
-    measured: int = 0
-    stature: float = 1.0
+    height_samples: int = 0
+    relative_height: float = 1.0
 
     @property
-    def sure(self) -> bool:
-        """Seen often enough to be believed."""
-        return self.hits >= _SURE
+    def confirmed(self) -> bool:
+        """Whether it has been detected often enough."""
+        return self.hits >= _CONFIRM_HITS
 
-    def measure(self, stature: float) -> None:
-        """Its height, of the usual one where it stands, seen once more."""
-        self.measured += 1
-        share = 1.0 / (min(self.measured, _MEASURED) + _DOUBT)
-        self.stature *= float(np.clip(stature / self.stature, 0.7, 1.4)) ** share
+    def update_height(self, relative_height: float) -> None:
+        """Add a measurement of its height over that of the height model."""
+        self.height_samples += 1
+        weight = 1.0 / (min(self.height_samples, _MAX_HEIGHT_SAMPLES) + _PRIOR_HEIGHT_SAMPLES)
+        self.relative_height *= float(np.clip(relative_height / self.relative_height, 0.7, 1.4)) ** weight
 
-    def expected(self, time: float) -> Box:
-        """Its box [px] at a time [s]."""
+    def predicted_box(self, time: float) -> Box:
+        """Its predicted box [px] at a time [s], by constant velocity."""
         x, y, w, h = self.box
         ahead = min(max(time - self.time, 0.0), 1.0)
         return x + ahead * float(self.velocity[0]), y + ahead * float(self.velocity[1]), w, h
 
-    def see(self, box: Box, time: float, colour: Floats | None, trust: float = 0.6) -> None:
-        """Seen again. trust: 0..1 of the box against what was expected."""
-        expected = self.expected(time)
+    def update(self, box: Box, time: float, colour: Floats | None, gain: float = 0.6) -> None:
+        """Update with a detection. gain: 0..1, weight of the box against the prediction."""
+        expected = self.predicted_box(time)
         before = self.box[0] + 0.5 * self.box[2], self.box[1] + 0.5 * self.box[3]
         span = max(time - self.time, 1e-3)
         foot = np.array([box[0] + 0.5 * box[2], box[1] + box[3]])
-        thought = np.array([expected[0] + 0.5 * expected[2], expected[1] + expected[3]])
-        share = 0.5 if self.hits < 3 else 0.25
-        limit = 3.0 * box[3]  # nobody runs three heights a second
-        self.velocity = np.clip(self.velocity + share * trust * (foot - thought) / max(span, 0.08), -limit, limit)
-        self.box = tuple(float(a + trust * (b - a)) for a, b in zip(expected, box, strict=True))  # type: ignore[assignment]
+        predicted_foot = np.array([expected[0] + 0.5 * expected[2], expected[1] + expected[3]])
+        weight = 0.5 if self.hits < 3 else 0.25
+        limit = 3.0 * box[3]  # limit of the speed: three heights per second
+        self.velocity = np.clip(
+            self.velocity + weight * gain * (foot - predicted_foot) / max(span, 0.08), -limit, limit
+        )
+        self.box = tuple(float(a + gain * (b - a)) for a, b in zip(expected, box, strict=True))  # type: ignore[assignment]
         self.time = time
         self.hits += 1
         self.missed_since = None
         if colour is not None:
             self.colour = colour if self.colour is None else 0.9 * self.colour + 0.1 * colour
-        self.way += float(
+        self.path_length += float(
             np.hypot(self.box[0] + 0.5 * self.box[2] - before[0], self.box[1] + 0.5 * self.box[3] - before[1])
         )
         middle = self.box[0] + 0.5 * self.box[2], self.box[1] + 0.5 * self.box[3]
-        away = float(np.hypot(middle[0] - self.birthplace[0], middle[1] - self.birthplace[1]))
-        # A branch that sways goes a long way and gets nowhere.
-        if away > self.must_move * min(self.box[2:]) + 1.0 and away > _GETS_ON * self.way:
+        displacement = float(np.hypot(middle[0] - self.birthplace[0], middle[1] - self.birthplace[1]))
+        # A swaying branch has a long path and a small displacement.
+        if (
+            displacement > self.min_displacement * min(self.box[2:]) + 1.0
+            and displacement > _MIN_DIRECTNESS * self.path_length
+        ):
             self.moved = True
 
 
-class Following:
-    """All that are followed in one picture. prefix: of their names, p0, p1, …; must_move: see ``Follower``."""
+class ShortTermTracker:
+    """All tracklets of one camera. prefix: of their names, p0, p1, …; min_displacement: see ``ImageTracklet``."""
 
-    def __init__(self, prefix: str, must_move: float) -> None:
+    def __init__(self, prefix: str, min_displacement: float) -> None:
         self._prefix = prefix
-        self._must_move = must_move
+        self._min_displacement = min_displacement
         self._next = 0
-        self.all: list[Follower] = []
+        self.tracklets: list[ImageTracklet] = []
 
     def clear(self) -> None:
-        """Forget everybody; names are not used again."""
-        self.all = []
+        """Delete all tracklets; names are not used again."""
+        self.tracklets = []
 
     def assign(
-        self, boxes: list[Box], colours: list[Floats | None], time: float, given: list[Follower | None]
-    ) -> list[Follower]:
-        """Whose each box is; new ones are begun. given: follower that a box was placed for, if any."""
-        owners: list[Follower | None] = list(given)
-        taken = {id(one) for one in owners if one is not None}
-        free = [one for one in self.all if id(one) not in taken]
-        open_boxes = [index for index, owner in enumerate(owners) if owner is None]
+        self, boxes: list[Box], colours: list[Floats | None], time: float, preassigned: list[ImageTracklet | None]
+    ) -> list[ImageTracklet]:
+        """The tracklet of each box; new ones are initiated. preassigned: tracklet that a box belongs to, if known."""
+        assigned: list[ImageTracklet | None] = list(preassigned)
+        taken = {id(one) for one in assigned if one is not None}
+        free = [one for one in self.tracklets if id(one) not in taken]
+        open_boxes = [index for index, assigned_tracklet in enumerate(assigned) if assigned_tracklet is None]
         if free and open_boxes:
             cost = np.array(
-                [[_distance(one, boxes[index], colours[index], time) for one in free] for index in open_boxes]
+                [[_association_cost(one, boxes[index], colours[index], time) for one in free] for index in open_boxes]
             )
             for row, column in zip(*linear_sum_assignment(cost), strict=True):
                 if cost[row, column] < 1.0:
-                    owners[open_boxes[row]] = free[column]
+                    assigned[open_boxes[row]] = free[column]
         result = []
-        for index, (box, owner) in enumerate(zip(boxes, owners, strict=True)):
-            if owner is None:
+        for index, (box, assigned_tracklet) in enumerate(zip(boxes, assigned, strict=True)):
+            if assigned_tracklet is None:
                 middle = box[0] + 0.5 * box[2], box[1] + 0.5 * box[3]
-                owner = Follower(
-                    f"{self._prefix}{self._next}", box, time, born=time, birthplace=middle, must_move=self._must_move
+                assigned_tracklet = ImageTracklet(
+                    f"{self._prefix}{self._next}",
+                    box,
+                    time,
+                    born=time,
+                    birthplace=middle,
+                    min_displacement=self._min_displacement,
                 )
-                owner.colour = colours[index]
+                assigned_tracklet.colour = colours[index]
                 self._next += 1
-                self.all.append(owner)
-            result.append(owner)
+                self.tracklets.append(assigned_tracklet)
+            result.append(assigned_tracklet)
         return result
 
-    def forget(self, time: float, size: tuple[int, int]) -> None:
-        """Let go of those who have not been seen for a while, or have left the picture (width, height)."""
+    def prune(self, time: float, size: tuple[int, int]) -> None:
+        """Delete tracklets without detections for a while, or outside the image (width, height)."""
         kept = []
-        for one in self.all:
-            x, y, w, h = one.expected(time)
+        for one in self.tracklets:
+            x, y, w, h = one.predicted_box(time)
             gone = x + w < 0 or y + h < 0 or x > size[0] or y > size[1]
             silent = time - one.time
-            if not gone and silent <= (_FORGET_S if one.sure else _TENTATIVE_S):
+            if not gone and silent <= (_COAST_S if one.confirmed else _TENTATIVE_COAST_S):
                 kept.append(one)
-        self.all = kept
+        self.tracklets = kept
 
 
-def _distance(one: Follower, box: Box, colour: Floats | None, time: float) -> float:
-    """How little a box fits a follower: below 1 it may be."""
-    x, y, w, h = one.expected(time)
+def _association_cost(one: ImageTracklet, box: Box, colour: Floats | None, time: float) -> float:
+    """Cost of assigning a box to a tracklet: below 1 it is admissible."""
+    x, y, w, h = one.predicted_box(time)
     scale = max(h, box[3], 8.0)
-    away = np.hypot(x + 0.5 * w - box[0] - 0.5 * box[2], y + 0.5 * h - box[1] - 0.5 * box[3]) / scale
-    # Where it may be by now grows with the time that it has not been seen.
+    displacement = np.hypot(x + 0.5 * w - box[0] - 0.5 * box[2], y + 0.5 * h - box[1] - 0.5 * box[3]) / scale
+    # The gate grows with the time since the last detection.
     reach = 0.35 + 0.6 * min(time - one.time, 1.0)
     taller = abs(np.log(max(h, 1.0) / max(box[3], 1.0)))
-    looks = 0.0
+    colour_distance = 0.0
     if colour is not None and one.colour is not None:
-        looks = float(np.linalg.norm(colour - one.colour)) / 150.0
-    return float(away / reach + 0.5 * taller + 0.5 * looks)
+        colour_distance = float(np.linalg.norm(colour - one.colour)) / 150.0
+    return float(displacement / reach + 0.5 * taller + 0.5 * colour_distance)

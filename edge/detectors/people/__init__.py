@@ -1,1 +1,1 @@
-"""People detection from silhouettes: templates, occupancy, height model, segmentation."""
+"""Detection of people as silhouettes: shape templates, occupancy, height model, segmentation."""

@@ -1,9 +1,9 @@
-"""The observation node's eye: people before a fixed camera, with head, foot, representative point and clothes.
+"""Detection of people before a fixed camera, with head, foot point, representative point and clothing colour.
 
-After section 2 and 3.1.1 of the paper on distributed human tracking: silhouettes against a model of the background,
-the maximum of their distance transform as representative point, the head's top, the foot point, the torso's colour,
-and the distance from head to foot as size. Silhouettes of several people are taken apart by what height people have
-at that place and by where those who are followed were expected (``bodies``).
+After sections 2 and 3.1.1 of the paper on distributed human tracking: silhouettes from a background model, the maximum
+of their distance transform as representative point, the top of the head, the foot point, the torso's colour, and the
+distance from head to foot as size. Silhouettes of several people are segmented by the heights of people at that place
+and by the predictions of tracklets (``segmentation``).
 """
 
 from __future__ import annotations
@@ -17,229 +17,242 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.detectors.base import Detection, Prediction
-from edge.detectors.moving.foreground import Foreground, Layers, ModelName, is_ghost
+from edge.detectors.moving.foreground import BackgroundSubtractor, ForegroundMasks, SubtractorName, is_ghost
 from edge.detectors.moving.gating import match_predictions
-from edge.detectors.moving.tracklets import Follower, Following
-from edge.detectors.people.height_model import Stature
-from edge.detectors.people.segmentation import explain
-from edge.detectors.people.silhouettes import Body, LonePeople
+from edge.detectors.moving.tracklets import ImageTracklet, ShortTermTracker
+from edge.detectors.people.height_model import HeightModel
+from edge.detectors.people.segmentation import segment_people
+from edge.detectors.people.silhouettes import IsolatedPeople, PersonSilhouette
 from protocols.geometry.types import Floats
 
 Image = npt.NDArray[np.uint8]
-_MOST_PIXELS = 700_000  # a larger picture is looked at smaller
+_MAX_PIXELS = 700_000  # larger images are downscaled to this
 _GHOST_AFTER_S = 0.5
-_ASKED = 3  # sightings after which it is asked again whether somebody who has not moved is a ghost
-_U_STD, _V_STD = 0.024, 0.105  # of the representative point, of the size, as rendered rooms have it
+_GHOST_CHECK_HITS = 3  # detections after which a tracklet that has not moved is tested again for being a ghost
+_U_STD, _V_STD = 0.024, 0.105  # std of the representative point over the size, measured on rendered rooms
 _FLOOR_STD = 0.6  # px
-_LEAST_TOLD = 12.0  # px: who is expected smaller tells no height
-_VAGUE = 0.12  # of the size: std of a place that is expected, above which it tells nothing
-_BETWEEN = 0.12  # of the height: gaps across that are closed where they seem a shadow
-_BELOW = 0.62  # of the height: the foot below the representative point that is expected
-_COMES_S, _COMES, _ALIKE = (0.2, 1.0), (0.12, 1.0), 0.15
-"""Who walks: seconds, way in heights, logarithm of the height between two sightings of him alone."""
+_MIN_PREDICTED_PX = 12.0  # px: smaller predictions do not update the height model
+_MAX_PREDICTED_STD = 0.12  # over the size: largest std of a predicted place that updates the height model
+_GAP_WIDTH = 0.12  # over the height: width of gaps that are closed where they seem a shadow
+_FOOT_BELOW = 0.62  # over the height: distance of the foot point below the predicted representative point
+_WALKING_GAP_S, _WALKING_STEP, _HEIGHT_TOLERANCE = (0.2, 1.0), (0.12, 1.0), 0.15
+"""Of a walking person between two isolated detections: limits of the time [s], of the distance over the height, and of
+the log ratio of heights.
+"""
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
-    body: Body
-    follower: Follower
+class _TrackedSilhouette:
+    body: PersonSilhouette
+    tracklet: ImageTracklet
     colour: Floats | None
 
 
 class PersonDetector:
-    """People before one fixed camera.
+    """Detects people before one fixed camera.
 
-    model: of the background, mog2 or knn. fps: of the pictures, where their times are not told. sure_only: report
-    only who has been seen several times and has moved; else everybody, with a lower score (see ``is_sure``).
-    prefix: of the labels; those of several cameras must differ, as they do not know each other's people.
+    model: of the background, mog2 or knn. fps: frame rate where images have no times. confirmed_only: report only
+    people who have been detected several times and have moved; otherwise all, with a lower score (see
+    ``is_confirmed``). prefix: of the labels; those of several cameras must differ, because cameras do not know each
+    other's people. max_pixels: larger images are downscaled.
     """
 
     def __init__(
         self,
-        model: ModelName = "mog2",
+        model: SubtractorName = "mog2",
         fps: float = 25.0,
         *,
-        sure_only: bool = True,
+        confirmed_only: bool = True,
         prefix: str = "p",
-        most_pixels: int = _MOST_PIXELS,
+        max_pixels: int = _MAX_PIXELS,
     ) -> None:
         self._fps = fps if fps > 0 and math.isfinite(fps) else 25.0
-        self._foreground = Foreground(model, self._fps)
-        self._following = Following(prefix, must_move=0.35)
-        self._sure_only = sure_only
-        self._most_pixels = most_pixels
-        self._stature: Stature | None = None
+        self._foreground = BackgroundSubtractor(model, self._fps)
+        self._tracker = ShortTermTracker(prefix, min_displacement=0.35)
+        self._confirmed_only = confirmed_only
+        self._max_pixels = max_pixels
+        self._height_model: HeightModel | None = None
         self._size = (0, 0)
-        self._shrink = 1.0
+        self._scale = 1.0
         self._time = -1.0
-        self._sure: set[str] = set()
-        self._learns = True  # how tall people are
-        self._lone: list[tuple[float, float, float, float]] = []  # time, foot and height of those alone lately
+        self._confirmed: set[str] = set()
+        self._learns_heights = True  # whether the height model is updated
+        # time, foot point and height of recent isolated people
+        self._recent_isolated: list[tuple[float, float, float, float]] = []
 
     @property
-    def jolts(self) -> int:
-        """How often the camera was pushed or the light changed at once, and everything was learnt anew."""
-        return self._foreground.jolts
+    def resets(self) -> int:
+        """How often the background model was reset because the camera was moved or the light changed suddenly."""
+        return self._foreground.resets
 
-    def is_sure(self, label: str) -> bool:
-        """Whether somebody who was reported under this label turned out to be one: seen again, and moving."""
-        return label in self._sure
+    def is_confirmed(self, label: str) -> bool:
+        """Whether the track of this label was confirmed: detected several times, and moving."""
+        return label in self._confirmed
 
-    def prime(self, pictures: Sequence[Image]) -> None:
-        """Learn the background from pictures of a longer time, before the first one is looked at."""
-        if pictures:
-            self._fit_to(pictures[0])
-            self._foreground.prime([self._smaller(picture) for picture in pictures])
+    def initialise(self, images: Sequence[Image]) -> None:
+        """Learn the background from images spread over a longer time, before the first detection."""
+        if images:
+            self._set_size(images[0])
+            self._foreground.initialise([self._downscaled(image) for image in images])
 
     def rewind(self) -> None:
-        """Begin again at an earlier time with what was learnt of the place, and nobody in the picture."""
-        self._following.clear()
-        self._lone = []
+        """Restart at an earlier time with the learnt background and heights, and without tracks."""
+        self._tracker.clear()
+        self._recent_isolated = []
         self._time = -1.0
-        if self._stature is not None:
-            self._stature.settle()
-            self._learns = not self._stature.known
+        if self._height_model is not None:
+            self._height_model.refit()
+            self._learns_heights = not self._height_model.is_fitted
 
     def detect(
         self, image: Image, time_s: float | None = None, predictions: Sequence[Prediction] = ()
     ) -> list[Detection]:
-        """People in an image (H, W, 3) BGR taken at ``time_s`` on the camera's clock; the surest first.
+        """People in an image (H, W, 3) BGR taken at ``time_s`` on the camera's clock; highest score first.
 
-        predictions: where the tracking expects its targets in this picture; whoever is found there carries its id.
+        predictions: of tracked targets in this image; detections that match one carry its id.
         """
-        self._fit_to(image)
+        self._set_size(image)
         now = self._time + 1.0 / self._fps if time_s is None else time_s
         if not now > self._time:
             now = self._time + 1.0 / self._fps
         self._time = now
-        small = self._smaller(image)
-        followed = [one.box for one in self._following.all if one.sure and one.moved]
-        layers = self._foreground.look(small, followed, now)
-        if layers.fresh:
-            self._following.clear()
+        small = self._downscaled(image)
+        tracked_boxes = [one.box for one in self._tracker.tracklets if one.confirmed and one.moved]
+        masks = self._foreground.segment(small, tracked_boxes, now)
+        if masks.initialising:
+            self._tracker.clear()
             return []
-        figure = clean(layers.figure, layers.shadow, self._typical())
-        self._learn_from(predictions)
-        found = self._explain(small, layers, figure, now)
-        detections = [self._report(small, figure, one) for one in found if self._worth_telling(one)]
+        foreground = clean_silhouettes(masks.foreground, masks.shadow, self._median_height())
+        self._learn_heights(predictions)
+        found = self._segment_people(small, masks, foreground, now)
+        detections = [self._report(small, foreground, one) for one in found if self._is_reportable(one)]
         detections.sort(key=lambda one: -one.score)
         return match_predictions(detections, predictions)
 
-    def _worth_telling(self, one: _Found) -> bool:
-        """Seen several times, and moving, or else of the height that people have here."""
-        assert self._stature is not None
-        if one.follower.sure and one.follower.moved:
-            self._sure.add(one.follower.name)
+    def _is_reportable(self, one: _TrackedSilhouette) -> bool:
+        """Whether it has been confirmed, or else has been detected several times with the height of people here."""
+        assert self._height_model is not None
+        if one.tracklet.confirmed and one.tracklet.moved:
+            self._confirmed.add(one.tracklet.name)
             return True
-        fits = self._stature.known and not one.body.cut and not one.follower.ghost
-        return not self._sure_only or (one.follower.sure and fits)
+        fits = self._height_model.is_fitted and not one.body.truncated and not one.tracklet.ghost
+        return not self._confirmed_only or (one.tracklet.confirmed and fits)
 
-    def _fit_to(self, image: Image) -> None:
+    def _set_size(self, image: Image) -> None:
         size = image.shape[1], image.shape[0]
         if size == self._size:
             return
         self._size = size
-        self._shrink = min(1.0, math.sqrt(self._most_pixels / (size[0] * size[1])))
-        small = round(size[0] * self._shrink), round(size[1] * self._shrink)
-        self._stature = Stature(*small)
-        self._following.clear()
+        self._scale = min(1.0, math.sqrt(self._max_pixels / (size[0] * size[1])))
+        small = round(size[0] * self._scale), round(size[1] * self._scale)
+        self._height_model = HeightModel(*small)
+        self._tracker.clear()
 
-    def _smaller(self, image: Image) -> Image:
-        if self._shrink == 1.0:
+    def _downscaled(self, image: Image) -> Image:
+        if self._scale == 1.0:
             return image
-        size = round(image.shape[1] * self._shrink), round(image.shape[0] * self._shrink)
+        size = round(image.shape[1] * self._scale), round(image.shape[0] * self._scale)
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
-    def _learn_from(self, predictions: Sequence[Prediction]) -> None:
-        """How tall people are here, by those whom calibrated cameras follow: this one need not have seen anybody alone.
+    def _learn_heights(self, predictions: Sequence[Prediction]) -> None:
+        """Update the height model from targets tracked by calibrated cameras: this camera need not have seen isolated
+        people.
 
-        Nobody is sought where he is predicted: a target that is none would find itself in whoever stands there.
+        Predictions are not used for segmentation: a false track would confirm itself by any person at that place.
         """
-        assert self._stature is not None
-        for one in predictions if self._learns else ():
-            tall = one.size * self._shrink
+        assert self._height_model is not None
+        for one in predictions if self._learns_heights else ():
+            height = one.size * self._scale
             a, _, c = one.covariance
-            if tall < _LEAST_TOLD or not math.sqrt(max(a, c)) < _VAGUE * one.size:
+            if height < _MIN_PREDICTED_PX or not math.sqrt(max(a, c)) < _MAX_PREDICTED_STD * one.size:
                 continue
-            foot = (one.v + 0.5) * self._shrink + _BELOW * tall
-            self._stature.told((one.u + 0.5) * self._shrink, foot, tall, one.target)
+            foot = (one.v + 0.5) * self._scale + _FOOT_BELOW * height
+            self._height_model.add_predicted((one.u + 0.5) * self._scale, foot, height, one.target)
 
-    def _typical(self) -> float:
-        heights = [one.box[3] for one in self._following.all if one.sure]
-        return float(np.median(heights)) if heights else 0.25 * self._size[1] * self._shrink
+    def _median_height(self) -> float:
+        heights = [one.box[3] for one in self._tracker.tracklets if one.confirmed]
+        return float(np.median(heights)) if heights else 0.25 * self._size[1] * self._scale
 
-    def _explain(self, image: Image, layers: Layers, figure: Image, now: float) -> list[_Found]:
-        assert self._stature is not None
-        following = self._following
-        followers = list(following.all)
-        boxes = [one.expected(now) for one in followers]
-        moving = [(box, one.name) for box, one in zip(boxes, followers, strict=True) if one.sure and one.moved]
-        alone = LonePeople(figure) if self._learns else None
-        lone = [(now, *one) for one in alone.find()] if alone else []
-        for _, u, v, tall in lone:
-            # What has not moved may be the place that somebody has left.
-            who = [name for box, name in moving if _stands(box, u, v, tall)]
-            if who or self._comes(now, u, v, tall):
-                self._stature.learn(u, v, tall, who[0] if who else "")
-        if alone and self._foreground.young:
-            guesses = alone.find(strict=False)
-            tallest = max((one[2] for one in guesses), default=0.0)
-            for u, v, tall in guesses:
-                if tall > 0.5 * tallest:  # others may be pieces
-                    self._stature.guess(u, v, tall)
-        self._lone = [one for one in self._lone if now - one[0] < _COMES_S[1]] + lone
-        bodies = explain(
-            figure,
-            layers.shadow,
-            self._stature,
+    def _segment_people(
+        self, image: Image, masks: ForegroundMasks, foreground: Image, now: float
+    ) -> list[_TrackedSilhouette]:
+        assert self._height_model is not None
+        tracker = self._tracker
+        tracklets = list(tracker.tracklets)
+        boxes = [one.predicted_box(now) for one in tracklets]
+        moving = [(box, one.name) for box, one in zip(boxes, tracklets, strict=True) if one.confirmed and one.moved]
+        isolated = IsolatedPeople(foreground) if self._learns_heights else None
+        isolated_people = [(now, *one) for one in isolated.find()] if isolated else []
+        for _, u, v, height in isolated_people:
+            # A static silhouette may be a ghost.
+            who = [name for box, name in moving if _matches_box(box, u, v, height)]
+            if who or self._is_walking(now, u, v, height):
+                self._height_model.add(u, v, height, who[0] if who else "")
+        if isolated and self._foreground.bootstrapping:
+            tentative = isolated.find(strict=False)
+            greatest_height = max((one[2] for one in tentative), default=0.0)
+            for u, v, height in tentative:
+                if height > 0.5 * greatest_height:  # others may be fragments
+                    self._height_model.add_tentative(u, v, height)
+        self._recent_isolated = [
+            one for one in self._recent_isolated if now - one[0] < _WALKING_GAP_S[1]
+        ] + isolated_people
+        bodies = segment_people(
+            foreground,
+            masks.shadow,
+            self._height_model,
             boxes,
             image,
-            [one.colour for one in followers],
-            [one.stature for one in followers],
+            [one.colour for one in tracklets],
+            [one.relative_height for one in tracklets],
         )
-        colours = [_torso(image, figure, body) for body in bodies]
-        given = [followers[body.expected] if body.expected >= 0 else None for body in bodies]
-        owners = following.assign([body.box for body in bodies], colours, now, given)
+        colours = [_torso_colour(image, foreground, body) for body in bodies]
+        preassigned = [tracklets[body.expected] if body.expected >= 0 else None for body in bodies]
+        assigned = tracker.assign([body.box for body in bodies], colours, now, preassigned)
         found = []
-        for body, owner, colour in zip(bodies, owners, colours, strict=True):
-            if body.alone and not body.cut and self._stature.known:
+        for body, tracklet, colour in zip(bodies, assigned, colours, strict=True):
+            if body.isolated and not body.truncated and self._height_model.is_fitted:
                 x, y, w, h = body.box
-                usual = float(self._stature.at(np.array(x + 0.5 * w), np.array(y + h)))
-                owner.measure(h / usual)
-            if owner.time < now or owner.hits == 1:
-                if owner.time < now:
-                    trust = 0.9 if body.alone and not body.cut else 0.6 if body.seen > 0.6 else 0.35
-                    owner.see(body.box, now, colour if body.seen > 0.6 else None, trust)
-                found.append(_Found(body, owner, colour))
-            if not owner.moved and owner.hits % _ASKED == 0:
-                owner.ghost = is_ghost(image, layers.background, body.box, figure)
-                if owner.ghost and now - owner.born > _GHOST_AFTER_S:
-                    self._foreground.haunt(image, body.box)
-        following.forget(now, (image.shape[1], image.shape[0]))
+                model_height = float(self._height_model.heights_at(np.array(x + 0.5 * w), np.array(y + h)))
+                tracklet.update_height(h / model_height)
+            if tracklet.time < now or tracklet.hits == 1:
+                if tracklet.time < now:
+                    gain = 0.9 if body.isolated and not body.truncated else 0.6 if body.visible > 0.6 else 0.35
+                    tracklet.update(body.box, now, colour if body.visible > 0.6 else None, gain)
+                found.append(_TrackedSilhouette(body, tracklet, colour))
+            if not tracklet.moved and tracklet.hits % _GHOST_CHECK_HITS == 0:
+                tracklet.ghost = is_ghost(image, masks.background, body.box, foreground)
+                if tracklet.ghost and now - tracklet.born > _GHOST_AFTER_S:
+                    self._foreground.absorb_ghost(image, body.box)
+        tracker.prune(now, (image.shape[1], image.shape[0]))
         return found
 
-    def _comes(self, now: float, u: float, v: float, tall: float) -> bool:
-        """Whether somebody alone whose foot is here stood somewhere else a moment ago, as tall."""
-        for when, u2, v2, tall2 in self._lone:
-            away = math.hypot(u - u2, v - v2) / tall
-            if now - when >= _COMES_S[0] and _COMES[0] < away < _COMES[1] and abs(math.log(tall / tall2)) < _ALIKE:
+    def _is_walking(self, now: float, u: float, v: float, height: float) -> bool:
+        """Whether an isolated person of this foot point and height was detected somewhere else a moment ago."""
+        for when, u2, v2, height2 in self._recent_isolated:
+            away = math.hypot(u - u2, v - v2) / height
+            if (
+                now - when >= _WALKING_GAP_S[0]
+                and _WALKING_STEP[0] < away < _WALKING_STEP[1]
+                and abs(math.log(height / height2)) < _HEIGHT_TOLERANCE
+            ):
                 return True
         return False
 
-    def _report(self, image: Image, figure: Image, one: _Found) -> Detection:
-        body, follower = one.body, one.follower
+    def _report(self, image: Image, foreground: Image, one: _TrackedSilhouette) -> Detection:
+        body, tracklet = one.body, one.tracklet
         box = body.box
-        features = silhouette_features(figure, box)
-        scale = 1.0 / self._shrink
+        features = silhouette_features(foreground, box)
+        scale = 1.0 / self._scale
         head, foot = (features.head, features.foot)
         size = math.hypot(head[0] - foot[0], head[1] - foot[1]) * scale
         u_std = math.hypot(_U_STD * size, _FLOOR_STD)
         v_std = math.hypot(_V_STD * size, _FLOOR_STD)
-        if not body.alone:
+        if not body.isolated:
             u_std, v_std = 1.5 * u_std, 1.4 * v_std
-        colour = one.colour  # this picture's: who was taken for another must not wear his clothes from then on
-        score = 0.95 if body.alone else 0.4 + 0.5 * min(body.fill, 1.0) * body.seen
-        if not (follower.sure and follower.moved):
+        colour = one.colour  # of this image: after an identity switch the colour is right at once
+        score = 0.95 if body.isolated else 0.4 + 0.5 * min(body.fill, 1.0) * body.visible
+        if not (tracklet.confirmed and tracklet.moved):
             score *= 0.5
 
         def back(place: tuple[float, float]) -> tuple[float, float]:
@@ -251,7 +264,7 @@ class PersonDetector:
             v=v,
             size=size,
             score=float(np.clip(score, 0.0, 1.0)),
-            label=follower.name,
+            label=tracklet.name,
             colour=None
             if colour is None
             else (round(float(colour[2])), round(float(colour[1])), round(float(colour[0]))),
@@ -264,26 +277,28 @@ class PersonDetector:
 
 
 @dataclass(frozen=True, slots=True)
-class Features:
-    """Of one silhouette, pixels (u, v): the representative point, the head's top, the foot point."""
+class SilhouetteFeatures:
+    """Features of one silhouette, pixels (u, v): the representative point, the top of the head, the foot point."""
 
     middle: tuple[float, float]
     head: tuple[float, float]
     foot: tuple[float, float]
 
 
-def silhouette_features(figure: Image, box: tuple[float, float, float, float]) -> Features:
+def silhouette_features(foreground: Image, box: tuple[float, float, float, float]) -> SilhouetteFeatures:
     """The paper's features of the silhouette (H, W) 0/255 in a box x, y, w, h [px] (section 3.1.1, fig. 4 and 5).
 
-    Where a part of the box holds no silhouette, the box itself tells.
+    Where a part of the box contains no silhouette, the feature is taken from the box.
     """
     x, y, w, h = box
     left, top = max(math.floor(x), 0), max(math.floor(y), 0)
-    part = figure[top : max(math.ceil(y + h), 0), left : max(math.ceil(x + w), 0)]
-    whole = Features((x + 0.5 * w - 0.5, y + 0.35 * h), (x + 0.5 * w - 0.5, y - 0.5), (x + 0.5 * w - 0.5, y + h - 0.5))
+    part = foreground[top : max(math.ceil(y + h), 0), left : max(math.ceil(x + w), 0)]
+    whole = SilhouetteFeatures(
+        (x + 0.5 * w - 0.5, y + 0.35 * h), (x + 0.5 * w - 0.5, y - 0.5), (x + 0.5 * w - 0.5, y + h - 0.5)
+    )
     if part.size == 0 or not part.any():
         return whole
-    # A frame of zeros, so that the picture's border and a neighbour's part are borders too.
+    # A border of zeros, so that the image border and a neighbour's part count as background.
     framed = cv2.copyMakeBorder(part, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
     distance = cv2.distanceTransform(framed, cv2.DIST_L2, 5)[1:-1, 1:-1]
     peak = float(distance.max())
@@ -293,45 +308,44 @@ def silhouette_features(figure: Image, box: tuple[float, float, float, float]) -
     head_u, foot_u = _middle(part[: max(upper, 0)]), _middle(part[max(lower, 0) :])
     head_u = middle[0] if head_u is None else left + head_u
     foot_u = middle[0] if foot_u is None else left + foot_u
-    return Features(middle, (head_u, y - 0.5), (foot_u, y + h - 0.5))
+    return SilhouetteFeatures(middle, (head_u, y - 0.5), (foot_u, y + h - 0.5))
 
 
 def _middle(part: Image) -> float | None:
-    """The mean column of a silhouette (h, w); None of none."""
+    """Mean column of a silhouette (h, w); None where it is empty."""
     counts = np.count_nonzero(part, axis=0)
     total = int(counts.sum())
     return float(counts @ np.arange(len(counts))) / total if total else None
 
 
-def _stands(box: tuple[float, float, float, float], u: float, v: float, tall: float) -> bool:
-    """Whether a foot point and height [px] are about those of a box x, y, w, h."""
+def _matches_box(box: tuple[float, float, float, float], u: float, v: float, height: float) -> bool:
+    """Whether a foot point and height [px] agree with a box x, y, w, h."""
     x, y, w, h = box
     near = abs(u - x - 0.5 * w) < 0.3 * h and abs(v - y - h) < 0.3 * h
-    return near and 0.6 * h < tall < 1.6 * h
+    return near and 0.6 * h < height < 1.6 * h
 
 
-def clean(figure: Image, shadow: Image, typical: float) -> Image:
-    """A silhouette picture (H, W) 0/255 without specks, and with a body's parts joined.
+def clean_silhouettes(foreground: Image, shadow: Image, typical: float) -> Image:
+    """A foreground mask (H, W) 0/255 without specks, and with the parts of a body joined.
 
-    typical: height [px] of people. A belt of the wall's colour cuts nobody in two.
-
-    What seems a shadow between two parts of a body side by side is of the body.
+    typical: height [px] of people. A belt of the wall's colour must not split a person. Shadow pixels between two parts
+    of a body side by side belong to the body.
     """
-    calm = cv2.medianBlur(figure, 3)
-    wide = int(np.clip(_BETWEEN * typical, 3, 41)) | 1
+    calm = cv2.medianBlur(foreground, 3)
+    wide = int(np.clip(_GAP_WIDTH * typical, 3, 41)) | 1
     across = cv2.morphologyEx(calm, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_RECT, (wide, 1)))
     calm = cv2.bitwise_or(calm, cv2.bitwise_and(across, shadow))
-    tall = int(np.clip(0.1 * typical, 3, 15)) | 1
-    joined = cv2.morphologyEx(calm, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_RECT, (3, tall)))
+    height = int(np.clip(0.1 * typical, 3, 15)) | 1
+    joined = cv2.morphologyEx(calm, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_RECT, (3, height)))
     return np.asarray(joined, dtype=np.uint8)
 
 
-def _torso(image: Image, figure: Image, body: Body) -> Floats | None:
-    """Mean colour (3,) BGR of the clothes between shoulders and hips; None where none of it is seen."""
+def _torso_colour(image: Image, foreground: Image, body: PersonSilhouette) -> Floats | None:
+    """Mean colour (3,) BGR of the clothes between shoulders and hips; None where they are not visible."""
     x, y, w, h = body.box
     rows = slice(max(int(y + 0.2 * h), 0), max(int(y + 0.5 * h) + 1, 0))
     columns = slice(max(int(x + 0.25 * w), 0), max(int(x + 0.75 * w) + 1, 0))
-    mask = figure[rows, columns]
+    mask = foreground[rows, columns]
     if mask.size == 0 or cv2.countNonZero(mask) < 4:
         return None
     return np.array(cv2.mean(np.ascontiguousarray(image[rows, columns]), np.ascontiguousarray(mask))[:3])

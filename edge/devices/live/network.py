@@ -1,8 +1,7 @@
 """Network cameras (RTSP, or MJPEG over HTTP) with the stream's own frame times, through PyAV.
 
-An RTSP camera stamps its frames by its own clock (RTP): they come later by a network that delays each differently, yet
-their stamps keep the camera's rhythm. Motion JPEG over HTTP has no stamps, and is stamped on arrival. Without PyAV the
-stream is read through OpenCV.
+An RTSP camera stamps its frames by its own clock (RTP), so the stamps are free of the jitter of the network delay.
+Motion JPEG over HTTP carries no stamps and is stamped on arrival. Without PyAV the stream is read through OpenCV.
 """
 
 from __future__ import annotations
@@ -15,15 +14,15 @@ from typing import Any, Literal
 import numpy as np
 
 from edge.devices.base import Device, DeviceInfo, Frame, check_size
-from edge.devices.live.opencv_capture import LiveCamera
-from edge.devices.live.reconnecting import Connection, Gone, ReturningCamera, without_password
+from edge.devices.live.opencv_capture import OpenCvCamera
+from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera, redact_password
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
 _OPEN_S, _READ_S = 5.0, 3.0
 _REMEDY = "check address, user and password, and that the camera is on this network"
-_STAMPED = ("rtsp", "rtp", "srt", "udp")  # kinds of stream whose sender stamps
+_TIMESTAMPED_SCHEMES = ("rtsp", "rtp", "srt", "udp")  # URL schemes whose streams carry the sender's time stamps
 
 
 def open_network(
@@ -32,21 +31,21 @@ def open_network(
     transport: Literal["tcp", "udp"] = "tcp",
     fps: float | None = None,
     intrinsics: Intrinsics | None = None,
-    there: Callable[[str], bool] = lambda name: find_spec(name) is not None,
+    is_installed: Callable[[str], bool] = lambda name: find_spec(name) is not None,
     now_ns: Callable[[], int] = time.monotonic_ns,
 ) -> Device:
-    """The camera through PyAV; without it through OpenCV, which stamps on arrival. It still has to be opened."""
-    if there("av"):
+    """The device for a stream, not yet open: through PyAV, or through OpenCV, which stamps on arrival."""
+    if is_installed("av"):
         return NetworkCamera(url, transport=transport, fps=fps, intrinsics=intrinsics, now_ns=now_ns)
-    return LiveCamera(url, fps=fps, intrinsics=intrinsics, driver="rtsp", now_ns=now_ns)
+    return OpenCvCamera(url, fps=fps, intrinsics=intrinsics, driver="rtsp", now_ns=now_ns)
 
 
-class NetworkCamera(ReturningCamera):
+class NetworkCamera(ReconnectingCamera):
     """A network stream; see ``edge.devices.base.Device``.
 
-    Stamps of one connection are laid on the host's clock at the picture that came with the least delay of its first
-    second, so that times go on after a reconnection. How late that one was nobody knows; the offset that is estimated
-    for this camera absorbs it, anew after each reconnection. ``read`` is held up for 3 s at most by a silent stream.
+    The stamps of one connection are mapped to the host's clock by the frame with the least delay in its first second,
+    so that times continue after a reconnection. The delay of that frame is unknown; the time offset estimated for this
+    camera absorbs it, anew after each reconnection. A silent stream blocks ``read`` for at most 3 s.
     """
 
     def __init__(
@@ -59,7 +58,7 @@ class NetworkCamera(ReturningCamera):
         now_ns: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        name = f"camera {without_password(url)}"
+        name = f"camera {redact_password(url)}"
 
         def connect() -> Connection:
             return NetworkConnection(url, transport, fps, name, now_ns)
@@ -76,7 +75,7 @@ class NetworkCamera(ReturningCamera):
 
 
 class NetworkConnection:
-    """One open stream. stamped: whether its pictures carry the sender's times. Raises InputError."""
+    """One open stream. stamped: whether its frames carry the sender's time stamps. Raises InputError."""
 
     def __init__(self, url: str, transport: str, fps: float | None, name: str, now_ns: Callable[[], int]) -> None:
         import av
@@ -95,8 +94,8 @@ class NetworkConnection:
         except FFmpegError as error:
             what = " ".join(str(error.strerror or error).split())[:120]
             raise InputError(f"{name} does not answer: {what}", remedy=_REMEDY) from None
-        self._stream.codec_context.thread_count = 1  # frame threads would hold pictures back
-        self.stamped = kind in _STAMPED
+        self._stream.codec_context.thread_count = 1  # frame threads would delay frames
+        self.stamped = kind in _TIMESTAMPED_SCHEMES
         rate = self._stream.average_rate or self._stream.guessed_rate
         self.fps = fps or (float(rate) if rate and self.stamped and 0 < rate <= 1000 else 0.0)
         self._now_ns = now_ns
@@ -107,46 +106,45 @@ class NetworkConnection:
 
     def take(self, timeout_s: float) -> Frame | None:
         try:
-            picture = next(self._frames)
+            decoded = next(self._frames)
             arrived = self._now_ns()
-            image = np.asarray(picture.to_ndarray(format="bgr24"), dtype=np.uint8)
+            image = np.asarray(decoded.to_ndarray(format="bgr24"), dtype=np.uint8)
         except (StopIteration, EOFError, self._error):
-            raise Gone from None
-        moment, passed = arrived, 1
-        if self.stamped and picture.pts is not None and picture.time_base is not None:
-            stamp = round(float(picture.pts * picture.time_base) * NANOSECONDS)
-            moment, passed = self._clock.place(stamp, arrived, self.fps)
-        self._number += passed
-        return Frame(image, moment, self._number)
+            raise ConnectionLost from None
+        time_ns, periods = arrived, 1
+        if self.stamped and decoded.pts is not None and decoded.time_base is not None:
+            stamp = round(float(decoded.pts * decoded.time_base) * NANOSECONDS)
+            time_ns, periods = self._clock.to_host_time(stamp, arrived, self.fps)
+        self._number += periods
+        return Frame(image, time_ns, self._number)
 
     def close(self) -> None:
         self._container.close()
 
 
 class StreamClock:
-    """Lays a stream's stamps on the host's clock, both ns.
+    """Maps a stream's time stamps to the host's clock, both in ns, by a constant offset.
 
-    The map is a constant for a whole connection: taken from the first pictures, it never follows the delay of later
-    ones, which would put the network's jitter into the times. The first second's least delay is kept; until then each
-    earlier arrival moves it.
+    The offset is that of the least delay within the first ``calibration_s`` of a connection; until then each earlier
+    arrival lowers it. It does not follow later delays, which would add the network's jitter to the times.
     """
 
-    def __init__(self, settle_s: float = 1.0) -> None:
-        self._settle_ns = round(settle_s * NANOSECONDS)
-        self._shift: int | None = None
-        self._first = self._last = self._last_moment = 0
+    def __init__(self, calibration_s: float = 1.0) -> None:
+        self._calibration_ns = round(calibration_s * NANOSECONDS)
+        self._offset: int | None = None
+        self._first = self._last = self._last_time_ns = 0
 
-    def place(self, stamp: int, arrived: int, fps: float) -> tuple[int, int]:
-        """(host time of a stamp, how many periods after the one before it)."""
-        if self._shift is None:
-            self._shift, self._first, self._last = arrived - stamp, stamp, stamp
-            self._last_moment = arrived
+    def to_host_time(self, stamp: int, arrived: int, fps: float) -> tuple[int, int]:
+        """(host time of a stamp, number of frame periods since the previous one)."""
+        if self._offset is None:
+            self._offset, self._first, self._last = arrived - stamp, stamp, stamp
+            self._last_time_ns = arrived
             return arrived, 1
-        passed = max(round((stamp - self._last) / NANOSECONDS * fps), 1) if fps > 0.0 else 1
-        if stamp <= self._last or stamp - self._last > 60 * NANOSECONDS:  # the sender began anew
-            self._shift, self._first, passed = arrived - stamp, stamp, 1
-        elif stamp - self._first < self._settle_ns:
-            self._shift = min(self._shift, arrived - stamp)
-        moment = max(stamp + self._shift, self._last_moment + 1)
-        self._last, self._last_moment = stamp, moment
-        return moment, passed
+        periods = max(round((stamp - self._last) / NANOSECONDS * fps), 1) if fps > 0.0 else 1
+        if stamp <= self._last or stamp - self._last > 60 * NANOSECONDS:  # the sender has restarted
+            self._offset, self._first, periods = arrived - stamp, stamp, 1
+        elif stamp - self._first < self._calibration_ns:
+            self._offset = min(self._offset, arrived - stamp)
+        time_ns = max(stamp + self._offset, self._last_time_ns + 1)
+        self._last, self._last_time_ns = stamp, time_ns
+        return time_ns, periods

@@ -1,8 +1,8 @@
-"""OAK cameras through depthai: fixed exposure and focus, mid-exposure stamps, back after being unplugged.
+"""OAK cameras through depthai: fixed exposure and focus, mid-exposure stamps, automatic reconnection.
 
-Given an NN archive, the board detects too; what it found comes with the picture that it was found in.
+With an NN archive the board also runs a detection network; its detections are delivered with the frame they belong to.
 
-The only module that knows depthai, which is imported when a camera is opened (90 MB, half a second).
+depthai is imported only when a camera is opened (90 MB, half a second).
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame, check_size
-from edge.devices.live.oak_network import Naming, boxes
-from edge.devices.live.reconnecting import Connection, Gone, ReturningCamera
+from edge.devices.live.oak_network import BoxLabeller, boxes_in_image
+from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
-_QUEUE = 4  # newest frames: what is older than that has been waited for in vain
-_BEHIND = 16  # pictures that wait for what the network finds in them
+_QUEUE_LENGTH = 4  # frames: older ones are discarded
+_SYNC_QUEUE_LENGTH = 16  # frames that wait for the network's result
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,10 +32,10 @@ class OakSettings:
     """One sensor of one OAK board.
 
     device: IP address, device id or USB path; "" = the only one there is. socket: CAM_A, CAM_B or CAM_C.
-    size: (width, height) [px]. exposure_us, iso: fixed, so that mid-exposure and brightness keep still.
-    focus: lens position 0..255 of an auto-focus lens, fixed; None = a lens that cannot move.
-    nn: archive of a detection network that runs on the board; None = none. labels: of it, those that are kept; none =
-    all. confidence: 0..1, the least of a detection. prefix: of the names of people and vehicles.
+    size: (width, height) [px]. exposure_us, iso: fixed, so that mid-exposure and brightness stay constant.
+    focus: fixed lens position 0..255 of an auto-focus lens; None = a fixed-focus lens.
+    nn: archive of a detection network that runs on the board; None = none. labels: the classes to keep; empty = all.
+    confidence: threshold of a detection, 0..1. prefix: of the labels of people and vehicles.
     """
 
     device: str = ""
@@ -52,20 +52,20 @@ class OakSettings:
 
 
 @dataclass(slots=True)
-class Stream:
-    """An open pipeline, the queue of its pictures and that of what its network finds (depthai's objects)."""
+class OakStream:
+    """depthai's objects of an open pipeline: the pipeline, its queue of frames and its queue of detections."""
 
     pipeline: Any
     queue: Any
     results: Any = None
 
 
-class OakCamera(ReturningCamera):
+class OakCamera(ReconnectingCamera):
     """A camera on an OAK board; see ``edge.devices.base.Device``.
 
-    Stamps are the host's CLOCK_MONOTONIC, to which depthai maps the board's clock: that clock goes on when the board
-    is plugged in again, as the board's own does not. connect: makes the stream; tests give a host-only one.
-    now_ns: a monotonic clock; sleep: for trying again.
+    Stamps are in the host's CLOCK_MONOTONIC, to which depthai maps the board's clock: unlike the board's own clock it
+    continues when the board is plugged in again. connect: opens the stream; tests pass a host-only pipeline.
+    now_ns: a monotonic clock; sleep: used between reconnection attempts.
     """
 
     def __init__(
@@ -73,17 +73,17 @@ class OakCamera(ReturningCamera):
         settings: OakSettings,
         *,
         intrinsics: Intrinsics | None = None,
-        connect: Callable[[OakSettings], Stream] | None = None,
+        connect: Callable[[OakSettings], OakStream] | None = None,
         now_ns: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         name = settings.device or "OAK camera"
         make = connect or open_stream
-        naming = Naming(settings.prefix)
+        labeller = BoxLabeller(settings.prefix)
 
         def connected() -> Connection:
             try:
-                return OakConnection(make(settings), settings.labels, naming)
+                return OakConnection(make(settings), settings.labels, labeller)
             except ImportError:
                 raise InputError("depthai is not installed", remedy='pip install "syncline[oak]"') from None
             except RuntimeError as error:
@@ -98,66 +98,66 @@ class OakCamera(ReturningCamera):
 
 
 class OakConnection:
-    """The pictures of one open stream; with a network, those that it has looked at, and what it found.
+    """The frames of one open stream; with a network, only the frames that it processed, with their detections.
 
-    labels: those that are kept; none = all.
+    labels: the classes to keep; empty = all.
     """
 
-    def __init__(self, stream: Stream, labels: tuple[str, ...] = (), naming: Naming | None = None) -> None:
+    def __init__(self, stream: OakStream, labels: tuple[str, ...] = (), labeller: BoxLabeller | None = None) -> None:
         self._stream, self._labels = stream, labels
-        self._naming = naming or Naming("oak")
+        self._labeller = labeller or BoxLabeller("oak")
         self._result: Any = None
-        self._picture: Any = None
+        self._pending_frame: Any = None
 
     def take(self, timeout_s: float) -> Frame | None:
         import depthai as dai
 
         results = self._stream.results
         if results is None:
-            picture = self._get(self._stream.queue, timeout_s)
+            message = self._get(self._stream.queue, timeout_s)
         else:
             if self._result is None:
                 self._result = self._get(results, timeout_s)
-            picture = None if self._result is None else self._shown(self._result.getSequenceNum(), timeout_s)
-        if picture is None:
+            message = None if self._result is None else self._matching_image(self._result.getSequenceNum(), timeout_s)
+        if message is None:
             return None
-        middle = picture.getTimestamp(dai.CameraExposureOffset.MIDDLE)
-        image = np.ascontiguousarray(_bgr(picture.getCvFrame()), dtype=np.uint8)
+        middle = message.getTimestamp(dai.CameraExposureOffset.MIDDLE)
+        image = np.ascontiguousarray(_three_channels(message.getCvFrame()), dtype=np.uint8)
         time_ns = (middle // timedelta(microseconds=1)) * 1000
-        found = None
+        detections = None
         if results is not None:
             result, self._result = self._result, None
             size = (image.shape[1], image.shape[0])
-            found = self._naming.detections(boxes(result, picture, size, self._labels), time_ns, size)
+            detections = self._labeller.detections(boxes_in_image(result, message, size, self._labels), time_ns, size)
         return Frame(
             image=image,
             device_time_ns=time_ns,
-            frame=int(picture.getSequenceNum()),
-            exposure_ns=(picture.getExposureTime() // timedelta(microseconds=1)) * 1000,
-            found=found,
+            frame=int(message.getSequenceNum()),
+            exposure_ns=(message.getExposureTime() // timedelta(microseconds=1)) * 1000,
+            detections=detections,
         )
 
-    def _shown(self, number: int, timeout_s: float) -> Any:
-        """The picture of this sequence number; None where it has not come yet, or never will: then its result goes."""
-        while self._picture is None or self._picture.getSequenceNum() < number:
-            self._picture = self._get(self._stream.queue, timeout_s)
-            if self._picture is None:
+    def _matching_image(self, number: int, timeout_s: float) -> Any:
+        """The frame of this sequence number; None if it has not arrived, or was lost: then its result is dropped."""
+        while self._pending_frame is None or self._pending_frame.getSequenceNum() < number:
+            self._pending_frame = self._get(self._stream.queue, timeout_s)
+            if self._pending_frame is None:
                 return None
-        if self._picture.getSequenceNum() > number:
+        if self._pending_frame.getSequenceNum() > number:
             self._result = None
             return None
-        picture, self._picture = self._picture, None
-        return picture
+        message, self._pending_frame = self._pending_frame, None
+        return message
 
     def _get(self, queue: Any, timeout_s: float) -> Any:
         import depthai as dai
 
         try:
             message = queue.get(timedelta(seconds=timeout_s))
-        except (RuntimeError, dai.MessageQueue.QueueException):  # the link is gone
-            raise Gone from None
+        except (RuntimeError, dai.MessageQueue.QueueException):  # the connection is lost
+            raise ConnectionLost from None
         if message is None and not self._stream.pipeline.isRunning():
-            raise Gone
+            raise ConnectionLost
         return message
 
     def close(self) -> None:
@@ -166,7 +166,7 @@ class OakConnection:
 
     @property
     def temperature(self) -> float | None:
-        """Of the board's chip [°C]; None where it does not tell."""
+        """Temperature of the board's chip [°C]; None where it is not available."""
         device = getattr(self._stream.pipeline, "getDefaultDevice", lambda: None)()
         try:
             return None if device is None else float(device.getChipTemperature().average)
@@ -179,10 +179,10 @@ _REMEDY = (
 )
 
 
-def open_stream(settings: OakSettings) -> Stream:
+def open_stream(settings: OakSettings) -> OakStream:
     """Open the board and start its camera and network.
 
-    Raises RuntimeError where none answers, ImportError without depthai, InputError for a bad archive.
+    Raises RuntimeError where no board answers, ImportError without depthai, InputError for a bad archive.
     """
     import depthai as dai
 
@@ -191,7 +191,7 @@ def open_stream(settings: OakSettings) -> Stream:
         device = dai.Device(dai.DeviceInfo(settings.device))
     else:
         if not dai.Device.getAllAvailableDevices():
-            raise RuntimeError("no OAK board is found")  # opening would look for 11 s
+            raise RuntimeError("no OAK board is found")  # depthai would search for 11 s
         device = dai.Device()
     pipeline = dai.Pipeline(device)
     camera = pipeline.create(dai.node.Camera).build(getattr(dai.CameraBoardSocket, settings.socket))
@@ -199,18 +199,18 @@ def open_stream(settings: OakSettings) -> Stream:
     if settings.focus is not None:
         camera.initialControl.setManualFocus(settings.focus)
     output = camera.requestOutput(settings.size, dai.ImgFrame.Type.BGR888i, fps=settings.fps)
-    queue = output.createOutputQueue(maxSize=_QUEUE if archive is None else _BEHIND, blocking=False)
+    queue = output.createOutputQueue(maxSize=_QUEUE_LENGTH if archive is None else _SYNC_QUEUE_LENGTH, blocking=False)
     results = None
     if archive is not None:
         network = pipeline.create(dai.node.DetectionNetwork).build(camera, archive, fps=settings.fps)
         network.setConfidenceThreshold(settings.confidence)
-        results = network.out.createOutputQueue(maxSize=_QUEUE, blocking=False)
+        results = network.out.createOutputQueue(maxSize=_QUEUE_LENGTH, blocking=False)
     pipeline.start()
-    return Stream(pipeline, queue, results)
+    return OakStream(pipeline, queue, results)
 
 
 def open_archive(file: Path, labels: tuple[str, ...] = ()) -> Any:
-    """depthai's NNArchive of a file. Raises InputError where it is none, or does not know one of the labels."""
+    """depthai's NNArchive of a file. Raises InputError if it cannot be read or lacks one of the labels."""
     import depthai as dai
 
     if not file.is_file():
@@ -219,18 +219,18 @@ def open_archive(file: Path, labels: tuple[str, ...] = ()) -> Any:
         archive = dai.NNArchive(file)
         heads = archive.getConfig().model.heads or []
     except (RuntimeError, ValueError) as error:
-        what = f"this is no NN archive that depthai can read: {_one_line(error)}"
+        what = f"depthai cannot read this NN archive: {_one_line(error)}"
         raise InputError(what, file=file, remedy="take a .tar.xz made for this kind of board") from None
     known = [name for head in heads for name in (head.metadata.classes or ())]
-    strange = [label for label in labels if known and label not in known]
-    if strange:
-        told = ", ".join(known[:12]) + (", …" if len(known) > 12 else "")
-        raise InputError(f"the network knows no {', '.join(strange)}", file=file, remedy=f"use some of {told}")
+    unknown = [label for label in labels if known and label not in known]
+    if unknown:
+        listed = ", ".join(known[:12]) + (", …" if len(known) > 12 else "")
+        raise InputError(f"the network has no class {', '.join(unknown)}", file=file, remedy=f"use some of {listed}")
     return archive
 
 
-def _bgr(image: Any) -> Any:
-    """(H, W, 3) of a colour or grey picture."""
+def _three_channels(image: Any) -> Any:
+    """(H, W, 3) of a colour or grey image."""
     return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
 
 

@@ -1,6 +1,6 @@
-"""Live cameras through OpenCV: a USB camera, or a network stream. Any machine with OpenCV has it.
+"""Live cameras through OpenCV: a USB camera or a network stream, stamped on arrival.
 
-``usb`` and ``network`` know more of when a picture was taken, where their packages are installed.
+The fallback for ``usb`` and ``network``, whose time stamps are better but which need linuxpy and PyAV.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ import cv2
 import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame, check_size
-from edge.devices.live.reconnecting import Connection, Gone, ReturningCamera, without_password
+from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera, redact_password
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
-ON_ARRIVAL = ("exposure", "time of capture: stamped on arrival", "dropped frames")
-"""What is unknown of frames that OpenCV gives."""
+UNKNOWN_WITH_OPENCV = ("exposure", "time of capture: stamped on arrival", "dropped frames")
+"""Quantities that OpenCV does not provide for a frame."""
 _OPEN_TIMEOUT_MS = 5000
 _READ_TIMEOUT_MS = 3000
-_GONE_AFTER_S = 1.0  # a source that fails, and has given no frame for this long, is gone
+_LOST_AFTER_S = 1.0  # a source that fails and has given no frame for this long is lost
 
 
-class LiveCamera(ReturningCamera):
-    """A USB camera or a network stream. Its frames are stamped by the host when they arrive.
+class OpenCvCamera(ReconnectingCamera):
+    """A USB camera or a network stream whose frames are stamped by the host on arrival.
 
-    That is later than the exposure by an unknown, mostly constant delay, which the estimated offset of this camera
-    absorbs; frames that the driver loses are not seen as gaps. OpenCV's waits cannot be cut short: a silent network
-    stream holds ``read`` up for 3 s, one that is sought for 5 s.
+    The arrival is later than the exposure by an unknown, mostly constant delay, which the estimated time offset of this
+    camera absorbs; frames lost by the driver leave no gap in the numbers. OpenCV's waits cannot be interrupted: a
+    silent network stream blocks ``read`` for 3 s, a failing connection attempt for 5 s.
     """
 
     def __init__(
@@ -44,22 +44,24 @@ class LiveCamera(ReturningCamera):
         now_ns: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        name = f"camera {without_password(source)}"
+        name = f"camera {redact_password(source)}"
 
         def connect() -> Connection:
-            return _Capture(source, fps, name, now_ns, sleep)
+            return OpenCvConnection(source, fps, name, now_ns, sleep)
 
         def describe(connection: Connection, first: Frame) -> DeviceInfo:
-            assert isinstance(connection, _Capture)
+            assert isinstance(connection, OpenCvConnection)
             height, width = first.image.shape[:2]
             check_size(intrinsics, width, height, name)
-            return DeviceInfo(width, height, fps or connection.fps, driver, "monotonic", intrinsics, unknown=ON_ARRIVAL)
+            return DeviceInfo(
+                width, height, fps or connection.fps, driver, "monotonic", intrinsics, unknown=UNKNOWN_WITH_OPENCV
+            )
 
         super().__init__(name, connect, describe, remedy=_remedy(source), now_ns=now_ns, sleep=sleep)
 
 
-class _Capture:
-    """OpenCV's capture of a source, numbered as its pictures come."""
+class OpenCvConnection:
+    """An open cv2.VideoCapture; frames are numbered by arrival."""
 
     def __init__(
         self,
@@ -73,9 +75,9 @@ class _Capture:
         self._capture = _open(source)
         if fps is not None:
             self._capture.set(cv2.CAP_PROP_FPS, fps)
-        self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # old frames are worth nothing; drivers may ignore it
-        good, image = self._capture.read() if self._capture.isOpened() else (False, None)
-        if not good or image is None:
+        self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # no stale frames; drivers may ignore it
+        ok, image = self._capture.read() if self._capture.isOpened() else (False, None)
+        if not ok or image is None:
             self._capture.release()
             raise InputError(f"{name} does not answer", remedy=_remedy(source))
         reported = self._capture.get(cv2.CAP_PROP_FPS)
@@ -85,17 +87,17 @@ class _Capture:
 
     def take(self, timeout_s: float) -> Frame | None:
         if not self._capture.grab():
-            if self._now_ns() - self._alive_ns > _GONE_AFTER_S * NANOSECONDS:
-                raise Gone
-            self._sleep(min(timeout_s, 0.05))  # an unplugged camera fails at once: do not spin
+            if self._now_ns() - self._alive_ns > _LOST_AFTER_S * NANOSECONDS:
+                raise ConnectionLost
+            self._sleep(min(timeout_s, 0.05))  # an unplugged camera fails immediately: avoid a busy loop
             return None
-        moment = self._now_ns()
-        good, image = self._capture.retrieve()
-        if not good or image is None:
+        time_ns = self._now_ns()
+        ok, image = self._capture.retrieve()
+        if not ok or image is None:
             return None
         self._frame += 1
-        self._alive_ns = moment
-        return Frame(np.asarray(image, dtype=np.uint8), moment, self._frame)
+        self._alive_ns = time_ns
+        return Frame(np.asarray(image, dtype=np.uint8), time_ns, self._frame)
 
     def close(self) -> None:
         self._capture.release()
@@ -110,7 +112,7 @@ def _open(source: str | int) -> cv2.VideoCapture:
             _READ_TIMEOUT_MS,
         ]
         return cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
-    # A stable name, /dev/syncline/…, is a link; OpenCV tells cameras from files by the name /dev/video….
+    # A stable name, /dev/syncline/…, is a symbolic link; OpenCV recognises cameras by the name /dev/video….
     local = os.path.realpath(source) if isinstance(source, str) else source
     return cv2.VideoCapture(local)
 

@@ -1,4 +1,4 @@
-"""Cameras on a Raspberry Pi's ribbon cable, through picamera2, which is a Debian package and no wheel.
+"""Raspberry Pi cameras (CSI) through picamera2, which is a Debian package and not on PyPI as a wheel.
 
 SensorTimestamp is sampled at the interrupt that begins a frame, as its first row is read out: that row's exposure has
 just ended (picamera2, issue 821). Mid-exposure of the middle row is then half a readout later and half an exposure
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame, check_size
-from edge.devices.live.reconnecting import Connection, Gone, ReturningCamera
+from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
@@ -27,9 +27,9 @@ _REMEDY = "check the ribbon cable (contacts, both ends), and that `rpicam-hello 
 class PiSettings:
     """One camera of a Raspberry Pi.
 
-    camera: its number. size: (width, height) [px]. exposure_us: fixed; None = the camera chooses, and tells for each
-    frame what it chose. gain: fixed analogue gain; None = chosen. readout_s: first to last row; None = the shortest
-    time in which this mode of the sensor can take a frame, which is a few per cent too long (its blanking).
+    camera: its number. size: (width, height) [px]. exposure_us: fixed; None = automatic, reported with each frame.
+    gain: fixed analogue gain; None = automatic. readout_s: time from first to last row; None = the shortest frame
+    duration of this sensor mode, which is a few per cent too long (vertical blanking).
     """
 
     camera: int = 0
@@ -40,8 +40,8 @@ class PiSettings:
     readout_s: float | None = None
 
 
-class PiCamera(ReturningCamera):
-    """See ``edge.devices.base.Device``. make: gives the picamera2 object of a camera number; tests give another."""
+class PiCamera(ReconnectingCamera):
+    """See ``edge.devices.base.Device``. make: creates the picamera2 object of a camera number; replaced in tests."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class PiCamera(ReturningCamera):
 
 
 class PiConnection:
-    """A started picamera2 object. Frames that it lost are told by the gaps between stamps: it numbers none."""
+    """A started picamera2 object. It does not number frames: lost ones are found from the gaps between stamps."""
 
     def __init__(self, camera: Any, settings: PiSettings) -> None:
         self._camera = camera
@@ -101,7 +101,7 @@ class PiConnection:
         if settings.readout_s is None:
             shortest = camera.camera_controls.get("FrameDurationLimits", (0,))[0]
             self.readout_s = min(float(shortest) * 1e-6, 1.0 / settings.fps)
-        self._order: Any = None
+        self._pending_request: Any = None
         self._number = -1
         self._last_ns = 0
         self.temperature: float | None = None
@@ -109,14 +109,14 @@ class PiConnection:
 
     def take(self, timeout_s: float) -> Frame | None:
         try:
-            # One order at a time: an order that nobody waits for any more would keep its buffer for ever.
-            self._order = self._order or self._camera.capture_request(wait=False)
-            request = self._camera.wait(self._order, timeout=timeout_s)
+            # One request at a time: an abandoned request would never return its buffer.
+            self._pending_request = self._pending_request or self._camera.capture_request(wait=False)
+            request = self._camera.wait(self._pending_request, timeout=timeout_s)
         except TimeoutError:
             return None
         except (RuntimeError, OSError):
-            raise Gone from None
-        self._order = None
+            raise ConnectionLost from None
+        self._pending_request = None
         try:
             known = request.get_metadata()
             image = np.ascontiguousarray(request.make_array("main")[..., :3], dtype=np.uint8)
@@ -127,16 +127,16 @@ class PiConnection:
         if "SensorTemperature" in known:
             self.temperature = float(known["SensorTemperature"])
         period = float(known.get("FrameDuration", 0)) * 1e3 or self._period_ns
-        passed = 1 if self._number < 0 else max(round((first_row_ended - self._last_ns) / period), 1)
-        self._number += passed
+        periods = 1 if self._number < 0 else max(round((first_row_ended - self._last_ns) / period), 1)
+        self._number += periods
         self._last_ns = first_row_ended
         middle = first_row_ended - exposure_ns // 2 + round(self.readout_s * 0.5e9)
         return Frame(image.copy(), middle, self._number, exposure_ns)
 
     def close(self) -> None:
-        for end in (self._camera.stop, self._camera.close):
+        for release in (self._camera.stop, self._camera.close):
             with suppress(RuntimeError, OSError):
-                end()
+                release()
 
 
 def _picamera2(number: int) -> Any:

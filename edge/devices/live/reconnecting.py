@@ -1,7 +1,7 @@
-"""A live camera that comes back by itself after it was unplugged: what all drivers of real cameras share.
+"""Reconnection logic shared by all drivers of real cameras.
 
-A driver says how to connect and how to take a picture from a connection; this says when to try again, how frame
-numbers go on, and what of it is a gap.
+A driver defines how to connect and how to take a frame from a connection. This module decides when to reconnect and
+continues the frame numbers, with a gap for the frames that were missed.
 """
 
 from __future__ import annotations
@@ -15,84 +15,84 @@ from edge.devices.base import DeviceInfo, Frame
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 
-_RETRY_S, _SLOWEST_RETRY_S = 0.5, 5.0
+_RETRY_S, _MAX_RETRY_S = 0.5, 5.0
 _FIRST_FRAME_S = 10.0
 
 
-class Gone(Exception):
-    """The connection is lost, and is to be made anew."""
+class ConnectionLost(Exception):
+    """The connection is lost; the camera has to be reconnected."""
 
 
 class Connection(Protocol):
     """An open camera."""
 
     def take(self, timeout_s: float) -> Frame | None:
-        """The next picture, numbered as the source counts; None where none came. Raises Gone."""
+        """The next frame with the source's own number; None if none came. Raises ConnectionLost."""
 
     def close(self) -> None:
-        """Release it; may be called of a camera that is gone."""
+        """Release it; may be called after the connection was lost."""
 
 
 @dataclass(slots=True)
-class BackOff:
-    """When to try again: at once, after 0.5 s, and then ever more slowly, at last each 5 s. Times are s."""
+class ReconnectBackOff:
+    """Schedule of reconnection attempts: at once, after 0.5 s, then doubling up to 5 s. Times are in s."""
 
     due: float = 0.0
     _pause: float = field(default=_RETRY_S)
 
-    def lost(self, now: float) -> None:
-        """The connection is gone: try at once."""
+    def connection_lost(self, now: float) -> None:
+        """The connection was lost: the first attempt is due at once."""
         self.due = now
 
-    def failed(self, began: float) -> None:
-        """A try that began then was in vain."""
-        self.due = began + self._pause
-        self._pause = min(2.0 * self._pause, _SLOWEST_RETRY_S)
+    def attempt_failed(self, started_s: float) -> None:
+        """An attempt that started at ``started_s`` has failed."""
+        self.due = started_s + self._pause
+        self._pause = min(2.0 * self._pause, _MAX_RETRY_S)
 
-    def good(self) -> None:
-        """A picture has come."""
+    def frame_received(self) -> None:
+        """A frame has arrived: reset the pause."""
         self._pause = _RETRY_S
 
 
 @dataclass(slots=True)
-class FrameNumbers:
-    """Numbers that only rise, also where a camera counts anew after a reconnection; what it missed is a gap."""
+class FrameNumbering:
+    """Strictly increasing frame numbers across reconnections and counter resets; missed frames leave a gap."""
 
     _last: int = -1
     _last_ns: int = 0
-    _shift: int = 0
+    _offset: int = 0
     _first: tuple[int, int] | None = None
     _period_ns: float = 0.0
 
-    def next(self, number: int, moment_ns: int, fps: float) -> int:
-        """The number of a picture that its source calls ``number``, taken at ``moment_ns``."""
-        number += self._shift
+    def next(self, number: int, time_ns: int, fps: float) -> int:
+        """The number of a frame that its source numbers ``number``, taken at ``time_ns``."""
+        number += self._offset
         if self._first is None and self._last >= 0:
             period = self._period_ns or (NANOSECONDS / fps if fps > 0.0 else 0.0)
-            passed = max(round((moment_ns - self._last_ns) / period), 1) if period > 0.0 else 1
-            self._shift += self._last + passed - number
-            number = self._last + passed
-        elif number <= self._last:  # a source that counts anew without having been away
-            self._shift += self._last + 1 - number
+            periods = max(round((time_ns - self._last_ns) / period), 1) if period > 0.0 else 1
+            self._offset += self._last + periods - number
+            number = self._last + periods
+        elif number <= self._last:  # the source's counter was reset without a reconnection
+            self._offset += self._last + 1 - number
             number = self._last + 1
         if self._first is None:
-            self._first = number, moment_ns
-        self._last, self._last_ns = number, moment_ns
+            self._first = number, time_ns
+        self._last, self._last_ns = number, time_ns
         return number
 
-    def broken(self) -> None:
-        """The connection is gone; the rate that it had tells later how much was missed."""
+    def connection_lost(self) -> None:
+        """The connection was lost; keep its measured frame period to count the missed frames later."""
         if self._first is not None and self._last > self._first[0]:
             self._period_ns = (self._last_ns - self._first[1]) / (self._last - self._first[0])
         self._first = None
 
 
-class ReturningCamera:
+class ReconnectingCamera:
     """A camera behind a connection that may break; see ``edge.devices.base.Device``.
 
-    name: for a person, without passwords. connect: opens the camera; raises InputError where it does not answer.
-    describe: what the driver knows once the first picture is there; raises InputError where that does not fit.
-    now_ns: a monotonic clock; sleep: for trying again.
+    name: for messages, without passwords. connect: opens the camera; raises InputError where it does not answer.
+    describe: the description of the camera, given the first frame; raises InputError where the frame does not fit.
+    now_ns: a monotonic clock; sleep: used between reconnection attempts.
     """
 
     def __init__(
@@ -113,59 +113,59 @@ class ReturningCamera:
         self._connection: Connection | None = None
         self._info: DeviceInfo | None = None
         self._first: Frame | None = None
-        self._numbers = FrameNumbers()
-        self._back_off = BackOff()
-        self._fresh = False  # reconnected, and no picture has come yet
-        self._fresh_s = 0.0
+        self._numbers = FrameNumbering()
+        self._back_off = ReconnectBackOff()
+        self._awaiting_frame = False  # reconnected, but no frame has come yet
+        self._awaiting_since_s = 0.0
         self._ended = False
         self.reconnections = 0
 
     @property
     def info(self) -> DeviceInfo:
-        """What the driver knows; size as the first picture has it."""
+        """The driver's description, with the size of the first frame."""
         if self._info is None:
             raise RuntimeError("open the camera first")
         return self._info
 
     @property
     def ended(self) -> bool:
-        """True once closed: an unplugged camera is waited for."""
+        """True once closed; an unplugged camera has not ended, it is reconnected."""
         return self._ended
 
     @property
-    def away(self) -> bool:
-        """Whether the camera is gone, and is tried again with every ``read``."""
-        return self._info is not None and not self._ended and (self._connection is None or self._fresh)
+    def disconnected(self) -> bool:
+        """Whether the connection is lost; every ``read`` then tries to reconnect."""
+        return self._info is not None and not self._ended and (self._connection is None or self._awaiting_frame)
 
     @property
     def temperature(self) -> float | None:
-        """Of sensor or board [°C]; None where it does not tell."""
+        """Temperature of the sensor or board [°C]; None where it is not available."""
         return getattr(self._connection, "temperature", None)
 
     def open(self) -> None:
-        """Raises InputError where the camera does not answer, or gives no picture."""
+        """Connect and wait for the first frame. Raises InputError if the camera does not answer or gives no frame."""
         self._connection = self._connect()
         self._ended = False
-        began = self._now_s()
+        started_s = self._now_s()
         first: Frame | None = None
         try:
-            while first is None and self._now_s() - began < _FIRST_FRAME_S:
+            while first is None and self._now_s() - started_s < _FIRST_FRAME_S:
                 first = self._connection.take(0.5)
             if first is None:
-                raise InputError(f"{self._name} gives no picture", remedy=self._remedy)
+                raise InputError(f"{self._name} gives no frame", remedy=self._remedy)
             self._info = self._describe(self._connection, first)
-        except Gone:
+        except ConnectionLost:
             self.close()
-            raise InputError(f"{self._name} gives no picture", remedy=self._remedy) from None
+            raise InputError(f"{self._name} gives no frame", remedy=self._remedy) from None
         except InputError:
             self.close()
             raise
         self._first = self._numbered(first)
 
     def read(self, timeout_s: float) -> Frame | None:
-        """The next picture; None while the camera is away, which is then tried again.
+        """The next frame; None while the camera is disconnected: then a reconnection is tried when it is due.
 
-        Raises InputError where it comes back with another picture size.
+        Raises InputError where the reconnected camera has another image size.
         """
         if self._ended or self._info is None:
             return None
@@ -177,13 +177,13 @@ class ReturningCamera:
             return None
         try:
             frame = self._connection.take(timeout_s)
-        except Gone:
-            self._lose()
+        except ConnectionLost:
+            self._drop_connection()
             return None
         if frame is None:
-            if self._fresh and self._now_s() - self._fresh_s > _FIRST_FRAME_S:
-                self._lose()  # it answers, but shows nothing
-                self._back_off.failed(self._now_s())
+            if self._awaiting_frame and self._now_s() - self._awaiting_since_s > _FIRST_FRAME_S:
+                self._drop_connection()  # it answers, but gives no frame
+                self._back_off.attempt_failed(self._now_s())
             return None
         height, width = frame.image.shape[:2]
         if (width, height) != (self._info.width, self._info.height):
@@ -191,10 +191,10 @@ class ReturningCamera:
                 f"{self._name} came back as {width}x{height}, it was {self._info.width}x{self._info.height}",
                 remedy="plug the same camera in, or start its agent again",
             )
-        if self._fresh:
-            self._fresh = False
+        if self._awaiting_frame:
+            self._awaiting_frame = False
             self.reconnections += 1
-        self._back_off.good()
+        self._back_off.frame_received()
         return self._numbered(frame)
 
     def close(self) -> None:
@@ -209,33 +209,33 @@ class ReturningCamera:
         number = self._numbers.next(frame.frame, frame.device_time_ns, fps)
         return replace(frame, frame=number)
 
-    def _lose(self) -> None:
+    def _drop_connection(self) -> None:
         connection, self._connection = self._connection, None
         if connection is not None:
             connection.close()
-        self._numbers.broken()
-        self._fresh = False
-        self._back_off.lost(self._now_s())
+        self._numbers.connection_lost()
+        self._awaiting_frame = False
+        self._back_off.connection_lost(self._now_s())
 
     def _reconnect(self, timeout_s: float) -> None:
         wait = self._back_off.due - self._now_s()
         if wait > 0.0:
             self._sleep(min(timeout_s, wait))
             return
-        began = self._now_s()
+        started_s = self._now_s()
         try:
             self._connection = self._connect()
         except InputError:
-            self._back_off.failed(began)
+            self._back_off.attempt_failed(started_s)
             return
-        self._fresh, self._fresh_s = True, self._now_s()
+        self._awaiting_frame, self._awaiting_since_s = True, self._now_s()
 
     def _now_s(self) -> float:
         return self._now_ns() / NANOSECONDS
 
 
-def without_password(source: str | int) -> str:
-    """A source as it may stand in an error or a log."""
+def redact_password(source: str | int) -> str:
+    """A source without user and password, for error messages and logs."""
     text = str(source)
     if "://" not in text or "@" not in text:
         return text

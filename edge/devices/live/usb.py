@@ -1,8 +1,8 @@
-"""USB cameras (V4L2) with the kernel's own stamps, sequence numbers and exposure, through linuxpy.
+"""USB cameras (V4L2) with the kernel's own time stamps, sequence numbers and exposure, through linuxpy.
 
-The kernel stamps a buffer on CLOCK_MONOTONIC when its first packet comes ("start of exposure", as uvcvideo calls it) or
-when it is complete, and numbers all frames, also those that nobody took. Without linuxpy the camera is read through
-OpenCV, which stamps on arrival.
+The kernel stamps a buffer on CLOCK_MONOTONIC when its first packet arrives ("start of exposure" in uvcvideo's terms) or
+when it is complete, and numbers all frames, including those that were not read. Without linuxpy the camera is read
+through OpenCV, which stamps on arrival.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ import cv2
 import numpy as np
 
 from edge.devices.base import Device, DeviceInfo, Frame, Image, check_size
-from edge.devices.live.opencv_capture import LiveCamera
-from edge.devices.live.reconnecting import Connection, Gone, ReturningCamera
+from edge.devices.live.opencv_capture import OpenCvCamera
+from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
-_MONOTONIC, _CLOCKS = 0x2000, 0xE000  # V4L2_BUF_FLAG_TIMESTAMP_…
-_START_OF_EXPOSURE, _MOMENTS = 0x10000, 0x70000  # V4L2_BUF_FLAG_TSTAMP_SRC_…; else the end of the frame
-_BAD = 0x40  # V4L2_BUF_FLAG_ERROR: the pixels are damaged
+_MONOTONIC, _CLOCK_MASK = 0x2000, 0xE000  # V4L2_BUF_FLAG_TIMESTAMP_…
+_START_OF_EXPOSURE, _SOURCE_MASK = 0x10000, 0x70000  # V4L2_BUF_FLAG_TSTAMP_SRC_…; else the end of the frame
+_DAMAGED = 0x40  # V4L2_BUF_FLAG_ERROR: the pixels are damaged
 _BUFFERS = 4
 _REMEDY = "check that it is plugged in, that no other program uses it, and that you may read /dev/video*"
 _EXPOSURE_UNIT_US = 100  # V4L2_CID_EXPOSURE_ABSOLUTE
@@ -39,9 +39,10 @@ _EXPOSURE_UNIT_US = 100  # V4L2_CID_EXPOSURE_ABSOLUTE
 class UsbSettings:
     """One USB camera.
 
-    device: /dev/video…, or a stable name of udev's. size: (width, height) [px]; None = as it is set. fps: None = as it
-    is set. pixels: MJPG, YUYV or GREY. exposure_us: fixed; None = the camera chooses, and mid-exposure wanders with
-    the light. gain: the camera's own units; None = left alone. readout_s: first to last row; 0 = not known.
+    device: /dev/video…, or a stable name made by udev. size: (width, height) [px]; None = the current setting. fps:
+    None = the current setting. pixels: MJPG, YUYV or GREY. exposure_us: fixed; None = automatic, and mid-exposure then
+    varies with the light. gain: in the camera's own units; None = unchanged. readout_s: time from first to last row;
+    0 = not known.
     """
 
     device: str = "/dev/video0"
@@ -53,21 +54,26 @@ class UsbSettings:
     readout_s: float = 0.0
 
 
+def device_path(device: str) -> str:
+    """/dev/video… of a camera's number; any other name unchanged."""
+    return f"/dev/video{device}" if device.isdecimal() else device
+
+
 def open_usb(
     settings: UsbSettings,
     *,
     intrinsics: Intrinsics | None = None,
-    there: Callable[[str], bool] = lambda name: find_spec(name) is not None,
+    is_installed: Callable[[str], bool] = lambda name: find_spec(name) is not None,
     now_ns: Callable[[], int] = time.monotonic_ns,
 ) -> Device:
-    """The camera through linuxpy; without it through OpenCV, which stamps on arrival. It still has to be opened."""
-    if there("linuxpy"):
+    """The device for a USB camera, not yet open: through linuxpy, or through OpenCV, which stamps on arrival."""
+    if is_installed("linuxpy"):
         return UsbCamera(settings, intrinsics=intrinsics, now_ns=now_ns)
-    return LiveCamera(settings.device, fps=settings.fps, intrinsics=intrinsics, driver="usb", now_ns=now_ns)
+    return OpenCvCamera(settings.device, fps=settings.fps, intrinsics=intrinsics, driver="usb", now_ns=now_ns)
 
 
-class UsbCamera(ReturningCamera):
-    """A V4L2 camera; see ``edge.devices.base.Device``. stream: makes the open stream; tests give another."""
+class UsbCamera(ReconnectingCamera):
+    """A V4L2 camera; see ``edge.devices.base.Device``. stream: opens the V4L2 stream; replaced in tests."""
 
     def __init__(
         self,
@@ -101,7 +107,7 @@ class UsbCamera(ReturningCamera):
 
 
 class V4l2Stream:
-    """linuxpy's device and its memory-mapped buffers. Raises OSError where it does not answer."""
+    """A V4L2 device with memory-mapped buffers, through linuxpy. Raises OSError where it does not answer."""
 
     def __init__(self, settings: UsbSettings) -> None:
         from linuxpy.video.device import Device as V4l2Device
@@ -129,7 +135,7 @@ class V4l2Stream:
     fps = 0.0
 
     def _fix(self, settings: UsbSettings) -> None:
-        """Fixed exposure and gain, as far as the camera has them."""
+        """Set the fixed exposure and gain. Raises OSError where the camera lacks the control."""
         controls = self._device.controls
         if settings.exposure_us is not None:
             if "auto_exposure" not in controls or "exposure_time_absolute" not in controls:
@@ -142,7 +148,7 @@ class V4l2Stream:
             controls["gain"].value = settings.gain
 
     def exposure_ns(self) -> int:
-        """Of the pictures now; 0 where the camera chooses it, as it may be another each time, or does not tell."""
+        """The present exposure; 0 where it is automatic, as it may vary by frame, or not reported."""
         controls = self._device.controls
         if "auto_exposure" not in controls or "exposure_time_absolute" not in controls:
             return 0
@@ -151,14 +157,14 @@ class V4l2Stream:
         return int(controls["exposure_time_absolute"].value) * _EXPOSURE_UNIT_US * 1000
 
     def get(self, timeout_s: float) -> Any:
-        """linuxpy's frame; None where none came. Raises OSError where the camera is gone."""
+        """linuxpy's frame; None if none came. Raises OSError where the camera is lost."""
         ready, _, broken = select.select([self._device], [], [self._device], timeout_s)
         if broken and not ready:
             raise OSError(errno.ENODEV, "unplugged")
         return self._capture.buffer.raw_read() if ready else None
 
     def close(self) -> None:
-        """Stop, and release the buffers; also of a camera that is gone."""
+        """Stop and release the buffers; also after the camera was unplugged."""
         for close in (getattr(getattr(self, "_capture", None), "close", None), self._device.close):
             with suppress(OSError, ValueError, AttributeError):
                 if close is not None:
@@ -166,7 +172,7 @@ class V4l2Stream:
 
 
 class UsbConnection:
-    """The pictures of one open V4L2 stream, with mid-exposure times as far as they can be told."""
+    """The frames of one open V4L2 stream, stamped at mid-exposure as far as exposure and readout are known."""
 
     def __init__(self, stream: Any, settings: UsbSettings, now_ns: Callable[[], int]) -> None:
         self._stream = stream
@@ -180,13 +186,13 @@ class UsbConnection:
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """What this camera does not tell."""
-        told = [] if self._exposure_ns else ["exposure: the camera chooses it"]
+        """Quantities that this camera does not report."""
+        unknown_items = [] if self._exposure_ns else ["exposure: automatic"]
         if not self._readout_ns:
-            told.append("readout of a rolling shutter")
+            unknown_items.append("readout of a rolling shutter")
         if self._arrival:
-            told.append("time of capture: stamped on arrival")
-        return tuple(told)
+            unknown_items.append("time of capture: stamped on arrival")
+        return tuple(unknown_items)
 
     def take(self, timeout_s: float) -> Frame | None:
         try:
@@ -194,13 +200,13 @@ class UsbConnection:
         except OSError as error:
             if error.errno in (errno.EAGAIN, errno.EINTR):
                 return None
-            raise Gone from None
+            raise ConnectionLost from None
         if frame is None:
             return None
         flags = int(frame.buff.flags)
-        image = None if flags & _BAD else picture(frame)
+        image = None if flags & _DAMAGED else decode_frame(frame)
         if image is None:
-            self.damaged += 1  # its number is a gap
+            self.damaged += 1  # its number stays a gap
             return None
         return Frame(image, self._middle(frame, flags), int(frame.frame_nb), self._exposure_ns)
 
@@ -210,16 +216,16 @@ class UsbConnection:
     def _middle(self, frame: Any, flags: int) -> int:
         """Mid-exposure of the middle row [ns]."""
         stamp = frame.buff.timestamp
-        moment = int(stamp.secs) * NANOSECONDS + int(stamp.usecs) * 1000
-        self._arrival = flags & _CLOCKS != _MONOTONIC
+        time_ns = int(stamp.secs) * NANOSECONDS + int(stamp.usecs) * 1000
+        self._arrival = flags & _CLOCK_MASK != _MONOTONIC
         if self._arrival:
             return self._now_ns()
-        inwards = (self._exposure_ns + self._readout_ns) // 2
-        return moment + inwards if flags & _MOMENTS == _START_OF_EXPOSURE else moment - inwards
+        to_middle = (self._exposure_ns + self._readout_ns) // 2
+        return time_ns + to_middle if flags & _SOURCE_MASK == _START_OF_EXPOSURE else time_ns - to_middle
 
 
-def picture(frame: Any) -> Image | None:
-    """(H, W, 3) BGR of one of linuxpy's frames; None where it is damaged. Raises InputError for an unknown format."""
+def decode_frame(frame: Any) -> Image | None:
+    """(H, W, 3) BGR image of a linuxpy frame; None where it is damaged. Raises InputError for an unknown format."""
     kind = frame.pixel_format.name
     data = np.frombuffer(bytes(frame.data), dtype=np.uint8)
     if kind in ("MJPEG", "JPEG"):

@@ -1,7 +1,7 @@
-"""The time by which simulated and recorded sources deliver: real, or as fast as the machine goes.
+"""The playback clock of simulated and recorded sources: real time, or as fast as possible.
 
-Time comes in from outside, so that tests run a minute of video in milliseconds, and so that the
-processes of a demo agree on what is when.
+The clock is passed in, so that tests run a minute of video in milliseconds, and so that the processes of a demo share
+one time.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ import time
 from typing import Protocol
 
 
-class Pace(Protocol):
-    """A clock that can be waited on [s]. Its zero is the true time 0 of a simulated world."""
+class PlaybackClock(Protocol):
+    """A clock that can be waited on [s]. Its zero is the true time 0 of a simulated scene."""
 
     def now(self) -> float:
-        """The time now [s]."""
+        """The present time [s]."""
 
     def sleep(self, seconds: float) -> None:
         """Return once ``seconds`` have passed on this clock."""
@@ -23,9 +23,9 @@ class Pace(Protocol):
 class RealTime:
     """The machine's time, counted from ``epoch_unix_s``.
 
-    epoch_unix_s: Unix time [s] of zero. Processes given the same epoch agree to within what their
-    machines' clocks agree; the clock is read once and then counted by the monotonic clock, so that a step of
-    the system time does not tear a running world apart.
+    epoch_unix_s: Unix time [s] of zero. Processes with the same epoch agree as well as their machines' clocks do. The
+    system clock is read once and then extrapolated by the monotonic clock, so that a step of the system time has no
+    effect on a running simulation.
     """
 
     def __init__(self, epoch_unix_s: float) -> None:
@@ -40,9 +40,9 @@ class RealTime:
 
 
 class AsFastAsPossible:
-    """A clock that stands still except while somebody sleeps on it: every wait is over at once.
+    """A clock that advances only by ``sleep``, which returns at once.
 
-    start: the time [s] at which it stands first.
+    start: its initial time [s].
     """
 
     def __init__(self, start: float = 0.0) -> None:

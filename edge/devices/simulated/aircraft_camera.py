@@ -1,36 +1,36 @@
-"""The simulated aircraft's camera as a device: pictures of the town from wherever the aircraft really is."""
+"""The camera of the simulated aircraft as a device: renders the town from the aircraft's true pose."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame, Image
-from edge.devices.playback.playback_clock import Pace
+from edge.devices.playback.playback_clock import PlaybackClock
 from edge.devices.simulated.aircraft import SimulatedAircraft
-from edge.uav.world.world import World
+from edge.uav.world.world import FlightWorld
 from protocols.core.clocks import NANOSECONDS
 
 _TRANSFER_S = 0.004
 
 
 class FlightCamera:
-    """Delivers a frame when the world's true time has come for it; frames that it is late for are left out.
+    """Delivers a frame when it is due on the playback clock; overdue frames are skipped and counted in ``late``.
 
-    world: what there is to see. aircraft: where the camera is. pace: the true time. ahead_s: the camera's clock against
-    the true time [s]: what it stamps is its own. duration_s: it ends then; None: with the world.
+    world: the rendered world. aircraft: gives the camera pose. playback_clock: the true time. clock_offset_s: the
+    camera's clock minus the true time [s]. duration_s: duration of the recording; None: that of the world.
     """
 
     def __init__(
         self,
-        world: World,
+        world: FlightWorld,
         aircraft: SimulatedAircraft,
-        pace: Pace,
+        playback_clock: PlaybackClock,
         *,
-        ahead_s: float = 0.0,
+        clock_offset_s: float = 0.0,
         duration_s: float | None = None,
     ) -> None:
-        self._world, self._aircraft, self._pace = world, aircraft, pace
-        self._ahead = ahead_s
+        self._world, self._aircraft, self._playback_clock = world, aircraft, playback_clock
+        self._clock_offset_s = clock_offset_s
         last = world.length if duration_s is None else min(world.length, int(duration_s * world.fps) + 1)
         self._last = last
         self._next = 0
@@ -39,7 +39,7 @@ class FlightCamera:
 
     @property
     def info(self) -> DeviceInfo:
-        """Known before it is opened."""
+        """Description, valid before opening too."""
         width, height = self._world.size
         return DeviceInfo(width, height, self._world.fps, "simulated", "monotonic", self._world.lens)
 
@@ -49,36 +49,36 @@ class FlightCamera:
         return self._next >= self._last
 
     def open(self) -> None:
-        """From now on, frames whose time has passed are lost."""
+        """Start; frames that are overdue from now on are skipped."""
         self._open = True
 
     def read(self, timeout_s: float) -> Frame | None:
-        """The next frame; None where its time does not come within ``timeout_s``."""
+        """The next frame; None if it is not due within ``timeout_s``."""
         if not self._open or self.ended:
             return None
-        due = max(0, int(np.ceil((self._pace.now() - _TRANSFER_S) * self._world.fps - 1.0)))
+        due = max(0, int(np.ceil((self._playback_clock.now() - _TRANSFER_S) * self._world.fps - 1.0)))
         if due > self._next:
             self.late += due - self._next
             self._next = due
             if self.ended:
                 return None
         index = self._next
-        wait = self._world.time(index) + _TRANSFER_S - self._pace.now()
+        wait = self._world.time(index) + _TRANSFER_S - self._playback_clock.now()
         if wait > timeout_s:
-            self._pace.sleep(timeout_s)
+            self._playback_clock.sleep(timeout_s)
             return None
-        self._pace.sleep(wait)
+        self._playback_clock.sleep(wait)
         self._next = index + 1
-        return Frame(self.picture(index), self.device_time_ns(index), index)
+        return Frame(self.render_frame(index), self.device_time_ns(index), index)
 
     def device_time_ns(self, index: int) -> int:
-        """What the camera's clock says of a frame."""
-        return round((self._world.time(index) + self._ahead) * NANOSECONDS)
+        """Time stamp [ns] of a frame on the camera's clock."""
+        return round((self._world.time(index) + self._clock_offset_s) * NANOSECONDS)
 
-    def picture(self, index: int) -> Image:
-        """Frame ``index``, from where the aircraft was then."""
+    def render_frame(self, index: int) -> Image:
+        """Render frame ``index`` from the aircraft's pose at its time."""
         rotation, centre = self._aircraft.camera_from_ned(self._world.time(index), self._world.body_from_camera)
-        return self._world.draw_from(index, rotation, centre)
+        return self._world.render_from(index, rotation, centre)
 
     def close(self) -> None:
         """May be called twice."""

@@ -1,4 +1,4 @@
-"""A link to one vehicle: only messages that may be believed come through, and why others did not is counted."""
+"""A MAVLink connection to one vehicle: validates received messages and counts rejections by reason."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from edge.mavlink.link.signing import Signing
 from edge.mavlink.link.transport import Address, Transport, Url, open_transport
 from protocols.core.clocks import NANOSECONDS
 
-_USUAL_VEHICLE = 1
-_SENDERS = 8  # addresses whose bytes are looked at while nobody is locked
-_SILENT_NS = 10 * NANOSECONDS  # after which the vehicle may speak from another address
-_FIRST_RETRY_S, _LAST_RETRY_S = 0.2, 10.0
+_DEFAULT_SYSTEM = 1
+_MAX_SENDERS = 8  # senders whose bytes are parsed while no vehicle is locked
+_SILENT_NS = 10 * NANOSECONDS  # silence after which the vehicle may use another address
+_MIN_RETRY_S, _MAX_RETRY_S = 0.2, 10.0
 _NAN_ALLOWED = frozenset({"COMMAND_LONG", "COMMAND_INT", "GIMBAL_MANAGER_SET_PITCHYAW", "CAMERA_TRACKING_IMAGE_STATUS",
                           "CAMERA_TRACKING_GEO_STATUS", "CAMERA_FOV_STATUS", "VIDEO_STREAM_INFORMATION",
                           "CAMERA_INFORMATION"})  # fmt: skip
-"""Kinds in which NaN means "not told"; who reads them looks at each field."""
+"""Message types in which NaN means "not available"; their readers check each field."""
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
-    """A message that was let in. received_ns: the host's monotonic clock when its bytes were taken."""
+class ReceivedMessage:
+    """An accepted message. kind: its type. received_ns: the host's monotonic clock when its bytes were read."""
 
     message: Any
     kind: str
@@ -38,16 +38,16 @@ class Heard:
 
 
 class Link:
-    """One link, opened by ``poll`` and opened again whenever it breaks.
+    """A MAVLink connection, opened by ``poll`` and reopened whenever it breaks.
 
-    url: where to. system, component: what this side calls itself; system None: as the vehicle, whose part it is.
-    allowed: names of the messages that are let in. signing: refuses what is not signed; None: anything goes, and
-    nothing is signed. vehicle: system id of the only vehicle that is heard; None: the first autopilot whose heartbeat
-    comes. transport: an open one instead of ``url``.
-    now_ns: the host's monotonic clock; unix_s: its wall clock, which only signing asks.
+    url: address. system, component: own ids; system None: that of the vehicle, of which this is a component.
+    allowed: names of the message types that are accepted. signing: rejects unsigned messages; None: no signing in
+    either direction. vehicle: system id of the only accepted vehicle; None: the first autopilot whose heartbeat is
+    received. transport: an open one instead of ``url``. now_ns: the host's monotonic clock; unix_s: its wall clock,
+    used only for signing.
 
-    Messages of the locked vehicle and, over its address, of any other system (ground stations behind it) are let in;
-    the receiver looks at ``Heard.system``. counters: by what happened; see the README of the folder above.
+    Messages of the locked vehicle and, over its address, of any other system (ground stations behind it) are accepted;
+    the reader checks ``ReceivedMessage.system``. counters: by event, in dotted names ("refused.replayed").
     """
 
     def __init__(
@@ -65,33 +65,33 @@ class Link:
     ) -> None:
         self._url, self._transport = url, transport
         self._allowed = frozenset(allowed)
-        self._whole = url is None or url.kind.startswith("udp")
+        self._datagrams = url is None or url.kind.startswith("udp")
         self._signing = signing
         self._now_ns, self._unix_s = now_ns, unix_s
-        self._codec: Any = mavlink.MAVLink(None, system or vehicle or _USUAL_VEHICLE, component)
+        self._codec: Any = mavlink.MAVLink(None, system or vehicle or _DEFAULT_SYSTEM, component)
         self._as_vehicle = system is None
         if signing is not None:
             self._codec.signing.secret_key = signing.key
             self._codec.signing.link_id = signing.link
             self._codec.signing.sign_outgoing = True
-        self._lock = threading.RLock()  # one thread listens, another speaks
+        self._lock = threading.RLock()  # one thread receives, another sends
         self._framers: dict[Address, Framer] = {}
-        self._retry_s = _FIRST_RETRY_S
+        self._retry_s = _MIN_RETRY_S
         self._next_try_ns = 0
         self._address: Address | None = None
         self._address_ns = 0
         self.vehicle = vehicle
-        self.heard_ns = 0
+        self.last_received_ns = 0
         self.counters: Counter[str] = Counter()
         self.problem = ""
 
     @property
     def open(self) -> bool:
-        """Whether the link can be used at the moment."""
+        """Whether the transport is open at present."""
         return self._transport is not None
 
     def wait(self, timeout_s: float) -> None:
-        """Return when something may have come, or the time is up."""
+        """Wait until there may be something to receive, or the timeout has passed."""
         transport = self._transport
         if transport is None:
             time.sleep(min(max(timeout_s, 0.0), 0.05))
@@ -101,10 +101,10 @@ class Link:
         except (OSError, ValueError) as error:  # ValueError: closed by the other thread meanwhile
             with self._lock:
                 if transport is self._transport:
-                    self._broken(error)
+                    self._handle_failure(error)
 
-    def poll(self) -> list[Heard]:
-        """What came since the last call."""
+    def poll(self) -> list[ReceivedMessage]:
+        """The messages accepted since the last call; (re)opens the transport if that is due."""
         with self._lock:
             if self._transport is None and not self._try_open():
                 return []
@@ -112,16 +112,16 @@ class Link:
             try:
                 pieces = self._transport.receive()
             except OSError as error:
-                self._broken(error)
+                self._handle_failure(error)
                 return []
             now = self._now_ns()
-            out: list[Heard] = []
+            out: list[ReceivedMessage] = []
             for data, address in pieces:
-                out += self._from(data, address, now)
+                out += self._process(data, address, now)
             return out
 
     def send(self, message: Any) -> bool:
-        """Send a message; False where the link is down. Lost on the way is as on the air: nobody tells."""
+        """Send a message; False where the link is down. A loss on the way is not detected."""
         with self._lock:
             if self._transport is None:
                 return False
@@ -134,22 +134,22 @@ class Link:
             try:
                 self._transport.send(bytes(data), self._address)
             except OSError as error:
-                self._broken(error)
+                self._handle_failure(error)
                 return False
             self.counters["sent"] += 1
             return True
 
     def close(self) -> None:
-        """Close, and keep the last times of signing."""
+        """Close for good, and save the signing timestamps."""
         with self._lock:
             if self._transport is not None:
                 self._transport.close()
                 self._transport = None
-            self._url = None  # it is not opened again
+            self._url = None  # prevents reopening
             if self._signing is not None:
                 self._signing.save()
 
-    def _from(self, data: bytes, address: Address, now: int) -> list[Heard]:
+    def _process(self, data: bytes, address: Address, now: int) -> list[ReceivedMessage]:
         self.counters["bytes"] += len(data)
         silent = now - self._address_ns > _SILENT_NS
         if self._address is not None and address != self._address and not silent:
@@ -157,31 +157,31 @@ class Link:
             return []
         framer = self._framers.get(address)
         if framer is None:
-            if len(self._framers) >= _SENDERS:
+            if len(self._framers) >= _MAX_SENDERS:
                 self._framers.pop(next(key for key in self._framers if key != self._address))
             framer = self._framers[address] = Framer()
         garbage, unknown = framer.unreadable, framer.unknown
         out = []
-        for message, frame in framer.feed(data, whole=self._whole):
-            heard = self._admit(message, frame, address, now)
-            if heard is not None:
-                out.append(heard)
+        for message, frame in framer.feed(data, whole=self._datagrams):
+            received = self._accept(message, frame, address, now)
+            if received is not None:
+                out.append(received)
         self.counters["garbled_bytes"] += framer.unreadable - garbage
         self.counters["unknown"] += framer.unknown - unknown
         return out
 
-    def _admit(self, message: Any, frame: bytes, address: Address, now: int) -> Heard | None:
+    def _accept(self, message: Any, frame: bytes, address: Address, now: int) -> ReceivedMessage | None:
         system, component = int(message.get_srcSystem()), int(message.get_srcComponent())
         kind = str(message.get_type())
         if self._signing is not None:
-            reason = self._signing.refused(frame, system, component, self._unix_s())
+            reason = self._signing.rejection_reason(frame, system, component, self._unix_s())
             if reason is not None:
                 self.counters[f"refused.{reason}"] += 1
                 return None
         if kind not in self._allowed:
             self.counters["not_needed"] += 1
             return None
-        if kind not in _NAN_ALLOWED and not _finite(message):
+        if kind not in _NAN_ALLOWED and not _all_finite(message):
             self.counters["refused.not_finite"] += 1
             return None
         is_vehicle = kind == "HEARTBEAT" and is_autopilot(message, component)
@@ -197,9 +197,9 @@ class Link:
             self.counters["refused.other_vehicle"] += 1
             return None
         if system == self.vehicle:
-            self._address_ns = self.heard_ns = now
+            self._address_ns = self.last_received_ns = now
         self.counters["received"] += 1
-        return Heard(message, kind, system, component, now)
+        return ReceivedMessage(message, kind, system, component, now)
 
     def _try_open(self) -> bool:
         now = self._now_ns()
@@ -208,14 +208,14 @@ class Link:
         try:
             self._transport = open_transport(self._url)
         except OSError as error:
-            self._broken(error)
+            self._handle_failure(error)
             return False
         self.counters["opened"] += 1
-        self._retry_s, self.problem = _FIRST_RETRY_S, ""
+        self._retry_s, self.problem = _MIN_RETRY_S, ""
         return True
 
-    def _broken(self, error: OSError | ValueError) -> None:
-        """Close and try again later, each time later."""
+    def _handle_failure(self, error: OSError | ValueError) -> None:
+        """Close the transport and schedule the next attempt with exponential back-off."""
         if self._transport is not None:
             self._transport.close()
             self._transport = None
@@ -223,15 +223,15 @@ class Link:
         self.problem = str(getattr(error, "strerror", None) or error)
         self.counters["broken"] += 1
         self._next_try_ns = self._now_ns() + round(self._retry_s * NANOSECONDS)
-        self._retry_s = min(2.0 * self._retry_s, _LAST_RETRY_S)
+        self._retry_s = min(2.0 * self._retry_s, _MAX_RETRY_S)
 
 
 def is_autopilot(message: Any, component: int) -> bool:
-    """Whether a heartbeat is an autopilot's, not a station's, a camera's or a gimbal's."""
+    """Whether a heartbeat comes from an autopilot rather than a station, a camera or a gimbal."""
     return component == 1 and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
 
 
-def _finite(message: Any) -> bool:
+def _all_finite(message: Any) -> bool:
     for name in message.get_fieldnames():
         value = getattr(message, name)
         values = value if isinstance(value, list) else (value,)

@@ -1,7 +1,7 @@
-"""Finds whole messages in a stream of bytes in which anything may have happened.
+"""MAVLink framing: finds whole messages in a corrupted byte stream.
 
-pymavlink's own parser throws away as many bytes as a chance marker in garbage claims, and good messages with them.
-This one goes on one byte after a marker that began no message.
+pymavlink's own parser discards as many bytes as a false start marker claims, and valid messages with them. This one
+continues one byte after a marker that did not start a message.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _LONGEST = 280 + _SIGNATURE
 
 
 class Framer:
-    """One stream. unreadable: bytes that belong to no message; unknown: messages of other dialects."""
+    """Parser of one byte stream. unreadable: bytes that belong to no message; unknown: messages of other dialects."""
 
     def __init__(self) -> None:
         self._codec: Any = mavlink.MAVLink(None)
@@ -27,10 +27,10 @@ class Framer:
         self.unknown = 0
 
     def feed(self, data: bytes, *, whole: bool = False) -> Iterator[tuple[Any, bytes]]:
-        """Messages whose checksum is right, each with its bytes.
+        """Messages with a valid checksum, each with its bytes.
 
-        whole: no message goes on in the next piece, as in datagrams: what looks like the beginning of one at the end
-        holds nothing up.
+        whole: no message continues in the next piece, as in datagrams: an incomplete frame at the end is then
+        discarded instead of waited for.
         """
         self._buffer += data
         at = 0
@@ -50,7 +50,7 @@ class Framer:
                 self.unreadable += 1
                 at += 1
             elif message.get_msgId() < 0 or isinstance(message, mavlink.MAVLink_unknown):
-                # Its checksum can't be known. Believe its length only if something begins where it ends.
+                # Its checksum cannot be verified. Accept its length only if another frame starts where it ends.
                 end = at + length
                 if end < len(self._buffer) and self._buffer[end] not in (_V1, _V2):
                     self.unreadable += 1
@@ -71,7 +71,7 @@ class Framer:
         return min(first, default=None)
 
     def _length(self, at: int) -> int | None:
-        """Bytes of the message that may begin here; None where too few have come to tell."""
+        """Length of the message that may start here; None while the header is incomplete."""
         head = self._buffer[at : at + 3]
         if len(head) < 3:
             return None

@@ -1,35 +1,35 @@
-"""A thread that listens to the vehicle beside the agent's loop."""
+"""A receiving thread for a MAVLink link."""
 
 from __future__ import annotations
 
 import queue
 import threading
 
-from edge.mavlink.link.connection import Heard, Link
+from edge.mavlink.link.connection import Link, ReceivedMessage
 
 
-class Ear:
-    """Listens on a link in a thread of its own, so that a slow picture does not make messages late."""
+class Receiver:
+    """Polls a link in its own thread, so that slow image processing does not delay the arrival times of messages."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
-        self._heard: queue.Queue[Heard] = queue.Queue(4096)
+        self._messages: queue.Queue[ReceivedMessage] = queue.Queue(4096)
         self._stop = threading.Event()
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
 
-    def drain(self) -> list[Heard]:
-        """What came since the last call. Raises what the thread has raised."""
+    def drain(self) -> list[ReceivedMessage]:
+        """Messages received since the last call. Re-raises an error of the thread."""
         if self._error is not None:
             raise self._error
         out = []
         while True:
             try:
-                out.append(self._heard.get_nowait())
+                out.append(self._messages.get_nowait())
             except queue.Empty:
                 return out
 
-    def __enter__(self) -> Ear:
+    def __enter__(self) -> Receiver:
         self._thread.start()
         return self
 
@@ -41,8 +41,8 @@ class Ear:
         try:
             while not self._stop.is_set():
                 self._link.wait(0.05)
-                for heard in self._link.poll():
-                    if not self._heard.full():
-                        self._heard.put(heard)
-        except Exception as error:  # noqa: BLE001 - it belongs to the thread that runs the agent
+                for received in self._link.poll():
+                    if not self._messages.full():
+                        self._messages.put(received)
+        except Exception as error:  # noqa: BLE001 - re-raised in the thread that runs the agent
             self._error = error

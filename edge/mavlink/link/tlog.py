@@ -1,7 +1,7 @@
-"""Reads a .tlog: MAVLink messages, each after the receiver's time in µs since 1970, big-endian.
+"""Reading of .tlog telemetry logs: MAVLink messages, each preceded by the receiver's time in µs since 1970, big-endian.
 
-The receiver's time says when a message came over the radio, in bursts. What is used is the vehicle's own
-time_boot_ms, whose zero is the vehicle's start.
+The receiver's time is that of arrival over the radio, in bursts. The samples use the vehicle's own time_boot_ms,
+whose zero is the vehicle's boot.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from edge.mavlink.dialect import mavlink
 from edge.mavlink.link.connection import is_autopilot
-from edge.mavlink.roles.telemetry import Attitude, GlobalPosition, LocalPosition, report
+from edge.mavlink.roles.telemetry import Attitude, GlobalPosition, LocalPosition, parse_telemetry
 from edge.uav.navigation import Origin
 from edge.uav.tracker import Telemetry
 from protocols.core.errors import InputError
@@ -23,15 +23,16 @@ from protocols.geometry.types import Floats
 
 _STAMP = 8
 _LONGEST = 280 + 13
-_POSITION_GAP_S = 3.0  # between two positions that are still interpolated
+_POSITION_GAP_S = 3.0  # greatest interval over which positions are interpolated
 _REBOOT_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tlog:
-    """samples: of one vehicle and one boot, by its clock [s], strictly increasing. system: the vehicle's.
+    """Telemetry from a .tlog. samples: of one vehicle and one boot, by its clock [s], strictly increasing.
 
-    left_out: samples that made no sense. unreadable: bytes that belong to no message. boots: how many the log holds.
+    system: the vehicle's id. left_out: invalid or out-of-order samples. unreadable: bytes that belong to no message.
+    boots: number of boots in the log.
     """
 
     samples: tuple[Telemetry, ...]
@@ -42,7 +43,7 @@ class Tlog:
 
 
 def read_tlog(file: Path) -> Tlog:
-    """The attitudes and positions in a .tlog. Raises InputError."""
+    """Read the attitudes and positions of a .tlog. Raises InputError."""
     try:
         data = file.read_bytes()
     except OSError as error:
@@ -51,33 +52,37 @@ def read_tlog(file: Path) -> Tlog:
     if not messages:
         raise InputError("holds no MAVLink message", file=file, remedy="give a .tlog as ground stations write it")
     kinds = ("ATTITUDE", "ATTITUDE_QUATERNION")
-    told = Counter(m.get_srcSystem() for m in messages if m.get_type() in kinds)
-    beats = [m for m in messages if m.get_type() == "HEARTBEAT"]
-    pilots = {m.get_srcSystem() for m in beats if is_autopilot(m, m.get_srcComponent())}
-    vehicles = {system: count for system, count in told.items() if not pilots or system in pilots}
+    attitude_counts = Counter(m.get_srcSystem() for m in messages if m.get_type() in kinds)
+    heartbeats = [m for m in messages if m.get_type() == "HEARTBEAT"]
+    autopilots = {m.get_srcSystem() for m in heartbeats if is_autopilot(m, m.get_srcComponent())}
+    vehicles = {system: count for system, count in attitude_counts.items() if not autopilots or system in autopilots}
     if not vehicles:
         raise InputError("no attitude in this log", file=file, remedy="record ATTITUDE at 20 Hz or more")
     system = max(vehicles, key=lambda name: vehicles[name])
-    # The quaternion is the finer one; both together would be two samplings of one thing.
+    # The quaternion has the better resolution; using both would duplicate the attitude.
     quaternion = any(m.get_type() == kinds[1] and m.get_srcSystem() == system for m in messages)
     return _samples([m for m in messages if m.get_srcSystem() == system], kinds[quaternion], system, unreadable, file)
 
 
 def _messages(data: bytes) -> tuple[list[Any], int]:
-    """All whole messages of the autopilots' kinds, and the bytes that are none."""
+    """All valid messages of the wanted types, and the number of bytes that belong to no message."""
     codec: Any = mavlink.MAVLink(None)
     wanted = {"HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT"}
     out: list[Any] = []
     at = unreadable = 0
     while at + _STAMP + 8 <= len(data):
-        place = at + _STAMP
-        marker = data[place]
+        position = at + _STAMP
+        marker = data[position]
         if marker not in (0xFE, 0xFD):
             at, unreadable = at + 1, unreadable + 1
             continue
-        length = 8 + data[place + 1] if marker == 0xFE else 12 + data[place + 1] + (13 if data[place + 2] & 1 else 0)
-        frame = data[place : place + length]
-        end = place + length
+        length = (
+            8 + data[position + 1]
+            if marker == 0xFE
+            else 12 + data[position + 1] + (13 if data[position + 2] & 1 else 0)
+        )
+        frame = data[position : position + length]
+        end = position + length
         try:
             message = codec.decode(bytearray(frame)) if len(frame) == length else None
         except mavlink.MAVError:
@@ -93,50 +98,56 @@ def _messages(data: bytes) -> tuple[list[Any], int]:
 
 
 def _samples(messages: list[Any], kind: str, system: int, unreadable: int, file: Path) -> Tlog:
-    """Attitudes with the positions between which they lie; of the boot that has most of them."""
+    """Attitudes with interpolated positions, of the boot with the most attitudes."""
     boots: list[tuple[list[Attitude], list[tuple[float, Floats]]]] = [([], [])]
     local = any(m.get_type() == "LOCAL_POSITION_NED" for m in messages)
     origin: Origin | None = None
     newest, left_out = -1.0, 0
     for message in messages:
-        told = report(message)
-        if told is None or (isinstance(told, Attitude) and message.get_type() != kind):
+        telemetry = parse_telemetry(message)
+        if telemetry is None or (isinstance(telemetry, Attitude) and message.get_type() != kind):
             continue
-        if told.boot_s < newest - _REBOOT_S:
+        if telemetry.boot_s < newest - _REBOOT_S:
             boots.append(([], []))
             newest = -1.0
-        newest = max(newest, told.boot_s)
+        newest = max(newest, telemetry.boot_s)
         attitudes, positions = boots[-1]
-        if isinstance(told, Attitude):
-            if np.isfinite(told.ned_from_body).all() and (not attitudes or told.boot_s > attitudes[-1].boot_s):
-                attitudes.append(told)
+        if isinstance(telemetry, Attitude):
+            if np.isfinite(telemetry.ned_from_body).all() and (
+                not attitudes or telemetry.boot_s > attitudes[-1].boot_s
+            ):
+                attitudes.append(telemetry)
             else:
                 left_out += 1
-        elif isinstance(told, LocalPosition) and np.isfinite(told.position).all():
-            positions.append((told.boot_s, told.position))
-        elif isinstance(told, GlobalPosition) and not local:
-            if origin is None:  # where home is at height 0
-                origin = Origin(told.latitude, told.longitude, told.altitude - told.relative_altitude)
-            positions.append((told.boot_s, origin.local(told.latitude, told.longitude, told.altitude)))
+        elif isinstance(telemetry, LocalPosition) and np.isfinite(telemetry.position).all():
+            positions.append((telemetry.boot_s, telemetry.position))
+        elif isinstance(telemetry, GlobalPosition) and not local:
+            if origin is None:  # home has height 0
+                origin = Origin(
+                    telemetry.latitude, telemetry.longitude, telemetry.altitude - telemetry.relative_altitude
+                )
+            positions.append(
+                (telemetry.boot_s, origin.to_ned(telemetry.latitude, telemetry.longitude, telemetry.altitude))
+            )
     attitudes, positions = max(boots, key=lambda boot: len(boot[0]))
     if len(attitudes) < 2:
         raise InputError("no usable attitude in this log", file=file, remedy="record ATTITUDE at 20 Hz or more")
-    places = _at(positions, np.array([attitude.boot_s for attitude in attitudes]))
+    positions_at = _interpolate_positions(positions, np.array([attitude.boot_s for attitude in attitudes]))
     samples = tuple(
-        Telemetry(attitude.boot_s, attitude.ned_from_body, None if np.isnan(place).any() else place)
-        for attitude, place in zip(attitudes, places, strict=True)
+        Telemetry(attitude.boot_s, attitude.ned_from_body, None if np.isnan(position).any() else position)
+        for attitude, position in zip(attitudes, positions_at, strict=True)
     )
     return Tlog(samples, system, left_out, unreadable, len(boots))
 
 
-def _at(positions: list[tuple[float, Floats]], times: Floats) -> Floats:
-    """Positions (n, 3) at ``times`` (n,); NaN where none are near."""
+def _interpolate_positions(positions: list[tuple[float, Floats]], times: Floats) -> Floats:
+    """Positions (n, 3) interpolated at ``times`` (n,); NaN where none are close in time."""
     out = np.full((len(times), 3), np.nan)
     ordered = sorted(positions, key=lambda entry: entry[0])
     if len(ordered) < 2:
         return out
     known = np.array([moment for moment, _ in ordered])
-    table = np.array([place for _, place in ordered])
+    table = np.array([position for _, position in ordered])
     index = np.clip(np.searchsorted(known, times) - 1, 0, len(known) - 2)
     near = (known[index + 1] - known[index] <= _POSITION_GAP_S) & (times >= known[0] - 0.5) & (times <= known[-1] + 0.5)
     for axis in range(3):

@@ -1,7 +1,7 @@
-"""Bytes in and out of a serial port, UDP or TCP, by the addresses that MAVLink tools use.
+"""Byte transports for MAVLink: serial port, UDP and TCP, with the address syntax of MAVLink tools.
 
-``udpin:host:port`` waits for a sender, ``udpout:host:port`` and ``tcp:host:port`` call one,
-``serial:/dev/ttyAMA0:921600`` is a wire. Nothing here knows messages.
+``udpin:host:port`` binds and waits for a sender, ``udpout:host:port`` and ``tcp:host:port`` connect to one,
+``serial:/dev/ttyAMA0:921600`` is a serial port.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from typing import Any, Protocol
 from protocols.core.errors import InputError
 
 Address = tuple[str, int]
-"""Who sent bytes: host and port; ("", 0) where a link has only one other end."""
+"""The sender of bytes: host and port; ("", 0) for a point-to-point transport."""
 ONLY: Address = ("", 0)
 
-_DATAGRAM = 65_535
-_AT_ONCE = 256  # datagrams taken in one go: a flood must not keep the loop from its work
-_BAUD = 57_600
+_MAX_DATAGRAM = 65_535
+_MAX_DATAGRAMS = 256  # datagrams read per call, so that a flood cannot block the caller
+_DEFAULT_BAUD = 57_600
 _REMEDY = 'write it like "udpin:0.0.0.0:14550", "udpout:192.168.1.10:14550", "tcp:…" or "serial:/dev/ttyAMA0:921600"'
 _NETWORK = re.compile(r"(?P<kind>udp|udpin|udpout|tcp):(?P<host>[^:\s]+):(?P<port>\d{1,5})\Z")
-_WIRE = re.compile(r"(?:serial:)?(?P<device>/[^:,\s]+|COM\d+)(?:[:,](?P<baud>\d{3,8}))?\Z")
+_SERIAL = re.compile(r"(?:serial:)?(?P<device>/[^:,\s]+|COM\d+)(?:[:,](?P<baud>\d{3,8}))?\Z")
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,38 +36,38 @@ class Url:
     number: int
 
 
-def parse(text: str) -> Url:
-    """Read an address; raises InputError."""
+def parse_url(text: str) -> Url:
+    """Parse an address; raises InputError."""
     network = _NETWORK.match(text)
     if network and 0 <= int(network["port"]) <= 65_535:
         kind = "udpin" if network["kind"] == "udp" else network["kind"]
         if kind != "udpin" and network["port"] == "0":
             raise InputError(f"link {text!r} has no port", remedy=_REMEDY)
         return Url(kind, network["host"], int(network["port"]))
-    wire = _WIRE.match(text)
+    wire = _SERIAL.match(text)
     if wire:
-        return Url("serial", wire["device"], int(wire["baud"] or _BAUD))
+        return Url("serial", wire["device"], int(wire["baud"] or _DEFAULT_BAUD))
     raise InputError(f"link {text!r} is not an address", remedy=_REMEDY)
 
 
 class Transport(Protocol):
-    """One way to the other side. OSError from any call means that it is broken and has to be opened again."""
+    """A bidirectional byte transport. An OSError from any call means that it is broken and has to be reopened."""
 
     def wait(self, timeout_s: float) -> bool:
         """Wait until there may be something to receive."""
 
     def receive(self) -> list[tuple[bytes, Address]]:
-        """What has come; never waits."""
+        """The bytes received so far, by sender; never waits."""
 
     def send(self, data: bytes, address: Address | None) -> None:
-        """Send to one sender heard before, None: to the only one there is."""
+        """Send to an address received from before; None: to the only peer."""
 
     def close(self) -> None:
-        """Give it back; may be called twice."""
+        """Release it; may be called twice."""
 
 
 def open_transport(url: Url) -> Transport:
-    """Open an address. Raises OSError where that fails now (and may work later)."""
+    """Open the transport of an address. Raises OSError where that fails now (and may work later)."""
     if url.kind == "udpin":
         return Udp(url, bound=True)
     if url.kind == "udpout":
@@ -76,7 +76,7 @@ def open_transport(url: Url) -> Transport:
 
 
 class Udp:
-    """Datagrams. bound: waits at the address; else calls it, and hears nobody else."""
+    """UDP. bound: binds to the address; otherwise connects to it and receives from it only."""
 
     def __init__(self, url: Url, *, bound: bool) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -101,13 +101,13 @@ class Udp:
 
     def receive(self) -> list[tuple[bytes, Address]]:
         out: list[tuple[bytes, Address]] = []
-        for _ in range(_AT_ONCE):
+        for _ in range(_MAX_DATAGRAMS):
             try:
-                data, sender = self._socket.recvfrom(_DATAGRAM)
+                data, sender = self._socket.recvfrom(_MAX_DATAGRAM)
             except BlockingIOError:
                 break
             except ConnectionRefusedError:
-                continue  # nobody listens there yet
+                continue  # no process listens there yet
             out.append((data, (str(sender[0]), int(sender[1])) if self._bound else ONLY))
         return out
 
@@ -118,14 +118,14 @@ class Udp:
             elif address is not None and address != ONLY:
                 self._socket.sendto(data, address)
         except (BlockingIOError, ConnectionRefusedError):
-            pass  # as if it were lost on the air
+            pass  # equivalent to a lost datagram
 
     def close(self) -> None:
         self._socket.close()
 
 
 class Tcp:
-    """A stream to a listener."""
+    """A TCP connection to a server."""
 
     def __init__(self, url: Url) -> None:
         self._socket = socket.create_connection((url.place, url.number), timeout=2.0)
@@ -137,7 +137,7 @@ class Tcp:
 
     def receive(self) -> list[tuple[bytes, Address]]:
         try:
-            data = self._socket.recv(_DATAGRAM)
+            data = self._socket.recv(_MAX_DATAGRAM)
         except BlockingIOError:
             return []
         if not data:
@@ -148,7 +148,7 @@ class Tcp:
         try:
             sent = self._socket.send(data)
         except BlockingIOError:
-            return  # a full buffer: the message is lost whole
+            return  # the buffer is full: the whole message is dropped
         if sent != len(data):
             raise ConnectionResetError("the link is too slow for what is sent")
 
@@ -157,7 +157,7 @@ class Tcp:
 
 
 class Serial:
-    """A wire through pyserial."""
+    """A serial port through pyserial."""
 
     def __init__(self, url: Url) -> None:
         try:
@@ -184,7 +184,7 @@ class Serial:
 
 
 class Pipe:
-    """Two ends in one process: what one sends, the other receives. For simulations that run faster than time."""
+    """An in-process transport with two ends. For simulations that run faster than real time."""
 
     def __init__(self) -> None:
         self._inbox: deque[bytes] = deque()
@@ -192,7 +192,7 @@ class Pipe:
 
     @classmethod
     def pair(cls) -> tuple[Pipe, Pipe]:
-        """Two joined ends."""
+        """Two connected ends."""
         a, b = cls(), cls()
         a.other, b.other = b, a
         return a, b

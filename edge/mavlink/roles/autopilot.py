@@ -1,7 +1,7 @@
-"""The autopilot's side of MAVLink, for the simulated aircraft: streams, commands, parameters, routing, and faults.
+"""A simulated autopilot's MAVLink interface: message streams, commands, parameters, routing, and link faults.
 
-What flies is behind ``Airframe``; this only speaks for it. It routes between its senders as ArduPilot does, so that a
-ground station reaches the companion computer through it.
+The vehicle itself is behind ``Airframe``. Messages are routed between the connected systems as ArduPilot does, so that
+a ground station reaches the companion computer through the autopilot.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from edge.mavlink.dialect import AUTOPILOT, GIMBAL, mavlink
 from edge.mavlink.link.framing import Framer
 from edge.mavlink.link.signing import Signing
 from edge.mavlink.link.transport import Address, Transport
-from edge.uav.navigation import Origin, to_quaternion
+from edge.uav.navigation import Origin, quaternion_from_rotation
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats
 
-_RATES = {
+_DEFAULT_RATES = {
     "HEARTBEAT": 1.0,
     "SYSTEM_TIME": 1.0,
     "ATTITUDE": 4.0,
@@ -33,16 +33,16 @@ _RATES = {
     "GIMBAL_DEVICE_ATTITUDE_STATUS": 10.0,
     "GIMBAL_MANAGER_STATUS": 1.0,
 }
-_FASTEST_HZ = 100.0
+_MAX_RATE_HZ = 100.0
 _UNIX_AT_START = 1_700_000_000.0
-_SENDERS = 8
-ORIGIN = Origin(47.3977, 8.5456, 488.0)
-"""Where the simulated aircraft's local frame stands, unless told otherwise."""
+_MAX_SENDERS = 8
+DEFAULT_ORIGIN = Origin(47.3977, 8.5456, 488.0)
+"""Default origin of the simulated aircraft's local NED frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Flying:
-    """ned_from_body (3, 3), position, velocity (3,) NED [m, m/s], rates (3,) body [rad/s]; ned_from_gimbal or None."""
+class SensorReadings:
+    """ned_from_body (3, 3), position, velocity (3,) NED [m, m/s], body rates (3,) [rad/s]; ned_from_gimbal or None."""
 
     ned_from_body: Floats
     position: Floats
@@ -52,22 +52,24 @@ class Flying:
 
 
 class Airframe(Protocol):
-    """What an autopilot flies. Times are the world's [s]."""
+    """The vehicle under an autopilot's control. Times are simulation time [s]."""
 
-    def flying(self, time: float) -> Flying:
-        """What its sensors say now."""
+    def sensor_readings(self, time: float) -> SensorReadings:
+        """The sensor readings at ``time``."""
 
-    def point(self, time: float, pitch: float, yaw: float, earth: bool) -> None:
-        """Turn the gimbal [rad]; earth: yaw from north, else from the nose."""
+    def point_gimbal(self, time: float, pitch: float, yaw: float, earth: bool) -> None:
+        """Command the gimbal angles [rad]; earth: yaw relative to north, else to the vehicle's heading."""
 
-    def chase(self, time: float, position: Floats, velocity: Floats) -> None:
-        """Follow a target at a place (3,) NED [m] that moves with a velocity (3,) [m/s]."""
+    def follow_target(self, time: float, position: Floats, velocity: Floats) -> None:
+        """Follow a target at a position (3,) NED [m] with a velocity (3,) [m/s]."""
 
 
 @dataclass(frozen=True, slots=True)
-class Faults:
-    """What goes wrong on the way to the others. drop, duplicate, garble: share of messages. delay_s, jitter_s: of
-    their transport. reboot_at: times at which the autopilot starts anew. steps: times and by how much its clock jumps.
+class LinkFaults:
+    """Simulated faults of the autopilot and its outgoing link.
+
+    drop, duplicate, garble: fraction of messages. delay_s, jitter_s: of their delivery. reboot_at: times [s] of
+    autopilot reboots. steps: (time, size) [s] of steps of its clock.
     """
 
     drop: float = 0.0
@@ -80,9 +82,9 @@ class Faults:
 
 
 class Autopilot:
-    """One autopilot on one transport. boot_s: how long it has been up at the world's time 0.
+    """An autopilot on one transport. boot_s: its clock at simulation time 0 [s].
 
-    origin: where the local frame stands. seed: of faults. signing: signs all it says, and hears only what is signed.
+    origin: of the local NED frame. seed: of the faults. signing: signs all messages and accepts only signed ones.
     """
 
     def __init__(
@@ -93,14 +95,14 @@ class Autopilot:
         system: int = 1,
         boot_s: float = 123.4,
         origin: Origin | None = None,
-        faults: Faults | None = None,
+        faults: LinkFaults | None = None,
         signing: Signing | None = None,
         seed: int = 0,
     ) -> None:
         self._airframe, self._transport = airframe, transport
         self.system = system
-        self.origin = origin or ORIGIN
-        self.faults = faults or Faults()
+        self.origin = origin or DEFAULT_ORIGIN
+        self.faults = faults or LinkFaults()
         self._random = random.Random(seed)
         self._boot_s = boot_s
         self._now = 0.0
@@ -113,57 +115,57 @@ class Autopilot:
         self._steps = sorted(self.faults.steps)
         self._down_until = -math.inf
         self._senders: dict[Address, _Sender] = {}
-        self._waiting: deque[tuple[float, bytes, Address]] = deque()
-        self._begin()
+        self._delayed: deque[tuple[float, bytes, Address]] = deque()
+        self._reset()
         self.parameters = {"SYSID_THISMAV": float(system), "SR0_EXTRA1": 4.0, "FOLL_ENABLE": 1.0, "MNT1_TYPE": 1.0}
         self.counters: Counter[str] = Counter()
 
     def boot_ns(self, time: float) -> int:
-        """The autopilot's clock at a time of the world."""
+        """The autopilot's clock [ns] at a simulation time [s]."""
         return round((time + self._boot_s) * NANOSECONDS)
 
     def step(self, time: float) -> None:
-        """Hear, answer, and say what is due at the world's time ``time`` [s]; call it 100 times a second or more."""
+        """Receive, respond and send what is due at simulation time ``time`` [s]; call at 100 Hz or more."""
         self._now = time
-        self._break_down(time)
+        self._apply_faults(time)
         pieces = self._transport.receive()
         if time < self._down_until:
             return
         for data, address in pieces:
-            self._hear(data, address)
+            self._receive(data, address)
         for kind, rate in self._rates.items():
             if rate > 0.0 and time >= self._due.get(kind, -math.inf):
                 late = time - self._due.get(kind, time)
                 self._due[kind] = time + 1.0 / rate - (late if late < 1.0 / rate else 0.0)
                 for message, part in self._message(kind, time):
-                    self._say(message, part)
-        while self._waiting and self._waiting[0][0] <= time:
-            _, data, address = self._waiting.popleft()
+                    self._send(message, part)
+        while self._delayed and self._delayed[0][0] <= time:
+            _, data, address = self._delayed.popleft()
             self._transport.send(data, address)
 
-    def _begin(self) -> None:
-        self._rates = dict(_RATES)
+    def _reset(self) -> None:
+        self._rates = dict(_DEFAULT_RATES)
         self._due: dict[str, float] = {}
 
-    def _break_down(self, time: float) -> None:
+    def _apply_faults(self, time: float) -> None:
         if self._reboots and time >= self._reboots[0]:
             self._reboots.pop(0)
-            self._begin()
+            self._reset()
             self._boot_s = -time
             self._down_until = time + 1.5
             self.counters["reboots"] += 1
         if self._steps and time >= self._steps[0][0]:
             self._boot_s += self._steps.pop(0)[1]
 
-    def _hear(self, data: bytes, address: Address) -> None:
+    def _receive(self, data: bytes, address: Address) -> None:
         sender = self._senders.get(address)
         if sender is None:
-            if len(self._senders) >= _SENDERS:
+            if len(self._senders) >= _MAX_SENDERS:
                 self._senders.pop(next(iter(self._senders)))
             sender = self._senders[address] = _Sender()
         for message, frame in sender.framer.feed(data):
             if self._signing is not None:
-                reason = self._signing.refused(
+                reason = self._signing.rejection_reason(
                     frame, message.get_srcSystem(), message.get_srcComponent(), _UNIX_AT_START + self._now
                 )
                 if reason:
@@ -171,10 +173,10 @@ class Autopilot:
                     continue
             sender.systems.add((message.get_srcSystem(), message.get_srcComponent()))
             self._route(message, frame, address)
-            self._obey(message)
+            self._handle(message)
 
     def _route(self, message: Any, frame: bytes, source: Address) -> None:
-        """Hand on what is meant for others."""
+        """Forward a message that addresses other systems."""
         system = getattr(message, "target_system", 0)
         component = getattr(message, "target_component", 0)
         if system == self.system and component == AUTOPILOT:
@@ -182,69 +184,69 @@ class Autopilot:
         for address, sender in self._senders.items():
             known = system == 0 or any(s == system and component in (0, c) for s, c in sender.systems)
             if address != source and known:
-                self._post(frame, address)
+                self._transmit(frame, address)
 
-    def _obey(self, message: Any) -> None:
+    def _handle(self, message: Any) -> None:
         kind = message.get_type()
         if getattr(message, "target_system", self.system) not in (0, self.system):
             return
         if kind == "TIMESYNC" and message.tc1 == 0:
-            self._say(mavlink.MAVLink_timesync_message(self.boot_ns(self._now), message.ts1), AUTOPILOT)
+            self._send(mavlink.MAVLink_timesync_message(self.boot_ns(self._now), message.ts1), AUTOPILOT)
         elif kind in ("COMMAND_LONG", "COMMAND_INT") and message.target_component in (0, AUTOPILOT, GIMBAL):
             self._command(message)
         elif kind == "GIMBAL_MANAGER_SET_PITCHYAW":
             earth = bool(int(message.flags) & mavlink.GIMBAL_MANAGER_FLAGS_YAW_LOCK)
             if math.isfinite(message.pitch) and math.isfinite(message.yaw):
                 self.counters["pointed"] += 1
-                self._airframe.point(self._now, message.pitch, message.yaw, earth)
+                self._airframe.point_gimbal(self._now, message.pitch, message.yaw, earth)
         elif kind == "FOLLOW_TARGET":
             self.counters["follow_targets"] += 1
-            place = self.origin.local(1e-7 * message.lat, 1e-7 * message.lon, message.alt)
-            self._airframe.chase(self._now, place, np.array(message.vel, np.float64))
+            place = self.origin.to_ned(1e-7 * message.lat, 1e-7 * message.lon, message.alt)
+            self._airframe.follow_target(self._now, place, np.array(message.vel, np.float64))
         elif kind == "PARAM_REQUEST_LIST":
             for name in self.parameters:
-                self._tell_parameter(name)
+                self._send_parameter(name)
         elif kind in ("PARAM_REQUEST_READ", "PARAM_SET"):
             name = message.param_id
             if name in self.parameters:
                 if kind == "PARAM_SET" and math.isfinite(message.param_value):
                     self.parameters[name] = float(message.param_value)
-                self._tell_parameter(name)
+                self._send_parameter(name)
 
     def _command(self, message: Any) -> None:
         result = mavlink.MAV_RESULT_UNSUPPORTED
         if message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-            kind = _name(int(message.param1))
+            kind = _message_name(int(message.param1))
             interval = float(message.param2)
             result = mavlink.MAV_RESULT_DENIED
             if kind in self._rates and math.isfinite(interval):
-                default = _RATES[kind]
-                self._rates[kind] = 0.0 if interval < 0 else min(1e6 / interval, _FASTEST_HZ) if interval else default
+                default = _DEFAULT_RATES[kind]
+                self._rates[kind] = 0.0 if interval < 0 else min(1e6 / interval, _MAX_RATE_HZ) if interval else default
                 self._due.pop(kind, None)
                 result = mavlink.MAV_RESULT_ACCEPTED
         elif message.command == mavlink.MAV_CMD_REQUEST_MESSAGE:
-            kind = _name(int(message.param1))
-            if kind in _RATES:
+            kind = _message_name(int(message.param1))
+            if kind in _DEFAULT_RATES:
                 result = mavlink.MAV_RESULT_ACCEPTED
                 for answer, part in self._message(kind, self._now):
-                    self._say(answer, part)
+                    self._send(answer, part)
         elif message.command == mavlink.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE:
             result = mavlink.MAV_RESULT_ACCEPTED
         answer = mavlink.MAVLink_command_ack_message(
             message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
         )
-        self._say(answer, AUTOPILOT)
+        self._send(answer, AUTOPILOT)
 
-    def _tell_parameter(self, name: str) -> None:
+    def _send_parameter(self, name: str) -> None:
         index = list(self.parameters).index(name)
         kind = mavlink.MAV_PARAM_TYPE_REAL32
         value = self.parameters[name]
-        self._say(
+        self._send(
             mavlink.MAVLink_param_value_message(name.encode(), value, kind, len(self.parameters), index), AUTOPILOT
         )
 
     def _message(self, kind: str, time: float) -> Iterator[tuple[Any, int]]:
-        """The message of a kind now, and which component says it."""
+        """The current message of a type, and the component that sends it."""
         boot_ms = (self.boot_ns(time) // 1_000_000) & 0xFFFFFFFF
         if kind == "HEARTBEAT":
             yield (
@@ -262,7 +264,7 @@ class Autopilot:
         if kind == "SYSTEM_TIME":
             yield mavlink.MAVLink_system_time_message(round(1e6 * (_UNIX_AT_START + time)), boot_ms), AUTOPILOT
             return
-        now = self._airframe.flying(time)
+        now = self._airframe.sensor_readings(time)
         r, v = now.ned_from_body, now.velocity
         if kind == "ATTITUDE":
             roll, pitch = math.atan2(r[2, 1], r[2, 2]), -math.asin(float(np.clip(r[2, 0], -1.0, 1.0)))
@@ -271,11 +273,14 @@ class Autopilot:
                 AUTOPILOT,
             )
         elif kind == "ATTITUDE_QUATERNION":
-            yield mavlink.MAVLink_attitude_quaternion_message(boot_ms, *to_quaternion(r), *now.rates), AUTOPILOT
+            yield (
+                mavlink.MAVLink_attitude_quaternion_message(boot_ms, *quaternion_from_rotation(r), *now.rates),
+                AUTOPILOT,
+            )
         elif kind == "LOCAL_POSITION_NED":
             yield mavlink.MAVLink_local_position_ned_message(boot_ms, *now.position, *v), AUTOPILOT
         elif kind == "GLOBAL_POSITION_INT":
-            latitude, longitude, altitude = self.origin.world(*now.position)
+            latitude, longitude, altitude = self.origin.to_geodetic(*now.position)
             heading = round(math.degrees(math.atan2(r[1, 0], r[0, 0])) % 360.0 * 100) % 36000
             yield (
                 mavlink.MAVLink_global_position_int_message(
@@ -293,24 +298,24 @@ class Autopilot:
             flags = mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
             yield (
                 mavlink.MAVLink_gimbal_device_attitude_status_message(
-                    0, 0, boot_ms, flags, to_quaternion(now.ned_from_gimbal), 0.0, 0.0, 0.0, 0
+                    0, 0, boot_ms, flags, quaternion_from_rotation(now.ned_from_gimbal), 0.0, 0.0, 0.0, 0
                 ),
                 GIMBAL,
             )
         elif kind == "GIMBAL_MANAGER_STATUS" and now.ned_from_gimbal is not None:
             yield mavlink.MAVLink_gimbal_manager_status_message(boot_ms, 0, GIMBAL, 0, 0, 0, 0), AUTOPILOT
 
-    def _say(self, message: Any, part: int) -> None:
+    def _send(self, message: Any, part: int) -> None:
         codec = self._codecs[part]
         if self._signing is not None:
             codec.signing.timestamp = self._signing.next_time(_UNIX_AT_START + self._now)
         frame = bytes(message.pack(codec))
         codec.seq = (codec.seq + 1) % 256
         for address in list(self._senders):
-            self._post(frame, address)
+            self._transmit(frame, address)
 
-    def _post(self, frame: bytes, address: Address) -> None:
-        """Send a message, or what the faults make of it."""
+    def _transmit(self, frame: bytes, address: Address) -> None:
+        """Transmit a frame, subject to the simulated faults."""
         faults = self.faults
         if self._random.random() < faults.drop:
             return
@@ -323,7 +328,7 @@ class Autopilot:
                 data = bytes(broken)
             if faults.delay_s or faults.jitter_s:
                 due = self._now + faults.delay_s + self._random.random() * faults.jitter_s
-                self._waiting.append((due, data, address))
+                self._delayed.append((due, data, address))
             else:
                 self._transport.send(data, address)
 
@@ -334,7 +339,7 @@ class _Sender:
     systems: set[tuple[int, int]] = field(default_factory=set)
 
 
-def _name(number: int) -> str:
-    """The name of a message id; "" for one that the dialect has not."""
+def _message_name(number: int) -> str:
+    """The name of a message id; "" for one that the dialect lacks."""
     kind = mavlink.mavlink_map.get(number)
     return "" if kind is None else str(kind.msgname)

@@ -1,6 +1,7 @@
-"""A camera component as ground stations expect one: what it is, what it tracks, and what it is asked to.
+"""A MAVLink camera component: camera information, target tracking status, and tracking commands.
 
-Units and conventions are MAVLink's here and nowhere else: image coordinates 0 … 1, 1e-7 degrees, NaN for "not told".
+MAVLink's units and conventions are confined to this module: image coordinates 0 … 1, 1e-7 degrees, NaN for "not
+available".
 """
 
 from __future__ import annotations
@@ -12,21 +13,24 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from edge.mavlink.dialect import CAMERA, mavlink
-from edge.mavlink.link.connection import Heard, Link
+from edge.mavlink.link.connection import Link, ReceivedMessage
 from protocols.geometry.camera import Intrinsics
 
-KINDS = ("COMMAND_LONG", "COMMAND_INT", "PARAM_REQUEST_LIST")
+MESSAGE_TYPES = ("COMMAND_LONG", "COMMAND_INT", "PARAM_REQUEST_LIST")
 NAN = float("nan")
 _HEARTBEAT_S = 1.0
-_SOON = 2  # identical commands within so many seconds are the station's repeats
+_REPEAT_WINDOW_S = 2  # s within which identical commands are retransmissions of the station
 _UNKNOWN_INT = 0x7FFFFFFF
 _MODEL = b"Syncline UAV tracker"
 _DEFAULT_HZ = {"CAMERA_TRACKING_IMAGE_STATUS": 10.0, "CAMERA_TRACKING_GEO_STATUS": 5.0, "CAMERA_FOV_STATUS": 1.0}
 
 
 @dataclass(frozen=True, slots=True)
-class Select:
-    """Follow what is in this box: top left and bottom right as shares of the picture, or a point (both the same)."""
+class SelectTarget:
+    """Command to track the target in a box or at a point.
+
+    left, top, right, bottom: fractions of the image; both corners are equal for a point. by: the sender's system id.
+    """
 
     left: float
     top: float
@@ -41,55 +45,56 @@ class Select:
 
 
 @dataclass(frozen=True, slots=True)
-class Stop:
-    """Follow nothing any more."""
+class StopTracking:
+    """Command to stop tracking."""
 
     by: int
 
 
 @dataclass(frozen=True, slots=True)
-class Stream:
-    """The operator's video. kind: "rtsp" or "mjpeg"; uri: where."""
+class VideoStream:
+    """The operator's video stream. kind: "rtsp" or "mjpeg"; uri: its address."""
 
     kind: str
     uri: str
 
 
 @dataclass(slots=True)
-class Shown:
-    """What the component tells of the target and the camera; the agent keeps it up to date.
+class TrackingStatus:
+    """What the component reports of the target and the camera; the agent keeps it up to date.
 
-    state: "idle", "visible", "coasting", "lost". centre, half: shares of the picture, None where unknown or outside.
-    geo: latitude, longitude [degrees], altitude [m]. h_acc, distance [m]; velocity: north, east [m/s]; course [rad].
-    camera: latitude, longitude, altitude of the camera; looking: of the middle of the picture on the ground.
-    quaternion: of the camera's axes forward, right, down in NED.
+    state: "idle", "visible", "coasting", "lost". centre, half_size: of the target's box as fractions of the image, None
+    where unknown or outside. geo: latitude, longitude [degrees], altitude [m]. h_acc, distance [m]; velocity: north,
+    east [m/s]; course [rad]. camera: latitude, longitude, altitude of the camera; image_centre: of the ground point at
+    the image centre. quaternion: of the camera's axes forward, right, down in NED.
     """
 
     state: str = "idle"
     mode_point: bool = False
     centre: tuple[float, float] | None = None
-    half: tuple[float, float] | None = None
+    half_size: tuple[float, float] | None = None
     geo: tuple[float, float, float] | None = None
     h_acc: float = NAN
     velocity: tuple[float, float] | None = None
     distance: float = NAN
     course: float = NAN
     camera: tuple[float, float, float] | None = None
-    looking: tuple[float, float, float] | None = None
+    image_centre: tuple[float, float, float] | None = None
     quaternion: list[float] | None = None
     boot_ms: int = 0
 
 
 @dataclass(slots=True)
-class _Rate:
+class _MessageSchedule:
     interval_s: float
     due_s: float = -math.inf
 
 
 class CameraComponent:
-    """Answers on one link. size: (width, height) [px]; lens: None where not calibrated. stream: None without video.
+    """The camera component on one link. size: (width, height) [px]; lens: None where not calibrated.
 
-    obey: is told of Select and Stop and says whether it could. stations: system ids that may give orders; empty: all.
+    stream: None without video. on_command: called with SelectTarget and StopTracking; whether the command was accepted.
+    stations: system ids that may send commands; empty: all.
     """
 
     def __init__(
@@ -98,19 +103,19 @@ class CameraComponent:
         size: tuple[int, int],
         fps: float,
         lens: Intrinsics | None,
-        stream: Stream | None,
-        obey: Callable[[Select | Stop], bool],
+        stream: VideoStream | None,
+        on_command: Callable[[SelectTarget | StopTracking], bool],
         *,
         stations: frozenset[int] = frozenset(),
         version: tuple[int, int, int] = (0, 1, 0),
     ) -> None:
         self._link, self._size, self._fps, self._lens, self._stream = link, size, fps, lens, stream
-        self._obey, self._stations, self._version = obey, stations, version
-        self.shown = Shown()
+        self._on_command, self._stations, self._version = on_command, stations, version
+        self.status = TrackingStatus()
         self.counters: Counter[str] = Counter()
         self._beat_s = -math.inf
-        self._rates = {kind: _Rate(1.0 / rate) for kind, rate in _DEFAULT_HZ.items()}
-        self._last: dict[tuple[int, int], _Answered] = {}
+        self._rates = {kind: _MessageSchedule(1.0 / rate) for kind, rate in _DEFAULT_HZ.items()}
+        self._last: dict[tuple[int, int], _AcknowledgedCommand] = {}
 
     @property
     def fov(self) -> tuple[float, float]:
@@ -123,47 +128,47 @@ class CameraComponent:
             math.degrees(2.0 * math.atan(0.5 * self._size[1] / matrix[1, 1])),
         )
 
-    def handle(self, heard: Heard, now_s: float) -> None:
-        """Take a message that may be meant for the camera."""
-        message = heard.message
-        if heard.kind not in ("COMMAND_LONG", "COMMAND_INT"):
+    def handle(self, received: ReceivedMessage, now_s: float) -> None:
+        """Handle a message if it addresses the camera."""
+        message = received.message
+        if received.kind not in ("COMMAND_LONG", "COMMAND_INT"):
             return
         if message.target_system not in (0, self._link.vehicle) or message.target_component not in (0, CAMERA):
             return
         for_us = message.target_component == CAMERA
-        if self._stations and heard.system not in self._stations and heard.system != self._link.vehicle:
+        if self._stations and received.system not in self._stations and received.system != self._link.vehicle:
             self.counters["refused.station"] += 1
             if for_us:
-                self._acknowledge(message, heard, mavlink.MAV_RESULT_DENIED)
+                self._acknowledge(message, received, mavlink.MAV_RESULT_DENIED)
             return
         parameters = _parameters(message)
-        key = (heard.system, heard.component)
+        key = (received.system, received.component)
         last = self._last.get(key)
         if (
             last is not None
             and last.same(message, parameters)
-            and now_s - last.at_s < _SOON
-            and message_repeats(message)
+            and now_s - last.at_s < _REPEAT_WINDOW_S
+            and is_retransmission(message)
         ):
-            # Its ACK was lost: say it again, but don't do it again.
+            # The ACK was lost: repeat it without executing the command again.
             self.counters["repeated"] += 1
-            self._acknowledge(message, heard, last.result)
+            self._acknowledge(message, received, last.result)
             return
-        result = self._command(message.command, parameters, heard)
+        result = self._command(message.command, parameters, received)
         if result is None:
             if not for_us:
-                return  # a broadcast that is for others
+                return  # a broadcast for other components
             self.counters["unsupported"] += 1
             result = mavlink.MAV_RESULT_UNSUPPORTED
         if len(self._last) > 32:
             self._last.clear()
-        self._last[key] = _Answered(message.command, parameters, result, now_s)
-        self._acknowledge(message, heard, result)
-        self._answer(message.command, parameters, result)
+        self._last[key] = _AcknowledgedCommand(message.command, parameters, result, now_s)
+        self._acknowledge(message, received, result)
+        self._send_response(message.command, parameters, result)
 
     def tick(self, now_s: float, *, frame: bool) -> None:
-        """Say what is due. frame: a new frame has just been looked at."""
-        # Also before a vehicle is heard: who is called has to know that somebody is there.
+        """Send what is due. frame: a new frame has just been processed."""
+        # Also before any vehicle is known: the peer of an outgoing link has to learn that this side exists.
         if now_s >= self._beat_s:
             self._beat_s = now_s + _HEARTBEAT_S
             self._link.send(
@@ -174,66 +179,70 @@ class CameraComponent:
         if self._link.vehicle is None:
             return
         for kind, rate in self._rates.items():
-            paced = kind != "CAMERA_FOV_STATUS"
-            if paced and (not frame or self.shown.state == "idle"):
+            per_frame = kind != "CAMERA_FOV_STATUS"
+            if per_frame and (not frame or self.status.state == "idle"):
                 continue
             if rate.interval_s > 0.0 and now_s >= rate.due_s:
                 rate.due_s = max(rate.due_s + rate.interval_s, now_s + 0.5 * rate.interval_s)
-                self._tell(kind)
+                self._send_message(kind)
 
-    def tell_now(self) -> None:
-        """The state has changed: say it at once."""
+    def send_status_now(self) -> None:
+        """Send the tracking status at once, after a change of state."""
         for kind in ("CAMERA_TRACKING_IMAGE_STATUS", "CAMERA_TRACKING_GEO_STATUS"):
-            self._tell(kind)
+            self._send_message(kind)
 
-    def _command(self, command: int, p: tuple[float, ...], heard: Heard) -> Any:
-        """Obey one command; its result, None where it is not ours."""
+    def _command(self, command: int, p: tuple[float, ...], received: ReceivedMessage) -> Any:
+        """Execute one command; its MAV_RESULT, None where it is not for a camera."""
         accepted, denied = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED
         if command in _REQUESTS or command == mavlink.MAV_CMD_REQUEST_MESSAGE:
-            return accepted if self._requested(command, p) in self._known() else None
+            return accepted if self._requested(command, p) in self._available_messages() else None
         if command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-            rate = self._rates.get(_kind(p[0]))
+            rate = self._rates.get(_message_name(p[0]))
             if rate is None or not math.isfinite(p[1]):
                 return None
-            default = 1.0 / _DEFAULT_HZ[_kind(p[0])]
+            default = 1.0 / _DEFAULT_HZ[_message_name(p[0])]
             rate.interval_s = default if p[1] == 0 else 0.0 if p[1] < 0 else max(1e-6 * p[1], 1.0 / 60.0)
             rate.due_s = -math.inf
             return accepted
         if command == mavlink.MAV_CMD_CAMERA_TRACK_POINT:
-            order = Select(p[0], p[1], p[0], p[1], heard.system)
+            selection = SelectTarget(p[0], p[1], p[0], p[1], received.system)
         elif command == mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE:
-            order = Select(min(p[0], p[2]), min(p[1], p[3]), max(p[0], p[2]), max(p[1], p[3]), heard.system)
+            selection = SelectTarget(
+                min(p[0], p[2]), min(p[1], p[3]), max(p[0], p[2]), max(p[1], p[3]), received.system
+            )
         elif command == mavlink.MAV_CMD_CAMERA_STOP_TRACKING:
             self.counters["stops"] += 1
-            return accepted if self._obey(Stop(heard.system)) else mavlink.MAV_RESULT_FAILED
+            return accepted if self._on_command(StopTracking(received.system)) else mavlink.MAV_RESULT_FAILED
         else:
             return None
-        inside = all(0.0 <= value <= 1.0 for value in (order.left, order.top, order.right, order.bottom))  # NaN is not
-        flat = not order.is_point and (order.left == order.right or order.top == order.bottom)
-        if not inside or flat or (order.is_point and command == mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE):
+        inside = all(
+            0.0 <= value <= 1.0 for value in (selection.left, selection.top, selection.right, selection.bottom)
+        )  # NaN is not
+        flat = not selection.is_point and (selection.left == selection.right or selection.top == selection.bottom)
+        if not inside or flat or (selection.is_point and command == mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE):
             self.counters["refused.box"] += 1
             return denied
         self.counters["selections"] += 1
-        self.shown.mode_point = order.is_point
-        return accepted if self._obey(order) else mavlink.MAV_RESULT_FAILED
+        self.status.mode_point = selection.is_point
+        return accepted if self._on_command(selection) else mavlink.MAV_RESULT_FAILED
 
-    def _answer(self, command: int, p: tuple[float, ...], result: int) -> None:
-        """Send what a command asked for, after its ACK."""
+    def _send_response(self, command: int, p: tuple[float, ...], result: int) -> None:
+        """Send the data that a command requested, after its ACK."""
         if result != mavlink.MAV_RESULT_ACCEPTED:
             return
         if command in _REQUESTS or command == mavlink.MAV_CMD_REQUEST_MESSAGE:
-            self._tell(self._requested(command, p))
+            self._send_message(self._requested(command, p))
         elif command != mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-            self.tell_now()
+            self.send_status_now()
 
     def _requested(self, command: int, p: tuple[float, ...]) -> str:
-        return _REQUESTS.get(command) or _kind(p[0])
+        return _REQUESTS.get(command) or _message_name(p[0])
 
-    def _known(self) -> frozenset[str]:
+    def _available_messages(self) -> frozenset[str]:
         streams = ("VIDEO_STREAM_INFORMATION", "VIDEO_STREAM_STATUS") if self._stream is not None else ()
         return frozenset(("CAMERA_INFORMATION", "CAMERA_SETTINGS", *self._rates, *streams))
 
-    def _tell(self, kind: str) -> None:
+    def _send_message(self, kind: str) -> None:
         if self._link.send(getattr(self, f"_{kind.lower()}")()):
             self.counters["statuses"] += kind in _DEFAULT_HZ
 
@@ -244,7 +253,7 @@ class CameraComponent:
             flags |= mavlink.CAMERA_CAP_FLAGS_HAS_VIDEO_STREAM
         major, minor, patch = self._version
         return mavlink.MAVLink_camera_information_message(
-            self.shown.boot_ms,
+            self.status.boot_ms,
             list(b"Syncline".ljust(32, b"\0")),
             list(_MODEL.ljust(32, b"\0")),
             major | minor << 8 | patch << 16,
@@ -260,13 +269,13 @@ class CameraComponent:
         )
 
     def _camera_settings(self) -> Any:
-        return mavlink.MAVLink_camera_settings_message(self.shown.boot_ms, mavlink.CAMERA_MODE_VIDEO)
+        return mavlink.MAVLink_camera_settings_message(self.status.boot_ms, mavlink.CAMERA_MODE_VIDEO)
 
     def _video_stream_information(self) -> Any:
         assert self._stream is not None
         rtsp = self._stream.kind == "rtsp"
         hfov = self.fov[0]
-        # MAVLink has no type for MJPEG over HTTP: the uri says what it is, and the encoding is told as unknown.
+        # MAVLink has no type for MJPEG over HTTP: the uri identifies it, and the encoding is reported as unknown.
         return mavlink.MAVLink_video_stream_information_message(
             1,
             1,
@@ -297,64 +306,64 @@ class CameraComponent:
         )
 
     def _camera_tracking_image_status(self) -> Any:
-        shown = self.shown
+        status = self.status
         mode = mavlink.CAMERA_TRACKING_MODE_RECTANGLE
-        if shown.state == "idle":
+        if status.state == "idle":
             mode = mavlink.CAMERA_TRACKING_MODE_NONE
-        elif shown.mode_point:
+        elif status.mode_point:
             mode = mavlink.CAMERA_TRACKING_MODE_POINT
         x, y, box = NAN, NAN, (NAN,) * 4
-        # Off the picture there is no box: where it is thought to be, the geo status tells.
-        if shown.centre is not None and shown.half is not None and all(0.0 <= c <= 1.0 for c in shown.centre):
-            (x, y), (w, h) = shown.centre, shown.half
+        # Outside the image there is no box; the geo status reports the predicted position.
+        if status.centre is not None and status.half_size is not None and all(0.0 <= c <= 1.0 for c in status.centre):
+            (x, y), (w, h) = status.centre, status.half_size
             box = (max(x - w, 0.0), max(y - h, 0.0), min(x + w, 1.0), min(y + h, 1.0))
         return mavlink.MAVLink_camera_tracking_image_status_message(
-            _STATUS[shown.state], mode, mavlink.CAMERA_TRACKING_TARGET_DATA_IN_STATUS, x, y, NAN, *box
+            _STATUS_FLAGS[status.state], mode, mavlink.CAMERA_TRACKING_TARGET_DATA_IN_STATUS, x, y, NAN, *box
         )
 
     def _camera_tracking_geo_status(self) -> Any:
-        shown = self.shown
-        latitude, longitude, altitude = _scaled(shown.geo)
-        north, east = shown.velocity or (NAN, NAN)
+        status = self.status
+        latitude, longitude, altitude = _scaled_position(status.geo)
+        north, east = status.velocity or (NAN, NAN)
         return mavlink.MAVLink_camera_tracking_geo_status_message(
-            _STATUS[shown.state],
+            _STATUS_FLAGS[status.state],
             latitude,
             longitude,
             altitude,
-            shown.h_acc,
+            status.h_acc,
             NAN,
             north,
             east,
-            0.0 if shown.velocity else NAN,
+            0.0 if status.velocity else NAN,
             NAN,
-            shown.distance,
-            shown.course,
+            status.distance,
+            status.course,
             NAN,
         )
 
     def _camera_fov_status(self) -> Any:
-        shown, (hfov, vfov) = self.shown, self.fov
-        camera, image = _scaled(shown.camera), _scaled(shown.looking)
+        status, (hfov, vfov) = self.status, self.fov
+        camera, image = _scaled_position(status.camera), _scaled_position(status.image_centre)
         heights = [round(1e3 * place[2]) if place[0] != _UNKNOWN_INT else _UNKNOWN_INT for place in (camera, image)]
         return mavlink.MAVLink_camera_fov_status_message(
-            shown.boot_ms,
+            status.boot_ms,
             *camera[:2],
             heights[0],
             *image[:2],
             heights[1],
-            shown.quaternion or [NAN] * 4,
+            status.quaternion or [NAN] * 4,
             hfov,
             vfov,
         )
 
-    def _acknowledge(self, message: Any, heard: Heard, result: int) -> None:
+    def _acknowledge(self, message: Any, received: ReceivedMessage, result: int) -> None:
         self._link.send(
-            mavlink.MAVLink_command_ack_message(message.command, result, 0, 0, heard.system, heard.component)
+            mavlink.MAVLink_command_ack_message(message.command, result, 0, 0, received.system, received.component)
         )
 
 
 @dataclass(frozen=True, slots=True)
-class _Answered:
+class _AcknowledgedCommand:
     command: int
     parameters: tuple[float, ...]
     result: int
@@ -364,12 +373,12 @@ class _Answered:
         return bool(self.command == message.command and repr(self.parameters) == repr(parameters))
 
 
-def message_repeats(message: Any) -> bool:
-    """Whether the sender says that it says this again."""
+def is_retransmission(message: Any) -> bool:
+    """Whether the sender marks a command as a retransmission."""
     return int(getattr(message, "confirmation", 0)) > 0
 
 
-_STATUS = {
+_STATUS_FLAGS = {
     "idle": mavlink.CAMERA_TRACKING_STATUS_FLAGS_IDLE,
     "visible": mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE,
     "coasting": mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE | mavlink.CAMERA_TRACKING_STATUS_FLAGS_COASTING,
@@ -381,7 +390,7 @@ _REQUESTS = {
     mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_INFORMATION: "VIDEO_STREAM_INFORMATION",
     mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_STATUS: "VIDEO_STREAM_STATUS",
 }
-"""Commands of before MAV_CMD_REQUEST_MESSAGE, which stations still send."""
+"""Commands from before MAV_CMD_REQUEST_MESSAGE, which stations still send."""
 
 
 def _parameters(message: Any) -> tuple[float, ...]:
@@ -390,14 +399,14 @@ def _parameters(message: Any) -> tuple[float, ...]:
     return (message.param1, message.param2, message.param3, message.param4, message.param5, message.param6)
 
 
-def _kind(number: float) -> str:
-    """The name of a message id that came as a float; "" for none."""
+def _message_name(number: float) -> str:
+    """The name of a message id that came as a float; "" for an unknown one."""
     kind = mavlink.mavlink_map.get(int(number)) if math.isfinite(number) and number == int(number) else None
     return "" if kind is None else str(kind.msgname)
 
 
-def _scaled(geo: tuple[float, float, float] | None) -> tuple[int, int, float]:
-    """1e-7 degrees and metres; the greatest integer and NaN where unknown."""
+def _scaled_position(geo: tuple[float, float, float] | None) -> tuple[int, int, float]:
+    """Latitude, longitude in 1e-7 degrees and altitude [m]; INT32_MAX and NaN where unknown."""
     if geo is None:
         return _UNKNOWN_INT, _UNKNOWN_INT, NAN
     return round(1e7 * geo[0]), round(1e7 * geo[1]), geo[2]

@@ -1,4 +1,4 @@
-"""A small ground station: finds the camera behind an autopilot, selects a target, listens to what is said of it."""
+"""A minimal ground station: finds the camera behind an autopilot, selects a target, receives its tracking status."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 
 from edge.mavlink.dialect import CAMERA, STATION, mavlink
 from edge.mavlink.link.connection import Link
-from edge.mavlink.link.transport import parse
+from edge.mavlink.link.transport import parse_url
 from protocols.core.clocks import NANOSECONDS
 
-_KINDS = (
+_MESSAGE_TYPES = (
     "HEARTBEAT",
     "COMMAND_ACK",
     "CAMERA_INFORMATION",
@@ -22,16 +22,16 @@ _KINDS = (
     "CAMERA_FOV_STATUS",
 )
 _SYSTEM = 255
-_BEAT_S = 1.0
-_AGAIN_S = 1.0
-_TRIES = 5
+_HEARTBEAT_S = 1.0
+_RETRY_S = 1.0
+_MAX_TRIES = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """What the camera says of its target. flags: CAMERA_TRACKING_STATUS_FLAGS; box: shares of the picture or NaN.
+class TargetReport:
+    """The camera's report of its target. flags: CAMERA_TRACKING_STATUS_FLAGS; box: fractions of the image or NaN.
 
-    geo: latitude, longitude [degrees] and horizontal accuracy [m], None before any came.
+    geo: latitude, longitude [degrees] and horizontal accuracy [m], None before the first.
     """
 
     flags: int
@@ -40,7 +40,7 @@ class Told:
 
     @property
     def state(self) -> str:
-        """In words."""
+        """The flags as "idle", "visible", "coasting" or "lost"."""
         if self.flags & mavlink.CAMERA_TRACKING_STATUS_FLAGS_ERROR:
             return "lost"
         if self.flags & mavlink.CAMERA_TRACKING_STATUS_FLAGS_COASTING:
@@ -48,15 +48,15 @@ class Told:
         return "visible" if self.flags & mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE else "idle"
 
 
-class Station:
-    """One station on one link; call ``poll`` often.
+class GroundStation:
+    """A ground station on one link; call ``poll`` often.
 
-    url: where the autopilot is. camera_seen: whether the camera's heartbeat was heard. information: its
-    CAMERA_INFORMATION. told: the newest status. counts: messages of the camera by kind.
+    url: address of the autopilot. camera_seen: whether the camera's heartbeat was received. information: its
+    CAMERA_INFORMATION. report: the newest tracking status. counts: received camera messages by type.
     """
 
     def __init__(self, url: str, *, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        self._link = Link(parse(url), system=_SYSTEM, component=STATION, allowed=_KINDS, now_ns=now_ns)
+        self._link = Link(parse_url(url), system=_SYSTEM, component=STATION, allowed=_MESSAGE_TYPES, now_ns=now_ns)
         self._now_ns = now_ns
         self._beat_s = self._asked_s = -1e9
         self._pending: tuple[int, tuple[float, ...], int] | None = None
@@ -64,20 +64,20 @@ class Station:
         self.camera_seen = False
         self.information: Any = None
         self.stream: Any = None
-        self.told: Told | None = None
+        self.report: TargetReport | None = None
         self.results: dict[int, int] = {}
         self.counts: dict[str, int] = {}
 
     def poll(self, timeout_s: float = 0.0) -> None:
-        """Hear what came, say what is due."""
+        """Receive messages and send what is due."""
         self._link.wait(timeout_s)
-        for heard in self._link.poll():
-            if heard.component == CAMERA:
-                self.counts[heard.kind] = self.counts.get(heard.kind, 0) + 1
-                self._take(heard.kind, heard.message)
+        for received in self._link.poll():
+            if received.component == CAMERA:
+                self.counts[received.kind] = self.counts.get(received.kind, 0) + 1
+                self._handle(received.kind, received.message)
         now = self._now_ns() / NANOSECONDS
         if now >= self._beat_s:
-            self._beat_s = now + _BEAT_S
+            self._beat_s = now + _HEARTBEAT_S
             self._link.send(
                 mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
             )
@@ -87,32 +87,32 @@ class Station:
                 self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_CAMERA_INFORMATION)
             elif self.stream is None and self.information.flags & mavlink.CAMERA_CAP_FLAGS_HAS_VIDEO_STREAM:
                 self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_VIDEO_STREAM_INFORMATION)
-        if self._pending is not None and now >= self._sent_s + _AGAIN_S:
+        if self._pending is not None and now >= self._sent_s + _RETRY_S:
             command, parameters, tries = self._pending
             self._pending = None
-            if tries < _TRIES:
+            if tries < _MAX_TRIES:
                 self._command(command, *parameters, tries=tries + 1)
 
     def select(self, left: float, top: float, right: float, bottom: float) -> None:
-        """Ask the camera to follow what is in a box, shares of the picture."""
+        """Command the camera to track the target in a box, as fractions of the image."""
         self.results.pop(mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, None)
         self._command(mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, left, top, right, bottom)
 
     @property
     def selected(self) -> bool | None:
-        """Whether the last selection was accepted; None while it is not answered."""
+        """Whether the last selection was accepted; None while there is no response."""
         result = self.results.get(mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE)
         return None if result is None else bool(result == mavlink.MAV_RESULT_ACCEPTED)
 
     def stop(self) -> None:
-        """Ask it to follow nothing."""
+        """Command the camera to stop tracking."""
         self._command(mavlink.MAV_CMD_CAMERA_STOP_TRACKING)
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the link."""
         self._link.close()
 
-    def _take(self, kind: str, message: Any) -> None:
+    def _handle(self, kind: str, message: Any) -> None:
         if kind == "HEARTBEAT":
             self.camera_seen = True
         elif kind == "COMMAND_ACK":
@@ -125,10 +125,10 @@ class Station:
             self.stream = message
         elif kind == "CAMERA_TRACKING_IMAGE_STATUS":
             box = (message.rec_top_x, message.rec_top_y, message.rec_bottom_x, message.rec_bottom_y)
-            self.told = Told(message.tracking_status, box, None if self.told is None else self.told.geo)
-        elif kind == "CAMERA_TRACKING_GEO_STATUS" and self.told is not None and message.lat != 0x7FFFFFFF:
+            self.report = TargetReport(message.tracking_status, box, None if self.report is None else self.report.geo)
+        elif kind == "CAMERA_TRACKING_GEO_STATUS" and self.report is not None and message.lat != 0x7FFFFFFF:
             place = (1e-7 * message.lat, 1e-7 * message.lon, message.h_acc)
-            self.told = Told(self.told.flags, self.told.box, place)
+            self.report = TargetReport(self.report.flags, self.report.box, place)
 
     def _command(self, command: int, *parameters: float, tries: int = 0) -> None:
         if self._link.vehicle is None:

@@ -1,4 +1,4 @@
-"""What an autopilot tells of its attitude, place, gimbal and clock, out of MAVLink's units and conventions."""
+"""An autopilot's MAVLink telemetry (attitude, position, gimbal, clock) in SI units and rotation matrices."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from edge.mavlink.dialect import mavlink
-from edge.uav.navigation import from_angles, from_quaternion
+from edge.uav.navigation import rotation_from_euler, rotation_from_quaternion
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 
-KINDS = (
+MESSAGE_TYPES = (
     "HEARTBEAT",
     "ATTITUDE",
     "ATTITUDE_QUATERNION",
@@ -27,7 +27,7 @@ KINDS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attitude:
-    """boot_s: the vehicle's clock [s]. ned_from_body: (3, 3)."""
+    """Attitude. boot_s: the vehicle's clock [s]. ned_from_body: (3, 3)."""
 
     boot_s: float
     ned_from_body: Floats
@@ -35,7 +35,7 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalPosition:
-    """position: (3,) north, east, down of the vehicle's origin [m]. velocity: (3,) NED [m/s]."""
+    """Local position. position: (3,) north, east, down from the vehicle's origin [m]. velocity: (3,) NED [m/s]."""
 
     boot_s: float
     position: Floats
@@ -44,7 +44,7 @@ class LocalPosition:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GlobalPosition:
-    """latitude, longitude [degrees], altitude above the sea and above home [m], velocity: (3,) NED [m/s]."""
+    """Global position. latitude, longitude [degrees], altitude above sea level and home [m], velocity: (3,) NED."""
 
     boot_s: float
     latitude: float
@@ -56,7 +56,7 @@ class GlobalPosition:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GimbalAttitude:
-    """rotation: (3, 3) of the gimbal's axes. earth: into NED; else into the vehicle's heading, level."""
+    """Gimbal attitude. rotation: (3, 3) of its axes; earth: into NED, else into the vehicle's heading frame, level."""
 
     boot_s: float
     rotation: Floats
@@ -65,27 +65,27 @@ class GimbalAttitude:
 
 @dataclass(frozen=True, slots=True)
 class SystemTime:
-    """unix_s: 0 where the vehicle does not know it."""
+    """The vehicle's system time. unix_s: 0 where it is not known."""
 
     boot_s: float
     unix_s: float
 
 
-Report = Attitude | LocalPosition | GlobalPosition | GimbalAttitude | SystemTime
+TelemetryReport = Attitude | LocalPosition | GlobalPosition | GimbalAttitude | SystemTime
 
 
-def report(message: Any) -> Report | None:
-    """What a message tells; None for other kinds, and for one that makes no sense."""
+def parse_telemetry(message: Any) -> TelemetryReport | None:
+    """Parse a telemetry message; None for other types and for invalid values."""
     kind = message.get_type()
     boot = 1e-3 * float(getattr(message, "time_boot_ms", 0))
     if kind == "ATTITUDE":
-        return Attitude(boot, from_angles(message.roll, message.pitch, message.yaw))
+        return Attitude(boot, rotation_from_euler(message.roll, message.pitch, message.yaw))
     if kind == "ATTITUDE_QUATERNION":
-        turned = from_quaternion([message.q1, message.q2, message.q3, message.q4])
-        return None if turned is None else Attitude(boot, turned)
+        rotation = rotation_from_quaternion([message.q1, message.q2, message.q3, message.q4])
+        return None if rotation is None else Attitude(boot, rotation)
     if kind == "LOCAL_POSITION_NED":
-        place = np.array([message.x, message.y, message.z], np.float64)
-        return LocalPosition(boot, place, np.array([message.vx, message.vy, message.vz], np.float64))
+        position = np.array([message.x, message.y, message.z], np.float64)
+        return LocalPosition(boot, position, np.array([message.vx, message.vy, message.vz], np.float64))
     if kind == "GLOBAL_POSITION_INT":
         if (message.lat == 0 and message.lon == 0) or abs(message.lat) > 900_000_000:
             return None  # no fix yet
@@ -94,22 +94,22 @@ def report(message: Any) -> Report | None:
             boot, 1e-7 * message.lat, 1e-7 * message.lon, 1e-3 * message.alt, 1e-3 * message.relative_alt, velocity
         )
     if kind == "GIMBAL_DEVICE_ATTITUDE_STATUS":
-        turned = from_quaternion(message.q)
-        if turned is None:
+        rotation = rotation_from_quaternion(message.q)
+        if rotation is None:
             return None
         flags = int(message.flags)
         vehicle = bool(flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME)
         earth = bool(flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME)
-        if not vehicle and not earth:  # of before these two flags: what the yaw is locked to
+        if not vehicle and not earth:  # senders older than these two flags: the yaw lock defines the frame
             earth = bool(flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK)
-        return GimbalAttitude(boot, turned, earth)
+        return GimbalAttitude(boot, rotation, earth)
     if kind == "SYSTEM_TIME":
         return SystemTime(boot, 1e-6 * message.time_unix_usec)
     return None
 
 
 def ned_from_gimbal(gimbal: GimbalAttitude, ned_from_body: Floats | None) -> Floats | None:
-    """(3, 3) of a gimbal's axes; None where the vehicle's heading is needed and not known."""
+    """Rotation (3, 3) of a gimbal into NED; None where the vehicle's heading is needed and not known."""
     if gimbal.earth:
         return gimbal.rotation
     if ned_from_body is None:

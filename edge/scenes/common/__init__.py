@@ -1,1 +1,1 @@
-"""What simulated scenes share: cameras, placement, background, sensor noise."""
+"""Common parts of simulated scenes: cameras, placement, background, sensor noise."""

@@ -1,8 +1,8 @@
-"""What stands still behind the moving things: a furnished room or an open field, ray-cast for one camera.
+"""Static background of a scene for one camera: a furnished room or an open field, ray-cast.
 
-Everything is made of boxes, balls and value noise from the scene's seed, so that all cameras of a scene see
-the same room. The furniture holds look-alikes of the marker on purpose: balls of nearby hues, cardboard, a
-wooden floor.
+Everything consists of boxes, spheres and value noise from the scene's seed, so that all cameras of a scene see the same
+room. The furniture includes distractors similar to the marker on purpose: balls of nearby hues, cardboard, a wooden
+floor.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from protocols.geometry.types import Floats
 _CELLS = 256
 _LIGHT = np.array([0.25, -0.35, 0.9]) / np.linalg.norm([0.25, -0.35, 0.9])
 LIGHT_WORLD: Floats = _LIGHT
-"""Unit vector (3,) towards the lamp, in the world."""
+"""Unit vector (3,) towards the lamp, in world axes."""
 
 _WALL_BGR = np.array([[196, 206, 208], [186, 190, 178], [205, 200, 192], [176, 192, 200]], dtype=np.float64)
 _BALL_BGR = ((38, 36, 205), (40, 205, 228), (170, 70, 40), (140, 60, 205))  # red, yellow, blue, pink
@@ -28,7 +28,8 @@ _POSTER_BGR = ((60, 60, 190), (150, 140, 60), (150, 110, 60), (90, 130, 90), (12
 def room(rays: Floats, eye: Floats, half: float, height: float, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
     """A furnished room (H, W, 3) BGR.
 
-    rays: (H, W, 3) directions in the world, one a pixel. eye: (3,) camera centre. half, height: of the room [m].
+    rays: (H, W, 3) directions in world axes, one per pixel. eye: (3,) camera centre. half, height: half the side and
+    the height of the room [m].
     """
     directions = rays.reshape(-1, 3)
     texture = _Texture(rng)
@@ -47,7 +48,7 @@ def field(rays: Floats, eye: Floats, rng: np.random.Generator) -> npt.NDArray[np
     directions = rays.reshape(-1, 3)
     texture = _Texture(rng)
     down = directions[:, 2]
-    # The horizon as a circle: noise over an azimuth would tear at ±180°.
+    # The horizon as a circle: noise over an azimuth would have a seam at ±180°.
     east, north = (directions[:, :2] / np.maximum(np.linalg.norm(directions[:, :2], axis=1), 1e-9)[:, None]).T
     sky = np.array([225, 195, 160.0]) + np.clip(down, 0, 1)[:, None] * np.array([10, -45, -70.0])
     clouds = texture.at(east * 2.0 + np.clip(down, 0, 1) * 6.0, north * 2.0)
@@ -83,7 +84,7 @@ class _Texture:
             scale, shift = 2.3**octave * 2.0, 37.7 * octave
             u = np.mod(x * scale + shift, _CELLS).astype(np.float32)
             v = np.mod(y * scale + 1.7 * shift, _CELLS).astype(np.float32)
-            rows = len(u) // 1024 + 1  # cv2.remap wants images, not rows longer than 32767
+            rows = len(u) // 1024 + 1  # cv2.remap takes images, not rows longer than 32767
             padded = np.zeros((2, rows * 1024), np.float32)
             padded[0, : len(u)], padded[1, : len(v)] = u, v
             sample = cv2.remap(
@@ -94,7 +95,7 @@ class _Texture:
 
 
 def _by_the_wall(rng: np.random.Generator, half: float, depth: float) -> Floats:
-    """A place (2,) on the floor within ``depth`` of a random wall: behind the cameras, never before them."""
+    """A place (2,) on the floor within ``depth`` of a random wall: behind the cameras, never in front of them."""
     along, inset = rng.uniform(-0.85 * half, 0.85 * half), half - rng.uniform(0.5, 1.0) * depth
     return np.array([(inset, along), (-inset, along), (along, inset), (along, -inset)][int(rng.integers(4))])
 
@@ -120,7 +121,7 @@ def _shell(
     _paint_window(wall, side, along, hit[:, 2], int(rng.integers(4)), rng.uniform(-0.5, 0.5) * half)
     colour = np.where((side == 4)[:, None], _planks(hit, texture), wall)
     colour[side == 5] = np.array([222, 226, 226.0])
-    # Corners gather less light.
+    # Ambient occlusion: corners are darker.
     to_corner = np.minimum.reduce([half - np.abs(along), hit[:, 2] + 0.15, height - hit[:, 2] + 0.3])
     on_flat = np.minimum(half - np.abs(hit[:, 0]), half - np.abs(hit[:, 1]))
     nook = np.where(axis == 2, on_flat, to_corner)
@@ -181,7 +182,7 @@ def _add_box(
     texture: _Texture,
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:
-    """A box on the floor by the wall; nearer hits win."""
+    """Add a box on the floor by the wall, by depth test."""
     bgr = np.array(_BOX_BGR[int(rng.integers(len(_BOX_BGR)))], dtype=np.float64)
     size = np.array([rng.uniform(0.2, 0.35), rng.uniform(0.2, 0.35), rng.uniform(0.2, 0.9)])
     centre = np.array([*_by_the_wall(rng, half, 0.4), 0.5 * size[2]])
@@ -201,7 +202,7 @@ def _add_box(
 def _add_ball(
     directions: Floats, eye: Floats, depth: Floats, colour: Floats, centre: Floats, radius: float, bgr: Floats
 ) -> tuple[Floats, Floats]:
-    """A ball that is not the marker; nearer hits win."""
+    """Add a ball that is not the marker, by depth test."""
     square = (directions * directions).sum(axis=1)
     closest = directions @ (centre - eye) / square
     miss2 = ((eye + closest[:, None] * directions - centre) ** 2).sum(axis=1)
@@ -214,6 +215,6 @@ def _add_ball(
 
 
 def _finish(colour: Floats, shape: tuple[int, ...]) -> npt.NDArray[np.uint8]:
-    """To 8 bits, with the softness of a lens."""
+    """Round to 8 bits, blurred as by a lens."""
     image = np.clip(colour, 0.0, 255.0).reshape(shape[0], shape[1], 3).astype(np.float32)
     return np.asarray(np.rint(cv2.GaussianBlur(image, (0, 0), 0.6)), dtype=np.uint8)

@@ -1,6 +1,6 @@
-"""What every simulated world is: cameras with true clocks and poses, and a way to draw what they see.
+"""Base of all simulated scenes: cameras with true clocks and poses, and the renderer's interface.
 
-World axes: z up, metres, the floor at z = 0. Time: the world's true time [s], which no camera knows.
+World axes: z up, metres, the floor at z = 0. Time: true time [s] of the scene, which no camera knows.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from protocols.geometry.types import Floats
 class SimulatedClock:
     """A camera's own clock.
 
-    epoch_ns: what it shows at true time 0. rate: its seconds per true second (1 + drift).
-    stamp_noise_s: std of the error with which a moment is stamped.
+    epoch_ns: its reading at true time 0. rate: its seconds per true second (1 + drift). stamp_noise_s: std of the error
+    of time stamps.
     """
 
     epoch_ns: int
@@ -31,26 +31,25 @@ class SimulatedClock:
     stamp_noise_s: float = 50e-6
 
     def device_time_ns(self, true_time: float) -> int:
-        """What the clock shows at a true time [s].
+        """Reading of the clock at a true time [s].
 
-        In whole nanoseconds from the epoch on: a Unix time as a float would be coarse by a quarter
-        of a microsecond.
+        In whole nanoseconds from the epoch on: a Unix time as a float would have a resolution of a quarter of a
+        microsecond.
         """
         return self.epoch_ns + round(self.rate * true_time * NANOSECONDS)
 
     def true_time(self, device_time_ns: int) -> float:
-        """The true time [s] at which the clock shows ``device_time_ns``."""
+        """The true time [s] at which the clock reads ``device_time_ns``."""
         return (device_time_ns - self.epoch_ns) / NANOSECONDS / self.rate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedCamera:
-    """One camera of a world: where it stands, how it sees, when it fires.
+    """One camera of a scene: intrinsics, pose, clock and exposure.
 
-    fps: on its own clock. exposure_s: shutter time. readout_s: first to last row (0 = global shutter).
-    jitter_s: std by which a capture really strays from the regular grid (and is stamped truthfully).
-    drop_fraction: share of frames that the device never delivers. start_s: true time of its first frame in
-    an offline session.
+    fps: on its own clock. exposure_s: exposure time. readout_s: first to last row (0 = global shutter). jitter_s: std
+    of the true deviation of captures from the regular grid (which the time stamps include). drop_fraction: share of
+    frames that the device never delivers. start_s: true time of its first frame in an offline session.
     """
 
     name: str
@@ -69,7 +68,7 @@ class SimulatedCamera:
     ) -> Floats:
         """True mid-exposure times (count,) [s] of frames ``first`` … of a recording that begins at ``start``.
 
-        jitter_s: instead of the camera's own.
+        jitter_s: in place of the camera's own.
         """
         period = 1.0 / (self.fps * self.clock.rate)
         limit = 0.3 * period  # frames keep their order
@@ -78,7 +77,7 @@ class SimulatedCamera:
 
 
 class Renderer(ABC):
-    """Draws what one camera sees."""
+    """Renders the images of one camera."""
 
     @abstractmethod
     def render(self, true_time: float) -> npt.NDArray[np.uint8]:
@@ -86,10 +85,10 @@ class Renderer(ABC):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene(ABC):
-    """A simulated world; a pure function of its name, seed and number of cameras.
+class SimulatedScene:
+    """A simulated scene with its cameras; a pure function of its name, seed and number of cameras.
 
-    A new kind of world derives from this, says how its cameras see it, and is entered in the registry.
+    A new kind of scene derives from this class, and is entered with its renderer in ``edge.scenes``.
     """
 
     name: str
@@ -105,11 +104,7 @@ class Scene(ABC):
         raise InputError(f"scene {self.name} has no camera {name!r}", remedy=f"use one of {names}")
 
     def true_time_map(self, camera: str, reference_camera: str) -> TimeMap:
-        """The truth that timing looks for: ``t_reference = clock_rate * t_camera + time_offset`` [s]."""
+        """True clock relation of two cameras: ``t_reference = clock_rate * t_camera + time_offset`` [s]."""
         clock, reference = self.camera(camera).clock, self.camera(reference_camera).clock
         rate = reference.rate / clock.rate
         return TimeMap(rate, reference.epoch_ns / NANOSECONDS - rate * (clock.epoch_ns / NANOSECONDS))
-
-    @abstractmethod
-    def renderer(self, camera: str, rng: np.random.Generator) -> Renderer:
-        """Draws frames of one camera; ``rng`` gives the sensor noise."""

@@ -1,4 +1,4 @@
-"""Random but sensible cameras: around a volume, looking in, each with its own lens and clock."""
+"""Random camera placement: around a volume, looking inwards, each with its own intrinsics and clock."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _MIXED_FPS = (30.0, 25.0, 29.97, 50.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
-    """Where cameras of a scene may stand and what they are; ranges are (low, high).
+class CameraPlacement:
+    """Distribution of the cameras of a scene; ranges are (low, high).
 
-    distance: from the volume's axis [m]. height: above the floor [m]. aim: std [m] by which a camera misses
-    the volume's centre. focal: [image widths].
+    distance: from the volume's axis [m]. height: above the floor [m]. aim: std [m] of the point aimed at about the
+    volume's centre. focal: [image widths].
     """
 
     distance: tuple[float, float]
@@ -35,8 +35,8 @@ class Surroundings:
     roll: float = 0.3
 
 
-def cameras_around(
-    rng: np.random.Generator, centre: Floats, count: int, surroundings: Surroundings
+def place_cameras(
+    rng: np.random.Generator, centre: Floats, count: int, surroundings: CameraPlacement
 ) -> tuple[SimulatedCamera, ...]:
     """``count`` cameras cam0 … around ``centre`` (3,) [m], in a random order of azimuth."""
     sector = 2.0 * np.pi / count
@@ -44,8 +44,8 @@ def cameras_around(
     return tuple(_camera(rng, index, float(azimuth[index]), centre, surroundings) for index in range(count))
 
 
-def looking_at(position: Floats, target: Floats, roll: float) -> Pose:
-    """A camera at ``position`` (3,) looking at ``target`` (3,), turned by ``roll`` [rad] about its axis."""
+def look_at_pose(position: Floats, target: Floats, roll: float) -> Pose:
+    """Pose of a camera at ``position`` (3,) looking at ``target`` (3,), rolled by ``roll`` [rad] about its axis."""
     forward = (target - position) / np.linalg.norm(target - position)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -54,31 +54,33 @@ def looking_at(position: Floats, target: Floats, roll: float) -> Pose:
 
 
 def _camera(
-    rng: np.random.Generator, index: int, azimuth: float, centre: Floats, where: Surroundings
+    rng: np.random.Generator, index: int, azimuth: float, centre: Floats, placement: CameraPlacement
 ) -> SimulatedCamera:
-    distance = rng.uniform(*where.distance)
+    distance = rng.uniform(*placement.distance)
     position = np.array(
-        [centre[0] + distance * np.cos(azimuth), centre[1] + distance * np.sin(azimuth), rng.uniform(*where.height)]
+        [centre[0] + distance * np.cos(azimuth), centre[1] + distance * np.sin(azimuth), rng.uniform(*placement.height)]
     )
-    pose = looking_at(position, centre + rng.normal(0.0, where.aim, 3), rng.uniform(-where.roll, where.roll))
-    rates = _MIXED_FPS if where.mixed_fps else where.fps
+    pose = look_at_pose(
+        position, centre + rng.normal(0.0, placement.aim, 3), rng.uniform(-placement.roll, placement.roll)
+    )
+    rates = _MIXED_FPS if placement.mixed_fps else placement.fps
     fps = float(rates[index % len(rates)])
     return SimulatedCamera(
         name=f"cam{index}",
-        intrinsics=_lens(rng, where),
+        intrinsics=_lens(rng, placement),
         pose=pose,
         fps=fps,
         clock=_clock(rng, index),
-        exposure_s=where.exposure_s,
+        exposure_s=placement.exposure_s,
         jitter_s=rng.uniform(0.5e-3, 2.5e-3),
         drop_fraction=rng.uniform(0.01, 0.03),
         start_s=float(rng.uniform(0.0, 2.0)),
     )
 
 
-def _lens(rng: np.random.Generator, where: Surroundings) -> Intrinsics:
-    width, height = where.size
-    focal = rng.uniform(*where.focal) * width
+def _lens(rng: np.random.Generator, placement: CameraPlacement) -> Intrinsics:
+    width, height = placement.size
+    focal = rng.uniform(*placement.focal) * width
     matrix = np.array(
         [
             [focal, 0.0, 0.5 * (width - 1) + rng.normal(0.0, 0.01 * width)],
@@ -87,14 +89,14 @@ def _lens(rng: np.random.Generator, where: Surroundings) -> Intrinsics:
         ]
     )
     k1 = rng.uniform(-0.25, 0.05)
-    # 9 k1² < 20 k2 keeps the polynomial monotonic: a lens never folds the world over.
+    # 9 k1² < 20 k2 keeps the radial polynomial monotonic, hence the distortion invertible.
     k2 = 0.6 * k1 * k1 + rng.uniform(0.005, 0.05)
     k3 = rng.uniform(0.0, 0.01)
     return Intrinsics(width, height, matrix, np.array([k1, k2, *rng.normal(0.0, 6e-4, 2), k3]))
 
 
 def _clock(rng: np.random.Generator, index: int) -> SimulatedClock:
-    """Epochs of all the kinds that are met: time since the camera's boot, Unix time, and 0 at its start."""
+    """Epochs of all usual kinds: time since the camera's boot, Unix time, and 0 at its start."""
     uptime = rng.uniform(10.0, 2e5)
     unix = 1.75e9 + rng.uniform(0.0, 1e7)
     start = rng.uniform(-180.0, 180.0)

@@ -1,4 +1,4 @@
-"""The same world through smaller or slower cameras: what lets many simulated cameras share a small machine."""
+"""A scene at another resolution or frame rate, so that many simulated cameras fit on a small machine."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import TypeVar
 
 import numpy as np
 
-from edge.scenes.common.base import Scene
+from edge.scenes.common.base import SimulatedScene
 from protocols.geometry.camera import Intrinsics
 
-_Scene = TypeVar("_Scene", bound=Scene)
+_Scene = TypeVar("_Scene", bound=SimulatedScene)
 
 
-def scaled(scene: _Scene, width: int | None = None, fps: float | None = None) -> _Scene:
-    """``scene`` with all pictures ``width`` [px] wide and all cameras at ``fps`` [Hz]; None = as they are."""
+def rescale_scene(scene: _Scene, width: int | None = None, fps: float | None = None) -> _Scene:
+    """``scene`` with all images ``width`` [px] wide and all cameras at ``fps`` [Hz]; None = unchanged."""
     cameras = tuple(
         replace(
             camera,
-            intrinsics=camera.intrinsics if width is None else scaled_lens(camera.intrinsics, width),
+            intrinsics=camera.intrinsics if width is None else rescale_intrinsics(camera.intrinsics, width),
             fps=camera.fps if fps is None else fps,
         )
         for camera in scene.cameras
@@ -26,8 +26,8 @@ def scaled(scene: _Scene, width: int | None = None, fps: float | None = None) ->
     return replace(scene, cameras=cameras)
 
 
-def scaled_lens(lens: Intrinsics, width: int) -> Intrinsics:
-    """A lens of the same view for pictures ``width`` [px] wide; pixel centres are at whole numbers."""
+def rescale_intrinsics(lens: Intrinsics, width: int) -> Intrinsics:
+    """Intrinsics of the same view for images ``width`` [px] wide; pixel centres are at integers."""
     factor = width / lens.width
     height = round(lens.height * factor)
     matrix = lens.matrix.copy()

@@ -1,4 +1,4 @@
-"""What every drawn camera shares: the rays of its pixels, and the noise of its sensor."""
+"""Common parts of renderers: viewing rays of pixels, and sensor noise."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
 PEDESTAL = 20
-"""The noise is stored with it, so that one saturating 8-bit addition applies it."""
-_BANK_MARGIN = 96  # px by which the noise picture exceeds the image: 9216 different crops
+"""Offset of the stored noise, so that one saturating 8-bit addition applies it."""
+_BANK_MARGIN = 96  # px by which the noise image exceeds the image: 9216 different crops
 
 
 def pixel_rays(lens: Intrinsics, u: Floats, v: Floats) -> Floats:
@@ -32,13 +32,13 @@ class SensorNoise:
         noise = rng.standard_normal(shape, dtype=np.float32) * std + PEDESTAL
         self._bank = np.clip(np.rint(noise), 0, 255).astype(np.uint8)
 
-    def add(self, dimmed: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        """The noisy picture of one from which PEDESTAL has been taken; it saturates as a sensor does."""
+    def add(self, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        """The noisy image of one from which PEDESTAL has been subtracted; it saturates as a sensor does."""
         dy, dx = self._rng.integers(0, _BANK_MARGIN, 2)
         width, height = self._size
-        return np.asarray(cv2.add(dimmed, self._bank[dy : dy + height, dx : dx + width]), dtype=np.uint8)
+        return np.asarray(cv2.add(image, self._bank[dy : dy + height, dx : dx + width]), dtype=np.uint8)
 
 
-def dimmed(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """A picture less PEDESTAL, for ``SensorNoise.add``."""
-    return np.asarray(np.maximum(picture, PEDESTAL) - np.uint8(PEDESTAL), dtype=np.uint8)
+def subtract_pedestal(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """An image less PEDESTAL, for ``SensorNoise.add``."""
+    return np.asarray(np.maximum(image, PEDESTAL) - np.uint8(PEDESTAL), dtype=np.uint8)

@@ -1,1 +1,1 @@
-"""Scenes with one moving marker."""
+"""Scenes of one moving marker: scene, renderer, simulated detections."""

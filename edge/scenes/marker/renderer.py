@@ -1,8 +1,7 @@
-"""Draws the marker of a simulated world into a camera's picture, at sub-pixel truth.
+"""Renderer of marker scenes: anti-aliased ball, motion blur, static background, sensor noise.
 
-The ball is drawn as what it is: each pixel's ray is tested against the sphere, so its outline is the exact ellipse
-that the lens makes of it, and the picture is the mean over the exposure, so a moving ball is smeared about the place
-where it was at mid-exposure.
+Each pixel's ray is intersected with the sphere, so that the outline is the exact ellipse under the lens model; the
+image is the mean over the exposure, so that a moving ball is smeared about its mid-exposure position.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy.typing as npt
 
 from edge.scenes.common import background
 from edge.scenes.common.base import Renderer
-from edge.scenes.common.sensor import PEDESTAL, SensorNoise, dimmed, pixel_rays
+from edge.scenes.common.sensor import PEDESTAL, SensorNoise, pixel_rays, subtract_pedestal
 from protocols.geometry.types import Floats
 
 if TYPE_CHECKING:
@@ -23,13 +22,13 @@ if TYPE_CHECKING:
 
 BACKGROUND_STREAM = 2  # beside the streams of cameras (0) and path (1)
 _NOISE_STD = 3.0  # of a small sensor indoors, in 8-bit steps
-_MAX_STEPS = 16  # instants that an exposure is sampled at
-_BACKGROUND_WIDTH = 960  # px; wider pictures get a background of this width, enlarged
+_MAX_STEPS = 16  # samples of one exposure
+_BACKGROUND_WIDTH = 960  # px; wider images get a background of this width, enlarged
 _AMBIENT, _DIFFUSE, _GLINT = 0.62, 0.42, 0.35
 
 
 class MarkerRenderer(Renderer):
-    """Pictures of a marker scene from one camera.
+    """Images of a marker scene from one camera.
 
     noise_rng: sensor noise. noise_std: its std [8-bit steps]. The furniture comes from the scene's own seed, so that
     all cameras see the same.
@@ -47,7 +46,7 @@ class MarkerRenderer(Renderer):
         self._name = camera
         lens = self._camera.intrinsics
         self._background = self._draw_background(np.random.default_rng([scene.seed, BACKGROUND_STREAM]))
-        self._dimmed = dimmed(self._background)
+        self._dimmed = subtract_pedestal(self._background)
         self._noise = SensorNoise(lens.width, lens.height, noise_std, noise_rng)
         self._light = self._camera.pose.rotation @ background.LIGHT_WORLD
 
@@ -64,14 +63,14 @@ class MarkerRenderer(Renderer):
         v = (np.arange(height) + 0.5) * lens.height / height - 0.5
         rays = pixel_rays(lens, *np.meshgrid(u, v)) @ pose.rotation
         if self._scene.room is None:
-            picture = background.field(rays, pose.position, rng)
+            image = background.field(rays, pose.position, rng)
         else:
-            picture = background.room(rays, pose.position, *self._scene.room, rng)
+            image = background.room(rays, pose.position, *self._scene.room, rng)
         if shrink > 1.0:
-            picture = np.asarray(
-                cv2.resize(picture, (lens.width, lens.height), interpolation=cv2.INTER_CUBIC), dtype=np.uint8
+            image = np.asarray(
+                cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_CUBIC), dtype=np.uint8
             )
-        return picture
+        return image
 
     def _draw_marker(self, image: npt.NDArray[np.uint8], true_time: float) -> None:
         camera, lens = self._camera, self._camera.intrinsics
@@ -91,7 +90,7 @@ class MarkerRenderer(Renderer):
         rays = np.where(np.isfinite(rays), rays, 0.0)
         steps = int(np.clip(np.ceil(2.0 * smear), 1, _MAX_STEPS))
         instants = true_time + camera.exposure_s * ((np.arange(steps) + 0.5) / steps - 0.5)
-        if camera.readout_s:  # the ball is where it was when its own row was read
+        if camera.readout_s:  # the ball's position when its own row is read
             row = np.clip(pixels[1, 1], 0, lens.height - 1)
             instants = instants + camera.readout_s * (row / (lens.height - 1) - 0.5)
         centres = camera.pose.camera_from_world(self._scene.marker_position(instants))
@@ -104,17 +103,17 @@ class MarkerRenderer(Renderer):
     def _ball(self, rays: Floats, centres: Floats) -> tuple[Floats, Floats]:
         """Coverage (s, h, w) in 0..1 and colour (s, h, w, 3) of the ball.
 
-        rays: (h, w, 3) unit vectors, one a pixel. centres: (s, 3) of the ball at s instants; camera axes.
+        rays: (h, w, 3) unit vectors, one per pixel. centres: (s, 3) of the ball at s instants; camera axes.
         """
         distance = np.linalg.norm(centres, axis=1)
         towards = centres / distance[:, None]
         cosine = np.clip(np.einsum("hwk,sk->shw", rays, towards), 0.05, 1.0)
         sine_edge = (self._scene.marker_radius / distance)[:, None, None]
-        # Where a ray passes the centre, in units of the sphere's radius, across the line of sight.
+        # Offset of a ray from the centre across the line of sight, in units of the sphere's radius.
         across = (rays / cosine[..., None] - towards[:, None, None]) / sine_edge[..., None]
         across *= cosine[..., None]  # sin instead of tan: exact at the outline
         radius = np.linalg.norm(across, axis=-1)
-        # Pixels from the outline: the radius' own slope in the picture gives the scale.
+        # Distance from the outline in pixels: scaled by the gradient of the radius in the image.
         slope = np.hypot(np.gradient(radius, axis=1), np.gradient(radius, axis=2)) if min(rays.shape[:2]) > 1 else 1.0
         cover = np.clip(0.5 + (1.0 - radius) / np.maximum(slope, 1e-3), 0.0, 1.0)
         inner = np.minimum(radius, 1.0)

@@ -1,4 +1,4 @@
-"""A recorded session of a simulated world without drawing a picture: what detectors would have reported."""
+"""Simulated detections of the marker, without rendering: what detectors would have reported."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from protocols.geometry.types import Bools, Floats, Ints
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedTrack:
-    """What one camera reported of the marker; rows in order of time.
+    """Detections of the marker by one camera; rows in order of time.
 
     frame: (n,). time: (n,) [s] on the camera's own clock. pixels: (n, 2) distorted pixels. size: (n,) diameter [px].
-    Truth: true_time: (n,) [s] of the exposures; is_outlier: (n,) rows that show something else.
+    Ground truth: true_time: (n,) [s] of the exposures; is_outlier: (n,) rows that are false detections.
     """
 
     camera: str
@@ -34,9 +34,10 @@ class SimulatedTrack:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedTracks:
-    """A session and its truth: the scene knows intrinsics, poses, clocks and the marker's path.
+    """Detections of all cameras with ground truth: the scene knows intrinsics, poses, clocks and the marker's
+    trajectory.
 
-    start, end: true times [s] within which frames were taken.
+    start, end: true times [s] between which frames were exposed.
     """
 
     scene: MarkerScene
@@ -46,20 +47,20 @@ class SimulatedTracks:
 
     @property
     def cameras(self) -> tuple[SimulatedCamera, ...]:
-        """All cameras, also such as saw nothing."""
+        """All cameras, also those without detections."""
         return self.scene.cameras
 
     def true_time_map(self, camera: str, reference_camera: str) -> TimeMap:
-        """``t_reference = clock_rate * t_camera + time_offset`` in truth."""
+        """True clock relation ``t_reference = clock_rate * t_camera + time_offset``."""
         return self.scene.true_time_map(camera, reference_camera)
 
     def marker_position(self, camera: str, camera_time: Floats) -> Floats:
-        """Where the marker truly was, (n, 3) [m], at times (n,) [s] on a camera's clock."""
+        """True marker positions (n, 3) [m] at times (n,) [s] on a camera's clock."""
         clock = self.scene.camera(camera).clock
         return self.scene.marker_position((np.asarray(camera_time) - clock.epoch_ns / NANOSECONDS) / clock.rate)
 
 
-def simulated_session(
+def simulate_tracks(
     scene: MarkerScene,
     duration_s: float,
     seed: int,
@@ -70,16 +71,16 @@ def simulated_session(
     drop_fraction: float | None = None,
     jitter_s: float | None = None,
 ) -> SimulatedTracks:
-    """Film the marker for ``duration_s`` from true time 0; every camera starts when its ``start_s`` says.
+    """Simulate detections for ``duration_s`` from true time 0; every camera starts at its ``start_s``.
 
-    pixel_noise: std of each coordinate [px]; 0.1 is what the shipped detector does. size_noise: relative std of the
-    diameter. outlier_fraction: share of rows that show a random place instead. drop_fraction, jitter_s:
-    for all cameras, instead of their own. The same arguments give the same session.
+    pixel_noise: std of each coordinate [px]; 0.1 is that of the shipped detector. size_noise: relative std of the
+    diameter. outlier_fraction: share of rows at a uniformly random place. drop_fraction, jitter_s: for all cameras, in
+    place of their own. The same arguments give the same detections.
     """
     tracks = {}
     for index, camera in enumerate(scene.cameras):
         rng = np.random.default_rng([seed, index])
-        tracks[camera.name] = _film(
+        tracks[camera.name] = _record(
             scene,
             camera,
             duration_s,
@@ -93,7 +94,7 @@ def simulated_session(
     return SimulatedTracks(scene, tracks, 0.0, duration_s)
 
 
-def _film(
+def _record(
     scene: MarkerScene,
     camera: SimulatedCamera,
     duration_s: float,
@@ -110,7 +111,7 @@ def _film(
     pixels, size = scene.seen_by(camera.name, true_time)
     pixels = pixels + rng.normal(0.0, pixel_noise, (count, 2))
     size = size * (1.0 + rng.normal(0.0, size_noise, count))
-    # A ball that the image's border cuts is not reported.
+    # A ball truncated by the image border is not detected.
     limit = np.array([camera.intrinsics.width, camera.intrinsics.height]) - 1.0
     reach = 0.5 * size[:, None]
     with np.errstate(invalid="ignore"):

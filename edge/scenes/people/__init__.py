@@ -1,1 +1,1 @@
-"""Scenes with walking people."""
+"""Scenes of walking people: scene, gait, renderer, simulated detections."""

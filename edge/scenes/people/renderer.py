@@ -1,6 +1,7 @@
-"""Draws walkers into a camera's picture: bodies of limbs with cloth on them, before a room, with their shadows.
+"""Renderer of people scenes: bodies of limbs with textured clothes before a room, with cast shadows.
 
-The farther is drawn first, so that people hide each other. A frame is sharp: at 8 ms a walking leg moves by a pixel.
+Bodies are drawn from the farthest to the nearest, so that they occlude each other. There is no motion blur: at 8 ms a
+walking leg moves by a pixel.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from edge.scenes.common import background
 from edge.scenes.common.base import Renderer
-from edge.scenes.common.sensor import PEDESTAL, SensorNoise, dimmed, pixel_rays
+from edge.scenes.common.sensor import PEDESTAL, SensorNoise, pixel_rays, subtract_pedestal
 from edge.scenes.people.scene import RADII, Person, joint_radii
 from edge.scenes.people.walking import JOINTS
 from protocols.geometry.types import Floats
@@ -26,17 +27,17 @@ Image = npt.NDArray[np.uint8]
 _BACKGROUND_STREAM = 2
 _NOISE_STD = 3.0
 _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
-_SHADE = 0.62  # of the light is left in a shadow
-_SHRINK = 4  # shadows are drawn that much smaller
+_SHADE = 0.62  # share of light left in a shadow
+_SHRINK = 4  # downscaling of the shadow mask
 _CLOTH = (96, 48)  # px of a body's texture
 _J = {name: index for index, name in enumerate(JOINTS)}
 _LIMBS = ("hip", "knee", "ankle", "toe"), ("shoulder", "elbow", "hand")
 
 
 class PeopleRenderer(Renderer):
-    """Pictures of a people scene from one camera.
+    """Images of a people scene from one camera.
 
-    noise_rng: sensor noise. noise_std: its std [8-bit steps]. shadows: whether people throw them.
+    noise_rng: sensor noise. noise_std: its std [8-bit steps]. shadows: whether people cast shadows.
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class PeopleRenderer(Renderer):
         u, v = np.meshgrid(np.arange(lens.width, dtype=float), np.arange(lens.height, dtype=float))
         rays = pixel_rays(lens, u, v) @ self._camera.pose.rotation
         rng = np.random.default_rng([scene.seed, _BACKGROUND_STREAM])
-        self._dimmed = dimmed(background.room(rays, self._camera.pose.position, *scene.room, rng))
+        self._dimmed = subtract_pedestal(background.room(rays, self._camera.pose.position, *scene.room, rng))
         self._noise = SensorNoise(lens.width, lens.height, noise_std, noise_rng)
         self._cloth = [_cloth(scene.seed, index, person.pattern) for index, person in enumerate(scene.people)]
         self._reach = joint_radii(scene.heights)
@@ -64,7 +65,7 @@ class PeopleRenderer(Renderer):
         return self._noise.add(self._draw(true_time, None))
 
     def render_with_owners(self, true_time: float) -> tuple[Image, Image]:
-        """The picture, and whose each pixel is (H, W): 0 nobody's, else the person's index + 1."""
+        """The image, and the instance mask (H, W): 0 background, else the person's index + 1."""
         owners = np.zeros(self._dimmed.shape[:2], np.uint8)
         return self._noise.add(self._draw(true_time, owners)), owners
 
@@ -80,7 +81,7 @@ class PeopleRenderer(Renderer):
         return image
 
     def _shaded(self, joints: Floats) -> Image:
-        """The room with the soft shadows of bodies on its floor."""
+        """The room with soft shadows of the bodies on its floor."""
         lens = self._camera.intrinsics
         light = background.LIGHT_WORLD
         ground = joints - joints[..., 2:] / light[2] * light
@@ -104,8 +105,8 @@ class PeopleRenderer(Renderer):
         image = self._dimmed.copy()
         part = image[top:bottom]
         lit = cv2.multiply(part, cv2.merge([share[top:bottom].astype(np.uint8)] * 3), scale=1.0 / 255.0)
-        # The pedestal has been taken off already, and it isn't the light's.
-        image[top:bottom] = cv2.subtract(lit, _missing(share[top:bottom].astype(np.uint8)))
+        # The pedestal has been subtracted already, and must not be attenuated.
+        image[top:bottom] = cv2.subtract(lit, _pedestal_correction(share[top:bottom].astype(np.uint8)))
         return image
 
     def _draw_person(
@@ -126,15 +127,15 @@ class PeopleRenderer(Renderer):
         cloth = cv2.resize(self._cloth[index], size, interpolation=cv2.INTER_LINEAR)
         cloth = cloth[top - low[1] : bottom - low[1], left - low[0] : right - low[0]]
         worn = cv2.multiply(colour, cloth, scale=1.0 / 128.0)
-        # Edges were mixed while they were drawn; inside them is cloth.
+        # Edges were anti-aliased when drawn; inside them the texture is applied.
         np.copyto(colour, worn, where=(mask > 250)[..., None])
         crop[:] = colour
         if owners is not None:
             owners[top:bottom, left:right][mask > 127] = index + 1
 
 
-def _missing(share: npt.NDArray[np.uint8]) -> Image:
-    """What the pedestal, taken off in full, has taken too much from where less light falls."""
+def _pedestal_correction(share: npt.NDArray[np.uint8]) -> Image:
+    """Correction of the pedestal, which was attenuated together with the light."""
     lost = np.rint(PEDESTAL * (1.0 - share.astype(np.float32) / 255.0)).astype(np.uint8)
     return np.asarray(cv2.merge([lost] * 3), dtype=np.uint8)
 
@@ -148,19 +149,19 @@ def _bones() -> list[tuple[int, int, float]]:
 
 
 def _body(canvas: tuple[Image, Image], pixels: Floats, depth: Floats, scale: Floats, person: Person) -> None:
-    """Paint a body's parts, the farther arm and leg first."""
+    """Draw a body's parts, the farther arm and leg first."""
     size = person.height * scale
 
     def limb(one: str, other: str, share: float, colour: tuple[float, float, float]) -> None:
         a, b = _J[one], _J[other]
         width = 2.0 * share * 0.5 * (size[a] + size[b])
-        _line(canvas[0], pixels[a], pixels[b], width, _dim(colour))
+        _line(canvas[0], pixels[a], pixels[b], width, _less_pedestal(colour))
         _line(canvas[1], pixels[a], pixels[b], width, 255)
 
     sides = sorted("lr", key=lambda side: -depth[_J[f"hip_{side}"]])
     for side in sides:
         far = 0.85 if side == sides[0] else 1.0
-        trousers, shoes = _times(person.trousers, far), _times(person.shoes, far)
+        trousers, shoes = _scaled_colour(person.trousers, far), _scaled_colour(person.shoes, far)
         if side == sides[0]:
             _arm(limb, person, side, far)
         limb(f"ankle_{side}", f"toe_{side}", 0.022, shoes)
@@ -172,19 +173,19 @@ def _body(canvas: tuple[Image, Image], pixels: Floats, depth: Floats, scale: Flo
         hull.append(at + radius * _CIRCLE)
     points = np.concatenate(hull).astype(np.float32)
     outline = np.rint(cv2.convexHull(points)[:, 0] * (1 << _SHIFT)).astype(np.int32)
-    for target, colour in ((canvas[0], _dim(person.top)), (canvas[1], 255)):
+    for target, colour in ((canvas[0], _less_pedestal(person.top)), (canvas[1], 255)):
         cv2.fillConvexPoly(target, outline, colour, cv2.LINE_AA, _SHIFT)
     limb("neck", "head", RADII["neck"], person.skin)
     limb("head", "head", RADII["head"], person.hair)
     face = pixels[_J["head"]] + 0.015 * size[_J["head"]] * np.array([0.0, 1.0])
-    _line(canvas[0], face, face, 2.0 * 0.048 * size[_J["head"]], _dim(person.skin))
+    _line(canvas[0], face, face, 2.0 * 0.048 * size[_J["head"]], _less_pedestal(person.skin))
     _arm(limb, person, sides[1], 1.0)
 
 
 def _arm(limb: object, person: Person, side: str, far: float) -> None:
     assert callable(limb)
-    limb(f"shoulder_{side}", f"elbow_{side}", RADII["arm"] * 1.15, _times(person.top, 0.92 * far))
-    limb(f"elbow_{side}", f"hand_{side}", RADII["arm"], _times(person.top, 0.92 * far))
+    limb(f"shoulder_{side}", f"elbow_{side}", RADII["arm"] * 1.15, _scaled_colour(person.top, 0.92 * far))
+    limb(f"elbow_{side}", f"hand_{side}", RADII["arm"], _scaled_colour(person.top, 0.92 * far))
     limb(f"hand_{side}", f"hand_{side}", RADII["arm"], person.skin)
 
 
@@ -192,21 +193,21 @@ _CIRCLE = np.stack([np.cos(np.linspace(0, 2 * np.pi, 12)), np.sin(np.linspace(0,
 
 
 def _line(target: Image, a: Floats, b: Floats, width: float, colour: object) -> None:
-    """A bar with round ends, to a sixteenth of a pixel (its width to whole ones)."""
+    """A bar with round ends, to a sixteenth of a pixel (its width to whole pixels)."""
     ends = [tuple(int(value) for value in np.rint(np.clip(at, -2e4, 2e4) * (1 << _SHIFT))) for at in (a, b)]
     cv2.line(target, ends[0], ends[1], colour, max(round(width), 1), cv2.LINE_AA, _SHIFT)  # type: ignore[call-overload]
 
 
-def _times(colour: tuple[float, float, float], share: float) -> tuple[float, float, float]:
+def _scaled_colour(colour: tuple[float, float, float], share: float) -> tuple[float, float, float]:
     return colour[0] * share, colour[1] * share, colour[2] * share
 
 
-def _dim(colour: tuple[float, float, float]) -> tuple[float, float, float]:
+def _less_pedestal(colour: tuple[float, float, float]) -> tuple[float, float, float]:
     return max(colour[0] - PEDESTAL, 0.0), max(colour[1] - PEDESTAL, 0.0), max(colour[2] - PEDESTAL, 0.0)
 
 
 def _cloth(seed: int, index: int, pattern: str) -> Image:
-    """Folds, patterns and the light from one side, (96, 48, 3) about 128."""
+    """Texture of folds, patterns and side light, (96, 48, 3) about 128."""
     rng = np.random.default_rng([seed, 7, index])
     height, width = _CLOTH
     folds = cv2.GaussianBlur(rng.normal(0.0, 1.0, _CLOTH), (0, 0), 2.5)

@@ -1,4 +1,4 @@
-"""``people``: walkers in a furnished room, seen by cameras with clocks of their own."""
+"""``people``: people walking in a furnished room, seen by cameras with clocks of their own."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.scenes.common.base import Renderer, Scene
-from edge.scenes.common.placement import Surroundings, cameras_around
-from edge.scenes.people.walking import CROWN, Paths, body, wander
+from edge.scenes.common.base import SimulatedScene
+from edge.scenes.common.placement import CameraPlacement, place_cameras
+from edge.scenes.people.walking import CROWN, WalkingPaths, body_joints, random_walks
 from protocols.geometry.types import Floats
 
-MOST_PEOPLE = 12
+MAX_PEOPLE = 12
 ROOM = (5.0, 3.0)
 """Half the side and the height [m] of the room."""
-_WALKED = 2.7  # half the side of the part that is walked [m]
-_CAMERAS = Surroundings(
+_WALKED = 2.7  # half the side of the area where people walk [m]
+_CAMERAS = CameraPlacement(
     distance=(4.1, 4.8),
     height=(2.0, 2.75),
     aim=0.2,
@@ -26,14 +26,14 @@ _CAMERAS = Surroundings(
     roll=0.06,
 )
 _MIXED = (10.0, 12.5, 9.99, 15.0)
-_STREAMS = {"cameras": 0, "people": 1}  # the background has 2
+_STREAMS = {"cameras": 0, "people": 1}  # the background has stream 2
 RADII = {"head": 0.062, "neck": 0.032, "torso": 0.085, "pelvis": 0.075, "arm": 0.028, "thigh": 0.05, "shank": 0.036}
-"""Of the parts of a body, of its height."""
+"""Radii of the parts of a body, over its height."""
 
 
 @dataclass(frozen=True, slots=True)
 class Person:
-    """One walker. height: [m]. Colours in full light, BGR 0..255. pattern: of the top: plain, stripes or checks."""
+    """One person. height: [m]. Colours in full light, BGR 0..255. pattern: of the top: plain, stripes or checks."""
 
     name: str
     height: float
@@ -46,40 +46,40 @@ class Person:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PeopleScene(Scene):
-    """People who walk about a room and avoid each other.
+class PeopleScene(SimulatedScene):
+    """People who walk in a room and avoid each other.
 
-    people: (n) who they are. paths: where they are.
+    people: (n) appearance. paths: where they walk.
     """
 
     people: tuple[Person, ...]
-    paths: Paths
+    paths: WalkingPaths
     room: tuple[float, float]
 
     @property
     def heights(self) -> Floats:
-        """(n,) [m]."""
+        """Heights (n,) [m]."""
         return np.array([person.height for person in self.people])
 
     def joints(self, true_time: Floats) -> Floats:
         """All joints (t, n, 19, 3) [m], see ``walking.JOINTS``, at true times (t,) [s]."""
-        return body(*self.paths.at(true_time), self.heights)
+        return body_joints(*self.paths.at(true_time), self.heights)
 
     def heads(self, true_time: Floats) -> Floats:
-        """Tops of the heads (t, n, 3) [m]; a walking head bobs."""
+        """Tops of the heads (t, n, 3) [m]; they move up and down with the gait."""
         return self.joints(true_time)[:, :, CROWN]
 
     def feet(self, true_time: Floats) -> Floats:
-        """Points of the floor (t, n, 3) [m] below the bodies."""
+        """Foot points (t, n, 3) [m] on the floor below the bodies."""
         place, _, _ = self.paths.at(true_time)
         return np.concatenate([place, np.zeros((*place.shape[:2], 1))], axis=-1)
 
     def centres(self, true_time: Floats) -> Floats:
-        """Middles (t, n, 3) [m] between head and foot."""
+        """Midpoints (t, n, 3) [m] of head and foot."""
         return 0.5 * (self.heads(true_time) + self.feet(true_time))
 
     def headings(self, true_time: Floats) -> Floats:
-        """Where people face (t, n) [rad] from the x axis."""
+        """Headings (t, n) [rad] from the x axis."""
         return self.paths.at(true_time)[2]
 
     def seen_by(self, camera: str, points: Floats) -> Floats:
@@ -92,9 +92,9 @@ class PeopleScene(Scene):
         return simulated.intrinsics.project(flat).reshape(*points.shape[:-1], 2)
 
     def boxes(self, camera: str, true_time: float) -> Floats:
-        """Boxes (n, 4) x, y, w, h [px] of the bodies as a camera would see them without the others.
+        """Bounding boxes (n, 4) x, y, w, h [px] of the bodies in a camera's image, without occlusion.
 
-        Cut by the image's border; NaN where nothing of a body is in the picture.
+        Clipped to the image; NaN where a body is outside the image.
         """
         simulated = self.camera(camera)
         joints = self.joints(np.array([true_time]))[0]
@@ -109,14 +109,9 @@ class PeopleScene(Scene):
         boxes = np.concatenate([low, high - low], axis=1)
         return np.where((boxes[:, 2:] > 0.0).all(axis=1, keepdims=True), boxes, np.nan)
 
-    def renderer(self, camera: str, rng: np.random.Generator) -> Renderer:
-        from edge.scenes.people.renderer import PeopleRenderer  # OpenCV is only needed to draw
-
-        return PeopleRenderer(self, camera, rng)
-
 
 def joint_radii(heights: Floats) -> Floats:
-    """How far a body reaches around its joints (n, 19) [m]."""
+    """Radii of the body around its joints (n, 19) [m]."""
     from edge.scenes.people.walking import JOINTS
 
     share = {"crown": 0.0, "head": RADII["head"], "neck": RADII["neck"], "chest": RADII["torso"]}
@@ -136,16 +131,16 @@ _SHOES = ((40, 42, 48), (205, 206, 210), (50, 70, 110))
 
 
 def people_room(seed: int, cameras: int, people: int, mixed_fps: bool = False) -> PeopleScene:
-    """The scene ``people`` of a seed; see ``edge.scenes.get_people``."""
+    """The scene ``people`` of a seed; see ``edge.scenes.get_people_scene``."""
     rng = np.random.default_rng([seed, _STREAMS["people"]])
-    where = _CAMERAS
+    placement = _CAMERAS
     if mixed_fps:
-        fields = {name: getattr(where, name) for name in where.__dataclass_fields__}
-        where = Surroundings(**fields | {"fps": _MIXED})
+        fields = {name: getattr(placement, name) for name in placement.__dataclass_fields__}
+        placement = CameraPlacement(**fields | {"fps": _MIXED})
     centre = np.array([0.0, 0.0, 0.9])
-    seen = cameras_around(np.random.default_rng([seed, _STREAMS["cameras"]]), centre, cameras, where)
+    placed_cameras = place_cameras(np.random.default_rng([seed, _STREAMS["cameras"]]), centre, cameras, placement)
     tops = rng.permutation(len(_TOPS))
-    walkers = tuple(
+    persons = tuple(
         Person(
             name=f"person{index}",
             height=float(np.clip(rng.normal(1.72, 0.09), 1.5, 1.95)),
@@ -158,4 +153,4 @@ def people_room(seed: int, cameras: int, people: int, mixed_fps: bool = False) -
         )
         for index in range(people)
     )
-    return PeopleScene("people", seed, seen, walkers, wander(rng, people, _WALKED), ROOM)
+    return PeopleScene("people", seed, placed_cameras, persons, random_walks(rng, people, _WALKED), ROOM)

@@ -1,6 +1,6 @@
-"""A recorded session of walkers without drawing a picture: head tops and foot points as labelled points.
+"""Simulated detections of people, without rendering: head tops and foot points as labelled points.
 
-Who is who is given, as for the marker: to find that out is the tracking's work, not a recording's.
+The identities are given by the labels, as for the marker: data association is the task of tracking, not of a recording.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Bools, Floats, Ints
 
 HIDDEN_PX = 3.0
-"""A head's top or a foot point this far inside a nearer body's box is not seen."""
+"""A head top or foot point at least this far inside a nearer body's box is occluded."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PeopleTrack:
-    """What one camera reported, rows in order of time.
+    """Detections of one camera, rows in order of time.
 
-    frame: (n,). time: (n,) [s] on the camera's own clock. pixels: (n, 2). size: (n,) [px] from head to foot.
-    label: n names, person0-head, person0-foot, …; truth: true_time (n,) [s].
+    frame: (n,). time: (n,) [s] on the camera's own clock. pixels: (n, 2). size: (n,) [px] from head to foot. label: n
+    names, person0-head, person0-foot, …; ground truth: true_time (n,) [s].
     """
 
     camera: str
@@ -37,23 +37,23 @@ class PeopleTrack:
         return len(self.time)
 
 
-def film_people(
+def simulate_people_tracks(
     scene: PeopleScene, duration_s: float, seed: int, *, pixel_noise: float, drop_fraction: float | None = None
 ) -> dict[str, PeopleTrack]:
-    """Film the walkers for ``duration_s`` from true time 0: a track a camera; the same arguments, the same session.
+    """Simulate detections for ``duration_s`` from true time 0, one track per camera; reproducible.
 
-    pixel_noise: std of each coordinate [px]. drop_fraction: of the frames, instead of the cameras' own.
+    pixel_noise: std of each coordinate [px]. drop_fraction: share of dropped frames, in place of the cameras' own.
     """
     return {
-        camera.name: _film(scene, index, duration_s, np.random.default_rng([seed, index]), pixel_noise, drop_fraction)
+        camera.name: _record(scene, index, duration_s, np.random.default_rng([seed, index]), pixel_noise, drop_fraction)
         for index, camera in enumerate(scene.cameras)
     }
 
 
-def seen(scene: PeopleScene, camera: str, true_time: Floats) -> tuple[Floats, Bools]:
-    """Pixels (t, n, 2, 2) of head tops and foot points, and whether each is seen (t, n, 2).
+def visible_points(scene: PeopleScene, camera: str, true_time: Floats) -> tuple[Floats, Bools]:
+    """Pixels (t, n, 2, 2) of head tops and foot points, and whether each is visible (t, n, 2).
 
-    Not seen is what lies outside the picture or behind a nearer person.
+    Points outside the image or behind a nearer person are not visible.
     """
     simulated = scene.camera(camera)
     lens = simulated.intrinsics
@@ -72,7 +72,7 @@ def seen(scene: PeopleScene, camera: str, true_time: Floats) -> tuple[Floats, Bo
     return pixels, visible
 
 
-def _film(
+def _record(
     scene: PeopleScene, which: int, duration_s: float, rng: np.random.Generator, noise: float, drops: float | None
 ) -> PeopleTrack:
     camera = scene.cameras[which]
@@ -82,7 +82,7 @@ def _film(
     stamp = rng.normal(0.0, camera.clock.stamp_noise_s, count)
     device = np.array([camera.clock.device_time_ns(moment) for moment in true_time], dtype=np.int64)
     seconds = (device + np.rint(stamp * NANOSECONDS).astype(np.int64)) / NANOSECONDS
-    pixels, visible = seen(scene, camera.name, true_time)
+    pixels, visible = visible_points(scene, camera.name, true_time)
     visible &= kept[:, None, None]
     size = np.linalg.norm(pixels[:, :, 0] - pixels[:, :, 1], axis=-1)
     noisy = pixels + rng.normal(0.0, noise, pixels.shape)

@@ -1,4 +1,4 @@
-"""How simulated people walk: paths that avoid each other, and the joints of a walking body.
+"""Walking people: random paths that avoid each other, and the joints of a walking body.
 
 World axes: z up, metres, the floor at z = 0.
 """
@@ -18,19 +18,20 @@ JOINTS = (
 )  # fmt: skip
 CROWN = JOINTS.index("crown")
 _STEP_S = 0.2  # of the stored path
-_TURN_S = 1.2  # in which a walker who goes back turns round
-_STRIDE = 0.82  # two steps, of the body's height
+_TURN_S = 1.2  # duration of the turn at an end of the path
+_STRIDE = 0.82  # length of two steps over the body's height
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Paths:
-    """Where n people are at any time: walked to an end, then back, then forth, for ever.
+class WalkingPaths:
+    """Paths of n people at any time: walked to an end, then back, and so on without end.
 
-    points: (m, n, 2) [m] on the floor every 0.2 s. way: (m, n) [m] walked until then. heading: (m, n) [rad] unwrapped.
+    points: (m, n, 2) [m] on the floor every 0.2 s. travelled: (m, n) [m] path length until then. heading: (m, n) [rad]
+    unwrapped.
     """
 
     points: Floats
-    way: Floats
+    travelled: Floats
     heading: Floats
 
     @property
@@ -39,22 +40,22 @@ class Paths:
         return float((len(self.points) - 4) * _STEP_S)
 
     def at(self, true_time: Floats) -> tuple[Floats, Floats, Floats]:
-        """Places (t, n, 2) [m], ways walked (t, n) [m] and headings (t, n) [rad] at true times (t,) [s]."""
-        there, back = _to_and_fro(np.asarray(true_time, dtype=np.float64), self.length_s)
+        """Places (t, n, 2) [m], path lengths (t, n) [m] and headings (t, n) [rad] at true times (t,) [s]."""
+        there, back = _back_and_forth(np.asarray(true_time, dtype=np.float64), self.length_s)
         place = _spline(self.points, there)
         heading = _spline(self.heading[..., None], there)[..., 0] + np.pi * back[:, None]
-        return place, _spline(self.way[..., None], there)[..., 0], heading
+        return place, _spline(self.travelled[..., None], there)[..., 0], heading
 
 
-def _to_and_fro(time: Floats, length: float) -> tuple[Floats, Floats]:
-    """Time along the path, slowing down at its ends, and how far (0..1) one has turned to go back."""
+def _back_and_forth(time: Floats, length: float) -> tuple[Floats, Floats]:
+    """Time along the path, slower at its ends, and the fraction (0..1) of the turn to go back."""
     turned, within = np.divmod(time, length)
-    # Runs evenly but for the first and last 2 s, where the pace falls to nothing and rises again.
+    # Constant rate, except for the first and last 2 s, where it falls to zero and rises again.
     ease = 2.0
-    pace = length / (length - ease)
+    rate = length / (length - ease)
     begin, end = np.clip(within, 0.0, ease), np.clip(length - within, 0.0, ease)
     lost = (ease - begin) ** 2 / (2 * ease) - (ease - end) ** 2 / (2 * ease)
-    along = np.clip((within - ease / 2 + lost) * pace, 0.0, length)
+    along = np.clip((within - ease / 2 + lost) * rate, 0.0, length)
     odd = np.mod(turned, 2.0) == 1.0
     nearest = np.where(within < 0.5 * length, within, within - length)  # to the turn before or after
     turn = np.clip(0.5 + nearest / _TURN_S, 0.0, 1.0)
@@ -78,8 +79,8 @@ def _spline(values: Floats, time: Floats) -> Floats:
     return np.asarray(sum(weight * values[first + k] for k, weight in enumerate(weights)))
 
 
-def wander(rng: np.random.Generator, people: int, half: float, length_s: float = 240.0) -> Paths:
-    """Paths of people who walk from place to place within ±half [m], 0.9 to 1.4 m/s, round each other."""
+def random_walks(rng: np.random.Generator, people: int, half: float, length_s: float = 240.0) -> WalkingPaths:
+    """Paths of people who walk between random goals within ±half [m], at 0.9 to 1.4 m/s, by a social-force model."""
     step = 0.05
     speed = rng.uniform(0.9, 1.4, people)
     angle = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(people) / people
@@ -111,12 +112,12 @@ def wander(rng: np.random.Generator, people: int, half: float, length_s: float =
         place = np.clip(place + step * velocity, -half, half)
     points = np.array(kept)
     steps = np.diff(points, axis=0, append=points[-1:])
-    way = np.concatenate([np.zeros((1, people)), np.cumsum(np.linalg.norm(steps, axis=-1), axis=0)[:-1]])
-    return Paths(points, way, _headings(steps))
+    travelled = np.concatenate([np.zeros((1, people)), np.cumsum(np.linalg.norm(steps, axis=-1), axis=0)[:-1]])
+    return WalkingPaths(points, travelled, _headings(steps))
 
 
 def _headings(steps: Floats) -> Floats:
-    """Where people face (m, n): the direction in which they go, kept while they stand, over about a second."""
+    """Headings (m, n): the direction of motion, kept while they stand, smoothed over about a second."""
     kernel = np.exp(-0.5 * (np.arange(-8, 9) * _STEP_S / 0.45) ** 2)
     smooth = np.stack(
         [
@@ -129,22 +130,23 @@ def _headings(steps: Floats) -> Floats:
     return np.unwrap(angle, axis=0)
 
 
-def body(place: Floats, way: Floats, heading: Floats, height: Floats) -> Floats:
-    """Joints (t, n, 19, 3) [m] of walkers, in the order of JOINTS.
+def body_joints(place: Floats, travelled: Floats, heading: Floats, height: Floats) -> Floats:
+    """Joints (t, n, 19, 3) [m] of walking people, in the order of JOINTS.
 
-    place: (t, n, 2). way: (t, n) [m] walked: it sets the phase of the legs. heading: (t, n) [rad]. height: (n,) [m].
+    place: (t, n, 2). travelled: (t, n) [m] path length, which sets the phase of the legs. heading: (t, n) [rad].
+    height: (n,) [m].
     """
-    phase = 2.0 * np.pi * way / (_STRIDE * height)
+    phase = 2.0 * np.pi * travelled / (_STRIDE * height)
     thigh, shank = 0.245 * height, 0.235 * height
     swing = 0.42
     legs = []
     for side in (0.0, np.pi):
         forward = swing * np.sin(phase + side)
-        bend = 0.15 + 0.75 * np.clip(np.cos(phase + side), 0.0, 1.0) ** 2  # the leg that comes forward bends
+        bend = 0.15 + 0.75 * np.clip(np.cos(phase + side), 0.0, 1.0) ** 2  # the swing leg bends
         knee = np.stack([thigh * np.sin(forward), -thigh * np.cos(forward)], -1)
         ankle = knee + np.stack([shank * np.sin(forward - bend), -shank * np.cos(forward - bend)], -1)
         legs.append((knee, ankle))
-    pelvis = 0.04 * height - np.minimum(legs[0][1][..., 1], legs[1][1][..., 1])  # the lower foot stands
+    pelvis = 0.04 * height - np.minimum(legs[0][1][..., 1], legs[1][1][..., 1])  # the lower foot is on the floor
     joints = np.zeros((*place.shape[:2], len(JOINTS), 3))  # forward, left, up
 
     def put(name: str, forward: Floats | float, left: Floats | float, up: Floats) -> None:

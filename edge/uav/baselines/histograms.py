@@ -1,4 +1,4 @@
-"""Hue-saturation histograms of many boxes at once, and how like the target's they are (2.7, 2.8, 3.13)."""
+"""Hue-saturation histograms of many boxes at once, and their similarity to the target's (2.7, 2.8, 3.13)."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ BINS = 1 + HUES * SATURATIONS
 SHARPNESS = 20.0
 """lambda of eq. (2.8); the paper gives no value."""
 _BITS = 5  # of each channel in the look-up table
-_GREY_SATURATION = 40  # of 255: below it the hue is noise, and such pixels share one bin
+_GREY_SATURATION = 40  # of 255: below it the hue is unreliable; such pixels share one bin
 _DARK = 40  # of 255: the same for the value
 _GRID = 9  # samples across a box, along each side
-_MEAN_STEP = 4  # every fourth pixel both ways is enough for the frame's own histogram
+_MEAN_STEP = 4  # subsampling in both axes for the histogram of the whole frame
 
 
 @cache
@@ -36,14 +36,14 @@ def _table() -> Bins:
 
 
 def colour_bins(colours: npt.NDArray[np.uint8]) -> Bins:
-    """The histogram bin (...) of BGR colours (..., 3). Bin 0 holds what has no hue to speak of (grey, dark)."""
+    """The histogram bin (...) of BGR colours (..., 3). Bin 0 holds colours without a reliable hue (grey, dark)."""
     shift = 8 - _BITS
     wide = colours.astype(np.int32) >> shift
     return np.asarray(_table()[(wide[..., 0] << 2 * _BITS) | (wide[..., 1] << _BITS) | wide[..., 2]])
 
 
 def target_histogram(image: Image, box: Box) -> Floats:
-    """(BINS,) of the pixels of a box in the image, adding up to 1: the template p of (2.7)."""
+    """(BINS,) of the pixels of a box in the image, normalised to 1: the template p of (2.7)."""
     left, top = max(round(box.x), 0), max(round(box.y), 0)
     inside = image[top : max(round(box.y + box.height), top + 1), left : max(round(box.x + box.width), left + 1)]
     counts = np.bincount(colour_bins(inside).ravel(), minlength=BINS).astype(np.float64)
@@ -51,15 +51,15 @@ def target_histogram(image: Image, box: Box) -> Floats:
 
 
 def mean_histogram(image: Image) -> Floats:
-    """(BINS,) of the whole frame, adding up to 1: q(I_k) of (3.13)."""
+    """(BINS,) of the whole frame, normalised to 1: q(I_k) of (3.13)."""
     counts = np.bincount(colour_bins(image[::_MEAN_STEP, ::_MEAN_STEP]).ravel(), minlength=BINS)
     return np.asarray(counts / counts.sum(), dtype=np.float64)
 
 
 def _box_bins(image: Image, centres: Floats, box: Box) -> tuple[Bins, Bools]:
-    """Bins (n, m) of a grid of pixels in boxes about centres (n, 2), and which of these pixels the image has.
+    """Bins (n, m) of a grid of pixels in boxes about centres (n, 2), and which of these pixels lie in the image.
 
-    A pixel beyond the border is given the bin of the nearest one that is seen.
+    A pixel beyond the border gets the bin of the nearest pixel in the image.
     """
     step = (np.arange(_GRID) + 0.5) / _GRID - 0.5
     x = np.rint(centres[:, 0, None] + step * box.width)
@@ -81,7 +81,7 @@ def _histograms(bins: Bins, counted: Bools | None = None) -> Floats:
 
 
 def bhattacharyya(template: Floats, histograms: Floats) -> Floats:
-    """Eq. (2.7): L = sum over u of sqrt(p_u q_u); 1 where they are the same. (BINS,), (n, BINS) -> (n,)."""
+    """Eq. (2.7): L = sum over u of sqrt(p_u q_u); 1 for equal histograms. (BINS,), (n, BINS) -> (n,)."""
     return np.asarray(np.sqrt(histograms) @ np.sqrt(template), dtype=np.float64)
 
 
@@ -90,20 +90,20 @@ def colour_log_likelihood(similarity: Floats, sharpness: float = SHARPNESS) -> F
     return np.asarray(-sharpness * (1.0 - similarity), dtype=np.float64)
 
 
-def seen_similarity(image: Image, centres: Floats, box: Box, template: Floats) -> Floats:
-    """Eq. (2.7) for boxes about centres (n, 2), where section 2 knows nothing of borders.
+def visible_similarity(image: Image, centres: Floats, box: Box, template: Floats) -> Floats:
+    """Eq. (2.7) for boxes about centres (n, 2), without treatment of borders (section 2).
 
-    What lies outside the image is like nothing: the histogram adds up to the share that is seen.
+    Pixels outside the image match nothing: the histogram sums to the share of the box within the image.
     """
     bins, inside = _box_bins(image, centres, box)
     return bhattacharyya(template, _histograms(bins, inside))
 
 
-def filled_similarity(image: Image, centres: Floats, box: Box, template: Floats, mean: Floats) -> Floats:
+def border_filled_similarity(image: Image, centres: Floats, box: Box, template: Floats, mean: Floats) -> Floats:
     """Eqs. (2.7) and (3.13) for boxes about centres (n, 2), by the three cases of section 3.2.
 
-    Wholly outside: the frame's mean histogram (BINS,) stands in. Partly outside: unseen pixels are filled from the
-    nearest seen ones. Inside: as it is.
+    Wholly outside: the mean histogram of the frame (BINS,) is used. Partly outside: missing pixels are filled from
+    the nearest border pixels. Inside: unchanged.
     """
     bins, inside = _box_bins(image, centres, box)
     similarity = bhattacharyya(template, _histograms(bins))

@@ -1,7 +1,7 @@
-"""The paper's tracker: a particle filter whose likelihood also asks the background (sections 3 and 4).
+"""The background-aware particle filter tracker of the paper (sections 3 and 4).
 
-The parts are in ``edge.uav.baselines``, each function with its equation; here they are put together. Known to lose the
-car where the paper's own does: where it leaves the road, and where shift and rotation are too little for the flight.
+The parts are in ``edge.uav.baselines``, each function with its equation; here they are combined. Known limitations are
+those of the paper: cars that leave the road, and flights whose background motion is not a shift and rotation.
 """
 
 from __future__ import annotations
@@ -14,52 +14,52 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.uav.baselines import histograms, regions
-from edge.uav.baselines.background import BackgroundFilter, Motion
-from edge.uav.baselines.car import BackgroundAware, RoadSteered, Scene
-from edge.uav.baselines.plain_tracker import AppearanceJudge
-from edge.uav.baselines.road import Course, Road, course
-from edge.uav.baselines.road_filter import RoadFilter, support
-from edge.uav.baselines.target import check_image, check_target, fits, seen_share
-from edge.uav.baselines.white_lines import Edges, sections
+from edge.uav.baselines.background import BackgroundFilter, BackgroundMotion
+from edge.uav.baselines.car import BackgroundAwareModel, FrameObservation, RoadSteeredModel
+from edge.uav.baselines.plain_tracker import AppearanceTest
+from edge.uav.baselines.road import RoadCourse, RoadMidline, extrapolated_course
+from edge.uav.baselines.road_filter import RoadFilter, line_support
+from edge.uav.baselines.target import check_image, check_target, has_frame_format, visible_share
+from edge.uav.baselines.white_lines import EdgeDistance, find_sections
 from edge.uav.prediction import particles as pf
-from edge.uav.tracker import Box, Estimate, Hypothesis, Image, State, Telemetry
+from edge.uav.tracker import Box, Estimate, Hypothesis, Image, Telemetry, TrackState
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
-_FASTEST = 0.3  # of the box's longer side, a frame, at the start
+_MAX_INITIAL_SPEED = 0.3  # of the box's longer side, per frame
 _SPEED_NOISE = 0.004  # of the box's longer side, a frame
 _FIRST_PARTICLES = 600
-_FEWEST, _MOST = 300, 800
-_BEYOND = 0.8  # image diagonals that the road is extrapolated by
+_MIN_PARTICLES, _MAX_PARTICLES = 300, 800
+_EXTRAPOLATION = 0.8  # image diagonals: length of the road extrapolation
 _COURSE_STEP = 6.0  # px
-_SEEN = 0.5  # of the box that must lie in the image to be called visible
-_USELESS = 0.35  # image diagonals: a cloud with a larger std says nothing
-_DIRECTION_MEMORY = 0.15  # a frame
-_DOUBTFUL = 0.6  # of a road in the picture has white lines: the target may be on another one
-_RETRACED_EVERY = 10  # frames, while the road is doubtful and the target in full sight
+_MIN_VISIBLE_SHARE = 0.5  # of the box that must lie in the image to be called visible
+_LOST_SPREAD = 0.35  # image diagonals: with a larger std of the particles the target is lost
+_DIRECTION_UPDATE_RATE = 0.15  # per frame
+_MIN_MARKED_SHARE = 0.6  # share of the visible road with white lines; below it the target may be on another road
+_RETRACE_INTERVAL = 10  # frames between searches for another road, while the target is fully visible
 _CLUSTER = 1.5  # radius of a hypothesis, in the box's longer side
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """What the tracker makes of its last frame, for pictures and tests.
+class FrameDiagnostics:
+    """Intermediate results of the last frame, for figures and tests.
 
-    labels, corrected: (h/4, w/4) regions before and after the road's correction. course: the road's, or None.
-    motion: the background's into this frame. direction: of travel along the course, 0 where unknown.
+    labels, corrected: (h/4, w/4) regions before and after correction by the road. course: of the road, or None.
+    motion: of the background into this frame. direction: of travel along the course, 0 if unknown.
     """
 
     labels: regions.Labels
     corrected: regions.Labels
-    course: Course | None
-    motion: Motion
+    course: RoadCourse | None
+    motion: BackgroundMotion
     direction: int
 
 
 class PaperTracker:
-    """Follows by colour, road and regions. Lens, mounting and telemetry are taken but not used: the paper has none.
+    """Tracks by colour, road and regions. Lens, mounting and telemetry are accepted but ignored, as in the paper.
 
     size: (width, height) [px]. section: 4 for the paper's final model, 3 for the one of section 3.2. teach: statistics
-    of road and other; without, they are learnt from the first frame.
+    of road and other; by default they are learnt from the first frame.
     """
 
     def __init__(
@@ -79,15 +79,15 @@ class PaperTracker:
         self._rng = np.random.default_rng(seed)
         self._centre = (np.array(size, dtype=np.float64) - 1.0) / 2.0
         self._diagonal = float(np.hypot(*size))
-        self._started: _Started | None = None
+        self._track: _Track | None = None
 
     @property
-    def view(self) -> View:
-        """Of the last frame. Raises RuntimeError before ``begin``."""
-        return self._ready().view
+    def diagnostics(self) -> FrameDiagnostics:
+        """Intermediate results of the last frame. Raises RuntimeError before ``begin``."""
+        return self._ready().diagnostics
 
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
-        """Learn target, road and regions. Raises InputError for a box that can't be one or an image of another size."""
+        """Learn target, road and regions. Raises InputError for an invalid box or an image of another size."""
         check_target(target, self.size)
         check_image(image, self.size)
         grey = _grey(image)
@@ -95,137 +95,144 @@ class PaperTracker:
         background.begin(grey, target)
         road_filter = RoadFilter(self.size, self._rng)
         road, marked = _first_road(grey, target, road_filter)
-        drawn = self._drawn(road)
+        road_course = self._road_course(road)
         small = regions.reduced(image)
-        statistics = self._teach or regions.learn(small, _first_road_pixels(small, target, drawn))
-        self._started = started = _Started(target, image, background, road_filter, road, statistics)
-        started.marked = marked
-        started.view = _looked_at(small, statistics, drawn, Motion(), 0)
-        started.cloud = pf.Particles.evenly(self._first_states(target, drawn))
+        statistics = self._teach or regions.learn_statistics(small, _first_road_pixels(small, target, road_course))
+        self._track = track = _Track(target, image, background, road_filter, road, statistics)
+        track.marked = marked
+        track.diagnostics = _diagnose(small, statistics, road_course, BackgroundMotion(), 0)
+        track.particles = pf.Particles.uniform(self._first_states(target, road_course))
         longer = max(target.width, target.height)
-        kind = RoadSteered if self._section == 3 else BackgroundAware
-        started.model = kind(self._centre, _SPEED_NOISE * longer)
-        started.number = pf.AdaptiveNumber((longer / 2, longer / 2, longer / 20, 0.35), fewest=_FEWEST, most=_MOST)
-        started.model.before = self._scene(image, started)
-        return self._estimate(time, State.VISIBLE, started)
+        model_class = RoadSteeredModel if self._section == 3 else BackgroundAwareModel
+        track.model = model_class(self._centre, _SPEED_NOISE * longer)
+        track.number = pf.KldSampleSize(
+            (longer / 2, longer / 2, longer / 20, 0.35), min_count=_MIN_PARTICLES, max_count=_MAX_PARTICLES
+        )
+        track.model.previous = self._observation(image, track)
+        return self._estimate(time, TrackState.VISIBLE, track)
 
     def handle_telemetry(self, sample: Telemetry) -> None:
-        """Taken and not used: section 4 estimates the camera's motion from the picture alone."""
+        """Accepted and ignored: section 4 estimates the camera's motion from images alone."""
 
     def handle_frame(self, image: Image | None, time: float) -> Estimate:
-        """Follow into the next frame. None, or an image of another shape, is a frame in which nothing was seen.
+        """Predict and update with the next frame. None, or an image of another shape, is a frame without measurement.
 
         Raises RuntimeError before ``begin``.
         """
-        started = self._ready()
-        usable = image if image is not None and fits(image, self.size) else None
+        track = self._ready()
+        usable = image if image is not None and has_frame_format(image, self.size) else None
         if usable is not None:
-            self._look(usable, started)
-        scene = self._scene(usable, started)
-        started.model.motion = started.view.motion
-        started.cloud = pf.step(
-            started.cloud,
-            started.model,
-            scene if usable is not None else None,
+            self._look(usable, track)
+        observation = self._observation(usable, track)
+        track.model.motion = track.diagnostics.motion
+        track.particles = pf.step(
+            track.particles,
+            track.model,
+            observation if usable is not None else None,
             self._rng,
             resample_below=0.7,
-            number=started.number,
+            number=track.number,
         )
-        started.model.before = scene
-        state = self._state(scene, started)
-        if state is State.VISIBLE:
-            started.learn_direction()
-        return self._estimate(time, state, started)
+        track.model.previous = observation
+        state = self._state(observation, track)
+        if state is TrackState.VISIBLE:
+            track.learn_direction()
+        return self._estimate(time, state, track)
 
-    def _look(self, image: Image, started: _Started) -> None:
-        """Background, road and regions of a new frame."""
+    def _look(self, image: Image, track: _Track) -> None:
+        """Update background, road and regions from a new frame."""
         grey = _grey(image)
-        place = started.place()
+        position = track.position()
         box = Box(
-            place[0] - started.box.width / 2, place[1] - started.box.height / 2, started.box.width, started.box.height
+            position[0] - track.box.width / 2, position[1] - track.box.height / 2, track.box.width, track.box.height
         )
-        motion = started.background.step(grey, box)
-        edges = Edges.of(grey, started.marked)
+        motion = track.background.step(grey, box)
+        edges = EdgeDistance.of(grey, track.marked)
         share = 0.0
-        if started.road is not None:
-            started.road = started.road_filter.step(started.road.moved(motion, self._centre), edges)
-            if started.road is not None and started.marked:
-                share = support(started.road, edges)[1]
-        started.frames += 1
-        seen = started.visible and seen_share(place[0], place[1], box, self.size) >= 1.0
-        if share < _DOUBTFUL and seen and started.frames % _RETRACED_EVERY == 0:
-            found, marked = _first_road(grey, box, started.road_filter)
-            better = found is not None and support(found, Edges.of(grey, marked))[1] > share
-            if better and (marked or started.road is None):
-                started.road, started.marked = found, marked
-                started.forget_direction()
-        drawn = self._drawn(started.road)
+        if track.road is not None:
+            track.road = track.road_filter.step(track.road.moved(motion, self._centre), edges)
+            if track.road is not None and track.marked:
+                share = line_support(track.road, edges)[1]
+        track.frames += 1
+        seen = track.visible and visible_share(position[0], position[1], box, self.size) >= 1.0
+        if share < _MIN_MARKED_SHARE and seen and track.frames % _RETRACE_INTERVAL == 0:
+            found, marked = _first_road(grey, box, track.road_filter)
+            better = found is not None and line_support(found, EdgeDistance.of(grey, marked))[1] > share
+            if better and (marked or track.road is None):
+                track.road, track.marked = found, marked
+                track.forget_direction()
+        road_course = self._road_course(track.road)
         small = regions.reduced(image)
-        started.view = _looked_at(small, started.statistics, drawn, motion, started.direction)
-        sure = np.zeros(small.shape[:2], dtype=np.bool_)
-        if drawn is not None:
-            sure = regions.road_mask(drawn, (small.shape[0], small.shape[1]), np.zeros(2), 0.8, known=True)
-        started.statistics = started.statistics.adapted(small, started.view.corrected, sure)
+        track.diagnostics = _diagnose(small, track.statistics, road_course, motion, track.direction)
+        road_core = np.zeros(small.shape[:2], dtype=np.bool_)
+        if road_course is not None:
+            road_core = regions.road_mask(road_course, (small.shape[0], small.shape[1]), np.zeros(2), 0.8, known=True)
+        track.statistics = track.statistics.adapted(small, track.diagnostics.corrected, road_core)
 
-    def _scene(self, image: Image | None, started: _Started) -> Scene:
-        view = started.view
-        return Scene(
+    def _observation(self, image: Image | None, track: _Track) -> FrameObservation:
+        diagnostics = track.diagnostics
+        return FrameObservation(
             image=image,
-            box=started.box,
-            template=started.template,
-            mean=started.template if image is None else histograms.mean_histogram(image),
-            course=view.course,
-            direction=started.direction,
-            existence=regions.existence(view.corrected, view.course, started.box) if self._section == 4 else None,
+            box=track.box,
+            template=track.template,
+            mean=track.template if image is None else histograms.mean_histogram(image),
+            course=diagnostics.course,
+            direction=track.direction,
+            existence=regions.existence(diagnostics.corrected, diagnostics.course, track.box)
+            if self._section == 4
+            else None,
         )
 
-    def _state(self, scene: Scene, started: _Started) -> State:
-        """Visible: its box lies in the frame and shows the target. Lost: the cloud is as wide as the picture."""
-        place = started.place()
-        started.visible = False
-        if scene.image is not None and seen_share(place[0], place[1], started.box, self.size) >= _SEEN:
-            similarity = histograms.seen_similarity(scene.image, place[None], started.box, started.template)[0]
-            started.visible = started.judge.accepts(float(similarity))
-        if started.visible:
-            return State.VISIBLE
-        return State.LOST if started.spread() > _USELESS * self._diagonal else State.COASTING
+    def _state(self, observation: FrameObservation, track: _Track) -> TrackState:
+        """Visible: the box lies in the frame and shows the target. Lost: the particles spread as wide as the image."""
+        position = track.position()
+        track.visible = False
+        if (
+            observation.image is not None
+            and visible_share(position[0], position[1], track.box, self.size) >= _MIN_VISIBLE_SHARE
+        ):
+            similarity = histograms.visible_similarity(observation.image, position[None], track.box, track.template)[0]
+            track.visible = track.appearance_test.accepts(float(similarity))
+        if track.visible:
+            return TrackState.VISIBLE
+        return TrackState.LOST if track.spread() > _LOST_SPREAD * self._diagonal else TrackState.COASTING
 
-    def _drawn(self, road: Road | None) -> Course | None:
-        return None if road is None else course(road, _BEYOND * self._diagonal, _COURSE_STEP)
+    def _road_course(self, road: RoadMidline | None) -> RoadCourse | None:
+        return None if road is None else extrapolated_course(road, _EXTRAPOLATION * self._diagonal, _COURSE_STEP)
 
-    def _first_states(self, target: Box, drawn: Course | None) -> Floats:
-        """(n, 4): any speed up to a limit, along the road both ways, or any way where none is known."""
+    def _first_states(self, target: Box, road_course: RoadCourse | None) -> Floats:
+        """(n, 4): any speed up to a limit, along the road in both directions, or any heading without a road."""
         count, rng = _FIRST_PARTICLES, self._rng
-        place = np.array([target.x + target.width / 2, target.y + target.height / 2])
+        position = np.array([target.x + target.width / 2, target.y + target.height / 2])
         heading = rng.uniform(-np.pi, np.pi, count)
-        if drawn is not None:
-            tangent = drawn.nearest(place[None])[1][0]
+        if road_course is not None:
+            tangent = road_course.nearest(position[None])[1][0]
             heading = tangent + np.pi * rng.integers(0, 2, count) + rng.normal(0.0, 0.2, count)
-        speed = rng.uniform(0.0, _FASTEST * max(target.width, target.height), count)
-        return np.column_stack([place + rng.normal(0.0, 1.0, (count, 2)), speed, heading])
+        speed = rng.uniform(0.0, _MAX_INITIAL_SPEED * max(target.width, target.height), count)
+        return np.column_stack([position + rng.normal(0.0, 1.0, (count, 2)), speed, heading])
 
-    def _estimate(self, time: float, state: State, started: _Started) -> Estimate:
-        """The densest cluster's mean; the paper does not say which point of the cloud it takes."""
-        states, weights = started.cloud.states, started.cloud.weights
-        parts = started.clusters
+    def _estimate(self, time: float, state: TrackState, track: _Track) -> Estimate:
+        """The densest cluster's mean; the paper does not state its point estimate."""
+        states, weights = track.particles.states, track.particles.weights
+        parts = track.clusters
         total = sum(part.weight for part in parts)
-        x, y = started.place()
+        x, y = track.position()
         chosen = parts[0].members
         share = weights[chosen] / weights[chosen].sum()
         heading = np.where(states[chosen, 2] < 0.0, states[chosen, 3] + np.pi, states[chosen, 3])
         layers: dict[str, Floats] = {}
-        if started.view.course is not None:
-            layers = _outlines(started.view.course)
-        lost = state is State.LOST
+        if track.diagnostics.course is not None:
+            layers = _outlines(track.diagnostics.course)
+        lost = state is TrackState.LOST
         return Estimate(
             time=time,
             state=state,
             x=float("nan") if lost else float(x),
             y=float("nan") if lost else float(y),
-            width=started.box.width,
-            height=started.box.height,
+            width=track.box.width,
+            height=track.box.height,
             heading=float("nan") if lost else pf.circular_mean(heading, share),
-            std=started.spread(),
+            std=track.spread(),
             hypotheses=tuple(
                 Hypothesis(part.weight / total, float(part.centre[0]), float(part.centre[1])) for part in parts
             )
@@ -235,14 +242,14 @@ class PaperTracker:
             layers=layers,
         )
 
-    def _ready(self) -> _Started:
-        if self._started is None:
+    def _ready(self) -> _Track:
+        if self._track is None:
             raise RuntimeError("begin comes before handle_frame")
-        return self._started
+        return self._track
 
 
-class _Started:
-    """What there is once the target is known; changed frame by frame."""
+class _Track:
+    """State of the tracker after initialisation; updated with every frame."""
 
     def __init__(
         self,
@@ -250,107 +257,111 @@ class _Started:
         image: Image,
         background: BackgroundFilter,
         road_filter: RoadFilter,
-        road: Road | None,
+        road: RoadMidline | None,
         statistics: regions.RegionStatistics,
     ) -> None:
         self.box, self.background, self.road_filter, self.road = box, background, road_filter, road
         self.statistics = statistics
         self.template = histograms.target_histogram(image, box)
-        self.judge = AppearanceJudge.beside(image, box, self.template)
-        self._cloud = pf.Particles.evenly(np.zeros((1, 4)))
-        self._place = np.zeros(2)
-        self.model: RoadSteered | BackgroundAware
-        self.number: pf.AdaptiveNumber
-        self.view: View
+        self.appearance_test = AppearanceTest.from_surroundings(image, box, self.template)
+        self._particles = pf.Particles.uniform(np.zeros((1, 4)))
+        self._position = np.zeros(2)
+        self.model: RoadSteeredModel | BackgroundAwareModel
+        self.number: pf.KldSampleSize
+        self.diagnostics: FrameDiagnostics
         self.visible = True
         self.marked = True
         self.frames = 0
-        self._progress = 0.0  # mean of V cos(theta - tangent) lately [px a frame]
+        self._progress = 0.0  # exponential mean of V cos(theta - tangent) [px a frame]
         self._progress_frames = 0
 
     @property
     def direction(self) -> int:
-        """Of travel along the road's order: +1, -1, or 0 until it is clear."""
+        """Direction of travel along the order of the road's points: +1, -1, or 0 while undetermined."""
         clear = self._progress_frames >= 8 and abs(self._progress) > 0.01 * max(self.box.width, self.box.height)
         return int(np.sign(self._progress)) if clear else 0
 
     def learn_direction(self) -> None:
-        """From the velocity of the cloud in a frame in which the target was seen."""
-        if self.view.course is None:
+        """Update the direction of travel from the particles' velocity in a frame with a visible target."""
+        if self.diagnostics.course is None:
             return
-        weights, states = self.cloud.weights, self.cloud.states
-        _, tangent = self.view.course.nearest(states[:, :2])
+        weights, states = self.particles.weights, self.particles.states
+        _, tangent = self.diagnostics.course.nearest(states[:, :2])
         progress = float(weights @ (states[:, 2] * np.cos(states[:, 3] - tangent)))
-        self._progress += _DIRECTION_MEMORY * (progress - self._progress)
+        self._progress += _DIRECTION_UPDATE_RATE * (progress - self._progress)
         self._progress_frames += 1
 
     def forget_direction(self) -> None:
-        """For another road."""
+        """Reset the direction of travel, for another road."""
         self._progress, self._progress_frames = 0.0, 0
 
     @property
-    def cloud(self) -> pf.Particles:
+    def particles(self) -> pf.Particles:
         """The car's particles."""
-        return self._cloud
+        return self._particles
 
-    @cloud.setter
-    def cloud(self, cloud: pf.Particles) -> None:
-        self._cloud = cloud
+    @particles.setter
+    def particles(self, particles: pf.Particles) -> None:
+        self._particles = particles
         radius = _CLUSTER * max(self.box.width, self.box.height)
-        self.clusters = pf.clusters(cloud.states[:, :2], cloud.weights, radius)
-        self._place = self.clusters[0].centre
+        self.clusters = pf.clusters(particles.states[:, :2], particles.weights, radius)
+        self._position = self.clusters[0].centre
 
-    def place(self) -> Floats:
-        """(2,) the densest cluster's middle."""
-        return self._place
+    def position(self) -> Floats:
+        """Centre (2,) of the densest cluster."""
+        return self._position
 
     def spread(self) -> float:
-        """Std of one coordinate about the estimate, of the whole cloud."""
-        off = self.cloud.states[:, :2] - self.place()
-        return float(np.sqrt(0.5 * self.cloud.weights @ np.square(off).sum(axis=1)))
+        """Std per coordinate about the estimate, over all particles."""
+        off = self.particles.states[:, :2] - self.position()
+        return float(np.sqrt(0.5 * self.particles.weights @ np.square(off).sum(axis=1)))
 
 
 def _grey(image: Image) -> npt.NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
-def _first_road(grey: npt.NDArray[np.uint8], target: Box, road_filter: RoadFilter) -> tuple[Road | None, bool]:
-    """And whether it is a marked one: without white lines, any edges have to do."""
-    beside = sections(grey, target)
+def _first_road(grey: npt.NDArray[np.uint8], target: Box, road_filter: RoadFilter) -> tuple[RoadMidline | None, bool]:
+    """The road in the first frame and whether it has white lines; without any, Canny edges are used."""
+    sections = find_sections(grey, target)
     for marked in (True, False):
-        road = road_filter.begin(Edges.of(grey, marked), beside)
+        road = road_filter.begin(EdgeDistance.of(grey, marked), sections)
         if road is not None:
             return road, marked
     return None, True
 
 
-def _first_road_pixels(small: Image, target: Box, drawn: Course | None) -> npt.NDArray[np.bool_]:
-    """Which pixels of the reduced first frame are road: within its shape near the target, else a ring about it."""
+def _first_road_pixels(small: Image, target: Box, road_course: RoadCourse | None) -> npt.NDArray[np.bool_]:
+    """Road pixels of the reduced first frame: within the road model beside the target, else a ring about it."""
     height, width = small.shape[:2]
     x, y = np.meshgrid(np.arange(width) * regions.SCALE, np.arange(height) * regions.SCALE)
     dx = np.abs(x - target.x - target.width / 2) / (target.width / 2 + 4.0)
     dy = np.abs(y - target.y - target.height / 2) / (target.height / 2 + 4.0)
     beside = np.maximum(dx, dy) > 1.0
-    if drawn is not None:
-        within = regions.road_mask(drawn, (height, width), np.zeros(2), 0.8, known=True) & beside
+    if road_course is not None:
+        within = regions.road_mask(road_course, (height, width), np.zeros(2), 0.8, known=True) & beside
         if within.sum() > 30:
             return np.asarray(within)
     ring = beside & (np.maximum(dx, dy) < 1.6)
     return np.asarray(ring if ring.sum() > 8 else beside)
 
 
-def _looked_at(
-    small: Image, statistics: regions.RegionStatistics, drawn: Course | None, motion: Motion, direction: int
-) -> View:
+def _diagnose(
+    small: Image,
+    statistics: regions.RegionStatistics,
+    road_course: RoadCourse | None,
+    motion: BackgroundMotion,
+    direction: int,
+) -> FrameDiagnostics:
     labels = regions.classify(small, statistics)
-    return View(labels, regions.corrected(labels, drawn), drawn, motion, direction)
+    return FrameDiagnostics(labels, regions.corrected(labels, road_course), road_course, motion, direction)
 
 
-def _outlines(drawn: Course) -> dict[str, Floats]:
-    """The road's middle and white lines, for overlays."""
-    normal = np.column_stack([-np.sin(drawn.headings), np.cos(drawn.headings)])
+def _outlines(road_course: RoadCourse) -> dict[str, Floats]:
+    """Midline and white lines of the road, for overlays."""
+    normal = np.column_stack([-np.sin(road_course.headings), np.cos(road_course.headings)])
     return {
-        "road": drawn.points,
-        "white line left": drawn.points - drawn.half_width * normal,
-        "white line right": drawn.points + drawn.half_width * normal,
+        "road": road_course.points,
+        "white line left": road_course.points - road_course.half_width * normal,
+        "white line right": road_course.points + road_course.half_width * normal,
     }

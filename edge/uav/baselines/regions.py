@@ -1,4 +1,4 @@
-"""Section 4.1: road, building and other by colour, corrected by the road's shape: where a car may be (4.1 to 4.9)."""
+"""Section 4.1: road, building and other regions by colour, corrected by the road model; existence map (4.1-4.9)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.baselines.road import Course
+from edge.uav.baselines.road import RoadCourse
 from edge.uav.tracker import Box, Image
 from protocols.geometry.types import Bools, Floats
 
@@ -18,14 +18,14 @@ BUILDING, ROAD, OTHER = 0, 1, 2
 COLOURS = np.array([[0, 0, 255], [255, 0, 0], [0, 255, 0]], dtype=np.uint8)
 """BGR of the labels as in (4.7) to (4.9)."""
 EXISTENCE = np.array([0.1, 1.0, 0.8], dtype=np.float32)
-"""Second eq. (4.9): how probable a car is on a building, on the road, elsewhere."""
+"""Second eq. (4.9): probability of a car on a building, on the road, elsewhere."""
 SCALE = 4
 """Regions are classified at a quarter of the resolution."""
-_GATE = 11.34  # chi-square of three bands, 99 %
-_LEAST_VARIANCE = 16.0  # grey levels squared
-_ADAPTATION = 0.03  # a frame
-_SIDEWALK = 1.5  # half widths: building this near to the road is taken for sidewalk
-_MARGIN = 0.75  # of the image's size that the map reaches beyond each border
+_CHI_SQUARE_GATE = 11.34  # chi-square of three bands, 99 %
+_MIN_VARIANCE = 16.0  # grey levels squared
+_UPDATE_RATE = 0.03  # a frame
+_SIDEWALK_REACH = 1.5  # half widths: building labels this near to the road are taken for sidewalk
+_MARGIN = 0.75  # of the image size: extent of the map beyond each border
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,46 +38,46 @@ class RegionStatistics:
     other_variance: Floats
 
     @classmethod
-    def taught(cls, image: Image, road: Bools, other: Bools) -> RegionStatistics:
-        """From an image (h, w, 3) and which of its pixels (h, w) are road and which other; both must have some."""
+    def from_masks(cls, image: Image, road: Bools, other: Bools) -> RegionStatistics:
+        """From an image (h, w, 3) and masks (h, w) of road and other; neither may be empty."""
         return cls(*_statistics(image[road]), *_statistics(image[other]))
 
-    def adapted(self, image: Image, labels: Labels, sure_road: Bools) -> RegionStatistics:
-        """A little nearer to what this frame shows within the road's shape, and to what it calls other."""
+    def adapted(self, image: Image, labels: Labels, road_core: Bools) -> RegionStatistics:
+        """Exponential update from this frame's pixels within the road model and its pixels labelled other."""
         changed = self
-        if sure_road.sum() > 50:
-            mean, variance = _statistics(image[sure_road])
+        if road_core.sum() > 50:
+            mean, variance = _statistics(image[road_core])
             changed = replace(
                 changed,
-                road_mean=self.road_mean + _ADAPTATION * (mean - self.road_mean),
-                road_variance=self.road_variance + _ADAPTATION * (variance - self.road_variance),
+                road_mean=self.road_mean + _UPDATE_RATE * (mean - self.road_mean),
+                road_variance=self.road_variance + _UPDATE_RATE * (variance - self.road_variance),
             )
-        other = (labels == OTHER) & ~sure_road
+        other = (labels == OTHER) & ~road_core
         if other.sum() > 50:
-            # Its variance stays: the gate has cut off what lies farther out.
-            moved = self.other_mean + _ADAPTATION * (_statistics(image[other])[0] - self.other_mean)
+            # Its variance is kept: the gate truncates the distribution, which would bias it.
+            moved = self.other_mean + _UPDATE_RATE * (_statistics(image[other])[0] - self.other_mean)
             changed = replace(changed, other_mean=moved)
         return changed
 
 
 def reduced(image: Image) -> Image:
-    """The image at the resolution of regions."""
+    """The image at the resolution of the region labels."""
     return np.asarray(
         cv2.resize(image, (image.shape[1] // SCALE, image.shape[0] // SCALE), interpolation=cv2.INTER_AREA),
         dtype=np.uint8,
     )
 
 
-def learn(small: Image, road: Bools) -> RegionStatistics:
-    """Statistics from the first frame: small is it (reduced), road (h/4, w/4) says what lies within the road's shape.
+def learn_statistics(small: Image, road: Bools) -> RegionStatistics:
+    """Statistics from the first frame: small: reduced image; road (h/4, w/4): mask of the road model.
 
-    Other: the commonest of three kinds of colour among the pixels that are not the road's colour.
+    Other: the largest of three k-means clusters among the pixels that do not have the road's colour.
     """
     road_mean, road_variance = _statistics(small[road])
     rest = small.reshape(-1, 3).astype(np.float64)
-    rest = rest[(np.square(rest - road_mean) / road_variance).sum(axis=1) > _GATE]
+    rest = rest[(np.square(rest - road_mean) / road_variance).sum(axis=1) > _CHI_SQUARE_GATE]
     if len(rest) < 50:
-        return RegionStatistics(road_mean, road_variance, 255.0 - road_mean, np.full(3, _LEAST_VARIANCE))
+        return RegionStatistics(road_mean, road_variance, 255.0 - road_mean, np.full(3, _MIN_VARIANCE))
     criteria = (cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 10, 1.0)
     kind = np.zeros((len(rest), 1), dtype=np.int32)
     kind[:, 0] = np.argsort(np.argsort(rest.sum(axis=1))) * 3 // len(rest)
@@ -91,26 +91,26 @@ def band_distances(
     pixels: Floats | npt.NDArray[np.float32], mean: Floats, variance: Floats
 ) -> npt.NDArray[np.floating]:
     """Eqs. (4.5), (4.6): squared standardised distance of pixels (..., 3) to a mean (3,), variances (3,) -> (...)."""
-    apart = pixels - mean.astype(pixels.dtype)
-    return np.asarray((apart * apart) @ (1.0 / variance).astype(pixels.dtype))
+    difference = pixels - mean.astype(pixels.dtype)
+    return np.asarray((difference * difference) @ (1.0 / variance).astype(pixels.dtype))
 
 
 def classify(small: Image, statistics: RegionStatistics) -> Labels:
     """Eqs. (4.7) to first (4.9): road, other, or building where it is neither; (h, w, 3) -> (h, w).
 
-    Deviation: printed as d^2 < s^2, which compares a number without unit with grey levels squared. Here d^2 is
-    gated by the chi-square quantile of three bands (99 %); where both pass, the nearer one has it.
+    Deviation: printed as d^2 < s^2, which compares a dimensionless number with grey levels squared. Here d^2 is
+    gated by the chi-square quantile of three bands (99 %); where both pass, the nearer one is chosen.
     """
     pixels = small.astype(np.float32)
     road = band_distances(pixels, statistics.road_mean, statistics.road_variance)
     other = band_distances(pixels, statistics.other_mean, statistics.other_variance)
     labels = np.where(other < road, OTHER, ROAD)
-    return np.where(np.minimum(road, other) < _GATE, labels, BUILDING).astype(np.uint8)
+    return np.where(np.minimum(road, other) < _CHI_SQUARE_GATE, labels, BUILDING).astype(np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExistenceMap:
-    """Where a car may be, also beyond the image.
+    """Existence probability of a car, also beyond the image.
 
     mean: (h, w) float32, existence probability averaged over the target's box. origin: (2,) image pixel of mean[0, 0].
     """
@@ -127,10 +127,10 @@ class ExistenceMap:
         return np.log(self.mean[y, x].astype(np.float64))
 
 
-def road_mask(course: Course, shape: tuple[int, int], origin: Floats, widths: float, known: bool = False) -> Bools:
-    """(h, w) of a map of that shape at a quarter resolution: what lies within widths half widths of the course.
+def road_mask(course: RoadCourse, shape: tuple[int, int], origin: Floats, widths: float, known: bool = False) -> Bools:
+    """(h, w) of a map of that shape at a quarter resolution: pixels within ``widths`` half widths of the course.
 
-    origin: (2,) image pixel of [0, 0]. known: without what is extrapolated.
+    origin: (2,) image pixel of [0, 0]. known: without the extrapolated part.
     """
     mask = np.zeros(shape, dtype=np.uint8)
     points = course.points[course.known] if known else course.points
@@ -140,25 +140,25 @@ def road_mask(course: Course, shape: tuple[int, int], origin: Floats, widths: fl
     return np.asarray(mask > 0)
 
 
-def corrected(labels: Labels, course: Course | None) -> Labels:
-    """Section 4.1: within the road's shape all is road; building beside it is sidewalk, and counts as road too."""
+def corrected(labels: Labels, course: RoadCourse | None) -> Labels:
+    """Section 4.1: within the road model all is road; building beside it is sidewalk and counts as road too."""
     if course is None:
         return labels
     at = np.zeros(2)
     result = np.where(road_mask(course, labels.shape, at, 1.0, known=True), ROAD, labels)
-    beside = road_mask(course, labels.shape, at, _SIDEWALK, known=True) & (labels == BUILDING)
+    beside = road_mask(course, labels.shape, at, _SIDEWALK_REACH, known=True) & (labels == BUILDING)
     return np.where(beside, ROAD, result).astype(np.uint8)
 
 
-def existence(labels: Labels, course: Course | None, box: Box) -> ExistenceMap:
-    """Second eq. (4.9), carried beyond the image and averaged over boxes of box's size.
+def existence(labels: Labels, course: RoadCourse | None, box: Box) -> ExistenceMap:
+    """Second eq. (4.9), extended beyond the image and averaged over boxes of box's size.
 
-    Section 4.3: beyond the border building and other are those of the border's pixels; the road there is the
-    extrapolated spline, and what the border shows of the road itself does not continue straight out.
+    Section 4.3: beyond the border, building and other are replicated from the border pixels; the road there is the
+    extrapolated spline, and road pixels at the border are not replicated.
     """
     height, width = labels.shape
     wide, high = round(_MARGIN * width), round(_MARGIN * height)
-    # Road at the border would be smeared outwards: only the spline may say where it goes on.
+    # Replicating road pixels would smear the road outwards; only the spline extends it.
     outward = labels if course is None else np.where(labels == ROAD, OTHER, labels).astype(np.uint8)
     padded = cv2.copyMakeBorder(outward, high, high, wide, wide, cv2.BORDER_REPLICATE)
     padded[high : high + height, wide : wide + width] = labels
@@ -173,9 +173,9 @@ def existence(labels: Labels, course: Course | None, box: Box) -> ExistenceMap:
 
 
 def _statistics(pixels: npt.NDArray[np.generic]) -> tuple[Floats, Floats]:
-    """Mean (3,) and variance (3,) of pixels (n, 3), from medians: markings and cars are among the road's pixels."""
+    """Mean (3,) and variance (3,) of pixels (n, 3), robust (median, MAD) to markings and cars on the road."""
     flat = pixels.reshape(-1, 3)
     values = flat[:: max(len(flat) // 800, 1)].astype(np.float64)
     middle = np.median(values, axis=0)
     deviation = 1.4826 * np.median(np.abs(values - middle), axis=0)
-    return middle, np.maximum(np.square(deviation), _LEAST_VARIANCE)
+    return middle, np.maximum(np.square(deviation), _MIN_VARIANCE)

@@ -1,6 +1,6 @@
-"""Parts of the ground-plane tracker: ego-motion, appearance, road and the motion of one car.
+"""Ground frame of the UAV tracker: ego-motion over the ground plane, localisation, photometric gain and road map.
 
-Ground units: metres where telemetry gives the height, else chosen so that the target is a car's length long.
+Ground units: metres where telemetry gives the height, else scaled so that the target is as long as a car.
 Ground axes: X, Y on the plane; with telemetry X is north and Y east, without it X is right and Y down in the
-first picture. Angles are atan2(Y, X).
+first image. Angles are atan2(Y, X).
 """

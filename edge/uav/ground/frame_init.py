@@ -1,4 +1,4 @@
-"""Where the ground frame comes from: telemetry where it is there, else the first picture itself."""
+"""Initialisation of the ground frame: from telemetry where available, else from the first image alone."""
 
 from __future__ import annotations
 
@@ -6,67 +6,69 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.uav.ground.image_plane import ImagePlane, inverse, transfer
-from edge.uav.ground.plane_motion import ChainPlane, PosePlane
-from edge.uav.timing.telemetry_track import TelemetryClock
+from edge.uav.ground.image_plane import ImagePlane, apply_homography, inverse
+from edge.uav.ground.plane_motion import PlaneHomography, PlanePose
+from edge.uav.timing.telemetry_track import TelemetryTrack
 from edge.uav.tracker import Box
 from protocols.geometry.types import Floats
 
 CAR_LENGTH = 4.5
-"""What the target's longer side is taken for where nothing gives the scale [ground units]."""
-_SHORTEST_CAR, _LONGEST_CAR = 1.2, 30.0  # of what a target can be [m]
-_LOWEST = 2.0  # height that can be meant [m]
-_STEEPEST = 12.0  # distance on the ground over the height: beyond, the target is near the horizon
+"""Assumed length of the target where the scale is not observable [ground units]."""
+_MIN_CAR_LENGTH, _MAX_CAR_LENGTH = 1.2, 30.0  # of a plausible target [m]
+_MIN_HEIGHT = 2.0  # of the camera for a plausible position [m]
+_MAX_RANGE_RATIO = 12.0  # horizontal distance over height: beyond, the target is near the horizon
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Root:
-    """A start of the ground frame. kind: "metric", "attitude" (scale unknown) or "picture"."""
+class GroundFrame:
+    """An initial camera pose that defines the ground frame. kind: "metric", "attitude" (scale unknown) or "image"."""
 
-    motion: PosePlane | ChainPlane
+    pose: PlanePose | PlaneHomography
     kind: str
 
     @property
     def rank(self) -> int:
-        """The more is known, the higher."""
-        return ("picture", "attitude", "metric").index(self.kind)
+        """Higher if more degrees of freedom of the frame are known."""
+        return ("image", "attitude", "metric").index(self.kind)
 
 
-def root_from_telemetry(plane: ImagePlane, clock: TelemetryClock | None, time: float, target: Box) -> Root | None:
-    """A pose over the plane from the attitude nearest to ``time``; None where there is none or it can't be meant."""
-    if clock is None or plane.lens is None:
+def frame_from_telemetry(
+    plane: ImagePlane, telemetry: TelemetryTrack | None, time: float, target: Box
+) -> GroundFrame | None:
+    """A pose over the plane from the attitude nearest to ``time``; None if there is none or it is implausible."""
+    if telemetry is None or plane.lens is None:
         return None
-    found = clock.nearest(time, within=0.6)
+    found = telemetry.nearest(time, within=0.6)
     if found is None:
         return None
     rotation, position = found
-    seen = plane.normalise(_corners(target))
-    if position is not None and -position[2] > _LOWEST:
-        motion = PosePlane(rotation, np.asarray(position, dtype=np.float64))
-        if not _in_reach(motion, seen):
+    normalised = plane.normalise(_corners(target))
+    if position is not None and -position[2] > _MIN_HEIGHT:
+        pose = PlanePose(rotation, np.asarray(position, dtype=np.float64))
+        if not _is_within_range(pose, normalised):
             return None
-        longer = _longer_side(motion, seen)
-        # A height from which the target is a toy or a ship is wrong; the attitude may still be right.
-        if _SHORTEST_CAR < longer < _LONGEST_CAR:
-            return Root(motion, "metric")
-    unit = PosePlane(rotation, np.array([0.0, 0.0, -1.0]))
-    if not _in_reach(unit, seen):
+        longer_side = _longer_side(pose, normalised)
+        # A height that makes the target as small as a toy or as long as a ship is wrong; the attitude may be right.
+        if _MIN_CAR_LENGTH < longer_side < _MAX_CAR_LENGTH:
+            return GroundFrame(pose, "metric")
+    at_unit_height = PlanePose(rotation, np.array([0.0, 0.0, -1.0]))
+    if not _is_within_range(at_unit_height, normalised):
         return None
-    height = CAR_LENGTH / max(_longer_side(unit, seen), 1e-9)
-    return Root(PosePlane(rotation, np.array([0.0, 0.0, -height])), "attitude")
+    height = CAR_LENGTH / max(_longer_side(at_unit_height, normalised), 1e-9)
+    return GroundFrame(PlanePose(rotation, np.array([0.0, 0.0, -height])), "attitude")
 
 
-def _longer_side(motion: PosePlane, seen: Floats) -> float:
-    """Of the box with normalised corners (4, 2), on the ground."""
-    corners = transfer(inverse(motion.matrix), seen)
+def _longer_side(pose: PlanePose, normalised: Floats) -> float:
+    """Longer side on the ground of the box with normalised corners (4, 2)."""
+    corners = apply_homography(inverse(pose.matrix), normalised)
     return float(max(np.linalg.norm(corners[1] - corners[0]), np.linalg.norm(corners[3] - corners[0])))
 
 
-def root_from_picture(plane: ImagePlane, target: Box) -> Root:
-    """The first picture is the ground, seen from straight above; the target is a car's length long."""
+def frame_from_image(plane: ImagePlane, target: Box) -> GroundFrame:
+    """A frame in which the first image is the ground seen from straight above and the target has a car's length."""
     size = max(target.width, target.height) / plane.focal / CAR_LENGTH
     matrix = np.diag([size, size, 1.0])
-    return Root(ChainPlane(matrix / np.cbrt(np.linalg.det(matrix))), "picture")
+    return GroundFrame(PlaneHomography(matrix / np.cbrt(np.linalg.det(matrix))), "image")
 
 
 def _corners(target: Box) -> Floats:
@@ -74,13 +76,13 @@ def _corners(target: Box) -> Floats:
     return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], dtype=np.float64)
 
 
-def _in_reach(motion: PosePlane, seen: Floats) -> bool:
-    """Whether all of these image points are on the ground and not near the horizon."""
+def _is_within_range(pose: PlanePose, normalised: Floats) -> bool:
+    """Whether all of these normalised image points lie on the ground and not near the horizon."""
     try:
-        ground = transfer(inverse(motion.matrix), seen)
+        ground = apply_homography(inverse(pose.matrix), normalised)
     except np.linalg.LinAlgError:
         return False
     if not np.isfinite(ground).all():
         return False
-    away = np.linalg.norm(ground - motion.centre[:2], axis=1).max()
-    return bool(away < _STEEPEST * abs(float(motion.centre[2])))
+    distance = np.linalg.norm(ground - pose.centre[:2], axis=1).max()
+    return bool(distance < _MAX_RANGE_RATIO * abs(float(pose.centre[2])))

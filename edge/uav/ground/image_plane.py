@@ -1,4 +1,4 @@
-"""The camera as the tracker needs it: pixels to undistorted normalised coordinates and back, everywhere finite."""
+"""Camera model of the tracker: pixels to normalised coordinates and back, finite everywhere; homographies."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from protocols.geometry.types import Floats
 class ImagePlane:
     """Maps pixels (n, 2) to normalised coordinates (n, 2).
 
-    With a lens these are its undistorted x/z, y/z. Without one they are pixels from the image's centre in units
+    With intrinsics these are the undistorted x/z, y/z. Without them they are pixels from the image centre in units
     of the longer side.
     """
 
@@ -24,27 +24,29 @@ class ImagePlane:
             self.matrix: Floats = np.array([[longer, 0.0, centre[0]], [0.0, longer, centre[1]], [0.0, 0.0, 1.0]])
         else:
             self.matrix = np.asarray(lens.matrix, dtype=np.float64)
-        self.bent = lens is not None and (lens.fisheye or bool(np.any(lens.distortions)))
+        self.distorted = lens is not None and (lens.fisheye or bool(np.any(lens.distortions)))
         self.focal = float(0.5 * (self.matrix[0, 0] + self.matrix[1, 1]))
         self._inverse = np.linalg.inv(self.matrix)
 
     def normalise(self, pixels: Floats) -> Floats:
-        """Normalised coordinates (n, 2) of pixels (n, 2); NaN where the lens has no inverse."""
-        if self.bent and self.lens is not None:
+        """Normalised coordinates (n, 2) of pixels (n, 2); NaN where the distortion model has no inverse."""
+        if self.distorted and self.lens is not None:
             return self.lens.unproject(pixels)
         m = self._inverse
         return np.asarray(pixels @ m[:2, :2].T + m[:2, 2])
 
     def pixels(self, normalised: Floats) -> Floats:
-        """Pixels (n, 2); far outside the picture, where a lens model folds over, those of a pinhole."""
+        """Pixels (n, 2); far outside the image, where a distortion model folds over, pinhole projection."""
         m = self.matrix
-        straight = np.asarray(normalised @ m[:2, :2].T + m[:2, 2])
-        if not self.bent or self.lens is None:
-            return straight
-        bent = self.lens.project_normalised(normalised)
-        # Past the corners the polynomial means nothing: blend to the pinhole where it was never measured.
-        far = np.hypot(normalised[:, 0], normalised[:, 1]) > self._reach
-        return np.where(np.isfinite(bent) & ~far[:, None], bent, straight + self._edge_shift(normalised))
+        pinhole = np.asarray(normalised @ m[:2, :2].T + m[:2, 2])
+        if not self.distorted or self.lens is None:
+            return pinhole
+        distorted = self.lens.project_normalised(normalised)
+        # Beyond the corners the distortion polynomial is not calibrated: continue with the pinhole model there.
+        outside = np.hypot(normalised[:, 0], normalised[:, 1]) > self._valid_radius
+        return np.where(
+            np.isfinite(distorted) & ~outside[:, None], distorted, pinhole + self._distortion_at_limit(normalised)
+        )
 
     def inside(self, pixels: Floats, margin: float = 0.0) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
         """Which pixels (n, 2) lie in the image, at least ``margin`` from its border."""
@@ -55,9 +57,9 @@ class ImagePlane:
             )
 
     @property
-    def _reach(self) -> float:
-        """Normalised radius up to which the lens model is believed: 1.3 times the corners'."""
-        cached: float | None = getattr(self, "_reach_value", None)
+    def _valid_radius(self) -> float:
+        """Normalised radius up to which the distortion model is used: 1.3 times that of the corners."""
+        cached: float | None = getattr(self, "_valid_radius_value", None)
         if cached is None:
             corners = np.array(
                 [[0, 0], [self.width - 1, 0], [0, self.height - 1], [self.width - 1, self.height - 1]], dtype=np.float64
@@ -65,14 +67,14 @@ class ImagePlane:
             found = self.normalise(corners)
             radius = np.hypot(found[:, 0], found[:, 1])
             cached = 1.3 * float(np.nanmax(radius)) if np.isfinite(radius).any() else 1.0
-            self._reach_value = cached
+            self._valid_radius_value = cached
         return cached
 
-    def _edge_shift(self, normalised: Floats) -> Floats:
-        """What keeps the map continuous at the reach: the distortion there, along the same direction."""
+    def _distortion_at_limit(self, normalised: Floats) -> Floats:
+        """The distortion at the valid radius in the same direction, which keeps the map continuous."""
         assert self.lens is not None
         radius = np.maximum(np.hypot(normalised[:, 0], normalised[:, 1]), 1e-9)
-        at = normalised * (self._reach / radius)[:, None]
+        at = normalised * (self._valid_radius / radius)[:, None]
         m = self.matrix
         shift = self.lens.project_normalised(at) - (at @ m[:2, :2].T + m[:2, 2])
         return np.asarray(np.where(np.isfinite(shift), shift, 0.0))
@@ -83,8 +85,8 @@ def inverse(matrix: Floats) -> Floats:
     return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
 
 
-def transfer(matrix: Floats, points: Floats) -> Floats:
-    """Points (n, 2) through a homography (3, 3); NaN where they are not in front (third coordinate <= 0)."""
+def apply_homography(matrix: Floats, points: Floats) -> Floats:
+    """Points (n, 2) mapped by a homography (3, 3); NaN where they are not in front (third coordinate <= 0)."""
     p = points @ matrix[:, :2].T + matrix[:, 2]
     z = np.where(p[:, 2] > 1e-9, p[:, 2], np.nan)
     return np.asarray(p[:, :2] / z[:, None])

@@ -1,4 +1,4 @@
-"""How much lighter or darker the picture is than it was at the start, each channel, from the ground that stays."""
+"""Photometric gain: brightness change of each channel since the first frame, from static ground points."""
 
 from __future__ import annotations
 
@@ -8,92 +8,92 @@ import numpy.typing as npt
 
 from protocols.geometry.types import Floats
 
-Picture = npt.NDArray[np.uint8]
+Image = npt.NDArray[np.uint8]
 
-_MOST_A_FRAME = 0.3  # of the logarithm
-_KEPT = 0.99  # of the gain, a frame
-_RANGE = (0.3, 3.0)
-_FEWEST = 12  # points that tell anything
-_SHADE_RATE = 0.8  # of a look
-_MOST_SHADE_A_LOOK = 0.25  # of the logarithm
-_DARKEST = 0.7
-_SHADE_S = 1.5
-_NO_SHADE = 0.02
+_MAX_LOG_CHANGE = 0.3  # of the gain, per frame
+_LEAK = 0.99  # of the log gain, per frame
+_GAIN_LIMITS = (0.3, 3.0)
+_MIN_POINTS = 12  # for an update
+_TARGET_RATE = 0.8  # share of the target's measured change that is applied
+_MAX_TARGET_CHANGE = 0.25  # of the log gain, per measurement
+_MAX_TARGET_LOG_GAIN = 0.7
+_TARGET_DECAY_S = 1.5
+_NEGLIGIBLE_LOG_GAIN = 0.02
 
 
-class Light:
-    """Gain (3,) of the channels over those of the first frame."""
+class PhotometricGain:
+    """Gain (3,) of the channels relative to the first frame."""
 
     def __init__(self) -> None:
         self.gain = np.ones(3)
-        self._before: Picture | None = None
-        self._tables: Picture | None = None
+        self._previous: Image | None = None
+        self._lookup_table: Image | None = None
 
-    def update(self, small: Picture, old: Floats, new: Floats) -> None:
-        """Compare the same ground points in the last working picture (``old``, (n, 2)) and in this one (``new``)."""
-        soft = np.asarray(cv2.blur(small, (5, 5)), np.uint8)
-        if self._before is not None and len(old) >= _FEWEST:
-            before, after = _sampled(self._before, old), _sampled(soft, new)
+    def update(self, working: Image, old: Floats, new: Floats) -> None:
+        """Compare the same ground points in the last working image (``old``, (n, 2)) and in this one (``new``)."""
+        blurred = np.asarray(cv2.blur(working, (5, 5)), np.uint8)
+        if self._previous is not None and len(old) >= _MIN_POINTS:
+            before, after = _bilinear(self._previous, old), _bilinear(blurred, new)
             usable = ((before > 8) & (after > 8) & (before < 247) & (after < 247)).all(axis=1)
-            if int(usable.sum()) >= _FEWEST:
+            if int(usable.sum()) >= _MIN_POINTS:
                 change = np.median(np.log(after[usable] / before[usable]), axis=0)
-                change = np.clip(change, -_MOST_A_FRAME, _MOST_A_FRAME)
-                # What the tables have learnt meanwhile need not be undone, and rounding must not add up.
-                self.gain = np.clip(np.exp(_KEPT * np.log(self.gain) + change), *_RANGE)
-                self._tables = None
-        self._before = soft
+                change = np.clip(change, -_MAX_LOG_CHANGE, _MAX_LOG_CHANGE)
+                # The colour models adapt meanwhile, and rounding errors must not accumulate: hence the leak.
+                self.gain = np.clip(np.exp(_LEAK * np.log(self.gain) + change), *_GAIN_LIMITS)
+                self._lookup_table = None
+        self._previous = blurred
 
-    def undone(self, picture: Picture, shade: float = 0.0) -> Picture:
-        """The picture (h, w, 3) in the light of the start. shade: logarithm of what it has there besides the gain."""
-        if abs(shade) >= _NO_SHADE:
-            return _relit(picture, self.gain * np.exp(shade))
+    def corrected(self, image: Image, log_gain: float = 0.0) -> Image:
+        """The image (h, w, 3) with the gain removed. log_gain: additional gain to remove, natural logarithm."""
+        if abs(log_gain) >= _NEGLIGIBLE_LOG_GAIN:
+            return _divided(image, self.gain * np.exp(log_gain))
         if np.abs(self.gain - 1.0).max() < 0.02:
-            return picture
-        if self._tables is None:
-            self._tables = _tables(self.gain)
-        return np.asarray(cv2.LUT(np.ascontiguousarray(picture), self._tables), np.uint8)
+            return image
+        if self._lookup_table is None:
+            self._lookup_table = _lookup_table(self.gain)
+        return np.asarray(cv2.LUT(np.ascontiguousarray(image), self._lookup_table), np.uint8)
 
 
-class Shade:
-    """A cloud's shadow on the target, which the median over the picture knows nothing of: the car drives through it.
+class TargetGain:
+    """Gain at the target relative to the image's, for example in a cloud's shadow that the car drives through.
 
-    ``value`` is the logarithm of the light at the target over the picture's. Shadows are grey: a car of another colour
-    stays one.
+    ``log_gain`` is the natural logarithm of the ratio, common to all channels since shadows are grey: a car of another
+    colour remains distinguishable.
     """
 
     def __init__(self) -> None:
-        self.value = 0.0
-        self._usual: float | None = None
+        self.log_gain = 0.0
+        self._reference: float | None = None
 
-    def teach(self, brightness: float) -> None:
-        """From now on the target is this bright (mean logarithm) in the light that is known to fall on it."""
-        self._usual = brightness
+    def set_reference(self, brightness: float) -> None:
+        """Set the target's mean log brightness under the present gain."""
+        self._reference = brightness
 
     def update(self, brightness: float) -> None:
-        """Take the target's brightness as it was seen with ``value`` undone."""
-        if self._usual is None:
+        """Add the target's mean log brightness, measured with ``log_gain`` removed."""
+        if self._reference is None:
             return
-        change = float(np.clip(brightness - self._usual, -_MOST_SHADE_A_LOOK, _MOST_SHADE_A_LOOK))
-        self.value = float(np.clip(self.value + _SHADE_RATE * change, -_DARKEST, _DARKEST))
+        change = float(np.clip(brightness - self._reference, -_MAX_TARGET_CHANGE, _MAX_TARGET_CHANGE))
+        self.log_gain = float(
+            np.clip(self.log_gain + _TARGET_RATE * change, -_MAX_TARGET_LOG_GAIN, _MAX_TARGET_LOG_GAIN)
+        )
 
-    def fade(self, dt: float) -> None:
-        """The target is out of sight: where it is now the light may be another."""
-        self.value *= float(np.exp(-dt / _SHADE_S))
+    def decay(self, dt: float) -> None:
+        """Decay towards 0 while the target is not visible: its illumination may have changed."""
+        self.log_gain *= float(np.exp(-dt / _TARGET_DECAY_S))
 
 
-def _tables(gain: Floats) -> Picture:
+def _lookup_table(gain: Floats) -> Image:
     levels = np.arange(256)[:, None] / gain
     return np.asarray(np.clip(np.rint(levels), 0, 255), np.uint8)[None]
 
 
-def _relit(picture: Picture, gain: Floats) -> Picture:
-    return np.asarray(cv2.LUT(np.ascontiguousarray(picture), _tables(gain)), np.uint8)
+def _divided(image: Image, gain: Floats) -> Image:
+    return np.asarray(cv2.LUT(np.ascontiguousarray(image), _lookup_table(gain)), np.uint8)
 
 
-def _sampled(picture: Picture, points: Floats) -> Floats:
-    """Colours (n, 3) at image points (n, 2), linearly between pixels."""
+def _bilinear(image: Image, points: Floats) -> Floats:
+    """Colours (n, 3) at image points (n, 2), bilinearly interpolated."""
     at = points.astype(np.float32)
-    found = cv2.remap(
-        picture.astype(np.float32), at[:, :1], at[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    found = cv2.remap(image.astype(np.float32), at[:, :1], at[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(found, dtype=np.float64).reshape(-1, 3)

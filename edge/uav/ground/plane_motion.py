@@ -1,4 +1,4 @@
-"""Where the camera is over the ground plane: as a pose of 6 degrees of freedom, or as a bare homography.
+"""Camera pose over the ground plane: with 6 degrees of freedom (calibrated), or as a homography (uncalibrated).
 
 Both give ``matrix`` H (3, 3), normalised image from ground: m ~ H [X, Y, 1], third coordinate > 0 in front.
 """
@@ -14,36 +14,36 @@ from protocols.geometry import so3
 from protocols.geometry.types import Floats
 
 
-class PlaneMotion(Protocol):
-    """A camera over the plane that Gauss-Newton can move."""
+class PlaneCamera(Protocol):
+    """A camera over the plane whose parameters Gauss-Newton optimises."""
 
     @property
     def matrix(self) -> Floats:
         """(3, 3), normalised image from ground."""
         ...
 
-    def jacobian(self, ground: Floats, seen: Floats, depth: Floats) -> Floats:
+    def jacobian(self, ground: Floats, normalised: Floats, depth: Floats) -> Floats:
         """Derivative (n, 2, k) of normalised coordinates by the parameters.
 
-        ground: (n, 2) points; seen: (n, 2) their normalised coordinates; depth: (n,) third coordinates.
+        ground: (n, 2) points; normalised: (n, 2) their normalised coordinates; depth: (n,) third coordinates.
         """
         ...
 
-    def moved(self, step: Floats) -> Self:
-        """Moved by k parameters."""
+    def retract(self, step: Floats) -> Self:
+        """The camera changed by k local parameters."""
         ...
 
-    def continued(self, before: Self, ratio: float) -> Self:
-        """What follows if the motion since ``before`` goes on, times ``ratio``."""
+    def extrapolated(self, previous: Self, ratio: float) -> Self:
+        """The camera if the motion since ``previous`` continues, times ``ratio``."""
         ...
 
-    def prior_std(self, seconds: float, scale: float) -> Floats:
-        """(k,) std of the prediction. scale: typical distance to the ground [ground units]."""
+    def prediction_std(self, seconds: float, scale: float) -> Floats:
+        """(k,) std of the extrapolation. scale: typical distance to the ground [ground units]."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PosePlane:
+class PlanePose:
     """A calibrated camera: rotation (3, 3) camera from ground axes (X, Y, down), centre (3,).
 
     Parameters: rotation vector in camera axes [rad], centre [ground units].
@@ -54,15 +54,15 @@ class PosePlane:
 
     @property
     def matrix(self) -> Floats:
-        """H = R [e1 e2 -C], with the camera matrix taken off."""
+        """H = R [e1 e2 -C], without the camera matrix."""
         out = self.rotation.copy()
         out[:, 2] = -(self.rotation @ self.centre)
         return out
 
-    def jacobian(self, ground: Floats, seen: Floats, depth: Floats) -> Floats:
-        """Rotation acts as delta x p, a shift of the centre as -R delta."""
-        x, y = seen[:, 0], seen[:, 1]
-        out = np.empty((len(seen), 2, 6))
+    def jacobian(self, ground: Floats, normalised: Floats, depth: Floats) -> Floats:
+        """Derivative by a rotation vector, delta x p, and by a shift of the centre, -R delta."""
+        x, y = normalised[:, 0], normalised[:, 1]
+        out = np.empty((len(normalised), 2, 6))
         out[:, 0, 0], out[:, 1, 0] = -x * y, -1.0 - y * y
         out[:, 0, 1], out[:, 1, 1] = 1.0 + x * x, x * y
         out[:, 0, 2], out[:, 1, 2] = -y, x
@@ -71,16 +71,18 @@ class PosePlane:
         out[:, 1, 3:] = (a[1] - y[:, None] * a[2]) / depth[:, None]
         return out
 
-    def moved(self, step: Floats) -> PosePlane:
+    def retract(self, step: Floats) -> PlanePose:
         """exp(step[:3]) on the left of the rotation, step[3:] added to the centre."""
-        return PosePlane(so3.exp(step[:3]) @ self.rotation, self.centre + step[3:])
+        return PlanePose(so3.exp(step[:3]) @ self.rotation, self.centre + step[3:])
 
-    def continued(self, before: PosePlane, ratio: float) -> PosePlane:
+    def extrapolated(self, previous: PlanePose, ratio: float) -> PlanePose:
         """Constant angular and linear velocity."""
-        turn = so3.log(self.rotation @ before.rotation.T)
-        return PosePlane(so3.exp(ratio * turn) @ self.rotation, self.centre + ratio * (self.centre - before.centre))
+        rotation_step = so3.log(self.rotation @ previous.rotation.T)
+        return PlanePose(
+            so3.exp(ratio * rotation_step) @ self.rotation, self.centre + ratio * (self.centre - previous.centre)
+        )
 
-    def prior_std(self, seconds: float, scale: float) -> Floats:
+    def prediction_std(self, seconds: float, scale: float) -> Floats:
         """Angular acceleration of a few rad/s², speed changing by 1/20 of the height a frame of 1/30 s."""
         steps = max(seconds * 30.0, 0.3)
         return np.asarray(steps * np.r_[np.full(3, 0.02), np.full(3, 0.01 * scale)])
@@ -88,9 +90,9 @@ class PosePlane:
 
 _GENERATORS = np.array(
     [
-        [[0, 0, 1], [0, 0, 0], [0, 0, 0]],  # shift
+        [[0, 0, 1], [0, 0, 0], [0, 0, 0]],  # translation
         [[0, 0, 0], [0, 0, 1], [0, 0, 0]],
-        [[0, -1, 0], [1, 0, 0], [0, 0, 0]],  # turn
+        [[0, -1, 0], [1, 0, 0], [0, 0, 0]],  # rotation
         [[1, 0, 0], [0, 1, 0], [0, 0, 0]],  # scale
         [[1, 0, 0], [0, -1, 0], [0, 0, 0]],  # shear
         [[0, 1, 0], [1, 0, 0], [0, 0, 0]],
@@ -102,38 +104,38 @@ _GENERATORS = np.array(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ChainPlane:
-    """An uncalibrated camera: the homography itself, 8 parameters on its left."""
+class PlaneHomography:
+    """An uncalibrated camera: a homography with 8 parameters, the generators of SL(3) applied on its left."""
 
     matrix: Floats
 
-    def jacobian(self, ground: Floats, seen: Floats, depth: Floats) -> Floats:
+    def jacobian(self, ground: Floats, normalised: Floats, depth: Floats) -> Floats:
         """d m = (G m)_xy - m (G m)_z for each generator G."""
-        homogeneous = np.column_stack([seen, np.ones(len(seen))])
+        homogeneous = np.column_stack([normalised, np.ones(len(normalised))])
         moved = np.einsum("kij,nj->nik", _GENERATORS, homogeneous)
-        return np.asarray(moved[:, :2] - seen[:, :, None] * moved[:, 2:3])
+        return np.asarray(moved[:, :2] - normalised[:, :, None] * moved[:, 2:3])
 
-    def moved(self, step: Floats) -> ChainPlane:
+    def retract(self, step: Floats) -> PlaneHomography:
         """(I + sum step_k G_k) H, with the third coordinate kept positive and of unit size."""
         matrix = (np.eye(3) + np.tensordot(step, _GENERATORS, 1)) @ self.matrix
-        return ChainPlane(_unit(matrix))
+        return PlaneHomography(_unit_determinant(matrix))
 
-    def continued(self, before: ChainPlane, ratio: float) -> ChainPlane:
-        """The last frame-to-frame homography again, to first order times ``ratio``."""
+    def extrapolated(self, previous: PlaneHomography, ratio: float) -> PlaneHomography:
+        """The last frame-to-frame homography repeated, to first order times ``ratio``."""
         try:
-            last = self.matrix @ np.linalg.inv(before.matrix)
+            last = self.matrix @ np.linalg.inv(previous.matrix)
         except np.linalg.LinAlgError:
             return self
         last = last / np.cbrt(np.linalg.det(last))
         step = np.eye(3) + ratio * (last - np.eye(3))
-        return ChainPlane(_unit(step @ self.matrix))
+        return PlaneHomography(_unit_determinant(step @ self.matrix))
 
-    def prior_std(self, seconds: float, scale: float) -> Floats:
-        """Shift and turn wide; shear and perspective of a flying camera change slowly."""
+    def prediction_std(self, seconds: float, scale: float) -> Floats:
+        """Wide for translation and rotation; shear and perspective of a flying camera change slowly."""
         steps = max(seconds * 30.0, 0.3)
         return steps * np.array([0.03, 0.03, 0.02, 0.02, 0.004, 0.004, 0.004, 0.004])
 
 
-def _unit(matrix: Floats) -> Floats:
-    """The same homography with determinant 1: m ~ H g, the sign of the depth kept."""
+def _unit_determinant(matrix: Floats) -> Floats:
+    """The same homography with determinant 1: m ~ H g; the sign of the depth is kept."""
     return np.asarray(matrix / np.cbrt(np.linalg.det(matrix)))

@@ -1,1 +1,1 @@
-"""Prediction of a target out of view: particle set, road paths, driver model."""
+"""Prediction of a target out of view: particle filter, particle set, road paths, driver model."""

@@ -1,6 +1,7 @@
-"""How the target's driver drives: the speed kept on straights and the acceleration accepted across in bends.
+"""Driver model: cruise speed on straight road and accepted lateral acceleration in bends.
 
-Both are learnt while it is seen, and say how fast it goes on while it is not: slower into a bend, faster out of it.
+Both are estimated while the target is visible and determine its speed while it is not: slower into a bend, faster out
+of it.
 """
 
 from __future__ import annotations
@@ -13,62 +14,62 @@ import numpy as np
 from edge.uav.target.motion_history import MotionFit
 from protocols.geometry.types import Floats
 
-_EVERY_S = 0.1
-_MEMORY_S = 10.0
-_STRAIGHT = 1.0  # acceleration across up to which a road counts as straight [units/s²]
-_BENDING = 1.6  # and from which it tells how fast this driver takes a bend
-_USUAL_SIDEWAYS, _SIDEWAYS_SPREAD = 3.4, 0.3  # median of what drivers accept [units/s²], std of its logarithm
-_KNOWN_SPREAD = 0.15  # the same of a driver who was seen in a bend
-_NOW = 0.5  # share of the speed now, of its mean before the rest
-_SPEED_SPREAD = 0.04  # std of the speed kept, over it
-_FASTER_AFTER = 0.12  # of who was only seen in a bend: how much faster the straight is driven, mean and std
+_SAMPLE_SPACING_S = 0.1
+_WINDOW_S = 10.0
+_MAX_STRAIGHT_LATERAL = 1.0  # lateral acceleration up to which the road counts as straight [units/s²]
+_MIN_CURVE_LATERAL = 1.6  # and from which it is informative about this driver's limit in bends
+_LATERAL_MEDIAN, _LATERAL_LOG_STD = 3.4, 0.3  # prior of the lateral limit: median [units/s²], std of its logarithm
+_OBSERVED_LOG_STD = 0.15  # the same for a driver observed in a bend
+_CURRENT_SPEED_WEIGHT = 0.5  # of the current speed; the mean speed on straights has the rest
+_RELATIVE_SPEED_STD = 0.04  # std of the cruise speed, over the speed
+_STRAIGHT_SPEED_GAIN = 0.12  # relative increase of speed after a bend, of a driver only observed in it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Habits:
-    """Of n possible drivers. cruise: (n,) speed on a straight [units/s]. sideways: (n,) acceleration [units/s²]."""
+class DriverParameters:
+    """Samples of n drivers. cruise_speed: (n,) on straights [units/s]. lateral_limit: (n,) acceleration [units/s²]."""
 
-    cruise: Floats
-    sideways: Floats
+    cruise_speed: Floats
+    lateral_limit: Floats
 
 
-class Driving:
-    """What was seen of the driver: speed and acceleration across, some seconds of it."""
+class DriverModel:
+    """Observed speeds and lateral accelerations of the driver during some seconds."""
 
     def __init__(self) -> None:
-        self._seen: deque[tuple[float, float, float]] = deque()
+        self._samples: deque[tuple[float, float, float]] = deque()
 
-    def saw(self, fit: MotionFit) -> None:
-        """Take one good fit."""
-        if self._seen and fit.time < self._seen[-1][0] + _EVERY_S:
+    def update(self, fit: MotionFit) -> None:
+        """Add one well-determined motion fit."""
+        if self._samples and fit.time < self._samples[-1][0] + _SAMPLE_SPACING_S:
             return
-        self._seen.append((fit.time, fit.speed, abs(fit.turn_rate) * fit.speed))
-        while self._seen[0][0] < fit.time - _MEMORY_S:
-            self._seen.popleft()
+        self._samples.append((fit.time, fit.speed, abs(fit.turn_rate) * fit.speed))
+        while self._samples[0][0] < fit.time - _WINDOW_S:
+            self._samples.popleft()
 
-    def rescaled(self, factor: float) -> None:
+    def rescale(self, factor: float) -> None:
         """Ground units became smaller by ``factor``."""
-        self._seen = deque((time, factor * speed, factor * across) for time, speed, across in self._seen)
+        self._samples = deque((time, factor * speed, factor * lateral) for time, speed, lateral in self._samples)
 
-    def habits(self, fit: MotionFit, speeds: Floats, rng: np.random.Generator) -> Habits:
-        """Drivers to go with particles of speeds (n,) that set out with a fit."""
+    def sample(self, fit: MotionFit, speeds: Floats, rng: np.random.Generator) -> DriverParameters:
+        """Sample driver parameters for particles of speeds (n,) initialised from a fit."""
         count = len(speeds)
-        across_now = abs(fit.turn_rate) * fit.speed
-        seen = np.array(self._seen).reshape(-1, 3)
-        straight = seen[seen[:, 2] < _STRAIGHT, 1]
-        spread = fit.speed * _SPEED_SPREAD * rng.standard_normal(count)
-        if across_now < _BENDING:
-            usual = float(straight.mean()) if len(straight) else fit.speed
-            # Much slower or faster than before is meant: it brakes or gets going.
-            weight = _NOW if abs(usual - fit.speed) < 0.15 * fit.speed else 1.0
-            cruise = weight * speeds + (1.0 - weight) * usual + spread
+        lateral = abs(fit.turn_rate) * fit.speed
+        samples = np.array(self._samples).reshape(-1, 3)
+        straight = samples[samples[:, 2] < _MAX_STRAIGHT_LATERAL, 1]
+        speed_error = fit.speed * _RELATIVE_SPEED_STD * rng.standard_normal(count)
+        if lateral < _MIN_CURVE_LATERAL:
+            typical = float(straight.mean()) if len(straight) else fit.speed
+            # A large change of speed is intended: the driver brakes or accelerates.
+            weight = _CURRENT_SPEED_WEIGHT if abs(typical - fit.speed) < 0.15 * fit.speed else 1.0
+            cruise_speed = weight * speeds + (1.0 - weight) * typical + speed_error
         elif len(straight):
-            cruise = np.maximum(float(straight.mean()) + spread, speeds)
+            cruise_speed = np.maximum(float(straight.mean()) + speed_error, speeds)
         else:
-            cruise = speeds * (1.0 + np.abs(_FASTER_AFTER * rng.standard_normal(count)))
-        most = float(np.quantile(seen[:, 2], 0.9)) if len(seen) >= 5 else 0.0
-        logarithm = np.log(_USUAL_SIDEWAYS) + _SIDEWAYS_SPREAD * rng.standard_normal(count)
-        if most > _BENDING:
-            known = np.log(most) + _KNOWN_SPREAD * rng.standard_normal(count)
-            logarithm = np.maximum(known, np.where(rng.random(count) < 0.5, known, logarithm))
-        return Habits(np.maximum(cruise, 0.0), np.exp(logarithm))
+            cruise_speed = speeds * (1.0 + np.abs(_STRAIGHT_SPEED_GAIN * rng.standard_normal(count)))
+        observed_limit = float(np.quantile(samples[:, 2], 0.9)) if len(samples) >= 5 else 0.0
+        log_limit = np.log(_LATERAL_MEDIAN) + _LATERAL_LOG_STD * rng.standard_normal(count)
+        if observed_limit > _MIN_CURVE_LATERAL:
+            observed = np.log(observed_limit) + _OBSERVED_LOG_STD * rng.standard_normal(count)
+            log_limit = np.maximum(observed, np.where(rng.random(count) < 0.5, observed, log_limit))
+        return DriverParameters(np.maximum(cruise_speed, 0.0), np.exp(log_limit))

@@ -1,12 +1,12 @@
-"""The particle filter itself: what is the same for every model of a target.
+"""Generic particle filter: weighted samples, resampling, adaptive sample size, clustering.
 
-A particle set is an array of states (n, d) with log-weights (n,). A ``Model`` says how one state becomes the next and
-how well a state explains an observation; everything here knows only those two. Nothing is changed in place, and all
+A particle set is an array of states (n, d) with log-weights (n,). A ``Model`` provides the transition density and the
+likelihood of an observation; everything here depends on these two only. Nothing is changed in place, and all
 randomness comes from the generator that is passed in.
 
 Sources: low-variance (systematic) resampling and the effective sample size as in Doucet, Godsill, Andrieu, "On
 sequential Monte Carlo sampling methods" (2000); the adaptive number of particles as in Fox, "Adapting the sample size
-in particle filters through KLD-sampling" (2003). Equation numbers are those of the paper on following a car.
+in particle filters through KLD-sampling" (2003). Equation numbers are those of the background-aware tracking paper.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Observation = TypeVar("Observation")
 
 
 class Model(Protocol[Observation_contra]):
-    """What a particle filter has to know of the thing that it follows."""
+    """State-space model: transition density and observation likelihood."""
 
     def propagate(self, states: Floats, rng: np.random.Generator) -> Floats:
-        """One draw from p(x_k | x_{k-1}) a particle: (n, d) -> (n, d)."""
+        """One draw from p(x_k | x_{k-1}) per particle: (n, d) -> (n, d)."""
         ...
 
     def log_likelihood(self, states: Floats, observation: Observation_contra) -> Floats:
@@ -43,7 +43,7 @@ class Particles:
     log_weights: Floats
 
     @classmethod
-    def evenly(cls, states: Floats) -> Particles:
+    def uniform(cls, states: Floats) -> Particles:
         """States (n, d) of equal weight; n of at least 1."""
         return cls(states, np.full(len(states), -np.log(len(states))))
 
@@ -53,40 +53,40 @@ class Particles:
         return np.asarray(np.exp(self.log_weights), dtype=np.float64)
 
     def reweighted(self, log_likelihoods: Floats) -> Particles:
-        """The set after an observation: each weight times its likelihood (eq. 2.6), normalised (eq. 2.1)."""
+        """The posterior set: each weight times its likelihood (eq. 2.6), normalised (eq. 2.1)."""
         return Particles(self.states, normalise(self.log_weights + log_likelihoods))
 
     def resampled(self, rng: np.random.Generator, count: int | None = None) -> Particles:
-        """count (default: as many as there are) particles of equal weight, drawn in proportion to the weights."""
-        return Particles.evenly(self.states[systematic(self.weights, count or len(self.states), rng)])
+        """count particles (default: the same number) of equal weight, drawn in proportion to the weights."""
+        return Particles.uniform(self.states[systematic_resample(self.weights, count or len(self.states), rng)])
 
 
 @dataclass(frozen=True, slots=True)
-class AdaptiveNumber:
-    """How many particles there shall be.
+class KldSampleSize:
+    """Adaptive number of particles by KLD sampling.
 
-    cell: (d,) widths of the cells in which the spread is counted, in the units of the state (inf: that coordinate
-    does not count). error: bound on the Kullback-Leibler distance between the sample and the posterior; it is kept
-    with probability confidence. fewest, most: the number stays between them.
+    cell: (d,) bin widths of the histogram over the states, in their units (inf: that coordinate is ignored). error:
+    bound on the Kullback-Leibler distance between the sample and the posterior, met with probability confidence.
+    min_count, max_count: limits of the number.
     """
 
     cell: tuple[float, ...]
     error: float = 0.05
     confidence: float = 0.99
-    fewest: int = 100
-    most: int = 1000
+    min_count: int = 100
+    max_count: int = 1000
 
-    def of(self, states: Floats) -> int:
-        """The number that a sample spread like states (n, d) needs."""
-        wanted = kld_number(occupied_cells(states, np.array(self.cell)), self.error, self.confidence)
-        return min(max(wanted, self.fewest), self.most)
+    def size_for(self, states: Floats) -> int:
+        """The number needed for a sample spread like states (n, d)."""
+        wanted = kld_sample_size(occupied_cells(states, np.array(self.cell)), self.error, self.confidence)
+        return min(max(wanted, self.min_count), self.max_count)
 
 
 def normalise(log_weights: Floats) -> Floats:
     """Eq. (2.1): log-weights (n,) whose exponentials add up to 1.
 
-    nan counts as weight 0. If no particle has any weight, all get the same: an observation that contradicts all of
-    them says nothing about which is right.
+    nan is treated as weight 0. If no particle has any weight, all get the same: an observation that is impossible for
+    all of them is uninformative.
     """
     if not len(log_weights):
         return log_weights
@@ -97,7 +97,7 @@ def normalise(log_weights: Floats) -> Floats:
     return np.asarray(scaled - np.log(np.exp(scaled).sum()), dtype=np.float64)
 
 
-def systematic(weights: Floats, count: int, rng: np.random.Generator) -> Ints:
+def systematic_resample(weights: Floats, count: int, rng: np.random.Generator) -> Ints:
     """Low-variance resampling: count indices, each index drawn count * weight times, rounded up or down, unbiased.
 
     weights: (n,), adding up to 1.
@@ -108,17 +108,17 @@ def systematic(weights: Floats, count: int, rng: np.random.Generator) -> Ints:
 
 
 def effective_sample_size(weights: Floats) -> float:
-    """1 / sum of squares: from 1 (one particle has all the weight) to n (all the same). weights add up to 1."""
+    """1 / sum of squares: from 1 (one particle has all the weight) to n (uniform). weights add up to 1."""
     return float(1.0 / np.square(weights).sum())
 
 
 def occupied_cells(states: Floats, cell: Floats) -> int:
-    """In how many cells of the given widths (d,) the states (n, d) lie; a width of inf leaves a coordinate out."""
+    """Number of occupied cells of the widths (d,) for states (n, d); a width of inf ignores the coordinate."""
     index = np.floor(states[:, np.isfinite(cell)] / cell[np.isfinite(cell)]).astype(np.int64)
     return len(np.unique(_keys(index))) if index.size else 1
 
 
-def kld_number(cells: int, error: float, confidence: float) -> int:
+def kld_sample_size(cells: int, error: float, confidence: float) -> int:
     """Particles needed so that a sample over that many occupied cells is within error of the distribution.
 
     Fox's bound (the Wilson-Hilferty approximation of the chi-square quantile): for k cells and the standard normal
@@ -140,19 +140,19 @@ def step(
     rng: np.random.Generator,
     *,
     resample_below: float = 0.5,
-    number: AdaptiveNumber | None = None,
+    number: KldSampleSize | None = None,
 ) -> Particles:
-    """One cycle: resample if need be, propagate, weigh. Gives the posterior as a weighted set.
+    """One filter cycle: resample if necessary, propagate, reweight. Returns the posterior as a weighted set.
 
     observation: None predicts only. resample_below: resamples if the effective sample size is below this share of
-    the particles. With number, the size of the set follows its spread: it may change wherever there is resampling.
+    the particles. With number, the size of the set is adapted at every resampling.
     """
     weights = particles.weights
     if effective_sample_size(weights) < resample_below * len(weights):
-        chosen = systematic(weights, len(weights), rng)
+        chosen = systematic_resample(weights, len(weights), rng)
         if number is not None:
-            chosen = systematic(weights, number.of(particles.states[chosen]), rng)
-        particles = Particles.evenly(particles.states[chosen])
+            chosen = systematic_resample(weights, number.size_for(particles.states[chosen]), rng)
+        particles = Particles.uniform(particles.states[chosen])
     moved = Particles(model.propagate(particles.states, rng), particles.log_weights)
     return moved if observation is None else moved.reweighted(model.log_likelihood(moved.states, observation))
 
@@ -175,7 +175,7 @@ def circular_mean(angles: Floats, weights: Floats) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cluster:
-    """Some of the particles. centre: (2,). weight: theirs together. members: (n,) which ones."""
+    """A subset of the particles. centre: (2,). weight: their total. members: (n,) mask."""
 
     centre: Floats
     weight: float
@@ -183,10 +183,10 @@ class Cluster:
 
 
 def densest_cluster(points: Floats, weights: Floats, radius: float) -> Cluster:
-    """The particles within radius of the place where the most weight lies together.
+    """The particles within radius of the mode of their density.
 
-    points: (n, 2); weights: (n,). Starts at the fullest block of three by three cells of width radius and moves its
-    centre to the mean of what is within radius until it rests (mean shift with a flat kernel).
+    points: (n, 2); weights: (n,). Mean shift with a flat kernel of that radius, started at the block of three by three
+    cells of width radius with the most weight.
     """
     index = np.floor(points / radius).astype(np.int64)
     cells, inverse = np.unique(_keys(index), return_inverse=True)
@@ -209,31 +209,33 @@ def densest_cluster(points: Floats, weights: Floats, radius: float) -> Cluster:
     return Cluster(np.asarray(centre, dtype=np.float64), float(weights[members].sum()), members)
 
 
-def clusters(points: Floats, weights: Floats, radius: float, most: int = 4, least: float = 0.05) -> tuple[Cluster, ...]:
-    """Up to most separate clusters, heaviest found first, each of at least the weight least; at least one.
+def clusters(
+    points: Floats, weights: Floats, radius: float, max_clusters: int = 4, min_weight: float = 0.05
+) -> tuple[Cluster, ...]:
+    """Up to max_clusters separate clusters, heaviest first, each of at least min_weight; at least one.
 
-    points: (n, 2); weights: (n,). After each, what is within twice radius of it is set aside.
+    points: (n, 2); weights: (n,). After each, the particles within twice the radius of it are excluded.
     """
     found: list[Cluster] = []
-    left = np.ones(len(points), dtype=np.bool_)
-    while left.any() and len(found) < most:
-        here = np.flatnonzero(left)
+    remaining = np.ones(len(points), dtype=np.bool_)
+    while remaining.any() and len(found) < max_clusters:
+        here = np.flatnonzero(remaining)
         part = densest_cluster(points[here], weights[here], radius)
-        if found and part.weight < least:
+        if found and part.weight < min_weight:
             break
         members = np.zeros(len(points), dtype=np.bool_)
         members[here[part.members]] = True
         found.append(Cluster(part.centre, part.weight, members))
-        left &= np.square(points - part.centre).sum(axis=1) > 4.0 * radius * radius
-        left &= ~members
+        remaining &= np.square(points - part.centre).sum(axis=1) > 4.0 * radius * radius
+        remaining &= ~members
     return tuple(found)
 
 
-_STRIDES = (1, 1 << 21, 1 << 42, 1 << 52)  # a cell's coordinates side by side in one integer
+_STRIDES = (1, 1 << 21, 1 << 42, 1 << 52)  # packs a cell's coordinates into one integer
 
 
 def _keys(index: Ints) -> Ints:
-    """One integer a cell of index (n, d). Cells more than 2**20 apart may share one: that is far beyond use."""
+    """One integer per cell of index (n, d). Cells more than 2**20 apart may share one, which does not happen here."""
     if index.shape[1] > len(_STRIDES):
         return np.asarray(np.unique(index, axis=0, return_inverse=True)[1], dtype=np.int64).reshape(-1)
     return np.asarray(index @ np.array(_STRIDES[: index.shape[1]], dtype=np.int64), dtype=np.int64)

@@ -1,1 +1,1 @@
-"""The target: appearance, likelihood, motion history, re-detection, state estimate."""
+"""Target model of the UAV tracker: appearance, footprint, motion, measurement likelihood, re-detection."""

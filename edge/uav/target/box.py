@@ -1,4 +1,4 @@
-"""Whether a box that a user drew can be a target."""
+"""Validation of a target bounding box that a user drew."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ import numpy as np
 from edge.uav.tracker import Box, Image
 from protocols.core.errors import InputError
 
-_SMALLEST_BOX = 4.0  # px
-_LEAST_INSIDE = 0.3  # share of the box
+_MIN_BOX_PX = 4.0  # side
+_MIN_INSIDE_SHARE = 0.3  # share of the box
 
 
-def check_target(image: Image, size: tuple[int, int], target: Box) -> None:
-    """Raises InputError for a box that can't be a target, or a picture that isn't of this size."""
+def check_target_box(image: Image, size: tuple[int, int], target: Box) -> None:
+    """Raises InputError for a box that cannot be a target, or for an image of another size."""
     width, height = size
     if image.ndim != 3 or image.shape[:2] != (height, width):
-        raise InputError(f"a picture of {image.shape[1]}x{image.shape[0]}, not {width}x{height}", remedy="check --rig")
+        raise InputError(f"an image of {image.shape[1]}x{image.shape[0]}, not {width}x{height}", remedy="check --rig")
     values = (target.x, target.y, target.width, target.height)
     text = ",".join(f"{value:g}" for value in values)
     if not np.isfinite(values).all():
         raise InputError(f"target {text} is not finite", remedy="give x,y,w,h in pixels")
-    if min(target.width, target.height) < _SMALLEST_BOX:
-        remedy = f"draw a box of at least {_SMALLEST_BOX:g} pixels a side round the car"
+    if min(target.width, target.height) < _MIN_BOX_PX:
+        remedy = f"draw a box of at least {_MIN_BOX_PX:g} pixels a side round the car"
         raise InputError(f"target {text} is too small to be recognised", remedy=remedy)
     overlap_x = min(target.x + target.width, width) - max(target.x, 0.0)
     overlap_y = min(target.y + target.height, height) - max(target.y, 0.0)
-    if min(overlap_x, overlap_y) <= 0 or overlap_x * overlap_y < _LEAST_INSIDE * target.width * target.height:
+    if min(overlap_x, overlap_y) <= 0 or overlap_x * overlap_y < _MIN_INSIDE_SHARE * target.width * target.height:
         raise InputError(
-            f"target {text} is outside the image of {width}x{height}", remedy="give x,y,w,h of a car in the picture"
+            f"target {text} is outside the image of {width}x{height}", remedy="give x,y,w,h of a car in the image"
         )
     if target.width * target.height > 0.5 * width * height:
         raise InputError(f"target {text} fills the image", remedy="draw the box round one car")

@@ -1,4 +1,4 @@
-"""What a frame says about every particle: the candidates that were found, and that elsewhere none was."""
+"""Measurement likelihood of one frame for every particle: from the detected candidates, and from missed detections."""
 
 from __future__ import annotations
 
@@ -7,159 +7,162 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.uav.prediction.particle_set import Cloud
+from edge.uav.prediction.particle_set import ParticleSet
 from edge.uav.target.appearance import Candidate
 from edge.uav.target.tracklets import Tracklet
 from protocols.geometry.types import Floats
 
-_SLOPE, _MIDDLE = 14.0, 0.62  # of the log-likelihood ratio of target against clutter over the score
-_MIDDLE_AGAIN = 0.72  # the same after a while unseen: crowns of trees have many spots that are a little alike
-_LEAST, _MOST = -6.0, 5.0
-_CLUTTER = 0.01  # candidates that are not the target [1/unit²]
-_BELIEVE = 0.7  # posterior of a candidate from which it is taken for the target
-_BELIEVE_AGAIN = 0.8  # the same after a while unseen
-_SCORE = 0.45  # and its least score; after a while unseen:
-_SCORE_AGAIN = 0.6
-_SHAPE_AGAIN = 0.45
-_CUT_LESS = 0.4  # by which a score counts less for each unit of the candidate that the picture's border cuts off
-_PATIENT = 25.0  # most that one frame says for a place where it is found again: a look-alike soon drives elsewhere
-_SAYS_AT_MOST = 100.0  # factor on the odds by one look-alike in all its frames
-_THERE = 3.0  # stds within which a particle is where a candidate is
-_UNKNOWN_MOTION = 3.0  # the same before its motion is known
-_BETTER = 4.0
-_MOTION_STD = 1.5  # of a particle's velocity, one coordinate [units/s]
-_TURN_STD = 0.2  # of a heading by the shape [rad]
-_CUT = 0.42  # least share of it in the picture
+_LLR_SLOPE, _LLR_CENTRE = 14.0, 0.62  # log-likelihood ratio of target to clutter over the score
+_LLR_CENTRE_REACQUIRE = 0.72  # when re-acquiring: crowns of trees have many slightly similar regions
+_MIN_LLR, _MAX_LLR = -6.0, 5.0
+_CLUTTER_DENSITY = 0.01  # of candidates that are not the target [1/unit²]
+_MIN_POSTERIOR = 0.7  # of a candidate that is accepted as the target
+_MIN_POSTERIOR_REACQUIRE = 0.8  # the same when re-acquiring
+_MIN_SCORE = 0.45  # of an accepted candidate; when re-acquiring:
+_MIN_SCORE_REACQUIRE = 0.6
+_MIN_SHAPE_REACQUIRE = 0.45
+_BORDER_PENALTY = 0.4  # subtracted from the score, times the share of the candidate outside the image
+_MAX_PEAK_REACQUIRE = 25.0  # of the likelihood of one frame when re-acquiring: a similar car soon drives elsewhere
+_MAX_BAYES_FACTOR = 100.0  # of one tracklet over all its frames
+_GATE = 3.0  # stds within which a particle is at a candidate
+_MAX_PEAK_UNKNOWN_MOTION = 3.0  # of the likelihood before the tracklet's velocity is known
+_SCORE_PREFERENCE = 4.0  # log-likelihood per unit of score below the best candidate
+_VELOCITY_STD = 1.5  # of a particle's velocity, one coordinate [units/s]
+_HEADING_STD = 0.2  # of a heading from the template [rad]
+_MIN_VISIBLE_SHARE = 0.42  # of the footprint inside the image
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Verdict:
-    """best: the candidate that is the target, or None. sureness: its posterior. likelihood: (n,) of the particles.
+class MeasurementLikelihood:
+    """best: the candidate accepted as the target, or None. posterior: its probability.
 
-    crowded: whether something similar stands beside it.
+    likelihood: (n,) of the particles; None without a measurement. ambiguous: whether a similar candidate is close to
+    it.
     """
 
     best: Candidate | None
-    sureness: float
+    posterior: float
     likelihood: Floats | None
-    crowded: bool
+    ambiguous: bool
 
     @classmethod
-    def nothing(cls) -> Verdict:
-        """Nothing was looked at."""
+    def empty(cls) -> MeasurementLikelihood:
+        """The result of a frame without a search."""
         return cls(None, 0.0, None, False)
 
 
-def allow(tracklet: Tracklet, weight: float) -> None:
-    """A look-alike was given particles of a weight: it may be the target at least so far as these say."""
-    tracklet.odds_limit = max(tracklet.odds_limit or 0.0, _SAYS_AT_MOST * weight)
+def raise_odds_limit(tracklet: Tracklet, weight: float) -> None:
+    """Raise the odds limit of a tracklet at which particles of this total weight were injected."""
+    tracklet.odds_limit = max(tracklet.odds_limit or 0.0, _MAX_BAYES_FACTOR * weight)
 
 
-def judge(
-    cloud: Cloud,
+def evaluate_candidates(
+    particles: ParticleSet,
     candidates: Sequence[Candidate],
     tracklets: Sequence[Tracklet],
-    chance: Floats,
-    noise: Callable[[Candidate], tuple[float, float]],
+    detection_probability: Floats,
+    position_stds: Callable[[Candidate], tuple[float, float]],
     length: float,
-    again: bool,
-    is_shaped: Callable[[Candidate], bool],
-) -> Verdict:
-    """Weigh particles by candidates: p = 1 - c + c sum_j r_j N(z_j; x, R) / clutter.
+    reacquiring: bool,
+    shape_matches: Callable[[Candidate], bool],
+) -> MeasurementLikelihood:
+    """Likelihood of the particles: p = 1 - c + c sum_j r_j N(z_j; x, R) / clutter.
 
-    chance: (n,) c, the chance that the target would have been found if it were at the particle. noise: std of a
-    candidate's place, one coordinate [ground units], if it is seen as usual, and if something hides what it lacks.
-    length: the target's. again: the target has been out of sight for a while: one frame then says less, its shape must
-    fit too, and it must be seen to move as the particles do. is_shaped: whether a candidate's shape fits so well that
-    its angle is the target's heading.
+    detection_probability: (n,) c, of detecting the target if it were at the particle. position_stds: std of a
+    candidate's position, one coordinate [ground units], unoccluded, and if its missing score is due to occlusion.
+    length: the target's. reacquiring: the target has been out of view for a while: the likelihood of one frame is then
+    limited, the shape must match too, and the tracklet's velocity must match the particles'. shape_matches: whether a
+    candidate's shape matches so well that its angle is the target's heading.
     """
-    gain = np.zeros((len(candidates), len(cloud)))
-    there = np.zeros((len(candidates), len(cloud)), np.bool_)
-    most_alike = max((candidate.score for candidate in candidates), default=0.0)
-    velocity = cloud.speed[:, None] * np.column_stack([np.cos(cloud.heading), np.sin(cloud.heading)])
+    gain = np.zeros((len(candidates), len(particles)))
+    in_gate = np.zeros((len(candidates), len(particles)), np.bool_)
+    best_score = max((candidate.score for candidate in candidates), default=0.0)
+    velocity = particles.speed[:, None] * np.column_stack([np.cos(particles.heading), np.sin(particles.heading)])
     for j, candidate in enumerate(candidates):
-        usual, std = ((1.5 * value + 0.1 if again else value) for value in noise(candidate))
-        squared = np.square(cloud.place - candidate.ground).sum(axis=1)
-        there[j] = squared < (_THERE * usual) ** 2
+        unoccluded_std, std = ((1.5 * value + 0.1 if reacquiring else value) for value in position_stds(candidate))
+        squared = np.square(particles.position - candidate.ground).sum(axis=1)
+        in_gate[j] = squared < (_GATE * unoccluded_std) ** 2
         squared = squared / std**2
-        middle = _MIDDLE_AGAIN if again else _MIDDLE
-        score = _sure_score(candidate) if again else candidate.score
-        ratio = np.exp(np.clip(_SLOPE * (score - middle), _LEAST, _MOST))
-        peak = 0.9 * ratio / (2 * np.pi * std**2) / _CLUTTER
-        if again:
+        llr_centre = _LLR_CENTRE_REACQUIRE if reacquiring else _LLR_CENTRE
+        score = _border_discounted_score(candidate) if reacquiring else candidate.score
+        ratio = np.exp(np.clip(_LLR_SLOPE * (score - llr_centre), _MIN_LLR, _MAX_LLR))
+        peak = 0.9 * ratio / (2 * np.pi * std**2) / _CLUTTER_DENSITY
+        if reacquiring:
             motion = tracklets[j].velocity()
             if motion is None:
-                peak = min(peak, _UNKNOWN_MOTION)
+                peak = min(peak, _MAX_PEAK_UNKNOWN_MOTION)
             else:
-                # Of two that both may be it, the more alike wins in time.
-                peak = min(peak, _PATIENT) * float(np.exp(_BETTER * (candidate.score - most_alike)))
-                off = np.square(velocity - motion[0]).sum(axis=1) / (motion[1] ** 2 + _MOTION_STD**2)
-                # Where an oncoming car passes is not where the target is.
-                there[j] &= off < _THERE**2
-                squared = squared + off
-                if is_shaped(candidate):
-                    off_angle = (cloud.heading - candidate.angle + np.pi) % (2 * np.pi) - np.pi
-                    squared = squared + np.square(off_angle / _TURN_STD)
+                # Between two plausible candidates the one with the higher score prevails over time.
+                peak = min(peak, _MAX_PEAK_REACQUIRE) * float(
+                    np.exp(_SCORE_PREFERENCE * (candidate.score - best_score))
+                )
+                velocity_distance = np.square(velocity - motion[0]).sum(axis=1) / (motion[1] ** 2 + _VELOCITY_STD**2)
+                # An oncoming car at the position of the particles is not the target.
+                in_gate[j] &= velocity_distance < _GATE**2
+                squared = squared + velocity_distance
+                if shape_matches(candidate):
+                    heading_error = (particles.heading - candidate.angle + np.pi) % (2 * np.pi) - np.pi
+                    squared = squared + np.square(heading_error / _HEADING_STD)
         gain[j] = peak * np.exp(-0.5 * np.minimum(squared, 50.0))
-    none = 1.0 - chance
-    likelihood = none + gain.sum(axis=0)
-    if again:
+    miss_likelihood = 1.0 - detection_probability
+    likelihood = miss_likelihood + gain.sum(axis=0)
+    if reacquiring:
         for candidate, tracklet, own in zip(candidates, tracklets, gain, strict=True):
-            # Where another car is the target is not; but a leaf that is a little alike leaves room for it.
-            car = candidate.score > _SCORE_AGAIN and candidate.shape > _SHAPE_AGAIN
-            least = np.zeros(len(cloud)) if car else likelihood - own
-            likelihood = _limited(cloud, likelihood, least, candidate, tracklet, length)
+            # A vehicle excludes the target at its position; a weakly similar background region does not.
+            is_vehicle = candidate.score > _MIN_SCORE_REACQUIRE and candidate.shape > _MIN_SHAPE_REACQUIRE
+            floor = np.zeros(len(particles)) if is_vehicle else likelihood - own
+            likelihood = _limit_odds(particles, likelihood, floor, candidate, tracklet, length)
     if not len(candidates):
-        return Verdict(None, 0.0, likelihood, False)
-    mass = gain @ cloud.weights
-    total = mass.sum() + float(cloud.weights @ none)
+        return MeasurementLikelihood(None, 0.0, likelihood, False)
+    mass = gain @ particles.weights
+    total = mass.sum() + float(particles.weights @ miss_likelihood)
     posterior = mass / total
-    if again:
-        # What was said of a candidate before is in the weights of the particles that are where it is.
-        weighted = cloud.weights * likelihood
-        posterior = there @ weighted / weighted.sum()
+    if reacquiring:
+        # Earlier frames of a candidate are already in the weights of the particles in its gate.
+        weighted = particles.weights * likelihood
+        posterior = in_gate @ weighted / weighted.sum()
     k = int(np.argmax(posterior))
     best = candidates[k]
-    crowded = any(
+    ambiguous = any(
         other is not best and other.score > 0.6 and np.linalg.norm(other.ground - best.ground) < 1.3 * length
         for other in candidates
     )
-    good = (
-        posterior[k] > (_BELIEVE_AGAIN if again else _BELIEVE)
-        and (_sure_score(best) > _SCORE_AGAIN if again else best.score > _SCORE)
-        and best.seen > _CUT
+    accepted = (
+        posterior[k] > (_MIN_POSTERIOR_REACQUIRE if reacquiring else _MIN_POSTERIOR)
+        and (_border_discounted_score(best) > _MIN_SCORE_REACQUIRE if reacquiring else best.score > _MIN_SCORE)
+        and best.visible_share > _MIN_VISIBLE_SHARE
     )
-    if again:
-        good &= best.shape > _SHAPE_AGAIN and tracklets[k].age >= 3
-    return Verdict(best if good else None, float(posterior[k]), likelihood, crowded)
+    if reacquiring:
+        accepted &= best.shape > _MIN_SHAPE_REACQUIRE and tracklets[k].age >= 3
+    return MeasurementLikelihood(best if accepted else None, float(posterior[k]), likelihood, ambiguous)
 
 
-def _sure_score(candidate: Candidate) -> float:
-    """The score of what is found again, less where the picture's border cuts it off.
+def _border_discounted_score(candidate: Candidate) -> float:
+    """The score for re-acquisition, reduced where the image border cuts the candidate off.
 
-    Half of anything is easily alike, and where the picture moves after the target its border drives as the target does.
+    A partial view matches more easily, and when the image follows the target its border moves like the target.
     """
-    return candidate.score - _CUT_LESS * (1.0 - min(candidate.seen, 1.0))
+    return candidate.score - _BORDER_PENALTY * (1.0 - min(candidate.visible_share, 1.0))
 
 
-def _limited(
-    cloud: Cloud, likelihood: Floats, least: Floats, candidate: Candidate, tracklet: Tracklet, length: float
+def _limit_odds(
+    particles: ParticleSet, likelihood: Floats, floor: Floats, candidate: Candidate, tracklet: Tracklet, length: float
 ) -> Floats:
-    """The likelihood with what one look-alike says in all bounded: some other car looks the same, frame after frame.
+    """The likelihood with the total evidence of one tracklet bounded: a similar car matches in frame after frame.
 
-    The odds of the particles about it may grow by _SAYS_AT_MOST over what they were when it was first seen, and by what
-    the others lose for not being seen where they should be. least: (n,) what is left to them at least: a cloud that
-    comes to where something hardly alike stands is not driven off.
+    The odds of the particles near it may grow to _MAX_BAYES_FACTOR times their value at its first detection, and by the
+    weight that the other particles lose through missed detections. floor: (n,) lower bound of the likelihood: particles
+    that reach a weakly similar background region keep theirs.
     """
-    about = np.square(cloud.place - candidate.ground).sum(axis=1) < length**2
-    before = float(cloud.weights[about].sum())
+    nearby = np.square(particles.position - candidate.ground).sum(axis=1) < length**2
+    prior_weight = float(particles.weights[nearby].sum())
     if tracklet.odds_limit is None:
-        tracklet.odds_limit = _SAYS_AT_MOST * before / max(1.0 - before, 1e-6)
-    rest = float(cloud.weights[~about] @ likelihood[~about])
-    if rest <= 1e-12:
+        tracklet.odds_limit = _MAX_BAYES_FACTOR * prior_weight / max(1.0 - prior_weight, 1e-6)
+    remaining = float(particles.weights[~nearby] @ likelihood[~nearby])
+    if remaining <= 1e-12:
         return likelihood
-    tracklet.odds_limit *= max((1.0 - before) / rest, 1.0)
-    odds = float(cloud.weights[about] @ likelihood[about]) / rest
+    tracklet.odds_limit *= max((1.0 - prior_weight) / remaining, 1.0)
+    odds = float(particles.weights[nearby] @ likelihood[nearby]) / remaining
     if odds <= tracklet.odds_limit:
         return likelihood
-    return np.where(about, np.maximum(likelihood * (tracklet.odds_limit / odds), least), likelihood)
+    return np.where(nearby, np.maximum(likelihood * (tracklet.odds_limit / odds), floor), likelihood)

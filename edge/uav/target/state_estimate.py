@@ -1,4 +1,4 @@
-"""What the tracker says of a frame: state, densest cluster of the cloud, its spread, and the other clusters."""
+"""State estimate from the particle set: track state, densest cluster, covariance, other clusters as hypotheses."""
 
 from __future__ import annotations
 
@@ -6,46 +6,50 @@ from dataclasses import replace
 
 import numpy as np
 
-from edge.uav.ground.localisation import Placing
+from edge.uav.ground.localisation import CameraLocaliser
 from edge.uav.prediction import particles as pf
-from edge.uav.prediction.particle_set import Cloud
+from edge.uav.prediction.particle_set import ParticleSet
 from edge.uav.target import footprint
 from edge.uav.target.target import Target
-from edge.uav.tracker import Estimate, Hypothesis, State
+from edge.uav.tracker import Estimate, Hypothesis, TrackState
 
 _LOST_STD = 8.0  # in target lengths
 _LOST_AFTER_S = 15.0
-_CLUSTER, _WIDEST = 0.7, 2.0  # radius of what counts as one place, in target lengths
-_SMOOTH = 0.7  # the same over the cloud's std
+_MIN_RADIUS, _MAX_RADIUS = 0.7, 2.0  # of a cluster, in target lengths
+_RADIUS_PER_STD = 0.7  # of a cluster, over the particle set's std
 
 
-def answer(cloud: Cloud, target: Target, placing: Placing, missed: int, time: float, unseen: float) -> Estimate:
-    """The estimate of a frame, without layers. missed: frames in a row without the target; unseen: seconds."""
-    groups: tuple[pf.Cluster, ...]
-    if missed:
-        # What is spread wide has no fine structure but the sample's own.
-        wide = pf.weighted_covariance(cloud.place, cloud.weights)
-        radius = float(np.clip(_SMOOTH * np.sqrt(0.5 * np.trace(wide)) / target.length, _CLUSTER, _WIDEST))
-        groups = pf.clusters(cloud.place, cloud.weights, radius * target.length)
+def estimate_target(
+    particles: ParticleSet, target: Target, localiser: CameraLocaliser, missed_frames: int, time: float, unseen_s: float
+) -> Estimate:
+    """The estimate of a frame, without layers. missed_frames: consecutive; unseen_s: since the last detection."""
+    clusters: tuple[pf.Cluster, ...]
+    if missed_frames:
+        # In a widely spread sample, fine structure is sampling noise.
+        covariance = pf.weighted_covariance(particles.position, particles.weights)
+        radius = float(
+            np.clip(_RADIUS_PER_STD * np.sqrt(0.5 * np.trace(covariance)) / target.length, _MIN_RADIUS, _MAX_RADIUS)
+        )
+        clusters = pf.clusters(particles.position, particles.weights, radius * target.length)
     else:
-        groups = (pf.Cluster(cloud.weights @ cloud.place, 1.0, np.ones(len(cloud), dtype=np.bool_)),)
-    weights = np.where(groups[0].members, cloud.weights, 0.0)
+        clusters = (pf.Cluster(particles.weights @ particles.position, 1.0, np.ones(len(particles), dtype=np.bool_)),)
+    weights = np.where(clusters[0].members, particles.weights, 0.0)
     weights = weights / weights.sum()
-    place = weights @ cloud.place
-    heading = pf.circular_mean(cloud.heading, weights)
-    spread = pf.weighted_covariance(cloud.place, cloud.weights if missed else weights)
+    position = weights @ particles.position
+    heading = pf.circular_mean(particles.heading, weights)
+    spread = pf.weighted_covariance(particles.position, particles.weights if missed_frames else weights)
     std_m = float(np.sqrt(0.5 * np.trace(spread)))
-    axes = footprint.local_axes(placing.plane, placing.body_matrix, place)
+    axes = footprint.pixel_jacobian(localiser.plane, localiser.target_matrix, position)
     std = float(np.sqrt(0.5 * np.trace(axes @ spread @ axes.T)))
-    centre = placing.body_pixels(place[None])[0]
-    state = State.COASTING if missed else State.VISIBLE
-    useless = std_m > _LOST_STD * target.length or unseen > _LOST_AFTER_S
-    if missed and (useless or not np.isfinite([*centre, std]).all()):
-        state = State.LOST
-    corners = placing.body_pixels(target.outline(place, heading))
+    centre = localiser.target_pixels(position[None])[0]
+    state = TrackState.COASTING if missed_frames else TrackState.VISIBLE
+    uninformative = std_m > _LOST_STD * target.length or unseen_s > _LOST_AFTER_S
+    if missed_frames and (uninformative or not np.isfinite([*centre, std]).all()):
+        state = TrackState.LOST
+    corners = localiser.target_pixels(target.outline(position, heading))
     size = corners.max(axis=0) - corners.min(axis=0)
-    ahead = axes @ np.array([np.cos(heading), np.sin(heading)])
-    moving = target.aligned and np.isfinite(ahead).all()
+    direction = axes @ np.array([np.cos(heading), np.sin(heading)])
+    heading_known = target.aligned and np.isfinite(direction).all()
     common = Estimate(
         time=time,
         state=state,
@@ -53,25 +57,26 @@ def answer(cloud: Cloud, target: Target, placing: Placing, missed: int, time: fl
         y=float(centre[1]),
         width=float(size[0]),
         height=float(size[1]),
-        heading=float(np.arctan2(ahead[1], ahead[0])) if moving else float("nan"),
+        heading=float(np.arctan2(direction[1], direction[0])) if heading_known else float("nan"),
         std=std,
-        hypotheses=_hypotheses(groups, placing),
-        particles=placing.body_pixels(cloud.place),
+        hypotheses=_hypotheses(clusters, localiser),
+        particles=localiser.target_pixels(particles.position),
     )
-    if state is State.LOST:
+    if state is TrackState.LOST:
         return replace(common, x=float("nan"), y=float("nan"), heading=float("nan"), hypotheses=())
-    if not placing.metric:
+    if not localiser.metric:
         return common
     course = float(np.arctan2(np.sin(heading), np.cos(heading))) if target.aligned else float("nan")
-    speed = float(weights @ cloud.speed)
-    return replace(common, north=float(place[0]), east=float(place[1]), speed=speed, course=course, std_m=std_m)
+    speed = float(weights @ particles.speed)
+    return replace(common, north=float(position[0]), east=float(position[1]), speed=speed, course=course, std_m=std_m)
 
 
-def _hypotheses(groups: tuple[pf.Cluster, ...], placing: Placing) -> tuple[Hypothesis, ...]:
-    if len(groups) < 2:
+def _hypotheses(clusters: tuple[pf.Cluster, ...], localiser: CameraLocaliser) -> tuple[Hypothesis, ...]:
+    if len(clusters) < 2:
         return ()
-    total = sum(group.weight for group in groups)
-    places = placing.body_pixels(np.array([group.centre for group in groups]))
+    total = sum(cluster.weight for cluster in clusters)
+    positions = localiser.target_pixels(np.array([cluster.centre for cluster in clusters]))
     return tuple(
-        Hypothesis(group.weight / total, float(x), float(y)) for group, (x, y) in zip(groups, places, strict=True)
+        Hypothesis(cluster.weight / total, float(x), float(y))
+        for cluster, (x, y) in zip(clusters, positions, strict=True)
     )

@@ -1,7 +1,7 @@
-"""Telemetry onto the camera's clock: the host's clock between them, and what the pictures say of the rest.
+"""Alignment of telemetry to the camera's clock: host arrival times and the visually observed rotation.
 
-The host knows when frames arrive and, by round trips, the vehicle's clock. What is left (delays of exposure, of the
-wire, of the autopilot's filter) is constant; it is found from the camera's turning against the attitude.
+The host knows when frames arrive and, by round trips, the vehicle's clock. The remaining delays (exposure, transfer,
+the autopilot's filter) are constant; their sum is estimated from the camera's rotation against the attitude.
 """
 
 from __future__ import annotations
@@ -10,35 +10,35 @@ from collections import deque
 
 import numpy as np
 
-from edge.uav.timing.telemetry_offset import Offset, find_offset
-from edge.uav.timing.visual_rotation import SeenTurning
+from edge.uav.timing.telemetry_offset import OffsetEstimate, find_offset
+from edge.uav.timing.visual_rotation import VisualRotationEstimator
 from edge.uav.tracker import Image, Telemetry
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
-_ARRIVALS = 900
-_SEARCH_S = 0.7
+_DELAY_BUFFER = 900
+_SEARCH_HALF_WIDTH_S = 0.7
 _WINDOW_S = 24.0
-_FIRST_S, _EVERY_S = 6.0, 2.0
-_GOOD_STD_S = 0.003  # good enough to stop looking for a while
-_REST_S = 60.0
-_CAREFUL_S = 0.015  # by more than this the map is not moved under a tracker that works with it
-_STEP_S = 0.15  # by more, and what was known is void
+_FIRST_SOLVE_S, _SOLVE_EVERY_S = 6.0, 2.0
+_GOOD_STD_S = 0.003  # precise enough to pause the estimation
+_PAUSE_S = 60.0
+_MAX_CHANGE_WHILE_TRACKING_S = 0.015  # a larger change of the offset is not applied while a tracker uses it
+_CLOCK_STEP_S = 0.15  # a larger step invalidates the delays collected so far
 
 
 class CameraHostClock:
-    """The camera's clock against the host's: the quickest arrival of late is the least delayed. Times in ns."""
+    """The camera's clock against the host's: the minimum of recent arrival delays. Times in ns. steps: clock steps."""
 
     def __init__(self) -> None:
-        self._delays: deque[int] = deque(maxlen=_ARRIVALS)
+        self._delays: deque[int] = deque(maxlen=_DELAY_BUFFER)
         self.steps = 0
 
     def handle_frame(self, device_ns: int, arrival_ns: int) -> None:
-        """Take a frame stamped ``device_ns`` that came at ``arrival_ns``."""
+        """Add a frame stamped ``device_ns`` that arrived at ``arrival_ns``."""
         delay = arrival_ns - device_ns
-        if self._delays and delay < min(self._delays) - round(_STEP_S * NANOSECONDS):
-            self._delays.clear()  # the camera's clock began anew, ahead
+        if self._delays and delay < min(self._delays) - round(_CLOCK_STEP_S * NANOSECONDS):
+            self._delays.clear()  # the camera's clock stepped forward
             self.steps += 1
         elif len(self._delays) >= 30 and delay - min(self._delays) > 2 * NANOSECONDS:
             self._delays.clear()
@@ -46,74 +46,79 @@ class CameraHostClock:
         self._delays.append(delay)
 
     def camera_ns(self, host_ns: int) -> int | None:
-        """The camera's time of a time of the host; None before the first frame."""
+        """Camera time of a host time; None before the first frame."""
         return host_ns - min(self._delays) if self._delays else None
 
 
-class Aligner:
-    """Finds telemetry time − camera time of samples that are on the camera's clock but for a constant.
+class ClockAligner:
+    """Estimates telemetry time − camera time for samples on the camera's clock up to a constant offset.
 
-    size, lens: the camera's. body_from_camera: (3, 3). The answer moves only as it gets better.
+    size, lens: of the camera. body_from_camera: (3, 3). The estimate is only replaced by a better one.
+    estimate: the current one, or None; reason: why there is none.
     """
 
     def __init__(self, size: tuple[int, int], lens: Intrinsics, body_from_camera: Floats) -> None:
         self._mounting = np.asarray(body_from_camera, np.float64)
-        self._seen = SeenTurning(size, lens, keep=round(_WINDOW_S * 60.0))
+        self._visual = VisualRotationEstimator(size, lens, keep=round(_WINDOW_S * 60.0))
         self._samples: deque[Telemetry] = deque(maxlen=round(_WINDOW_S * 100.0))
-        self._began: float | None = None
-        self._next_s = -float("inf")
-        self._rest_until_s = -float("inf")
-        self.found: Offset | None = None
-        self.why = "not enough was seen yet"
+        self._collecting_since: float | None = None
+        self._next_solve_s = -float("inf")
+        self._paused_until_s = -float("inf")
+        self.estimate: OffsetEstimate | None = None
+        self.reason = "too few images and samples so far"
 
     @property
     def offset_s(self) -> float:
-        """The best that is known; 0 at first."""
-        return 0.0 if self.found is None else self.found.offset
+        """The current offset estimate; 0 at first."""
+        return 0.0 if self.estimate is None else self.estimate.offset
 
     def handle_sample(self, sample: Telemetry) -> None:
-        """Take a sample as it would be without this offset."""
+        """Add a telemetry sample whose time is not yet corrected by this offset."""
         if self._samples and sample.time <= self._samples[-1].time:
             return
         self._samples.append(sample)
 
-    def handle_frame(self, image: Image | None, time: float, busy: bool) -> None:
-        """Take a picture of camera time ``time`` [s]. busy: a tracker works with the present map."""
-        if time < self._rest_until_s or not self._samples:
+    def handle_frame(self, image: Image | None, time: float, tracking: bool) -> None:
+        """Add an image of camera time ``time`` [s]. tracking: a tracker uses the present offset."""
+        if time < self._paused_until_s or not self._samples:
             return
         tilt = self._mounting.T @ self._samples[-1].ned_from_body.T
-        self._seen.update(image, time, tilt)
-        if self._began is None:
-            self._began = time
-        if time - self._began < _FIRST_S or time < self._next_s:
+        self._visual.update(image, time, tilt)
+        if self._collecting_since is None:
+            self._collecting_since = time
+        if time - self._collecting_since < _FIRST_SOLVE_S or time < self._next_solve_s:
             return
-        self._next_s = time + _EVERY_S
-        self._solve(time, busy)
+        self._next_solve_s = time + _SOLVE_EVERY_S
+        self._solve(time, tracking)
 
-    def clear(self) -> None:
-        """A clock began anew: nothing of before counts."""
-        self._seen.clear()
+    def reset(self) -> None:
+        """Discard everything: a clock was restarted."""
+        self._visual.reset()
         self._samples.clear()
-        self._began = self.found = None
-        self._rest_until_s = self._next_s = -float("inf")
-        self.why = "not enough was seen yet"
+        self._collecting_since = self.estimate = None
+        self._paused_until_s = self._next_solve_s = -float("inf")
+        self.reason = "too few images and samples so far"
 
-    def _solve(self, time: float, busy: bool) -> None:
-        turning = self._seen.turning()
-        recent = turning.begins > time - _WINDOW_S
-        turning = type(turning)(turning.begins[recent], turning.ends[recent], turning.turns[recent])
+    def _solve(self, time: float, tracking: bool) -> None:
+        rotations = self._visual.relative_rotations()
+        recent = rotations.starts > time - _WINDOW_S
+        rotations = type(rotations)(rotations.starts[recent], rotations.ends[recent], rotations.vectors[recent])
         samples = [sample for sample in self._samples if sample.time > time - _WINDOW_S - 2.0]
-        answer = find_offset(turning, samples, self._mounting, (-_SEARCH_S, _SEARCH_S))
-        if isinstance(answer, str):
-            self.why = answer
+        result = find_offset(rotations, samples, self._mounting, (-_SEARCH_HALF_WIDTH_S, _SEARCH_HALF_WIDTH_S))
+        if isinstance(result, str):
+            self.reason = result
             return
-        self.why = ""
-        old = self.found
-        better = old is None or answer.std < 1.2 * old.std or abs(answer.offset - old.offset) > 4.0 * old.std
-        moved = 0.0 if old is None else abs(answer.offset - old.offset)
-        if better and not (busy and old is not None and moved > _CAREFUL_S):
-            self.found = answer
-        if answer.std < _GOOD_STD_S and time - (self._began or time) > 0.8 * _WINDOW_S:
-            self._rest_until_s = time + _REST_S
-            self._began = None
-            self._seen.clear()
+        self.reason = ""
+        previous = self.estimate
+        better = (
+            previous is None
+            or result.std < 1.2 * previous.std
+            or abs(result.offset - previous.offset) > 4.0 * previous.std
+        )
+        change = 0.0 if previous is None else abs(result.offset - previous.offset)
+        if better and not (tracking and previous is not None and change > _MAX_CHANGE_WHILE_TRACKING_S):
+            self.estimate = result
+        if result.std < _GOOD_STD_S and time - (self._collecting_since or time) > 0.8 * _WINDOW_S:
+            self._paused_until_s = time + _PAUSE_S
+            self._collecting_since = None
+            self._visual.reset()

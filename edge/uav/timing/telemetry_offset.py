@@ -1,8 +1,8 @@
-"""The offset between a camera's clock and its telemetry's: the turning seen in the pictures against the attitude's.
+"""Offset between the camera's clock and the telemetry's, by correlating visual rotation with the attitude.
 
-telemetry time = camera time + offset. Both turned angles are laid on one time grid and freed of what changes slowly
-(a bias, or the camera's own motion over the ground); the offset is where they agree best. Every offset of the search
-window is looked at, by one correlation, and an answer must beat all others that are not beside it.
+telemetry time = camera time + offset. Both integrated rotations are resampled on one time grid and high-pass filtered,
+which removes slow errors (a bias, or the camera's own motion over the ground). The offset maximises a likelihood ratio
+that is evaluated at every offset of the search window by FFT; the maximum must be unique.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from edge.uav.tracker import Telemetry
 from protocols.geometry.types import Bools, Floats
 
 _STEP_S = 1.0 / 60.0
-_SLOW_S = 2.0  # width of the window whose mean is taken away
-_WHOLE = 0.95  # of that window that must be known: half a window has another mean
-_LONGEST_FRAME_S = 0.25
-_LONGEST_GAP_S = 2.5
-_SLOW_SAMPLES_S = 0.08  # sampled more seldom, attitude is interpolated by a spline
-_SURE = 12.0  # by how much the log-likelihood of the answer must beat the others', beside the number of others
-_BESIDE_S = 0.35  # offsets that near to the answer are no others
-_LEAST_S = 2.0  # seconds of pictures that overlap
-_FINE_S = 0.002
-_MISSING = 2.5  # usual distances between samples, after which some are missing
-_USELESS_S = 0.02  # std of an answer that is none: at a turn of 30 degrees a second it is half a degree
+_HIGH_PASS_WINDOW_S = 2.0  # of the weighted moving average that is subtracted
+_MIN_COVERAGE = 0.95  # of that window: the mean of half a window would be biased
+_MAX_FRAME_GAP_S = 0.25
+_MAX_TELEMETRY_GAP_S = 2.5
+_SPARSE_SPACING_S = 0.08  # attitude sampled less often is interpolated by a rotation spline
+_MIN_LOG_RATIO = 12.0  # of the maximum to other offsets, and (plus log of their number) to no correlation
+_PEAK_HALF_WIDTH_S = 0.35  # offsets closer to the maximum belong to the same peak
+_MIN_OVERLAP_S = 2.0  # of images and telemetry
+_FINE_STEP_S = 0.002
+_GAP_FACTOR = 2.5  # times the median spacing: a longer one is a gap
+_MAX_STD_S = 0.02  # of an accepted offset: at 30 degrees a second it is half a degree
 
 
 @dataclass(frozen=True, slots=True)
-class Offset:
-    """offset, std [s]. agreement: share of the pictures' turning that the telemetry explains, 0 … 1."""
+class OffsetEstimate:
+    """offset, std [s]. agreement: share of the visual rotation that the telemetry explains, 0 … 1."""
 
     offset: float
     std: float
@@ -39,130 +39,132 @@ class Offset:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Turning:
-    """Rotation vectors (n, 3) [rad] of the camera from ``begins`` to ``ends`` (n,) [s], camera axes."""
+class RelativeRotations:
+    """Rotation vectors (n, 3) [rad] of the camera from ``starts`` to ``ends`` (n,) [s], in camera axes."""
 
-    begins: Floats
+    starts: Floats
     ends: Floats
-    turns: Floats
+    vectors: Floats
 
 
 def find_offset(
-    seen: Turning,
+    visual: RelativeRotations,
     telemetry: Sequence[Telemetry],
     body_from_camera: Floats,
     search: tuple[float, float] | None = None,
-) -> Offset | str:
-    """The offset, or why it can't be told.
+) -> OffsetEstimate | str:
+    """The offset, or the reason why it is not observable.
 
-    telemetry: by time. body_from_camera: (3, 3). search: lowest and highest offset [s]; None: all at which the two
-    overlap by 2 s.
+    visual: rotation seen by the camera. telemetry: by increasing time. body_from_camera: (3, 3). search: lowest and
+    highest offset [s]; None: all offsets at which the two overlap by 2 s.
     """
-    told = _told_angles(telemetry, body_from_camera)
-    if len(seen.turns) < 10:
-        return "the pictures show no turning that can be measured"
-    if told is None:
-        return "the telemetry holds too few attitudes"
-    origin = float(seen.begins[0])
-    pictures = _picture_angles(seen, origin)
-    epoch = float(telemetry[0].time)
-    low = epoch - float(seen.ends[-1]) + _LEAST_S
-    high = float(telemetry[-1].time) - origin - _LEAST_S
+    from_telemetry = _telemetry_angles(telemetry, body_from_camera)
+    if len(visual.vectors) < 10:
+        return "no camera rotation could be measured in the images"
+    if from_telemetry is None:
+        return "the telemetry has too few attitudes"
+    start = float(visual.starts[0])
+    from_images = _visual_angles(visual, start)
+    telemetry_start = float(telemetry[0].time)
+    low = telemetry_start - float(visual.ends[-1]) + _MIN_OVERLAP_S
+    high = float(telemetry[-1].time) - start - _MIN_OVERLAP_S
     if search is not None:
         low, high = max(low, search[0]), min(high, search[1])
     if low > high:
-        return "pictures and telemetry overlap nowhere in the search window"
-    a, a_known = _quick(pictures)
-    b, b_known = _quick(told)
-    # Row i of a is at origin + i step, row j of b at epoch + j step: offset = epoch − origin + (j − i) step.
+        return "images and telemetry do not overlap anywhere in the search window"
+    a, a_known = _high_pass(from_images)
+    b, b_known = _high_pass(from_telemetry)
+    # Row i of a is at start + i step, row j of b at telemetry_start + j step:
+    # offset = telemetry_start − start + (j − i) step.
     shifts = np.arange(
-        int(np.ceil((low - epoch + origin) / _STEP_S)), int(np.floor((high - epoch + origin) / _STEP_S)) + 1
+        int(np.ceil((low - telemetry_start + start) / _STEP_S)),
+        int(np.floor((high - telemetry_start + start) / _STEP_S)) + 1,
     )
     if len(shifts) < 3:
         return "the search window is too narrow"
-    score = _likelihood(a, a_known, b, b_known, shifts)
+    score = _log_likelihood_ratios(a, a_known, b, b_known, shifts)
     if not np.isfinite(score).any():
-        return "pictures and telemetry overlap nowhere in the search window"
+        return "images and telemetry do not overlap anywhere in the search window"
     best = int(np.argmax(score))
-    piece = _piece(a, a_known, b, b_known, int(shifts[best]))
-    score = score * (_STEP_S / piece)
-    lead = float(score[best])
-    others = np.abs(shifts - shifts[best]) * _STEP_S > _BESIDE_S
-    rival = float(np.max(score[others], initial=-np.inf))
-    # Nothing but noise reaches the better a likelihood the more offsets there are to choose from.
-    chance = _SURE + np.log(max(1.0, len(shifts) * _STEP_S / _BESIDE_S))
-    if lead < chance:
-        return "the camera turned too little, or otherwise than the telemetry says"
-    if lead - rival < _SURE:
-        return "several offsets fit alike: the flight is too even"
+    correlation_time = _correlation_time(a, a_known, b, b_known, int(shifts[best]))
+    score = score * (_STEP_S / correlation_time)
+    peak = float(score[best])
+    others = np.abs(shifts - shifts[best]) * _STEP_S > _PEAK_HALF_WIDTH_S
+    second = float(np.max(score[others], initial=-np.inf))
+    # The maximum over noise alone grows with the number of independent offsets.
+    threshold = _MIN_LOG_RATIO + np.log(max(1.0, len(shifts) * _STEP_S / _PEAK_HALF_WIDTH_S))
+    if peak < threshold:
+        return "the camera rotated too little, or its rotation does not match the telemetry"
+    if peak - second < _MIN_LOG_RATIO:
+        return "the offset is ambiguous: the rotation varies too little"
     if best in (0, len(shifts) - 1):
         return "the offset lies outside the search window"
-    near = epoch - origin + float(shifts[best]) * _STEP_S
-    offset, std, agreement = _refine(a, a_known, told, near, epoch - origin, piece)
-    if std > _USELESS_S:
-        return f"it would be known to {1e3 * std:.0f} ms only: the camera turned too little, or is told too seldom"
-    return Offset(offset, std, agreement)
+    coarse = telemetry_start - start + float(shifts[best]) * _STEP_S
+    offset, std, agreement = _refine(a, a_known, from_telemetry, coarse, telemetry_start - start, correlation_time)
+    if std > _MAX_STD_S:
+        return f"its std would be {1e3 * std:.0f} ms: the camera rotated too little, or attitudes are too sparse"
+    return OffsetEstimate(offset, std, agreement)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Angles:
-    """Turned angles (n, 3) [rad], summed up in camera axes, at grid times first + k step [s]; NaN where unknown.
+class _IntegratedAngles:
+    """Integrated rotation (n, 3) [rad] in camera axes at grid times first + k step [s]; NaN where unknown.
 
-    Angles and not rates: the noise of an attitude is white, that of its rate is not and drowns the motion.
+    Angles and not rates: the noise of an attitude is white; that of its rate is not, and masks the motion.
     """
 
     first: float
     values: Floats
 
 
-def _picture_angles(seen: Turning, origin: float) -> _Angles:
-    spans = seen.ends - seen.begins
-    good = (spans > 0.0) & (spans < _LONGEST_FRAME_S)
-    begins, ends = seen.begins[good] - origin, seen.ends[good] - origin
-    summed = np.cumsum(seen.turns[good], axis=0)
+def _visual_angles(visual: RelativeRotations, start: float) -> _IntegratedAngles:
+    spans = visual.ends - visual.starts
+    valid = (spans > 0.0) & (spans < _MAX_FRAME_GAP_S)
+    starts, ends = visual.starts[valid] - start, visual.ends[valid] - start
+    integrated = np.cumsum(visual.vectors[valid], axis=0)
     grid = np.arange(0.0, float(ends[-1]), _STEP_S)
-    index = np.clip(np.searchsorted(begins, grid, side="right") - 1, 0, len(begins) - 1)
-    inside = (grid >= begins[index] - 1e-9) & (grid <= ends[index] + 1e-9)
-    nodes = np.r_[begins[0], ends]
-    values = _between(nodes, np.vstack([np.zeros(3), summed]), grid)
+    index = np.clip(np.searchsorted(starts, grid, side="right") - 1, 0, len(starts) - 1)
+    inside = (grid >= starts[index] - 1e-9) & (grid <= ends[index] + 1e-9)
+    nodes = np.r_[starts[0], ends]
+    values = _interpolate(nodes, np.vstack([np.zeros(3), integrated]), grid)
     values[~inside] = np.nan
-    return _Angles(0.0, values)
+    return _IntegratedAngles(0.0, values)
 
 
-def _told_angles(telemetry: Sequence[Telemetry], body_from_camera: Floats) -> _Angles | None:
-    """The same of the attitudes."""
+def _telemetry_angles(telemetry: Sequence[Telemetry], body_from_camera: Floats) -> _IntegratedAngles | None:
+    """Integrated rotation of the telemetry attitudes; None with too few of them."""
     times = np.array([sample.time for sample in telemetry])
     if len(times) < 5:
         return None
-    fresh = np.r_[True, np.diff(times) > 1e-6]
-    times = times[fresh]
+    increasing = np.r_[True, np.diff(times) > 1e-6]
+    times = times[increasing]
     if len(times) < 5:
         return None
-    turned = np.array([sample.ned_from_body for sample in telemetry])[fresh]
-    camera_from_ned = np.asarray(body_from_camera).T @ np.swapaxes(turned, 1, 2)
+    attitudes = np.array([sample.ned_from_body for sample in telemetry])[increasing]
+    camera_from_ned = np.asarray(body_from_camera).T @ np.swapaxes(attitudes, 1, 2)
     gaps = np.diff(times)
     at = times[0] + np.arange(0.0, times[-1] - times[0], _STEP_S)
     index = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(gaps) - 1)
-    if np.median(gaps) > _SLOW_SAMPLES_S:
-        times, camera_from_ned = _smooth(times, camera_from_ned)
-    steps = _logs(camera_from_ned[1:] @ np.swapaxes(camera_from_ned[:-1], 1, 2))
-    summed = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
-    values = _between(times, summed, at)
-    values[gaps[index] > _LONGEST_GAP_S] = np.nan
-    return _Angles(float(at[0]), values)
+    if np.median(gaps) > _SPARSE_SPACING_S:
+        times, camera_from_ned = _upsample(times, camera_from_ned)
+    steps = _rotation_vectors(camera_from_ned[1:] @ np.swapaxes(camera_from_ned[:-1], 1, 2))
+    integrated = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+    values = _interpolate(times, integrated, at)
+    values[gaps[index] > _MAX_TELEMETRY_GAP_S] = np.nan
+    return _IntegratedAngles(float(at[0]), values)
 
 
-def _between(times: Floats, values: Floats, at: Floats) -> Floats:
-    """Values (n, 3) at ``times``, by cubic splines at the moments ``at`` between them; straight across what is missing.
+def _interpolate(times: Floats, values: Floats, at: Floats) -> Floats:
+    """Values (n, 3) at ``times`` resampled at the times ``at`` by cubic splines; linearly across gaps.
 
-    Straight lines are flattest half-way: two such rows agree best with corner on corner, and an offset found from
-    pictures and attitudes of like rates would be drawn by up to 4 ms to where they fall together.
+    Linear interpolation has its knots as corners: two such series agree best with corner on corner, and an offset from
+    images and attitudes of similar rates would be biased by up to 4 ms towards aligned samples.
     """
     from scipy.interpolate import CubicSpline
 
     out = np.column_stack([np.interp(at, times, values[:, axis]) for axis in range(3)])
     gaps = np.diff(times)
-    breaks = np.flatnonzero(gaps > _MISSING * np.median(gaps))
+    breaks = np.flatnonzero(gaps > _GAP_FACTOR * np.median(gaps))
     for first, last in zip(np.r_[0, breaks + 1], np.r_[breaks, len(times) - 1], strict=True):
         inside = (at >= times[first]) & (at <= times[last])
         if last - first >= 3 and inside.any():
@@ -170,8 +172,8 @@ def _between(times: Floats, values: Floats, at: Floats) -> Floats:
     return out
 
 
-def _logs(rotations: Floats) -> Floats:
-    """Rotation vectors (n, 3) of rotations (n, 3, 3) well below half a turn."""
+def _rotation_vectors(rotations: Floats) -> Floats:
+    """Rotation vectors (n, 3) of rotation matrices (n, 3, 3) well below half a turn."""
     m = rotations
     twice = np.column_stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]])
     sine = 0.5 * np.linalg.norm(twice, axis=1)
@@ -180,38 +182,40 @@ def _logs(rotations: Floats) -> Floats:
     return np.asarray(factor[:, None] * twice)
 
 
-def _smooth(times: Floats, camera_from_ned: Floats) -> tuple[Floats, Floats]:
-    """Seldom samples, filled up by a cubic spline of rotations."""
+def _upsample(times: Floats, camera_from_ned: Floats) -> tuple[Floats, Floats]:
+    """Sparse attitudes resampled densely by a cubic rotation spline."""
     from scipy.spatial.transform import Rotation, RotationSpline
 
     spline = RotationSpline(times, Rotation.from_matrix(np.swapaxes(camera_from_ned, 1, 2)))
-    dense = np.arange(times[0], times[-1], 0.5 * _SLOW_SAMPLES_S)
+    dense = np.arange(times[0], times[-1], 0.5 * _SPARSE_SPACING_S)
     return dense, np.swapaxes(np.asarray(spline(dense).as_matrix()), 1, 2)
 
 
-def _quick(angles: _Angles) -> tuple[Floats, Floats]:
-    """Angles without their slow part (n, 3), zero where unknown, and (n,) 1 where known."""
+def _high_pass(angles: _IntegratedAngles) -> tuple[Floats, Floats]:
+    """Angles without their low-frequency part (n, 3), zero where unknown, and (n,) 1 where known."""
     known: Bools = np.asarray(np.isfinite(angles.values).all(axis=1), dtype=np.bool_)
     filled: Floats = np.where(known[:, None], angles.values, 0.0)
-    half = round(0.5 * _SLOW_S / _STEP_S)
+    half = round(0.5 * _HIGH_PASS_WINDOW_S / _STEP_S)
     window = np.hanning(2 * half + 3)[1:-1]
 
     def smoothed(row: Floats) -> Floats:
         return np.convolve(row, window, "full")[half : half + len(row)]
 
     weight = smoothed(known.astype(np.float64))
-    slow = np.column_stack([smoothed(np.asarray(filled[:, k])) for k in range(3)]) / np.maximum(weight, 1e-9)[:, None]
-    # Beside a gap there is no slow part to take away.
-    known = np.asarray(known & (weight > _WHOLE * window.sum()), dtype=np.bool_)
-    return np.where(known[:, None], filled - slow, 0.0), known.astype(np.float64)
+    low_pass = (
+        np.column_stack([smoothed(np.asarray(filled[:, k])) for k in range(3)]) / np.maximum(weight, 1e-9)[:, None]
+    )
+    # Close to a gap the low-frequency part is not defined.
+    known = np.asarray(known & (weight > _MIN_COVERAGE * window.sum()), dtype=np.bool_)
+    return np.where(known[:, None], filled - low_pass, 0.0), known.astype(np.float64)
 
 
-def _likelihood(
+def _log_likelihood_ratios(
     a: Floats, a_known: Floats, b: Floats, b_known: Floats, shifts: np.ndarray[tuple[int], np.dtype[np.int64]]
 ) -> Floats:
-    """Log-likelihood ratio against "nothing in common" for every shift (n,), as if all grid points were independent.
+    """Log-likelihood ratio against "uncorrelated" for every shift (n,), as if all grid points were independent.
 
-    Per axis: half the number of points times log(energy / residual), by FFT; -inf where too little overlaps.
+    Per axis: half the number of points times log(energy / residual), by FFT; -inf where the overlap is too short.
     """
     size = 1
     while size < len(a) + len(b):
@@ -223,79 +227,83 @@ def _likelihood(
         return np.asarray(np.fft.irfft(spectrum, size)[shifts % size])
 
     count = correlate(a_known, b_known)
-    enough = count * _STEP_S >= _LEAST_S - 2 * _STEP_S
+    enough = count * _STEP_S >= _MIN_OVERLAP_S - 2 * _STEP_S
     score = np.zeros(len(shifts))
     for axis in range(3):
         energy = correlate(np.square(a[:, axis]), b_known)
-        theirs = correlate(a_known, np.square(b[:, axis]))
+        other_energy = correlate(a_known, np.square(b[:, axis]))
         cross = correlate(a[:, axis], b[:, axis])
-        residual = np.maximum(energy + theirs - 2.0 * cross, 1e-9)
+        residual = np.maximum(energy + other_energy - 2.0 * cross, 1e-9)
         with np.errstate(divide="ignore", invalid="ignore"):
-            gain = 0.5 * count * np.log(np.maximum(energy + theirs, 1e-9) / residual)
-        # An axis that disagrees (the camera's own motion) says nothing rather than against.
+            gain = 0.5 * count * np.log(np.maximum(energy + other_energy, 1e-9) / residual)
+        # An axis that disagrees (the camera's own translation) is uninformative, not contrary evidence.
         score += np.maximum(gain, 0.0)
     return np.where(enough, score, -np.inf)
 
 
-def _piece(a: Floats, a_known: Floats, b: Floats, b_known: Floats, shift: int) -> float:
-    """Seconds over which the residual at a shift is of one piece: its autocorrelation, summed up to its first zero."""
+def _correlation_time(a: Floats, a_known: Floats, b: Floats, b_known: Floats, shift: int) -> float:
+    """Correlation time [s] of the residual at a shift: its autocorrelation, integrated up to its first zero."""
     first, last = max(0, -shift), min(len(a), len(b) - shift)
     known = (a_known[first:last] * b_known[first + shift : last + shift]) > 0
-    gap = np.where(known[:, None], a[first:last] - b[first + shift : last + shift], 0.0)
-    size = 2 * len(gap)
-    spectrum = np.abs(np.fft.rfft(gap, size, axis=0)) ** 2
-    together = np.fft.irfft(spectrum, size, axis=0)[: len(gap)]
+    residual = np.where(known[:, None], a[first:last] - b[first + shift : last + shift], 0.0)
+    size = 2 * len(residual)
+    spectrum = np.abs(np.fft.rfft(residual, size, axis=0)) ** 2
+    autocorrelation = np.fft.irfft(spectrum, size, axis=0)[: len(residual)]
     longest = _STEP_S
-    for row in (together / np.maximum(together[0], 1e-12)).T:
+    for row in (autocorrelation / np.maximum(autocorrelation[0], 1e-12)).T:
         ends = np.flatnonzero(row <= 0.0)
         longest = max(longest, _STEP_S * (2.0 * float(row[: ends[0] if len(ends) else len(row)].sum()) - 1.0))
     return longest
 
 
 def _refine(
-    a: Floats, a_known: Floats, told: _Angles, near: float, zero: float, piece: float
+    a: Floats, a_known: Floats, from_telemetry: _IntegratedAngles, coarse: float, base: float, correlation_time: float
 ) -> tuple[float, float, float]:
-    """The offset to a fraction of the grid; its std, and the share that is explained."""
+    """The offset refined below the grid step; its std, and the share of the visual rotation that is explained."""
     from scipy.interpolate import CubicSpline
 
-    grid = np.arange(len(told.values)) * _STEP_S
-    b, b_known = _quick(told)
-    here = np.arange(len(a)) * _STEP_S
-    tries = near + np.arange(-3.0 * _STEP_S, 3.0 * _STEP_S, _FINE_S)
-    common, ours, theirs_all = np.zeros((len(tries), 3)), np.zeros((len(tries), 3)), np.zeros((len(tries), 3))
-    # Straight lines would weaken what lies between grid points, and draw the answer onto them.
-    between = CubicSpline(grid, b)
-    # The same moments of the pictures at every offset: what comes and goes at a gap's edge is no agreement.
+    grid = np.arange(len(from_telemetry.values)) * _STEP_S
+    b, b_known = _high_pass(from_telemetry)
+    frame_times = np.arange(len(a)) * _STEP_S
+    candidates = coarse + np.arange(-3.0 * _STEP_S, 3.0 * _STEP_S, _FINE_STEP_S)
+    cross, visual_energy, telemetry_energy = (
+        np.zeros((len(candidates), 3)),
+        np.zeros((len(candidates), 3)),
+        np.zeros((len(candidates), 3)),
+    )
+    # Linear interpolation would attenuate between grid points and bias the offset towards them.
+    spline = CubicSpline(grid, b)
+    # The same image times at every offset: samples entering or leaving at a gap would change the agreement.
     known = a_known > 0
-    for offset in (tries[0], tries[-1]):
-        known &= np.interp(here + offset - zero, grid, b_known, left=0.0, right=0.0) > 0.99
+    for offset in (candidates[0], candidates[-1]):
+        known &= np.interp(frame_times + offset - base, grid, b_known, left=0.0, right=0.0) > 0.99
     total = 0.0
-    for k, offset in enumerate(tries):
-        moments = here + offset - zero
-        theirs = np.asarray(between(np.clip(moments, grid[0], grid[-1])))
+    for k, offset in enumerate(candidates):
+        times = frame_times + offset - base
+        shifted = np.asarray(spline(np.clip(times, grid[0], grid[-1])))
         total = float(max(int(known.sum()), 1))
-        common[k] = (a * theirs)[known].sum(axis=0) / total
-        ours[k] = np.square(a)[known].sum(axis=0) / total
-        theirs_all[k] = np.square(theirs)[known].sum(axis=0) / total
-    # The energy of the interpolated attitude is smaller between samples, where noise is averaged: taken at each offset,
-    # it would draw the answer there. Its trend must stay: a manoeuvre that enters the window is worth milliseconds.
-    energy = ours.max(axis=0)
-    cost = ours - common * np.abs(common) / np.maximum(_trend(tries, theirs_all), 1e-12)
+        cross[k] = (a * shifted)[known].sum(axis=0) / total
+        visual_energy[k] = np.square(a)[known].sum(axis=0) / total
+        telemetry_energy[k] = np.square(shifted)[known].sum(axis=0) / total
+    # The energy of the interpolated attitude is smaller between samples, where noise is averaged: used as it is at each
+    # offset, it would bias the offset. Its trend must stay: a manoeuvre that enters the window is worth milliseconds.
+    energy = visual_energy.max(axis=0)
+    cost = visual_energy - cross * np.abs(cross) / np.maximum(_fit_parabolas(candidates, telemetry_energy), 1e-12)
     noise = np.maximum(cost.min(axis=0), 1e-3 * energy)
-    # Axes in which nothing agrees carry no weight.
+    # Axes without correlation get no weight.
     useful = noise < 0.8 * energy
     weight = np.where(useful, 1.0 / np.maximum(noise, 1e-9), 0.0)
-    score = 0.5 * (cost @ weight) * total * _STEP_S / piece
-    k = int(np.clip(np.argmin(score), 2, len(tries) - 3))
-    bend, slope, _ = np.polyfit(tries[k - 2 : k + 3] - tries[k], score[k - 2 : k + 3], 2)
-    shift = float(np.clip(-slope / (2.0 * bend), -2 * _FINE_S, 2 * _FINE_S)) if bend > 0 else 0.0
-    wide_bend = np.polyfit(tries - tries[k], score, 2)[0]
-    # The curvature of the log-likelihood, whose seconds count as pieces of ``piece`` each: the noise is not white.
-    std = 1.0 / float(np.sqrt(max(2.0 * wide_bend, 1.0)))
+    score = 0.5 * (cost @ weight) * total * _STEP_S / correlation_time
+    k = int(np.clip(np.argmin(score), 2, len(candidates) - 3))
+    curvature, slope, _ = np.polyfit(candidates[k - 2 : k + 3] - candidates[k], score[k - 2 : k + 3], 2)
+    shift = float(np.clip(-slope / (2.0 * curvature), -2 * _FINE_STEP_S, 2 * _FINE_STEP_S)) if curvature > 0 else 0.0
+    wide_curvature = np.polyfit(candidates - candidates[k], score, 2)[0]
+    # From the curvature of the log-likelihood, scaled by the correlation time: the noise is not white.
+    std = 1.0 / float(np.sqrt(max(2.0 * wide_curvature, 1.0)))
     agreement = 1.0 - float((cost[k] * weight).sum() / max((energy * weight).sum(), 1e-12))
-    return float(tries[k]) + shift, std, float(np.clip(agreement, 0.0, 1.0))
+    return float(candidates[k]) + shift, std, float(np.clip(agreement, 0.0, 1.0))
 
 
-def _trend(at: Floats, values: Floats) -> Floats:
-    """Parabolas (n, 3) through values (n, 3) at (n,)."""
+def _fit_parabolas(at: Floats, values: Floats) -> Floats:
+    """Values (n, 3) of least-squares parabolas fitted to values (n, 3) at (n,)."""
     return np.column_stack([np.polyval(np.polyfit(at - at.mean(), row, 2), at - at.mean()) for row in values.T])

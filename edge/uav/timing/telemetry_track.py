@@ -1,7 +1,7 @@
-"""Attitude and position from telemetry, and the unknown constant offset between its clock and the camera's.
+"""Interpolated attitude and position from telemetry, with an online estimate of its constant clock offset.
 
-telemetry time = camera time + offset. Each sample's attitude is compared with the one seen in the pictures at every
-candidate offset; the spread of the difference tells how likely that offset is. A constant bias doesn't matter.
+telemetry time = camera time + offset. Each sample's attitude is compared with the visually estimated one at every
+candidate offset; the variance of the difference gives the likelihood of the offset. A constant bias cancels.
 """
 
 from __future__ import annotations
@@ -14,47 +14,47 @@ from edge.uav.tracker import Telemetry
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 
-REACH_S = 0.6
-"""Largest offset [s]: half a second, and a little lateness of the samples themselves."""
+MAX_OFFSET_S = 0.6
+"""Largest offset [s]: half a second, plus some delay of the samples themselves."""
 _STEP_S = 0.02
 _PRIOR_STD_S = 0.3
-_LONGEST_GAP_S = 2.5  # between two samples that are still interpolated
-_FORGET = 0.995  # of the evidence, a sample
+_MAX_GAP_S = 2.5  # between two samples for interpolation
+_FORGETTING_FACTOR = 0.995  # of the cost, per sample
 _NOISE_RAD = np.deg2rad(0.4)
-_APART_S = 0.06  # samples closer than this are of one piece
-_DRIFT_S = 1.5
-_MEMORY = 400
+_MIN_SPACING_S = 0.06  # samples closer than this are not independent
+_MEAN_TIME_CONSTANT_S = 1.5
+_BUFFER = 400
 
 
-class TelemetryClock:
-    """Samples in order, queried in camera time. Bad samples are left out and counted."""
+class TelemetryTrack:
+    """Telemetry samples in order, queried by camera time. Invalid samples are rejected and counted."""
 
     def __init__(self, body_from_camera: Floats) -> None:
         self._camera_from_body = np.asarray(body_from_camera, dtype=np.float64).T
-        self._times: deque[float] = deque(maxlen=_MEMORY)
-        self._rotations: deque[Floats] = deque(maxlen=_MEMORY)
-        self._positions: deque[Floats | None] = deque(maxlen=_MEMORY)
-        self._waiting: deque[tuple[float, Floats]] = deque(maxlen=_MEMORY)
-        self._seen_times: deque[float] = deque(maxlen=_MEMORY)
-        self._seen: deque[Floats] = deque(maxlen=_MEMORY)
-        self._grid = np.arange(-REACH_S, REACH_S + _STEP_S / 2, _STEP_S)
-        self._count = 0.0
-        self._cost = np.zeros(len(self._grid))
+        self._times: deque[float] = deque(maxlen=_BUFFER)
+        self._rotations: deque[Floats] = deque(maxlen=_BUFFER)
+        self._positions: deque[Floats | None] = deque(maxlen=_BUFFER)
+        self._pending: deque[tuple[float, Floats]] = deque(maxlen=_BUFFER)
+        self._visual_times: deque[float] = deque(maxlen=_BUFFER)
+        self._visual: deque[Floats] = deque(maxlen=_BUFFER)
+        self._offsets = np.arange(-MAX_OFFSET_S, MAX_OFFSET_S + _STEP_S / 2, _STEP_S)
+        self._weight_sum = 0.0
+        self._cost = np.zeros(len(self._offsets))
         self._mean: Floats | None = None
-        self._compared = 0.0
+        self._last_update = 0.0
         self.offset = 0.0
         self.offset_std = _PRIOR_STD_S
         self.rejected = 0
 
     def add(self, sample: Telemetry) -> None:
-        """Take one sample; NaN, no rotation or a time that does not increase is counted in ``rejected``."""
+        """Add one sample; NaN, no rotation matrix or a time that does not increase is counted in ``rejected``."""
         rotation = np.asarray(sample.ned_from_body, dtype=np.float64)
-        good = np.isfinite(sample.time) and rotation.shape == (3, 3) and bool(np.isfinite(rotation).all())
-        if good:
-            good = bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < 0.05)
-        if good and self._times and sample.time <= self._times[-1]:
-            good = False
-        if not good:
+        valid = np.isfinite(sample.time) and rotation.shape == (3, 3) and bool(np.isfinite(rotation).all())
+        if valid:
+            valid = bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < 0.05)
+        if valid and self._times and sample.time <= self._times[-1]:
+            valid = False
+        if not valid:
             self.rejected += 1
             return
         position = None if sample.position is None else np.asarray(sample.position, dtype=np.float64)
@@ -64,43 +64,43 @@ class TelemetryClock:
         self._times.append(float(sample.time))
         self._rotations.append(camera_from_ned)
         self._positions.append(position)
-        self._waiting.append((float(sample.time), camera_from_ned))
+        self._pending.append((float(sample.time), camera_from_ned))
 
     @property
     def rate_hz(self) -> float:
-        """Samples a second over those held; 0 with fewer than two."""
+        """Sample rate over the samples held [Hz]; 0 with fewer than two."""
         if len(self._times) < 2:
             return 0.0
         return (len(self._times) - 1) / max(self._times[-1] - self._times[0], 1e-6)
 
-    def rotation_at(self, time: float, ahead: float = 0.12) -> Floats | None:
+    def rotation_at(self, time: float, extrapolation: float = 0.12) -> Floats | None:
         """Rotation (3, 3) camera from NED at a camera time; None where no samples are near.
 
-        ahead: how far beyond the newest sample it is continued at constant turn rate [s].
+        extrapolation: how far beyond the newest sample it is continued at constant angular rate [s].
         """
-        at = self._bracket(time + self.offset, ahead)
-        if at is None:
+        bracket = self._bracket(time + self.offset, extrapolation)
+        if bracket is None:
             return None
-        index, share = at
+        index, fraction = bracket
         first, second = self._rotations[index], self._rotations[index + 1]
-        return np.asarray(so3.exp(share * so3.log(second @ first.T)) @ first)
+        return np.asarray(so3.exp(fraction * so3.log(second @ first.T)) @ first)
 
-    def position_at(self, time: float, ahead: float = 0.25) -> Floats | None:
+    def position_at(self, time: float, extrapolation: float = 0.25) -> Floats | None:
         """Position (3,) NED [m] at a camera time; None where no samples are near."""
-        at = self._bracket(time + self.offset, ahead)
-        if at is None:
+        bracket = self._bracket(time + self.offset, extrapolation)
+        if bracket is None:
             return None
-        index, share = at
+        index, fraction = bracket
         first, second = self._positions[index], self._positions[index + 1]
         if first is None or second is None:
             return None
-        return np.asarray(first + share * (second - first))
+        return np.asarray(first + fraction * (second - first))
 
     def nearest(self, time: float, within: float) -> tuple[Floats, Floats | None] | None:
-        """Rotation and position of the sample nearest to a camera time, or interpolated; None if none is near."""
-        rotation = self.rotation_at(time, ahead=within)
+        """Rotation and position interpolated at a camera time, or of the nearest sample; None if none is within [s]."""
+        rotation = self.rotation_at(time, extrapolation=within)
         if rotation is not None:
-            return rotation, self.position_at(time, ahead=within)
+            return rotation, self.position_at(time, extrapolation=within)
         if not self._times:
             return None
         gaps = np.abs(np.array(self._times) - (time + self.offset))
@@ -109,63 +109,63 @@ class TelemetryClock:
             return None
         return self._rotations[index], self._positions[index]
 
-    def saw(self, time: float, rotation: Floats) -> None:
-        """Take the attitude (3, 3) camera from NED that the pictures gave for a camera time."""
-        self._seen_times.append(time)
-        self._seen.append(rotation)
-        while self._waiting and self._waiting[0][0] + REACH_S <= time:
-            self._compare(*self._waiting.popleft())
+    def add_visual_attitude(self, time: float, rotation: Floats) -> None:
+        """Add the attitude (3, 3) camera from NED that was estimated from the image of a camera time."""
+        self._visual_times.append(time)
+        self._visual.append(rotation)
+        while self._pending and self._pending[0][0] + MAX_OFFSET_S <= time:
+            self._update_offset(*self._pending.popleft())
 
-    def forget_seen(self) -> None:
-        """The pictures' attitudes began anew: what was compared says nothing of the new ones."""
-        self._seen_times.clear()
-        self._seen.clear()
+    def reset_visual_attitudes(self) -> None:
+        """Discard the visual attitudes, whose frame has changed."""
+        self._visual_times.clear()
+        self._visual.clear()
         self._mean = None
 
-    def _bracket(self, moment: float, ahead: float) -> tuple[int, float] | None:
+    def _bracket(self, telemetry_time: float, extrapolation: float) -> tuple[int, float] | None:
         if len(self._times) < 2:
             return None
         times = np.array(self._times)
-        if moment < times[0] - ahead or moment > times[-1] + ahead:
+        if telemetry_time < times[0] - extrapolation or telemetry_time > times[-1] + extrapolation:
             return None
-        index = int(np.clip(np.searchsorted(times, moment) - 1, 0, len(times) - 2))
+        index = int(np.clip(np.searchsorted(times, telemetry_time) - 1, 0, len(times) - 2))
         gap = times[index + 1] - times[index]
-        if gap > _LONGEST_GAP_S:
+        if gap > _MAX_GAP_S:
             return None
-        return index, float((moment - times[index]) / gap)
+        return index, float((telemetry_time - times[index]) / gap)
 
-    def _compare(self, sampled: float, rotation: Floats) -> None:
-        """Add one sample's evidence for every candidate offset."""
-        soon = self._mean is not None and sampled - self._compared < _APART_S
-        if len(self._seen_times) < 2 or soon:
+    def _update_offset(self, sample_time: float, rotation: Floats) -> None:
+        """Add the cost of one sample at every candidate offset and update the estimate."""
+        too_soon = self._mean is not None and sample_time - self._last_update < _MIN_SPACING_S
+        if len(self._visual_times) < 2 or too_soon:
             return
-        times = np.array(self._seen_times)
-        moments = sampled - self._grid
-        if moments.min() < times[0] or moments.max() > times[-1]:
+        times = np.array(self._visual_times)
+        camera_times = sample_time - self._offsets
+        if camera_times.min() < times[0] or camera_times.max() > times[-1]:
             return
-        first = int(np.searchsorted(times, moments.min())) - 1
-        seen = np.array([self._seen[i] for i in range(max(first, 0), len(times))])
+        first = int(np.searchsorted(times, camera_times.min())) - 1
+        visual = np.array([self._visual[i] for i in range(max(first, 0), len(times))])
         times = times[max(first, 0) :]
-        index = np.clip(np.searchsorted(times, moments) - 1, 0, len(times) - 2)
-        share = (moments - times[index]) / (times[index + 1] - times[index])
-        between = seen[index] + share[:, None, None] * (seen[index + 1] - seen[index])
-        m = np.einsum("ij,nkj->nik", rotation, between)
+        index = np.clip(np.searchsorted(times, camera_times) - 1, 0, len(times) - 2)
+        fraction = (camera_times - times[index]) / (times[index + 1] - times[index])
+        interpolated = visual[index] + fraction[:, None, None] * (visual[index + 1] - visual[index])
+        m = np.einsum("ij,nkj->nik", rotation, interpolated)
         difference = 0.5 * np.column_stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]])
-        # Against its own recent mean: what the pictures drift within many seconds is not an offset.
+        # Relative to its recent mean: slow drift of the visual attitude is not caused by a clock offset.
         if self._mean is None:
-            self._mean, self._compared = difference, sampled
+            self._mean, self._last_update = difference, sample_time
             return
-        share = 1.0 - np.exp(-(sampled - self._compared) / _DRIFT_S)
+        fraction = 1.0 - np.exp(-(sample_time - self._last_update) / _MEAN_TIME_CONSTANT_S)
         change = difference - self._mean
-        self._mean, self._compared = self._mean + share * change, sampled
-        self._count = _FORGET * self._count + 1.0
-        self._cost = _FORGET * self._cost + (1.0 - 0.5 * share) * np.square(change).sum(axis=1)
-        if self._count < 4.0:
+        self._mean, self._last_update = self._mean + fraction * change, sample_time
+        self._weight_sum = _FORGETTING_FACTOR * self._weight_sum + 1.0
+        self._cost = _FORGETTING_FACTOR * self._cost + (1.0 - 0.5 * fraction) * np.square(change).sum(axis=1)
+        if self._weight_sum < 4.0:
             return
         spread = self._cost
-        noise = max(_NOISE_RAD, float(np.sqrt(spread.min() / (3.0 * self._count))))
-        score = -0.5 * spread / noise**2 - 0.5 * np.square(self._grid / _PRIOR_STD_S)
+        noise = max(_NOISE_RAD, float(np.sqrt(spread.min() / (3.0 * self._weight_sum))))
+        score = -0.5 * spread / noise**2 - 0.5 * np.square(self._offsets / _PRIOR_STD_S)
         weight = np.exp(score - score.max())
         weight /= weight.sum()
-        self.offset = float(weight @ self._grid)
-        self.offset_std = float(np.sqrt(weight @ np.square(self._grid - self.offset)) + 0.3 * _STEP_S)
+        self.offset = float(weight @ self._offsets)
+        self.offset_std = float(np.sqrt(weight @ np.square(self._offsets - self.offset)) + 0.3 * _STEP_S)

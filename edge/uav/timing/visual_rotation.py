@@ -1,6 +1,6 @@
-"""How the camera turns, seen in its pictures alone: its pose over the ground plane, followed from picture to picture.
+"""Camera rotation estimated from the images alone, by tracking the camera's pose over the ground plane.
 
-A pose and not a bare rotation: over a plane, a camera that moves sideways looks much like one that tilts.
+A pose and not a pure rotation: over a plane, sideways translation looks much like tilting.
 """
 
 from __future__ import annotations
@@ -13,76 +13,78 @@ import numpy as np
 
 from edge.uav.ground.ego_motion import EgoMotion
 from edge.uav.ground.image_plane import ImagePlane
-from edge.uav.ground.plane_motion import PosePlane
-from edge.uav.timing.telemetry_offset import Turning
+from edge.uav.ground.plane_motion import PlanePose
+from edge.uav.timing.telemetry_offset import RelativeRotations
 from edge.uav.tracker import Image, Telemetry
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
-_HEIGHT = 50.0  # the unit of length is free
-_LONGEST_S = 0.25  # between two pictures
-_LOST = 5  # pictures without a pose after which it begins anew
+_NOMINAL_HEIGHT = 50.0  # the scale is not observable
+_MAX_FRAME_GAP_S = 0.25  # between two images
+_MAX_BLIND_FRAMES = 5  # without a pose, after which tracking is restarted
 
 
-class SeenTurning:
-    """Fed with every picture in order. size: (width, height) [px]; lens: of the camera. keep: of how many turns."""
+class VisualRotationEstimator:
+    """Fed with every image in order. size: (width, height) [px]; lens: intrinsics. keep: number of rotations kept."""
 
     def __init__(self, size: tuple[int, int], lens: Intrinsics, keep: int | None = None) -> None:
         self._plane = ImagePlane(size, lens)
         self._size = size
         self._ego: EgoMotion | None = None
         self._last: tuple[float, Floats] | None = None
-        self._turns: deque[tuple[float, float, Floats]] = deque(maxlen=keep)
+        self._rotations: deque[tuple[float, float, Floats]] = deque(maxlen=keep)
 
     def update(self, image: Image | None, time: float, camera_from_ned: Floats) -> None:
-        """Take a picture of camera time ``time`` [s]; None: one that could not be decoded.
+        """Add an image of camera time ``time`` [s]; None: one that could not be decoded.
 
-        camera_from_ned: (3, 3) about how the camera was tilted then; only needed where the pose begins anew.
+        camera_from_ned: (3, 3) approximate attitude of the camera; only used where tracking is restarted.
         """
         usable = image is not None and image.shape[:2] == (self._size[1], self._size[0])
         ego = self._ego
-        if ego is None or not usable or image is None or self._last is None or time - self._last[0] > _LONGEST_S:
+        if ego is None or not usable or image is None or self._last is None or time - self._last[0] > _MAX_FRAME_GAP_S:
             self._ego = self._last = None
             if usable and image is not None:
-                self._begin(image, time, camera_from_ned)
+                self._restart(image, time, camera_from_ned)
             return
-        before_s, before = self._last
-        if time <= before_s:
+        previous_s, previous = self._last
+        if time <= previous_s:
             return
-        small = cv2.cvtColor(ego.shrink(image), cv2.COLOR_BGR2GRAY)
-        report = ego.update(np.asarray(small, np.uint8), time - before_s, keep_out=None)
-        motion = ego.motion
-        assert isinstance(motion, PosePlane)
+        working = cv2.cvtColor(ego.working_image(image), cv2.COLOR_BGR2GRAY)
+        report = ego.update(np.asarray(working, np.uint8), time - previous_s, excluded=None)
+        pose = ego.pose
+        assert isinstance(pose, PlanePose)
         if report.trusted:
-            self.add(before_s, time, motion.rotation @ before.T)
-        self._last = time, motion.rotation
-        if ego.blind > _LOST or not motion.centre[2] < 0.0:
+            self.add(previous_s, time, pose.rotation @ previous.T)
+        self._last = time, pose.rotation
+        if ego.frames_without_pose > _MAX_BLIND_FRAMES or not pose.centre[2] < 0.0:
             self._ego = None
 
-    def add(self, begin: float, end: float, turned: Floats) -> None:
-        """Take a rotation (3, 3) of the camera between two camera times, seen by somebody else."""
-        self._turns.append((begin, end, so3.log(turned)))
+    def add(self, start: float, end: float, rotation: Floats) -> None:
+        """Add a rotation (3, 3) of the camera between two camera times that was estimated elsewhere."""
+        self._rotations.append((start, end, so3.log(rotation)))
 
-    def clear(self) -> None:
-        """What was seen belongs to another time."""
-        self._turns.clear()
+    def reset(self) -> None:
+        """Discard all rotations, for example after a clock step."""
+        self._rotations.clear()
         self._ego = self._last = None
 
-    def turning(self) -> Turning:
-        """All that was kept."""
-        table = np.array([(begin, end, *turn) for begin, end, turn in self._turns]).reshape(-1, 5)
-        return Turning(table[:, 0], table[:, 1], table[:, 2:])
+    def relative_rotations(self) -> RelativeRotations:
+        """All rotations kept."""
+        table = np.array([(start, end, *vector) for start, end, vector in self._rotations]).reshape(-1, 5)
+        return RelativeRotations(table[:, 0], table[:, 1], table[:, 2:])
 
-    def _begin(self, image: Image, time: float, camera_from_ned: Floats) -> None:
+    def _restart(self, image: Image, time: float, camera_from_ned: Floats) -> None:
         ego = EgoMotion(self._plane)
-        small = cv2.cvtColor(ego.shrink(image), cv2.COLOR_BGR2GRAY)
-        ego.begin(np.asarray(small, np.uint8), PosePlane(camera_from_ned, np.array([0.0, 0.0, -_HEIGHT])), None)
+        working = cv2.cvtColor(ego.working_image(image), cv2.COLOR_BGR2GRAY)
+        ego.begin(
+            np.asarray(working, np.uint8), PlanePose(camera_from_ned, np.array([0.0, 0.0, -_NOMINAL_HEIGHT])), None
+        )
         self._ego, self._last = ego, (time, camera_from_ned)
 
 
-def usual_tilt(telemetry: Sequence[Telemetry], body_from_camera: Floats) -> Floats:
-    """camera_from_ned (3, 3) of the sample whose camera looks down as the middle one does."""
+def median_tilt_rotation(telemetry: Sequence[Telemetry], body_from_camera: Floats) -> Floats:
+    """camera_from_ned (3, 3) of the telemetry sample whose optical axis has the median downward component."""
     down = np.array([float((sample.ned_from_body @ body_from_camera[:, 2])[2]) for sample in telemetry])
-    middle = telemetry[int(np.argsort(down)[len(down) // 2])]
-    return np.asarray(body_from_camera).T @ middle.ned_from_body.T
+    centre = telemetry[int(np.argsort(down)[len(down) // 2])]
+    return np.asarray(body_from_camera).T @ centre.ned_from_body.T

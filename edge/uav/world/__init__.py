@@ -1,1 +1,1 @@
-"""A simulated town seen from a drone: pictures, telemetry and the truth, also while the car is out of the picture."""
+"""Simulated town seen from a drone: images, telemetry and ground truth, also while the target is out of view."""

@@ -1,4 +1,4 @@
-"""Cars: how they look from above, and where they are in each frame."""
+"""Cars: geometric model, rendering, and trajectories on the ground plane."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy.typing as npt
 from protocols.geometry.types import Floats
 
 LENGTH, WIDTH = 4.5, 1.9
-MIDDLE_HEIGHT = 0.7  # of the point that is called the car's centre [m]
+CENTRE_HEIGHT = 0.7  # m: height of the reference point taken as the car's centre
 _BODY_TOP, _ROOF_TOP = 0.85, 1.45
-_SHIFT = 4  # bits of sub-pixel that OpenCV's polygons take
-_NEAREST = LENGTH  # depth of a car's middle before the camera below which it is not drawn [m]
-_FARTHEST = 1e5  # a corner beyond is no pixel's any more [px]
+_SHIFT = 4  # fractional bits of OpenCV's fixed-point polygon coordinates
+_MIN_DEPTH = LENGTH  # m: smallest depth of a car's centre in the camera frame at which it is drawn
+_MAX_PIXEL = 1e5  # px: coordinates are clipped here, to keep fixed-point values in range
 
 COLOURS_BGR = {
     "red": (42, 38, 186),
@@ -30,7 +30,7 @@ COLOURS_BGR = {
 
 
 def _chamfered(back: float, front: float, half: float, cut: float) -> Floats:
-    """An octagon (8, 2) forward, right [m]."""
+    """Rectangle with chamfered corners: an octagon (8, 2) forward, right [m]."""
     return np.array(
         [
             (front, -half + cut),
@@ -54,7 +54,7 @@ _LAMPS = [
 ]
 _LAMP_BGR = ((215, 235, 240), (215, 235, 240), (30, 24, 150), (30, 24, 150))
 _SHADOW = _chamfered(-LENGTH / 2, LENGTH / 2, WIDTH / 2, 0.2)
-_SHADOW_SHIFT = np.array([-0.55, 0.65])  # north, east [m]: where the sun puts it
+_SHADOW_SHIFT = np.array([-0.55, 0.65])  # north, east [m]: offset of the shadow cast by the sun
 
 
 def _stack(*layers: tuple[Floats, float]) -> tuple[Floats, list[slice]]:
@@ -77,50 +77,50 @@ _GRID = np.array(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Car:
-    """One car's whole way. ground: (n, 2) north, east [m] and course: (n,) [rad] of frame 0 …; colour: BGR."""
+    """One car's trajectory. ground: (n, 2) north, east [m] and course: (n,) [rad] of frame 0 …; colour: BGR."""
 
     ground: Floats
     course: Floats
     colour: tuple[int, int, int]
 
 
-def corners(ground: Floats, course: float) -> Floats:
+def hull_points(ground: Floats, course: float) -> Floats:
     """The hull of a car's body (k, 3) in NED [m]; its projection's bounding box is the target's box."""
-    return _placed(ground, course)[_HULL]
+    return _model_at(ground, course)[_HULL]
 
 
-def grid(ground: Floats, course: float) -> Floats:
-    """Points (135, 3) in NED [m] spread evenly over a car at half its height: shares of them are shares of it."""
-    return np.asarray(grids(ground[None], np.array([course]))[0])
+def body_points(ground: Floats, course: float) -> Floats:
+    """Sample points (135, 3) in NED [m], uniform over a car at half its height, to estimate visible area shares."""
+    return np.asarray(body_points_batch(ground[None], np.array([course]))[0])
 
 
-def grids(ground: Floats, course: Floats) -> Floats:
-    """``grid`` of n places (n, 2) and courses (n,): (n, 135, 3)."""
+def body_points_batch(ground: Floats, course: Floats) -> Floats:
+    """``body_points`` for n positions (n, 2) and courses (n,): (n, 135, 3)."""
     c, s = np.cos(course)[:, None], np.sin(course)[:, None]
     north = ground[:, :1] + c * _GRID[:, 0] - s * _GRID[:, 1]
     east = ground[:, 1:] + s * _GRID[:, 0] + c * _GRID[:, 1]
-    return np.stack([north, east, np.full_like(north, -MIDDLE_HEIGHT)], axis=-1)
+    return np.stack([north, east, np.full_like(north, -CENTRE_HEIGHT)], axis=-1)
 
 
-def _turn(course: float) -> Floats:
+def _yaw_rotation(course: float) -> Floats:
     c, s = np.cos(course), np.sin(course)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _placed(ground: Floats, course: float) -> Floats:
-    return np.asarray(_MODEL @ _turn(course).T + np.array([ground[0], ground[1], 0.0]))
+def _model_at(ground: Floats, course: float) -> Floats:
+    return np.asarray(_MODEL @ _yaw_rotation(course).T + np.array([ground[0], ground[1], 0.0]))
 
 
 def draw(
     image: npt.NDArray[np.uint8], matrix: Floats, ground: Floats, course: float, colour: tuple[int, int, int]
 ) -> None:
-    """Draw a car into ``image``. matrix: (3, 4) projection, pixels from NED; nothing of a car that is not before it."""
-    if float((matrix[2, :3] @ np.array([ground[0], ground[1], -MIDDLE_HEIGHT])) + matrix[2, 3]) < _NEAREST:
+    """Draw a car into ``image``. matrix: (3, 4) projection, pixels from NED; cars behind the camera are skipped."""
+    if float((matrix[2, :3] @ np.array([ground[0], ground[1], -CENTRE_HEIGHT])) + matrix[2, 3]) < _MIN_DEPTH:
         return
-    shadow = np.column_stack([_SHADOW, np.zeros(len(_SHADOW))]) @ _turn(course).T
+    shadow = np.column_stack([_SHADOW, np.zeros(len(_SHADOW))]) @ _yaw_rotation(course).T
     shadow[:, :2] += ground + _SHADOW_SHIFT
     _fill(image, _project(matrix, shadow), (38, 38, 40))
-    pixels = _project(matrix, _placed(ground, course))
+    pixels = _project(matrix, _model_at(ground, course))
     both = np.vstack([pixels[_PARTS[0]], pixels[_PARTS[1]]])
     _fill(image, np.asarray(cv2.convexHull(both.astype(np.float32)), np.float64).reshape(-1, 2), _shade(colour, 0.62))
     _fill(image, pixels[_PARTS[1]], _shade(colour, 1.0))
@@ -141,5 +141,5 @@ def _project(matrix: Floats, points: Floats) -> Floats:
 
 
 def _fill(image: npt.NDArray[np.uint8], outline: Floats, colour: tuple[int, int, int]) -> None:
-    fixed = np.rint(np.clip(outline, -_FARTHEST, _FARTHEST) * (1 << _SHIFT)).astype(np.int32)
+    fixed = np.rint(np.clip(outline, -_MAX_PIXEL, _MAX_PIXEL) * (1 << _SHIFT)).astype(np.int32)
     cv2.fillConvexPoly(image, fixed, colour, cv2.LINE_AA, _SHIFT)

@@ -1,4 +1,4 @@
-"""Where the drone's camera is and how it is turned, at any moment.
+"""Drone trajectories: position and attitude over time, with random disturbances.
 
 Frames: ned = north, east, down [m]; body = forward, right, down; camera = x right, y down, z forward.
 """
@@ -9,25 +9,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.uav.world.noise import wander
+from edge.uav.world.noise import smoothed_noise
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 
-LEAD_S = 2.0  # the flight is known from this long before the first frame on
+LEAD_S = 2.0  # s: the trajectory begins this long before the first frame
 GRID_HZ = 120.0
 BODY_FROM_DOWN_CAMERA: Floats = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-"""Camera looking straight down, the top of the picture forward."""
+"""Camera looking straight down, the top of the image forward."""
 
 
 @dataclass(frozen=True, slots=True)
-class Shake:
-    """How restless the drone is: std of each smooth wander, with its time constant [s]."""
+class DisturbanceLevels:
+    """Levels of attitude and position disturbances: std of each coloured noise, with its time constant [s]."""
 
     tilt_deg: float = 1.1
     tilt_s: float = 0.55
     yaw_deg: float = 2.5
     yaw_s: float = 1.5
-    buzz_deg: float = 0.03  # vibration
+    vibration_deg: float = 0.03  # vibration
     position_m: float = 0.8
     position_s: float = 1.0
     altitude_m: float = 0.7
@@ -36,14 +36,14 @@ class Shake:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flight:
-    """Position (n, 3) NED [m] and roll, pitch, yaw (n, 3) [rad] at the grid's ``times`` (n,) [s]."""
+    """Position (n, 3) NED [m] and roll, pitch, yaw (n, 3) [rad] at the time grid ``times`` (n,) [s]."""
 
     times: Floats
     position: Floats
     angles: Floats
 
     def at(self, times: Floats) -> tuple[Floats, Floats]:
-        """ned_from_body (k, 3, 3) and position (k, 3) at moments (k,) [s]."""
+        """ned_from_body (k, 3, 3) and position (k, 3), interpolated at ``times`` (k,) [s]."""
         roll, pitch, yaw = (np.interp(times, self.times, self.angles[:, axis]) for axis in range(3))
         position = np.column_stack([np.interp(times, self.times, self.position[:, axis]) for axis in range(3)])
         return rotation(roll, pitch, yaw), position
@@ -57,54 +57,64 @@ def rotation(roll: Floats, pitch: Floats, yaw: Floats) -> Floats:
 
 
 def grid_times(seconds: float) -> Floats:
-    """The moments (n,) [s] at which a flight of this length is computed."""
+    """Time grid (n,) [s] on which a flight of this length is computed."""
     return np.arange(-LEAD_S, seconds + 0.5, 1.0 / GRID_HZ)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Unrest:
-    """One draw of the drone's shaking on the grid. angles: (n, 3) [rad]; shift: (n, 3) NED [m]."""
+class Disturbance:
+    """One random draw of the disturbances on the time grid. angles: (n, 3) [rad]; shift: (n, 3) NED [m]."""
 
     angles: Floats
     shift: Floats
 
 
-def unrest(rng: np.random.Generator, times: Floats, shake: Shake, mean_tilt_deg: float = 2.5) -> Unrest:
-    """Draw how the drone shakes: constant tilt, smooth tilt and yaw, vibration, drift of position."""
+def sample_disturbance(
+    rng: np.random.Generator, times: Floats, levels: DisturbanceLevels, mean_tilt_deg: float = 2.5
+) -> Disturbance:
+    """Draw disturbances: constant tilt, coloured tilt and yaw noise, vibration, coloured position noise."""
     step, n = 1.0 / GRID_HZ, len(times)
     tilt = np.deg2rad(rng.normal(0.0, mean_tilt_deg, 2))
     angles = np.column_stack(
         [
-            *(tilt[axis] + wander(rng, n, step, np.deg2rad(shake.tilt_deg), shake.tilt_s) for axis in range(2)),
-            wander(rng, n, step, np.deg2rad(shake.yaw_deg), shake.yaw_s),
+            *(
+                tilt[axis] + smoothed_noise(rng, n, step, np.deg2rad(levels.tilt_deg), levels.tilt_s)
+                for axis in range(2)
+            ),
+            smoothed_noise(rng, n, step, np.deg2rad(levels.yaw_deg), levels.yaw_s),
         ]
     )
     for axis in range(3):
-        angles[:, axis] += wander(rng, n, step, np.deg2rad(shake.buzz_deg), 0.015)
+        angles[:, axis] += smoothed_noise(rng, n, step, np.deg2rad(levels.vibration_deg), 0.015)
     shift = np.column_stack(
         [
-            *(wander(rng, n, step, shake.position_m, shake.position_s) for _ in range(2)),
-            wander(rng, n, step, shake.altitude_m, shake.altitude_s),
+            *(smoothed_noise(rng, n, step, levels.position_m, levels.position_s) for _ in range(2)),
+            smoothed_noise(rng, n, step, levels.altitude_m, levels.altitude_s),
         ]
     )
-    return Unrest(angles, shift)
+    return Disturbance(angles, shift)
 
 
-def fly(
-    times: Floats, aim: Floats, yaw: Floats, altitude: float | Floats, shaking: Unrest, body_from_camera: Floats
+def flight_over(
+    times: Floats,
+    aim: Floats,
+    yaw: Floats,
+    altitude: float | Floats,
+    disturbance: Disturbance,
+    body_from_camera: Floats,
 ) -> Flight:
-    """A flight that looks at ``aim`` on the whole, shaking about it.
+    """A flight whose camera points at ``aim`` on average, with disturbances about it.
 
-    times: (n,) the grid. aim: (n, 2) ground point that the middle of the picture shows but for the shaking [m].
-    yaw: (n,) wanted [rad]. altitude: [m], one or (n,). The constant tilt and the mounting are flown out, their wander
-    is not.
+    times: (n,) the grid. aim: (n, 2) ground point at the image centre without disturbances [m]. yaw: (n,) nominal
+    [rad]. altitude: [m], one or (n,). The constant tilt and the mounting are compensated by the position, the
+    time-varying part is not.
     """
-    angles = shaking.angles.copy()
+    angles = disturbance.angles.copy()
     angles[:, 2] += yaw
-    mean = shaking.angles[:, :2].mean(axis=0)
+    mean = disturbance.angles[:, :2].mean(axis=0)
     level = rotation(np.full(len(times), mean[0]), np.full(len(times), mean[1]), yaw)
     axis = level @ body_from_camera[:, 2]
     heights = np.broadcast_to(altitude, len(times))
     ahead = heights[:, None] * axis[:, :2] / axis[:, 2:]
-    position = np.column_stack([aim - ahead, -heights]) + shaking.shift
+    position = np.column_stack([aim - ahead, -heights]) + disturbance.shift
     return Flight(times, position, angles)

@@ -1,4 +1,4 @@
-"""The ground as one large picture, north up: grass, soil, yards, pavements, asphalt, white lines, shadows."""
+"""Ground texture, one large image, north up: grass, soil, yards, pavements, asphalt, white lines, shadows."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.uav.world.noise import value_noise
-from edge.uav.world.roads import STEP, Road, apron
+from edge.uav.world.roads import STEP, Road, crossing_outline
 from protocols.geometry.types import Floats
 
 METRES_PER_PIXEL = 0.1
@@ -30,7 +30,7 @@ class Area:
 
     @property
     def size(self) -> float:
-        """Square metres."""
+        """Area [m²]."""
         return (self.north[1] - self.north[0]) * (self.east[1] - self.east[0])
 
     def contains(self, points: Floats) -> npt.NDArray[np.bool_]:
@@ -40,21 +40,21 @@ class Area:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ground:
-    """The painted ground. image: (h, w, 3) BGR; ground_from_pixel: (3, 3), (north, east, 1) from (column, row, 1)."""
+class GroundTexture:
+    """The ground texture. image: (h, w, 3) BGR; ground_from_pixel: (3, 3), (north, east, 1) from (column, row, 1)."""
 
     image: npt.NDArray[np.uint8]
     ground_from_pixel: Floats
 
 
-def paint(
+def paint_ground(
     rng: np.random.Generator,
     area: Area,
     roads: Sequence[Road],
     yards: Sequence[Floats],
     shadows: Sequence[Floats],
-) -> Ground:
-    """Paint the ground. yards, shadows: outlines (k, 2) [m]."""
+) -> GroundTexture:
+    """Paint the ground texture. yards, shadows: outlines (k, 2) [m]."""
     canvas = _Canvas(area)
     rows, columns = canvas.shape
     fine = value_noise(rng, rows, columns, 3.0, 2, gain=0.8)
@@ -62,41 +62,46 @@ def paint(
     large = value_noise(rng, rows, columns, 160.0, 2)
     soil = np.clip(1.6 * (large - 0.75) + 0.35 * middle, 0.0, 1.0)[..., None]
     dry = np.clip(0.5 + 0.25 * middle + 0.2 * large, 0.0, 1.0)[..., None]
-    picture = (1.0 - soil) * (_GRASS + dry * np.array([8, 6, 40], np.float32)) + soil * _SOIL
-    picture *= (1.0 + 0.11 * fine + 0.13 * middle + 0.05 * large)[..., None]
+    texture = (1.0 - soil) * (_GRASS + dry * np.array([8, 6, 40], np.float32)) + soil * _SOIL
+    texture *= (1.0 + 0.11 * fine + 0.13 * middle + 0.05 * large)[..., None]
     asphalt_tone = 1.0 + 0.055 * fine + 0.04 * middle + 0.04 * large
-    _lay(picture, canvas.filled(yards), asphalt_tone, _YARD)
+    _blend(texture, canvas.filled(yards), asphalt_tone, _YARD)
     slabs = np.asarray(1.0 + 0.05 * fine + 0.05 * np.sign(middle), np.float32)
-    _lay(picture, canvas.bands(roads, 2.0 * _PAVEMENT_WIDTH), slabs, _PAVEMENT)
-    _repairs(rng, asphalt_tone, canvas, roads)
+    _blend(texture, canvas.bands(roads, 2.0 * _PAVEMENT_WIDTH), slabs, _PAVEMENT)
+    _add_repairs(rng, asphalt_tone, canvas, roads)
     aprons = [
-        outline for k, one in enumerate(roads) for other in roads[:k] if (outline := apron(one, other)) is not None
+        outline
+        for k, one in enumerate(roads)
+        for other in roads[:k]
+        if (outline := crossing_outline(one, other)) is not None
     ]
     open_space = canvas.filled(aprons)
-    _lay(picture, np.asarray(cv2.max(canvas.bands(roads, 0.0), open_space), np.uint8), asphalt_tone, _ASPHALT)
+    _blend(texture, np.asarray(cv2.max(canvas.bands(roads, 0.0), open_space), np.uint8), asphalt_tone, _ASPHALT)
     worn = np.asarray(1.0 - 0.1 * np.clip(middle, 0.0, 3.0) + 0.04 * fine, np.float32)
-    _lay(picture, canvas.markings(roads, open_space), worn, _PAINT)
+    _blend(texture, canvas.markings(roads, open_space), worn, _PAINT)
     dark = np.asarray(cv2.GaussianBlur(canvas.filled(shadows), (0, 0), 2.0), np.uint8)
     shaded = dark > 0
-    picture[shaded] *= (1.0 - _SHADOW_DEPTH / 255.0 * dark[shaded].astype(np.float32))[:, None]
-    return Ground(np.clip(picture, 0, 255).astype(np.uint8), canvas.ground_from_pixel)
+    texture[shaded] *= (1.0 - _SHADOW_DEPTH / 255.0 * dark[shaded].astype(np.float32))[:, None]
+    return GroundTexture(np.clip(texture, 0, 255).astype(np.uint8), canvas.ground_from_pixel)
 
 
-def _lay(
-    picture: npt.NDArray[np.float32],
+def _blend(
+    texture: npt.NDArray[np.float32],
     mask: npt.NDArray[np.uint8],
     tone: npt.NDArray[np.float32],
     colour: npt.NDArray[np.float32],
 ) -> None:
-    """Blend a colour of varying tone in where the mask is, in place."""
+    """Alpha-blend a colour of varying tone where the mask is set, in place."""
     chosen = mask > 0
-    under = picture[chosen]
-    picture[chosen] = under + (mask[chosen].astype(np.float32) / 255.0)[:, None] * (
+    under = texture[chosen]
+    texture[chosen] = under + (mask[chosen].astype(np.float32) / 255.0)[:, None] * (
         tone[chosen][:, None] * colour - under
     )
 
 
-def _repairs(rng: np.random.Generator, tone: npt.NDArray[np.float32], canvas: _Canvas, roads: Sequence[Road]) -> None:
+def _add_repairs(
+    rng: np.random.Generator, tone: npt.NDArray[np.float32], canvas: _Canvas, roads: Sequence[Road]
+) -> None:
     """Patches of newer asphalt, cracks and oil stains, in place."""
     for road in roads:
         curve = road.centre
@@ -113,7 +118,7 @@ def _repairs(rng: np.random.Generator, tone: npt.NDArray[np.float32], canvas: _C
 
 
 class _Canvas:
-    """Draws masks in the ground picture's pixels."""
+    """Rasterises masks in the ground texture's pixels."""
 
     def __init__(self, area: Area) -> None:
         self.shape = (
@@ -137,18 +142,18 @@ class _Canvas:
         return mask
 
     def bands(self, roads: Sequence[Road], extra: float) -> npt.NDArray[np.uint8]:
-        """Mask of roads, wider by ``extra`` [m] in all."""
+        """Mask of roads, widened by ``extra`` [m] in total."""
         mask = np.zeros(self.shape, np.uint8)
         for road in roads:
             half = 0.5 * (road.width + extra)
             left, right = road.centre.offset(-half).points, road.centre.offset(half).points
-            for k in range(0, len(left) - 1, 8):  # in pieces: a bend's outline may cross itself
+            for k in range(0, len(left) - 1, 8):  # in pieces: the outline of a bend may intersect itself
                 piece = np.vstack([left[k : k + 10], right[k : k + 10][::-1]])
                 cv2.fillPoly(mask, [self.fixed(piece)], 255, cv2.LINE_AA, _SHIFT)
         return mask
 
     def markings(self, roads: Sequence[Road], open_space: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        """Mask of white lines: solid edges, dashed middles, none within crossings and their aprons."""
+        """Mask of white lines: solid edges, dashed middles, none within crossings."""
         total = np.zeros(self.shape, np.uint8)
         for number, road in enumerate(roads):
             mask = np.zeros(self.shape, np.uint8)

@@ -1,4 +1,4 @@
-"""Random textures and random motions; every function is pure in its generator."""
+"""Random textures (value noise) and smooth random processes; the only state is the given generator."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FloatImage = npt.NDArray[np.float32]
 def value_noise(
     rng: np.random.Generator, rows: int, columns: int, cell: float, octaves: int = 1, gain: float = 0.5
 ) -> FloatImage:
-    """Smooth noise (rows, columns), std about 1; ``cell`` is its coarsest grain [px], each octave has half of it."""
+    """Value noise (rows, columns), std about 1; ``cell`` is the coarsest cell size [px], halved with each octave."""
     total = np.zeros((rows, columns), np.float32)
     power = 0.0
     for octave in range(octaves):
@@ -27,10 +27,10 @@ def value_noise(
     return np.asarray(total / np.float32(np.sqrt(power)), np.float32)
 
 
-def wander(rng: np.random.Generator, count: int, step_s: float, std: float, time_constant_s: float) -> Floats:
-    """A smooth stationary random motion (count,) of the given std: white noise through a Gaussian window.
+def smoothed_noise(rng: np.random.Generator, count: int, step_s: float, std: float, time_constant_s: float) -> Floats:
+    """A stationary coloured noise (count,) of the given std: white noise through a Gaussian window.
 
-    step_s: between its values. time_constant_s: std of the window; rates are about std / time_constant.
+    step_s: sampling interval. time_constant_s: std of the window; the rate of change is about std / time_constant.
     """
     sigma = time_constant_s / step_s
     reach = int(4.0 * sigma) + 1

@@ -1,8 +1,6 @@
-"""What stands on the ground and hides cars: buildings, tree canopies, a bridge.
+"""Occluders that stand on the ground: buildings, tree canopies, a bridge; rendering and ray-based occlusion tests.
 
-Each draws itself and tells what it hides.
-
-Hiding is asked as: which of the rays from the camera to points on a car does it cut?
+Occlusion is tested by the rays from the camera to points on a car: which of them does an occluder intersect?
 """
 
 from __future__ import annotations
@@ -26,8 +24,8 @@ _ROOFS_BGR = ((72, 92, 148), (88, 88, 92), (70, 80, 104), (168, 172, 174), (120,
 _SHIFT = 4
 
 
-class Solid(Protocol):
-    """Something that stands on the ground."""
+class Occluder(Protocol):
+    """An object above the ground that can occlude cars."""
 
     @property
     def centre(self) -> Floats:
@@ -35,16 +33,16 @@ class Solid(Protocol):
         ...
 
     @property
-    def reach(self) -> float:
-        """Radius of a circle about the centre that holds it [m]."""
+    def bounding_radius(self) -> float:
+        """Radius of a bounding circle about the centre on the ground [m]."""
         ...
 
     def draw(self, image: Image, matrix: Floats) -> None:
         """Draw into ``image``; matrix: (3, 4) pixels from NED."""
         ...
 
-    def hides(self, camera: Floats, points: Floats) -> Bools:
-        """Which of points (n, 3) NED the camera at (3,) NED cannot see for it."""
+    def occludes(self, camera: Floats, points: Floats) -> Bools:
+        """Which of points (n, 3) NED this object occludes for a camera at (3,) NED."""
         ...
 
     def shadow(self) -> Floats:
@@ -53,11 +51,11 @@ class Solid(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Slab:
-    """A flat picture at a height: a canopy, a bridge's deck, a roof.
+class FlatOccluder:
+    """A horizontal textured rectangle at a height: a canopy, a bridge deck, a roof.
 
-    sprite: (h, w, 4) BGR and cover, along x (right) its length, y its width. centre: (2,) [m]. course: of its x axis.
-    height: [m]. thickness: of a solid rim below it, 0 for none [m].
+    sprite: (h, w, 4) BGR and opacity, along x (right) its length, y its width. centre: (2,) [m]. course: of its x axis.
+    height: [m]. thickness: of an opaque rim below it, 0 for none [m].
     """
 
     sprite: Image
@@ -67,7 +65,7 @@ class Slab:
     thickness: float = 0.0
 
     @property
-    def reach(self) -> float:
+    def bounding_radius(self) -> float:
         return 0.5 * _SPRITE_M * float(np.hypot(*self.sprite.shape[:2]))
 
     @property
@@ -87,7 +85,7 @@ class Slab:
         return np.asarray(matrix @ ground)
 
     def outline(self, matrix: Floats, height: float) -> Floats:
-        """The sprite's corners (4, 2) in the image, were it at ``height``."""
+        """The sprite's corners (4, 2) projected into the image as if it were at ``height``."""
         rows, columns = self.sprite.shape[:2]
         corner = np.array([[0, 0, 1], [columns, 0, 1], [columns, rows, 1], [0, rows, 1.0]]) - [0.5, 0.5, 0.0]
         seen = corner @ self._from_sprite(matrix, height).T
@@ -110,10 +108,10 @@ class Slab:
         view = image[top:bottom, left:right]
         cv2.copyTo(cv2.cvtColor(seen, cv2.COLOR_BGRA2BGR), cover, view)
 
-    def hides(self, camera: Floats, points: Floats) -> Bools:
-        hidden = self._covers(_cut(camera, points, self.height))
+    def occludes(self, camera: Floats, points: Floats) -> Bools:
+        hidden = self._covers(_ray_at_height(camera, points, self.height))
         if self.thickness:
-            hidden |= self._covers(_cut(camera, points, self.height - self.thickness))
+            hidden |= self._covers(_ray_at_height(camera, points, self.height - self.thickness))
         return hidden
 
     def _covers(self, ground: Floats) -> Bools:
@@ -139,7 +137,7 @@ class Slab:
 class Building:
     """A box with a textured roof. wall: BGR."""
 
-    roof: Slab
+    roof: FlatOccluder
     wall: tuple[int, int, int]
 
     @property
@@ -147,8 +145,8 @@ class Building:
         return self.roof.centre
 
     @property
-    def reach(self) -> float:
-        return self.roof.reach
+    def bounding_radius(self) -> float:
+        return self.roof.bounding_radius
 
     @property
     def half(self) -> Floats:
@@ -164,11 +162,11 @@ class Building:
             _fill(image, _hull(np.array([foot[k], foot[n], top[n], top[k]])), (b, g, r))
         self.roof.draw(image, matrix)
 
-    def hides(self, camera: Floats, points: Floats) -> Bools:
-        """Slab test of the part of each ray below the roof against the footprint."""
+    def occludes(self, camera: Floats, points: Floats) -> Bools:
+        """Ray-box slab test: the part of each ray below the roof against the footprint."""
         axes = self.roof._axes
         near = (points[:, :2] - self.centre) @ axes
-        far = (_cut(camera, points, self.roof.height) - self.centre) @ axes
+        far = (_ray_at_height(camera, points, self.roof.height) - self.centre) @ axes
         step = np.where(np.abs(far - near) < 1e-9, 1e-9, far - near)
         first, second = (-self.half - near) / step, (self.half - near) / step
         enter = np.minimum(first, second).max(axis=1)
@@ -181,29 +179,29 @@ class Building:
         return _hull(np.vstack([foot, foot + self.roof.height * SUN_SHADOW]))
 
 
-def building(
+def random_building(
     rng: np.random.Generator, centre: Floats, course: float, length: float, width: float, height: float
 ) -> Building:
     """A building with a ridged or flat roof, with vents and weathering."""
     rows, columns = round(width / _SPRITE_M), round(length / _SPRITE_M)
     colour = np.array(_ROOFS_BGR[int(rng.integers(len(_ROOFS_BGR)))], np.float32)
     tone = 1.0 + 0.06 * value_noise(rng, rows, columns, 24.0, 3) + 0.03 * value_noise(rng, rows, columns, 2.0)
-    if rng.random() < 0.6:  # a ridge: one side in the sun
+    if rng.random() < 0.6:  # a ridged roof: one side is lit by the sun
         tone[: rows // 2] *= 1.12
         tone[rows // 2 :] *= 0.82
         tone[:, ::6] *= 0.93
-    picture = tone[..., None] * colour
-    picture[:3], picture[-3:], picture[:, :3], picture[:, -3:] = (0.75 * colour,) * 4
+    texture = tone[..., None] * colour
+    texture[:3], texture[-3:], texture[:, :3], texture[:, -3:] = (0.75 * colour,) * 4
     for _ in range(int(rng.integers(2, 6))):
         y, x = int(rng.integers(6, rows - 14)), int(rng.integers(6, columns - 14))
-        picture[y : y + int(rng.integers(4, 11)), x : x + int(rng.integers(4, 11))] = rng.uniform(40, 215)
-    sprite = np.dstack([np.clip(picture, 0, 255), np.full((rows, columns), 255.0)]).astype(np.uint8)
+        texture[y : y + int(rng.integers(4, 11)), x : x + int(rng.integers(4, 11))] = rng.uniform(40, 215)
+    sprite = np.dstack([np.clip(texture, 0, 255), np.full((rows, columns), 255.0)]).astype(np.uint8)
     b, g, r = (int(value) for value in rng.uniform(0.9, 1.1) * np.array([168, 182, 196]))
-    return Building(Slab(sprite, centre, course, height), (b, g, r))
+    return Building(FlatOccluder(sprite, centre, course, height), (b, g, r))
 
 
-def canopy(rng: np.random.Generator, centre: Floats, radius: float, height: float) -> Slab:
-    """The crown of a tree: a blob of leaves with a ragged rim and a few holes."""
+def random_canopy(rng: np.random.Generator, centre: Floats, radius: float, height: float) -> FlatOccluder:
+    """A tree canopy: leaf texture with a ragged rim and a few holes."""
     side = 2 * round(1.15 * radius / _SPRITE_M) + 1
     axis = (np.arange(side) - side // 2) * _SPRITE_M
     away = np.hypot(axis[:, None], axis[None]) / radius
@@ -212,68 +210,68 @@ def canopy(rng: np.random.Generator, centre: Floats, radius: float, height: floa
     leaves = value_noise(rng, side, side, 0.9 / _SPRITE_M, 3, gain=0.7)
     lit = 1.0 + 0.3 * (axis[:, None] * -SUN_SHADOW[0] + axis[None] * -SUN_SHADOW[1]) / radius
     colour = np.array([34, 76, 52]) * rng.uniform(0.75, 1.25) * np.array([1.0, 1.0, rng.uniform(0.85, 1.3)])
-    picture = np.clip(1.0 + 0.24 * leaves, 0.35, 1.8)[..., None] * lit[..., None] * colour
-    sprite = np.dstack([np.clip(picture, 0, 255), 255.0 * cover]).astype(np.uint8)
-    return Slab(sprite, centre, 0.0, height)
+    texture = np.clip(1.0 + 0.24 * leaves, 0.35, 1.8)[..., None] * lit[..., None] * colour
+    sprite = np.dstack([np.clip(texture, 0, 255), 255.0 * cover]).astype(np.uint8)
+    return FlatOccluder(sprite, centre, 0.0, height)
 
 
-def bridge(rng: np.random.Generator, centre: Floats, course: float, length: float, width: float) -> Slab:
+def random_bridge(rng: np.random.Generator, centre: Floats, course: float, length: float, width: float) -> FlatOccluder:
     """A road bridge, 6 m above the ground."""
     rows, columns = round(width / _SPRITE_M), round(length / _SPRITE_M)
     tone = 1.0 + 0.07 * value_noise(rng, rows, columns, 30.0, 4) + 0.05 * value_noise(rng, rows, columns, 2.0)
-    picture = tone[..., None] * np.array([104, 102, 100], np.float32)
+    texture = tone[..., None] * np.array([104, 102, 100], np.float32)
     rim = round(0.8 / _SPRITE_M)
-    picture[:rim] = picture[-rim:] = 158.0 * tone[:rim, :, None]
+    texture[:rim] = texture[-rim:] = 158.0 * tone[:rim, :, None]
     line = round(1.2 / _SPRITE_M)
-    picture[line : line + 2] = picture[-line - 2 : -line] = 222.0
+    texture[line : line + 2] = texture[-line - 2 : -line] = 222.0
     dashes = (np.arange(columns) * _SPRITE_M) % 8.0 < 4.0
-    picture[rows // 2 - 1 : rows // 2 + 1, dashes] = 222.0
-    picture[:, :: round(15.0 / _SPRITE_M)] *= 0.6  # joints
-    sprite = np.dstack([np.clip(picture, 0, 255), np.full((rows, columns), 255.0)]).astype(np.uint8)
-    return Slab(sprite, centre, course, 6.0, thickness=1.2)
+    texture[rows // 2 - 1 : rows // 2 + 1, dashes] = 222.0
+    texture[:, :: round(15.0 / _SPRITE_M)] *= 0.6  # joints
+    sprite = np.dstack([np.clip(texture, 0, 255), np.full((rows, columns), 255.0)]).astype(np.uint8)
+    return FlatOccluder(sprite, centre, course, 6.0, thickness=1.2)
 
 
 @dataclass(frozen=True, eq=False)
-class Solids:
-    """All solids of a town. centres: (n, 2), reaches: (n,) [m]."""
+class Occluders:
+    """All occluders of a town. centres: (n, 2), reaches: (n,) [m]."""
 
-    members: tuple[Solid, ...]
+    members: tuple[Occluder, ...]
     centres: Floats
-    reaches: Floats
+    bounding_radii: Floats
 
     @classmethod
-    def of(cls, members: Sequence[Solid]) -> Solids:
+    def of(cls, members: Sequence[Occluder]) -> Occluders:
         """From its members."""
-        centres = np.array([solid.centre for solid in members]).reshape(-1, 2)
-        return cls(tuple(members), centres, np.array([solid.reach for solid in members]))
+        centres = np.array([occluder.centre for occluder in members]).reshape(-1, 2)
+        return cls(tuple(members), centres, np.array([occluder.bounding_radius for occluder in members]))
 
-    def hide(self, camera: Floats, points: Floats) -> Bools:
-        """Which of points (n, 3) NED, all within one car, any of them hides from the camera at (3,) NED."""
+    def occluded(self, camera: Floats, points: Floats) -> Bools:
+        """Which of points (n, 3) NED, all within one car, any member occludes for the camera at (3,) NED."""
         out = np.zeros(len(points), bool)
         middle = points[:, :2].mean(axis=0)
         span = camera[:2] - middle
         along = np.clip((self.centres - middle) @ span / max(float(span @ span), 1e-9), 0.0, 1.0)
         away = np.hypot(*(middle + along[:, None] * span - self.centres).T)
-        for k in np.flatnonzero(away < self.reaches + 4.0):
-            out |= self.members[k].hides(camera, points)
+        for k in np.flatnonzero(away < self.bounding_radii + 4.0):
+            out |= self.members[k].occludes(camera, points)
         return out
 
     def draw(self, image: Image, matrix: Floats, camera: Floats) -> None:
-        """Draw all that may be seen. matrix: (3, 4) pixels from NED; camera: (3,) NED."""
+        """Draw all members that may be visible, far to near. matrix: (3, 4) pixels from NED; camera: (3,) NED."""
         foot = self.centres @ matrix[:, :2].T + matrix[:, 3]
         scale = np.hypot(*matrix[:2, 0]) / foot[:, 2]  # pixels per metre on the ground, about
         pixels = foot[:, :2] / foot[:, 2:]
-        spare = scale * (1.5 * self.reaches + 3.0)  # what is high stands farther out
+        spare = scale * (1.5 * self.bounding_radii + 3.0)  # relief displacement: tall objects project farther out
         limit = np.array([image.shape[1], image.shape[0]])
         seen = ((pixels > -spare[:, None]) & (pixels < limit + spare[:, None])).all(axis=1)
         near = np.flatnonzero(seen)
-        # What is farther from the point below the camera leans away from it and is covered by what is nearer.
+        # Painter's order: relief displacement is away from the nadir, so objects nearer to it cover farther ones.
         for k in near[np.argsort(-np.hypot(*(self.centres[near] - camera[:2]).T), kind="stable")]:
             self.members[k].draw(image, matrix)
 
 
-def _cut(camera: Floats, points: Floats, height: float) -> Floats:
-    """Where the rays from points (n, 3) to the camera (3,) are at ``height`` above the ground: (n, 2) [m]."""
+def _ray_at_height(camera: Floats, points: Floats, height: float) -> Floats:
+    """Coordinates (n, 2) [m] of the rays from points (n, 3) to the camera (3,) at ``height`` above the ground."""
     share = (-height - points[:, 2]) / (camera[2] - points[:, 2])
     return np.asarray(points[:, :2] + np.clip(share, 0.0, 1.0)[:, None] * (camera[:2] - points[:, :2]))
 

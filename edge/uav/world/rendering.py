@@ -1,4 +1,4 @@
-"""Draws what the drone's camera sees: the ground through one homography, then cars, then what stands above them."""
+"""Renders the drone's camera images: the ground by a homography, then cars, occluders and photometric effects."""
 
 from __future__ import annotations
 
@@ -16,39 +16,46 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
 Image = npt.NDArray[np.uint8]
-_BANK_MARGIN = 64  # px by which the noise pictures exceed the image: 4096 crops
-_BLUR_SIGMA = 0.6  # px, of the lens
-_CLOUD_CELL = 2.0  # metres per pixel of the clouds' shadows
+_BANK_MARGIN = 64  # px by which the noise images exceed the frame: 4096 different crops
+_BLUR_SIGMA = 0.6  # px: blur of the lens
+_CLOUD_CELL = 2.0  # metres per pixel of the cloud shadow map
 _CLOUD_SPEED = np.array([9.0, 6.0])  # north, east [m/s]
-_COARSE = 16  # a shadow of a cloud is soft: computed at every so many pixels
+_COARSE = 16  # px: cloud shadows are smooth, so they are computed on a coarser grid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Light:
-    """How bright each frame is. gain: (n, 3) of blue, green, red. clouds: their shadows' depth, 0 for none."""
+class Illumination:
+    """Illumination of each frame. gain: (n, 3) of blue, green, red. clouds: depth of cloud shadows, 0 for none."""
 
     gain: Floats
     clouds: float = 0.0
 
 
-class Renderer:
-    """Pictures of one world. rng: of sensor noise. noise_std: in 8-bit steps."""
+class FlightRenderer:
+    """Renders the images of one world. rng: for sensor noise. noise_std: in grey levels (8 bit)."""
 
     def __init__(
-        self, town: Town, lens: Intrinsics, light: Light, rng: np.random.Generator, *, fps: float, noise_std: float
+        self,
+        town: Town,
+        lens: Intrinsics,
+        illumination: Illumination,
+        rng: np.random.Generator,
+        *,
+        fps: float,
+        noise_std: float,
     ) -> None:
-        self._town, self._lens, self._light, self._fps = town, lens, light, fps
+        self._town, self._lens, self._illumination, self._fps = town, lens, illumination, fps
         shape = (lens.height + _BANK_MARGIN, lens.width + _BANK_MARGIN, 3)
         noise = rng.standard_normal(shape, dtype=np.float32) * np.float32(noise_std)
         self._brighter = np.clip(np.rint(noise), 0, 255).astype(np.uint8)
         self._darker = np.clip(np.rint(-noise), 0, 255).astype(np.uint8)
-        self._crops = rng.integers(0, _BANK_MARGIN, (len(light.gain), 2))
+        self._crops = rng.integers(0, _BANK_MARGIN, (len(illumination.gain), 2))
         self._clouds = np.zeros((1, 1), np.float32)
-        if light.clouds:
+        if illumination.clouds:
             shade = 0.5 + 0.5 * np.tanh(1.5 * value_noise(rng, 256, 256, 24.0, 2))
-            self._clouds = np.asarray(255.0 * (1.0 - light.clouds * shade), np.float32)
+            self._clouds = np.asarray(255.0 * (1.0 - illumination.clouds * shade), np.float32)
 
-    def draw(
+    def render(
         self,
         frame: int,
         matrix: Floats,
@@ -57,9 +64,9 @@ class Renderer:
         *,
         noise: bool = True,
     ) -> Image:
-        """The picture of one frame. matrix: (3, 4) pixels from NED; camera: its centre (3,) NED [m].
+        """The image of one frame. matrix: (3, 4) pixels from NED; camera: its centre (3,) NED [m].
 
-        moving: the cars to draw besides the parked ones.
+        moving: the cars to draw in addition to the parked ones.
         """
         size = (self._lens.width, self._lens.height)
         flat = matrix[:, [0, 1, 3]]
@@ -84,7 +91,7 @@ class Renderer:
         return self._expose(image, frame, flat, noise)
 
     def _footprint(self, flat: Floats) -> tuple[Floats, float]:
-        """Middle (2,) and radius [m] of a circle of ground that holds all that is seen, with 12 m to spare."""
+        """Centre (2,) and radius [m] of a ground circle that contains the field of view, with a margin of 12 m."""
         w, h = self._lens.width, self._lens.height
         corner = np.array([[0, 0, 1], [w, 0, 1], [w, h, 1], [0, h, 1.0]]) @ np.linalg.inv(flat).T
         ground = corner[:, :2] / corner[:, 2:]
@@ -92,10 +99,10 @@ class Renderer:
         return middle, float(np.linalg.norm(ground - middle, axis=1).max()) + 12.0
 
     def _expose(self, image: Image, frame: int, flat: Floats, noise: bool) -> Image:
-        if self._light.clouds:
-            image = self._shaded(image, frame, flat)
-        gain = self._light.gain[frame]
-        gain = gain[:1] if np.ptp(gain) == 0.0 else gain  # one table for all colours is faster
+        if self._illumination.clouds:
+            image = self._with_cloud_shadows(image, frame, flat)
+        gain = self._illumination.gain[frame]
+        gain = gain[:1] if np.ptp(gain) == 0.0 else gain  # one look-up table for all channels is faster
         table = np.clip(np.rint(np.arange(256.0)[:, None] * gain), 0, 255).astype(np.uint8).reshape(256, 1, -1)
         image = np.asarray(cv2.LUT(image, table), np.uint8)
         image = np.asarray(cv2.GaussianBlur(image, (3, 3), _BLUR_SIGMA), np.uint8)
@@ -107,7 +114,7 @@ class Renderer:
         cv2.subtract(image, self._darker[y : y + h, x : x + w], image)
         return image
 
-    def _shaded(self, image: Image, frame: int, flat: Floats) -> Image:
+    def _with_cloud_shadows(self, image: Image, frame: int, flat: Floats) -> Image:
         shift = _CLOUD_SPEED * frame / self._fps
         ground = np.array([[_CLOUD_CELL, 0.0, shift[0]], [0.0, _CLOUD_CELL, shift[1]], [0.0, 0.0, 1.0]])
         shrink = np.diag([1.0 / _COARSE, 1.0 / _COARSE, 1.0])

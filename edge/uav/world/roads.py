@@ -1,4 +1,4 @@
-"""Roads as curves of given curvature, and how fast a car takes them.
+"""Roads as curves of given curvature, and speed profiles of cars along them.
 
 Ground axes: north, east [m]. A curve's right-hand normal is (−sin ψ, cos ψ) for course ψ = atan2(east, north).
 """
@@ -14,8 +14,8 @@ import numpy as np
 from protocols.geometry.types import Floats
 
 STEP = 0.5  # metres between the points of a curve
-_EASE = 6.0  # metres over which a bend's curvature comes and goes
-_CORNER = 5.0  # metres of kerb that a crossing's corners are cut by
+_TRANSITION_LENGTH = 6.0  # m over which the curvature ramps up and down at a bend
+_CORNER_CUT = 5.0  # m of kerb by which the corners of a crossing are cut
 LANE = 3.5
 ROAD_WIDTH = 2 * LANE
 
@@ -30,7 +30,7 @@ class Bend:
 
     @property
     def length(self) -> float:
-        """Of the arc [m]."""
+        """Arc length [m]."""
         return abs(self.angle) * self.radius
 
 
@@ -65,20 +65,20 @@ class Curve:
         return Curve(self.begin, self.points + lateral * normal, self.course)
 
     def distance(self, points: Floats) -> Floats:
-        """Distance (k,) of points (k, 2) from the curve [m], to the nearest 2 m of it."""
+        """Distance (k,) of points (k, 2) from the curve [m], resolved to 2 m along it."""
         coarse = self.points[::4]
         return np.asarray(np.linalg.norm(points[:, None] - coarse[None], axis=2).min(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
 class Road:
-    """A road of two lanes about its centre line."""
+    """A two-lane road about its centre line."""
 
     centre: Curve
     width: float = ROAD_WIDTH
 
 
-def curve(
+def curve_from_bends(
     bends: Sequence[Bend],
     begin: float,
     end: float,
@@ -88,12 +88,12 @@ def curve(
 ) -> Curve:
     """The curve from arc length ``begin`` to ``end`` that passes the origin at 0 with ``course`` [rad].
 
-    sway: amplitudes (k,) [1/m] of gentle curvature waves of ``sway_length`` / 1 … k metres.
+    sway: amplitudes (k,) [1/m] of sinusoidal curvature of wavelengths ``sway_length`` / 1 … k metres.
     """
     s = np.arange(begin, end + STEP, STEP)
     curvature = np.zeros(len(s))
     for bend in bends:
-        ease = min(_EASE, 0.8 * bend.length)
+        ease = min(_TRANSITION_LENGTH, 0.8 * bend.length)
         rise = np.clip((s - bend.start) / ease + 0.5, 0.0, 1.0)
         fall = np.clip((s - bend.start - bend.length) / ease + 0.5, 0.0, 1.0)
         curvature += np.sign(bend.angle) / bend.radius * (rise - fall)
@@ -109,21 +109,21 @@ def curve(
     return Curve(float(s[0]), points - points[zero], heading)
 
 
-def straight(point: Floats, course: float, begin: float, end: float) -> Curve:
+def straight_curve(point: Floats, course: float, begin: float, end: float) -> Curve:
     """A straight line with arc length 0 at ``point`` (2,)."""
-    line = curve((), begin, end, course)
+    line = curve_from_bends((), begin, end, course)
     return Curve(line.begin, line.points + point, line.course)
 
 
-def apron(one: Road, other: Road) -> Floats | None:
-    """Outline (8, 2) of the asphalt where two roads cross, its corners cut for those who turn; None: they don't."""
+def crossing_outline(one: Road, other: Road) -> Floats | None:
+    """Outline (8, 2) of the asphalt where two roads cross, with cut corners for turning cars; None: no crossing."""
     gap = np.linalg.norm(one.centre.points[:, None, :] - other.centre.points[None, ::2], axis=2)
     i, j = np.unravel_index(int(gap.argmin()), gap.shape)
     if gap[i, j] > 2.0 * STEP:
         return None
     places = []
     for road, s, partner in ((one, one.centre.arc[i], other), (other, other.centre.arc[::2][j], one)):
-        reach = 0.5 * partner.width + _CORNER
+        reach = 0.5 * partner.width + _CORNER_CUT
         ends = np.array([s + reach, s + reach, s - reach, s - reach])
         course = road.centre.at(ends)[1]
         side = 0.5 * road.width * np.array([1.0, -1.0, 1.0, -1.0])
@@ -133,19 +133,25 @@ def apron(one: Road, other: Road) -> Floats | None:
     return np.asarray(outline[np.argsort(np.arctan2(*(outline - middle).T))])
 
 
-def drive(path: Curve, times: Floats, cruise: float | Floats, sideways: float = 3.0, braking: float = 2.2) -> Floats:
+def arc_length_over_time(
+    path: Curve,
+    times: Floats,
+    cruise: float | Floats,
+    max_lateral_acceleration: float = 3.0,
+    max_longitudinal_acceleration: float = 2.2,
+) -> Floats:
     """Arc length (n,) of a car on ``path`` at ``times`` (n,) [s]; at arc length 0 at time 0.
 
     cruise: speed on a straight [m/s], one or (n,) along the path.
-    sideways: most acceleration across in a bend, braking: along it [m/s²].
+    max_lateral_acceleration: limit in a bend; max_longitudinal_acceleration: limit along the path [m/s²].
     """
     curvature = np.abs(np.gradient(path.course, STEP))
-    limit = np.minimum(cruise, np.sqrt(sideways / np.maximum(curvature, 1e-6)))
+    limit = np.minimum(cruise, np.sqrt(max_lateral_acceleration / np.maximum(curvature, 1e-6)))
     squares = limit**2
-    for k in range(1, len(squares)):  # accelerate no faster …
-        squares[k] = min(squares[k], squares[k - 1] + 2.0 * braking * STEP)
-    for k in range(len(squares) - 2, -1, -1):  # … and brake in time
-        squares[k] = min(squares[k], squares[k + 1] + 2.0 * braking * STEP)
+    for k in range(1, len(squares)):  # forward pass: limit of acceleration
+        squares[k] = min(squares[k], squares[k - 1] + 2.0 * max_longitudinal_acceleration * STEP)
+    for k in range(len(squares) - 2, -1, -1):  # backward pass: limit of braking
+        squares[k] = min(squares[k], squares[k + 1] + 2.0 * max_longitudinal_acceleration * STEP)
     speed = np.sqrt(squares)
     moment = np.r_[0.0, np.cumsum(STEP / (0.5 * (speed[1:] + speed[:-1])))]
     moment -= np.interp(0.0, path.arc, moment)

@@ -1,4 +1,4 @@
-"""What stands where in the town: buildings, trees, parked cars along given roads."""
+"""Town layout: buildings, trees and parked cars along given roads."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import numpy as np
 
 from edge.uav.world import occluders
 from edge.uav.world.cars import COLOURS_BGR, Car
-from edge.uav.world.ground import Area, Ground, paint
-from edge.uav.world.occluders import Solid, Solids
+from edge.uav.world.ground import Area, GroundTexture, paint_ground
+from edge.uav.world.occluders import Occluder, Occluders
 from edge.uav.world.roads import Curve, Road
 from protocols.geometry.types import Floats
 
-_CELL = 1.0  # metres, of the map of distances
-_PARKED_AT = 4.7  # metres from the middle of the road
+_CELL = 1.0  # m: cell size of the distance map
+_PARKING_OFFSET = 4.7  # m from the centre line of the road
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Town:
-    """All that stands still. parked: cars that never move (one frame each)."""
+    """All static objects. parked: cars that never move (one frame each)."""
 
-    ground: Ground
-    occluders: Solids
+    ground: GroundTexture
+    occluders: Occluders
     parked: tuple[Car, ...]
 
 
-class _Distance:
-    """Distance of points from the nearest of several curves, by a map of 1 m cells."""
+class _DistanceMap:
+    """Distance of points from the nearest of several curves, by a distance transform with 1 m cells."""
 
     def __init__(self, area: Area, curves: Sequence[Curve]) -> None:
         self._origin = np.array([area.north[0], area.east[0]])
@@ -46,43 +46,43 @@ class _Distance:
         return np.asarray(self._map[tuple(np.clip(cells, 0, limit).T)], np.float64)
 
 
-def build(
+def build_town(
     rng: np.random.Generator,
     area: Area,
     roads: Sequence[Road],
     *,
-    special: Sequence[Solid] = (),
+    scenario_occluders: Sequence[Occluder] = (),
     keep_clear: Sequence[Curve] = (),
     not_colour: str = "",
     parked_share: float = 0.22,
-    in_sight: Sequence[tuple[Floats, Floats]] = (),
+    sight_lines: Sequence[tuple[Floats, Floats]] = (),
 ) -> Town:
-    """Furnish the town.
+    """Place buildings, trees and parked cars at random, and paint the ground.
 
-    special: solids that the scenario wants. keep_clear: ways off the road that nothing may block.
-    not_colour: a colour that no parked car has. parked_share: of the places for parking that are taken.
-    in_sight: pairs of a camera (3,) and points of a car (n, 3) NED that no house or tree may stand between.
+    scenario_occluders: given by the scenario. keep_clear: off-road paths that nothing may block.
+    not_colour: a colour that no parked car has. parked_share: occupied share of the parking places.
+    sight_lines: pairs of a camera (3,) and points of a car (n, 3) NED that no building or tree may occlude.
     """
-    away = _Distance(area, [road.centre for road in roads])
-    clear = _Distance(area, keep_clear) if keep_clear else None
-    houses = _buildings(rng, area, roads, away, clear, special)
-    trees = _trees(rng, area, houses, away, clear)
-    houses = [house for house in houses if not _between(house, in_sight)]
-    trees = [tree for tree in trees if not _between(tree, in_sight)]
-    parked = _parked(rng, area, roads, clear, not_colour, parked_share)
+    road_distance = _DistanceMap(area, [road.centre for road in roads])
+    clearance = _DistanceMap(area, keep_clear) if keep_clear else None
+    houses = _buildings(rng, area, roads, road_distance, clearance, scenario_occluders)
+    trees = _trees(rng, area, houses, road_distance, clearance)
+    houses = [house for house in houses if not _blocks_view(house, sight_lines)]
+    trees = [tree for tree in trees if not _blocks_view(tree, sight_lines)]
+    parked = _parked(rng, area, roads, clearance, not_colour, parked_share)
     yards = [_yard(house) for house in houses if rng.random() < 0.7]
-    everything: list[Solid] = [*houses, *special, *trees]
-    ground = paint(rng, area, roads, yards, [solid.shadow() for solid in everything])
-    return Town(ground, Solids.of(everything), tuple(parked))
+    everything: list[Occluder] = [*houses, *scenario_occluders, *trees]
+    ground = paint_ground(rng, area, roads, yards, [occluder.shadow() for occluder in everything])
+    return Town(ground, Occluders.of(everything), tuple(parked))
 
 
 def _buildings(
     rng: np.random.Generator,
     area: Area,
     roads: Sequence[Road],
-    away: _Distance,
-    clear: _Distance | None,
-    special: Sequence[Solid],
+    road_distance: _DistanceMap,
+    clearance: _DistanceMap | None,
+    scenario_occluders: Sequence[Occluder],
 ) -> list[occluders.Building]:
     out: list[occluders.Building] = []
     for _ in range(int(area.size / 110.0)):
@@ -90,13 +90,18 @@ def _buildings(
             break
         centre = np.array([rng.uniform(*area.north), rng.uniform(*area.east)])
         length, width = rng.uniform(8.0, 17.0), rng.uniform(7.0, 11.0)
-        reach = 0.5 * float(np.hypot(length, width))
-        free = float(away.at(centre[None])[0])
-        if not reach + 5.5 < free < 40.0 or (clear is not None and clear.at(centre[None])[0] < reach + 7.0):
+        bounding_radius = 0.5 * float(np.hypot(length, width))
+        free = float(road_distance.at(centre[None])[0])
+        if not bounding_radius + 5.5 < free < 40.0 or (
+            clearance is not None and clearance.at(centre[None])[0] < bounding_radius + 7.0
+        ):
             continue
-        if any(np.linalg.norm(centre - other.centre) < reach + other.reach + 2.0 for other in (*out, *special)):
+        if any(
+            np.linalg.norm(centre - other.centre) < bounding_radius + other.bounding_radius + 2.0
+            for other in (*out, *scenario_occluders)
+        ):
             continue
-        out.append(occluders.building(rng, centre, _along(roads, centre), length, width, rng.uniform(3.0, 8.0)))
+        out.append(occluders.random_building(rng, centre, _along(roads, centre), length, width, rng.uniform(3.0, 8.0)))
     return out
 
 
@@ -104,18 +109,20 @@ def _trees(
     rng: np.random.Generator,
     area: Area,
     houses: Sequence[occluders.Building],
-    away: _Distance,
-    clear: _Distance | None,
-) -> list[occluders.Slab]:
-    out: list[occluders.Slab] = []
+    road_distance: _DistanceMap,
+    clearance: _DistanceMap | None,
+) -> list[occluders.FlatOccluder]:
+    out: list[occluders.FlatOccluder] = []
     for _ in range(int(area.size / 170.0)):
         centre = np.array([rng.uniform(*area.north), rng.uniform(*area.east)])
         radius = rng.uniform(1.4, 3.3)
-        if away.at(centre[None])[0] < radius + 6.3 or (clear is not None and clear.at(centre[None])[0] < radius + 4.0):
+        if road_distance.at(centre[None])[0] < radius + 6.3 or (
+            clearance is not None and clearance.at(centre[None])[0] < radius + 4.0
+        ):
             continue
-        if any(np.linalg.norm(centre - house.centre) < 0.7 * house.reach + radius for house in houses):
+        if any(np.linalg.norm(centre - house.centre) < 0.7 * house.bounding_radius + radius for house in houses):
             continue
-        out.append(occluders.canopy(rng, centre, radius, rng.uniform(3.0, 5.5)))
+        out.append(occluders.random_canopy(rng, centre, radius, rng.uniform(3.0, 5.5)))
     return sorted(out, key=lambda tree: tree.height)
 
 
@@ -123,7 +130,7 @@ def _parked(
     rng: np.random.Generator,
     area: Area,
     roads: Sequence[Road],
-    clear: _Distance | None,
+    clearance: _DistanceMap | None,
     not_colour: str,
     share: float,
 ) -> list[Car]:
@@ -135,17 +142,17 @@ def _parked(
             for side in (-1.0, 1.0):
                 if rng.random() > share:
                     continue
-                place, course = road.centre.at(np.array([s + rng.uniform(-0.8, 0.8)]), side * _PARKED_AT)
+                place, course = road.centre.at(np.array([s + rng.uniform(-0.8, 0.8)]), side * _PARKING_OFFSET)
                 near = any(other.distance(place)[0] < 11.0 for other in crossing)
-                if near or not area.contains(place)[0] or (clear is not None and clear.at(place)[0] < 5.0):
+                if near or not area.contains(place)[0] or (clearance is not None and clearance.at(place)[0] < 5.0):
                     continue
                 turned = course + rng.normal(0.0, 0.03) + (np.pi if side < 0 else 0.0)
                 out.append(Car(place, turned, COLOURS_BGR[names[int(rng.integers(len(names)))]]))
     return out
 
 
-def _between(solid: Solid, in_sight: Sequence[tuple[Floats, Floats]]) -> bool:
-    return any(bool(solid.hides(camera, points).any()) for camera, points in in_sight)
+def _blocks_view(occluder: Occluder, sight_lines: Sequence[tuple[Floats, Floats]]) -> bool:
+    return any(bool(occluder.occludes(camera, points).any()) for camera, points in sight_lines)
 
 
 def _along(roads: Sequence[Road], point: Floats) -> float:

@@ -1,0 +1,130 @@
+"""Detection of people and vehicles in a whole video, in two passes: background first, then every frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from edge.detectors.moving.foreground import SubtractorName
+from edge.detectors.moving.vehicle import VehicleDetector
+from edge.detectors.people.person import PersonDetector
+from edge.devices.playback.video_reader import VideoReader
+from edge.offline.detections import VideoDetections, run_detector
+
+if TYPE_CHECKING:
+    from edge.detectors.base import Detection
+    from edge.devices.base import Image
+
+MovingDetector = PersonDetector | VehicleDetector
+EXTRA_COLUMNS = "head_u,head_v,foot_u,foot_v,box_x,box_y,box_w,box_h"
+_LEARN_S, _LEARN_IMAGES = 60.0, 48
+_HEIGHT_FRAMES = 400
+_MIN_FRAMES = 5
+
+
+def moving_detector(what: str, model: SubtractorName, fps: float) -> MovingDetector:
+    """A detector that also reports tentative tracks: in a recording they are confirmed or dropped at the end."""
+    if what == "person":
+        return PersonDetector(model, fps, confirmed_only=False)
+    return VehicleDetector(model, fps, confirmed_only=False)
+
+
+def detect_moving(
+    video: VideoReader,
+    camera: str,
+    detector: MovingDetector,
+    progress: Callable[[str, float], None] = lambda text, fraction: None,
+    overlay: Path | None = None,
+) -> VideoDetections:
+    """Read a video twice: its first minute to learn the background and people's heights, then all of it.
+
+    progress: called with a text and the fraction done. Labels hold within the video: p0, p1, … of people (``person``
+    where there is never more than one at a time), t0, t1, … of vehicles. overlay: video file to write with the
+    detections drawn into it. Raises InputError.
+    """
+    total = max(video.info.frames, 1)
+    _learn(video, detector, progress)
+    rows: dict[int, list[tuple[str, Detection]]] = {}
+
+    def on_frame(frame: int) -> None:
+        progress(f"frame {frame} of {total}", frame / total)
+
+    found = run_detector(video, camera, detector, on_frame, collected=rows)
+    names = _confirmed_labels(rows, detector)
+    if overlay is not None:
+        from edge.offline.overlay import write_overlay
+
+        confirmed = {
+            frame: [(names[one.label], one) for _, one in shown if one.label in names] for frame, shown in rows.items()
+        }
+        write_overlay(video, overlay, confirmed)
+    lines = []
+    frames_with_detection = 0
+    for shown in rows.values():
+        kept = [(row, one) for row, one in shown if one.label in names]
+        frames_with_detection += bool(kept)
+        lines += [f"{row.format(label=names[one.label])},{_extra_cells(one)}" for row, one in kept]
+    return replace(found, rows=tuple(lines), frames_with_detection=frames_with_detection, extra_columns=EXTRA_COLUMNS)
+
+
+def _learn(video: VideoReader, detector: MovingDetector, progress: Callable[[str, float], None]) -> None:
+    """Learn the background from images spread over the first minute, then people's heights from its first frames."""
+    fps = video.info.fps
+    span = min(video.info.frames or 10**9, round(_LEARN_S * fps))
+    every = max(span // _LEARN_IMAGES, 1)
+    images: list[Image] = []
+    progress("learning the background", 0.0)
+    for frame in video:
+        if frame.frame >= span or len(images) > 2 * _LEARN_IMAGES:
+            break
+        if frame.frame % every == 0:
+            images.append(frame.image())
+    if len(images) > 4:
+        detector.initialise(images)
+    del images
+    for frame in video:
+        if frame.frame >= min(_HEIGHT_FRAMES, span):
+            break
+        detector.detect(frame.image(), frame.time)
+    detector.rewind()
+
+
+def _confirmed_labels(rows: dict[int, list[tuple[str, Detection]]], detector: MovingDetector) -> dict[str, str]:
+    """Output labels of the confirmed tracks, numbered in order of appearance."""
+    names: dict[str, str] = {}
+    at_once = 0
+    stationary = _stationary_labels(rows) if isinstance(detector, VehicleDetector) else set()
+    for shown in rows.values():
+        confirmed = [one for _, one in shown if detector.is_confirmed(one.label) and one.label not in stationary]
+        at_once = max(at_once, len(confirmed))
+        for one in sorted(confirmed, key=lambda each: int(each.label[1:])):
+            names.setdefault(one.label, f"{one.label[0]}{len(names)}")
+    if isinstance(detector, PersonDetector) and at_once == 1:
+        return dict.fromkeys(names, "person")
+    return names
+
+
+def _stationary_labels(rows: dict[int, list[tuple[str, Detection]]]) -> set[str]:
+    """Labels of tracks of few frames or of a displacement below their own length: paint, shadows, swaying trees."""
+    seen: dict[str, list[Detection]] = {}
+    for shown in rows.values():
+        for _, one in shown:
+            seen.setdefault(one.label, []).append(one)
+    stationary = set()
+    for label, ones in seen.items():
+        # A box that grows after its first frame moves its centre: compare with the longest side it ever had.
+        length = max(max(one.box[2:]) if one.box else one.size for one in ones)
+        displacement = max(math.hypot(one.u - ones[0].u, one.v - ones[0].v) for one in ones)
+        if len(ones) < _MIN_FRAMES or displacement < length:
+            stationary.add(label)
+    return stationary
+
+
+def _extra_cells(one: Detection) -> str:
+    cells: list[float | None] = []
+    for part, length in ((one.head, 2), (one.foot, 2), (one.box, 4)):
+        cells += [None] * length if part is None else list(part)
+    return ",".join("" if cell is None else f"{cell:.17g}" for cell in cells)

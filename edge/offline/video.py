@@ -1,0 +1,172 @@
+"""Detection in a whole video, and marker model files."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal, get_args
+
+import tomli_w
+
+from edge.detectors.base import Detection, Detector
+from edge.detectors.marker.ball import MarkerDetector, MarkerModel, learn_marker_model
+from edge.devices.base import check_size
+from edge.devices.playback.video_reader import VideoReader
+from edge.offline.detections import VideoDetections, run_detector
+from protocols.core.errors import InputError
+from protocols.core.names import check_name, name_from_file
+from protocols.geometry.camera import Intrinsics
+from protocols.session.calibration import csv_cell
+from protocols.session.rig import read_toml
+
+VideoDetector = Literal["marker", "bright", "tag", "person", "vehicle"]
+MARKER_FILE = "marker.toml"
+"""File of the marker model beside the videos, where `calibrate` looks for it."""
+
+
+def detect_video(
+    video: str | Path,
+    detector: VideoDetector = "marker",
+    *,
+    camera: str | None = None,
+    marker: MarkerModel | str | Path | None = None,
+    intrinsics: Intrinsics | None = None,
+    fps: float | None = None,
+    threshold: int = 200,
+    dictionary: str = "apriltag_36h11",
+    background: Literal["mog2", "knn"] = "mog2",
+    overlay: str | Path | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> VideoDetections:
+    """Detect a marker, people or vehicles in every frame of a video file or of a folder of images.
+
+    Parameters
+    ----------
+    video
+        A video file, or a folder of images in the order of their names.
+    detector
+        marker: one brightly coloured ball. bright: a point of light. tag: AprilTag or ArUco tags. person: people
+        before a fixed camera. vehicle: moving vehicles; the camera may move.
+    camera
+        Name of the camera in the rows; default: the video's name.
+    marker
+        Of ``marker``: the ball's appearance, or the file marker.toml; default: the orange ball of the demo.
+    intrinsics
+        Of ``marker``: the camera's intrinsics for this image size. The ball's centre is then corrected for perspective
+        and distortion.
+    fps
+        Frame rate [Hz] in place of the file's time stamps; default of image folders: 30.
+    threshold
+        Of ``bright``: grey level (0..255) that the point of light exceeds.
+    dictionary
+        Of ``tag``: family of the tags, see ``edge.detectors.marker.tag.DICTIONARIES``.
+    background
+        Of ``person`` and ``vehicle``: OpenCV's background model.
+    overlay
+        Video file to write, a copy with the detections drawn into it.
+    progress
+        Called now and then with a text and the fraction (0..1) of the frames done.
+
+    Returns
+    -------
+    VideoDetections
+        Pixels are distorted ones, (0, 0) is the centre of the top-left pixel; times are those of the file [s]. There
+        are no rows where nothing was detected.
+
+    Raises
+    ------
+    InputError
+        Where the video or the marker file cannot be read, or intrinsics are for another image size.
+    """
+    path, move = Path(video), progress or (lambda text, fraction: None)
+    if detector not in (names := get_args(VideoDetector)):
+        raise InputError(f"there is no detector {detector!r}", remedy=f"use one of {', '.join(names)}")
+    if detector != "marker" and (marker is not None or intrinsics is not None):
+        given = "intrinsics" if marker is None else "marker"
+        raise InputError(f"{given} has no effect on the detector {detector}", remedy="leave it out")
+    reader = VideoReader(path, fps)
+    name = name_from_file(path.stem, path) if camera is None else check_name(camera, "camera")
+    check_size(intrinsics, *reader.info.size, str(path))
+    overlay = None if overlay is None else Path(overlay)
+    if detector == "person" or detector == "vehicle":
+        from edge.offline import moving
+
+        return moving.detect_moving(
+            reader, name, moving.moving_detector(detector, background, reader.info.fps), move, overlay
+        )
+    total = reader.info.frames
+
+    def on_frame(frame: int) -> None:
+        move(f"frame {frame}" + (f" of {total}" if total else ""), frame / total if total else 0.0)
+
+    if detector == "marker":
+        model = read_marker_model(Path(marker)) if isinstance(marker, str | Path) else marker or MarkerModel.default()
+        finder: Detector = ball_detector(model, intrinsics, reader.info.size)
+    else:
+        finder = bright_or_tag_detector(detector, threshold, dictionary)
+    drawn: dict[int, list[tuple[str, Detection]]] = {}
+    found = run_detector(reader, name, finder, on_frame, collected=None if overlay is None else drawn)
+    return found if overlay is None else _with_overlay(reader, found, drawn, overlay)
+
+
+def _with_overlay(
+    video: VideoReader, found: VideoDetections, collected: dict[int, list[tuple[str, Detection]]], overlay: Path
+) -> VideoDetections:
+    """Write a copy of the video with the detections drawn into it; ``found`` with its rows. Raises InputError."""
+    from edge.offline.overlay import write_overlay
+
+    write_overlay(video, overlay, {frame: [(one.label, one) for _, one in shown] for frame, shown in collected.items()})
+    rows = [row.format(label=csv_cell(one.label)) for shown in collected.values() for row, one in shown]
+    return replace(found, rows=tuple(rows))
+
+
+def ball_detector(model: MarkerModel, lens: Intrinsics | None, size: tuple[int, int]) -> MarkerDetector:
+    """The ball detector of one camera; a lens given for an image size other than the video's is ignored."""
+    fits = lens is not None and (lens.width, lens.height) == size
+    return MarkerDetector(model, lens if fits else None)
+
+
+def bright_or_tag_detector(
+    mode: Literal["bright", "tag"],
+    threshold: int = 200,
+    dictionary: str = "apriltag_36h11",
+    label: str = "marker",
+    min_size: float | None = None,
+    max_size: float | None = None,
+) -> Detector:
+    """The detector of a point of light or of fiducial tags; see ``MarkerConfig``. Raises InputError."""
+    if mode == "tag":
+        from edge.detectors.marker.tag import TagDetector, TagModel
+
+        tags = TagModel(dictionary, "tag" if label == "marker" else label)
+        return TagDetector(tags if min_size is None else replace(tags, min_size=min_size))
+    from edge.detectors.marker.bright import BrightDetector, BrightModel
+
+    light = BrightModel(threshold, min_size or 0.0, label=label)
+    return BrightDetector(light if max_size is None else replace(light, max_size=max_size))
+
+
+def read_marker_model(file: Path) -> MarkerModel:
+    """Read the marker model that ``detect --teach`` wrote. Raises InputError."""
+    values, _ = read_toml(file, "marker file")
+    try:
+        return MarkerModel.from_table(values)
+    except InputError as error:
+        raise InputError(error.what, file=file, remedy="make it again with `syncline detect marker --teach`") from None
+
+
+def marker_toml(model: MarkerModel) -> str:
+    """A marker model as TOML text."""
+    text = tomli_w.dumps(model.to_table())
+    assert tomllib.loads(text)
+    return text
+
+
+def learn_marker_from_frame(video: VideoReader, box: tuple[float, float, float, float], start: int) -> MarkerModel:
+    """Learn the marker model from a box x, y, w, h [px] of frame ``start`` (0 = first). Raises InputError."""
+    for frame in video:
+        if frame.frame == start:
+            return learn_marker_model(frame.image(), box)
+    raise InputError(f"there is no frame {start}", file=video.path, remedy="give --start an index, 0 is the first")
