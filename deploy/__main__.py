@@ -1,4 +1,4 @@
-"""`python -m deploy` is the `syncline` command, so that a process can start others without a PATH."""
+"""`python -m deploy` runs the `syncline` command, so that a process can start others without searching PATH."""
 
 from deploy.cli import main
 

@@ -1,1 +1,1 @@
-"""Agents as processes: assembly from configuration, health, systemd, recorder."""
+"""Agents as processes: construction from a configuration, health endpoints, systemd notification, recorder."""

@@ -13,8 +13,8 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
-from deploy.agents.malloc_tuning import trim
-from deploy.config.agents import CameraConfig, HubConfig, OakConfig, PiConfig, SimulatedConfig, UsbConfig
+from deploy.agents.malloc_tuning import release_free_pages
+from deploy.config.agents import CameraConfig, HubConfig, OakConfig, PiCameraConfig, SimulatedConfig, UsbConfig
 from edge.detectors.base import Detector
 from edge.devices.base import Device
 from protocols.bus.base import Bus
@@ -22,15 +22,13 @@ from protocols.core.errors import EXIT_DONE, InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.session.rig import Rig, RigCamera, read_rig
 
-_DAY_S = 86_400.0
-
 
 def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event, beat: Callable[[], None] = lambda: None) -> int:
     """Run a camera agent until it is stopped or its recording ends. beat: called with every frame."""
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # a source that doesn't open is told by us, in one line
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # a source that doesn't open is reported by us, in one line
     import cv2
 
-    from deploy.agents.systemd_notify import Watched
+    from deploy.agents.systemd_notify import HeartbeatDevice
     from edge.agents.camera import run_camera_agent
 
     cv2.setNumThreads(1)  # one core a camera: several agents share a board
@@ -40,11 +38,11 @@ def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event, beat: Ca
         device.open()  # the lens and the rate are in the log
         if damage := getattr(device, "damage", ""):
             print(f"{config.id}: the log is damaged, its good part is played: {damage}", file=sys.stderr, flush=True)
-    told = device.info if config.driver in ("simulated", "log") else None
-    lens = told.intrinsics if told is not None else None if known is None else known.intrinsics
-    detector = _detector(config, lens, _fps(config) if told is None or told.fps <= 0.0 else told.fps)
+    info = device.info if config.driver in ("simulated", "log") else None
+    lens = info.intrinsics if info is not None else None if known is None else known.intrinsics
+    detector = _detector(config, lens, _fps(config) if info is None or info.fps <= 0.0 else info.fps)
     run_camera_agent(
-        Watched(device, beat),
+        HeartbeatDevice(device, beat),
         detector,
         bus,
         config.id,
@@ -70,9 +68,9 @@ def _detector(config: CameraConfig, lens: Intrinsics | None, fps: float) -> Dete
 
         marker = config.marker
         if marker.mode != "colour":
-            from deploy.offline.detect import other_marker
+            from edge.offline.video import bright_or_tag_detector
 
-            return other_marker(
+            return bright_or_tag_detector(
                 marker.mode, marker.threshold, marker.dictionary, marker.label, marker.min_size, marker.max_size
             )
         model = MarkerModel.default() if marker.colour is None else MarkerModel.of_colour(*marker.colour)
@@ -117,7 +115,7 @@ def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable
     hub = LiveHub(settings, rig, None if known is not None else nodes, known)
     export = None if config.out is None else partial(_export, out=config.out)
     # A solve leaves holes behind it, which would add up.
-    run_hub(hub, bus, config.id, stop, rig=rig, beat=beat, export=export, solved=lambda _: trim())
+    run_hub(hub, bus, config.id, stop, rig=rig, beat=beat, export=export, on_result=lambda _: release_free_pages())
     if config.out is not None:
         write_last(hub, config.out)
     return EXIT_DONE
@@ -135,17 +133,19 @@ def _export(hub: object, out: Path) -> str:
 def write_last(hub: object, out: Path) -> None:
     """The hub's last answer, or its last refusal, as the files that `calibrate` writes."""
     # Only here: with it comes the report, which costs a camera agent a fifth of a second of its start.
-    from deploy.offline.outputs import write_outputs, write_refusal
+    from deploy.offline.outputs import report_refusal, report_result
+    from hub.api import CalibrationResult
     from hub.live.live_hub import LiveHub
+    from protocols.session.session import Session
 
     assert isinstance(hub, LiveHub)
     if hub.session is None:
         return
-    rig, observations = hub.session
+    session = Session(*hub.session)
     if hub.refusal is not None:
-        write_refusal(out, hub.refusal, rig, observations, "syncline hub")
+        report_refusal(hub.refusal, session, out, "syncline hub")
     elif hub.calibration is not None:
-        write_outputs(out, hub.calibration, rig, observations, "syncline hub")
+        report_result(CalibrationResult(hub.calibration, session), out, "syncline hub")
 
 
 def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:
@@ -171,18 +171,19 @@ def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:
         )
         return OakCamera(settings, intrinsics=intrinsics)
     if config.driver == "usb":
-        from edge.devices.live.usb import UsbSettings, open_usb
+        from edge.devices.live.usb import UsbSettings, device_path, open_usb
 
         usb = config.usb or UsbConfig()
-        place = f"/dev/video{usb.device}" if usb.device.isdigit() else str(usb.device)
         return open_usb(
-            UsbSettings(place, usb.size, usb.fps, usb.pixels, usb.exposure_us, usb.gain, usb.readout_s),
+            UsbSettings(
+                device_path(str(usb.device)), usb.size, usb.fps, usb.pixels, usb.exposure_us, usb.gain, usb.readout_s
+            ),
             intrinsics=intrinsics,
         )
     if config.driver == "picamera2":
         from edge.devices.live.picamera import PiCamera, PiSettings
 
-        pi = config.picamera2 or PiConfig()
+        pi = config.picamera2 or PiCameraConfig()
         made = PiSettings(pi.camera, pi.size, pi.fps, pi.exposure_us, pi.gain, pi.readout_s)
         return PiCamera(made, intrinsics=intrinsics)
     if config.driver == "rtsp":
@@ -194,11 +195,13 @@ def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:
     from edge.devices.playback.playback_clock import RealTime
 
     if config.driver == "log":
-        from edge.devices.playback.log_playback import LoggedCamera
+        from edge.devices.playback.log_playback import LogPlayback
 
         assert config.log is not None  # the configuration has seen to that
-        pace = None if config.log.fast else RealTime(time.time())
-        return LoggedCamera(config.log.file, config.log.camera or config.id, pace=pace, intrinsics=intrinsics)
+        playback_clock = None if config.log.fast else RealTime(time.time())
+        return LogPlayback(
+            config.log.file, config.log.camera or config.id, playback_clock=playback_clock, intrinsics=intrinsics
+        )
     from edge.devices.playback.open_video import open_video
 
     assert config.video is not None  # the configuration has seen to that
@@ -206,26 +209,25 @@ def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:
         str(config.video.source),
         fps=config.video.fps,
         loop=config.video.loop,
-        pace=RealTime(time.time()),
+        playback_clock=RealTime(time.time()),
         intrinsics=intrinsics,
     )
 
 
 def _simulated(config: CameraConfig) -> Device:
-    from edge import scenes
-    from edge.devices.playback.playback_clock import RealTime
-    from edge.devices.simulated.camera import SimulatedDevice
-    from edge.scenes.common.scaled import scaled
+    from edge.devices.simulated.camera import open_simulated
 
-    world = config.simulated or SimulatedConfig()
-    epoch = world.start_unix_s
-    if epoch is None:
-        epoch = time.time() // _DAY_S * _DAY_S
-    scene = scenes.any_scene(world.scene, world.seed, world.cameras)
-    if world.width is not None or world.fps is not None:
-        scene = scaled(scene, world.width, world.fps)
-    camera = world.camera or config.id
-    return SimulatedDevice(scene, camera, world.seed, RealTime(epoch), duration_s=world.duration_s)
+    simulated = config.simulated or SimulatedConfig()
+    return open_simulated(
+        simulated.scene,
+        simulated.camera or config.id,
+        seed=simulated.seed,
+        cameras=simulated.cameras,
+        width=simulated.width,
+        fps=simulated.fps,
+        epoch_unix_s=simulated.start_unix_s,
+        duration_s=simulated.duration_s,
+    )
 
 
 def _known_camera(config: CameraConfig) -> RigCamera | None:

@@ -1,6 +1,6 @@
-"""An agent's health as others ask for it: /metrics, /livez, /readyz over HTTP, and lines of JSON on standard error.
+"""Health endpoints of an agent: /metrics, /livez and /readyz over HTTP, and JSON log lines on standard error.
 
-Everything is read from the status that the agent publishes anyway, so that no agent knows of this.
+All values come from the status messages that the agent publishes anyway, so agents do not depend on this module.
 """
 
 from __future__ import annotations
@@ -20,14 +20,16 @@ from protocols.messages import syncline_pb2 as pb
 if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
 
-LIVE_S = 5.0
-"""An agent publishes its status each second; after this without one it does not live."""
-_LINES_S = 10.0
-_LINES = 5
+STATUS_TIMEOUT_S = 5.0
+"""Time without a status message after which an agent counts as not live [s]; it publishes one each second."""
+_REFUSAL_WINDOW_S = 10.0
+"""Period over which log lines of refused messages are limited [s]."""
+_REFUSALS_PER_WINDOW = 5
+"""Log lines per reason and source within one period."""
 
 
 class Health:
-    """The last status and what was refused. seen and refused may be called from any thread.
+    """The last status of an agent and its refused messages; ``seen`` and ``refused`` are thread-safe.
 
     now: a monotonic clock [s].
     """
@@ -36,23 +38,23 @@ class Health:
         self._now = now
         self._lock = threading.Lock()
         self._status: pb.AgentStatus | None = None
-        self._at = self._began = now()
-        self._log: Any = None
-        self._said = ""
-        self._unheard = 0
-        self._told: dict[tuple[str, str], tuple[float, int]] = {}
+        self._status_at = self._started_at = now()
+        self._logger: Any = None
+        self._reported_state = ""
+        self._unheard_statuses = 0
+        self._refusal_counts: dict[tuple[str, str], tuple[float, int]] = {}
 
     def seen(self, status: pb.AgentStatus) -> None:
-        """The agent has published its status."""
+        """Handle a status message that the agent has published."""
         with self._lock:
-            self._status, self._at = status, self._now()
+            self._status, self._status_at = status, self._now()
         unheard = "heard" in status.gauges and status.gauges["heard"] == 0.0
-        if unheard and self._unheard == 1:  # at the start the first look may come too early
-            self._line("warning", "unheard", role=status.role, agent=status.agent, message=status.message)
-        self._unheard = self._unheard + 1 if unheard else 0
-        said = f"{status.state}: {status.message}" if status.state == "degraded" else status.state
-        if said != self._said and (status.state == "degraded" or self._said):
-            self._line(
+        if unheard and self._unheard_statuses == 1:  # the first status after the start may precede any subscriber
+            self._log_event("warning", "unheard", role=status.role, agent=status.agent, message=status.message)
+        self._unheard_statuses = self._unheard_statuses + 1 if unheard else 0
+        description = f"{status.state}: {status.message}" if status.state == "degraded" else status.state
+        if description != self._reported_state and (status.state == "degraded" or self._reported_state):
+            self._log_event(
                 "warning" if status.state == "degraded" else "info",
                 status.state,
                 role=status.role,
@@ -60,19 +62,19 @@ class Health:
                 sequence=status.sequence,
                 message=status.message,
             )
-        self._said = said
+        self._reported_state = description
 
     def refused(self, refusal: Refusal) -> None:
-        """A message was not let in: a few lines a reason and source, all of them counted."""
+        """Log a refused message: a few lines per reason and source; the agent counts all of them."""
         now, key = self._now(), (refusal.reason, refusal.agent)
-        began, lines = self._told.get(key, (now, 0))
-        if now - began > _LINES_S:
+        began, lines = self._refusal_counts.get(key, (now, 0))
+        if now - began > _REFUSAL_WINDOW_S:
             began, lines = now, 0
-        if len(self._told) > 1024:
-            self._told.clear()
-        self._told[key] = (began, lines + 1)
-        if lines < _LINES:
-            self._line(
+        if len(self._refusal_counts) > 1024:
+            self._refusal_counts.clear()
+        self._refusal_counts[key] = (began, lines + 1)
+        if lines < _REFUSALS_PER_WINDOW:
+            self._log_event(
                 "warning",
                 "refused",
                 reason=refusal.reason,
@@ -80,19 +82,19 @@ class Health:
                 sequence=refusal.sequence,
                 key=refusal.key,
                 detail=refusal.detail,
-                more="further ones are only counted for 10 s" if lines == _LINES - 1 else None,
+                more="further ones are only counted for 10 s" if lines == _REFUSALS_PER_WINDOW - 1 else None,
             )
 
     def live(self) -> tuple[bool, str]:
-        """Whether the agent's loop turns, and a word about it."""
+        """Whether the agent's main loop runs, and a short description."""
         with self._lock:
-            silent, status = self._now() - self._at, self._status
-        if silent > LIVE_S:
+            silent, status = self._now() - self._status_at, self._status
+        if silent > STATUS_TIMEOUT_S:
             return False, f"no status for {silent:.0f} s"
         return True, "starting" if status is None else "ok"
 
     def ready(self) -> tuple[bool, str]:
-        """Whether it does what it is there for."""
+        """Whether the agent is running normally, and a short description."""
         alive, text = self.live()
         with self._lock:
             status = self._status
@@ -101,25 +103,25 @@ class Health:
         return status.state == "running", f"{status.state}: {status.message}".rstrip(": ")
 
     def collect(self) -> Iterator[Metric]:
-        """The status as Prometheus' metrics: counters by name, refusals by reason and source, gauges, age."""
+        """The status as Prometheus metrics: counters by name, refusals by reason and source, gauges, age."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         with self._lock:
-            status, age = self._status, self._now() - self._at
-        yield GaugeMetricFamily("syncline_up_seconds", "Since the start.", value=self._now() - self._began)
-        yield GaugeMetricFamily("syncline_status_age_seconds", "Since the last status.", value=age)
+            status, age = self._status, self._now() - self._status_at
+        yield GaugeMetricFamily("syncline_up_seconds", "Time since the start.", value=self._now() - self._started_at)
+        yield GaugeMetricFamily("syncline_status_age_seconds", "Time since the last status.", value=age)
         if status is None:
             return
         names = ["role", "agent"]
         who = [status.role, status.agent]
-        state = GaugeMetricFamily("syncline_state", "1 for the present state.", labels=[*names, "state"])
+        state = GaugeMetricFamily("syncline_state", "1 for the current state.", labels=[*names, "state"])
         state.add_metric([*who, status.state], 1.0)
         yield state
-        rejected = CounterMetricFamily("syncline_rejected", "Messages that were not let in.", labels=[*names, "reason"])
+        rejected = CounterMetricFamily("syncline_rejected", "Refused messages.", labels=[*names, "reason"])
         sources = CounterMetricFamily(
-            "syncline_rejected_by_source", "The same, by the id in the key.", labels=[*names, "reason", "source"]
+            "syncline_rejected_by_source", "Refused messages by the id in the key.", labels=[*names, "reason", "source"]
         )
-        events = CounterMetricFamily("syncline_events", "What the agent counts.", labels=[*names, "name"])
+        events = CounterMetricFamily("syncline_events", "Counters of the agent.", labels=[*names, "name"])
         for name, value in status.counters.items():
             if name.startswith("rejected."):
                 reason, _, source = name.removeprefix("rejected.").partition("@")
@@ -130,18 +132,18 @@ class Health:
             else:
                 events.add_metric([*who, name], value)
         yield from (rejected, sources, events)
-        gauges = GaugeMetricFamily("syncline_gauge", "What the agent measures.", labels=[*names, "name"])
+        gauges = GaugeMetricFamily("syncline_gauge", "Gauges of the agent.", labels=[*names, "name"])
         for name, value in status.gauges.items():
             gauges.add_metric([*who, name], value)
         yield gauges
 
-    def _line(self, level: str, event: str, **values: Any) -> None:
-        if self._log is None:
-            self._log = _logger()
-        getattr(self._log, level)(event, **{name: value for name, value in values.items() if value is not None})
+    def _log_event(self, level: str, event: str, **values: Any) -> None:
+        if self._logger is None:
+            self._logger = _json_logger()
+        getattr(self._logger, level)(event, **{name: value for name, value in values.items() if value is not None})
 
 
-def _logger() -> Any:
+def _json_logger() -> Any:
     import sys
 
     import structlog
@@ -157,7 +159,7 @@ def _logger() -> Any:
 
 
 class HealthServer:
-    """Answers over HTTP while the context is open. Raises InputError where the address is taken."""
+    """Serves the health endpoints over HTTP while the context is open. Raises InputError if the address is in use."""
 
     def __init__(self, config: HealthConfig, health: Health) -> None:
         host, _, port = config.listen.rpartition(":")

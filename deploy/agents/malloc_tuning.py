@@ -1,4 +1,4 @@
-"""How the C library keeps a process's memory: lean where it runs for months, at hand where it is one command."""
+"""Tuning of glibc's malloc: small resident memory for long-running agents, fast reuse for a single command."""
 
 from __future__ import annotations
 
@@ -6,45 +6,51 @@ import ctypes
 from contextlib import suppress
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of glibc's mallopt
-_ARENAS = 2
-_LARGE = 128 * 1024
-_LARGEST = 32 * 1024 * 1024  # glibc takes no more for a block's size
-_ALL = 1024**3
+_MAX_ARENAS = 2
+_LARGE_BLOCK_BYTES = 128 * 1024
+_MAX_MMAP_THRESHOLD_BYTES = 32 * 1024 * 1024  # glibc's upper limit
+_NEVER_TRIM_BYTES = 1024**3
 
 
-def steady_heap(*, give_back: bool) -> bool:
-    """Keep the heap from growing by fragments; call it before there are threads. False where the C library can't.
+def limit_heap_growth(*, release_large_blocks: bool) -> bool:
+    """Limit heap growth by fragmentation; call it before threads are started. False if the C library has no mallopt.
 
-    glibc gives every thread an arena of its own, up to eight a core, and raises the size from which on a block is the
-    system's again each time that a large one is freed: the holes that the threads of the bus and a solver leave behind
-    made a hub grow by some MB an hour. give_back: hand every large block back as soon as it is freed, which costs
-    a fresh page for each 4 KiB of it: right for what solves every few seconds, not for what handles a picture 30 times
-    a second. What the environment says (MALLOC_ARENA_MAX, …) is overruled.
+    glibc gives every thread an arena of its own, up to eight per core, and raises the mmap threshold each time that a
+    large block is freed: the holes that the threads of the bus and a solver leave behind made a hub grow by some MB
+    per hour. release_large_blocks: return every large block to the system as soon as it is freed, which costs a page
+    fault for each 4 KiB of it: suitable for a process that solves every few seconds, not for one that handles 30
+    images per second. Environment variables (MALLOC_ARENA_MAX, …) are overridden.
     """
     try:
         set_option = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError):  # musl, macOS
         return False
-    done = bool(set_option(_ARENA_MAX, _ARENAS))
-    if give_back:
-        done = bool(set_option(_MMAP_THRESHOLD, _LARGE)) and bool(set_option(_TRIM_THRESHOLD, _LARGE)) and done
+    done = bool(set_option(_ARENA_MAX, _MAX_ARENAS))
+    if release_large_blocks:
+        done = (
+            bool(set_option(_MMAP_THRESHOLD, _LARGE_BLOCK_BYTES))
+            and bool(set_option(_TRIM_THRESHOLD, _LARGE_BLOCK_BYTES))
+            and done
+        )
     return done
 
 
-def keep_heap() -> bool:
-    """Keep what is freed for the next one who asks, in a process that ends soon. False where the C library can't.
+def retain_freed_memory() -> bool:
+    """Keep freed memory in the heap for reuse, in a process that ends soon. False if the C library has no mallopt.
 
-    Solvers make and free the same arrays of some 100 kB again and again; asked back from the system each time, every
-    4 KiB of them are a fault and are zeroed: a fifth of what `calibrate` took.
+    Solvers allocate and free the same arrays of some 100 kB repeatedly. If each is requested from the system again,
+    every 4 KiB cause a page fault and are zeroed, which took a fifth of the run time of `calibrate`.
     """
     try:
         set_option = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError):  # musl, macOS
         return False
-    return bool(set_option(_MMAP_THRESHOLD, _LARGEST)) and bool(set_option(_TRIM_THRESHOLD, _ALL))
+    return bool(set_option(_MMAP_THRESHOLD, _MAX_MMAP_THRESHOLD_BYTES)) and bool(
+        set_option(_TRIM_THRESHOLD, _NEVER_TRIM_BYTES)
+    )
 
 
-def trim() -> None:
-    """Give free pages back to the system, also those between blocks that are in use; about a millisecond."""
+def release_free_pages() -> None:
+    """Return free pages to the system, also those between blocks that are in use; takes about a millisecond."""
     with suppress(AttributeError, OSError):
         ctypes.CDLL(None).malloc_trim(0)

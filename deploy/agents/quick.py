@@ -1,4 +1,4 @@
-"""Two or more cameras on this machine, in one process and without configuration: show, teach, guide, calibrate."""
+"""Interactive calibration of the cameras of this machine in one process: cameras, marker teaching, advice, hub."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from edge.agents.camera import CameraAgent
-from edge.detectors.marker.ball import MarkerModel, teach
-from edge.detectors.marker.teach import TaughtDetector, teach_at
+from edge.detectors.marker.ball import MarkerModel, learn_marker_model
+from edge.detectors.marker.interactive import InteractiveMarkerDetector, learn_marker_at
 from edge.devices.base import Device, DeviceInfo, Frame
-from edge.lens.solve import lens_from_angle
-from hub.calibration.coverage import ENOUGH
+from edge.lens.solve import intrinsics_from_field_of_view
+from hub.calibration.coverage import MIN_COVERAGE
 from hub.live.agent import run_hub
 from hub.live.live_hub import LiveHub, LiveSettings
-from hub.view.image_planes import PicturePlanes
+from hub.view.image_planes import ImagePlanes
 from hub.view.server import ViewServer, run_view
 from hub.view.state import ViewState
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
@@ -29,39 +29,41 @@ from protocols.geometry.camera import Intrinsics
 from protocols.session.rig import Rig
 
 WINDOW_S = 600.0
-_GOOD_STD_S = 0.0005  # every clock known so well: enough
-_QUIET_S = 3.0  # between two lines of advice
-_STEADY = 3  # calibrations in a row that are
+_TARGET_OFFSET_STD_S = 0.0005  # clock offset std of every camera at which the calibration is sufficient
+_ADVICE_INTERVAL_S = 3.0  # shortest time between two lines of advice
+_MIN_CONSECUTIVE_GOOD = 3  # sufficient calibrations in a row before it ends
 
 
-class Tapped:
-    """A device whose last frame can be looked at from elsewhere, with a first guess of the lens where it has none.
+class LastFrameDevice:
+    """A device that keeps its last frame for other threads, with assumed intrinsics where it has none.
 
-    angle: how wide its picture is [degrees].
+    field_of_view: assumed horizontal field of view [degrees].
     """
 
-    def __init__(self, device: Device, angle: float) -> None:
-        self._device, self._angle = device, angle
+    def __init__(self, device: Device, field_of_view: float) -> None:
+        self._device, self._field_of_view = device, field_of_view
         self.frame: Frame | None = None
-        self.guessed = False
+        self.lens_assumed = False
         self.done = False
 
     @property
     def info(self) -> DeviceInfo:
-        """The device's own, with a lens."""
+        """The device's information, with intrinsics."""
         info = self._device.info
         if info.intrinsics is not None:
             return info
-        self.guessed = True
-        return replace(info, intrinsics=lens_from_angle((info.width, info.height), self._angle, False))
+        self.lens_assumed = True
+        return replace(
+            info, intrinsics=intrinsics_from_field_of_view((info.width, info.height), self._field_of_view, False)
+        )
 
     @property
     def ended(self) -> bool:
-        """As the device says."""
+        """Whether the device has ended."""
         return self._device.ended
 
     def open(self) -> None:
-        """Raises InputError where the device does not answer."""
+        """Open the device. Raises InputError if it does not respond."""
         self._device.open()
 
     def read(self, timeout_s: float) -> Frame | None:
@@ -78,24 +80,25 @@ class Tapped:
 
 @dataclass(slots=True, eq=False)
 class QuickSettings:
-    """What to run. devices: by camera. out: folder. live: somebody waves; else the sources end by themselves.
+    """Settings of a run. devices: by camera. out: folder. live: cameras; False = recordings, which end by themselves.
 
-    rig: lenses and references that are known. target: a box x, y, w, h [px] in the first camera's first picture.
+    field_of_view: assumed where a lens is not known [degrees]. seconds: longest duration [s]. rig: known intrinsics
+    and control points. target: a box x, y, w, h [px] around the marker in the first frame of the first camera.
     """
 
     devices: dict[str, Device]
     out: Path
-    angle: float = 65.0
+    field_of_view: float = 65.0
     live: bool = True
     seconds: float = 300.0
     rig: Rig | None = None
     marker: MarkerModel | None = None
     target: tuple[float, float, float, float] | None = None
-    tell: Callable[[str], None] = field(default=lambda text: None)
+    report: Callable[[str], None] = field(default=lambda text: None)
 
 
-class Quick:
-    """One run. ``finish`` may be set by anyone; ``run`` returns the hub with its last answer or refusal."""
+class QuickCalibration:
+    """One run. ``finish`` may be set from any thread; ``run`` returns the hub with its last calibration or refusal."""
 
     def __init__(self, settings: QuickSettings, view: ViewServer | None) -> None:
         self.settings = settings
@@ -103,31 +106,33 @@ class Quick:
         self._view = view
         self._network = MemoryHub()
         self._stop_cameras, self._stop_hub = threading.Event(), threading.Event()
-        self._devices = {name: Tapped(device, settings.angle) for name, device in settings.devices.items()}
-        self._detectors = {name: TaughtDetector(self._lens(name), settings.marker) for name in self._devices}
+        self._devices = {
+            name: LastFrameDevice(device, settings.field_of_view) for name, device in settings.devices.items()
+        }
+        self._detectors = {name: InteractiveMarkerDetector(self._lens(name), settings.marker) for name in self._devices}
         rig = settings.rig
         self.hub = LiveHub(LiveSettings(WINDOW_S, 2.0), rig)
         self._errors: list[BaseException] = []
-        self._anew = threading.Event()
-        self._steady = 0
+        self._reset_requested = threading.Event()
+        self._consecutive_good = 0
         self._revision = -1
-        self._told, self._told_at = "", 0.0
-        self._planes: PicturePlanes | None = None
+        self._reported, self._reported_at = "", 0.0
+        self._planes: ImagePlanes | None = None
         if view is not None:
-            self._planes = PicturePlanes(view.server, self._clicked)
+            self._planes = ImagePlanes(view.server, self._on_click)
             with view.server.gui.add_folder("Your cameras", order=-1.0):
-                self._note = view.server.gui.add_markdown("Click on the marker in a picture if it has no ring yet.")
+                self._note = view.server.gui.add_markdown("Click on the marker in an image if it has no ring yet.")
                 button = view.server.gui.add_button("Finish", color="green")
                 button.on_click(lambda event: self.finish.set())
 
     def run(self, stop: threading.Event) -> LiveHub:
-        """Film until it is enough, ``finish`` or ``stop`` is set, the sources end or the time is over.
+        """Run until the calibration is sufficient, ``finish`` or ``stop`` is set, the sources end or time is up.
 
-        Raises InputError where a camera does not answer.
+        Raises InputError if a camera does not respond.
         """
         cameras = [self._thread(f"camera {name}", self._run_camera, name) for name in self._devices]
         hub = self._thread("hub", self._run_hub)
-        began = time.monotonic()
+        started = time.monotonic()
         try:
             if self.settings.target is not None:
                 self._teach_target(*self.settings.target)
@@ -135,12 +140,12 @@ class Quick:
                 done = threading.Event()
 
                 def each(state: ViewState) -> None:
-                    self._look(state, cameras, began)
+                    self._update(state, cameras, started)
                     if self._errors or stop.is_set() or self.finish.is_set():
                         done.set()
 
                 if self._view is None:
-                    self._watch_alone(bus, done, each)
+                    self._run_headless(bus, done, each)
                 else:
                     stack.callback(self._view.close)
                     run_view(bus, self._view, done, each=each)
@@ -155,12 +160,12 @@ class Quick:
         return self.hub
 
     @property
-    def guessed(self) -> list[str]:
-        """Cameras whose lens is only a guess."""
-        return [name for name, device in self._devices.items() if device.guessed]
+    def lens_assumed(self) -> list[str]:
+        """Cameras whose intrinsics are assumed from the field of view."""
+        return [name for name, device in self._devices.items() if device.lens_assumed]
 
     def _lens(self, name: str) -> Intrinsics | None:
-        """What corrects a ball's outline must be a measured lens, not a guess."""
+        """The measured intrinsics of a camera: the centre of a ball's outline is not corrected with assumed ones."""
         known = None if self.settings.rig is None else self.settings.rig.cameras.get(name)
         return None if known is None else known.intrinsics
 
@@ -168,7 +173,7 @@ class Quick:
         def guarded() -> None:
             try:
                 work(*arguments)
-            except Exception as error:  # noqa: BLE001 - it belongs to the thread that waits for this one
+            except Exception as error:  # noqa: BLE001 - raised again in the thread that waits for this one
                 self._errors.append(error)
 
         thread = threading.Thread(target=guarded, name=name, daemon=True)
@@ -183,15 +188,15 @@ class Quick:
 
     def _run_hub(self) -> None:
         with MemoryBus(self._network) as bus:
-            run_hub(self.hub, bus, "hub", self._stop_hub, rig=self.settings.rig, beat=self._forget)
+            run_hub(self.hub, bus, "hub", self._stop_hub, rig=self.settings.rig, beat=self._reset_if_requested)
 
-    def _forget(self) -> None:
-        if self._anew.is_set():
-            self._anew.clear()
-            self.hub.start_anew()
+    def _reset_if_requested(self) -> None:
+        if self._reset_requested.is_set():
+            self._reset_requested.clear()
+            self.hub.reset()
 
-    def _watch_alone(self, bus: MemoryBus, done: threading.Event, each: Callable[[ViewState], None]) -> None:
-        """The same loop without a browser."""
+    def _run_headless(self, bus: MemoryBus, done: threading.Event, each: Callable[[ViewState], None]) -> None:
+        """The view's loop without a browser."""
         from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION
 
         state = ViewState()
@@ -202,46 +207,50 @@ class Quick:
                     state.handle(received.message, time.monotonic())
             each(state)
 
-    def _look(self, state: ViewState, cameras: list[threading.Thread], began: float) -> None:
-        """Pictures until something is solved, advice, and whether it is enough."""
+    def _update(self, state: ViewState, cameras: list[threading.Thread], started: float) -> None:
+        """Show images until a calibration exists, report advice, and decide whether the calibration is sufficient."""
         if self._planes is not None and self._view is not None:
             if state.solved is None:
                 self._planes.update(state)
             else:
                 self._planes.clear()
         advice = state.guidance.advice(1)
-        line = f"{state.headline()}" + (f"; {advice[0].text}" if advice and not self._enough(state) else "")
+        line = f"{state.headline()}" + (f"; {advice[0].text}" if advice and not self._is_sufficient(state) else "")
         revision = state.calibration.revision if state.calibration else -1
-        if line != self._told and (revision != self._revision or time.monotonic() - self._told_at > _QUIET_S):
-            self._told, self._told_at = line, time.monotonic()
-            self.settings.tell(line)
-        if all(not thread.is_alive() for thread in cameras) or time.monotonic() - began > self.settings.seconds:
+        if line != self._reported and (
+            revision != self._revision or time.monotonic() - self._reported_at > _ADVICE_INTERVAL_S
+        ):
+            self._reported, self._reported_at = line, time.monotonic()
+            self.settings.report(line)
+        if all(not thread.is_alive() for thread in cameras) or time.monotonic() - started > self.settings.seconds:
             self.finish.set()
-        found = state.calibration
-        if found is not None and found.revision != self._revision:
-            self._revision = found.revision
-            self._steady = self._steady + 1 if self._enough(state) else 0
-        if self.settings.live and self._steady >= _STEADY:
+        latest = state.calibration
+        if latest is not None and latest.revision != self._revision:
+            self._revision = latest.revision
+            self._consecutive_good = self._consecutive_good + 1 if self._is_sufficient(state) else 0
+        if self.settings.live and self._consecutive_good >= _MIN_CONSECUTIVE_GOOD:
             self.finish.set()
 
-    def _enough(self, state: ViewState) -> bool:
-        found = state.calibration
-        if found is None or found.status != "solved" or len(found.cameras) < len(self._devices):
+    def _is_sufficient(self, state: ViewState) -> bool:
+        latest = state.calibration
+        if latest is None or latest.status != "solved" or len(latest.cameras) < len(self._devices):
             return False
-        sharp = all(camera.time_offset_std <= _GOOD_STD_S for camera in found.cameras)
-        return sharp and all(state.guidance.coverage(name) >= ENOUGH for name in self._devices)
+        precise = all(camera.time_offset_std <= _TARGET_OFFSET_STD_S for camera in latest.cameras)
+        return precise and all(state.guidance.coverage(name) >= MIN_COVERAGE for name in self._devices)
 
-    def _clicked(self, camera: str, u: float, v: float) -> None:
+    def _on_click(self, camera: str, u: float, v: float) -> None:
         frame = self._devices[camera].frame
         if frame is None:
             return
         try:
-            model, box = teach_at(frame.image, u, v)
+            model, box = learn_marker_at(frame.image, u, v)
         except InputError as error:
-            self._say(f"{camera}: {error}")
+            self._show_message(f"{camera}: {error}")
             return
-        self._use(model)
-        self._say(f"taught from {camera}, a box of {box[2]}×{box[3]} pixels: now wave it through all pictures")
+        self._set_marker_model(model)
+        self._show_message(
+            f"marker learned from {camera}, a box of {box[2]}×{box[3]} pixels: now wave it through all images"
+        )
 
     def _teach_target(self, *box: float) -> None:
         first = next(iter(self._devices.values()))
@@ -249,22 +258,22 @@ class Quick:
         while first.frame is None and time.monotonic() < deadline and not self._errors and not first.done:
             time.sleep(0.01)
         if first.frame is None:
-            return  # its error is told by the camera's thread
-        self._use(teach(first.frame.image, (box[0], box[1], box[2], box[3])))
+            return  # the camera's thread reports the error
+        self._set_marker_model(learn_marker_model(first.frame.image, (box[0], box[1], box[2], box[3])))
 
-    def _use(self, model: MarkerModel) -> None:
+    def _set_marker_model(self, model: MarkerModel) -> None:
         for detector in self._detectors.values():
-            detector.teach(model)
-        self._anew.set()  # what was seen of another thing is forgotten, by the hub's own thread
+            detector.set_model(model)
+        self._reset_requested.set()  # the hub's own thread discards observations of the former marker
 
-    def _say(self, text: str) -> None:
+    def _show_message(self, text: str) -> None:
         if self._view is not None:
             self._note.content = text
-        self.settings.tell(text)
+        self.settings.report(text)
 
 
 def show_report(file: Path) -> bool:
-    """Open a file in this machine's browser, where there is a screen."""
+    """Open a file in this machine's browser; False without a display."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         return False
     return webbrowser.open(file.resolve().as_uri())

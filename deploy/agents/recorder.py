@@ -1,4 +1,4 @@
-"""The recorder: everything of a site that the catalogue calls recorded, into one log."""
+"""The recorder: writes every topic of a site that the catalogue marks as recorded to one log."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from protocols.validation.codec import SCHEMA_VERSION
 ROLE = "record"
 _TICK_S = 0.02
 _SYNC_S = 0.5
-"""Half of the second that may be lost: the writing and the disk need time too."""
+"""Interval of fsync: half of the second that may be lost, because writing and the disk take time too."""
 _STATUS_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class RecorderResult:
-    """What was recorded. counters: recorded, dropped, lost, skipped, rejected.<reason>, summed over all topics.
+    """Result of a recording. counters: recorded, dropped, lost, skipped, rejected.<reason>, summed over all topics.
 
-    path: the log, or the first of its parts. stopped: why it ended before it was told to; "" if it did not.
+    path: the log, or its first part. parts: number of files. stopped: why recording ended by itself; "" if it did not.
     """
 
     path: Path
@@ -46,19 +46,19 @@ class RecorderResult:
 
 
 def free_bytes(folder: Path) -> int:
-    """Bytes that may still be written below ``folder``, which need not be there yet."""
+    """Free bytes on the disk of ``folder``, which need not exist yet."""
     place = next(parent for parent in (folder, *folder.absolute().parents) if parent.is_dir())
     return shutil.disk_usage(place).free
 
 
 def disk_bytes(folder: Path) -> int:
-    """Size of the disk below ``folder``, which need not be there yet."""
+    """Size in bytes of the disk of ``folder``, which need not exist yet."""
     place = next(parent for parent in (folder, *folder.absolute().parents) if parent.is_dir())
     return shutil.disk_usage(place).total
 
 
 def log_path(out: Path, now: datetime) -> Path:
-    """The file to write: ``out`` itself if it is named .mcap, else a new one in the folder ``out``."""
+    """The file to write: ``out`` itself if its suffix is .mcap, else a new file in the folder ``out``."""
     if out.suffix == ".mcap":
         return out
     return out / now.strftime("syncline-%Y%m%dT%H%M%SZ.mcap")
@@ -76,9 +76,9 @@ def run_recorder(
 ) -> RecorderResult:
     """Record until ``stop`` is set, until ``stop_when(messages so far)`` is true, or until the disk is nearly full.
 
-    Log times are the arrival times. Twice a second the log is brought to the disk; each second the recorder's
-    status is published. free: bytes left where the log is. beat: called after every round. Raises InputError if the log
-    exists already or cannot be written, or if the disk is too full to begin.
+    Log times are arrival times. The log is flushed to disk (fsync) twice a second; the recorder's status is published
+    each second. free: free bytes on the log's disk. beat: called in every cycle. Raises InputError if the log exists
+    already or cannot be written, or if the disk is too full to start.
     """
     boot = boot_id or uuid.uuid4().hex
     path = log_path(config.out, datetime.now(UTC))
@@ -86,10 +86,10 @@ def run_recorder(
     if full:
         raise InputError(f"not recorded: {full}", file=path, remedy="make room, or lower min_free_mb")
     with _writer(config, path, bus.site, boot) as writer, bus.announce(ROLE, config.id, boot):
-        # Cameras send pictures only where somebody wants them.
+        # Cameras publish thumbnails only while somebody subscribes to them.
         wanted = [topic for topic in TOPICS if topic.recorded and (config.pictures_hz > 0.0 or topic is not PICTURE)]
         subscriptions = [bus.subscribe(topic) for topic in wanted]
-        thinned = Thinned(config.pictures_hz)
+        limiter = ThumbnailRateLimiter(config.pictures_hz)
         publisher = bus.publisher(STATUS, config.id)
         status = pb.AgentStatus(
             schema_version=SCHEMA_VERSION, agent=config.id, role=ROLE, boot_id=boot, state="running", version=VERSION
@@ -98,13 +98,13 @@ def run_recorder(
         next_sync = next_status = time.monotonic()
         try:
             while not stop.is_set() and not (stop_when is not None and stop_when(messages)) and not full:
-                messages += _record(writer, bus.site, subscriptions, thinned)
+                messages += _record(writer, bus.site, subscriptions, limiter)
                 now = time.monotonic()
                 if now >= next_sync:
                     next_sync = now + _SYNC_S
                     writer.sync()
                     full = _too_full(config, path, free)
-                    # Only right after a sync: what it reports as recorded is on the disk.
+                    # Only directly after a sync, so that everything reported as recorded is on the disk.
                     if now >= next_status or full:
                         next_status = now + _STATUS_S - _SYNC_S / 2
                         _report(status, subscriptions, messages, writer.size, full)
@@ -113,7 +113,7 @@ def run_recorder(
                 beat()
                 if not full:
                     stop.wait(_TICK_S)
-            messages += _record(writer, bus.site, subscriptions, thinned)
+            messages += _record(writer, bus.site, subscriptions, limiter)
             counters = _counters(subscriptions, messages)
         finally:
             publisher.close()
@@ -146,7 +146,7 @@ def _writer(config: RecorderConfig, path: Path, site: str, boot: str) -> LogWrit
 
 
 def _too_full(config: RecorderConfig, path: Path, free: Callable[[Path], int]) -> str:
-    """Why the disk has no room for more; "" while it has."""
+    """Why the disk is too full to continue; "" while it is not."""
     left = free(path.parent) / 1e6
     if left < config.min_free_mb:
         return f"{left:.0f} MB are free on the disk, min_free_mb is {config.min_free_mb:g}"
@@ -156,30 +156,32 @@ def _too_full(config: RecorderConfig, path: Path, free: Callable[[Path], int]) -
     return ""
 
 
-class Thinned:
-    """Lets through at most ``hz`` pictures of each camera a second; what else there is, always."""
+class ThumbnailRateLimiter:
+    """Limits the thumbnails of each camera to ``hz`` per second; messages of other topics always pass."""
 
     def __init__(self, hz: float) -> None:
-        # A picture that comes a little early is the one that was due.
-        self._apart_ns = 0.9 * NANOSECONDS / hz if hz > 0.0 else inf
+        # 0.9: an image that arrives slightly early still counts as the one that is due.
+        self._min_interval_ns = 0.9 * NANOSECONDS / hz if hz > 0.0 else inf
         self._last: dict[str, int] = {}
 
-    def keeps(self, received: Received) -> bool:
-        """Whether to record it."""
+    def accepts(self, received: Received) -> bool:
+        """Whether to record a message."""
         if received.topic is not PICTURE:
             return True
         last = self._last.get(received.agent)
-        # A clock that was set back does not end the pictures.
-        if last is not None and 0 <= received.arrival_ns - last < self._apart_ns:
+        # A clock that was set back must not suppress images.
+        if last is not None and 0 <= received.arrival_ns - last < self._min_interval_ns:
             return False
         self._last[received.agent] = received.arrival_ns
         return True
 
 
-def _record(writer: LogWriter | RotatingWriter, site: str, subscriptions: list[Subscription], thinned: Thinned) -> int:
-    """Write what has arrived, in the order of arrival over all topics."""
+def _record(
+    writer: LogWriter | RotatingWriter, site: str, subscriptions: list[Subscription], limiter: ThumbnailRateLimiter
+) -> int:
+    """Write all pending messages in order of arrival over all topics; returns their number."""
     arrived = [received for subscription in subscriptions for received in subscription.drain()]
-    batch = [received for received in arrived if thinned.keeps(received)]
+    batch = [received for received in arrived if limiter.accepts(received)]
     batch.sort(key=lambda received: received.arrival_ns)
     for received in batch:
         writer.write(received.topic, received.agent, site, received.message, received.arrival_ns)

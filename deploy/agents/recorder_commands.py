@@ -1,4 +1,4 @@
-"""A recorder that is told to stop and start from a view: each start is a log of its own."""
+"""A recorder that is paused and resumed by commands on the bus; each start writes a new log."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import msgspec
 from deploy.agents.recorder import ROLE, RecorderResult, run_recorder
 from deploy.config.agents import RecorderConfig
 from protocols.bus.base import Bus
-from protocols.core.commands import Orders
+from protocols.bus.commands import CommandSubscription
 from protocols.core.errors import InputError
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
@@ -23,67 +23,73 @@ _STATUS_S = 1.0
 _START, _STOP = "start_recording", "stop_recording"
 
 
-def record_as_asked(
+def record_on_command(
     config: RecorderConfig,
     bus: Bus,
     stop: threading.Event,
     *,
     beat: Callable[[], None] = lambda: None,
-    tell: Callable[[str], None] = lambda text: None,
+    report: Callable[[str], None] = lambda text: None,
 ) -> RecorderResult:
-    """Record until ``stop`` is set, with pauses where a view asks for them; returns the last log's result.
+    """Record until ``stop`` is set, with pauses that a view commands; returns the result of the last log.
 
-    tell: hears a line for each log that ended. Raises InputError as ``run_recorder`` does for the first log; a later
-    one that cannot be begun is told, and the recorder waits on.
+    report: called with one line for each finished log. Raises InputError as ``run_recorder`` does for the first log.
+    If a later one cannot be started, that is reported and the recorder stays paused.
     """
     boot = uuid.uuid4().hex
-    orders = Orders(bus, config.id, boot, (_START, _STOP))
+    recording_commands = CommandSubscription(bus, config.id, boot, (_START, _STOP))
     paused = False
 
-    def asked(messages: int) -> bool:
+    def is_paused(messages: int) -> bool:
         nonlocal paused
-        for action in orders.take():
+        for action in recording_commands.take():
             paused = action == _STOP
         return paused
 
     try:
-        result = run_recorder(config, bus, stop, stop_when=asked, boot_id=boot, beat=beat)
+        result = run_recorder(config, bus, stop, stop_when=is_paused, boot_id=boot, beat=beat)
         while paused and not stop.is_set() and not result.stopped:
-            tell(f"recorded {result.messages} messages to {result.path}; paused, as a view asked")
-            _wait(config.id, bus, boot, orders, stop, beat, f"paused after {result.path.name}")
+            report(f"recorded {result.messages} messages to {result.path}; paused, as a view asked")
+            _wait_for_start(config.id, bus, boot, recording_commands, stop, beat, f"paused after {result.path.name}")
             if stop.is_set():
                 break
             paused = False
-            again = replace_out(config)
+            again = with_unused_log_path(config)
             try:
-                result = run_recorder(again, bus, stop, stop_when=asked, boot_id=boot, beat=beat)
+                result = run_recorder(again, bus, stop, stop_when=is_paused, boot_id=boot, beat=beat)
             except InputError as error:
-                tell(f"not recorded: {error}")
+                report(f"not recorded: {error}")
                 paused = True
     finally:
-        orders.close()
+        recording_commands.close()
     return result
 
 
-def replace_out(config: RecorderConfig) -> RecorderConfig:
-    """The same recorder with a log that is not there yet: demo.mcap, demo-2.mcap, demo-3.mcap, …"""
+def with_unused_log_path(config: RecorderConfig) -> RecorderConfig:
+    """The same configuration with an unused log name: demo.mcap, demo-2.mcap, demo-3.mcap, …"""
     out = config.out
     if out.suffix != ".mcap":
         return config  # a folder: its files are named by time
     number = 2
-    while _taken(out.with_stem(f"{out.stem}-{number}")):
+    while _log_exists(out.with_stem(f"{out.stem}-{number}")):
         number += 1
     return msgspec.structs.replace(config, out=out.with_stem(f"{out.stem}-{number}"))
 
 
-def _taken(path: Path) -> bool:
+def _log_exists(path: Path) -> bool:
     return path.exists() or any(path.parent.glob(f"{path.stem}-[0-9][0-9][0-9].mcap"))
 
 
-def _wait(
-    agent: str, bus: Bus, boot: str, orders: Orders, stop: threading.Event, beat: Callable[[], None], text: str
+def _wait_for_start(
+    agent: str,
+    bus: Bus,
+    boot: str,
+    recording_commands: CommandSubscription,
+    stop: threading.Event,
+    beat: Callable[[], None],
+    text: str,
 ) -> None:
-    """Be seen, and record nothing, until asked to start or to end."""
+    """Publish the status, and record nothing, until a start command arrives or ``stop`` is set."""
     status = pb.AgentStatus(
         schema_version=SCHEMA_VERSION,
         agent=agent,
@@ -98,7 +104,7 @@ def _wait(
     rounds = 0
     try:
         with bus.announce(ROLE, agent, boot):
-            while not stop.is_set() and _START not in orders.take():
+            while not stop.is_set() and _START not in recording_commands.take():
                 if rounds % 10 == 0:
                     status.sequence += 1
                     publisher.put(status)

@@ -1,4 +1,4 @@
-"""Stopping a process in order."""
+"""Clean termination of a process on SIGTERM, SIGINT and SIGHUP."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from types import FrameType
 
 
 def stop_on_signals() -> threading.Event:
-    """An event that SIGTERM and SIGINT set; a second signal ends the process at once.
+    """An event that SIGTERM and SIGINT set; a second signal terminates the process immediately.
 
     Call it on the main thread.
     """
@@ -26,43 +26,43 @@ def stop_on_signals() -> threading.Event:
 
 
 class Interruption:
-    """Whether the process was told to end, and stretches in which that must wait."""
+    """A termination request, and sections of code in which it is deferred."""
 
     def __init__(self) -> None:
-        self._told, self._holding = False, False
+        self._requested, self._deferring = False, False
 
     def is_set(self) -> bool:
-        """Whether it was told to end."""
-        return self._told
+        """Whether termination was requested."""
+        return self._requested
 
-    def tell(self) -> None:
-        """Note it, and raise KeyboardInterrupt unless that must wait."""
-        self._told = True
-        if not self._holding:
+    def request(self) -> None:
+        """Record the request, and raise KeyboardInterrupt unless it is deferred."""
+        self._requested = True
+        if not self._deferring:
             raise KeyboardInterrupt
 
     @contextmanager
-    def held(self) -> Iterator[None]:
-        """Let a word to end wait until the block is through: a process begun in it would else be nobody's."""
-        self._holding = True
+    def deferred(self) -> Iterator[None]:
+        """Defer a request to the end of the block, so that a child process started in it is not orphaned."""
+        self._deferring = True
         try:
             yield
         finally:
-            self._holding = False
-        if self._told:
+            self._deferring = False
+        if self._requested:
             raise KeyboardInterrupt
 
 
 def interrupt_on_signals() -> Interruption:
-    """What SIGTERM, SIGHUP and SIGINT tell as they raise KeyboardInterrupt; whoever waits long looks at it.
+    """The interruption that SIGTERM, SIGHUP and SIGINT request as they raise KeyboardInterrupt; long waits poll it.
 
-    What is raised while an object is being deleted is lost, and with it the only word that the process should end.
+    Python discards an exception that is raised while an object is deleted, so the exception alone could be lost.
     """
-    told = Interruption()
+    interruption = Interruption()
 
     def handle(number: int, frame: FrameType | None) -> None:
-        told.tell()
+        interruption.request()
 
     for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
         signal.signal(number, handle)
-    return told
+    return interruption

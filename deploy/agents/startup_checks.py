@@ -1,4 +1,4 @@
-"""What every agent's process does around its agent: checks of its certificate, and its health over HTTP."""
+"""Start-up of every agent process: certificate checks, warnings on unprotected endpoints, and the health server."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Any
 
 from deploy.agents.health import Health, HealthServer
 from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig, RouterConfig
-from protocols.bus.settings import open_to_others
+from protocols.bus.settings import unprotected_listeners
 
 _ROLES: dict[type, str] = {CameraConfig: "camera", HubConfig: "hub", RecorderConfig: "record", RouterConfig: "router"}
 _RENEW_DAYS = 3.0
 
 
 def role_of(settings: Any) -> str:
-    """The role that an agent's configuration is of, as its certificate names it."""
+    """The role of an agent's configuration, as named in its certificate."""
     kind = type(settings)
     return _ROLES.get(kind, kind.__name__.removesuffix("Config").lower())
 
 
-def checked(settings: Any) -> None:
-    """Raise InputError where the certificate is not this agent's; warn of one that ends soon, and of open doors."""
+def check_startup(settings: Any) -> None:
+    """Raise InputError if the certificate is not this agent's; warn if it expires soon or a listener is unprotected."""
     tls = settings.bus.tls
     if tls is not None:
         from protocols.bus.security.tls import check_files, check_owner, days_left
@@ -31,12 +31,12 @@ def checked(settings: Any) -> None:
         left = days_left(tls.certificate)
         if left < _RENEW_DAYS:
             _warn(f"{tls.certificate} is valid for {left:.1f} days more; renew it with `syncline keys issue`")
-    for endpoint in open_to_others(settings.bus):
+    for endpoint in unprotected_listeners(settings.bus):
         _warn(f"{endpoint} lets everyone on the network in; see `syncline keys`")
 
 
 def serve_health(settings: Any, health: Health) -> AbstractContextManager[object]:
-    """The HTTP server that [health] asks for, or nothing."""
+    """The HTTP server that [health] configures, or a null context."""
     return nullcontext() if settings.health is None else HealthServer(settings.health, health)
 
 

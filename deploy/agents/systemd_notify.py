@@ -1,7 +1,7 @@
-"""Tells the service manager that data flows: systemd's notify protocol, and a file for a container's health check.
+"""Watchdog notification to the service manager: systemd's sd_notify protocol, and a file for container health checks.
 
-The agents call ``beat`` where a frame was taken or a round of messages was worked off, so that a process which is
-alive but does nothing any more is restarted. Without the environment that a service manager sets it is silent.
+The agents call ``beat`` after each frame or batch of messages, so that a process that is alive but no longer makes
+progress is restarted. Without the environment variables of a service manager nothing is sent.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from edge.devices.base import Device, DeviceInfo, Frame, Returning, Warm
+from edge.devices.base import Device, DeviceInfo, Frame, HasTemperature, Reconnecting
 
 ALIVE_FILE = "SYNCLINE_ALIVE_FILE"
-"""Environment variable: a file whose time of change says when data flowed last."""
+"""Environment variable: a file whose modification time is that of the last data flow."""
 _FILE_S = 1.0
 
 
 class Notifier:
-    """One process's line to its service manager.
+    """The connection of one process to its service manager.
 
-    address: of the datagram socket, ``@`` first for an abstract one; "" = none. watchdog_s: systemd's WatchdogSec;
-    0 = none asked for. alive: file to touch. now: a monotonic clock [s].
+    address: of the datagram socket, with a leading ``@`` for an abstract one; "" = none. watchdog_s: systemd's
+    WatchdogSec; 0 = no watchdog. alive: file to touch. now: a monotonic clock [s].
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class Notifier:
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self._address = "\0" + address[1:] if address.startswith("@") else address
-        # Often enough that one datagram that is lost costs nothing, and not once a frame.
+        # Four times per watchdog period, so that one lost datagram does no harm; not once per frame.
         self._every_s = min(watchdog_s / 4.0, 1.0) if watchdog_s > 0.0 else 1.0
         self._alive = alive
         self._now = now
@@ -47,9 +47,9 @@ class Notifier:
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] = os.environ) -> Notifier:
-        """What systemd, or a container's file, has asked of this very process."""
+        """The notifier that systemd or a container has configured for this process."""
         watchdog = environment.get("WATCHDOG_USEC", "")
-        # WATCHDOG_PID names whose watchdog it is: a child that inherited the environment is not meant.
+        # WATCHDOG_PID is the process that the watchdog is for: a child that inherited the environment is not meant.
         mine = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         file = environment.get(ALIVE_FILE, "")
         return cls(
@@ -59,9 +59,9 @@ class Notifier:
         )
 
     def beat(self, ending: bool = False) -> None:
-        """Data has flowed: READY=1 the first time, WATCHDOG=1 as often as is asked for.
+        """Report that data has flowed: READY=1 the first time, then WATCHDOG=1 at the configured interval.
 
-        ending: the end was ordered, and what is done now belongs to it: it may take a minute more.
+        ending: the process is shutting down and still working; the stop timeout is extended by a minute.
         """
         now = self._now()
         if not self._ready:
@@ -77,30 +77,30 @@ class Notifier:
                 self._alive.touch()
 
     def waiting(self, what: str) -> None:
-        """Not ready, for a reason outside this process: the start may take longer."""
+        """Report that the start waits for something outside this process; extends the start timeout."""
         now = self._now()
         if not self._ready and now >= self._next_waiting:
             self._next_waiting = now + 5.0
             self._send(f"STATUS=waiting for {' '.join(what.split())}\nEXTEND_TIMEOUT_USEC=20000000")
 
     def stopping(self) -> None:
-        """The end has begun, in order."""
+        """Report that a clean shutdown has begun."""
         self._send("STOPPING=1\nSTATUS=stopping")
 
     def _send(self, text: str) -> None:
         if not self._address:
             return
-        # A manager that is gone must not end a measurement.
+        # A service manager that has gone must not end a measurement.
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as line:
             line.setblocking(False)
             line.sendto(text.encode(), self._address)
 
 
-class Watched:
-    """A device that beats with every frame it gives: see ``edge.devices.base.Device``.
+class HeartbeatDevice:
+    """A device that sends a heartbeat with every frame: see ``edge.devices.base.Device``.
 
-    It beats also while it seeks a camera that was unplugged: that is told in the agent's status, and to start the
-    agent anew would not help, but forget what is known of its clock.
+    It also sends heartbeats while it waits for an unplugged camera to return: the agent's status reports that, and a
+    restart of the agent would not help, but would lose its clock model.
     """
 
     def __init__(self, device: Device, beat: Callable[[], None]) -> None:
@@ -117,28 +117,28 @@ class Watched:
         return self._device.ended
 
     @property
-    def away(self) -> bool:
-        """The device's; False of one that does not come back by itself."""
-        return isinstance(self._device, Returning) and self._device.away
+    def disconnected(self) -> bool:
+        """Whether the device is disconnected; False for one that does not reconnect."""
+        return isinstance(self._device, Reconnecting) and self._device.disconnected
 
     @property
     def reconnections(self) -> int:
         """The device's."""
-        return self._device.reconnections if isinstance(self._device, Returning) else 0
+        return self._device.reconnections if isinstance(self._device, Reconnecting) else 0
 
     @property
     def temperature(self) -> float | None:
-        """The device's; None of one that does not measure it."""
-        return self._device.temperature if isinstance(self._device, Warm) else None
+        """The device's temperature [°C]; None if it does not measure one."""
+        return self._device.temperature if isinstance(self._device, HasTemperature) else None
 
     def open(self) -> None:
         """Open the device."""
         self._device.open()
 
     def read(self, timeout_s: float) -> Frame | None:
-        """The next frame. The one before has been looked at and handed to the bus when this is called again."""
+        """The next frame. When this is called again, the previous one has been processed and published."""
         frame = self._device.read(timeout_s)
-        if frame is not None or self.away:
+        if frame is not None or self.disconnected:
             self._beat()
         return frame
 

@@ -1,4 +1,4 @@
-"""Puts the UAV agent together from its configuration: camera, link, controls, video, and the simulated aircraft."""
+"""Builds the UAV agent from its configuration: camera, MAVLink connection, guidance, video, and simulated aircraft."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from deploy.config.uav import FlightConfig, UavConfig
+from deploy.config.uav import SimulatedFlightConfig, UavConfig
 from edge.devices.base import Device
 from protocols.bus.base import Bus
 from protocols.core.errors import EXIT_DONE, InputError
@@ -24,65 +24,73 @@ if TYPE_CHECKING:
     from edge.devices.simulated.aircraft import SimulatedAircraft
     from edge.mavlink.link.connection import Link
     from edge.mavlink.roles.autopilot import Autopilot
-    from edge.mavlink.roles.camera import CameraComponent, Select, Stop, Stream
+    from edge.mavlink.roles.camera import CameraComponent, SelectTarget, StopTracking, VideoStream
     from edge.uav.tracker import Estimate, Image
-    from edge.uav.world.world import World
+    from edge.uav.world.flight_world import FlightWorld
 
-_HOVER_M = 62.0
-_GIMBAL_PITCH = math.radians(-62.0)
+_HOVER_HEIGHT_M = 62.0
+_GIMBAL_PITCH_RAD = math.radians(-62.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Simulation:
-    """The world of a simulated agent, and what flies in it."""
+class SimulatedFlight:
+    """The simulated world of a UAV agent, its aircraft and its autopilot."""
 
-    world: World
+    world: FlightWorld
     aircraft: SimulatedAircraft
     autopilot: Autopilot | None = None
 
 
 def start_uav(config: UavConfig, bus: Bus, stop: threading.Event, beat: Callable[[], None] | None = None) -> int:
-    """Run a UAV agent until it is stopped or its recording ends. beat: called with every frame."""
+    """Run a UAV agent until it is stopped or its recording ends. beat: called for every frame."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     import cv2
 
-    from deploy.agents.systemd_notify import Watched
-    from deploy.agents.uav_video import Shown, serve_video
-    from edge.agents.uav import Looking, UavAgent
+    from deploy.agents.systemd_notify import HeartbeatDevice
+    from deploy.agents.uav_video import OperatorVideo, serve_video
+    from edge.agents.uav import UavAgent, UavSettings
 
     cv2.setNumThreads(1)
     with ExitStack() as stack:
         device, lens, mounting = stack.enter_context(_camera(config))
-        device.open()  # also tells its size; opening it again does nothing
+        device.open()  # its image size is known only then; opening it again has no effect
         info = device.info
         lens = lens or info.intrinsics
         if config.model == "ground" and (lens is None or mounting is None):
-            # It works without, but blind to telemetry: say so once, where somebody looks.
+            # It works without them, but cannot use telemetry: reported once, at the start.
             print("syncline: without matrix and body_from_camera in rig the telemetry is not used", flush=True)
         size, fps = (info.width, info.height), info.fps or 30.0
         link = make_link(config)
-        shown = Shown()
-        stream: Stream | None = None
+        operator_video = OperatorVideo()
+        stream: VideoStream | None = None
         if config.video_out is not None:
-            stream = serve_video(config.video_out, size, fps, shown, stack)
-        # With frames and not with every round: a camera that was unplugged must trip the watchdog.
-        watched = device if beat is None else Watched(device, beat)
-        agent = make_agent(
-            config, watched, link, Looking(size, fps, lens, mounting, config.seed, config.model, _quality(config),
-                                           config.pictures_hz, config.picture_width),
-            stream=stream, shown=shown.take if stream is not None else None,
-        )  # fmt: skip
+            stream = serve_video(config.video_out, size, fps, operator_video, stack)
+        # One heartbeat per frame and not per cycle: a hanging camera must trip the watchdog.
+        heartbeat_device = device if beat is None else HeartbeatDevice(device, beat)
+        settings = UavSettings(
+            size,
+            fps,
+            lens,
+            mounting,
+            config.seed,
+            config.model,
+            _quality(config),
+            config.pictures_hz,
+            config.picture_width,
+        )
+        show = operator_video.update if stream is not None else None
+        agent = make_agent(config, heartbeat_device, link, settings, stream=stream, shown=show)
         assert isinstance(agent, UavAgent)
         agent.run(bus, stop)
     return EXIT_DONE
 
 
 def make_link(config: UavConfig) -> Link:
-    """The link that the configuration names, not yet open."""
+    """The configured MAVLink connection, not yet open."""
     from edge.mavlink.dialect import CAMERA
     from edge.mavlink.link.connection import Link
     from edge.mavlink.link.signing import Signing, read_key
-    from edge.mavlink.link.transport import parse
+    from edge.mavlink.link.transport import parse_url
     from edge.mavlink.roles import camera, telemetry
 
     settings = config.mavlink
@@ -91,10 +99,10 @@ def make_link(config: UavConfig) -> Link:
         state = settings.key_state or settings.key.with_name(f"{settings.key.name}.times.json")
         signing = Signing(read_key(settings.key), state)
     return Link(
-        parse(settings.url),
+        parse_url(settings.url),
         system=settings.system,
         component=CAMERA,
-        allowed=(*telemetry.KINDS, *camera.KINDS),
+        allowed=(*telemetry.MESSAGE_TYPES, *camera.MESSAGE_TYPES),
         signing=signing,
         vehicle=settings.vehicle,
     )
@@ -104,23 +112,23 @@ def make_agent(
     config: UavConfig,
     device: Device,
     link: Link,
-    looking: object,
+    settings: object,
     *,
-    stream: Stream | None = None,
+    stream: VideoStream | None = None,
     shown: Callable[[Image, Estimate | None, str], None] | None = None,
     now_ns: Callable[[], int] = time.monotonic_ns,
     boot_id: str | None = None,
 ) -> object:
-    """The agent around a device and a link. looking: a ``Looking``; now_ns: the host's monotonic clock."""
-    from edge.agents.uav import Looking, UavAgent
+    """The agent for a device and a link. settings: a ``UavSettings``; now_ns: the host's monotonic clock."""
+    from edge.agents.uav import UavAgent, UavSettings
     from edge.mavlink.roles.camera import CameraComponent
-    from edge.mavlink.roles.guidance import Control, Limits
+    from edge.mavlink.roles.guidance import Guidance, GuidanceLimits
     from edge.mavlink.roles.vehicle import Vehicle
 
-    assert isinstance(looking, Looking)
+    assert isinstance(settings, UavSettings)
     numbers = tuple(int(part) for part in VERSION.split(".")[:3])
     bounds = config.control
-    limits = Limits(
+    limits = GuidanceLimits(
         gimbal=bounds.gimbal,
         follow=bounds.follow,
         pitch=(math.radians(bounds.pitch_deg[0]), math.radians(bounds.pitch_deg[1])),
@@ -131,14 +139,14 @@ def make_agent(
         speed=bounds.speed,
     )
 
-    def component(obey: Callable[[Select | Stop], bool]) -> CameraComponent:
+    def component(on_command: Callable[[SelectTarget | StopTracking], bool]) -> CameraComponent:
         return CameraComponent(
             link,
-            looking.size,
-            looking.fps,
-            looking.lens,
+            settings.size,
+            settings.fps,
+            settings.lens,
             stream,
-            obey,
+            on_command,
             stations=frozenset(config.mavlink.stations),
             version=(numbers[0], numbers[1], numbers[2]),
         )
@@ -148,67 +156,69 @@ def make_agent(
         link,
         Vehicle(link, gimbal=config.mount == "gimbal", rate_hz=config.mavlink.rate_hz),
         component,
-        Control(link, limits),
+        Guidance(link, limits),
         config.id,
-        looking,
+        settings,
         shown=shown,
         now_ns=now_ns,
         boot_id=boot_id,
     )
 
 
-def simulation(flight: FlightConfig, size: tuple[int, int] = (640, 480)) -> Simulation:
-    """The world of a [simulated] table and its aircraft, at the world's time 0. Raises InputError."""
+def simulate_flight(flight: SimulatedFlightConfig, size: tuple[int, int] = (640, 480)) -> SimulatedFlight:
+    """The world and the aircraft of a [simulated] table, at world time 0. Raises InputError."""
     import numpy as np
 
     from edge.devices.simulated.aircraft import SimulatedAircraft
-    from edge.uav.world.patrol import patrol
+    from edge.uav.world.patrol import patrol_world
 
-    world = patrol(flight.seed, flight.seconds, size)
+    world = patrol_world(flight.seed, flight.seconds, size)
     if flight.flies == "path" and not flight.gimbal:
-        return Simulation(world, SimulatedAircraft(world.flight, seed=flight.seed))
+        return SimulatedFlight(world, SimulatedAircraft(world.flight, seed=flight.seed))
     ground, yaw = world.target.ground[0], float(world.target.course[0])
-    start = np.array([ground[0], ground[1], -_HOVER_M])
+    start = np.array([ground[0], ground[1], -_HOVER_HEIGHT_M])
     gimbal = pilot = None
     if flight.flies == "follow":
-        # As a pilot would, it flies above the car until it is told where that is.
+        # It flies above the car, as a pilot would, until the car's position is estimated.
         pilot = world.target_at
         if flight.gimbal:
             gimbal = (-0.5 * math.pi, yaw)
     else:
-        # Beside the way, so that the car is looked at from aside.
-        back = _HOVER_M / math.tan(-_GIMBAL_PITCH)
+        # Beside the path, so that the car is seen from the side.
+        back = _HOVER_HEIGHT_M / math.tan(-_GIMBAL_PITCH_RAD)
         start[:2] -= back * np.array([math.cos(yaw), math.sin(yaw)])
-        gimbal = (_GIMBAL_PITCH, yaw)
+        gimbal = (_GIMBAL_PITCH_RAD, yaw)
     camera = None if flight.gimbal else np.asarray(world.body_from_camera)
     aircraft = SimulatedAircraft(start=start, yaw=yaw, pilot=pilot, camera=camera, gimbal=gimbal, seed=flight.seed)
-    return Simulation(world, aircraft)
+    return SimulatedFlight(world, aircraft)
 
 
 @contextmanager
-def flying(flight: FlightConfig, site: Simulation, epoch_unix_s: float) -> Iterator[None]:
-    """The autopilot of a simulation, on its UDP port, in a thread of its own."""
+def running_autopilot(
+    flight: SimulatedFlightConfig, simulated_flight: SimulatedFlight, epoch_unix_s: float
+) -> Iterator[None]:
+    """Run the autopilot of a simulation on its UDP port in a separate thread."""
     from edge.devices.playback.playback_clock import RealTime
     from edge.mavlink.link.transport import Udp, Url
-    from edge.mavlink.roles.autopilot import Autopilot, Faults
+    from edge.mavlink.roles.autopilot import Autopilot, LinkFaults
 
     host, _, port = flight.autopilot.rpartition(":")
     try:
         transport = Udp(Url("udpin", host, int(port)), bound=True)
     except OSError as error:
         raise InputError(
-            f"the autopilot cannot wait at {flight.autopilot}: {error.strerror}", remedy="choose another port"
+            f"the autopilot cannot listen at {flight.autopilot}: {error.strerror}", remedy="choose another port"
         ) from None
-    faults = Faults(
+    faults = LinkFaults(
         flight.drop, flight.duplicate, flight.garble, flight.delay_s, flight.jitter_s, tuple(flight.reboot_at)
     )
-    autopilot = Autopilot(site.aircraft, transport, boot_s=flight.boot_s, faults=faults, seed=flight.seed)
-    pace, stop = RealTime(epoch_unix_s), threading.Event()
+    autopilot = Autopilot(simulated_flight.aircraft, transport, boot_s=flight.boot_s, faults=faults, seed=flight.seed)
+    clock, stop = RealTime(epoch_unix_s), threading.Event()
 
     def run() -> None:
         while not stop.is_set():
             transport.wait(0.005)
-            autopilot.step(pace.now())
+            autopilot.step(clock.now())
 
     thread = threading.Thread(target=run, name="autopilot", daemon=True)
     thread.start()
@@ -222,20 +232,22 @@ def flying(flight: FlightConfig, site: Simulation, epoch_unix_s: float) -> Itera
 
 @contextmanager
 def _camera(config: UavConfig) -> Iterator[tuple[Device, Intrinsics | None, Floats | None]]:
-    """The camera, its lens, and body_from_camera."""
+    """The camera, its intrinsics, and the rotation body_from_camera (3, 3)."""
     if config.driver == "simulated":
         import numpy as np
 
         from edge.devices.playback.playback_clock import RealTime
         from edge.devices.simulated.aircraft_camera import FlightCamera
 
-        flight = config.simulated or FlightConfig()
-        site = simulation(flight)
+        flight = config.simulated or SimulatedFlightConfig()
+        simulated_flight = simulate_flight(flight)
         epoch = time.time() if flight.start_unix_s is None else flight.start_unix_s
-        fixed = np.asarray(site.world.body_from_camera)
-        with flying(flight, site, epoch):
-            camera = FlightCamera(site.world, site.aircraft, RealTime(epoch), ahead_s=flight.camera_ahead_s)
-            yield camera, site.world.lens, gimbal_mounting() if config.mount == "gimbal" else fixed
+        fixed = np.asarray(simulated_flight.world.body_from_camera)
+        with running_autopilot(flight, simulated_flight, epoch):
+            camera = FlightCamera(
+                simulated_flight.world, simulated_flight.aircraft, RealTime(epoch), clock_offset_s=flight.camera_ahead_s
+            )
+            yield camera, simulated_flight.world.lens, gimbal_from_camera() if config.mount == "gimbal" else fixed
         return
     from deploy.agents.assembly import make_device
     from deploy.config.agents import CameraConfig
@@ -245,8 +257,8 @@ def _camera(config: UavConfig) -> Iterator[tuple[Device, Intrinsics | None, Floa
     yield make_device(settings, lens), lens, mounting
 
 
-def gimbal_mounting() -> Floats:
-    """body_from_camera of a camera that looks along its gimbal's x axis."""
+def gimbal_from_camera() -> Floats:
+    """The rotation gimbal_from_camera (3, 3) of a camera that looks along its gimbal's x axis."""
     from edge.devices.simulated.aircraft import GIMBAL_FROM_CAMERA
 
     return GIMBAL_FROM_CAMERA
@@ -254,7 +266,7 @@ def gimbal_mounting() -> Floats:
 
 def _rig_camera(config: UavConfig) -> tuple[Intrinsics | None, Floats | None]:
     if config.rig is None:
-        return None, gimbal_mounting() if config.mount == "gimbal" else None
+        return None, gimbal_from_camera() if config.mount == "gimbal" else None
     rig = read_rig(config.rig)
     camera = rig.cameras.get(config.id)
     if camera is None:
@@ -263,7 +275,7 @@ def _rig_camera(config: UavConfig) -> tuple[Intrinsics | None, Floats | None]:
         )
     mounting = camera.body_from_camera
     if mounting is None and config.mount == "gimbal":
-        mounting = gimbal_mounting()
+        mounting = gimbal_from_camera()
     return camera.intrinsics, mounting
 
 

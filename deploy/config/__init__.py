@@ -1,1 +1,1 @@
-"""Configuration files of the agents: structs and their reader."""
+"""Configuration files of the agents: schemas and the TOML reader."""

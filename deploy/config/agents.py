@@ -1,4 +1,4 @@
-"""What stands in an agent's configuration file, and how it is read, checked and printed."""
+"""Schemas of the agents' configuration files: common, camera, hub, recorder, router and view settings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from msgspec import Meta
 from deploy.config.file import Source, effective_toml, load
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import InputError
-from protocols.topics import valid_id
+from protocols.core.names import check_identifier, check_name
 
 __all__ = [
     "BusConfig",
@@ -22,7 +22,7 @@ __all__ = [
     "MarkerConfig",
     "MovingConfig",
     "OakConfig",
-    "PiConfig",
+    "PiCameraConfig",
     "RecorderConfig",
     "RouterConfig",
     "RtspConfig",
@@ -43,14 +43,14 @@ Byte = Annotated[int, Meta(ge=0, le=255)]
 Seed = Annotated[int, Meta(ge=0)]
 
 
-class _Strict(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An unknown key is an error: else a misspelt one would be a setting that silently does nothing."""
+class StrictConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of all tables. Unknown keys are errors: a misspelt setting would otherwise silently have no effect."""
 
 
-class HealthConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class HealthConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """[health]: /metrics, /livez and /readyz over HTTP at ``listen``, "address:port".
 
-    beyond_loopback: whether others than this machine may ask; nobody is asked for a password.
+    beyond_loopback: whether other machines may connect; there is no authentication.
     """
 
     listen: str = "127.0.0.1:9100"
@@ -66,24 +66,27 @@ class HealthConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             )
 
 
-class _Agent(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What every agent has. site: agents see only those of their own site. health: None = no HTTP."""
+class AgentConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of every agent. site: agents see only agents of the same site. health: None = no HTTP."""
 
     site: str = "local"
     bus: BusConfig = msgspec.field(default_factory=BusConfig)
     health: HealthConfig | None = None
 
     def __post_init__(self) -> None:
-        _check_id(self.site, "site")
-        _check_id(getattr(self, "id", "ok"), "id")
+        try:
+            check_identifier(self.site, "site")
+            check_name(getattr(self, "id", "ok"), "id")
+        except InputError as error:
+            raise ValueError(f"{error.what}; {error.remedy}") from None
         try:
             self.bus.endpoints()
         except InputError as error:
             raise ValueError(f"{error.what}; {error.remedy}") from None
 
 
-class RouterConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A router. bus: its mode is "router" without saying so; with `syncline keys`, access and [bus.tls] too."""
+class RouterConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The router. bus: its mode is always "router"; `syncline keys` adds access and [bus.tls]."""
 
     id: str = "router"
 
@@ -94,15 +97,15 @@ class RouterConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True
         super().__post_init__()
 
 
-class RecorderConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The recorder. out: the log to write; a folder gets a file named by the time of its start.
+class RecorderConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The recorder. out: the log to write; in a folder, the file is named by its start time.
 
-    part_s, part_mb: begin a new file, name-000.mcap, name-001.mcap, …, when the present one is so old or so large
-    [MB]; None = one file. min_free_mb, min_free_percent: recording ends, with a whole log, before less than this is
+    part_s, part_mb: start a new file, name-000.mcap, name-001.mcap, …, when the current one reaches this age or size
+    [MB]; None = one file. min_free_mb, min_free_percent: recording ends, with a complete log, before less than this is
     free on the disk.
-    foxglove: also write pictures, calibration, transforms, scene and annotations as Foxglove and rerun know them.
-    pictures_hz: at most so many small pictures of each camera are recorded a second, 8 kB each; 0 = none, and none are
-    asked of the cameras.
+    foxglove: also write images, calibration, transforms, scene and annotations in Foxglove's schemas, which rerun
+    reads too. pictures_hz: largest rate at which thumbnails of each camera are recorded, 8 kB each; 0 = none, and none
+    are requested from the cameras.
     """
 
     id: str = "recorder"
@@ -115,13 +118,13 @@ class RecorderConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     pictures_hz: Annotated[float, Meta(ge=0.0, le=30.0)] = 1.0
 
 
-class SimulatedConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[simulated]: a camera of a shipped world.
+class SimulatedConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[simulated]: a camera of a simulated scene.
 
-    cameras: how many the world has, which also decides where they stand. duration_s: None = endless.
-    start_unix_s: the Unix time of the world's true time 0; agents of one world must share it. None = the
-    machine's start of the day, which agents on one machine share without being told. camera: which of the world's
-    cameras this is; None = the one of the agent's id. width, fps: of all its pictures [px, Hz], instead of the world's.
+    cameras: number of cameras in the scene, which also determines their poses. duration_s: None = endless.
+    start_unix_s: the Unix time of true time 0 in the scene; agents of one scene must share it. None = the start of
+    the current day, which agents on one machine share without configuration. camera: which camera of the scene this
+    is; None = the one named like the agent's id. width, fps: of all its images [px, Hz], instead of the scene's.
     """
 
     scene: str = "marker"
@@ -134,13 +137,13 @@ class SimulatedConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=
     fps: Hertz | None = None
 
 
-class OakConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class OakConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """[oak]: one sensor of an OAK board, through depthai.
 
-    device: IP address, device id or USB path; "" = the only one there is. size: [w, h]. exposure_us, iso: fixed, so
-    that mid-exposure and brightness keep still. focus: lens position 0..255, fixed; None = a lens that cannot move.
-    nn: archive of a detection network (.tar.xz) that then runs on the board in place of a detector on the host. labels:
-    which of its classes are told; none = all. confidence: the least of a detection.
+    device: IP address, device id or USB path; "" = the only one connected. size: [w, h]. exposure_us, iso: fixed, so
+    that mid-exposure time and brightness stay constant. focus: lens position 0..255, fixed; None = a fixed-focus lens.
+    nn: archive of a detection network (.tar.xz) that then runs on the board instead of a detector on the host. labels:
+    which of its classes are published; none = all. confidence: smallest confidence of a published detection.
     """
 
     device: str = ""
@@ -159,8 +162,8 @@ class OakConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
             raise ValueError("labels are of a network; give its archive as nn")
 
 
-class VideoConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[video]: a file, a stream or a USB camera through OpenCV. fps: None = what the source says."""
+class VideoConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[video]: a file, a stream or a USB camera through OpenCV. fps: None = the rate that the source reports."""
 
     source: Source
     fps: Hertz | None = None
@@ -172,11 +175,12 @@ Microseconds = Annotated[int, Meta(ge=1, le=1_000_000)]
 Readout = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
-class UsbConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[usb]: a V4L2 camera with the kernel's stamps. What is absent stays as the camera is set.
+class UsbConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[usb]: a V4L2 camera with the kernel's time stamps. Settings that are absent are left as the camera has them.
 
-    device: /dev/video0, a stable name of udev's, or a number. size: [w, h]. exposure_us: fixed, so that mid-exposure
-    keeps still. gain: the camera's own units. readout_s: first to last row of a rolling shutter; 0 = not known.
+    device: /dev/video0, a stable udev name, or a number. size: [w, h]. exposure_us: fixed, so that the mid-exposure
+    time stays constant. gain: in the camera's own units. readout_s: rolling-shutter readout time from the first to
+    the last row; 0 = not known.
     """
 
     device: Source = Source("/dev/video0")
@@ -188,11 +192,11 @@ class UsbConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
     readout_s: Readout = 0.0
 
 
-class PiConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class PiCameraConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """[picamera2]: a camera on a Raspberry Pi's ribbon cable.
 
-    camera: its number. size: [w, h]. exposure_us, gain: fixed; without exposure_us the camera chooses. readout_s: first
-    to last row; None = the shortest frame that this mode of the sensor can take.
+    camera: its number. size: [w, h]. exposure_us, gain: fixed; without exposure_us, auto exposure. readout_s:
+    rolling-shutter readout time; None = the shortest frame duration of the sensor mode.
     """
 
     camera: Annotated[int, Meta(ge=0, le=15)] = 0
@@ -203,11 +207,11 @@ class PiConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
     readout_s: Readout | None = None
 
 
-class RtspConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class RtspConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """[rtsp]: a network camera: RTSP, or motion JPEG over HTTP.
 
-    url: rtsp://user:password@address/path or http://…. transport: tcp loses nothing, udp is a little faster. fps:
-    None = what the stream says.
+    url: rtsp://user:password@address/path or http://…. transport: tcp loses no packets, udp has a little less latency.
+    fps: None = the rate that the stream reports.
     """
 
     url: Annotated[str, Meta(pattern=r"^[a-z0-9]+://[^\s]+$", max_length=2048)]
@@ -215,11 +219,11 @@ class RtspConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True)
     fps: Hertz | None = None
 
 
-class LogConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[log]: the pictures of one camera in a recorded log.
+class LogConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[log]: the images of one camera in a recorded log.
 
-    file: the log, or the folder of its parts. camera: as the log names it; None = the agent's id. fast: as fast as they
-    are read; else by the times at which they were taken.
+    file: the log, or the folder of its parts. camera: its name in the log; None = the agent's id. fast: play as fast
+    as images can be read; otherwise at the rate at which they were taken.
     """
 
     file: Path
@@ -227,12 +231,12 @@ class LogConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
     fast: bool = False
 
 
-class MarkerConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[marker]: what the marker looks like; what is absent is taken from the picture.
+class MarkerConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[marker]: appearance of the marker; values that are absent are estimated from the image.
 
-    mode: "colour", one ball of a colour; "bright", an LED or a retro-reflector beside a lamp; "tag", AprilTags or
-    ArUco tags, each labelled by its number, as in tag7. colour: sRGB, 0..255, of a ball. threshold: grey level that a
-    bright marker exceeds. dictionary: family of the tags. min_size, max_size: diameter, of a tag its side [px].
+    mode: "colour", one ball of a uniform colour; "bright", an LED or a retro-reflector beside a lamp; "tag", AprilTags
+    or ArUco tags, each labelled by its number, as in tag7. colour: sRGB of the ball, 0..255. threshold: grey level that
+    a bright marker exceeds. dictionary: family of the tags. min_size, max_size: diameter, or side of a tag [px].
     """
 
     label: Annotated[str, Meta(min_length=1, max_length=64)] = "marker"
@@ -244,22 +248,22 @@ class MarkerConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     max_size: Pixels | None = None
 
 
-class MovingConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[moving]: how people and vehicles are told from what stands still.
+class MovingConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[moving]: background subtraction for people and vehicles.
 
-    background: the model of the background. camera: of vehicles, whether it stands or moves; people need one that
-    stands.
+    background: the background model. camera: for vehicles, whether the camera is fixed or moving; people need a fixed
+    one.
     """
 
     background: Literal["mog2", "knn"] = "mog2"
     camera: Literal["auto", "fixed", "moving"] = "auto"
 
 
-class CameraConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One camera agent. rig: a rig.toml to take this camera's intrinsics and known pose from.
+class CameraConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One camera agent. rig: a rig.toml with this camera's intrinsics and known pose.
 
-    pictures_hz: small pictures a second on the bus while a view or a recorder wants them; 0 = none, ever.
-    picture_width: of these [px].
+    pictures_hz: rate of thumbnails on the bus while a view or a recorder subscribes to them; 0 = never.
+    picture_width: width of the thumbnails [px].
     """
 
     id: str
@@ -271,7 +275,7 @@ class CameraConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True
     simulated: SimulatedConfig | None = None
     video: VideoConfig | None = None
     usb: UsbConfig | None = None
-    picamera2: PiConfig | None = None
+    picamera2: PiCameraConfig | None = None
     rtsp: RtspConfig | None = None
     oak: OakConfig | None = None
     log: LogConfig | None = None
@@ -288,14 +292,14 @@ class CameraConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True
             raise ValueError('driver = "log" needs a [log] table with file = "….mcap"')
 
 
-class HubConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The hub. rig: what is known of the rig; out: where calibrations are written.
+class HubConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The hub. rig: a rig.toml with what is known of the rig; out: folder in which calibrations are written.
 
-    window_s: how much of the past is solved together; interval_s: how often it is solved again. solve: false = this
-    hub seeks no timing itself. nodes: cameras whose pose nodes run here whoever else is there; the others are shared
-    out among all hubs. pose_nodes: false = none run here. leave_after_s: when a camera that has gone is forgotten.
-    known: a calibration.toml that is kept as it is: poses, lenses and clocks; nothing is solved then. track: whether
-    people, vehicles and markers without a name are followed.
+    window_s: length of the sliding window of observations that is solved; interval_s: time between solves. solve:
+    false = this hub does not estimate timing itself. nodes: cameras whose pose nodes always run on this hub; the others
+    are distributed among all hubs. pose_nodes: false = none run here. leave_after_s: time after which a camera that has
+    disappeared is removed. known: a calibration.toml whose poses, intrinsics and clocks are kept fixed; nothing is
+    solved then. track: whether people, vehicles and unlabelled markers are tracked.
     """
 
     id: str = "hub"
@@ -311,12 +315,5 @@ class HubConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
     track: bool = True
 
 
-class ViewConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=False):
-    """What a view takes from any agent's file: its site and how to reach the bus; the rest is that agent's own."""
-
-
-def _check_id(text: str, what: str) -> None:
-    try:
-        valid_id(text, what)
-    except InputError as error:
-        raise ValueError(f"{error.what}; {error.remedy}") from None
+class ViewConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=False):
+    """The part of any agent's file that a view uses: its site and the bus settings; all other keys are ignored."""

@@ -17,7 +17,7 @@ _Config = TypeVar("_Config", bound=msgspec.Struct)
 
 
 class Source(str):
-    """Where a video comes from: a file, a URL such as rtsp://…, or a camera's number or device file."""
+    """A video source: a file, a URL such as rtsp://…, or a camera's number or device file."""
 
     __slots__ = ()
 
@@ -30,8 +30,8 @@ _MISSING = re.compile(r"Object missing required field `(?P<key>[^`]*)`\Z")
 def load(path: Path | str, kind: type[_Config]) -> _Config:
     """Read a TOML file as ``kind``.
 
-    Relative paths in it are taken from the file's own folder. Raises InputError with file, line (as far
-    as it can be told), key and remedy.
+    Relative paths in it are resolved from the file's own folder. Raises InputError with file, line (if it can be
+    determined), key and remedy.
     """
     file = Path(path)
     try:
@@ -45,7 +45,9 @@ def load(path: Path | str, kind: type[_Config]) -> _Config:
     try:
         table = tomllib.loads(text)
     except (RecursionError, OverflowError):
-        raise InputError("nested or numbered beyond all measure", file=file, remedy="write a plain TOML file") from None
+        raise InputError(
+            "too deeply nested, or a number is out of range", file=file, remedy="write a plain TOML file"
+        ) from None
     except ValueError as error:
         raise _syntax_error(file, text, str(error)) from None
     bad = _not_finite(table, "")
@@ -59,7 +61,7 @@ def load(path: Path | str, kind: type[_Config]) -> _Config:
 
 
 def effective_toml(config: msgspec.Struct) -> str:
-    """The configuration with every default filled in, as TOML that ``load`` reads back to the same."""
+    """The configuration with every default filled in, as TOML from which ``load`` reads an equal configuration."""
     import tomli_w
 
     return tomli_w.dumps(_without_none(msgspec.to_builtins(config, enc_hook=str)))
@@ -106,7 +108,7 @@ def _syntax_error(file: Path, text: str, message: str) -> InputError:
 
 
 def _content_error(file: Path, text: str, kind: type[msgspec.Struct], message: str) -> InputError:
-    """One line from the validator's message, which ends in the path of what it speaks of."""
+    """A one-line error from the validator's message, which ends in the path of the value concerned."""
     path = ""
     place = _PLACE.search(message)
     if place:
@@ -123,7 +125,7 @@ def _content_error(file: Path, text: str, kind: type[msgspec.Struct], message: s
         remedy = f"add {missing['key']} = …"
         return InputError(f"{missing['key']} is missing{where}", file=file, line=_line(text, path), remedy=remedy)
     if not path:
-        # A struct's own check has no path, but begins with the key that it speaks of.
+        # The message of a struct's own check has no path, but begins with the key concerned.
         first = re.match(r"\w+", message)
         line = _line(text, first[0]) if first and first[0] in _keys(kind, "") else None
         return InputError(message, file=file, line=line, remedy="" if ";" in message else "correct it")
@@ -137,7 +139,7 @@ def _content_error(file: Path, text: str, kind: type[msgspec.Struct], message: s
 
 
 def _keys(kind: type[msgspec.Struct], path: str) -> list[str]:
-    """The keys that the table at a dotted path may have; none if it is no table."""
+    """The allowed keys of the table at a dotted path; none if it is not a table."""
     wanted = _type_of(kind, path)
     for option in (wanted, *get_args(wanted)):
         if isinstance(option, type) and issubclass(option, msgspec.Struct):
@@ -146,7 +148,7 @@ def _keys(kind: type[msgspec.Struct], path: str) -> list[str]:
 
 
 def _type_of(kind: type[msgspec.Struct], path: str) -> Any:
-    """The declared type of the value at a dotted path; None where there is none."""
+    """The declared type of the value at a dotted path; None if there is none."""
     wanted: Any = kind
     for name in path.split(".") if path else []:
         options = [item for item in (wanted, *get_args(wanted)) if isinstance(item, type)]
@@ -157,7 +159,7 @@ def _type_of(kind: type[msgspec.Struct], path: str) -> Any:
 
 
 def _line(text: str, path: str) -> int | None:
-    """The line of a dotted key, as far as a plain scan can tell; None if it is not found."""
+    """The line number of a dotted key, by a line-by-line scan; None if it is not found."""
     path = re.sub(r"\[[^\]]*\]", "", path)
     if not path:
         return None

@@ -1,4 +1,4 @@
-"""What stands in a UAV agent's configuration file."""
+"""Schema of the UAV agent's configuration file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from deploy.config.agents import OakConfig, Seconds, Seed, VideoConfig, _Agent, _check_id, _Strict
+from deploy.config.agents import AgentConfig, OakConfig, Seconds, Seed, StrictConfig, VideoConfig
 from protocols.core.errors import InputError
 
 Degrees = Annotated[float, Meta(ge=-180.0, le=180.0)]
@@ -16,14 +16,14 @@ SystemId = Annotated[int, Meta(ge=1, le=255)]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
-class MavlinkConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[mavlink]: the link to the autopilot.
+class MavlinkConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[mavlink]: the connection to the autopilot.
 
     url: "udpin:0.0.0.0:14550", "udpout:host:port", "tcp:host:port" or "serial:/dev/ttyAMA0:921600". vehicle: the only
-    system id that is heard; None = the first autopilot. system: what the camera calls itself; None = as its vehicle,
-    whose part it is. stations: system ids that may give orders; () = any. rate_hz: asked for of attitude and position.
-    key: file of the signing key, 32 bytes or 64 hexadecimal digits: then nothing unsigned is believed. key_state: file
-    of the last times of signing; None = beside the key.
+    system id whose messages are accepted; None = the first autopilot received. system: the camera's own system id;
+    None = that of its vehicle. stations: system ids that may send commands; () = any. rate_hz: requested rate of
+    attitude and position. key: file of the signing key, 32 bytes or 64 hexadecimal digits; with it, unsigned messages
+    are rejected. key_state: file of the last signing time stamps; None = beside the key.
     """
 
     url: str = "udpin:127.0.0.1:14550"
@@ -35,22 +35,23 @@ class MavlinkConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     key_state: Path | None = None
 
     def __post_init__(self) -> None:
-        from edge.mavlink.link.transport import parse
+        from edge.mavlink.link.transport import parse_url
 
         try:
-            parse(self.url)
+            parse_url(self.url)
         except InputError as error:
             raise ValueError(f"url: {error.what}; {error.remedy}") from None
         if self.key_state is not None and self.key is None:
             raise ValueError("key_state goes with key; add key, or remove it")
 
 
-class ControlConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[control]: what the agent may command. All of it is off unless it is switched on here.
+class ControlConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[control]: commands that the agent may send. All are off unless they are enabled here.
 
-    gimbal: turn it to the target (GIMBAL_MANAGER_SET_PITCHYAW). follow: send FOLLOW_TARGET. The rest are bounds: beyond
-    them nothing is sent. pitch_deg: lowest and highest; rate_deg_s: of the commanded angles. coast_s: longest without
-    seeing the target. std_m: of its place. range_m: from where it was chosen. speed: passed on [m/s].
+    gimbal: point the gimbal at the target (GIMBAL_MANAGER_SET_PITCHYAW). follow: send FOLLOW_TARGET. The other keys are
+    limits beyond which nothing is sent. pitch_deg: lowest and highest commanded pitch; rate_deg_s: largest rate of the
+    commanded angles. coast_s: longest time without a detection of the target. std_m: largest position std of the
+    target. range_m: largest distance from where it was selected. speed: largest speed that is sent [m/s].
     """
 
     gimbal: bool = False
@@ -67,13 +68,13 @@ class ControlConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             raise ValueError("pitch_deg is lowest, highest; correct it")
 
 
-class VideoOutConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[video_out]: the picture with the estimate on it.
+class VideoOutConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[video_out]: video stream of the frames with the estimate drawn on them.
 
-    stream: "rtsp" = H.264 as ground stations open it by themselves (needs the extra video), "mjpeg" = motion JPEG over
-    HTTP, for browsers. listen: "address:port". beyond_loopback: whether others than this machine may watch; nobody is
-    asked for a password. uri: what ground stations are told; None = rtsp://<listen>/overlay or
-    http://<listen>/stream.mjpg. quality: of the JPEGs. kbps: most of the H.264.
+    stream: "rtsp" = H.264, which ground stations open by themselves (needs the extra video), "mjpeg" = motion JPEG over
+    HTTP, for browsers. listen: "address:port". beyond_loopback: whether other machines may connect; there is no
+    authentication. uri: the address announced to ground stations; None = rtsp://<listen>/overlay or
+    http://<listen>/stream.mjpg. quality: of the JPEGs. kbps: largest bit rate of the H.264.
     """
 
     stream: Literal["mjpeg", "rtsp"] = "mjpeg"
@@ -92,28 +93,31 @@ class VideoOutConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=T
                 f"listen {self.listen!r} is open to the network; take 127.0.0.1, or set beyond_loopback = true"
             )
         if self.uri is None and host in ("0.0.0.0", "[::]"):
-            raise ValueError(f"listen {self.listen!r} is no address that can be called; add the uri that stations open")
+            raise ValueError(
+                f"listen {self.listen!r} is not an address that can be opened; add the uri that ground stations open"
+            )
         if self.uri is not None and not self.uri.startswith(("rtsp://", "http://", "https://")):
-            raise ValueError(f"uri {self.uri!r} is none that stations open; begin it with rtsp:// or http://")
+            raise ValueError(f"uri {self.uri!r} cannot be opened by ground stations; begin it with rtsp:// or http://")
 
 
-class ImagesConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[images]: pictures on the bus, so that a recorder keeps them and `replay --through uav` can be run.
+class ImagesConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[images]: full images on the bus, so that a recorder stores them and `replay --through uav` is possible.
 
-    The tracker then sees what was sent. quality: of the JPEGs.
+    The tracker then uses the compressed images that were sent. quality: of the JPEGs.
     """
 
     quality: Annotated[int, Meta(ge=30, le=100)] = 90
 
 
-class FlightConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SimulatedFlightConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """[simulated]: an aircraft over the simulated town, with its autopilot and camera, in the agent's process.
 
-    autopilot: where the autopilot waits for senders, "host:port"; the agent's url must be "udpout:" to it. seconds: of
-    the flight. flies: "path" = given, loses the car every 12 s; "follow" = hovers, and obeys FOLLOW_TARGET. gimbal: the
-    camera hangs on one. start_unix_s: Unix time of the world's time 0; None = when the agent starts. boot_s: how
-    long the autopilot is up by then. camera_ahead_s: the camera's clock against the world's. drop, duplicate, garble:
-    share of the autopilot's messages; delay_s, jitter_s: of their way. reboot_at: times at which it starts anew.
+    autopilot: where the autopilot listens, "host:port"; the agent's url must be "udpout:" to it. seconds: duration of
+    the flight. flies: "path" = a fixed path on which the car leaves the view every 12 s; "follow" = hovers, and obeys
+    FOLLOW_TARGET. gimbal: whether the camera is on a gimbal. start_unix_s: Unix time of world time 0; None = when the
+    agent starts. boot_s: autopilot uptime at world time 0. camera_ahead_s: offset of the camera's clock from world
+    time. drop, duplicate, garble: fractions of the autopilot's messages that are lost, duplicated and corrupted.
+    delay_s, jitter_s: of their transmission. reboot_at: world times at which the autopilot reboots [s].
     """
 
     autopilot: str = "127.0.0.1:14551"
@@ -137,18 +141,18 @@ class FlightConfig(_Strict, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise ValueError(f'autopilot {self.autopilot!r} is no address; write it like "127.0.0.1:14551"')
 
 
-class UavConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The UAV agent. rig: a rig.toml with this camera's matrix and body_from_camera, found by the agent's id.
+class UavConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The UAV agent. rig: a rig.toml with this camera's matrix and body_from_camera, looked up by the agent's id.
 
-    mount: "fixed" = on the airframe, "gimbal" = the attitude is the gimbal's, and body_from_camera is from its axes
-    (default: looks along its x axis). model, seed: of the tracker. pictures_hz, picture_width: small pictures a second
-    on the bus while a view or a recorder wants them, and their width [px]; 0 = none, ever.
+    mount: "fixed" = on the airframe, "gimbal" = the attitude is the gimbal's, and body_from_camera refers to the gimbal
+    axes (default: the camera looks along the x axis). model, seed: of the tracker. pictures_hz, picture_width: rate of
+    thumbnails on the bus while a view or a recorder subscribes to them, and their width [px]; 0 = never.
     """
 
     id: str
     rig: Path | None = None
     driver: Literal["simulated", "video", "oak"] = "simulated"
-    simulated: FlightConfig | None = None
+    simulated: SimulatedFlightConfig | None = None
     video: VideoConfig | None = None
     oak: OakConfig | None = None
     mount: Literal["fixed", "gimbal"] = "fixed"
@@ -163,12 +167,13 @@ class UavConfig(_Agent, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_id(self.id, "id")
         if self.driver == "video" and self.video is None:
             raise ValueError('driver = "video" needs a [video] table with source = "…"')
         if self.oak is not None and self.oak.nn is not None:
-            raise ValueError("oak.nn is for camera agents: this one follows by its own tracker; remove nn")
+            raise ValueError("oak.nn is for camera agents: a UAV agent uses its own tracker; remove nn")
         if self.control.gimbal and self.mount != "gimbal":
             raise ValueError('control.gimbal needs a camera on a gimbal; set mount = "gimbal", or switch it off')
-        if self.driver == "simulated" and (self.simulated or FlightConfig()).gimbal != (self.mount == "gimbal"):
+        if self.driver == "simulated" and (self.simulated or SimulatedFlightConfig()).gimbal != (
+            self.mount == "gimbal"
+        ):
             raise ValueError("mount and simulated.gimbal contradict each other; correct one")

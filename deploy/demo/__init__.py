@@ -1,1 +1,1 @@
-"""The demos: simulated rigs and flights as real processes."""
+"""The demos: simulated cameras and flights, run as separate agent processes."""

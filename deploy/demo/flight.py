@@ -1,4 +1,4 @@
-"""`demo --scene town`: UAV agent and recorder as processes; a ground station selects a car; then the truth."""
+"""`demo --scene town`: runs UAV agent and recorder, selects a car from a ground station, compares with ground truth."""
 
 from __future__ import annotations
 
@@ -18,8 +18,15 @@ import numpy as np
 import tomli_w
 
 from deploy.agents.signals import Interruption, interrupt_on_signals
-from deploy.config.uav import FlightConfig
-from deploy.demo.flight_outcome import LOG, REPORT, Outcome, as_json, compare, compare_geo
+from deploy.config.uav import SimulatedFlightConfig
+from deploy.demo.flight_outcome import (
+    LOG,
+    REPORT,
+    FlightOutcome,
+    as_json,
+    compare_geo_positions,
+    compare_log_with_world,
+)
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
@@ -29,20 +36,20 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.topics import TARGET
 
 if TYPE_CHECKING:
-    from edge.mavlink.roles.station import Station
-    from edge.uav.world.world import World
+    from edge.mavlink.roles.station import GroundStation
+    from edge.uav.world.flight_world import FlightWorld
 
 RESULT = "result.json"
 AGENT = "drone"
-_MINE = ("config", "logs", LOG, RESULT, REPORT)
-_STARTING_S, _SELECTING_S, _STOPPING_S = 60.0, 60.0, 40.0
-_SPARE_S = 150.0  # of the world's time beyond what is shown: for starting and selecting
+_OUTPUTS = ("config", "logs", LOG, RESULT, REPORT)
+_START_TIMEOUT_S, _SELECT_TIMEOUT_S, _STOP_TIMEOUT_S = 60.0, 60.0, 40.0
+_EXTRA_WORLD_S = 150.0  # world time beyond the shown duration, for starting and selecting
 _GEO = "CAMERA_TRACKING_GEO_STATUS"
 
 
 @dataclass(slots=True)
-class Progress:
-    """What is shown while it runs."""
+class FlightProgress:
+    """Progress of the running flight demo."""
 
     elapsed: float = 0.0
     line: str = "starting"
@@ -54,48 +61,52 @@ def run_town(
     out: Path,
     seconds: float,
     seed: int,
-    show: Callable[[Progress], None],
+    show: Callable[[FlightProgress], None],
     *,
     view_port: int | None = None,
-    viewed: Callable[[str], None] = lambda address: None,
-) -> Outcome:
-    """Fly, follow, compare. Raises Refused if an agent dies or does not come up, InputError for a bad --out.
+    on_view_address: Callable[[str], None] = lambda address: None,
+) -> FlightOutcome:
+    """Run the flight demo and compare. Raises Refused if an agent exits or does not start, InputError for a bad --out.
 
-    view_port: of a live view beside it; None = none, 0 = any free one. viewed: is told the address to open.
+    view_port: port of a live view; None = no view, 0 = any free port. on_view_address: called with its address.
     """
     from deploy.demo.flight_report import write_report
-    from edge.mavlink.roles.station import Station
-    from edge.uav.world.patrol import patrol
+    from edge.mavlink.roles.station import GroundStation
+    from edge.uav.world.patrol import patrol_world
 
     out = out.resolve()
     _clean(out)
     endpoint, port = free_endpoint(), _free_port()
-    progress = Progress()
+    progress = FlightProgress()
     show(progress)
     interrupted = interrupt_on_signals()
-    world = patrol(seed, seconds + _SPARE_S)
+    world = patrol_world(seed, seconds + _EXTRA_WORLD_S)
     epoch = time.time()
     processes = _Processes(out, _configs(out, endpoint, port, seconds, seed, epoch), interrupted)
     with Router(endpoint), open_bus("demo", BusConfig(mode="client", connect=(endpoint,)), timeout_s=10.0) as bus:
         targets = bus.subscribe(TARGET)
-        station = Station(f"udpout:127.0.0.1:{port}")
+        station = GroundStation(f"udpout:127.0.0.1:{port}")
         try:
             if view_port is not None:
-                viewed(processes.open_view(endpoint, view_port))
+                on_view_address(processes.open_view(endpoint, view_port))
             processes.start("recorder", "record")
             processes.start(AGENT, "uav")
             _wait_for_camera(station, processes, progress, show)
-            # A busy machine takes its time to start: the world goes on meanwhile.
+            # Starting may take long on a busy machine; world time continues meanwhile.
             _select(station, processes, world, epoch, progress, show)
             began = time.monotonic()
-            told_geo: list[tuple[float, float, float, float]] = []
+            reported_geo: list[tuple[float, float, float, float]] = []
             while (elapsed := time.monotonic() - began) < seconds:
-                heard = station.counts.get(_GEO, 0)
+                geo_count = station.counts.get(_GEO, 0)
                 station.poll(0.05)
                 if interrupted.is_set():
                     raise KeyboardInterrupt
-                if station.told is not None and station.told.geo is not None and station.counts.get(_GEO, 0) > heard:
-                    told_geo.append((time.time() - epoch, *station.told.geo))
+                if (
+                    station.report is not None
+                    and station.report.geo is not None
+                    and station.counts.get(_GEO, 0) > geo_count
+                ):
+                    reported_geo.append((time.time() - epoch, *station.report.geo))
                 for received in targets.drain():
                     assert isinstance(received.message, pb.TargetState)
                     progress.frames += 1
@@ -114,36 +125,40 @@ def run_town(
         finally:
             station.close()
             processes.kill()
-    near, median = compare_geo(told_geo, world)
-    outcome = replace(compare(out / LOG, world, FlightConfig().boot_s, statuses), geo_near=near, geo_median_m=median)
+    near, median = compare_geo_positions(reported_geo, world)
+    outcome = replace(
+        compare_log_with_world(out / LOG, world, SimulatedFlightConfig().boot_s, statuses),
+        geo_near=near,
+        geo_median_m=median,
+    )
     write_atomically(out / RESULT, as_json(outcome) + "\n")
     write_report(out / REPORT, out / LOG, outcome, world)
     return outcome
 
 
 def _wait_for_camera(
-    station: Station, processes: _Processes, progress: Progress, show: Callable[[Progress], None]
+    station: GroundStation, processes: _Processes, progress: FlightProgress, show: Callable[[FlightProgress], None]
 ) -> None:
-    deadline = time.monotonic() + _STARTING_S
+    deadline = time.monotonic() + _START_TIMEOUT_S
     while station.information is None:
         station.poll(0.1)
         processes.check()
         progress.line = "waiting for the camera's heartbeat" if not station.camera_seen else "asking what it can do"
         show(progress)
         if time.monotonic() > deadline:
-            raise Refused(f"the camera was not heard within {_STARTING_S:.0f} s; see {processes.folder}")
+            raise Refused(f"no heartbeat of the camera within {_START_TIMEOUT_S:.0f} s; see {processes.folder}")
 
 
 def _select(
-    station: Station,
+    station: GroundStation,
     processes: _Processes,
-    world: World,
+    world: FlightWorld,
     epoch: float,
-    progress: Progress,
-    show: Callable[[Progress], None],
+    progress: FlightProgress,
+    show: Callable[[FlightProgress], None],
 ) -> None:
-    """Draw the box round the car, as an operator would who sees it."""
-    deadline = time.monotonic() + _SELECTING_S
+    """Select the car with its true bounding box, as an operator would, once it is in view."""
+    deadline = time.monotonic() + _SELECT_TIMEOUT_S
     width, height = world.size
     while True:
         frame = round((time.time() - epoch) * world.fps)
@@ -166,26 +181,26 @@ def _select(
                 return
         station.poll(0.05)
         processes.check()
-        progress.line = "waiting until the car is in the picture"
+        progress.line = "waiting until the car is in view"
         show(progress)
         if time.monotonic() > deadline:
-            raise Refused(f"no selection was accepted within {_SELECTING_S:.0f} s; see {processes.folder}")
+            raise Refused(f"no selection was accepted within {_SELECT_TIMEOUT_S:.0f} s; see {processes.folder}")
 
 
-def _line(station: Station) -> str:
-    told = station.told
-    if told is None:
+def _line(station: GroundStation) -> str:
+    report = station.report
+    if report is None:
         return "no status yet"
-    text = told.state
-    if np.isfinite(told.box).all():
-        text += "  box " + " ".join(f"{value:.3f}" for value in told.box)
-    if told.geo is not None:
-        text += f"  {told.geo[0]:.6f} {told.geo[1]:.6f} +-{told.geo[2]:.1f} m"
+    text = report.state
+    if np.isfinite(report.box).all():
+        text += "  box " + " ".join(f"{value:.3f}" for value in report.box)
+    if report.geo is not None:
+        text += f"  {report.geo[0]:.6f} {report.geo[1]:.6f} +-{report.geo[2]:.1f} m"
     return text
 
 
 class _Processes:
-    """The agents, each from its configuration file."""
+    """The agent processes, each started with its configuration file."""
 
     def __init__(self, out: Path, configs: dict[str, Path], interrupted: Interruption) -> None:
         self.folder = out / "logs"
@@ -197,9 +212,9 @@ class _Processes:
         self._run(name, [role, str(self._configs[name])])
 
     def open_view(self, endpoint: str, port: int) -> str:
-        """Start the live view; the address to open."""
+        """Start the live view; returns its address."""
         self._run("view", ["view", "--connect", endpoint, "--site", "demo", "--port", str(port)])
-        deadline = time.monotonic() + _STARTING_S
+        deadline = time.monotonic() + _START_TIMEOUT_S
         while time.monotonic() < deadline and self._running["view"].poll() is None:
             for line in (self.folder / "view.txt").read_text(encoding="utf-8").splitlines():
                 if line.startswith("open http") and len(line.split()) > 1:
@@ -208,7 +223,7 @@ class _Processes:
         raise Refused(f"the view did not start: {self._last_line('view')}")
 
     def _run(self, name: str, words: list[str]) -> None:
-        with (self.folder / f"{name}.txt").open("wb") as log, self._interrupted.held():
+        with (self.folder / f"{name}.txt").open("wb") as log, self._interrupted.deferred():
             self._running[name] = subprocess.Popen(
                 [sys.executable, "-m", "deploy", *words],
                 stdout=log,
@@ -222,9 +237,9 @@ class _Processes:
         if process.poll() is None:
             process.send_signal(signal.SIGTERM)
         try:
-            status = process.wait(_STOPPING_S)
+            status = process.wait(_STOP_TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            raise Refused(f"{name} did not stop within {_STOPPING_S:.0f} s; see {self.folder}/{name}.txt") from None
+            raise Refused(f"{name} did not stop within {_STOP_TIMEOUT_S:.0f} s; see {self.folder}/{name}.txt") from None
         if status != 0:
             raise Refused(f"{name} ended with status {status}: {self._last_line(name)}")
 
@@ -241,11 +256,11 @@ class _Processes:
 
     def _last_line(self, name: str) -> str:
         lines = (self.folder / f"{name}.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return lines[-1] if lines else "it said nothing"
+        return lines[-1] if lines else "no output"
 
 
 def _configs(out: Path, endpoint: str, port: int, seconds: float, seed: int, epoch: float) -> dict[str, Path]:
-    """One configuration file an agent, as a user would write it."""
+    """Write one configuration file per agent, as a user would."""
     bus = {"mode": "client", "connect": [endpoint]}
     tables: dict[str, dict[str, Any]] = {
         "recorder": {"id": "recorder", "site": "demo", "out": str(out / LOG), "bus": bus},
@@ -257,7 +272,7 @@ def _configs(out: Path, endpoint: str, port: int, seconds: float, seed: int, epo
             "simulated": {
                 "autopilot": f"127.0.0.1:{port}",
                 "seed": seed,
-                "seconds": seconds + _SPARE_S,
+                "seconds": seconds + _EXTRA_WORLD_S,
                 "start_unix_s": epoch,
             },
             "mavlink": {"url": f"udpout:127.0.0.1:{port}"},
@@ -273,10 +288,10 @@ def _configs(out: Path, endpoint: str, port: int, seconds: float, seed: int, epo
 
 
 def _clean(out: Path) -> None:
-    """Make the folder, taking away only what an earlier demo wrote."""
+    """Create the folder, and remove only the files of an earlier demo."""
     check_folder(out)
     try:
-        for name in _MINE:
+        for name in _OUTPUTS:
             path = out / name
             if path.is_dir():
                 shutil.rmtree(path)

@@ -1,4 +1,4 @@
-"""The flight demo while it runs: on a terminal a bar that redraws, elsewhere a line now and then."""
+"""Progress display of the flight demo: a live bar on a terminal, otherwise periodic lines."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.live import Live
 
-    from deploy.demo.flight import Progress
+    from deploy.demo.flight import FlightProgress
 
-_EVERY_S = 2.0
+_PRINT_INTERVAL_S = 2.0
 
 
-class Display:
-    """Use as a context; entering gives what is to be told of the progress."""
+class FlightDisplay:
+    """Context manager that returns the function to call with the progress."""
 
     def __init__(self, seconds: float, *, quiet: bool) -> None:
         self._seconds, self._quiet = seconds, quiet
-        self._printed = -_EVERY_S
+        self._printed = -_PRINT_INTERVAL_S
         self._line = ""
         self._live: Live | None = None
 
-    def __enter__(self) -> Callable[[Progress], None]:
+    def __enter__(self) -> Callable[[FlightProgress], None]:
         if not self._quiet and sys.stdout.isatty():
             from rich.console import Console
             from rich.live import Live
@@ -36,14 +36,14 @@ class Display:
         if self._live is not None:
             self._live.__exit__(None, None, None)
 
-    def show(self, progress: Progress) -> None:
-        """Draw the state."""
+    def show(self, progress: FlightProgress) -> None:
+        """Display the current progress."""
         if self._quiet:
             return
         states = "  ".join(f"{name} {progress.states[name]}" for name in ("visible", "coasting", "lost"))
         if self._live is None:
             fresh = progress.elapsed == 0.0 and progress.line != self._line
-            if fresh or progress.elapsed - self._printed >= _EVERY_S:
+            if fresh or progress.elapsed - self._printed >= _PRINT_INTERVAL_S:
                 self._printed, self._line = progress.elapsed, progress.line
                 print(f"{progress.elapsed:5.1f} s  {progress.line}  [{states}]", flush=True)
             return
@@ -53,9 +53,9 @@ class Display:
 
         self._live.update(
             Group(
-                Text(f"following {progress.elapsed:4.0f} of {self._seconds:.0f} s"),
+                Text(f"tracking {progress.elapsed:4.0f} of {self._seconds:.0f} s"),
                 ProgressBar(total=self._seconds, completed=min(progress.elapsed, self._seconds), width=60),
-                Text(f"the camera says: {progress.line}"),
+                Text(f"camera status: {progress.line}"),
                 Text(f"frames: {states}"),
             )
         )

@@ -1,4 +1,4 @@
-"""What `demo --scene town` ends with: the car as recovered against the truth of the world it drove in."""
+"""Result of `demo --scene town`: tracking errors against the ground truth of the simulated world."""
 
 from __future__ import annotations
 
@@ -16,22 +16,24 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.topics import STATUS, TARGET
 
 if TYPE_CHECKING:
-    from edge.uav.world.world import World
+    from edge.uav.world.flight_world import FlightWorld
 
 LOG, REPORT = "demo.mcap", "report.html"
-_NEAR_PX = 20.0
-_GEO_NEAR_M = 5.0
+_MAX_IMAGE_ERROR_PX = 20.0
+_MIN_GEO_TOLERANCE_M = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """Recovered against true. Shares are of frames, 0 … 1, None where there were none of that kind.
+class FlightOutcome:
+    """Tracking errors against ground truth. Fractions are of frames, 0 … 1, None if there are no such frames.
 
-    in_frame, in_near: frames that show a part of the car, and those of them within 20 px. out_frames, out_length: that
-    show nothing of it, and within one car length. claims_out: says visible from the third frame out on. median_m: of
-    the place on the ground, in and out. offset_error_s: of the map between the vehicle's clock and the camera's.
-    geo_near: share of the CAMERA_TRACKING_GEO_STATUS that came within three times their accuracy, or 5 m, of where the
-    car was when they came; geo_median_m: how far off they were.
+    in_frames, in_near: number of frames that show a part of the car, and fraction of them with an error below 20 px.
+    out_frames, out_length: number of frames without the car, and fraction with an error below one car length.
+    claims_out: fraction of frames reported visible, from the third frame of an exit on. median_in_m, median_out_m:
+    median ground position error, in and out of view. offset_error_s: error of the estimated offset between the
+    vehicle's and the camera's clock. statuses: tracking status messages received. geo_near: fraction of the
+    CAMERA_TRACKING_GEO_STATUS messages that were within three times their accuracy, or 5 m, of the car's position at
+    arrival; geo_median_m: their median error.
     """
 
     frames: int
@@ -51,15 +53,17 @@ class Outcome:
 
     @property
     def good(self) -> bool:
-        """Whether the demo shows what it promises."""
+        """Whether all errors are within the limits of the demo."""
         enough = self.in_frames >= 15 and (self.in_near or 0.0) >= 0.8
         honest = self.claims_out is None or self.claims_out <= 0.1
-        told = self.geo_near is not None and self.geo_near >= 0.8
-        return enough and honest and told and (self.out_length is None or self.out_frames < 5 or self.out_length >= 0.5)
+        located = self.geo_near is not None and self.geo_near >= 0.8
+        return (
+            enough and honest and located and (self.out_length is None or self.out_frames < 5 or self.out_length >= 0.5)
+        )
 
 
-def compare(log: Path, world: World, boot_s: float, statuses: int = 0) -> Outcome:
-    """What a log's agent said of the target against the truth of its world."""
+def compare_log_with_world(log: Path, world: FlightWorld, boot_s: float, statuses: int = 0) -> FlightOutcome:
+    """Compare the target states in a log with the ground truth of its world. Raises Refused if there are none."""
     states: Counter[str] = Counter()
     rows: list[tuple[float, float, float, bool, float]] = []  # inside, error px, car length px, visible, error m
     offsets: list[float] = []
@@ -81,45 +85,47 @@ def compare(log: Path, world: World, boot_s: float, statuses: int = 0) -> Outcom
                 metres = float(np.hypot(message.ground[0] - truth.north, message.ground[1] - truth.east))
             rows.append((truth.inside, error, truth.length, message.state == "visible", metres))
     if not rows:
-        raise Refused("the agent never said anything of a target", warnings=(f"see {log.parent}/logs",))
+        raise Refused("the agent never reported a target", warnings=(f"see {log.parent}/logs",))
     table = np.array(rows, dtype=np.float64)
     inside, outside = table[:, 0] > 0.0, table[:, 0] == 0.0
     late = outside & np.r_[False, outside[:-1]] & np.r_[False, False, outside[:-2]]
-    return Outcome(
+    return FlightOutcome(
         frames=len(rows),
         in_frames=int(inside.sum()),
-        in_near=_share(table[inside, 1] < _NEAR_PX),
+        in_near=_share(table[inside, 1] < _MAX_IMAGE_ERROR_PX),
         out_frames=int(outside.sum()),
         out_length=_share(table[outside, 1] < table[outside, 2]),
         claims_out=_share(table[late, 3] > 0),
         states=dict(states),
         median_in_m=_median(table[inside, 4]),
         median_out_m=_median(table[outside, 4]),
-        # The last third: once it was found.
+        # The last third, after the offset estimate has converged.
         offset_error_s=_median(np.array(offsets[-max(len(offsets) // 3, 1) :])) if offsets else None,
         latency_p99_s=latency,
         statuses=statuses,
     )
 
 
-def compare_geo(told: list[tuple[float, float, float, float]], world: World) -> tuple[float | None, float | None]:
-    """Share of places that are near enough, and their median error [m]; None without any.
+def compare_geo_positions(
+    reported: list[tuple[float, float, float, float]], world: FlightWorld
+) -> tuple[float | None, float | None]:
+    """Fraction of positions within tolerance, and their median error [m]; None without any.
 
-    told: world time [s], latitude, longitude [degrees], accuracy [m].
+    reported: world time [s], latitude, longitude [degrees], accuracy [m].
     """
-    from edge.mavlink.roles.autopilot import ORIGIN
+    from edge.mavlink.roles.autopilot import DEFAULT_ORIGIN
 
     errors, accuracies = [], []
-    for moment, latitude, longitude, accuracy in told:
+    for moment, latitude, longitude, accuracy in reported:
         if 0.0 <= moment <= world.time(world.length - 1):
             place, _ = world.target_at(moment)
-            errors.append(float(np.hypot(*(ORIGIN.local(latitude, longitude, 0.0)[:2] - place))))
+            errors.append(float(np.hypot(*(DEFAULT_ORIGIN.to_ned(latitude, longitude, 0.0)[:2] - place))))
             accuracies.append(accuracy)
     table = np.array(errors)
-    return _share(table <= np.maximum(3.0 * np.array(accuracies), _GEO_NEAR_M)), _median(table)
+    return _share(table <= np.maximum(3.0 * np.array(accuracies), _MIN_GEO_TOLERANCE_M)), _median(table)
 
 
-def as_json(outcome: Outcome) -> str:
+def as_json(outcome: FlightOutcome) -> str:
     """The outcome as one JSON object."""
     import json
     from dataclasses import asdict
@@ -127,8 +133,8 @@ def as_json(outcome: Outcome) -> str:
     return json.dumps({**asdict(outcome), "good": outcome.good}, allow_nan=False)
 
 
-def as_rows(outcome: Outcome) -> list[tuple[str, str, str]]:
-    """What was measured, recovered, promised."""
+def as_rows(outcome: FlightOutcome) -> list[tuple[str, str, str]]:
+    """Rows of the table: quantity, estimate, limit."""
 
     def percent(share: float | None) -> str:
         return "-" if share is None else f"{100.0 * share:.1f} %"
@@ -139,11 +145,11 @@ def as_rows(outcome: Outcome) -> list[tuple[str, str, str]]:
     ground = f"{metres(outcome.median_in_m)} / {metres(outcome.median_out_m)}"
     geo = f"{percent(outcome.geo_near)}, median {metres(outcome.geo_median_m)}"
     rows = [
-        (f"in the picture ({outcome.in_frames} frames): within 20 px", percent(outcome.in_near), ">= 80 %"),
-        (f"out of it ({outcome.out_frames} frames): within a car length", percent(outcome.out_length), ">= 50 %"),
-        ("says visible while out", percent(outcome.claims_out), "<= 10 %"),
-        ("place on the ground, in / out (median)", ground, ""),
-        ("latitude, longitude as told over MAVLink: within 3 accuracies or 5 m", geo, ">= 80 %"),
+        (f"in view ({outcome.in_frames} frames): within 20 px", percent(outcome.in_near), ">= 80 %"),
+        (f"out of view ({outcome.out_frames} frames): within a car length", percent(outcome.out_length), ">= 50 %"),
+        ("reported visible while out of view", percent(outcome.claims_out), "<= 10 %"),
+        ("ground position error, in / out of view (median)", ground, ""),
+        ("latitude, longitude as reported over MAVLink: within 3 accuracies or 5 m", geo, ">= 80 %"),
     ]
     if outcome.offset_error_s is not None:
         rows.append(("vehicle clock against camera clock", f"{1e3 * outcome.offset_error_s:+.1f} ms off", ""))
@@ -153,20 +159,20 @@ def as_rows(outcome: Outcome) -> list[tuple[str, str, str]]:
     return [*rows, ("states", states, "")]
 
 
-def print_outcome(outcome: Outcome, out: Path) -> None:
-    """The table at the end."""
+def print_outcome(outcome: FlightOutcome, out: Path) -> None:
+    """Print the table of results and the output files."""
     from rich.table import Table
 
     from deploy.offline.outputs import wide_console
 
-    table = Table(title="the car as recovered against the truth")
-    for name in ("", "recovered", "promised"):
+    table = Table(title="estimated against true position of the car")
+    for name in ("", "estimated", "limit"):
         table.add_column(name)
     for row in as_rows(outcome):
         table.add_row(*row)
     console = wide_console()
     console.print(table)
-    console.print(f"{outcome.statuses} tracking statuses came over MAVLink", soft_wrap=True)
+    console.print(f"{outcome.statuses} tracking statuses received over MAVLink", soft_wrap=True)
     console.print(f"the log is {out / LOG}, the report {out / REPORT}", soft_wrap=True)
     console.print(f"replay it: syncline replay {out / LOG} --through uav --out again.mcap", soft_wrap=True)
 

@@ -1,4 +1,4 @@
-"""The demo's processes: one per camera, a hub and a recorder, over a loopback router, on simulated devices."""
+"""Processes of the marker demo: simulated cameras, a hub and a recorder, connected by a loopback router."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.topics import CALIBRATION, OBSERVATION
 
 LOG = "demo.mcap"
-_STARTING_S = 60.0
-_STOPPING_S = 40.0
-_MINE = ("config", "logs", LOG, "calibration.toml", "trajectory.csv", "tracks.csv", "result.json", "report.html")
+_START_TIMEOUT_S = 60.0
+_STOP_TIMEOUT_S = 40.0
+_OUTPUTS = ("config", "logs", LOG, "calibration.toml", "trajectory.csv", "tracks.csv", "result.json", "report.html")
 
 
 @dataclass(slots=True)
-class Live:
-    """What the demo shows while it runs."""
+class DemoProgress:
+    """Progress of the running demo. observations, detections: counts by camera. address: of the live view."""
 
     elapsed: float = 0.0
     observations: dict[str, int] = field(default_factory=dict)
@@ -45,9 +45,9 @@ class Live:
 
 @dataclass(frozen=True, slots=True)
 class DemoSettings:
-    """What to run. scene, seed, cameras: the world; seconds: how long it is filmed.
+    """Settings of the demo. scene, seed, cameras: the simulated scene; seconds: length of the recording.
 
-    view_port: of a live view beside it; None = none, 0 = any free one.
+    view_port: port of a live view; None = no view, 0 = any free port.
     """
 
     scene: str
@@ -58,11 +58,11 @@ class DemoSettings:
     view_port: int | None = None
 
 
-class Fleet:
+class DemoProcesses:
     """The demo's processes, started together and stopped in order."""
 
-    _world_s = 0.0
-    """True time of the world when its cameras are switched on [s]."""
+    _world_start_s = 0.0
+    """True time in the scene at which the cameras start [s]."""
 
     def __init__(self, settings: DemoSettings) -> None:
         self.settings = settings
@@ -73,24 +73,24 @@ class Fleet:
         self._endpoint = free_endpoint()
         self._site = "demo"
 
-    def run(self, show: Callable[[Live], None]) -> Live:
-        """Film for the set time; ``show`` is told twice a second. Raises Refused if an agent dies."""
+    def run(self, show: Callable[[DemoProgress], None]) -> DemoProgress:
+        """Record for the set time; ``show`` is called several times a second. Raises Refused if an agent exits."""
         self._clean()
         configs = self._write_configs()
-        live = Live()
-        # Ended from outside, the demo must take its agents along: as after Ctrl-C, ``finally`` does it.
+        live = DemoProgress()
+        # When the demo is terminated it must also stop its agents: as after Ctrl-C, ``finally`` does that.
         self._interrupted = interrupt_on_signals()
         bus_config = BusConfig(mode="client", connect=(self._endpoint,))
         with Router(self._endpoint), open_bus(self._site, bus_config, timeout_s=10.0) as bus:
             observations, calibrations = bus.subscribe(OBSERVATION), bus.subscribe(CALIBRATION)
             try:
-                # Recorder and hub first, so that they hear everything from the first frame.
+                # Recorder and hub first, so that they receive all messages from the first frame on.
                 for name in ("recorder", "hub", *self.names):
                     self._start(name, configs[name])
                 if self.settings.view_port is not None:
                     live.address = self._open_view(self.settings.view_port)
                     show(live)
-                look = self._watch(bus)
+                poll_topics = self._make_listener(bus)
                 began = time.monotonic()
                 first: float | None = None
                 while first is None or time.monotonic() - first < self.settings.seconds:
@@ -112,13 +112,13 @@ class Fleet:
                         if solved and live.first_calibration_s is None:
                             live.first_calibration_s = time.monotonic() - (first or began)
                         live.status = _status(received.message)
-                    look(live)
+                    poll_topics(live)
                     live.elapsed = 0.0 if first is None else time.monotonic() - first
                     self._check_alive()
-                    if first is None and time.monotonic() - began > _STARTING_S:
+                    if first is None and time.monotonic() - began > _START_TIMEOUT_S:
                         missing = [name for name in self.names if name not in live.observations]
                         raise Refused(
-                            f"no frame from {', '.join(missing)} within {_STARTING_S:.0f} s; see {self.out}/logs"
+                            f"no frame from {', '.join(missing)} within {_START_TIMEOUT_S:.0f} s; see {self.out}/logs"
                         )
                     show(live)
                 if self.settings.view_port is not None:
@@ -127,7 +127,7 @@ class Fleet:
                 show(live)
                 for name in self.names:
                     self._stop(name)
-                live.status = "last calibration with everything seen"
+                live.status = "final calibration with all observations"
                 show(live)
                 self._stop("hub")
                 self._stop("recorder")
@@ -138,15 +138,15 @@ class Fleet:
                         process.wait()
         return live
 
-    def _watch(self, bus: Bus) -> Callable[[Live], None]:
-        """What else a scene's demo wants to hear and show; called every round."""
+    def _make_listener(self, bus: Bus) -> Callable[[DemoProgress], None]:
+        """A function that polls further topics of a scene's demo; called in every cycle."""
         return lambda live: None
 
     def _clean(self) -> None:
-        """Make the folder, taking away only what an earlier demo wrote."""
+        """Create the folder, and remove only the files of an earlier demo."""
         check_folder(self.out)
         try:
-            for name in _MINE:
+            for name in _OUTPUTS:
                 path = self.out / name
                 if path.is_dir():
                     shutil.rmtree(path)
@@ -160,13 +160,13 @@ class Fleet:
             ) from None
 
     def _write_configs(self) -> dict[str, Path]:
-        """One configuration file an agent, as a user would write it."""
+        """Write one configuration file per agent, as a user would."""
         bus = {"mode": "client", "connect": [self._endpoint]}
         world = {
             "scene": self.settings.scene,
             "seed": self.settings.seed,
             "cameras": self.settings.cameras,
-            "start_unix_s": time.time() - self._world_s,
+            "start_unix_s": time.time() - self._world_start_s,
         }
         tables: dict[str, dict[str, object]] = {
             "recorder": {"id": "recorder", "site": self._site, "out": str(self.out / LOG), "bus": bus},
@@ -192,9 +192,9 @@ class Fleet:
         self._run(name, [role, str(config)])
 
     def _open_view(self, port: int) -> str:
-        """Start the live view; the address to open."""
+        """Start the live view; returns its address."""
         self._run("view", ["view", "--connect", self._endpoint, "--site", self._site, "--port", str(port)])
-        deadline = time.monotonic() + 3 * _STARTING_S
+        deadline = time.monotonic() + 3 * _START_TIMEOUT_S
         while time.monotonic() < deadline and self._processes["view"].poll() is None:
             for line in (self.out / "logs" / "view.txt").read_text(encoding="utf-8").splitlines():
                 if line.startswith("open http") and len(line.split()) > 1:
@@ -203,7 +203,7 @@ class Fleet:
         raise Refused(f"the view did not start: {self._last_line('view')}")
 
     def _run(self, name: str, arguments: list[str]) -> None:
-        with (self.out / "logs" / f"{name}.txt").open("wb") as log, self._interrupted.held():
+        with (self.out / "logs" / f"{name}.txt").open("wb") as log, self._interrupted.deferred():
             self._processes[name] = subprocess.Popen(
                 [sys.executable, "-m", "deploy", *arguments],
                 stdout=log,
@@ -217,10 +217,12 @@ class Fleet:
         if process.poll() is None:
             process.send_signal(signal.SIGTERM)
         try:
-            status = process.wait(_STOPPING_S)
+            status = process.wait(_STOP_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             process.kill()
-            raise Refused(f"{name} did not stop within {_STOPPING_S:.0f} s; see {self.out}/logs/{name}.txt") from None
+            raise Refused(
+                f"{name} did not stop within {_STOP_TIMEOUT_S:.0f} s; see {self.out}/logs/{name}.txt"
+            ) from None
         if status != 0:
             raise Refused(f"{name} ended with status {status}: {self._last_line(name)}")
 
@@ -231,7 +233,7 @@ class Fleet:
 
     def _last_line(self, name: str) -> str:
         lines = (self.out / "logs" / f"{name}.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return lines[-1] if lines else "it said nothing"
+        return lines[-1] if lines else "no output"
 
 
 def _status(message: pb.Calibration) -> str:

@@ -1,1 +1,1 @@
-"""Evaluation against ground truth."""
+"""Evaluation of calibrations and tracks against ground truth."""

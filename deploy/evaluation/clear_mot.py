@@ -1,4 +1,4 @@
-"""How well targets were followed, against the truth: CLEAR MOT and identity scores.
+"""Multi-target tracking metrics against ground truth: CLEAR MOT and identity scores.
 
 Bernardin and Stiefelhagen, "Evaluating multiple object tracking performance: the CLEAR MOT metrics" (2008), and Ristani
 et al., "Performance measures and a data set for multi-target, multi-camera tracking" (2016).
@@ -16,22 +16,22 @@ from protocols.geometry.types import Floats
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
-    """One instant. truth: places (t, d) of those who are there, by name. found: (n, d) of those told, by label."""
+class EvaluationFrame:
+    """One instant. truth: true positions (t, d), by truth_names. found: estimates (n, d), by estimate_labels."""
 
     truth_names: tuple[str, ...]
     truth: Floats
-    found_names: tuple[str, ...]
+    estimate_labels: tuple[str, ...]
     found: Floats
 
 
 @dataclass(frozen=True, slots=True)
-class Scores:
-    """Counts over instants, and what is made of them.
+class MotScores:
+    """Tracking scores: counts over all instants, and ratios of them.
 
-    mota: 1 - (misses + false + switches) / truths. idf1: identity F1. error, error_p95: mean distance of the matched in
-    the truth's unit, and what 95 % of them keep. switches: times a true target's label changed. fragments: times it was
-    lost and found. labels: how many were given.
+    mota: 1 - (misses + false + switches) / truths. idf1: identity F1. error, error_p95: mean and 95 % quantile of the
+    distance of matched pairs, in the unit of the truth. switches: label changes of true targets. fragments:
+    interruptions of tracks of true targets. labels: number of different labels.
     """
 
     mota: float
@@ -47,11 +47,11 @@ class Scores:
     labels: int
 
 
-def clear_mot(moments: Sequence[Moment], reach: float) -> Scores:
-    """Scores over instants. reach: the farthest that a found place may be from a true one.
+def clear_mot(moments: Sequence[EvaluationFrame], max_distance: float) -> MotScores:
+    """Scores over instants. max_distance: largest distance of a matched estimate from the true position.
 
-    As in the paper, a pair of the last instant stays while it is within reach; the rest is matched anew by least
-    distance.
+    As in the CLEAR MOT paper, a pair of the previous instant is kept while it is within max_distance; the others are
+    assigned by minimum total distance.
     """
     last: dict[str, str] = {}
     holds: dict[str, str] = {}
@@ -61,31 +61,31 @@ def clear_mot(moments: Sequence[Moment], reach: float) -> Scores:
     shared: dict[tuple[str, str], int] = {}
     found_count: dict[str, int] = {}
     for moment in moments:
-        t, n = len(moment.truth_names), len(moment.found_names)
+        t, n = len(moment.truth_names), len(moment.estimate_labels)
         truths += t
-        for label in moment.found_names:
+        for label in moment.estimate_labels:
             found_count[label] = found_count.get(label, 0) + 1
         distance = np.linalg.norm(moment.truth[:, None] - moment.found[None], axis=2) if t and n else np.zeros((t, n))
         pairs: dict[int, int] = {}
         for i, name in enumerate(moment.truth_names):
             held = holds.get(name)
-            if held is not None and held in moment.found_names:
-                j = moment.found_names.index(held)
-                if distance[i, j] < reach and j not in pairs.values():
+            if held is not None and held in moment.estimate_labels:
+                j = moment.estimate_labels.index(held)
+                if distance[i, j] < max_distance and j not in pairs.values():
                     pairs[i] = j
         rows = [i for i in range(t) if i not in pairs]
         columns = [j for j in range(n) if j not in pairs.values()]
         if rows and columns:
             part = distance[np.ix_(rows, columns)]
-            a, b = linear_sum_assignment(np.where(part < reach, part, 1e6))
-            pairs |= {rows[i]: columns[j] for i, j in zip(a, b, strict=True) if part[i, j] < reach}
+            a, b = linear_sum_assignment(np.where(part < max_distance, part, 1e6))
+            pairs |= {rows[i]: columns[j] for i, j in zip(a, b, strict=True) if part[i, j] < max_distance}
         holds = {}
         for i, name in enumerate(moment.truth_names):
             if i not in pairs:
                 misses += 1
                 was_tracked[name] = False
                 continue
-            label = moment.found_names[pairs[i]]
+            label = moment.estimate_labels[pairs[i]]
             if name in last and last[name] != label:
                 switches += 1
             if was_tracked.get(name) is False and name in last:
@@ -95,11 +95,11 @@ def clear_mot(moments: Sequence[Moment], reach: float) -> Scores:
         false += n - len(pairs)
         for i in range(t):
             for j in range(n):
-                if distance[i, j] < reach:
-                    key = (moment.truth_names[i], moment.found_names[j])
+                if distance[i, j] < max_distance:
+                    key = (moment.truth_names[i], moment.estimate_labels[j])
                     shared[key] = shared.get(key, 0) + 1
     matches = len(errors)
-    return Scores(
+    return MotScores(
         mota=1.0 - (misses + false + switches) / max(truths, 1),
         idf1=_idf1(shared, truths, sum(found_count.values())),
         error=float(np.mean(errors)) if errors else float("nan"),
@@ -115,7 +115,7 @@ def clear_mot(moments: Sequence[Moment], reach: float) -> Scores:
 
 
 def _idf1(shared: dict[tuple[str, str], int], truths: int, found: int) -> float:
-    """2 IDTP / (truths + found), names and labels matched one to one over the whole time."""
+    """IDF1 = 2 IDTP / (truths + found), with a one-to-one assignment of names to labels over all instants."""
     if not shared or not truths + found:
         return 0.0
     names, labels = sorted({name for name, _ in shared}), sorted({label for _, label in shared})

@@ -1,4 +1,4 @@
-"""Recovered against true, for runs on simulated worlds."""
+"""Errors of a calibration against ground truth, for runs on simulated scenes."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.session.calibration import read_calibration
 
-OFFSET_MS, ROTATION_DEG, DIRECTION_DEG = 1.0, 0.3, 0.5
-"""What the demo promises: larger errors are a failure."""
+MAX_OFFSET_ERROR_MS, MAX_ROTATION_ERROR_DEG, MAX_DIRECTION_ERROR_DEG = 1.0, 0.3, 0.5
+"""Largest errors of clock offset [ms], rotation and direction [deg] with which the demo counts as passed."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraError:
-    """One camera, recovered against true. Offsets in the middle of what it filmed [s], errors in ms and degrees.
+    """Errors of one camera. Offsets in the middle of its recording [s], errors in ms and degrees.
 
-    direction: of the camera's position as seen from the reference camera. nan for the reference itself.
+    direction_error_deg: of the direction from the reference camera to this one; 0 for the reference itself.
     """
 
     camera: str
@@ -35,24 +35,24 @@ class CameraError:
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
-    """All cameras; missing: cameras without an answer."""
+class CalibrationComparison:
+    """Errors of all cameras; missing: cameras without a calibration."""
 
     cameras: tuple[CameraError, ...]
     missing: tuple[str, ...]
 
     @property
     def good(self) -> bool:
-        """Whether every camera is within what the demo promises."""
+        """Whether every camera is within the limits of the demo."""
         return not self.missing and all(
-            abs(c.offset_error_ms) < OFFSET_MS
-            and c.rotation_error_deg < ROTATION_DEG
-            and c.direction_error_deg < DIRECTION_DEG
+            abs(c.offset_error_ms) < MAX_OFFSET_ERROR_MS
+            and c.rotation_error_deg < MAX_ROTATION_ERROR_DEG
+            and c.direction_error_deg < MAX_DIRECTION_ERROR_DEG
             for c in self.cameras
         )
 
     def as_json(self, first_calibration_s: float | None) -> str:
-        """One JSON object."""
+        """The comparison as one JSON object."""
         document = {
             "good": self.good,
             "missing": list(self.missing),
@@ -62,7 +62,7 @@ class Comparison:
         return json.dumps(document)
 
     def print(self, first_calibration_s: float | None, out: Path) -> None:
-        """A table for a person."""
+        """Print the comparison as a table."""
         from rich.table import Table
 
         from deploy.offline.outputs import wide_console
@@ -91,26 +91,26 @@ class Comparison:
             )
         console.print(table)
         for name in self.missing:
-            console.print(f"{name}: no answer")
-        promise = f"{OFFSET_MS:g} ms, {ROTATION_DEG:g}° and {DIRECTION_DEG:g}°"
-        console.print(f"every camera within {promise}" if self.good else f"NOT every camera is within {promise}")
+            console.print(f"{name}: not calibrated")
+        limits = f"{MAX_OFFSET_ERROR_MS:g} ms, {MAX_ROTATION_ERROR_DEG:g}° and {MAX_DIRECTION_ERROR_DEG:g}°"
+        console.print(f"every camera within {limits}" if self.good else f"NOT every camera is within {limits}")
         if first_calibration_s is not None:
             console.print(f"first calibration after {first_calibration_s:.1f} s")
         console.print(f"log {out / 'demo.mcap'}, report {out / 'report.html'}", soft_wrap=True)
         console.print(f"again from the log: syncline calibrate {out / 'demo.mcap'} --out again", soft_wrap=True)
 
 
-def compare_with_truth(folder: Path, scene_name: str, seed: int, cameras: int) -> Comparison:
-    """Compare the outputs in a folder with the world that the cameras filmed.
+def compare_with_truth(folder: Path, scene_name: str, seed: int, cameras: int) -> CalibrationComparison:
+    """Compare the outputs in a folder with the simulated scene.
 
-    Poses are compared in the reference camera's own frame, so that no alignment can hide an error.
+    Poses are compared in the reference camera's frame, without a similarity alignment that could hide errors.
     """
-    scene = scenes.get(scene_name, seed, cameras)
+    scene = scenes.get_marker_scene(scene_name, seed, cameras)
     rig, solved = read_calibration(folder / "calibration.toml")
     reference = str(rig.metadata.get("reference", next(iter(solved))))
     base, base_truth = solved[reference].pose, scene.camera(reference).pose
     seen = np.loadtxt(folder / "trajectory.csv", delimiter=",", skiprows=1, usecols=0, ndmin=1)
-    # The offset alone extrapolates the rate to the clock's epoch; what matters is the map while filming.
+    # The time offset extrapolates the clock rate to the clock's epoch; the time map is compared during the recording.
     now = ReferenceTime(float(np.median(seen)))
     out = []
     for camera in scene.cameras:
@@ -135,11 +135,11 @@ def compare_with_truth(folder: Path, scene_name: str, seed: int, cameras: int) -
                 else _direction(found.pose, base, truth, base_truth),
             )
         )
-    return Comparison(tuple(out), tuple(c.name for c in scene.cameras if c.name not in solved))
+    return CalibrationComparison(tuple(out), tuple(c.name for c in scene.cameras if c.name not in solved))
 
 
 def _direction(found: Pose, base: Pose, truth: Pose, base_truth: Pose) -> float:
-    """Angle [deg] between recovered and true direction from the reference camera, in that camera's axes."""
+    """Angle [deg] between estimated and true direction from the reference camera, in that camera's frame."""
     a = base.rotation @ (found.position - base.position)
     b = base_truth.rotation @ (truth.position - base_truth.position)
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))

@@ -1,4 +1,4 @@
-"""A track against the truth: what `track --csv-truth` prints."""
+"""Scores of a single-target image track against ground truth, for `track --csv-truth`."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.offline.track import Tracked
-from edge.uav.tracker import State
+from deploy.offline.track import TrackedFrame
+from edge.uav.tracker import TrackState
 from protocols.core.errors import InputError
 from protocols.geometry.types import Bools, Floats
 
 NEAR_PX = 20.0
-_FOUND_FRAMES = 5
+_REACQUIRED_FRAMES = 5
 _SEARCH_FRAMES = 60
-_SETTLE_FRAMES = 2  # of an exit, in which the target may still be called visible
+_EXIT_GRACE_FRAMES = 2  # frames after an exit in which the target may still be reported visible
 
 
 def read_truth(file: Path) -> dict[int, dict[str, float]]:
-    """Rows by frame of a CSV with frame,x,y (the target's centre) and, if there, width,height,inside,visible.
+    """Rows by frame of a CSV with frame,x,y (the target's centre) and optionally width,height,inside,visible.
 
-    inside: share of the target in the picture; visible: share that is seen. Raises InputError.
+    inside: fraction of the target within the image; visible: fraction that is visible. Raises InputError.
     """
     try:
         text = file.read_text(encoding="utf-8-sig")
@@ -53,46 +53,53 @@ def read_truth(file: Path) -> dict[int, dict[str, float]]:
     return rows
 
 
-def score(rows: Sequence[Tracked], truth: dict[int, dict[str, float]], size: tuple[int, int]) -> dict[str, float | int]:
-    """Shares (0 to 1) and counts, those of which there is no frame left out.
+def score(
+    rows: Sequence[TrackedFrame], truth: dict[int, dict[str, float]], size: tuple[int, int]
+) -> dict[str, float | int]:
+    """Scores as fractions (0 to 1) and counts; scores without any frame are omitted.
 
     in_frame_20px; out_20px, out_one_length; visible_while_out (from the third frame of an exit); visible_while_in;
-    exits, reacquired, frames_to_reacquire (mean). size: (width, height) of the picture [px].
+    exits, reacquired, frames_to_reacquire (mean). size: (width, height) of the image [px].
     """
     known = [row for row in rows if row.frame in truth and math.isfinite(truth[row.frame]["x"])]
     if not known:
         raise InputError("the truth has none of the tracked frames", remedy="give the truth of this video")
-    facts = [truth[row.frame] for row in known]
+    true_rows = [truth[row.frame] for row in known]
     error = np.array(
         [
-            math.hypot(row.estimate.x - fact["x"], row.estimate.y - fact["y"])
-            for row, fact in zip(known, facts, strict=True)
+            math.hypot(row.estimate.x - true_row["x"], row.estimate.y - true_row["y"])
+            for row, true_row in zip(known, true_rows, strict=True)
         ]
     )
     error = np.where(np.isfinite(error), error, np.inf)
-    length = np.array([np.nanmax([fact["width"], fact["height"], 0.0]) for fact in facts])
+    length = np.array([np.nanmax([true_row["width"], true_row["height"], 0.0]) for true_row in true_rows])
     length = np.where(length > 0, length, np.nanmax([known[0].estimate.width, known[0].estimate.height]))
-    inside = np.array([_inside(fact, size) for fact in facts])
-    seen = np.array([fact["visible"] if math.isfinite(fact["visible"]) else _inside(fact, size) for fact in facts])
-    claimed = np.array([row.estimate.state is State.VISIBLE for row in known])
+    inside = np.array([_fraction_in_image(true_row, size) for true_row in true_rows])
+    seen = np.array(
+        [
+            true_row["visible"] if math.isfinite(true_row["visible"]) else _fraction_in_image(true_row, size)
+            for true_row in true_rows
+        ]
+    )
+    reported_visible = np.array([row.estimate.state is TrackState.VISIBLE for row in known])
     out, half = inside <= 0.0, seen >= 0.5
-    settled = out.copy()
-    for back in range(1, _SETTLE_FRAMES + 1):
-        settled[back:] &= out[:-back]
-        settled[:back] = False
+    established_exit = out.copy()
+    for back in range(1, _EXIT_GRACE_FRAMES + 1):
+        established_exit[back:] &= out[:-back]
+        established_exit[:back] = False
     scores: dict[str, float | int] = {"frames": len(known)}
     shares = (
         ("in_frame_20px", error <= NEAR_PX, half),
         ("out_20px", error <= NEAR_PX, out),
         ("out_one_length", error <= length, out),
-        ("visible_while_out", claimed, settled),
-        ("visible_while_in", claimed, half),
+        ("visible_while_out", reported_visible, established_exit),
+        ("visible_while_in", reported_visible, half),
     )
     for name, good, where in shares:
         if where.any():
             scores[name] = float(good[where].mean())
     ends = (int(last) for last in np.flatnonzero(out[:-1] & ~out[1:]))
-    waits = [wait for last in ends if (wait := _frames_to_find(last, half, error)) is not None]
+    waits = [wait for last in ends if (wait := _frames_to_reacquire(last, half, error)) is not None]
     if waits:
         found = [wait for wait in waits if math.isfinite(wait)]
         scores |= {"exits": len(waits), "reacquired": len(found)}
@@ -101,19 +108,22 @@ def score(rows: Sequence[Tracked], truth: dict[int, dict[str, float]], size: tup
     return scores
 
 
-def _frames_to_find(last_out: int, half: Bools, error: Floats) -> float | None:
-    """Frames from half visible to five running within 20 px; inf if never within 60; None if never half visible."""
+def _frames_to_reacquire(last_out: int, half: Bools, error: Floats) -> float | None:
+    """Frames from half visible to the first of five consecutive frames within 20 px.
+
+    inf if that is not reached within 60 frames; None if the target is never half visible again.
+    """
     again = np.flatnonzero(half[last_out:])
     if not len(again):
         return None
     begin = last_out + int(again[0])
-    for frame in range(begin, min(begin + _SEARCH_FRAMES, len(error) - _FOUND_FRAMES + 1)):
-        if (error[frame : frame + _FOUND_FRAMES] <= NEAR_PX).all():
+    for frame in range(begin, min(begin + _SEARCH_FRAMES, len(error) - _REACQUIRED_FRAMES + 1)):
+        if (error[frame : frame + _REACQUIRED_FRAMES] <= NEAR_PX).all():
             return float(frame - begin)
     return math.inf
 
 
-def _inside(fact: dict[str, float], size: tuple[int, int]) -> float:
-    if math.isfinite(fact["inside"]):
-        return fact["inside"]
-    return float(0.0 <= fact["x"] <= size[0] - 1 and 0.0 <= fact["y"] <= size[1] - 1)
+def _fraction_in_image(true_row: dict[str, float], size: tuple[int, int]) -> float:
+    if math.isfinite(true_row["inside"]):
+        return true_row["inside"]
+    return float(0.0 <= true_row["x"] <= size[0] - 1 and 0.0 <= true_row["y"] <= size[1] - 1)

@@ -1,1 +1,1 @@
-"""What is done with logs: replay, summaries, comparison, export to rerun."""
+"""Tools for recorded logs: replay, summary, comparison, export to rerun."""

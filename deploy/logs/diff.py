@@ -1,4 +1,4 @@
-"""Two logs side by side: count, order, and every field beyond its tolerance."""
+"""Comparison of two logs: message counts, order, and every field that differs by more than its tolerance."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 
 from protocols.core.errors import InputError
-from protocols.log.read.reader import Logged, LogReader
+from protocols.log.read.reader import LogMessage, LogReader
 from protocols.topics import TOPICS
 from protocols.validation.codec import message_class
 
@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class FieldDifference:
-    """One field of one kind of message. largest: the greatest |a - b| in the field's unit, inf where one has none.
+    """Differences of one field of one message type.
 
-    first: the message that differs first, and both values there.
+    count: messages that differ. largest: the largest |a - b| in the field's unit, inf for values that are not numbers.
+    first: the first message that differs, with both values.
     """
 
     field: str
@@ -35,7 +36,7 @@ class FieldDifference:
     first: str = ""
 
     def add(self, where: str, a: object, b: object, by: float) -> None:
-        """One more message of which this field differs."""
+        """Count one more message in which this field differs; by: |a - b|."""
         if not self.count:
             self.first = f"{where}: {a} against {b}"
         self.count += 1
@@ -43,10 +44,11 @@ class FieldDifference:
 
 
 @dataclass(slots=True)
-class Comparison:
-    """missing, extra: messages by key that only the first, only the second log has. order: why it differs, or "".
+class LogComparison:
+    """Result of a comparison of two logs.
 
-    compared: messages in both; damage: what is wrong with either file.
+    missing, extra: number of messages by key that only the first or only the second log has. order: where the order
+    first differs, or "". compared: messages in both; damage: descriptions of damage in either file.
     """
 
     first: str
@@ -85,15 +87,15 @@ def parse_tolerances(texts: list[str]) -> dict[str, float]:
     return tolerances
 
 
-def compare_logs(first: Path, second: Path, tolerances: Mapping[str, float], topics: list[str] | None) -> Comparison:
-    """Compare two logs message by message. tolerances: greatest |a - b| by ``topic.field``, in that field's unit.
+def compare_logs(first: Path, second: Path, tolerances: Mapping[str, float], topics: list[str] | None) -> LogComparison:
+    """Compare two logs message by message. tolerances: largest |a - b| by ``topic.field``, in that field's unit.
 
-    Messages are told apart by key, boot id and sequence number (by their place where they have none); log times
-    are not compared. Raises InputError.
+    Messages are identified by key, boot id and sequence number (by their index if they have none); log times are not
+    compared. Raises InputError.
     """
     readers = [LogReader(first), LogReader(second)]
     sides = [_identified(reader.messages(topics)) for reader in readers]
-    result = Comparison(str(first), str(second))
+    result = LogComparison(str(first), str(second))
     a, b = sides
     result.missing = dict(Counter(identity[0] for identity in a if identity not in b))
     result.extra = dict(Counter(identity[0] for identity in b if identity not in a))
@@ -105,11 +107,11 @@ def compare_logs(first: Path, second: Path, tolerances: Mapping[str, float], top
             continue
         result.compared += 1
         where = f"{identity[0]} {identity[2]}"
-        told: set[str] = set()
+        reported: set[str] = set()
         for name, left, right, by in _differences(logged.message, other.message, logged.topic.name):
             tolerance = tolerances.get(name, 0.0)
-            if by > tolerance and name not in told:
-                told.add(name)
+            if by > tolerance and name not in reported:
+                reported.add(name)
                 found.setdefault(name, FieldDifference(name, tolerance)).add(where, left, right, by)
             elif by > tolerance:
                 found[name].largest = max(found[name].largest, by)
@@ -118,7 +120,7 @@ def compare_logs(first: Path, second: Path, tolerances: Mapping[str, float], top
     return result
 
 
-def as_table(comparison: Comparison) -> RenderableType:
+def as_table(comparison: LogComparison) -> RenderableType:
     """The comparison as a rich renderable."""
     from rich.console import Group
     from rich.markup import escape
@@ -135,13 +137,13 @@ def as_table(comparison: Comparison) -> RenderableType:
             largest = f"{entry.largest:.3g}" if math.isfinite(entry.largest) else "-"
             table.add_row(entry.field, str(entry.count), largest, f"{entry.tolerance:g}", escape(entry.first))
         lines.append(table)
-    verdict = "equal" if comparison.equal else "different"
-    lines.append(f"{verdict}: {comparison.compared} messages compared")
+    outcome = "equal" if comparison.equal else "different"
+    lines.append(f"{outcome}: {comparison.compared} messages compared")
     return Group(*lines)
 
 
-def as_json(comparison: Comparison) -> dict[str, Any]:
-    """The comparison for machines; a difference that is no number is null."""
+def as_json(comparison: LogComparison) -> dict[str, Any]:
+    """The comparison as a JSON object; a difference that is not a number is null."""
     return {
         "equal": comparison.equal,
         "compared": comparison.compared,
@@ -162,9 +164,9 @@ def as_json(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def _identified(messages: Iterator[Logged]) -> dict[tuple[str, str, int, int], Logged]:
-    """By (key, boot, sequence or place, how often that came before), in file order."""
-    found: dict[tuple[str, str, int, int], Logged] = {}
+def _identified(messages: Iterator[LogMessage]) -> dict[tuple[str, str, int, int], LogMessage]:
+    """Messages by (key, boot id, sequence number or index, number of earlier duplicates), in file order."""
+    found: dict[tuple[str, str, int, int], LogMessage] = {}
     places: Counter[str] = Counter()
     times: Counter[tuple[str, str, int]] = Counter()
     for logged in messages:
@@ -179,7 +181,7 @@ def _identified(messages: Iterator[Logged]) -> dict[tuple[str, str, int, int], L
 
 
 def _order(a: list[tuple[str, str, int, int]], b: list[tuple[str, str, int, int]]) -> str:
-    """Where the order of the messages that both have differs first."""
+    """Where the order of the common messages first differs."""
     for place, (left, right) in enumerate(zip(a, b, strict=True)):
         if left != right:
             return f"differs from message {place} on: {left[0]} {left[2]} against {right[0]} {right[2]}"
@@ -187,7 +189,7 @@ def _order(a: list[tuple[str, str, int, int]], b: list[tuple[str, str, int, int]
 
 
 def _differences(a: Message, b: Message, prefix: str) -> Iterator[tuple[str, object, object, float]]:
-    """(field, value in a, value in b, |a - b|) of every field that is not equal; inf for what is no number."""
+    """(field, value in a, value in b, |a - b|) of every field that differs; inf for values that are not numbers."""
     for entry in a.DESCRIPTOR.fields:
         left, right = getattr(a, entry.name), getattr(b, entry.name)
         name = f"{prefix}.{entry.name}"
@@ -224,7 +226,7 @@ def _distance(left: Any, right: Any) -> float:
 
 
 def _field_names(descriptor: Any) -> Iterator[str]:
-    """Every field that holds numbers, with those inside it as ``outer.inner``."""
+    """Names of all numeric fields, nested ones as ``outer.inner``."""
     for entry in descriptor.fields:
         if entry.message_type is None:
             if entry.cpp_type not in (FieldDescriptor.CPPTYPE_STRING, FieldDescriptor.CPPTYPE_BOOL):

@@ -1,4 +1,4 @@
-"""What a log holds, for a person and for a machine."""
+"""Summary of a log's contents, as data and as a table."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class TopicDescription:
-    """One key of the log. topic and agent are empty for a channel that is not of the catalogue.
+    """One key of the log. topic and agent are empty for a channel that is not in the catalogue.
 
-    rate_hz: messages a second between its first and its last, 0 for fewer than two. first_s, last_s:
-    from the log's beginning.
+    rate_hz: mean message rate between the first and the last message, 0 for fewer than two. first_s, last_s: times of
+    these, since the start of the log.
     """
 
     key: str
@@ -35,7 +35,7 @@ class TopicDescription:
 
 @dataclass(frozen=True, slots=True)
 class CameraDescription:
-    """One boot of one camera. missing: observations that its sequence numbers say are not in the log."""
+    """One boot of one camera. missing: observations absent from the log, according to the sequence numbers."""
 
     camera: str
     boot_id: str
@@ -46,7 +46,7 @@ class CameraDescription:
 
 @dataclass(frozen=True, slots=True)
 class AttachmentDescription:
-    """One stored file."""
+    """One attached file. bytes: its size."""
 
     name: str
     media_type: str
@@ -55,7 +55,7 @@ class AttachmentDescription:
 
 @dataclass(frozen=True, slots=True)
 class LogDescription:
-    """A log. begin_ns: Unix time of its first message; damage: "" or what is wrong with the file."""
+    """Summary of a log. begin_ns: Unix time of the first message; damage: "" or a description of the damage."""
 
     path: str
     bytes: int
@@ -82,7 +82,7 @@ class _Boot:
 
 
 def describe_log(path: Path | str) -> LogDescription:
-    """Read a whole log and summarise it. Raises InputError for a file that is none."""
+    """Read a whole log and summarise it. Raises InputError for a file that is not a log."""
     reader = LogReader(path)
     summary = reader.summary()
     boots: dict[tuple[str, str], _Boot] = {}

@@ -1,4 +1,4 @@
-"""A log straight into an estimator, without bus, processes or wall clock: equal bytes every time."""
+"""Deterministic replay of a log through the hub's estimator, without bus, processes or wall clock."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def replay_through_hub(
     agent: str = "hub",
     calibration: Path | None = None,
 ) -> int:
-    """What a hub publishes when it hears a log, as a log; returns how many messages.
+    """Write the messages that a hub publishes for the input of a log to a new log; returns their number.
 
-    calibration: a calibration.toml to track with instead of solving. The hub's clock is the log's: it solves after the
-    same messages on every machine. ``out`` is whole or not there. Raises InputError.
+    calibration: a calibration.toml to track with instead of calibrating. The hub runs on log time, so it solves after
+    the same messages on every machine and the output is identical. ``out`` is written atomically. Raises InputError.
     """
     reader = LogReader(log)
     if out.exists():

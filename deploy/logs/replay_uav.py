@@ -1,4 +1,4 @@
-"""A recorded flight straight into the UAV agent's estimator, without camera, link or clock: equal bytes every time."""
+"""Deterministic replay of a recorded flight through the UAV agent's estimator, without camera, link or wall clock."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ import numpy as np
 
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
-from protocols.log.read.reader import Logged, LogReader
+from protocols.log.read.reader import LogMessage, LogReader
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import FLIGHT_IMAGE, ROAD_MAP, TARGET, TARGET_CLOUD, TARGET_COMMAND, TELEMETRY, UAV_INFO
 
 if TYPE_CHECKING:
-    from edge.uav.estimator import Follower
+    from edge.uav.estimator import TargetEstimator
 
 _INPUTS = (FLIGHT_IMAGE, TELEMETRY, TARGET_COMMAND)
 _OUTPUTS = {topic.message: topic for topic in (TARGET, TARGET_CLOUD, ROAD_MAP)}
-_AHEAD = 256  # inputs that may be recorded out of order
+_MAX_REORDERED = 256  # inputs that may be recorded out of order
 
 
 def replay_through_uav(log: Path, out: Path) -> tuple[int, int]:
-    """What a UAV agent publishes when it hears a log, as a log; returns how many messages, and how many inputs lack.
+    """Write the messages that a UAV agent publishes for the input of a log to a new log.
 
-    With none missing it is what the agent said when the log was recorded. Every agent and boot in it is replayed.
-    ``out`` is whole or not there. Raises InputError.
+    Returns the number of messages and of missing inputs; with none missing, the output equals what the agent published
+    during the recording. Every agent and boot in the log is replayed. ``out`` is written atomically. Raises InputError.
     """
     import cv2
 
@@ -38,8 +38,8 @@ def replay_through_uav(log: Path, out: Path) -> tuple[int, int]:
         raise InputError("exists already", file=out, remedy="choose another --out, or move it away")
     infos = _infos(reader)
     temporary = out.with_name(f".{out.name}.{os.getpid()}")
-    followers: dict[tuple[str, str], Follower] = {}
-    nexts: dict[tuple[str, str], int] = {}
+    estimators: dict[tuple[str, str], TargetEstimator] = {}
+    next_order: dict[tuple[str, str], int] = {}
     count = missing = 0
     try:
         with LogWriter(temporary, {"replay": {"through": "uav"}}) as writer:
@@ -51,16 +51,16 @@ def replay_through_uav(log: Path, out: Path) -> tuple[int, int]:
                     raise InputError(
                         f"no uav_info of {message.agent}", file=log, remedy="record from the agent's start on"
                     )
-                if name not in followers:
-                    followers[name] = _follower(info)
-                    nexts[name] = 0
-                missing += message.order - nexts[name]
-                nexts[name] = message.order + 1
-                for answer in followers[name].handle(message):
-                    topic = _OUTPUTS[answer.DESCRIPTOR.name]
-                    writer.write(topic, message.agent, logged.site, answer, logged.log_time_ns)
+                if name not in estimators:
+                    estimators[name] = _estimator(info)
+                    next_order[name] = 0
+                missing += message.order - next_order[name]
+                next_order[name] = message.order + 1
+                for output in estimators[name].handle(message):
+                    topic = _OUTPUTS[output.DESCRIPTOR.name]
+                    writer.write(topic, message.agent, logged.site, output, logged.log_time_ns)
                     count += 1
-            if not followers:
+            if not estimators:
                 raise InputError(
                     "no flight in this log", file=log, remedy="record a UAV agent with [images] in its configuration"
                 )
@@ -79,8 +79,8 @@ def _infos(reader: LogReader) -> dict[tuple[str, str], pb.UavInfo]:
     return infos
 
 
-def _follower(info: pb.UavInfo) -> Follower:
-    from edge.uav.estimator import Follower
+def _estimator(info: pb.UavInfo) -> TargetEstimator:
+    from edge.uav.estimator import TargetEstimator
 
     lens = None
     if info.matrix:
@@ -88,7 +88,7 @@ def _follower(info: pb.UavInfo) -> Follower:
         distortions = np.array(info.distortions) if info.distortions else np.zeros(5)
         lens = Intrinsics(info.width, info.height, matrix, distortions, info.fisheye)
     mounting = np.array(info.body_from_camera).reshape(3, 3) if info.body_from_camera else None
-    return Follower(
+    return TargetEstimator(
         info.agent,
         info.boot_id,
         (info.width, info.height),
@@ -100,21 +100,21 @@ def _follower(info: pb.UavInfo) -> Follower:
     )
 
 
-def _in_order(reader: LogReader) -> Iterator[Logged]:
-    """Inputs in the order in which the agent took them; topics may overtake each other on the bus."""
-    waiting: dict[tuple[str, str], dict[int, Logged]] = {}
-    nexts: dict[tuple[str, str], int] = {}
+def _in_order(reader: LogReader) -> Iterator[LogMessage]:
+    """Inputs in the order in which the agent processed them; the bus may reorder messages of different topics."""
+    waiting: dict[tuple[str, str], dict[int, LogMessage]] = {}
+    next_order: dict[tuple[str, str], int] = {}
     for logged in reader.messages(list(_INPUTS)):
         message: Any = logged.message
         name = (message.agent, message.boot_id)
         held = waiting.setdefault(name, {})
         held[message.order] = logged
-        due = nexts.setdefault(name, 0)
-        while due in held or len(held) > _AHEAD:
+        due = next_order.setdefault(name, 0)
+        while due in held or len(held) > _MAX_REORDERED:
             due = due if due in held else min(held)
             yield held.pop(due)
             due += 1
-        nexts[name] = due
+        next_order[name] = due
     for held in waiting.values():
         for order in sorted(held):
             yield held[order]

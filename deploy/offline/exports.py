@@ -1,4 +1,4 @@
-"""Results in the formats of other tools: which format takes what, in which units, as which files."""
+"""Export of calibrations, trajectories and logs to the formats of other tools."""
 
 from __future__ import annotations
 
@@ -6,23 +6,26 @@ from pathlib import Path
 
 from protocols.core.errors import InputError
 from protocols.formats import colmap, toml_rigs, trc, yaml_rigs
-from protocols.formats.cameras import Written, in_units
+from protocols.formats.cameras import ExportedFiles, convert_units
 from protocols.session.calibration import read_calibration
 
 IN_FOLDERS = ("opencv", "colmap")
-"""Formats of several files: --out is a folder."""
+"""Formats with several files, for which --out is a folder."""
 
 
 def calibration_files(source: Path, to: str, out: Path) -> tuple[dict[Path, str], tuple[str, ...]]:
-    """The files of a calibration in the format ``to``, and what that cannot hold. Raises InputError, Refused."""
+    """The files of a calibration in the format ``to``, and warnings on what it cannot represent.
+
+    Raises InputError, Refused.
+    """
     rig, cameras = read_calibration(source)
     scale = str(rig.metadata.get("scale", "metric"))
-    if to in toml_rigs.UNITS_OF:
+    if to in toml_rigs.PROJECT_UNITS:
         written = toml_rigs.write(to, cameras, rig.units, scale, out.name)
     elif to == "kalibr":
-        metric, warnings = in_units(cameras, rig.units, "m", scale)
+        metric, warnings = convert_units(cameras, rig.units, "m", scale)
         written = yaml_rigs.write_kalibr(metric, out.name)
-        written = Written(written.files, warnings + written.warnings)
+        written = ExportedFiles(written.files, warnings + written.warnings)
     elif to == "opencv":
         written = yaml_rigs.write_opencv(cameras, rig.units)
     else:
@@ -31,14 +34,14 @@ def calibration_files(source: Path, to: str, out: Path) -> tuple[dict[Path, str]
     return {folder / name: text for name, text in written.files.items()}, written.warnings
 
 
-def path_files(source: Path, out: Path, units: str) -> dict[Path, str]:
-    """A path as TRC. Raises InputError."""
+def trajectory_files(source: Path, out: Path, units: str) -> dict[Path, str]:
+    """The files of a trajectory in the TRC format. Raises InputError."""
     return {out: trc.trc_text(source, out.name, units)}
 
 
 def export_log(log: Path, out: Path) -> tuple[int, int, tuple[str, ...]]:
-    """A log as a session folder; returns cameras, observations, warnings. Raises InputError."""
-    from deploy.offline.imports import log_to_session
+    """Write a log as a session folder; returns numbers of cameras and observations, and warnings. Raises InputError."""
+    from deploy.offline.imports import rig_tables_of_log
     from protocols.log.read.session import session_from_log
     from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
 
@@ -46,6 +49,6 @@ def export_log(log: Path, out: Path) -> tuple[int, int, tuple[str, ...]]:
         if (out / name).exists():
             raise InputError(f"a {name} is there already", file=out, remedy="choose another --out")
     rig, observations, warnings = session_from_log(log)
-    write_rig(out / RIG_FILE, log_to_session(rig))
+    write_rig(out / RIG_FILE, rig_tables_of_log(rig))
     write_observations(out / OBSERVATIONS_FILE, observations)
     return len(rig.cameras), len(observations), warnings

@@ -1,7 +1,8 @@
-"""Other tools' files into a session: what a file is, told by its content, and what comes of it."""
+"""Import of other tools' calibrations and tracks: format detection and conversion; sessions to and from logs."""
 
 from __future__ import annotations
 
+import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,25 +16,25 @@ from protocols.formats.cameras import ForeignRig, rig_tables
 from protocols.geometry.types import Floats, Ints
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
 from protocols.session.observations import Observations
-from protocols.session.rig import Rig, camera_of_table, read_toml
+from protocols.session.rig import Rig, parse_camera_table, read_toml
 
 CALIBRATIONS = ("aniposelib", "caliscope", "pose2sim", "freemocap", "opencv", "kalibr", "colmap")
 POINTS = ("caliscope-points", "deeplabcut", "mvus")
 FORMATS = (*CALIBRATIONS, *POINTS, "session")
 _YAML = (".yml", ".yaml")
-_REMEDY = f"say what it is with --format: {', '.join(FORMATS)}"
+_REMEDY = f"give the format with --format: {', '.join(FORMATS)}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Source:
-    """What was given: its format and its files (of a session or a COLMAP model the folder)."""
+class ImportSource:
+    """Files to import and their format; for a session or a COLMAP model the files are one folder."""
 
     kind: str
     files: list[Path]
 
 
-def recognise(sources: list[Path], wanted: str | None) -> Source:
-    """The format of files or of one folder, by content, or as ``wanted`` says. Raises InputError."""
+def detect_source(sources: list[Path], wanted: str | None) -> ImportSource:
+    """Detect the format of files or of one folder from the content, unless ``wanted`` gives it. Raises InputError."""
     for path in sources:
         if not path.exists():
             raise InputError("this file does not exist", file=path, remedy="check the path")
@@ -41,9 +42,9 @@ def recognise(sources: list[Path], wanted: str | None) -> Source:
     if len(sources) == 1 and sources[0].is_dir():
         folder = sources[0]
         if wanted == "session" or (wanted is None and (folder / RIG_FILE).exists()):
-            return Source("session", [folder])
+            return ImportSource("session", [folder])
         if wanted == "colmap" or (wanted is None and (folder / colmap.IMAGES).exists()):
-            return Source("colmap", [folder])
+            return ImportSource("colmap", [folder])
         kinds = (".csv", ".txt", *_YAML, ".toml")
         files = sorted(path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in kinds)
         if not files:
@@ -53,19 +54,19 @@ def recognise(sources: list[Path], wanted: str | None) -> Source:
     if wanted in ("session", "colmap"):
         raise InputError(f"a {wanted} is a folder", file=files[0], remedy="give the folder")
     if wanted is not None:
-        return Source(wanted, files)
+        return ImportSource(wanted, files)
     found = {path: _kind_of(path) for path in files}
     unknown = next((path for path, kind in found.items() if kind is None), None)
     if unknown is not None:
-        raise InputError("nothing that is known here", file=unknown, line=1, remedy=_REMEDY)
+        raise InputError("unknown format", file=unknown, line=1, remedy=_REMEDY)
     kinds_found = sorted({str(kind) for kind in found.values()})
     if len(kinds_found) > 1:
         raise InputError(f"files of different kinds ({', '.join(kinds_found)})", remedy="import each kind by itself")
-    return Source(kinds_found[0], files)
+    return ImportSource(kinds_found[0], files)
 
 
-def read_calibration_of(source: Source) -> ForeignRig:
-    """A calibration of another project. Raises InputError."""
+def read_foreign_calibration(source: ImportSource) -> ForeignRig:
+    """Read a calibration of another tool. Raises InputError."""
     if source.kind == "opencv":
         return yaml_rigs.read_opencv(source.files)
     if len(source.files) > 1:
@@ -79,16 +80,16 @@ def read_calibration_of(source: Source) -> ForeignRig:
 
 
 def calibration_text(rig: ForeignRig, units: str | None, file: Path) -> str:
-    """rig.toml's text, whose every table holds to rig.toml's own rules. Raises InputError."""
+    """The text of a rig.toml, with every table validated. Raises InputError."""
     tables = rig_tables(rig, units or rig.units or "m")
     for name, table in tables.items():
         if name != "metadata":
-            camera_of_table(table, name, file, "")
+            parse_camera_table(table, name, file, "")
     return tomli_w.dumps(tables)
 
 
 def frame_clock(fps: float | None, videos: Path | None) -> points.Times:
-    """Seconds of frames: of the videos' own time stamps where they are given, else at a constant rate."""
+    """A function that gives frame times [s]: from the videos' own time stamps if given, else at a constant rate."""
     stamps: dict[str, Floats] = {}
 
     def times(camera: str, frames: Ints, file: Path) -> Floats:
@@ -102,22 +103,22 @@ def frame_clock(fps: float | None, videos: Path | None) -> points.Times:
                 raise InputError(what, file=file, remedy="give the very videos that were tracked")
             return known[frames]
         if fps is None:
-            what = "its frames tell no times"
+            what = "its frames have no times"
             raise InputError(what, file=file, remedy="give --videos FOLDER (best) or --fps RATE")
         return np.asarray(frames / fps, dtype=np.float64)
 
     return times
 
 
-def read_points(source: Source, times: points.Times, likelihood: float, camera: str | None) -> Observations:
-    """Observations of another tracker. Raises InputError."""
+def read_points(source: ImportSource, times: points.Times, likelihood: float, camera: str | None) -> Observations:
+    """Read the observations of another tracker. Raises InputError."""
     if camera is not None and (len(source.files) > 1 or source.kind == "caliscope-points"):
         raise InputError("--camera names the camera of one file", remedy="leave it out: files are named after cameras")
     return points.read(source.kind, source.files, times, likelihood, camera)
 
 
 def session_to_log(rig: Rig, observations: Observations, out: Path) -> int:
-    """A session as a log; returns the number of messages. The log is whole or not there. Raises InputError."""
+    """Write a session as a log, atomically; returns the number of messages. Raises InputError."""
     from protocols.log.write.writer import LogWriter
     from protocols.topics import CAMERA_INFO, OBSERVATION, RIG_INFO
 
@@ -141,8 +142,8 @@ def session_to_log(rig: Rig, observations: Observations, out: Path) -> int:
     return count
 
 
-def log_to_session(rig: Rig) -> dict[str, Any]:
-    """The tables of rig.toml of a log's rig."""
+def rig_tables_of_log(rig: Rig) -> dict[str, Any]:
+    """The tables of rig.toml for the rig of a log."""
     metadata: dict[str, Any] = {**rig.metadata, "units": rig.units, "clock": rig.clock}
     if rig.distances:
         metadata["distances"] = [list(row) for row in rig.distances]
@@ -172,25 +173,29 @@ def log_to_session(rig: Rig) -> dict[str, Any]:
 def _kind_of(file: Path) -> str | None:
     suffix = file.suffix.lower()
     if suffix == ".toml":
-        return toml_rigs.kind_of(read_toml(file, "calibration")[0])
+        return toml_rigs.detect_format(read_toml(file, "calibration")[0])
     if suffix in _YAML:
-        return yaml_rigs.kind_of(yaml_rigs.load(file)[0])
+        return yaml_rigs.detect_format(yaml_rigs.load(file)[0])
     try:
         with file.open(encoding="utf-8-sig") as text:
             begin = text.read(1 << 16)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot be read: {error}", file=file, remedy="give a text file") from None
-    return points.kind_of(begin)
+    return points.detect_format(begin)
 
 
 def _stamps_of(camera: str, videos: Path) -> Floats:
-    """Times (n,) [s] of the frames of a camera's video, in the order in which they are shown."""
-    from edge.devices.playback.video_reader import VIDEO_SUFFIXES, Film
+    """Times (n,) [s] of the frames of a camera's video, in presentation order."""
+    from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader
 
-    found = sorted(path for path in videos.glob(f"{camera}.*") if path.suffix.lower() in VIDEO_SUFFIXES)
+    found = sorted(
+        path
+        for path in videos.glob("*")
+        if path.suffix.lower() in VIDEO_SUFFIXES and unicodedata.normalize("NFC", path.stem) == camera
+    )
     if not found:
         raise InputError(f"no video of camera {camera!r}", file=videos, remedy=f"name it {camera}.mp4, or give --fps")
-    return np.array([shot.time for shot in Film(found[0])])
+    return np.array([shot.time for shot in VideoReader(found[0])])
 
 
 def _camera_info(rig: Rig, name: str) -> Any:
@@ -228,7 +233,7 @@ def _rig_info(rig: Rig) -> Any:
 
 
 def _observation_messages(rig: Rig, observations: Observations) -> list[tuple[int, str, Any]]:
-    """One message a frame of a camera, by the time since that camera's first frame."""
+    """One message per frame of each camera, sorted by the time since that camera's first frame."""
     from protocols.messages import syncline_pb2 as pb
 
     out: list[tuple[int, str, Any]] = []
@@ -254,12 +259,12 @@ __all__ = [
     "FORMATS",
     "OBSERVATIONS_FILE",
     "POINTS",
-    "Source",
+    "ImportSource",
     "calibration_text",
+    "detect_source",
     "frame_clock",
-    "log_to_session",
-    "read_calibration_of",
+    "read_foreign_calibration",
     "read_points",
-    "recognise",
+    "rig_tables_of_log",
     "session_to_log",
 ]

@@ -1,4 +1,4 @@
-"""The files of a calibration in their folder, and the summary that a person reads."""
+"""Output of a calibration: result files, summary table and capture advice."""
 
 from __future__ import annotations
 
@@ -8,116 +8,73 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hub.report import build_report
-from protocols.core.errors import InputError, Refused
-from protocols.core.files import write_together
-from protocols.session.calibration import Calibration, calibration_text, trajectory_text
+from hub.api import CALIBRATION, REPORT, RESULT, TRAJECTORY, CalibrationResult, save_refusal
+from protocols.core.errors import Refused
+from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations
-from protocols.session.result import refusal_document, result_document, result_text
 from protocols.session.rig import Rig
+from protocols.session.session import Session
 
-CALIBRATION, TRAJECTORY, RESULT, REPORT = "calibration.toml", "trajectory.csv", "result.json", "report.html"
-_WEAK_S = 0.002  # a clock known no better than this deserves advice
-
-
-def remove_outputs(out: Path) -> None:
-    """Take away an earlier answer: beside a refusal it would look like the present one. Raises InputError."""
-    for name in (CALIBRATION, TRAJECTORY):
-        try:
-            (out / name).unlink(missing_ok=True)
-        except OSError as error:
-            what = f"cannot be removed: {error.strerror}"
-            raise InputError(what, file=out / name, remedy="choose another --out") from None
+_ADVICE_OFFSET_STD_S = 0.002  # clock offset std above which advice is printed
 
 
-def write_outputs(
-    out: Path, calibration: Calibration, rig: Rig, observations: Observations, command: str, echo_json: bool = False
-) -> None:
-    """All four outputs, or none of them. Raises InputError."""
-    document = result_document(calibration, rig, command=command)
-    write_together(
-        {
-            out / CALIBRATION: calibration_text(calibration, rig),
-            out / TRAJECTORY: trajectory_text(calibration),
-            out / RESULT: result_text(document),
-            out / REPORT: build_report(calibration, rig, observations, command),
-        }
-    )
-    if echo_json:
-        print(json.dumps(document, allow_nan=False))
-    else:
-        print_summary(calibration, out)
-        weak = {
-            name: ""
-            for name, camera in calibration.cameras.items()
-            if camera.time_offset_std > _WEAK_S or name in calibration.refused
-        }
-        print_advice(rig, observations, {**weak, **calibration.refused})
-
-
-def print_advice(rig: Rig, observations: Observations, cameras: Mapping[str, str] | None = None) -> None:
-    """Where to wave the marker next time, in a line or two; nothing where nothing is lacking.
-
-    cameras: only these; None = all.
-    """
-    from hub.calibration.coverage import advice_for
-
-    for advice in advice_for(rig, observations, cameras):
-        print(f"hint: {advice.text}")
-
-
-def write_refusal(
-    out: Path,
-    refusal: Refused,
-    rig: Rig,
-    observations: Observations,
-    command: str,
-    *,
-    solver: str = "joint",
-    cpu_seconds: float = 0.0,
-    warnings: tuple[str, ...] = (),
-    echo_json: bool = False,
-) -> None:
-    """result.json and report.html of a session that has no answer; an earlier answer is removed."""
-    remove_outputs(out)
-    document = refusal_document(
-        refusal.reason,
-        refusal.cameras,
-        rig,
-        command=command,
-        solver=solver,
-        cpu_seconds=cpu_seconds,
-        pairs=refusal.pairs,
-        warnings=(*warnings, *refusal.warnings),
-    )
-    write_together(
-        {out / RESULT: result_text(document), out / REPORT: build_report(refusal, rig, observations, command)}
-    )
+def report_result(result: CalibrationResult, out: Path, command: str, echo_json: bool = False) -> None:
+    """Write all four outputs, or none, and print the summary, or result.json. Raises InputError."""
+    document = result.save(out, command)
     if echo_json:
         print(json.dumps(document, allow_nan=False))
         return
-    for warning in (*warnings, *refusal.warnings):
+    calibration = result.calibration
+    print_summary(calibration, out)
+    imprecise = {
+        name: ""
+        for name, camera in calibration.cameras.items()
+        if camera.time_offset_std > _ADVICE_OFFSET_STD_S or name in calibration.refused
+    }
+    print_advice(result.session.rig, result.session.observations, {**imprecise, **calibration.refused})
+
+
+def print_advice(rig: Rig, observations: Observations, cameras: Mapping[str, str] | None = None) -> None:
+    """Print where to wave the marker in the next recording, in a line or two; nothing if coverage is sufficient.
+
+    cameras: only these; None = all.
+    """
+    from hub.calibration.coverage import session_advice
+
+    for advice in session_advice(rig, observations, cameras):
+        print(f"hint: {advice.text}")
+
+
+def report_refusal(
+    refusal: Refused, session: Session, out: Path, command: str, solver: str = "joint", echo_json: bool = False
+) -> None:
+    """Write result.json and report.html of a refused session, and print warnings and advice, or result.json."""
+    document = save_refusal(out, refusal, session, command, solver)
+    if echo_json:
+        print(json.dumps(document, allow_nan=False))
+        return
+    for warning in refusal.warnings:
         print(f"warning: {warning}")
-    print_advice(rig, observations)
+    print_advice(session.rig, session.observations)
 
 
 def wide_console(markup: bool = False) -> Any:
-    """A console that never squeezes a table below what its figures need.
+    """A console that is wide enough for all table columns when the output is not a terminal.
 
-    markup: off, so that "[ms]" in a heading and brackets in a user's names are shown and not obeyed.
+    markup: off by default, so that "[ms]" in a heading and brackets in user-defined names are printed literally.
     """
     from rich.console import Console
 
     class _Console(Console):
         def on_broken_pipe(self) -> None:
-            """Let the command line end it quietly: whoever read our output went away."""
+            """Raise BrokenPipeError, which the command line handles: the reader of our output has closed the pipe."""
             raise BrokenPipeError
 
     return _Console(file=sys.stdout, highlight=False, markup=markup, width=None if sys.stdout.isatty() else 140)
 
 
 def print_summary(calibration: Calibration, out: Path) -> None:
-    """A table of the cameras, the refused ones and warnings, and where the files are."""
+    """Print a table of the cameras, the refused cameras, warnings and the paths of the written files."""
     from rich.table import Table
 
     console = wide_console()
@@ -146,6 +103,3 @@ def print_summary(calibration: Calibration, out: Path) -> None:
     console.print(
         f"written: {', '.join(str(out / name) for name in (CALIBRATION, TRAJECTORY, RESULT, REPORT))}", soft_wrap=True
     )
-
-
-__all__ = ["CALIBRATION", "REPORT", "RESULT", "TRAJECTORY", "print_summary", "remove_outputs", "write_outputs"]

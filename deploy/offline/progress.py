@@ -1,4 +1,4 @@
-"""Progress of long work on standard error, so that standard output stays clean for pipes and --json."""
+"""Progress bar on standard error, so that standard output stays usable for pipes and --json."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def progress_bar(title: str, quiet: bool = False) -> Iterator[Callable[[str, float], None]]:
-    """A bar told by ``tell(text, share)``, share 0..1; nothing is drawn where nobody looks."""
+    """A bar moved by the yielded ``move(text, share)``, share 0..1; not drawn if standard error is not a terminal."""
     if quiet or not sys.stderr.isatty():
         yield lambda text, share: None
         return
@@ -20,7 +20,7 @@ def progress_bar(title: str, quiet: bool = False) -> Iterator[Callable[[str, flo
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(title, total=1.0)
 
-        def tell(text: str, share: float) -> None:
+        def move(text: str, share: float) -> None:
             progress.update(task, completed=share, description=f"{title}: {text}")
 
-        yield tell
+        yield move

@@ -1,4 +1,4 @@
-"""What a session folder holds, for a person and for a machine."""
+"""Summary of a session folder, as a table or JSON."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Videos onto one clock: the reference time of every frame, and copies of the videos that line up.
+"""Synchronisation of videos: reference times of all frames, and copies resampled to a common time grid.
 
-A grid of reference times is laid over the span that all videos share. Each output frame shows, in every video, the
-source frame nearest to that time; which one it is stands in a table, so nothing of the choice is hidden.
+The grid of reference times covers the common time span of all videos. Each output frame shows, in every video, the
+source frame nearest to that time; a table lists which one it is.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from edge.devices.base import Image
-from edge.devices.playback.video_reader import Film
+from edge.devices.playback.video_reader import VideoReader
 from protocols.core.clocks import CameraTime, TimeMap
 from protocols.core.errors import InputError, Refused
 from protocols.geometry.types import Floats
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from av.container import OutputContainer
     from av.video.stream import VideoStream
 
-_CLOCK_HZ = 90_000  # ticks of the written time stamps, as MPEG has them
-_QUALITY = "16"  # of x264: hardly told from the source
+_CLOCK_HZ = 90_000  # time base of the written time stamps, the MPEG one
+_QUALITY = "16"  # crf of x264: visually close to the source
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,21 +39,21 @@ class Span:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Retimed:
-    """What became of one video.
+class SynchronisedVideo:
+    """Frame times of one video and the frames of its synchronised copy.
 
-    time, reference: (n,) of all its frames [s], own and reference clock. shown: (k,) for each output frame the
-    source frame that it shows. error: (k,) reference time of that frame less the output frame's [s].
+    time, reference: (n,) times of all its frames [s], on its own and on the reference clock. source_frames: (k,) source
+    frame that each output frame shows. error: (k,) reference time of that frame minus that of the output frame [s].
     """
 
     time: Floats
     reference: Floats
-    shown: list[int]
+    source_frames: list[int]
     error: Floats
 
 
-def span_of(film: Film, time_map: TimeMap) -> Span:
-    """First and last frame of a video on the reference clock; reads its packets, decodes nothing."""
+def reference_span(film: VideoReader, time_map: TimeMap) -> Span:
+    """Reference times of the first and last frame of a video; reads packet time stamps without decoding."""
     import av
 
     first, last = math.inf, -math.inf
@@ -74,13 +74,13 @@ def span_of(film: Film, time_map: TimeMap) -> Span:
     return Span(begin, end)
 
 
-def common_grid(spans: dict[str, Span], fps: float) -> Floats:
+def common_time_grid(spans: dict[str, Span], fps: float) -> Floats:
     """Reference times (k,) [s] of the output frames: multiples of the period within all spans. Raises Refused."""
     begin = max(span.first for span in spans.values())
     end = min(span.last for span in spans.values())
     late = max(spans, key=lambda name: spans[name].first)
     early = min(spans, key=lambda name: spans[name].last)
-    # Rounded outwards by a hair: a grid time that is a frame's own must not fall out by the last bit.
+    # Rounded outwards by 1e-6: rounding errors must not exclude a grid time that equals a frame's time.
     first, last = math.ceil(begin * fps - 1e-6), math.floor(end * fps + 1e-6)
     if last < first:
         raise Refused(
@@ -91,20 +91,20 @@ def common_grid(spans: dict[str, Span], fps: float) -> Floats:
 
 
 def retime(
-    film: Film,
+    film: VideoReader,
     time_map: TimeMap,
     grid: Floats,
     out: Path | None,
     fps: float,
-    tell: Callable[[int], None],
-) -> Retimed:
-    """Walk through a video once: reference times of all frames, and where ``out`` is given the copy on the grid.
+    progress: Callable[[int], None],
+) -> SynchronisedVideo:
+    """Compute the reference times of all frames of a video and, if ``out`` is given, write its copy on the grid.
 
-    Copies have a constant rate, as many frames as the grid, the first at time 0, and no sound.
+    Copies have a constant rate, as many frames as the grid, the first at time 0, and no audio.
     """
     times: list[float] = []
     references: list[float] = []
-    shown: list[int] = []
+    source_frames: list[int] = []
     done = 0
     with _Writer(out, fps, film.info.size) as writer:
         before: tuple[float, int, Callable[[], Image]] | None = None
@@ -115,25 +115,27 @@ def retime(
             if before is not None:
                 until = int(np.searchsorted(grid, 0.5 * (before[0] + reference), side="right"))
                 writer.write(before[2], until - done)
-                shown += [before[1]] * (until - done)
+                source_frames += [before[1]] * (until - done)
                 done = max(done, until)
             before = reference, shot.frame, shot.image
             if shot.frame % 10 == 0:
-                tell(shot.frame)
+                progress(shot.frame)
         if before is None:
             raise InputError("no frame can be read from this file", file=film.path, remedy="replace it")
         writer.write(before[2], len(grid) - done)
-        shown += [before[1]] * (len(grid) - done)
+        source_frames += [before[1]] * (len(grid) - done)
         writer.finish()
     reference_times = np.array(references)
-    return Retimed(np.array(times), reference_times, shown, reference_times[shown] - grid)
+    return SynchronisedVideo(np.array(times), reference_times, source_frames, reference_times[source_frames] - grid)
 
 
-def trim(film: Film, time_map: TimeMap, span: Span, out: Path, tell: Callable[[int], None]) -> Retimed:
-    """Every frame of ``span`` once, stamped with its reference time from the span's begin on; no sound."""
+def trim(
+    film: VideoReader, time_map: TimeMap, span: Span, out: Path, progress: Callable[[int], None]
+) -> SynchronisedVideo:
+    """Write every frame within ``span`` once, stamped with its reference time since the start of the span; no audio."""
     times: list[float] = []
     references: list[float] = []
-    shown: list[int] = []
+    source_frames: list[int] = []
     with _Writer(out, film.info.fps, film.info.size) as writer:
         for shot in film:
             reference = float(time_map.reference_from_camera(CameraTime(shot.time)))
@@ -141,19 +143,19 @@ def trim(film: Film, time_map: TimeMap, span: Span, out: Path, tell: Callable[[i
             references.append(reference)
             if span.first - 1e-9 <= reference <= span.last + 1e-9:
                 writer.write_at(shot.image, reference - span.first)
-                shown.append(shot.frame)
+                source_frames.append(shot.frame)
             if shot.frame % 10 == 0:
-                tell(shot.frame)
-        if not shown:
+                progress(shot.frame)
+        if not source_frames:
             raise Refused(
                 f"{film.path}: no frame of it lies in the {span.last - span.first:.3f} s that all videos share"
             )
         writer.finish()
-    return Retimed(np.array(times), np.array(references), shown, np.zeros(len(shown)))
+    return SynchronisedVideo(np.array(times), np.array(references), source_frames, np.zeros(len(source_frames)))
 
 
 class _Writer:
-    """Writes H.264 beside ``file`` and renames at the end: a file of that name is whole. None = writes nothing."""
+    """Writes H.264 to a temporary file that is renamed to ``file`` when complete. None = writes nothing."""
 
     def __init__(self, file: Path | None, fps: float, size: tuple[int, int]) -> None:
         self._file, self._fps, self._size = file, fps, size
@@ -170,14 +172,14 @@ class _Writer:
             return self
         self._file.parent.mkdir(parents=True, exist_ok=True)
         try:
-            # MP4 tells a later first frame in units of the film, by default milliseconds.
+            # MP4 stores the delay of the first frame in units of the movie time scale, by default milliseconds.
             self._container = av.open(str(self._part), "w", options={"movie_timescale": str(_CLOCK_HZ)})
             rate = Fraction(self._fps).limit_denominator(1001)
             stream = self._container.add_stream("libx264", rate=rate)
         except (av.error.FFmpegError, ValueError) as error:
             raise InputError(f"no video can be written here: {error}", file=self._file, remedy="check --out") from None
         width, height = self._size
-        # H.264 in the common pixel format needs even sides: an odd last row or column is left out.
+        # H.264 with yuv420p needs even image sides: an odd last row or column is cropped.
         stream.width, stream.height, stream.pix_fmt = width - width % 2, height - height % 2, "yuv420p"
         stream.time_base = stream.codec_context.time_base = Fraction(1, _CLOCK_HZ)
         stream.options = {"crf": _QUALITY, "preset": "veryfast", "bf": "0"}
@@ -191,21 +193,21 @@ class _Writer:
             self._part.unlink(missing_ok=True)
 
     def write(self, image: Callable[[], Image], times: int) -> None:
-        """The same picture ``times`` times (0 or less: not at all), on the grid."""
+        """Write an image ``times`` times (0 or less: not at all) on the grid."""
         if self._stream is None or times <= 0:
             return
-        picture = image()
+        decoded = image()
         for _ in range(times):
-            self._encode(picture, round(self._count * _CLOCK_HZ / self._fps))
+            self._encode(decoded, round(self._count * _CLOCK_HZ / self._fps))
             self._count += 1
 
     def write_at(self, image: Callable[[], Image], time: float) -> None:
-        """A picture at a time [s]."""
+        """Write an image at a time [s]."""
         if self._stream is not None:
             self._encode(image(), max(round(time * _CLOCK_HZ), self._last + 1))
 
     def finish(self) -> None:
-        """All frames are in: the file takes its name."""
+        """Finish encoding and rename the file to its final name."""
         if self._container is None or self._stream is None or self._part is None or self._file is None:
             return
         self._container.mux(self._stream.encode())
@@ -213,32 +215,32 @@ class _Writer:
         self._container = None
         self._part.replace(self._file)
 
-    def _encode(self, picture: Image, ticks: int) -> None:
+    def _encode(self, image: Image, ticks: int) -> None:
         import av
 
         assert self._stream is not None
         assert self._container is not None
-        shown = picture[: self._stream.height, : self._stream.width]
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(shown), format="bgr24")
+        cropped = image[: self._stream.height, : self._stream.width]
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(cropped), format="bgr24")
         frame.pts, frame.time_base = ticks, Fraction(1, _CLOCK_HZ)
         self._last = ticks
         self._container.mux(self._stream.encode(frame))
 
 
-def times_text(video: Retimed) -> str:
-    """frame,time,reference_time of every frame of a video."""
+def times_text(video: SynchronisedVideo) -> str:
+    """CSV text with frame,time,reference_time of every frame of a video."""
     lines = ["frame,time,reference_time"]
     lines += [f"{i},{t:.17g},{r:.17g}" for i, (t, r) in enumerate(zip(video.time, video.reference, strict=True))]
     return "\n".join(lines) + "\n"
 
 
-def grid_text(grid: Floats, videos: dict[str, Retimed], header: Callable[[str], str]) -> str:
-    """frame,reference_time,CAMERA,… : which source frame each video shows in each output frame."""
+def grid_text(grid: Floats, videos: dict[str, SynchronisedVideo], header: Callable[[str], str]) -> str:
+    """CSV text with frame,reference_time,CAMERA,…: the source frame of each video in each output frame."""
     lines = [",".join(["frame", "reference_time", *(header(name) for name in videos)])]
     lines += [",".join(row) for row in _grid_rows(grid, videos)]
     return "\n".join(lines) + "\n"
 
 
-def _grid_rows(grid: Floats, videos: dict[str, Retimed]) -> Iterator[list[str]]:
+def _grid_rows(grid: Floats, videos: dict[str, SynchronisedVideo]) -> Iterator[list[str]]:
     for index, time in enumerate(grid):
-        yield [str(index), f"{time:.17g}", *(str(video.shown[index]) for video in videos.values())]
+        yield [str(index), f"{time:.17g}", *(str(video.source_frames[index]) for video in videos.values())]

@@ -1,10 +1,11 @@
-"""Offline tracking of one car: pictures and telemetry in, track.csv and hypotheses.csv out."""
+"""Offline tracking of one car: reads images and telemetry, writes track.csv and hypotheses.csv."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
+import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 
 from edge.devices.base import Frame
 from edge.devices.playback.video_file import IMAGE_SUFFIXES
-from edge.uav.tracker import Box, Estimate, Image, State, Telemetry, Tracker
+from edge.uav.tracker import Box, Estimate, Image, Telemetry, Tracker, TrackState
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
@@ -26,19 +27,19 @@ COLUMNS = ("frame", "time", "state", "x", "y", "width", "height", "heading", "st
 GROUND_COLUMNS = ("north", "east", "speed", "course", "std_m")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _POSITION = ("north", "east", "down")
-_AHEAD_S = 0.6  # a file's samples are handed over that much early: the clocks may differ by half a second
+_TELEMETRY_LOOKAHEAD_S = 0.6  # lead with which samples are passed to the tracker: clocks may differ by 0.5 s
 
 
-class Pictures(Protocol):
-    """An opened recording."""
+class FrameSource(Protocol):
+    """An opened recording of images."""
 
     def read(self, timeout_s: float) -> Frame | None:
-        """The next picture; None after the last."""
+        """The next frame; None after the last."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tracked:
-    """One frame's answer. frame: 0-based index of the decoded frame. time: [s], 0 = the video's first frame."""
+class TrackedFrame:
+    """The estimate of one frame. frame: 0-based index of the decoded frame. time: [s], 0 = the video's first frame."""
 
     frame: int
     time: float
@@ -47,14 +48,14 @@ class Tracked:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TelemetryFile:
-    """samples: by time, strictly increasing. left_out: rows that held no sample (NaN, no rotation, repeated time)."""
+    """Telemetry samples in strictly increasing time. left_out: discarded rows (NaN, no rotation, repeated time)."""
 
     samples: tuple[Telemetry, ...]
     left_out: int
 
 
 def parse_target(text: str) -> Box:
-    """The box of ``x,y,w,h``. Raises InputError."""
+    """Parse a bounding box ``x,y,w,h``. Raises InputError."""
     remedy = "give --target x,y,w,h in pixels, x,y the top left, as in 312,200,44,20"
     try:
         values = [float(part) for part in text.split(",")]
@@ -68,20 +69,21 @@ def parse_target(text: str) -> Box:
 
 
 def choose_camera(rig_file: Path, video: Path) -> RigCamera:
-    """The camera of a rig file that took this video: the only one, or the one of the video's name."""
+    """The camera of a rig file that recorded this video: the only one, or the one named like the video."""
     rig = read_rig(rig_file)
     if len(rig.cameras) == 1:
         return next(iter(rig.cameras.values()))
-    if video.stem in rig.cameras:
-        return rig.cameras[video.stem]
+    name = unicodedata.normalize("NFC", video.stem)
+    if name in rig.cameras:
+        return rig.cameras[name]
     names = ", ".join(rig.cameras)
-    raise InputError(f"knows cameras {names}, none named {video.stem}", file=rig_file, remedy="keep one of them")
+    raise InputError(f"knows cameras {names}, none named {name}", file=rig_file, remedy="keep one of them")
 
 
 def read_telemetry(file: Path) -> TelemetryFile:
     """Read telemetry.csv: time,qw,qx,qy,qz[,north,east,down]; the quaternion is ned_from_body.
 
-    Rows with NaN, empty cells, no rotation or a time already seen are left out and counted.
+    Rows with NaN, empty cells, no rotation or a repeated time are discarded and counted.
     Raises InputError: file, line, what, remedy.
     """
     if file.suffix.lower() in (".bin", ".ulg"):
@@ -124,13 +126,13 @@ def read_telemetry(file: Path) -> TelemetryFile:
 
 
 def _sample(row: Floats) -> Telemetry:
-    """A row: time, quaternion, and position if it is there."""
+    """A sample from a row with time, quaternion and, if present, position."""
     position = row[5:8].copy() if len(row) == 8 and np.isfinite(row[5:8]).all() else None
     return Telemetry(float(row[0]), _rotation(row[1:5]), position)
 
 
 def _numbers(row: list[str], wanted: Sequence[int], file: Path, line: int) -> Floats:
-    """Some of a row's cells; empty ones are NaN."""
+    """The selected cells of a row as numbers; empty cells are NaN."""
     if len(row) <= max(wanted):
         what = f"{len(row)} cells where {max(wanted) + 1} are needed"
         raise InputError(what, file=file, line=line, remedy="correct this row")
@@ -146,7 +148,7 @@ def _numbers(row: list[str], wanted: Sequence[int], file: Path, line: int) -> Fl
 
 
 def _rotation(quaternion: Floats) -> Floats:
-    """ned_from_body (3, 3) of a quaternion w, x, y, z."""
+    """Rotation matrix ned_from_body (3, 3) of a quaternion w, x, y, z."""
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     return np.array(
         [
@@ -158,7 +160,7 @@ def _rotation(quaternion: Floats) -> Floats:
 
 
 def check_clock(telemetry: TelemetryFile, file: Path, start: float, end: float) -> None:
-    """Raise InputError where no sample lies in the video's time: then its clock is another one."""
+    """Raise InputError if no sample lies within the video's time span: then it is on another clock."""
     times = [sample.time for sample in telemetry.samples]
     if times[0] > end + 1.0 or times[-1] < start - 1.0:
         what = f"times {times[0]:.1f} to {times[-1]:.1f} s, but the video's are {start:.1f} to {end:.1f} s"
@@ -166,7 +168,7 @@ def check_clock(telemetry: TelemetryFile, file: Path, start: float, end: float) 
 
 
 def count_frames(video: Path) -> int:
-    """Frames that a video or folder says it has; 0 where it does not tell."""
+    """Number of frames of a video according to its header, or of images in a folder; 0 if unknown."""
     if video.is_dir():
         return sum(1 for path in video.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
     capture = cv2.VideoCapture(str(video))
@@ -175,20 +177,20 @@ def count_frames(video: Path) -> int:
     return int(count) if math.isfinite(count) and 0 < count < 1e9 else 0
 
 
-def follow(
-    recording: Pictures,
+def track_recording(
+    recording: FrameSource,
     tracker: Tracker,
     target: Box,
     *,
     start: int = 0,
     telemetry: Sequence[Telemetry] = (),
-    show: Callable[[Image, Tracked], None] | None = None,
-    tell: Callable[[int], None] | None = None,
-) -> Iterator[Tracked]:
+    show: Callable[[Image, TrackedFrame], None] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Iterator[TrackedFrame]:
     """Run a tracker over an opened recording, from frame ``start`` on.
 
-    show: called with every picture and its answer. tell: called with the index of every decoded frame.
-    Raises InputError where the recording ends before ``start``, and what the tracker says of the target.
+    show: called with every image and its estimate. progress: called with the index of every decoded frame.
+    Raises InputError if the recording ends before ``start``, and the tracker's errors about the target.
     """
     waiting = iter(telemetry)
     sample = next(waiting, None)
@@ -198,17 +200,17 @@ def follow(
         moment = frame.device_time_ns / NANOSECONDS
         first = moment if first is None else first
         time = moment - first
-        if tell is not None:
-            tell(count)
+        if progress is not None:
+            progress(count)
         if count >= start:
-            while sample is not None and sample.time <= time + _AHEAD_S:
+            while sample is not None and sample.time <= time + _TELEMETRY_LOOKAHEAD_S:
                 tracker.handle_telemetry(sample)
                 sample = next(waiting, None)
             if count == start:
                 estimate = tracker.begin(frame.image, time, target)
             else:
                 estimate = tracker.handle_frame(frame.image, time)
-            tracked = Tracked(count, time, estimate)
+            tracked = TrackedFrame(count, time, estimate)
             if show is not None:
                 show(frame.image, tracked)
             yield tracked
@@ -218,18 +220,18 @@ def follow(
         raise InputError(what, remedy="give a smaller --start")
 
 
-def without_layers(row: Tracked) -> Tracked:
-    """The answer without what only overlays need."""
+def without_overlay_data(row: TrackedFrame) -> TrackedFrame:
+    """The estimate without particles and layers, which only overlays need."""
     return replace(row, estimate=replace(row.estimate, particles=None, layers={}))
 
 
-def track_text(rows: Sequence[Tracked]) -> str:
-    """track.csv; the ground's columns only where any frame has them."""
+def track_text(rows: Sequence[TrackedFrame]) -> str:
+    """Text of track.csv; the ground-plane columns only if any frame has them."""
     metric = any(math.isfinite(row.estimate.north) for row in rows)
     lines = [",".join(COLUMNS + (GROUND_COLUMNS if metric else ()))]
     for row in rows:
         e = row.estimate
-        lost = e.state is State.LOST
+        lost = e.state is TrackState.LOST
         place = ["", ""] if lost else [_cell(e.x), _cell(e.y)]
         cells = [str(row.frame), _cell(row.time), e.state.value, *place]
         cells += [_cell(value) for value in (e.width, e.height, e.heading, e.std)]
@@ -239,8 +241,8 @@ def track_text(rows: Sequence[Tracked]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def hypotheses_text(rows: Sequence[Tracked]) -> str:
-    """hypotheses.csv: the frames in which more than one place is held, the likeliest first."""
+def hypotheses_text(rows: Sequence[TrackedFrame]) -> str:
+    """Text of hypotheses.csv: frames with more than one hypothesis, in descending order of weight."""
     lines = ["frame,rank,weight,x,y"]
     for row in rows:
         ranked = sorted(row.estimate.hypotheses, key=lambda hypothesis: -hypothesis.weight)

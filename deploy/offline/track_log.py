@@ -1,4 +1,4 @@
-"""The pictures of a UAV agent in a Syncline log, as a recording that `track` reads."""
+"""The images of a UAV agent in a Syncline log, as a frame source for `track`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame
-from edge.devices.playback.video_file import Recording
-from edge.uav.estimator import decoded
+from edge.devices.playback.video_file import VideoPlayback
+from edge.uav.estimator import decode_image
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
@@ -23,10 +23,10 @@ from protocols.topics import FLIGHT_IMAGE, UAV_INFO
 _FPS = 30.0
 
 
-class LoggedPictures:
-    """The agent and boot with the most pictures. lens, body_from_camera: as far as that agent knew them.
+class LoggedFlightImages:
+    """Images of the agent and boot with the most images. lens, body_from_camera: as known to that agent.
 
-    count: pictures in the log. repaired: pictures that are none, or whose time does not increase.
+    count: images in the log. repaired: images that cannot be decoded, or whose time does not increase.
     """
 
     def __init__(self, log: Path, *, fps: float | None = None, intrinsics: Intrinsics | None = None) -> None:
@@ -35,7 +35,7 @@ class LoggedPictures:
         self._reader = LogReader(log)
         names = Counter(_name(logged.message) for logged in self._reader.messages([FLIGHT_IMAGE]))
         if not names:
-            what = "this log holds no pictures of a flight"
+            what = "this log contains no flight images"
             raise InputError(what, file=log, remedy="give the video, or record a UAV agent with [images]")
         self._chosen, self.count = names.most_common(1)[0]
         self._info: pb.UavInfo | None = None
@@ -47,14 +47,14 @@ class LoggedPictures:
         self._given_fps = fps
         self.lens = intrinsics or _lens(self._info)
         self.body_from_camera = _mounting(self._info)
-        self._pictures: Iterator[Frame] | None = None
+        self._frames: Iterator[Frame] | None = None
         self._first: Frame | None = None
-        self._waiting: Frame | None = None
+        self._pending: Frame | None = None
         self.repaired = 0
 
     @property
     def info(self) -> DeviceInfo:
-        """Size of the first picture."""
+        """Device information, with the size of the first image."""
         if self._first is None:
             raise RuntimeError("open the log first")
         height, width = self._first.image.shape[:2]
@@ -63,35 +63,35 @@ class LoggedPictures:
 
     @property
     def ended(self) -> bool:
-        """True after the last picture."""
-        return self._pictures is None
+        """True after the last image."""
+        return self._frames is None
 
     @property
     def first_s(self) -> float:
-        """The camera's time of the first picture."""
+        """Camera time of the first image [s]."""
         return 0.0 if self._first is None else self._first.device_time_ns / NANOSECONDS
 
     def open(self) -> None:
-        """From the first picture on."""
-        self._pictures = self._read()
-        self._first = next(self._pictures, None)
+        """Start reading at the first image. Raises InputError if none can be decoded."""
+        self._frames = self._read()
+        self._first = next(self._frames, None)
         if self._first is None:
-            raise InputError("no picture of this log can be decoded", remedy="give the video itself")
-        self._waiting = self._first
+            raise InputError("no image of this log can be decoded", remedy="give the video itself")
+        self._pending = self._first
 
     def read(self, timeout_s: float) -> Frame | None:
-        """The next picture."""
-        if self._waiting is not None:
-            frame, self._waiting = self._waiting, None
+        """The next image; None after the last."""
+        if self._pending is not None:
+            frame, self._pending = self._pending, None
             return frame
-        following = None if self._pictures is None else next(self._pictures, None)
+        following = None if self._frames is None else next(self._frames, None)
         if following is None:
-            self._pictures = None
+            self._frames = None
         return following
 
     def close(self) -> None:
         """May be called twice."""
-        self._pictures = None
+        self._frames = None
 
     def _read(self) -> Iterator[Frame]:
         newest = -1
@@ -100,7 +100,7 @@ class LoggedPictures:
             message: Any = logged.message
             if _name(message) != self._chosen:
                 continue
-            image = decoded(message)
+            image = decode_image(message)
             if image is None or message.device_time_ns <= newest or image.shape != (shape or image.shape):
                 self.repaired += 1
                 continue
@@ -108,15 +108,15 @@ class LoggedPictures:
             yield Frame(image, message.device_time_ns, message.frame)
 
 
-def open_pictures(
+def open_recording(
     video: Path, fps: float | None, intrinsics: Intrinsics | None
-) -> tuple[Recording | LoggedPictures, int | None]:
-    """An opened recording of a file, a folder or a log; and how many pictures it has, None where it must be asked."""
+) -> tuple[VideoPlayback | LoggedFlightImages, int | None]:
+    """Open a video file, a folder of images or a log; returns it and, for a log, its number of images, else None."""
     if video.suffix.lower() != ".mcap":
-        recording = Recording(video, fps=fps, intrinsics=intrinsics)
+        recording = VideoPlayback(video, fps=fps, intrinsics=intrinsics)
         recording.open()
         return recording, None
-    logged = LoggedPictures(video, fps=fps, intrinsics=intrinsics)
+    logged = LoggedFlightImages(video, fps=fps, intrinsics=intrinsics)
     logged.open()
     return logged, logged.count
 

@@ -1,4 +1,4 @@
-"""The overlay video of `track`: a canvas larger than the picture, so that an estimate outside it is seen too."""
+"""The overlay video of `track`, on a canvas larger than the image that also shows estimates out of view."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from deploy.offline.track import Tracked
-from edge.uav.tracker import Image, State
+from deploy.offline.track import TrackedFrame
+from edge.uav.tracker import Image, TrackState
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 
-_MARGIN = 0.5  # of the picture, on each side
-_WIDEST = 1280
-_COLOURS = {State.VISIBLE: (80, 220, 80), State.COASTING: (40, 170, 255), State.LOST: (60, 60, 230)}
+_MARGIN = 0.5  # fraction of the image size added on each side
+_MAX_CANVAS_PX = 1280
+_COLOURS = {TrackState.VISIBLE: (80, 220, 80), TrackState.COASTING: (40, 170, 255), TrackState.LOST: (60, 60, 230)}
 _LAYERS = {"road": (110, 80, 30), "tracks": (160, 160, 160)}
 _OTHER_LAYER = (0, 220, 220)
 _PARTICLE = (230, 120, 230)
 
 
 class Overlay:
-    """Writes beside ``file`` and renames at the end: a file of that name is whole. Use as a context manager."""
+    """Writes the video to a temporary file that is renamed to ``file`` when complete. Use as a context manager."""
 
     def __init__(self, file: Path, fps: float) -> None:
         self._file, self._fps = file, fps
@@ -38,8 +38,8 @@ class Overlay:
         if not self._done:
             self._part.unlink(missing_ok=True)
 
-    def show(self, image: Image, tracked: Tracked) -> None:
-        """Add one frame. Raises InputError where no video can be written."""
+    def show(self, image: Image, tracked: TrackedFrame) -> None:
+        """Add one frame. Raises InputError if no video can be written."""
         canvas = draw(image, tracked)
         if self._writer is None:
             self._file.parent.mkdir(parents=True, exist_ok=True)
@@ -50,7 +50,7 @@ class Overlay:
         self._writer.write(canvas)
 
     def finish(self) -> None:
-        """All frames are in: the file takes its name."""
+        """Close the video and rename it to its final name."""
         if self._writer is not None:
             self._writer.release()
             self._writer = None
@@ -58,10 +58,10 @@ class Overlay:
         self._done = True
 
 
-def draw(image: Image, tracked: Tracked) -> Image:
-    """The picture on a larger canvas (h, w, 3) with road, tracks, ways, particles and the estimate; even sizes."""
+def draw(image: Image, tracked: TrackedFrame) -> Image:
+    """The image on a larger canvas (h, w, 3) with road, tracks, paths, particles and the estimate; even sizes."""
     height, width = image.shape[:2]
-    scale = min(1.0, _WIDEST / (width * (1 + 2 * _MARGIN)))
+    scale = min(1.0, _MAX_CANVAS_PX / (width * (1 + 2 * _MARGIN)))
     canvas_size = tuple(int(side * (1 + 2 * _MARGIN) * scale) // 2 * 2 for side in (width, height))
     canvas = np.full((canvas_size[1], canvas_size[0], 3), 28, np.uint8)
     small = cv2.resize(image, (int(width * scale), int(height * scale)), interpolation=cv2.INTER_AREA)
@@ -69,17 +69,17 @@ def draw(image: Image, tracked: Tracked) -> Image:
     canvas[y0 : y0 + small.shape[0], x0 : x0 + small.shape[1]] = small
     estimate = tracked.estimate
     for name, points in estimate.layers.items():
-        _dots(canvas, _placed(points, scale, x0, y0), _LAYERS.get(name, _OTHER_LAYER))
+        _dots(canvas, _to_canvas(points, scale, x0, y0), _LAYERS.get(name, _OTHER_LAYER))
     if estimate.particles is not None:
-        _dots(canvas, _placed(estimate.particles, scale, x0, y0), _PARTICLE)
+        _dots(canvas, _to_canvas(estimate.particles, scale, x0, y0), _PARTICLE)
     cv2.rectangle(canvas, (x0, y0), (x0 + small.shape[1] - 1, y0 + small.shape[0] - 1), (255, 255, 255), 1)
     colour = _COLOURS[estimate.state]
     for hypothesis in estimate.hypotheses:
-        at = _placed(np.array([[hypothesis.x, hypothesis.y]]), scale, x0, y0)[0]
+        at = _to_canvas(np.array([[hypothesis.x, hypothesis.y]]), scale, x0, y0)[0]
         if _drawable(at):
             cv2.circle(canvas, (int(at[0]), int(at[1])), 5, colour, 1, cv2.LINE_AA)
-    at = _placed(np.array([[estimate.x, estimate.y]]), scale, x0, y0)[0]
-    if _drawable(at) and estimate.state is not State.LOST:
+    at = _to_canvas(np.array([[estimate.x, estimate.y]]), scale, x0, y0)[0]
+    if _drawable(at) and estimate.state is not TrackState.LOST:
         half = 0.5 * scale * np.array([estimate.width, estimate.height])
         if np.isfinite(half).all():
             low, high = (at - half).astype(int), (at + half).astype(int)
@@ -92,7 +92,7 @@ def draw(image: Image, tracked: Tracked) -> Image:
     return canvas
 
 
-def _placed(points: Floats, scale: float, x0: int, y0: int) -> Floats:
+def _to_canvas(points: Floats, scale: float, x0: int, y0: int) -> Floats:
     return np.asarray(points * scale + [x0, y0], dtype=np.float64)
 
 

@@ -1,4 +1,4 @@
-"""From a folder of videos to a session: one detector a video, merged, kept beside the result, resumed."""
+"""Makes a session from a folder of videos: detection in each video, merged into a session, with cached detections."""
 
 from __future__ import annotations
 
@@ -15,16 +15,19 @@ from typing import Any, Literal
 import cv2
 import tomli_w
 
-from deploy.offline.detect import MARKER_FILE, Found, detect_in, marker_detector, observations_text, read_marker
 from edge.detectors.marker.ball import REVISION, MarkerModel
-from edge.devices.playback.video_reader import VIDEO_SUFFIXES, Film, has_pyav
+from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader, has_pyav
+from edge.offline.detections import VideoDetections, observations_csv, run_detector
+from edge.offline.video import MARKER_FILE, ball_detector, read_marker_model
 from protocols.core.errors import InputError
 from protocols.core.files import write_together
+from protocols.core.names import name_from_file
 from protocols.core.version import VERSION
 from protocols.geometry.camera import Intrinsics
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, read_folder
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, read_rig, read_toml
+from protocols.session.session import Session
 
 Progress = Callable[[str, float], None]
 DetectorName = Literal["marker", "person", "vehicle"]
@@ -36,7 +39,7 @@ _LENS = ("matrix", "distortions", "fisheye", "focal_std")
 
 @dataclass(frozen=True, slots=True)
 class VideoFile:
-    """One video of the folder; camera: its name without the suffix."""
+    """One video of a folder. camera: the file's name without the suffix. size: of the file [bytes]."""
 
     camera: str
     path: Path
@@ -45,22 +48,19 @@ class VideoFile:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Gathered:
-    """A session made of videos. warnings: what was wrong with single videos. told: one line a video."""
+class VideoSession(Session):
+    """A session made of videos. summaries: one line a video."""
 
-    rig: Rig
-    observations: Observations
-    warnings: tuple[str, ...]
-    told: tuple[str, ...]
+    summaries: tuple[str, ...] = ()
 
 
-def holds_videos(folder: Path) -> bool:
-    """Whether a folder is one of videos and not a session yet."""
+def is_video_folder(folder: Path) -> bool:
+    """Whether a folder contains videos and is not yet a session."""
     return folder.is_dir() and not (folder / OBSERVATIONS_FILE).exists() and bool(_video_paths(folder))
 
 
 def list_videos(folder: Path) -> tuple[list[VideoFile], list[str]]:
-    """The folder's videos by name, and warnings of those that are left out. Raises InputError."""
+    """The folder's videos sorted by name, and warnings on skipped ones. Raises InputError."""
     if not folder.is_dir():
         raise InputError("this folder does not exist", file=folder, remedy="give a folder of videos")
     paths = _video_paths(folder)
@@ -71,10 +71,7 @@ def list_videos(folder: Path) -> tuple[list[VideoFile], list[str]]:
     warnings: list[str] = []
     contents: dict[tuple[int, str], str] = {}
     for path in paths:
-        camera = path.stem
-        if camera != camera.strip() or '"' in camera or camera == "metadata":
-            remedy = "rename it: letters, digits, - and _"
-            raise InputError(f"{camera!r} is no name for a camera", file=path, remedy=remedy)
+        camera = name_from_file(path.stem, path)
         same = next((video.path.name for video in videos if video.camera == camera), None)
         if same is not None:
             remedy = "rename or remove one: a camera is named by its video"
@@ -89,35 +86,40 @@ def list_videos(folder: Path) -> tuple[list[VideoFile], list[str]]:
     return videos, warnings
 
 
-def gather_session(
-    folder: Path, session: Path, tell: Progress, marker: Path | None = None, detector: DetectorName = "marker"
-) -> Gathered:
-    """Detect the marker, or what else moves, in every video and merge what was seen to a session folder.
+def session_from_videos(
+    folder: str | Path,
+    session: str | Path,
+    progress: Progress = lambda text, share: None,
+    marker: Path | None = None,
+    detector: DetectorName = "marker",
+) -> VideoSession:
+    """Run a detector on every video and merge the detections into a session folder.
 
-    session: is made or brought up to date: rig.toml, observations.csv, and what each video gave, so that a video that
-    has not changed is not looked through again. marker: a marker.toml; default the folder's, or the
-    demo's orange ball. detector: person and vehicle take videos in which one of them is at a time: who is who in
-    two videos nobody knows yet. Raises InputError where fewer than two videos can be read.
+    session: folder that is created or updated: rig.toml, observations.csv and the detections of each video, which are
+    reused if the video has not changed. marker: a marker.toml; default: the one in the folder, or the demo's orange
+    ball. detector: person and vehicle require videos with one target at a time, because targets are not associated
+    between videos. Raises InputError if fewer than two videos can be read.
     """
+    folder, session = Path(folder), Path(session)
     videos, warnings = list_videos(folder)
     if len(videos) < 2:
         what = f"there is only one video ({videos[0].path.name})"
         raise InputError(what, file=folder, remedy="put those of the other cameras beside it")
     given, tables = _given_rig(folder)
     own_marker = marker or (folder / MARKER_FILE if (folder / MARKER_FILE).exists() else None)
-    model = MarkerModel.default() if own_marker is None else read_marker(own_marker)
-    found, failed = _detect_all(videos, session, model, given, tell, detector)
+    model = MarkerModel.default() if own_marker is None else read_marker_model(own_marker)
+    found, failed = _detect_all(videos, session, model, given, progress, detector)
     warnings += failed
     if len(found) < 2:
-        told = "; ".join(warnings)
-        raise InputError(f"fewer than two videos can be used ({told})", file=folder, remedy="add or replace videos")
+        listed = "; ".join(warnings)
+        raise InputError(f"fewer than two videos can be used ({listed})", file=folder, remedy="add or replace videos")
     lines: list[str] = []
     rows: list[str] = []
     for video in videos:
         if video.camera not in found:
             continue
         one, kept = found[video.camera]
-        several = _several(one)
+        several = _label_count_if_many(one)
         if several:
             warnings.append(
                 f"{video.path.name}: {several} {detector}s in it, and who is who in two videos is not known; left out"
@@ -125,25 +127,26 @@ def gather_session(
             one = replace(one, rows=())
         rows += one.rows
         again = " (kept from before)" if kept else ""
-        lines.append(f"{video.path.name}: {detector} in {one.seen} of {one.frames} frames{again}")
+        lines.append(f"{video.path.name}: {detector} in {one.frames_with_detection} of {one.frames} frames{again}")
         warnings += [f"{video.path.name}: {warning}" for warning in one.warnings]
         if not one.rows and not several:
             warnings.append(f"{video.path.name}: no {detector} in any of its frames")
-        table = _table(video, one, tables.get(video.camera, {}), warnings)
+        table = _camera_table(video, one, tables.get(video.camera, {}), warnings)
         lens = _measured_lens(given, video.camera)
-        # A ball's centre is not its outline's: with no lens to move it by, the solver does it with the one it finds.
+        # A ball's centre does not project to the centre of its outline: without measured intrinsics, the solver
+        # corrects that with the intrinsics it estimates.
         table.pop("ball_outline", None)
         if detector == "marker" and (lens is None or (lens.width, lens.height) != one.size):
             table["ball_outline"] = True
         tables[video.camera] = table
     metadata = tables.pop("metadata", {})
-    # Keys of [metadata] must not land in the last camera's table: it goes first.
+    # [metadata] goes first, so that its keys do not end up in the last camera's table.
     rig_text = tomli_w.dumps({"metadata": metadata, **tables} if metadata else tables)
-    write_together({session / RIG_FILE: rig_text, session / OBSERVATIONS_FILE: observations_text(rows)})
+    write_together({session / RIG_FILE: rig_text, session / OBSERVATIONS_FILE: observations_csv(rows)})
     if not rows:
-        return Gathered(read_rig(session / RIG_FILE), Observations({}), tuple(warnings), tuple(lines))
+        return VideoSession(read_rig(session / RIG_FILE), Observations({}), tuple(warnings), folder.name, tuple(lines))
     rig, observations = read_folder(session)
-    return Gathered(rig, observations, (*warnings, *observations.warnings), tuple(lines))
+    return VideoSession(rig, observations, (*warnings, *observations.warnings), folder.name, tuple(lines))
 
 
 def _video_paths(folder: Path) -> list[Path]:
@@ -155,7 +158,7 @@ def _video_paths(folder: Path) -> list[Path]:
 
 
 def _digest(path: Path) -> str:
-    """Enough of a file to tell it from another of the same length: videos differ from the first frames on."""
+    """Hash of the first and last 256 KiB of a file, which distinguishes videos of the same length."""
     piece = 1 << 18
     with path.open("rb") as file:
         begin = file.read(piece)
@@ -164,7 +167,7 @@ def _digest(path: Path) -> str:
 
 
 def _given_rig(folder: Path) -> tuple[Rig | None, dict[str, Any]]:
-    """The folder's rig.toml, checked, and its tables by camera as they stand there."""
+    """The folder's rig.toml, validated, and its original tables by camera."""
     file = folder / RIG_FILE
     if not file.exists():
         return None, {}
@@ -176,14 +179,16 @@ def _given_rig(folder: Path) -> tuple[Rig | None, dict[str, Any]]:
 
 
 def _measured_lens(given: Rig | None, camera: str) -> Intrinsics | None:
-    """A camera's lens as far as it was measured: a guess says nothing of a picture's pixels."""
+    """A camera's measured intrinsics; None if they are only assumed."""
     if given is None or camera not in given.cameras or given.cameras[camera].focal_std > 0.0:
         return None
     return given.cameras[camera].intrinsics
 
 
-def _table(video: VideoFile, found: Found, given: dict[str, Any], warnings: list[str]) -> dict[str, Any]:
-    """A camera's table of rig.toml: what is given, completed by what the video tells."""
+def _camera_table(
+    video: VideoFile, found: VideoDetections, given: dict[str, Any], warnings: list[str]
+) -> dict[str, Any]:
+    """A camera's table of rig.toml: the given values, completed by those of the video."""
     table = {"name": video.camera, "size": list(found.size), "fps": found.fps, **given}
     wanted = tuple(int(value) for value in table["size"])
     if wanted != found.size:
@@ -202,44 +207,46 @@ def _detect_all(
     session: Path,
     model: MarkerModel,
     given: Rig | None,
-    tell: Progress,
+    progress: Progress,
     kind: DetectorName,
-) -> tuple[dict[str, tuple[Found, bool]], list[str]]:
-    """What each video gave, and whether it was kept from before; and why some could not be read."""
+) -> tuple[dict[str, tuple[VideoDetections, bool]], list[str]]:
+    """Detections of each video with whether they come from the cache, and reasons why some could not be read."""
     state = _read_state(session)
-    found: dict[str, tuple[Found, bool]] = {}
+    found: dict[str, tuple[VideoDetections, bool]] = {}
     failed: dict[str, str] = {}
     lock, stop = threading.Lock(), threading.Event()
     shares = dict.fromkeys((video.camera for video in videos), 0.0)
 
-    def told(video: VideoFile, text: str, share: float) -> None:
+    def report(video: VideoFile, text: str, share: float) -> None:
         with lock:
             shares[video.camera] = share
-            tell(f"{video.path.name} {text}", sum(shares.values()) / len(shares))
+            progress(f"{video.path.name} {text}", sum(shares.values()) / len(shares))
 
     def look(video: VideoFile) -> None:
         lens = _measured_lens(given, video.camera)
-        told_lens = None if lens is None else [lens.matrix.tolist(), lens.distortions.tolist()]
-        key = _key(video, model if kind == "marker" else None, told_lens, kind)
-        before = _kept(session, video.camera, state.get(video.camera), key)
+        given_lens = None if lens is None else [lens.matrix.tolist(), lens.distortions.tolist()]
+        key = _cache_key(video, model if kind == "marker" else None, given_lens, kind)
+        before = _cached_detections(session, video.camera, state.get(video.camera), key)
         if before is not None:
             found[video.camera] = before, True
-            told(video, "kept", 1.0)
+            report(video, "kept", 1.0)
             return
         try:
-            film = Film(video.path)
+            film = VideoReader(video.path)
             total = max(film.info.frames, 1)
             if kind == "marker":
-                detector = marker_detector(model, lens, film.info.size)
-                one = detect_in(
+                detector = ball_detector(model, lens, film.info.size)
+                one = run_detector(
                     film,
                     video.camera,
                     detector,
-                    lambda frame: told(video, f"{frame} of {total}", min(frame / total, 1.0)),
+                    lambda frame: report(video, f"{frame} of {total}", min(frame / total, 1.0)),
                     stop.is_set,
                 )
             else:
-                one = _moving(film, video.camera, kind, lambda text, share: told(video, text, min(share, 1.0)))
+                one = _detect_people_or_vehicles(
+                    film, video.camera, kind, lambda text, share: report(video, text, min(share, 1.0))
+                )
         except InputError as error:
             with lock:
                 failed[video.camera] = f"{video.path.name}: {error.what}; left out"
@@ -251,12 +258,12 @@ def _detect_all(
             state[video.camera] = {"key": key, **asdict(replace(one, rows=()))}
             write_together(
                 {
-                    session / _DETECTIONS / f"{video.camera}.csv": observations_text(one.rows),
+                    session / _DETECTIONS / f"{video.camera}.csv": observations_csv(one.rows),
                     session / _STATE: json.dumps(state, indent=1) + "\n",
                 }
             )
 
-    # Decoding and OpenCV let go of the interpreter, so threads share the cores; OpenCV's own would be too many.
+    # Decoding and OpenCV release the GIL, so Python threads use all cores; OpenCV's own threads would oversubscribe.
     cv2.setNumThreads(1)
     pool = ThreadPoolExecutor(max_workers=max(1, min(len(videos), os.cpu_count() or 1)))
     try:
@@ -268,23 +275,23 @@ def _detect_all(
     return found, [failed[video.camera] for video in videos if video.camera in failed]
 
 
-def _moving(film: Film, camera: str, kind: str, tell: Progress) -> Found:
-    """People or vehicles of a video, without the columns that a session does not know."""
-    from deploy.offline.detect_moving import HEADER_EXTRA, find_moving, make_detector
+def _detect_people_or_vehicles(film: VideoReader, camera: str, kind: str, progress: Progress) -> VideoDetections:
+    """Detect people or vehicles in a video, without the extra columns that a session does not have."""
+    from edge.offline.moving import EXTRA_COLUMNS, detect_moving, moving_detector
 
-    found = find_moving(film, camera, make_detector(kind, "mog2", film.info.fps), tell)
-    extra = HEADER_EXTRA.count(",") + 1
-    return replace(found, rows=tuple(row.rsplit(",", extra)[0] for row in found.rows))
+    found = detect_moving(film, camera, moving_detector(kind, "mog2", film.info.fps), progress)
+    extra = EXTRA_COLUMNS.count(",") + 1
+    return replace(found, rows=tuple(row.rsplit(",", extra)[0] for row in found.rows), extra_columns="")
 
 
-def _several(found: Found) -> int:
-    """How many different points are in a video, if more than one: the label is the last cell but one."""
+def _label_count_if_many(found: VideoDetections) -> int:
+    """Number of different labels in a video if more than one, else 0; the label is the last cell but one."""
     labels = {row.rsplit(",", 2)[1] for row in found.rows}
     return len(labels) if len(labels) > 1 else 0
 
 
-def _key(video: VideoFile, model: MarkerModel | None, lens: Any, kind: str) -> str:
-    """Changes with whatever changes a video's detections."""
+def _cache_key(video: VideoFile, model: MarkerModel | None, lens: Any, kind: str) -> str:
+    """Cache key: a hash of everything that affects a video's detections."""
     table = None if model is None else {"revision": REVISION, **model.to_table()}
     about = [VERSION, has_pyav(), video.path.name, video.size, video.mtime_ns, table, lens, kind]
     return hashlib.sha256(json.dumps(about).encode()).hexdigest()
@@ -294,18 +301,18 @@ def _read_state(session: Path) -> dict[str, Any]:
     try:
         state = json.loads((session / _STATE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return {}  # nothing kept, or nothing that can be used: everything is looked through again
+        return {}  # no usable cache: all videos are processed again
     return state if isinstance(state, dict) else {}
 
 
-def _kept(session: Path, camera: str, entry: Any, key: str) -> Found | None:
+def _cached_detections(session: Path, camera: str, entry: Any, key: str) -> VideoDetections | None:
     if not isinstance(entry, dict) or entry.get("key") != key:
         return None
     try:
         text = (session / _DETECTIONS / f"{camera}.csv").read_text(encoding="utf-8")
         values = {name: value for name, value in entry.items() if name != "key"}
         size, span = values["size"], values["span"]
-        return Found(
+        return VideoDetections(
             **{
                 **values,
                 "rows": tuple(text.splitlines()[1:]),

@@ -1,1 +1,1 @@
-"""Simulated sessions and flights written to disk."""
+"""Writers of simulated sessions and flights with ground truth."""

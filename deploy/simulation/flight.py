@@ -1,4 +1,4 @@
-"""Writes a flight over the simulated town: video, rig and telemetry as a user has them, and the truth beside them."""
+"""Writes a simulated flight over the town: video, rig.toml and telemetry in user formats, and the ground truth."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import tomli_w
 
 from edge.uav.tracker import Telemetry
 from edge.uav.world import scenarios
-from edge.uav.world.world import World
+from edge.uav.world.flight_world import FlightWorld
 from protocols.core.errors import InputError
 from protocols.core.files import write_together
 from protocols.geometry import so3
@@ -28,9 +28,9 @@ _JPEG_QUALITY = 95
 def write_simulated_flight(
     scene: str, out: Path, *, seed: int, frames: int | None, size: tuple[int, int], rate_hz: float
 ) -> dict[str, Any]:
-    """Fly a scenario and write its folder; returns counts, the target's first box and the telemetry's true offset.
+    """Simulate a scenario and write its folder; returns counts, the target's first box and the true telemetry offset.
 
-    scene: ``town`` or ``town:scenario``. frames: out of the picture. rate_hz: of the telemetry. Raises InputError.
+    scene: ``town`` or ``town:scenario``. frames: number out of view. rate_hz: of the telemetry. Raises InputError.
     """
     world = scenarios.get(scene.partition(":")[2] or _USUAL, seed, size, frames)
     try:
@@ -52,14 +52,14 @@ def write_simulated_flight(
         "seed": seed,
         "video": str(video),
         "frames": world.length,
-        "out_of_picture": list(world.out),
+        "out_of_picture": list(world.out_of_view),
         "target": [round(value, 1) for value in (box.x, box.y, box.width, box.height)],
         "telemetry_offset": world.time_offset,
     }
 
 
-def _write_video(world: World, out: Path) -> Path:
-    """The video, or where OpenCV cannot encode one, a folder of JPEGs."""
+def _write_video(world: FlightWorld, out: Path) -> Path:
+    """Write the video or, if OpenCV cannot encode one, a folder of JPEGs."""
     partial = out / f".partial.{VIDEO_FILE}"
     writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*_CODEC), world.fps, world.size)
     if writer.isOpened():
@@ -77,7 +77,7 @@ def _write_video(world: World, out: Path) -> Path:
     return folder
 
 
-def _rig(world: World) -> dict[str, Any]:
+def _rig(world: FlightWorld) -> dict[str, Any]:
     width, height = world.size
     table = {
         "name": _CAMERA,
@@ -91,7 +91,7 @@ def _rig(world: World) -> dict[str, Any]:
 
 
 def _telemetry(samples: list[Telemetry]) -> str:
-    """time, quaternion ned_from_body, north, east, down; one row a sample."""
+    """CSV text with time, quaternion ned_from_body, north, east, down; one row per sample."""
     lines = ["time,qw,qx,qy,qz,north,east,down"]
     for sample in samples:
         turn = so3.log(sample.ned_from_body)
@@ -102,8 +102,8 @@ def _telemetry(samples: list[Telemetry]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _truth(world: World) -> str:
-    """One row a frame; the camera's pose as centre (NED) and Rodrigues vector, camera from NED."""
+def _truth(world: FlightWorld) -> str:
+    """CSV text with one row per frame; the camera pose as centre (NED) and Rodrigues vector, camera from NED."""
     lines = [
         "frame,time,x,y,width,height,heading,inside,visible,north,east,speed,course,"
         "camera_north,camera_east,camera_down,camera_rx,camera_ry,camera_rz"

@@ -1,4 +1,4 @@
-"""Writes a session of the scene ``people``: labelled head tops and foot points, the truth, and videos where asked."""
+"""Writes a session of the scene ``people``: labelled head tops and foot points, ground truth, and optional videos."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import tomli_w
 
 from deploy.simulation.session import TRUTH_CALIBRATION, TRUTH_TRAJECTORY, camera_tables
 from edge import scenes
+from edge.scenes import renderer_for
 from edge.scenes.people.scene import PeopleScene
-from edge.scenes.people.session import PeopleTrack, film_people, seen
+from edge.scenes.people.session import PeopleTrack, simulate_people_tracks, visible_points
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.files import write_atomically
@@ -33,12 +34,12 @@ def write_people_session(
     drops: float | None,
     render: bool,
 ) -> dict[str, Any]:
-    """Film the scene and write the session folder; returns counts. Raises InputError."""
-    scene = scenes.get_people(seed, cameras, people)
-    tracks = film_people(scene, seconds, seed, pixel_noise=noise_px, drop_fraction=drops)
+    """Simulate the scene and write the session folder; returns counts. Raises InputError."""
+    scene = scenes.get_people_scene(seed, cameras, people)
+    tracks = simulate_people_tracks(scene, seconds, seed, pixel_noise=noise_px, drop_fraction=drops)
     rows = sum(len(track) for track in tracks.values())
     if not rows:
-        raise InputError("no camera saw anybody", remedy="film longer or take another seed")
+        raise InputError("no camera saw anybody", remedy="simulate a longer time or use another seed")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -62,21 +63,21 @@ def write_people_session(
 
 
 def people_observations(scene: PeopleScene, tracks: dict[str, PeopleTrack]) -> Observations:
-    """What the cameras reported, as a session's observations: two labels a person."""
-    films = list(tracks.values())
+    """The simulated detections as a session's observations, with two labels per person."""
+    tracks_by_camera = list(tracks.values())
     return gather_tracks(
-        [film.camera for film in films for _ in range(len(film))],
-        [label for film in films for label in film.label],
-        np.concatenate([film.frame for film in films]),
-        np.concatenate([film.time for film in films]),
-        np.concatenate([film.pixels for film in films]),
-        np.concatenate([film.size for film in films]),
+        [film.camera for film in tracks_by_camera for _ in range(len(film))],
+        [label for film in tracks_by_camera for label in film.label],
+        np.concatenate([film.frame for film in tracks_by_camera]),
+        np.concatenate([film.time for film in tracks_by_camera]),
+        np.concatenate([film.pixels for film in tracks_by_camera]),
+        np.concatenate([film.size for film in tracks_by_camera]),
         order=[camera.name for camera in scene.cameras],
     )
 
 
 def _write_truth_trajectory(file: Path, scene: PeopleScene, seconds: float) -> None:
-    """time,x,y,z,label of head tops and foot points, on the first camera's clock."""
+    """Write time,x,y,z,label of head tops and foot points, with times on the first camera's clock."""
     clock = scene.cameras[0].clock
     true_time = np.arange(0.0, seconds, 1.0 / _TRUTH_HZ)
     camera_time = clock.epoch_ns / NANOSECONDS + clock.rate * true_time
@@ -91,27 +92,27 @@ def _write_truth_trajectory(file: Path, scene: PeopleScene, seconds: float) -> N
 
 
 def _write_truth_boxes(file: Path, scene: PeopleScene, tracks: dict[str, PeopleTrack]) -> None:
-    """Where every body is in every frame that shows somebody, also hidden ones: boxes as if nobody stood before it."""
+    """Write the bounding boxes of all people in every frame that shows somebody, ignoring occlusion."""
     lines = ["camera,frame,time,person,x,y,w,h,head_u,head_v,foot_u,foot_v,head_seen,foot_seen"]
     for name, track in tracks.items():
         frames, first = np.unique(track.frame, return_index=True)
-        pixels, visible = seen(scene, name, track.true_time[first])
+        pixels, visible = visible_points(scene, name, track.true_time[first])
         for row, (frame, at) in enumerate(zip(frames, first, strict=True)):
             boxes = scene.boxes(name, float(track.true_time[at]))
             for index, person in enumerate(scene.people):
                 if np.isfinite(boxes[index]).all() and np.isfinite(pixels[row, index]).all():
                     numbers = ",".join(f"{value:.3f}" for value in (*boxes[index], *pixels[row, index].ravel()))
-                    told = ",".join(str(int(value)) for value in visible[row, index])
-                    lines.append(f"{name},{frame},{track.time[at]:.17g},{person.name},{numbers},{told}")
+                    visibility = ",".join(str(int(value)) for value in visible[row, index])
+                    lines.append(f"{name},{frame},{track.time[at]:.17g},{person.name},{numbers},{visibility}")
     write_atomically(file, "\n".join(lines) + "\n")
 
 
 def _write_video(out: Path, scene: PeopleScene, name: str, track: PeopleTrack, seed: int) -> str:
-    """The camera's frames that are in the session, drawn, in a video of even frame rate."""
+    """Render the camera's frames that are in the session into a video of constant frame rate."""
     import cv2
 
     camera = scene.camera(name)
-    renderer = scene.renderer(name, np.random.default_rng([seed, 9]))
+    renderer = renderer_for(scene, name, np.random.default_rng([seed, 9]))
     file = out / f"{name}.mp4"
     part = out / f".{name}.part.mp4"
     size = camera.intrinsics.width, camera.intrinsics.height

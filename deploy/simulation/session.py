@@ -1,4 +1,4 @@
-"""Writes a session of a simulated world: what a user's folder looks like, with the truth beside it."""
+"""Writes a session of a simulated marker scene: a session folder with its ground truth."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 import tomli_w
 
 from edge import scenes
-from edge.scenes.common.base import Scene
-from edge.scenes.marker.session import SimulatedTracks, simulated_session
+from edge.scenes.common.base import SimulatedScene
+from edge.scenes.marker.session import SimulatedTracks, simulate_tracks
 from protocols.core.errors import InputError
 from protocols.core.files import write_atomically
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
@@ -32,28 +32,28 @@ def write_simulated_session(
     outliers: float,
     drops: float | None,
 ) -> dict[str, Any]:
-    """Film a scene and write the session folder; returns counts. Raises InputError."""
-    scene = scenes.get(scene_name, seed, cameras)
-    filmed = simulated_session(
+    """Simulate a scene and write the session folder; returns counts. Raises InputError."""
+    scene = scenes.get_marker_scene(scene_name, seed, cameras)
+    simulated = simulate_tracks(
         scene, seconds, seed, pixel_noise=noise_px, outlier_fraction=outliers, drop_fraction=drops
     )
-    rows = sum(len(track) for track in filmed.tracks.values())
+    rows = sum(len(track) for track in simulated.tracks.values())
     if not rows:
-        raise InputError("no camera saw the marker", remedy="film longer or take another seed")
+        raise InputError("no camera saw the marker", remedy="simulate a longer time or use another seed")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot be made: {error.strerror}", file=out, remedy="choose another --out") from None
     rig, truth = camera_tables(scene, scene_name)
     write_rig(out / RIG_FILE, rig)
-    write_observations(out / OBSERVATIONS_FILE, observations_of(filmed))
+    write_observations(out / OBSERVATIONS_FILE, observations_from_tracks(simulated))
     write_atomically(out / TRUTH_CALIBRATION, tomli_w.dumps(truth))
-    _write_truth_trajectory(out / TRUTH_TRAJECTORY, filmed)
+    _write_truth_trajectory(out / TRUTH_TRAJECTORY, simulated)
     return {"scene": scene_name, "seed": seed, "cameras": len(scene.cameras), "rows": rows, "seconds": seconds}
 
 
-def camera_tables(scene: Scene, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """rig.toml of a scene, and calibration.toml as it should come out, in the scene's own world and in metres."""
+def camera_tables(scene: SimulatedScene, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Tables of rig.toml of a scene, and of the true calibration.toml, in the scene's world frame in metres."""
     reference = scene.cameras[0].name
     metadata = {"name": name, "units": "m"}
     rig: dict[str, Any] = {"metadata": metadata}
@@ -78,21 +78,21 @@ def camera_tables(scene: Scene, name: str) -> tuple[dict[str, Any], dict[str, An
     return rig, truth
 
 
-def rig_of(filmed: SimulatedTracks) -> Rig:
-    """The rig of a simulated world: its cameras' lenses, and nothing of where they stand."""
+def rig_from_tracks(simulated: SimulatedTracks) -> Rig:
+    """The rig of a simulated scene, with intrinsics but without poses."""
     return Rig(
         {
             camera.name: RigCamera(
                 camera.name, (camera.intrinsics.width, camera.intrinsics.height), camera.fps, camera.intrinsics
             )
-            for camera in filmed.cameras
+            for camera in simulated.cameras
         }
     )
 
 
-def observations_of(filmed: SimulatedTracks) -> Observations:
-    """What the cameras of a simulated world reported, as a session's observations."""
-    tracks = list(filmed.tracks.values())
+def observations_from_tracks(simulated: SimulatedTracks) -> Observations:
+    """The simulated detections as a session's observations."""
+    tracks = list(simulated.tracks.values())
     names = [track.camera for track in tracks for _ in range(len(track))]
     return gather_tracks(
         names,
@@ -101,17 +101,17 @@ def observations_of(filmed: SimulatedTracks) -> Observations:
         np.concatenate([track.time for track in tracks]),
         np.concatenate([track.pixels for track in tracks]),
         np.concatenate([track.size for track in tracks]),
-        order=[camera.name for camera in filmed.cameras],
+        order=[camera.name for camera in simulated.cameras],
     )
 
 
-def _write_truth_trajectory(file: Path, filmed: SimulatedTracks) -> None:
-    """time,x,y,z on the first camera's clock."""
-    first = filmed.cameras[0]
-    true_time = np.arange(filmed.start, filmed.end, 1.0 / _TRUTH_HZ)
+def _write_truth_trajectory(file: Path, simulated: SimulatedTracks) -> None:
+    """Write time,x,y,z of the marker, with times on the first camera's clock."""
+    first = simulated.cameras[0]
+    true_time = np.arange(simulated.start, simulated.end, 1.0 / _TRUTH_HZ)
     epoch = first.clock.epoch_ns / 1e9
     camera_time = epoch + first.clock.rate * true_time
-    position = filmed.scene.marker_position(true_time)
+    position = simulated.scene.marker_position(true_time)
     lines = ["time,x,y,z"]
     lines += [f"{t:.17g},{x:.17g},{y:.17g},{z:.17g}" for t, (x, y, z) in zip(camera_time, position, strict=True)]
     write_atomically(file, "\n".join(lines) + "\n")

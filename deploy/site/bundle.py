@@ -1,7 +1,7 @@
-"""A wheelhouse to carry to a board that has no network, and the script that installs it there.
+"""Offline wheelhouse for a board without a network, with an install script.
 
-A board needs far less than a workstation: a camera no SciPy, no plotly, no log. So each role has its own list, drawn
-from the project's own requirements, and what is on it is installed without asking for the rest.
+A board needs fewer packages than a workstation: a camera needs no SciPy, no plotly and no log writer. Each role has its
+own subset of the project's requirements, which is installed without the other dependencies.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from protocols.core.version import VERSION
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
 
-_EVERY = (
+_COMMON_PACKAGES = (
     "cyclopts",
     "eclipse-zenoh",
     "msgspec",
@@ -37,19 +37,19 @@ _EVERY = (
     "structlog",
     "tomli-w",
 )
-_LOG = ("mcap", "zstandard", "foxglove-schemas-protobuf")
-NEEDS: dict[str, tuple[str, ...]] = {
-    "camera": (*_EVERY, "opencv-python-headless", "mcap"),
-    "uav": (*_EVERY, "opencv-python-headless", "pymavlink", "pyserial"),
-    "hub": (*_EVERY, *_LOG, "opencv-python-headless", "scipy", "plotly"),
-    "recorder": (*_EVERY, *_LOG),
-    "router": _EVERY,
+_LOG_PACKAGES = ("mcap", "zstandard", "foxglove-schemas-protobuf")
+ROLE_PACKAGES: dict[str, tuple[str, ...]] = {
+    "camera": (*_COMMON_PACKAGES, "opencv-python-headless", "mcap"),
+    "uav": (*_COMMON_PACKAGES, "opencv-python-headless", "pymavlink", "pyserial"),
+    "hub": (*_COMMON_PACKAGES, *_LOG_PACKAGES, "opencv-python-headless", "scipy", "plotly"),
+    "recorder": (*_COMMON_PACKAGES, *_LOG_PACKAGES),
+    "router": _COMMON_PACKAGES,
 }
-"""What a role imports; ``tests/faults/test_bundle.py`` runs each role with nothing else."""
+"""Packages that a role imports; ``tests/faults/test_bundle.py`` runs each role with only these."""
 BUDGET_MB = {"camera": 350.0, "uav": 350.0}
-"""Installed, without an OAK board's depthai."""
-_WARM = {
-    "camera": "deploy.agents.assembly, deploy.offline.detect, deploy.agents.systemd_notify, edge.agents.camera, "
+"""Largest installed size of a role [MB], without depthai for OAK boards."""
+_PRECOMPILED_MODULES = {
+    "camera": "deploy.agents.assembly, edge.offline.video, deploy.agents.systemd_notify, edge.agents.camera, "
     "edge.detectors.marker.bright, edge.detectors.marker.ball, edge.detectors.marker.tag, "
     "edge.devices.playback.log_playback, edge.devices.live.network, edge.devices.live.picamera, "
     "edge.devices.live.usb, edge.devices.playback.open_video, protocols.bus.transport.zenoh_bus",
@@ -61,26 +61,26 @@ _WARM = {
     "router": "deploy.commands.agents.router, protocols.bus.router.zenoh_router",
 }
 _WHEELS = "wheels"
-_GLIBC = 28  # Debian 10 and later, as all our wheels ask for
+_MAX_GLIBC_MINOR = 28  # minor version of glibc 2 in Debian 10, the oldest that all our wheels support
 _SOURCE = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The board. platform: aarch64 or x86_64. python: "3.11"."""
+    """The target board. platform: aarch64 or x86_64. python: version, such as "3.11"."""
 
     platform: str
     python: str
 
     def tags(self) -> tuple[str, ...]:
-        """Platform tags that run there, newest first."""
+        """Compatible wheel platform tags, newest first."""
         return (
-            *(f"manylinux_2_{minor}_{self.platform}" for minor in range(_GLIBC, 16, -1)),
+            *(f"manylinux_2_{minor}_{self.platform}" for minor in range(_MAX_GLIBC_MINOR, 16, -1)),
             f"manylinux2014_{self.platform}",
         )
 
     def markers(self) -> dict[str, str]:
-        """The environment in which its requirements' markers are judged."""
+        """The environment in which requirement markers are evaluated."""
         return {
             "implementation_name": "cpython",
             "implementation_version": f"{self.python}.0",
@@ -99,7 +99,7 @@ class Target:
 
 @dataclass(slots=True)
 class Bundle:
-    """What was made. sizes: wheel → bytes when installed."""
+    """A finished bundle. sizes: installed size [bytes] by wheel."""
 
     role: str
     target: Target
@@ -113,23 +113,23 @@ class Bundle:
 
     @property
     def carried_mb(self) -> float:
-        """Size of the wheels to carry over."""
+        """Size of the wheels to copy to the board."""
         return sum(path.stat().st_size for path in (self.out / _WHEELS).glob("*.whl")) / 1e6
 
 
 def make_bundle(role: str, target: Target, out: Path, extras: Sequence[str] = (), keep_budget: bool = True) -> Bundle:
-    """Gather wheels and write ``out``.
+    """Collect the wheels and write the bundle to ``out``.
 
-    extras: optional groups of the project, such as ``oak``, or packages that else only other roles get, such as scipy.
+    extras: optional dependency groups of the project, such as ``oak``, or packages of other roles, such as scipy.
 
-    Raises InputError where the wheels can't be had, Refused where a board's role has grown over its budget.
+    Raises InputError if wheels are not available, Refused if the role exceeds its size limit.
     """
     folder = out / _WHEELS
     _clean(out)
     needed = [*_requirements(role, target, extras)]
     wheel = _own_wheel(folder)
     _download([str(requirement) for requirement in needed], folder, target)
-    _complete(folder, wheel, target)
+    _download_missing_dependencies(folder, wheel, target)
     _download(["pip>=24"], folder, target)
     bundle = Bundle(role, target, out)
     pins = []
@@ -152,7 +152,7 @@ def make_bundle(role: str, target: Target, out: Path, extras: Sequence[str] = ()
 
 
 def _clean(out: Path) -> None:
-    """Make the folder; take away only what an earlier bundle wrote."""
+    """Create the folder, and remove only the wheels of an earlier bundle."""
     try:
         if (out / _WHEELS).is_dir():
             for file in (out / _WHEELS).glob("*.whl"):
@@ -163,7 +163,7 @@ def _clean(out: Path) -> None:
 
 
 def _requirements(role: str, target: Target, extras: Iterable[str]) -> Iterable[Requirement]:
-    """The project's own requirements that this role needs, with their bounds."""
+    """The project's requirements that this role needs, with their version bounds."""
     from packaging.requirements import Requirement
     from packaging.utils import canonicalize_name
 
@@ -175,11 +175,11 @@ def _requirements(role: str, target: Target, extras: Iterable[str]) -> Iterable[
         str(name).lower() for name in (metadata("syncline").get_all("Provides-Extra") or ()) if str(name) != "dev"
     }
     packages = {canonicalize_name(one.name) for one in declared if one.marker is None}
-    strange = [extra for extra in extras if extra not in groups and canonicalize_name(extra) not in packages]
-    if strange:
-        told = ", ".join(sorted(groups))
-        raise InputError(f"no extra {', '.join(strange)}", remedy=f"use {told}, or a package of the project's")
-    wanted = {canonicalize_name(name) for name in (*NEEDS[role], *(one for one in extras if one not in groups))}
+    unknown = [extra for extra in extras if extra not in groups and canonicalize_name(extra) not in packages]
+    if unknown:
+        known = ", ".join(sorted(groups))
+        raise InputError(f"no extra {', '.join(unknown)}", remedy=f"use {known}, or a package of the project's")
+    wanted = {canonicalize_name(name) for name in (*ROLE_PACKAGES[role], *(one for one in extras if one not in groups))}
     found = set()
     for requirement in declared:
         name = canonicalize_name(requirement.name)
@@ -232,7 +232,7 @@ def _download(requirements: Sequence[str], folder: Path, target: Target, deps: b
 
 
 def _lock(target: Target, folder: Path) -> Path | None:
-    """The checkout's pins that are meant for the target: pip would judge their markers by this machine."""
+    """The pinned requirements for the target: pip would evaluate their markers for this machine."""
     from packaging.requirements import InvalidRequirement, Requirement
 
     source = _SOURCE / "requirements.lock"
@@ -252,8 +252,8 @@ def _lock(target: Target, folder: Path) -> Path | None:
     return file
 
 
-def _complete(folder: Path, own: Path, target: Target) -> None:
-    """Fetch what the wheels ask for on the target, which pip judged by the machine that it runs on."""
+def _download_missing_dependencies(folder: Path, own: Path, target: Target) -> None:
+    """Download dependencies that apply only on the target, because pip evaluates markers for this machine."""
     from packaging.requirements import Requirement
     from packaging.utils import canonicalize_name
 
@@ -262,7 +262,7 @@ def _complete(folder: Path, own: Path, target: Target) -> None:
         missing: dict[str, str] = {}
         for file in folder.glob("*.whl"):
             if file == own:
-                continue  # its own needs are the role's, not all that it declares
+                continue  # of its own requirements only those of the role are needed
             for text in _metadata(file).get_all("Requires-Dist") or ():
                 requirement = Requirement(text)
                 name = canonicalize_name(requirement.name)
@@ -331,17 +331,17 @@ for pip in "$here"/{_WHEELS}/pip-*.whl; do :; done
 "$target/bin/python" "$pip/pip" install --quiet --disable-pip-version-check --no-index --no-compile --no-deps \\
     --upgrade --require-hashes --find-links "$here/{_WHEELS}" --requirement "$here/requirements.txt"
 # Byte code of what the agent imports, and of nothing else: services may not write here.
-"$target/bin/python" -c "import {_WARM[role]}"
+"$target/bin/python" -c "import {_PRECOMPILED_MODULES[role]}"
 echo "Syncline {VERSION} ({role}) is in $target: $(du -sm "$target" | cut -f1) MB"
 "$target/bin/syncline" --version
 """
 
 
 def folder_size_mb(folder: Path) -> float:
-    """Bytes of all files below it [MB]."""
+    """Total size of all files below a folder [MB]."""
     return sum(file.lstat().st_size for file in folder.rglob("*") if file.is_file() or file.is_symlink()) / 1e6
 
 
 def default_folder(role: str, target: Target) -> Path:
-    """Where a bundle goes if nothing is said."""
+    """The default output folder of a bundle."""
     return Path(f"syncline-{VERSION}-{role}-{target.platform}-py{target.python}")

@@ -1,4 +1,4 @@
-"""A whole rig's agents as processes of this machine: started in order, watched, restarted, stopped in order."""
+"""Supervisor of all agents of a rig on one machine: starts, monitors, restarts and stops their processes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-from deploy.site.rig_folder import ROLES, Agent, RigFolder, client, prepare
+from deploy.site.rig_folder import ROLES, Agent, RigFolder, client_bus, write_agent_configs
 from protocols.bus.base import Bus
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import LOOPBACK_ROUTER, BusConfig, is_loopback
@@ -26,14 +26,14 @@ from protocols.topics import CALIBRATION, STATUS
 
 STATE = "fleet.json"
 COMMANDS = {"recorder": "record"}
-_RESTART_S, _SLOWEST_RESTART_S, _SETTLED_S = 1.0, 10.0, 30.0
-_STOPPING_S = {"camera": 15.0, "uav": 15.0, "hub": 300.0, "recorder": 30.0, "router": 10.0}
+_MIN_RESTART_DELAY_S, _MAX_RESTART_DELAY_S, _STABLE_S = 1.0, 10.0, 30.0
+_STOP_TIMEOUT_S = {"camera": 15.0, "uav": 15.0, "hub": 300.0, "recorder": 30.0, "router": 10.0}
 _TICK_S = 0.2
 
 
 @dataclass(slots=True)
-class Seen:
-    """What is known of one agent. pid, started: of its process, /proc's start time with it; 0 = none runs."""
+class AgentRecord:
+    """State of one agent. pid, started: process id and start time in /proc; pid 0 = no process runs."""
 
     role: str
     pid: int = 0
@@ -45,42 +45,42 @@ class Seen:
 
 
 class Fleet:
-    """The processes of one rig.
+    """The supervised processes of one rig.
 
-    out: folder for logs, configuration and all that the agents write. tell: takes one line for a person.
+    out: folder for logs, configurations and all outputs of the agents. report: called with each message for the user.
     """
 
-    def __init__(self, rig: RigFolder, out: Path, *, simulated: bool, tell: Callable[[str], None]) -> None:
-        self.rig, self.out, self.simulated, self._tell = rig, out.resolve(), simulated, tell
-        self.seen = {agent.name: Seen(agent.role) for agent in rig.agents}
+    def __init__(self, rig: RigFolder, out: Path, *, simulated: bool, report: Callable[[str], None]) -> None:
+        self.rig, self.out, self.simulated, self._report = rig, out.resolve(), simulated, report
+        self.seen = {agent.name: AgentRecord(agent.role) for agent in rig.agents}
         self.calibrations: dict[str, str] = {}
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
-        self._due: dict[str, float] = {}
-        self._pause: dict[str, float] = {}
-        self._born: dict[str, float] = {}
+        self._restart_at: dict[str, float] = {}
+        self._backoff_s: dict[str, float] = {}
+        self._started_at: dict[str, float] = {}
         self._drain: Callable[[], None] = lambda: None
         self.elapsed = 0.0
 
     def run(self, seconds: float | None, stop: Event, show: Callable[[Fleet], None]) -> None:
-        """Run until ``stop`` is set, or for ``seconds`` after every camera was heard; then stop all in order.
+        """Run until ``stop`` is set, or for ``seconds`` after the first frames of all cameras; then stop in order.
 
-        show: told five times a second. Raises Refused if this fleet is up already, InputError.
+        show: called five times a second. Raises Refused if a fleet is already running in ``out``, InputError.
         """
-        self._take_over()
+        self._prepare_folder()
         own_router = not self.rig.of("router")
         endpoint = free_endpoint() if self.simulated else None
-        agents = prepare(self.rig, self.out, simulated=self.simulated, endpoint=endpoint)
+        agents = write_agent_configs(self.rig, self.out, simulated=self.simulated, endpoint=endpoint)
         (self.out / "logs").mkdir(exist_ok=True)
         with ExitStack() as stack:
             if own_router:
                 self._host_router(stack, endpoint or LOOPBACK_ROUTER)
-            stack.callback(self._end_all)
+            stack.callback(self._kill_all)
             self._save()
             try:
                 for agent in agents:
                     if agent.role == "router":
                         self._start(agent)
-                bus = stack.enter_context(self._own_bus(agents, endpoint, stop))
+                bus = stack.enter_context(self._open_bus(agents, endpoint, stop))
                 for agent in agents:
                     if agent.role != "router":
                         self._start(agent)
@@ -95,24 +95,24 @@ class Fleet:
     ) -> None:
         self._drain = self._listener(bus)
         cameras = [agent.name for agent in agents if agent.role in ("camera", "uav")]
-        began, first, saved = time.monotonic(), None, 0.0
-        # Twenty agents on two cores need their time to start; a camera that never comes must not hold up the rest.
-        patience = 20.0 + 3.0 * len(agents)
+        began, cameras_ready_at, saved = time.monotonic(), None, 0.0
+        # Twenty agents on two cores take long to start; a camera that never starts must not block the others.
+        start_timeout_s = 20.0 + 3.0 * len(agents)
         while not stop.is_set():
             now = time.monotonic()
             self._drain()
             self._restart_dead(agents, now)
             missing = [name for name in cameras if not self.seen[name].counters.get("frames")]
-            if first is None and (not missing or now - began > patience):
-                first = now
+            if cameras_ready_at is None and (not missing or now - began > start_timeout_s):
+                cameras_ready_at = now
                 if missing:
-                    self._tell(f"no frame yet from {', '.join(missing)}; see {self.out}/logs")
-            self.elapsed = 0.0 if first is None else now - first
+                    self._report(f"no frame yet from {', '.join(missing)}; see {self.out}/logs")
+            self.elapsed = 0.0 if cameras_ready_at is None else now - cameras_ready_at
             if now - saved > 1.0:
                 saved = now
                 self._save()
             show(self)
-            if seconds is not None and first is not None and self.elapsed >= seconds:
+            if seconds is not None and cameras_ready_at is not None and self.elapsed >= seconds:
                 return
             stop.wait(_TICK_S)
 
@@ -121,20 +121,20 @@ class Fleet:
 
         def drain() -> None:
             for received in statuses.drain():
-                self._heard(received.message)
+                self._handle_status(received.message)
             for received in calibrations.drain():
-                self._calibrated(received.agent, received.message)
+                self._handle_calibration(received.agent, received.message)
 
         return drain
 
-    def _heard(self, message: object) -> None:
+    def _handle_status(self, message: object) -> None:
         assert isinstance(message, pb.AgentStatus)
         seen = self.seen.get(message.agent)
         if seen is not None and seen.pid:
             seen.state, seen.message = message.state, message.message
             seen.counters = {name: round(count) for name, count in message.counters.items()}
 
-    def _calibrated(self, hub: str, message: object) -> None:
+    def _handle_calibration(self, hub: str, message: object) -> None:
         assert isinstance(message, pb.Calibration)
         solved = message.status == "solved"
         self.calibrations[hub] = (
@@ -148,12 +148,12 @@ class Fleet:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
-                # Ctrl-C goes to a whole process group: the agents must wait for their turn to stop.
+                # Ctrl-C goes to the whole process group, but agents must be stopped in order.
                 start_new_session=True,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
             )
         self._processes[agent.name] = process
-        self._born[agent.name] = time.monotonic()
+        self._started_at[agent.name] = time.monotonic()
         seen = self.seen[agent.name]
         seen.pid, seen.started, seen.state = process.pid, start_time(process.pid), "starting"
 
@@ -161,23 +161,25 @@ class Fleet:
         for agent in agents:
             name = agent.name
             process = self._processes.get(name)
-            if name in self._due:
-                if now >= self._due[name]:
-                    del self._due[name]
+            if name in self._restart_at:
+                if now >= self._restart_at[name]:
+                    del self._restart_at[name]
                     self.seen[name].restarts += 1
                     self._start(agent)
             elif process is not None and process.poll() is not None:
-                if now - self._born[name] > _SETTLED_S:
-                    self._pause.pop(name, None)
-                pause = self._pause.get(name, _RESTART_S)
-                self._pause[name] = min(2.0 * pause, _SLOWEST_RESTART_S)
-                self._due[name] = now + pause
+                if now - self._started_at[name] > _STABLE_S:
+                    self._backoff_s.pop(name, None)
+                pause = self._backoff_s.get(name, _MIN_RESTART_DELAY_S)
+                self._backoff_s[name] = min(2.0 * pause, _MAX_RESTART_DELAY_S)
+                self._restart_at[name] = now + pause
                 seen = self.seen[name]
                 seen.pid, seen.state, seen.message = 0, "down", self._last_line(name)
-                self._tell(f"{name} ended ({_how(process.returncode)}): {seen.message}; again in {pause:g} s")
+                self._report(
+                    f"{name} ended ({_exit_description(process.returncode)}): {seen.message}; again in {pause:g} s"
+                )
 
     def _stop(self, agents: tuple[Agent, ...], show: Callable[[Fleet], None]) -> None:
-        """Cameras first, so that hubs and recorders hear everything; then those who write, then the router."""
+        """Stop cameras first, so that hubs and recorders receive everything; then these, and the router last."""
         for group in (("camera", "uav"), ("hub",), ("recorder",), ("router",)):
             members = [agent for agent in agents if agent.role in group and agent.name in self._processes]
             for agent in members:
@@ -185,37 +187,37 @@ class Fleet:
                     self._processes[agent.name].send_signal(signal.SIGTERM)
             for agent in members:
                 process, seen = self._processes[agent.name], self.seen[agent.name]
-                dead_already = agent.name in self._due
+                dead_already = agent.name in self._restart_at
                 try:
-                    status = process.wait(_STOPPING_S[agent.role])
+                    status = process.wait(_STOP_TIMEOUT_S[agent.role])
                 except subprocess.TimeoutExpired:
                     process.kill()
                     status = process.wait()
-                    self._tell(f"{agent.name} did not stop within {_STOPPING_S[agent.role]:.0f} s and was ended")
-                self._drain()  # a hub's last answer, with all it has heard
+                    self._report(f"{agent.name} did not stop within {_STOP_TIMEOUT_S[agent.role]:.0f} s and was ended")
+                self._drain()  # the final calibration of a hub
                 if not dead_already:
                     seen.state = "stopped" if status == 0 else "failed"
                     seen.message = self._last_line(agent.name) if status else ""
                 seen.pid = 0
                 show(self)
 
-    def _end_all(self) -> None:
+    def _kill_all(self) -> None:
         for process in self._processes.values():
             if process.poll() is None:
                 process.kill()
                 process.wait()
 
     def _host_router(self, stack: ExitStack, endpoint: str) -> None:
-        """The router of a rig that has none of its own and stays on this machine."""
+        """Run a router in this process, for a rig that has none."""
         try:
             stack.enter_context(Router(endpoint))
         except InputError:
             if self.simulated:
                 raise
-            self._tell(f"a router listens at {endpoint} already: it is used")
+            self._report(f"a router listens at {endpoint} already: it is used")
 
-    def _own_bus(self, agents: Iterable[Agent], endpoint: str | None, stop: Event) -> Bus:
-        """This supervisor's ear: at the simulated rig's router, or where the first agent connects to."""
+    def _open_bus(self, agents: Iterable[Agent], endpoint: str | None, stop: Event) -> Bus:
+        """The supervisor's own bus connection: to the simulated rig's router, or where the first agent connects."""
         site = next(iter(agents)).config.site
         if endpoint is None:
             others = [agent.config.bus for agent in agents if agent.role != "router"]
@@ -223,13 +225,13 @@ class Fleet:
             endpoints = connect or (LOOPBACK_ROUTER,)
             config = BusConfig(mode="client", connect=endpoints, tls=others[0].tls if others else None)
         else:
-            config = client(endpoint)
+            config = client_bus(endpoint)
         if not all(is_loopback(one) for one in config.connect):
-            self._tell(f"waiting for the router at {', '.join(config.connect)}")
+            self._report(f"waiting for the router at {', '.join(config.connect)}")
         return open_bus(site, config, stop=stop.is_set, timeout_s=30.0)
 
-    def _take_over(self) -> None:
-        """Make the folder; refuse where a fleet is up in it, end what a killed one left behind."""
+    def _prepare_folder(self) -> None:
+        """Create the folder; refuse if a fleet is running in it, and stop processes orphaned by a killed one."""
         try:
             self.out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -239,13 +241,13 @@ class Fleet:
         state = read_state(self.out)
         if state is None:
             return
-        if runs(state["pid"], state["started"]):
+        if is_running(state["pid"], state["started"]):
             raise Refused(f"a fleet is up in {self.out} (pid {state['pid']}); `syncline fleet down --out …` stops it")
-        for name in end_left_over(state):
-            self._tell(f"{name} was left over from a fleet that was killed, and was ended")
+        for name in stop_orphaned_agents(state):
+            self._report(f"{name} was left over from a fleet that was killed, and was ended")
 
     def _save(self) -> None:
-        """For `fleet status` and `fleet down`: no fsync, a crash of the machine ends the fleet too."""
+        """Write the state for `fleet status` and `fleet down`; no fsync, because a machine crash ends the fleet too."""
         state = {
             "rig": self.rig.name,
             "pid": os.getpid(),
@@ -261,11 +263,11 @@ class Fleet:
 
     def _last_line(self, name: str) -> str:
         lines = (self.out / "logs" / f"{name}.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return lines[-1].removeprefix("syncline: ") if lines else "it said nothing"
+        return lines[-1].removeprefix("syncline: ") if lines else "no output"
 
 
 def start_time(pid: int) -> int:
-    """When a process began, in the kernel's ticks: with the pid it names one process for good. 0 = there is none."""
+    """Start time of a process in kernel ticks, which with the pid identifies a process uniquely; 0 = none."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
     except OSError:
@@ -274,13 +276,13 @@ def start_time(pid: int) -> int:
     return 0 if fields[0] == "Z" else int(fields[19])
 
 
-def runs(pid: int, started: int) -> bool:
-    """Whether that very process is still there."""
+def is_running(pid: int, started: int) -> bool:
+    """Whether the process with this pid and start time still runs."""
     return pid > 0 and started > 0 and start_time(pid) == started
 
 
 def read_state(out: Path) -> dict[str, Any] | None:
-    """What a fleet has written of itself; None where there never was one."""
+    """The state file of a fleet; None if there is none or it is invalid."""
     try:
         state = json.loads((out / STATE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -293,38 +295,38 @@ def read_state(out: Path) -> dict[str, Any] | None:
     return dict(state) if known else None
 
 
-def bring_down(out: Path, timeout_s: float = 420.0) -> list[str]:
-    """Stop the fleet that is up in ``out``, in order; returns what was done. Raises InputError where there is none."""
+def stop_fleet(out: Path, timeout_s: float = 420.0) -> list[str]:
+    """Stop the fleet that runs in ``out``, in order; returns what was done. Raises InputError if there is none."""
     state = read_state(out)
     if state is None:
         raise InputError("no fleet was started here", file=out, remedy="give the --out of `syncline fleet up`")
-    if not runs(state["pid"], state["started"]):
-        ended = end_left_over(state)
+    if not is_running(state["pid"], state["started"]):
+        ended = stop_orphaned_agents(state)
         return [f"the fleet was down already; ended what was left over: {', '.join(ended) or 'nothing'}"]
     os.kill(state["pid"], signal.SIGTERM)
     deadline = time.monotonic() + timeout_s
-    while runs(state["pid"], state["started"]):
+    while is_running(state["pid"], state["started"]):
         if time.monotonic() > deadline:
             raise Refused(f"the fleet did not stop within {timeout_s:.0f} s; see {out}/logs")
         time.sleep(0.1)
     return [f"stopped {len(state['agents'])} agents"]
 
 
-def end_left_over(state: dict[str, Any]) -> list[str]:
-    """End the agents of a supervisor that is no more; their names."""
+def stop_orphaned_agents(state: dict[str, Any]) -> list[str]:
+    """Stop the agents of a supervisor that no longer runs; returns their names."""
     ended = []
     for role in reversed(ROLES):
         for name, seen in state["agents"].items():
-            if seen["role"] == role and runs(seen["pid"], seen["started"]):
+            if seen["role"] == role and is_running(seen["pid"], seen["started"]):
                 os.kill(seen["pid"], signal.SIGTERM)
-                deadline = time.monotonic() + _STOPPING_S[role]
-                while runs(seen["pid"], seen["started"]) and time.monotonic() < deadline:
+                deadline = time.monotonic() + _STOP_TIMEOUT_S[role]
+                while is_running(seen["pid"], seen["started"]) and time.monotonic() < deadline:
                     time.sleep(0.05)
-                if runs(seen["pid"], seen["started"]):
+                if is_running(seen["pid"], seen["started"]):
                     os.kill(seen["pid"], signal.SIGKILL)
                 ended.append(name)
     return ended
 
 
-def _how(status: int) -> str:
+def _exit_description(status: int) -> str:
     return f"status {status}" if status >= 0 else signal.Signals(-status).name

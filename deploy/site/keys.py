@@ -1,13 +1,13 @@
-"""A site's certificates: an authority, one short-lived certificate an agent, and the router's rules in one file.
+"""Certificates of a site: a certificate authority, one short-lived certificate per agent, and the router's rules.
 
 ::
 
-    DIR/site.json              the site's name, and which certificates there are
-    DIR/ca.pem, ca-key.pem     the authority; who has ca-key.pem can be anybody, so it stays on one machine
-    DIR/<role>-<id>/           what one agent needs, to be copied to its machine: certificate.pem, key.pem (0600),
+    DIR/site.json              the site's name and its certificates
+    DIR/ca.pem, ca-key.pem     the authority; whoever has ca-key.pem can impersonate anyone: keep it on one machine
+    DIR/<role>-<id>/           files of one agent, to be copied to its machine: certificate.pem, key.pem (0600),
                                ca.pem and bus.toml, the beginning of its configuration (paths from that folder)
-    DIR/router-<id>/           moreover zenoh.json5, TLS and access rules for `syncline router` and for zenohd alike,
-                               and router.toml, ready to run
+    DIR/router-<id>/           additionally zenoh.json5, TLS and access rules for `syncline router` and zenohd,
+                               and router.toml, a complete configuration
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from protocols.bus.security.access import access_rules, certificate_name, tls_se
 from protocols.bus.settings import BusConfig, TlsConfig
 from protocols.core.errors import InputError
 from protocols.core.files import write_atomically
-from protocols.topics import valid_id
+from protocols.core.names import check_identifier
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -38,13 +38,13 @@ CA_FILE, CA_KEY_FILE = "ca.pem", "ca-key.pem"
 CERTIFICATE_FILE, KEY_FILE, BUS_FILE = "certificate.pem", "key.pem", "bus.toml"
 ZENOH_FILE, ROUTER_FILE = "zenoh.json5", "router.toml"
 _CA_DAYS = 3650
-_EARLY = timedelta(minutes=5)
-"""How far a board's clock may be behind before a fresh certificate is not valid yet."""
+_BACKDATE = timedelta(minutes=5)
+"""Certificates are valid from this long before their issue, for machines whose clock is behind."""
 
 
 @dataclass(frozen=True, slots=True)
 class Issued:
-    """One agent's folder, and until when its certificate is valid (UTC)."""
+    """An issued certificate: the agent's folder, and the end of its validity (UTC)."""
 
     role: str
     agent: str
@@ -53,8 +53,8 @@ class Issued:
 
 
 def make_site(folder: Path, site: str) -> None:
-    """Make the authority of a new site. Raises InputError where there is one already."""
-    valid_id(site, "site")
+    """Create the authority of a new site. Raises InputError if the folder already has one."""
+    check_identifier(site, "site")
     _need_cryptography()
     if (folder / SITE_FILE).exists() or (folder / CA_KEY_FILE).exists():
         raise InputError(
@@ -70,7 +70,7 @@ def make_site(folder: Path, site: str) -> None:
     now = datetime.now(UTC)
     usage = x509.KeyUsage(False, False, False, False, False, True, True, False, False)
     certificate = (
-        _builder(name, name, key.public_key(), now - _EARLY, now + timedelta(days=_CA_DAYS))
+        _builder(name, name, key.public_key(), now - _BACKDATE, now + timedelta(days=_CA_DAYS))
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(usage, critical=True)
     )
@@ -89,10 +89,10 @@ def issue(
     listen: Sequence[str] = (),
     hosts: Sequence[str] = (),
 ) -> Issued:
-    """Make, or renew, one agent's certificate, and write the routers' rules anew.
+    """Issue or renew one agent's certificate, and rewrite the routers' rules.
 
-    connect: endpoints of the site's routers, kept for the next agents. listen, hosts: of a router: where it listens,
-    and the names and addresses by which others reach it. Raises InputError.
+    connect: endpoints of the site's routers, stored with the agent. listen, hosts: for a router: its endpoints, and
+    the host names and addresses in its certificate. Raises InputError.
     """
     name = certificate_name(role, agent)
     if not 0.0 < days <= 825.0:
@@ -104,7 +104,7 @@ def issue(
         entry["listen"] = list(listen) or entry.get("listen") or ["tls/127.0.0.1:7447"]
         entry["hosts"] = sorted({*hosts, *entry.get("hosts", []), *_hosts_of(entry["listen"])})
     entry["connect"] = list(connect) or entry.get("connect", [])
-    # Refuses bad endpoints before anything is written.
+    # Raises InputError for invalid endpoints before anything is written.
     tls = TlsConfig(ca=Path(CA_FILE), certificate=Path(CERTIFICATE_FILE), key=Path(KEY_FILE))
     mode: Any = "router" if role == "router" else "client"
     BusConfig(mode=mode, connect=tuple(entry["connect"]), listen=tuple(entry.get("listen", ())), tls=tls).endpoints()
@@ -115,7 +115,7 @@ def issue(
     own = folder / f"{role}-{agent}"
     own.mkdir(exist_ok=True)
     own.chmod(0o700)
-    sign(folder, own, common, now - _EARLY, until, entry.get("hosts", []))
+    sign(folder, own, common, now - _BACKDATE, until, entry.get("hosts", []))
     entry["until"] = until.isoformat(timespec="seconds")
     agents[name] = entry
     _write_site(folder, site, agents)
@@ -124,11 +124,11 @@ def issue(
 
 
 def revoke(folder: Path, role: str, agent: str) -> list[Path]:
-    """Take an agent's certificates back: the rules forget their name, and the next one gets a new name.
+    """Revoke an agent's certificates: their name is removed from the rules, and the next certificate gets a new name.
 
-    Returns the routers' files of rules, which must reach the routers: until then the agent may do what it could.
-    Twice is once; it writes the rules again, should the first time have been cut short. Raises InputError where there
-    is no such agent.
+    Returns the routers' rule files, which must be copied to the routers; until then the agent keeps its access.
+    Idempotent: a repeated call rewrites the rules, in case the first was interrupted. Raises InputError for an unknown
+    agent.
     """
     name = certificate_name(role, agent)
     site, agents = read_site(folder)
@@ -153,9 +153,9 @@ def revoke(folder: Path, role: str, agent: str) -> list[Path]:
 
 
 def generation_of(entry: dict[str, Any]) -> int:
-    """Which generation of certificates an agent is at, from 1; ``revoked`` says that it has none of it yet.
+    """The generation of an agent's certificate, from 1; if ``revoked`` is set, none of this generation is issued yet.
 
-    Raises ValueError where a file says something else.
+    Raises ValueError for an invalid entry.
     """
     generation = entry.get("generation", 1)
     if not isinstance(generation, int) or not 1 <= generation < 10**6:
@@ -164,14 +164,14 @@ def generation_of(entry: dict[str, Any]) -> int:
 
 
 def read_site(folder: Path) -> tuple[str, dict[str, dict[str, Any]]]:
-    """(site, agents by certificate name). Raises InputError where ``folder`` holds no authority."""
+    """(site, agents by certificate name). Raises InputError if ``folder`` contains no authority."""
     file = folder / SITE_FILE
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
         agents = {certificate_name(a["role"], a["id"]): dict(a) for a in document["agents"]}
         for entry in agents.values():
             generation_of(entry)
-        return valid_id(document["site"], "site"), agents
+        return check_identifier(document["site"], "site"), agents
     except OSError:
         raise InputError("holds no authority", file=folder, remedy="make one with `syncline keys init`") from None
     except (ValueError, KeyError, TypeError):
@@ -184,15 +184,15 @@ def _write_site(folder: Path, site: str, agents: dict[str, dict[str, Any]]) -> N
 
 
 def _write_configurations(folder: Path, site: str, agents: dict[str, dict[str, Any]]) -> None:
-    """Every agent's [bus] table and every router's rules: each router must know of every agent."""
+    """Write every agent's [bus] table and every router's rules, which must list all agents."""
     valid = [a for a in agents.values() if not a.get("revoked")]
     named = {(a["role"], a["id"]): generation_of(a) for a in valid}
     rules = access_rules(site, named, named)
-    listening = [end for a in valid if a["role"] == "router" for end in _reached(a)]
+    listening = [end for a in valid if a["role"] == "router" for end in _reachable_endpoints(a)]
     for entry in valid:
         own = folder / f"{entry['role']}-{entry['id']}"
         if not own.is_dir():
-            continue  # moved to its machine and taken away here
+            continue  # moved to its machine and deleted here
         files = {"ca": CA_FILE, "certificate": CERTIFICATE_FILE, "key": KEY_FILE}
         if entry["role"] == "router":
             bus = {"mode": "router", "listen": entry["listen"], "connect": entry["connect"], "access": ZENOH_FILE}
@@ -207,9 +207,9 @@ def _write_configurations(folder: Path, site: str, agents: dict[str, dict[str, A
 
 
 def _zenoh_file(entry: dict[str, Any], rules: dict[str, Any]) -> str:
-    """A whole configuration for zenohd, to be started in this folder.
+    """A complete configuration for zenohd, to be started in this folder.
 
-    `syncline router` takes the access rules of it and sets the rest itself.
+    `syncline router` uses only its access rules and sets the rest itself.
     """
     tls = TlsConfig(ca=Path(CA_FILE), certificate=Path(CERTIFICATE_FILE), key=Path(KEY_FILE))
     document = {
@@ -227,7 +227,7 @@ def _zenoh_file(entry: dict[str, Any], rules: dict[str, Any]) -> str:
     return json.dumps(document, indent=1) + "\n"
 
 
-def _reached(router: dict[str, Any]) -> list[str]:
+def _reachable_endpoints(router: dict[str, Any]) -> list[str]:
     """Endpoints by which agents reach a router that may listen on every interface."""
     out = []
     for endpoint in router["listen"]:
@@ -246,6 +246,10 @@ def _hosts_of(endpoints: Sequence[str]) -> set[str]:
 
 
 def sign(folder: Path, own: Path, name: str, begin: datetime, end: datetime, hosts: Sequence[str]) -> None:
+    """Create a key and a certificate for ``name``, signed by the authority in ``folder``, in the folder ``own``.
+
+    hosts: host names and addresses of a server certificate; empty for a client. Raises InputError.
+    """
     from cryptography import x509
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -266,7 +270,7 @@ def sign(folder: Path, own: Path, name: str, begin: datetime, end: datetime, hos
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage(usage), critical=False)
     )
-    # rustls wants a name in every certificate that it is shown.
+    # rustls requires a subject alternative name in every certificate.
     builder = builder.add_extension(x509.SubjectAlternativeName(names or [x509.DNSName(name)]), critical=False)
     _write_key(own / KEY_FILE, key)
     write_atomically(own / CERTIFICATE_FILE, _pem(builder, signer))
@@ -315,7 +319,7 @@ def _pem(builder: x509.CertificateBuilder, signer: ec.EllipticCurvePrivateKey) -
 
 
 def _write_key(file: Path, key: ec.EllipticCurvePrivateKey) -> None:
-    """Never readable by others, not even for a moment."""
+    """Write a private key, which is at no time readable by others."""
     from cryptography.hazmat.primitives import serialization
 
     text = key.private_bytes(

@@ -1,4 +1,4 @@
-"""The self-test of a site's certificates: what each may do, and who is turned away with which reason."""
+"""Self-test of a site's certificates: what each agent may do, and which clients are refused with which reason."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any
 import msgspec
 
 from deploy.site import keys
+from protocols.bus.router.permission_selftest import PermissionCheck, try_agents, try_untrusted_client
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.security.access import certificate_name
-from protocols.bus.security.selftest import Finding, try_agents, try_stranger
 from protocols.bus.settings import BusConfig, TlsConfig
 from protocols.core.errors import InputError
 
@@ -22,8 +22,8 @@ def tls_of(folder: Path) -> TlsConfig:
     return TlsConfig(ca=folder / keys.CA_FILE, certificate=folder / keys.CERTIFICATE_FILE, key=folder / keys.KEY_FILE)
 
 
-def check_site(folder: Path) -> list[Finding]:
-    """Try every agent that has its folder here, and the strangers. Raises InputError where no router is issued."""
+def check_site(folder: Path) -> list[PermissionCheck]:
+    """Test every agent that has its folder here, and untrusted clients. Raises InputError if no router is issued."""
     site, agents = keys.read_site(folder)
     here = {name: folder / f"{a['role']}-{a['id']}" for name, a in agents.items()}
     here = {name: place for name, place in here.items() if (place / keys.CERTIFICATE_FILE).is_file()}
@@ -40,8 +40,8 @@ def check_site(folder: Path) -> list[Finding]:
         found += try_agents(config, site, revoked(folder, agents, Path(made)), revoked=True)
     endpoint = free_endpoint().replace("tcp/", "tls/")
     with Router(config=msgspec.structs.replace(config, listen=(endpoint,))), tempfile.TemporaryDirectory() as made:
-        for what, tls in strangers(folder, Path(made)).items():
-            found.append(try_stranger(endpoint, what, tls))
+        for what, tls in untrusted_clients(folder, Path(made)).items():
+            found.append(try_untrusted_client(endpoint, what, tls))
     return found
 
 
@@ -60,14 +60,14 @@ def revoked(folder: Path, agents: dict[str, dict[str, Any]], made: Path) -> list
     return out
 
 
-def strangers(folder: Path, made: Path) -> dict[str, TlsConfig | None]:
+def untrusted_clients(folder: Path, made: Path) -> dict[str, TlsConfig | None]:
     """Certificates that no router of the site may accept, made in ``made``; None = plain TCP."""
     out: dict[str, TlsConfig | None] = {"plain TCP": None}
     now = datetime.now(UTC)
     other = made / "other"
     keys.make_site(other, "elsewhere")
     wrong = keys.issue(other, "camera", "cam0").folder
-    # Somebody who knows the site's authority, but is not of it.
+    # A client that has the site's CA certificate, but a certificate of another authority.
     (wrong / keys.CA_FILE).write_bytes((folder / keys.CA_FILE).read_bytes())
     out["a certificate of another authority"] = tls_of(wrong)
     expired = made / "expired"

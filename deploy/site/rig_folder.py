@@ -1,6 +1,6 @@
-"""A rig as a folder: rig.toml, one TOML an agent, fleet.toml; with simulated cameras in place of the real ones.
+"""A rig as a folder: rig.toml, one TOML file per agent, fleet.toml; optionally with simulated cameras.
 
-An agent's role is told by its file's name: router*.toml, recorder*.toml, hub*.toml, uav*.toml; any other is a camera.
+An agent's role follows from its file's name: router*.toml, recorder*.toml, hub*.toml, uav*.toml; any other is a camera.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from protocols.session.rig import Rig, read_rig
 
 SHIPPED = Path(__file__).parents[1] / "examples" / "rigs"
 ROLES = ("router", "recorder", "hub", "camera", "uav")
-"""In the order in which they are started; they are stopped the other way round."""
+"""Roles in start order; they are stopped in reverse order."""
 _NOT_AGENTS = {"rig.toml", "fleet.toml"}
-_FLIGHT_S = 600.0
+_FLIGHT_DURATION_S = 600.0
 
 
-class World(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """fleet.toml, [simulated]: the world that stands in for the real one. width [px], fps [Hz]: of every camera."""
+class SimulatedWorldConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """fleet.toml, [simulated]: the simulated scene for `--simulated`. width [px], fps [Hz]: of every camera."""
 
     scene: str = "marker"
     seed: Annotated[int, Meta(ge=0)] = 1
@@ -42,14 +42,14 @@ class World(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class FleetFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """fleet.toml."""
+    """Schema of fleet.toml."""
 
-    simulated: World = msgspec.field(default_factory=World)
+    simulated: SimulatedWorldConfig = msgspec.field(default_factory=SimulatedWorldConfig)
 
 
 @dataclass(frozen=True, slots=True)
 class Agent:
-    """One agent of a rig. file: its configuration; config: the same, read."""
+    """One agent of a rig. file: its configuration file; config: its parsed configuration."""
 
     name: str
     role: str
@@ -59,13 +59,13 @@ class Agent:
 
 @dataclass(frozen=True, slots=True)
 class RigFolder:
-    """A whole rig. rig: what rig.toml says; None without one."""
+    """A whole rig. rig: the content of rig.toml; None without one. world: the simulated scene for `--simulated`."""
 
     name: str
     folder: Path
     agents: tuple[Agent, ...]
     rig: Rig | None
-    world: World
+    world: SimulatedWorldConfig
 
     def of(self, role: str) -> tuple[Agent, ...]:
         """The agents of one role."""
@@ -73,19 +73,19 @@ class RigFolder:
 
 
 def role_of(file: Path) -> str:
-    """The role that a file's name tells."""
+    """The role that follows from a file's name."""
     return next((role for role in ROLES if role != "camera" and file.stem.startswith(role)), "camera")
 
 
-def kind_of(role: str) -> type[msgspec.Struct]:
-    """The configuration struct of a role; InputError for one that this version does not have."""
-    from deploy.site.install.plan import config_kind
+def config_type(role: str) -> type[msgspec.Struct]:
+    """The configuration struct of a role. Raises InputError for an unknown role."""
+    from deploy.site.install.plan import config_type
 
-    return config_kind(role)
+    return config_type(role)
 
 
 def find_rig(rig: str) -> Path:
-    """The folder of a rig: a path, or the name of one that is shipped. Raises InputError."""
+    """The folder of a rig: a path, or the name of a shipped rig. Raises InputError."""
     if Path(rig).is_dir():
         return Path(rig)
     if "/" not in rig and (SHIPPED / rig).is_dir():
@@ -95,22 +95,24 @@ def find_rig(rig: str) -> Path:
 
 
 def read_rig_folder(folder: Path) -> RigFolder:
-    """Read and check everything in it. Raises InputError for the first thing that is wrong."""
+    """Read and check all files of a rig. Raises InputError for the first error."""
     files = sorted(path for path in folder.glob("*.toml") if path.name not in _NOT_AGENTS)
     if not files:
-        raise InputError("no agents in this rig", file=folder, remedy="add one TOML file an agent: cam0.toml, hub.toml")
+        raise InputError(
+            "no agents in this rig", file=folder, remedy="add one TOML file per agent: cam0.toml, hub.toml"
+        )
     agents: dict[str, Agent] = {}
     for file in files:
         role = role_of(file)
-        config = load(file, kind_of(role))
+        config = load(file, config_type(role))
         name = getattr(config, "id", file.stem)
         if name in agents:
             raise InputError(f"id {name!r} is also that of {agents[name].file.name}", file=file, remedy="rename one")
         agents[name] = Agent(name, role, file, config)
     sites = {agent.config.site: agent.file for agent in agents.values()}
     if len(sites) > 1:
-        told = ", ".join(f"{file.name}: {site}" for site, file in sites.items())
-        raise InputError(f"agents of several sites ({told})", file=folder, remedy="give all the same site")
+        listed = ", ".join(f"{file.name}: {site}" for site, file in sites.items())
+        raise InputError(f"agents of several sites ({listed})", file=folder, remedy="give all the same site")
     rig = read_rig(folder / "rig.toml") if (folder / "rig.toml").is_file() else None
     fleet = load(folder / "fleet.toml", FleetFile) if (folder / "fleet.toml").is_file() else FleetFile()
     for agent in agents.values():
@@ -123,12 +125,12 @@ def read_rig_folder(folder: Path) -> RigFolder:
     return RigFolder(folder.resolve().name, folder, tuple(ordered), rig, fleet.simulated)
 
 
-def prepare(rig: RigFolder, out: Path, *, simulated: bool, endpoint: str | None) -> tuple[Agent, ...]:
-    """Write what each agent runs with to OUT/config, and return the agents with those files.
+def write_agent_configs(rig: RigFolder, out: Path, *, simulated: bool, endpoint: str | None) -> tuple[Agent, ...]:
+    """Write the effective configuration of each agent to OUT/config, and return the agents with those files.
 
-    What hubs and recorders write goes below ``out``. simulated: cameras film the rig's stand-in world through lenses
-    of their own, and rig.toml is that world's. endpoint: where all meet instead of what their files say; None = as
-    they say.
+    The outputs of hubs and recorders go below ``out``. simulated: cameras view the simulated scene with its own
+    intrinsics, and rig.toml is that of the scene. endpoint: router endpoint for all agents, instead of those in their
+    files; None = keep those.
     """
     folder = out / "config"
     folder.mkdir(parents=True, exist_ok=True)
@@ -140,10 +142,10 @@ def prepare(rig: RigFolder, out: Path, *, simulated: bool, endpoint: str | None)
     for agent in rig.agents:
         config = agent.config
         if endpoint is not None:
-            bus = BusConfig(mode="router", listen=(endpoint,)) if agent.role == "router" else client(endpoint)
+            bus = BusConfig(mode="router", listen=(endpoint,)) if agent.role == "router" else client_bus(endpoint)
             config = msgspec.structs.replace(config, bus=bus)
         if isinstance(config, HubConfig | RecorderConfig):
-            config = msgspec.structs.replace(config, out=_out(agent, out))
+            config = msgspec.structs.replace(config, out=_output_path(agent, out))
         if simulated and isinstance(config, CameraConfig):
             config = _simulated_camera(config, rig.world, cameras, began, folder)
         if simulated and agent.role == "uav":
@@ -156,12 +158,12 @@ def prepare(rig: RigFolder, out: Path, *, simulated: bool, endpoint: str | None)
     return tuple(agents)
 
 
-def client(endpoint: str) -> BusConfig:
-    """A client of one router."""
+def client_bus(endpoint: str) -> BusConfig:
+    """Bus settings of a client of one router."""
     return BusConfig(mode="client", connect=(endpoint,))
 
 
-def _out(agent: Agent, out: Path) -> Path:
+def _output_path(agent: Agent, out: Path) -> Path:
     given = tomllib.loads(agent.file.read_text(encoding="utf-8")).get("out")
     default = "recordings" if agent.role == "recorder" else agent.name
     place = Path(given or default).expanduser()
@@ -169,9 +171,9 @@ def _out(agent: Agent, out: Path) -> Path:
 
 
 def _simulated_camera(
-    config: CameraConfig, world: World, cameras: Sequence[str], began: float, folder: Path
+    config: CameraConfig, world: SimulatedWorldConfig, cameras: Sequence[str], began: float, folder: Path
 ) -> CameraConfig:
-    stand_in = SimulatedConfig(
+    simulated_camera = SimulatedConfig(
         scene=world.scene,
         seed=world.seed,
         cameras=max(len(cameras), 2),
@@ -181,16 +183,22 @@ def _simulated_camera(
         fps=world.fps,
     )
     rig = None if config.rig is None else folder / "rig.toml"
-    return msgspec.structs.replace(config, driver="simulated", simulated=stand_in, video=None, oak=None, rig=rig)
+    return msgspec.structs.replace(
+        config, driver="simulated", simulated=simulated_camera, video=None, oak=None, rig=rig
+    )
 
 
-def _simulated_flight(config: Any, world: World, began: float) -> Any:
-    """A UAV agent over the simulated town, with an autopilot on a port of its own."""
-    from deploy.config.uav import FlightConfig, MavlinkConfig
+def _simulated_flight(config: Any, world: SimulatedWorldConfig, began: float) -> Any:
+    """The configuration of a UAV agent over the simulated town, with an autopilot on a free port."""
+    from deploy.config.uav import MavlinkConfig, SimulatedFlightConfig
 
     autopilot = f"127.0.0.1:{_free_port()}"
-    flight = FlightConfig(
-        autopilot=autopilot, seed=world.seed, seconds=_FLIGHT_S, gimbal=config.mount == "gimbal", start_unix_s=began
+    flight = SimulatedFlightConfig(
+        autopilot=autopilot,
+        seed=world.seed,
+        seconds=_FLIGHT_DURATION_S,
+        gimbal=config.mount == "gimbal",
+        start_unix_s=began,
     )
     link = MavlinkConfig(url=f"udpout:{autopilot}")
     return msgspec.structs.replace(
@@ -199,11 +207,13 @@ def _simulated_flight(config: Any, world: World, began: float) -> Any:
 
 
 def _simulated_rig(rig: RigFolder, cameras: Sequence[str]) -> dict[str, Any]:
-    """rig.toml of the stand-in world: its lenses, and of the rig's distances those that it has."""
+    """Tables of rig.toml of the simulated scene: its intrinsics, and true distances for the pairs given in the rig."""
     from edge import scenes
-    from edge.scenes.common.scaled import scaled
+    from edge.scenes.common.rescaling import rescale_scene
 
-    scene = scaled(scenes.get(rig.world.scene, rig.world.seed, max(len(cameras), 2)), rig.world.width, rig.world.fps)
+    scene = rescale_scene(
+        scenes.get_marker_scene(rig.world.scene, rig.world.seed, max(len(cameras), 2)), rig.world.width, rig.world.fps
+    )
     where = {name: scene.cameras[index] for index, name in enumerate(cameras)}
     tables: dict[str, Any] = {
         name: {

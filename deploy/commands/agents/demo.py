@@ -1,4 +1,4 @@
-"""`syncline demo`: the whole line on one machine, ending with recovered against true."""
+"""`syncline demo`: the whole processing chain on one machine with simulated cameras, compared with the ground truth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
 if TYPE_CHECKING:
     from rich.live import Live as RichLive
 
-    from deploy.demo.marker import Live
+    from deploy.demo.marker import DemoProgress
 
 
 def demo(
@@ -27,40 +27,40 @@ def demo(
     seed: int = 1,
     json: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
-    """Film a simulated marker with cameras that share no clock, find clocks and places, compare with the truth.
+    """Calibrate simulated cameras that share no clock, and compare clock offsets and poses with the ground truth.
 
-    --scene people: calibrated cameras find people who walk about a room, the hub follows them in 3-D.
-    --scene town: a drone over a town; a ground station selects a car by MAVLink and hears where it is, also when it is
-    out of the picture.
-    Cameras, hub and recorder are processes that talk over Zenoh on this machine. Ends with a table of recovered against
-    true, the log demo.mcap and report.html (people: tracks.csv) in --out. Exit status 3 if the errors are larger than
-    promised.
+    --scene people: calibrated cameras detect people walking in a room, and the hub tracks them in 3-D.
+    --scene town: a drone over a town; a ground station selects a car over MAVLink and receives its position, also
+    while the car is out of view.
+    Cameras, hub and recorder are processes that communicate over Zenoh on this machine. Prints a table of estimates
+    and ground truth, and writes the log demo.mcap and report.html (people: tracks.csv) to --out. Exit status 3 if the
+    errors exceed the limits in the table.
 
     Example: syncline demo --cameras 4 --seconds 40 --out demo-out
 
     Parameters
     ----------
     seconds
-        How long to film; without it 30, or 60 for people.
+        Length of the recording; default 30, or 60 for people.
     cameras
-        How many cameras, 2 to 20; without it 3, or 5 for people.
+        Number of cameras, 2 to 20; default 3, or 5 for people.
     scene
-        marker: a marker waved in a room. people: five walkers in a room. town: a car from a drone.
+        marker: a marker waved in a room. people: five people walking in a room. town: a car seen from a drone.
     out
         Folder for the results.
     view
-        Show it live in a browser too: prints the address to open.
+        Also start the live view for a browser; prints the address to open.
     view_port
-        Port of the live view; 0 = any free one.
+        Port of the live view; 0 = any free port.
     seed
-        Of the simulated world: same seed, same cameras and motion.
+        Seed of the simulated scene: the same seed gives the same cameras and motion.
     json
         Print the table as JSON.
     """
     if cameras is None:
         cameras = 5 if scene == "people" else 3
     if seconds is None:
-        seconds = 60.0 if scene == "people" else 30.0  # what is promised of people is so of a minute
+        seconds = 60.0 if scene == "people" else 30.0  # the limits for people hold for a recording of one minute
     if seed < 0:
         raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
     if not 2 <= cameras <= 20:
@@ -69,14 +69,14 @@ def demo(
         raise InputError(f"--seconds {seconds:g} is out of range", remedy="give 5 to 3600")
     if scene == "town":
         return _town(out, seconds, seed, view_port if view else None, as_json=json)
-    from deploy.demo.marker import DemoSettings, Fleet
+    from deploy.demo.marker import DemoProcesses, DemoSettings
 
     settings = DemoSettings(scene, seed, cameras, seconds, out, view_port if view else None)
     if scene == "people":
-        from deploy.demo.people import PeopleFleet, compare_with_people
+        from deploy.demo.people import PeopleDemoProcesses, compare_with_people
 
-        people = PeopleFleet(settings)
-        with _display(seconds, people.names, quiet=json, what="people") as show:
+        people = PeopleDemoProcesses(settings)
+        with _ProgressDisplay(seconds, people.names, quiet=json, what="people") as show:
             people.run(show)
         followed = compare_with_people(out, seed, cameras)
         if json:
@@ -86,8 +86,8 @@ def demo(
         return EXIT_DONE if followed.good else EXIT_REFUSED
     from deploy.evaluation.ground_truth import compare_with_truth
 
-    fleet = Fleet(settings)
-    with _display(seconds, fleet.names, quiet=json) as show:
+    fleet = DemoProcesses(settings)
+    with _ProgressDisplay(seconds, fleet.names, quiet=json) as show:
         live = fleet.run(show)
     comparison = compare_with_truth(out, scene, seed, cameras)
     if json:
@@ -99,16 +99,16 @@ def demo(
 
 def _town(out: Path, seconds: float, seed: int, view_port: int | None, *, as_json: bool) -> int:
     from deploy.demo.flight import run_town
-    from deploy.demo.flight_display import Display
+    from deploy.demo.flight_display import FlightDisplay
     from deploy.demo.flight_outcome import as_json as to_json
     from deploy.demo.flight_outcome import print_outcome
 
-    with Display(seconds, quiet=as_json) as show:
+    with FlightDisplay(seconds, quiet=as_json) as show:
 
-        def viewed(address: str) -> None:
+        def on_view_address(address: str) -> None:
             print(f"live view: open {address}", file=sys.stderr if as_json else sys.stdout, flush=True)
 
-        outcome = run_town(out, seconds, seed, show, view_port=view_port, viewed=viewed)
+        outcome = run_town(out, seconds, seed, show, view_port=view_port, on_view_address=on_view_address)
     if as_json:
         print(to_json(outcome))
     else:
@@ -116,13 +116,13 @@ def _town(out: Path, seconds: float, seed: int, view_port: int | None, *, as_jso
     return EXIT_DONE if outcome.good else EXIT_REFUSED
 
 
-class _display:
-    """Live progress: a bar, and what each camera has seen. On a terminal it redraws, elsewhere it prints lines."""
+class _ProgressDisplay:
+    """Progress display: a bar and the counts of each camera; redrawn on a terminal, otherwise printed line by line."""
 
     def __init__(self, seconds: float, names: list[str], quiet: bool, what: str = "marker") -> None:
         self._seconds, self._names, self._quiet, self._what = seconds, names, quiet, what
         self._printed = -10.0
-        self._told = False
+        self._address_printed = False
         self._live: RichLive | None = None
 
     def __enter__(self):  # type: ignore[no-untyped-def]
@@ -138,10 +138,10 @@ class _display:
         if self._live is not None:
             self._live.__exit__(None, None, None)
 
-    def show(self, live: Live) -> None:
-        """Draw the state."""
-        if live.address and not self._told:
-            self._told = True
+    def show(self, live: DemoProgress) -> None:
+        """Display the current progress."""
+        if live.address and not self._address_printed:
+            self._address_printed = True
             print(f"live view: open {live.address}", file=sys.stderr if self._quiet else sys.stdout, flush=True)
         if self._quiet:
             return

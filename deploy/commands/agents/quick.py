@@ -37,14 +37,16 @@ def quick(
     seed: int = 1,
     json: _Flag = False,
 ) -> int:
-    """Calibrate the cameras that are plugged in here: watch, wave a ball, done. No configuration file.
+    """Calibrate the cameras connected to this machine by waving a ball. No configuration file is needed.
 
-    Prints the address of a page that shows what the cameras see, with a ring around the marker. Click on the ball if
-    it has no ring, wave it where the page says, and it ends by itself once every clock is known to half a
-    millisecond (or by the button Finish). Writes what `syncline calibrate` writes to --out and opens the report.
+    Prints the address of a page that shows the cameras' images, with a ring around the marker. Click on the ball if it
+    has no ring, and wave it where the page advises. It ends by itself once the clock offset of every camera is known
+    to half a millisecond, or with the button Finish. Writes the same files as `syncline calibrate` to --out and opens
+    the report.
 
-    Webcams whose lens nobody measured are taken to be --field-of-view degrees wide: times are right, places are
-    rough. `syncline intrinsics` measures a lens; --rig takes it (cameras cam0, cam1, …).
+    Webcams without measured intrinsics are assumed to have a field of view of --field-of-view degrees: clock offsets
+    are still accurate, poses only approximate. `syncline intrinsics` calibrates a lens; pass its rig.toml with --rig
+    (cameras cam0, cam1, …).
 
     Example: syncline quick --cameras 0,1 --out quick-out
 
@@ -55,25 +57,25 @@ def quick(
     cameras
         Numbers of the webcams, or /dev/video…, separated by commas.
     source
-        Video files in place of webcams, one option a file; each is its camera's view of the same time.
+        Video files instead of webcams, one option per file; they must show the same scene at the same time.
     simulated
-        Two simulated cameras, to try it without any.
+        Use two simulated cameras.
     out
         Folder for the results.
     target
-        The marker as a box x,y,w,h in pixels of the first camera's first picture, instead of a click.
+        Bounding box x,y,w,h of the marker in pixels in the first camera's first frame, instead of a click.
     rig
-        rig.toml with lenses or known places.
+        rig.toml with intrinsics or known positions.
     field_of_view
-        How wide a webcam's picture is, in degrees, where no lens is known.
+        Horizontal field of view of a webcam in degrees, where no intrinsics are known.
     seconds
-        When it ends at the latest.
+        Longest duration.
     port
-        Of the page; 0 = any free one.
+        Port of the page; 0 = any free port.
     headless
-        No page: for scripts.
+        Serve no page, for use in scripts.
     seed
-        Of the simulated world.
+        Seed of the simulated scene.
     json
         Print the result as JSON.
     """
@@ -89,43 +91,47 @@ def quick(
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     import cv2
 
-    from deploy.agents.quick import Quick, QuickSettings, show_report
+    from deploy.agents.quick import QuickCalibration, QuickSettings, show_report
     from deploy.agents.signals import stop_on_signals
-    from deploy.offline.outputs import remove_outputs, write_outputs, write_refusal
+    from deploy.offline.outputs import report_refusal, report_result
+    from hub.api import CalibrationResult, remove_outputs
     from protocols.core.files import check_folder
     from protocols.session.rig import read_rig
+    from protocols.session.session import Session
 
     cv2.setNumThreads(1)
     check_folder(out)
     remove_outputs(out)
-    devices = _simulated(seed) if simulated else _films(source) if source else _webcams(cameras)
+    devices = _simulated(seed) if simulated else _video_files(source) if source else _webcams(cameras)
     known = None if rig is None else read_rig(rig)
-    view = None if headless else _page(port)
-    told = (lambda text: None) if json else lambda text: print(text, flush=True)
+    view = None if headless else _make_view_server(port)
+    report = (lambda text: None) if json else lambda text: print(text, flush=True)
     settings = QuickSettings(
-        devices, out, field_of_view, live=not source, seconds=seconds, rig=known, target=box, tell=told
+        devices, out, field_of_view, live=not source, seconds=seconds, rig=known, target=box, report=report
     )
-    run = Quick(settings, view)
+    run = QuickCalibration(settings, view)
     if view is not None:
         print(json_module.dumps({"address": view.address}) if json else f"open {view.address}", flush=True)
     began = time.process_time()
     hub = run.run(stop_on_signals())
     if hub.session is None:
         raise Refused(hub.missing() or "nothing was seen")
-    rig_seen, observations = hub.session
-    guess = f"the lens of {', '.join(run.guessed)} is a guess of {field_of_view:g} degrees: places are rough"
-    warnings = (guess,) if run.guessed else ()
+    session = Session(*hub.session)
+    assumed = ", ".join(run.lens_assumed)
+    text = f"a field of view of {field_of_view:g} degrees is assumed for {assumed}: poses are approximate"
+    warnings = (text,) if assumed else ()
     command = shlex.join(["syncline", *sys.argv[1:]])
     cpu = time.process_time() - began
     if hub.refusal is not None or hub.calibration is None:
         refusal = hub.refusal or Refused(hub.missing() or "nothing was seen")
-        write_refusal(out, refusal, rig_seen, observations, command, cpu_seconds=cpu, warnings=warnings, echo_json=json)
+        refusal.cpu_seconds, refusal.warnings = cpu, (*warnings, *refusal.warnings)
+        report_refusal(refusal, session, out, command, echo_json=json)
     else:
         found = replace(hub.calibration, warnings=(*warnings, *hub.calibration.warnings), cpu_seconds=cpu)
-        write_outputs(out, found, rig_seen, observations, command, echo_json=json)
-    report = out / "report.html"
-    if view is not None and not show_report(report) and not json:
-        print(f"the report is {report}")
+        report_result(CalibrationResult(found, session), out, command, echo_json=json)
+    page = out / "report.html"
+    if view is not None and not show_report(page) and not json:
+        print(f"the report is {page}")
     if hub.refusal is not None:
         raise hub.refusal
     return EXIT_DONE
@@ -144,22 +150,22 @@ def _box(text: str) -> tuple[float, float, float, float]:
 def _webcams(cameras: str) -> dict[str, Device]:
     from edge.devices.playback.open_video import open_video
 
-    places = [place.strip() for place in cameras.split(",") if place.strip()]
-    _enough(places, "--cameras")
-    for place in places:
+    names = [place.strip() for place in cameras.split(",") if place.strip()]
+    _check_cameras(names, "--cameras")
+    for place in names:
         if not (place.isdecimal() or place.startswith("/dev/") or "://" in place):
             raise InputError(f"--cameras {place!r} is no camera", remedy="give numbers, as in 0,1, or /dev/video0")
-    return {f"cam{index}": open_video(place) for index, place in enumerate(places)}
+    return {f"cam{index}": open_video(place) for index, place in enumerate(names)}
 
 
-def _films(files: tuple[Path, ...]) -> dict[str, Device]:
+def _video_files(files: tuple[Path, ...]) -> dict[str, Device]:
     from edge.devices.playback.open_video import open_video
 
-    _enough([str(file) for file in files], "--source")
+    _check_cameras([str(file) for file in files], "--source")
     for file in files:
         if not file.exists():
             raise InputError("this video does not exist", file=file, remedy="check the path")
-    # As fast as they are read: nobody waves at a file.
+    # Files are read as fast as possible, not in real time.
     return {f"cam{index}": open_video(file) for index, file in enumerate(files)}
 
 
@@ -168,19 +174,19 @@ def _simulated(seed: int) -> dict[str, Device]:
     from edge.devices.playback.playback_clock import RealTime
     from edge.devices.simulated.camera import SimulatedDevice
 
-    pace = RealTime(time.time())
-    scene = scenes.get("marker", seed, 2)
-    return {name: SimulatedDevice(scene, name, seed, pace) for name in ("cam0", "cam1")}
+    clock = RealTime(time.time())
+    scene = scenes.get_marker_scene("marker", seed, 2)
+    return {name: SimulatedDevice(scene, name, seed, clock) for name in ("cam0", "cam1")}
 
 
-def _enough(places: list[str], option: str) -> None:
-    if len(places) < 2:
-        raise InputError(f"{option} names {len(places)} of at least 2 cameras", remedy="give two or more")
-    if len(set(places)) < len(places):
+def _check_cameras(names: list[str], option: str) -> None:
+    if len(names) < 2:
+        raise InputError(f"{option} names {len(names)} of at least 2 cameras", remedy="give two or more")
+    if len(set(names)) < len(names):
         raise InputError(f"{option} names a camera twice", remedy="give each once")
 
 
-def _page(port: int) -> ViewServer:
+def _make_view_server(port: int) -> ViewServer:
     try:
         from hub.view.server import ViewServer
     except ImportError:

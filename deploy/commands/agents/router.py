@@ -1,4 +1,4 @@
-"""`syncline router`: what agents on several machines meet at."""
+"""`syncline router`: relays messages between agents on several machines."""
 
 from __future__ import annotations
 
@@ -18,42 +18,42 @@ if TYPE_CHECKING:
     from deploy.agents.systemd_notify import Notifier
 
 _RESTARTS = "SYNCLINE_ROUTER_RESTARTS"
-"""Carries the count over a restart that keeps the process; nothing depends on it."""
+"""Environment variable that carries the restart count over an exec; informational only."""
 
 
 def router(config: Path, /, *, print_config: Annotated[bool, Parameter(negative="")] = False) -> int:
-    """Run a router: agents in client mode connect to it, and it relays between them.
+    """Run a router: agents in client mode connect to it, and it relays messages between them.
 
-    A canary goes through it four times a second. When nothing passes for 0.9 s it starts itself anew in place; agents
-    reconnect within half a second and what they published meanwhile is recovered.
+    It sends itself a test message four times a second. If none arrives for 0.9 s it restarts in place; agents
+    reconnect within half a second, and messages published meanwhile are recovered.
 
     Example: syncline router router.toml
 
     Parameters
     ----------
     config
-        TOML file: id, site, [bus] with listen (default tcp/127.0.0.1:7447), connect to other routers, and the tls and
-        access that `syncline keys issue --role router` writes.
+        TOML file: id, site, [bus] with listen (default tcp/127.0.0.1:7447), connect for other routers, and the tls and
+        access settings that `syncline keys issue --role router` writes.
     print_config
-        Show the configuration with all defaults filled in, and stop.
+        Print the configuration with all defaults filled in, and exit.
     """
     settings = load(config, RouterConfig)
     if print_config:
         print(effective_toml(settings), end="")
         return EXIT_DONE
     from deploy.agents.health import Health
-    from deploy.agents.startup_checks import checked, serve_health
+    from deploy.agents.startup_checks import check_startup, serve_health
     from protocols.bus.base import BusDead
     from protocols.bus.router.zenoh_router import RulesChanged, run_router
 
-    checked(settings)
+    check_startup(settings)
     restarts = int(os.environ.get(_RESTARTS, "0"))
     notifier = _notifier()
 
-    def again(reason: str) -> NoReturn:
+    def restart(reason: str) -> NoReturn:
         print(f"syncline: {reason}; starting anew", file=sys.stderr, flush=True)
         os.environ[_RESTARTS] = str(restarts + 1)
-        # In place: whatever hangs in this process is gone, and its supervisor need not notice.
+        # In place: hanging threads disappear with the old program, and the supervisor does not notice a restart.
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
     stop = stop_on_signals()
@@ -65,15 +65,15 @@ def router(config: Path, /, *, print_config: Annotated[bool, Parameter(negative=
                 settings.site,
                 settings.id,
                 stop,
-                died=again,
+                died=restart,
                 restarts=restarts,
                 ready=lambda listen: print(f"relays at {', '.join(listen)}", flush=True),
                 beat=(lambda: None) if notifier is None else notifier.beat,
                 seen=health.seen,
             )
     except RulesChanged:
-        time.sleep(0.2)  # the file is whole by its rename; others of the same `keys issue` may follow
-        again("access rules have changed")
+        time.sleep(0.2)  # the file was renamed into place, but more files of the same `keys issue` may follow
+        restart("access rules have changed")
     except BusDead as error:
         print(f"syncline: {error}; start it again", file=sys.stderr)
         return EXIT_BUG
@@ -84,7 +84,7 @@ def router(config: Path, /, *, print_config: Annotated[bool, Parameter(negative=
 
 
 def _notifier() -> Notifier | None:
-    # Its imports cost as much time as all the rest, and a restart is waited for.
+    # Importing it takes as long as the rest of the start, and a restart must be fast.
     if "NOTIFY_SOCKET" not in os.environ and "SYNCLINE_ALIVE_FILE" not in os.environ:
         return None
     from deploy.agents.systemd_notify import Notifier

@@ -1,4 +1,4 @@
-"""`syncline camera`, `hub` and `record`: the agents, each from one configuration file."""
+"""`syncline camera`, `uav`, `hub` and `record`: run an agent from its configuration file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PrintConfig = Annotated[bool, Parameter(negative="")]
 
 
 def camera(config: Path, /, *, print_config: PrintConfig = False) -> int:
-    """Run a camera agent: open the device, detect, publish time-stamped observations.
+    """Run a camera agent: open the device, detect, and publish time-stamped observations.
 
     Example: syncline camera cam0.toml
 
@@ -42,7 +42,7 @@ def camera(config: Path, /, *, print_config: PrintConfig = False) -> int:
         return EXIT_DONE
 
     def start(bus: Any, stop: Any, beat: Any) -> int:
-        from deploy.agents.assembly import start_camera  # a refusal does not wait for it
+        from deploy.agents.assembly import start_camera  # imported late, so that configuration errors are reported fast
 
         return start_camera(settings, bus, stop, beat)
 
@@ -50,11 +50,11 @@ def camera(config: Path, /, *, print_config: PrintConfig = False) -> int:
 
 
 def uav(config: Path, /, *, print_config: PrintConfig = False) -> int:
-    """Run the UAV agent: follow the car that a ground station selects, also out of the picture, and tell it by MAVLink.
+    """Run the UAV agent: track the car that a ground station selects, also out of view, and report it over MAVLink.
 
     Example: syncline uav drone.toml
 
-    Nothing is commanded to the vehicle unless [control] switches it on.
+    No command is sent to the vehicle unless [control] enables it.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def uav(config: Path, /, *, print_config: PrintConfig = False) -> int:
 
 
 def hub(config: Path, /, *, print_config: PrintConfig = False) -> int:
-    """Run the hub: gather what the cameras see, find when they fired and where they stand, publish it.
+    """Run the hub: collect the cameras' observations, estimate their clock offsets and poses, and publish them.
 
     Example: syncline hub hub.toml
 
@@ -101,14 +101,14 @@ def hub(config: Path, /, *, print_config: PrintConfig = False) -> int:
 
 
 def record(config: Path, /, *, print_config: PrintConfig = False) -> int:
-    """Record everything on the site's bus into an MCAP log.
+    """Record all messages on the site's bus to an MCAP log.
 
     Example: syncline record recorder.toml
 
     Parameters
     ----------
     config
-        TOML file: id, site, [bus], out (a .mcap file, or a folder for files named by time), part_s, part_mb,
+        TOML file: id, site, [bus], out (a .mcap file, or a folder for files named by start time), part_s, part_mb,
         min_free_mb, foxglove.
     print_config
         Show the configuration with all defaults filled in, and stop.
@@ -117,13 +117,13 @@ def record(config: Path, /, *, print_config: PrintConfig = False) -> int:
     if print_config:
         print(effective_toml(settings), end="")
         return EXIT_DONE
-    from deploy.agents.recorder_commands import record_as_asked
+    from deploy.agents.recorder_commands import record_on_command
 
     def start(bus: Any, stop: Any, beat: Any) -> int:
-        result = record_as_asked(settings, bus, stop, beat=beat, tell=lambda line: print(line, flush=True))
+        result = record_on_command(settings, bus, stop, beat=beat, report=lambda line: print(line, flush=True))
         print(f"recorded {result.messages} messages to {result.path}" + _more_parts(result.parts))
         if result.stopped:
-            print(f"syncline: recording ended: {result.stopped}; the log is whole; make room", file=sys.stderr)
+            print(f"syncline: recording ended: {result.stopped}; the log is complete; free disk space", file=sys.stderr)
             return EXIT_INPUT
         return EXIT_DONE
 
@@ -135,29 +135,29 @@ def _more_parts(parts: int) -> str:
 
 
 def _with_bus(settings: Any, start: Any) -> int:
-    """Open the bus, run until a signal, close it; a signal while opening is a clean end.
+    """Open the bus, run until a signal arrives, and close the bus; a signal while opening is a clean end.
 
-    A bus that has died ends the process with one line and status 1, for its supervisor to start it again.
+    If the bus fails, the process ends with one line and status 1, so that its supervisor restarts it.
     """
     from deploy.agents.health import Health
-    from deploy.agents.malloc_tuning import steady_heap
-    from deploy.agents.startup_checks import checked, serve_health
+    from deploy.agents.malloc_tuning import limit_heap_growth
+    from deploy.agents.startup_checks import check_startup, serve_health
     from deploy.agents.systemd_notify import Notifier
     from protocols.bus.base import BusDead, BusStopped
-    from protocols.bus.security.sender_identity import GuardedBus
+    from protocols.bus.security.sender_identity import SenderCheckedBus
     from protocols.bus.transport.zenoh_bus import open_bus
 
-    steady_heap(give_back=isinstance(settings, HubConfig | RecorderConfig))
-    checked(settings)
+    limit_heap_growth(release_large_blocks=isinstance(settings, HubConfig | RecorderConfig))
+    check_startup(settings)
     stop = stop_on_signals()
     notifier = Notifier.from_environment()
     health = Health()
     try:
         with (
             serve_health(settings, health),
-            open_bus(settings.site, settings.bus, stop=_told_waiting(stop, settings.bus, notifier)) as bus,
+            open_bus(settings.site, settings.bus, stop=_stop_condition(stop, settings.bus, notifier)) as bus,
         ):
-            guarded = GuardedBus(bus, time.monotonic, seen=health.seen, refused=health.refused)
+            guarded = SenderCheckedBus(bus, time.monotonic, seen=health.seen, refused=health.refused)
             try:
                 return int(start(guarded, stop, lambda: notifier.beat(ending=stop.is_set())))
             except BusDead as error:
@@ -169,15 +169,15 @@ def _with_bus(settings: Any, start: Any) -> int:
         notifier.stopping()
 
 
-def _told_waiting(stop: threading.Event, bus: BusConfig, notifier: Notifier) -> Callable[[], bool]:
-    """The stop condition that is asked while a client waits for its router; after 2 s it says so, once."""
-    began, told = time.monotonic(), False
+def _stop_condition(stop: threading.Event, bus: BusConfig, notifier: Notifier) -> Callable[[], bool]:
+    """The stop condition that is polled while a client waits for its router; after 2 s it reports that, once."""
+    began, warned = time.monotonic(), False
 
     def stopped() -> bool:
-        nonlocal told
+        nonlocal warned
         notifier.waiting(f"a router at {', '.join(bus.endpoints()[0])}")
-        if not told and time.monotonic() - began > 2.0:
-            told = True
+        if not warned and time.monotonic() - began > 2.0:
+            warned = True
             print(f"syncline: waiting for a router at {', '.join(bus.endpoints()[0])}", file=sys.stderr, flush=True)
         return stop.is_set()
 

@@ -1,4 +1,4 @@
-"""`syncline view`: a rig in a browser, live or from a log."""
+"""`syncline view`: shows a rig in a browser, live or from a log."""
 
 from __future__ import annotations
 
@@ -33,13 +33,14 @@ def view(
     rerun: Path | None = None,
     json: _Flag = False,
 ) -> int:
-    """Show a rig in a browser: cameras, paths, uncertainty, and what each camera lacks.
+    """Show a rig in a browser: cameras, trajectories, uncertainty, and missing coverage of each camera.
 
-    Live from the bus with nothing or an agent's TOML file (its site and [bus] table); a .mcap log plays with a
-    timeline; the folder that `syncline calibrate` wrote shows its cameras and path. Prints the address to open.
+    Without a source, or with an agent's TOML file (its site and [bus] table), it shows the live bus. A .mcap log is
+    played with a timeline. A folder that `syncline calibrate` wrote shows its cameras and trajectory. Prints the
+    address to open.
 
-    Beyond this machine (--listen) the address carries a token, and nobody sees or does anything without it. The
-    connection is not encrypted: over a network that others share use a tunnel, ssh -L 8080:127.0.0.1:8080 HOST.
+    If it serves other machines (--listen), the address contains a token that is required for all access. The
+    connection is not encrypted: over a shared network use a tunnel, ssh -L 8080:127.0.0.1:8080 HOST.
 
     Example: syncline view --connect tcp/192.168.1.5:7447
 
@@ -52,19 +53,19 @@ def view(
     source
         An agent's TOML file, a .mcap log, or the folder of a calibration. Default: the bus on this machine.
     connect
-        Where the site's router or agents are.
+        Endpoints of the site's router or agents.
     site
-        The site to look at. Default: the file's, or "local".
+        The site to show. Default: the file's, or "local".
     port
-        Of the page; 0 = any free one.
+        Port of the page; 0 = any free port.
     listen
         Address to serve on; 0.0.0.0 = every interface.
     token
-        Instead of a new one each time.
+        Access token, instead of a new one each time.
     look_only
-        No button acts.
+        Read-only: all buttons are disabled.
     browser
-        Open the browser too.
+        Also open the browser.
     rerun
         Write a .rrd file for the rerun viewer from a log or a calibration instead of serving (needs rerun-sdk).
     json
@@ -88,22 +89,22 @@ def view(
         from hub.view.server import run_replay
 
         def serve_replay(player: Any) -> ViewServer:
-            return _told(serve(player), browser, json)
+            return _announce(serve(player), browser, json)
 
         run_replay(recording, serve_replay, stop_on_signals())
         return EXIT_DONE
     settings, wanted_site = _bus(source, connect, site)
-    return _live(settings, wanted_site, serve, browser, json)
+    return _serve_live(settings, wanted_site, serve, browser, json)
 
 
-def _live(settings: BusConfig, site: str, serve: Callable[[Any], ViewServer], browser: bool, json: bool) -> int:
+def _serve_live(settings: BusConfig, site: str, serve: Callable[[Any], ViewServer], browser: bool, json: bool) -> int:
     from deploy.agents.signals import stop_on_signals
     from hub.view.server import run_view
     from protocols.bus.base import BusDead, BusStopped
     from protocols.bus.transport.zenoh_bus import open_bus
 
     stop = stop_on_signals()
-    shown = _told(serve(None), browser, json)
+    shown = _announce(serve(None), browser, json)
     try:
         with open_bus(site, settings, stop=stop.is_set) as bus:
             run_view(bus, shown, stop)
@@ -118,7 +119,7 @@ def _live(settings: BusConfig, site: str, serve: Callable[[Any], ViewServer], br
 
 
 def _recording(source: Path) -> Any:
-    """What can be played. Raises InputError."""
+    """The recording at a path. Raises InputError."""
     if not source.exists():
         raise InputError("there is no such file or folder", file=source, remedy="name a log, a folder or a TOML file")
     from hub.view.player import CalibrationRecording, LogRecording
@@ -132,7 +133,7 @@ def _recording(source: Path) -> Any:
 
 
 def _bus(source: Path | None, connect: tuple[str, ...], site: str) -> tuple[BusConfig, str]:
-    """How to reach the site. Raises InputError."""
+    """The bus configuration and the site to show. Raises InputError."""
     if source is None:
         if not connect:
             return BusConfig(), site or "local"
@@ -142,16 +143,16 @@ def _bus(source: Path | None, connect: tuple[str, ...], site: str) -> tuple[BusC
     from deploy.config.agents import ViewConfig, load
 
     settings = load(source, ViewConfig)
-    bus = _beside(settings.bus) if not connect else BusConfig(mode="client", connect=connect)
+    bus = _local_bus(settings.bus) if not connect else BusConfig(mode="client", connect=connect)
     bus.endpoints()
     return bus, site or settings.site
 
 
-def _beside(bus: BusConfig) -> BusConfig:
-    """How to reach the bus of an agent from beside it: where it listens, there is no room for a second one."""
+def _local_bus(bus: BusConfig) -> BusConfig:
+    """The bus configuration for a second process on an agent's machine: it connects to where the agent listens."""
     if bus.mode == "router" or (bus.listen and not bus.connect):
-        told = bus.endpoints()[1]
-        here = tuple(re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", place) for place in told)
+        announced = bus.endpoints()[1]
+        here = tuple(re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", place) for place in announced)
         return BusConfig(mode="client" if bus.mode == "router" else "peer", connect=here, tls=bus.tls)
     return bus
 
@@ -168,8 +169,8 @@ def _server(listen: str, port: int, token: str, look_only: bool) -> Callable[[An
     return lambda player: ViewServer(listen, port, token=token, look_only=look_only, player=player)
 
 
-def _told(shown: ViewServer, browser: bool, json: bool) -> ViewServer:
-    """Say where it is; a browser is opened by this machine's own means."""
+def _announce(shown: ViewServer, browser: bool, json: bool) -> ViewServer:
+    """Print the address of the page, and open a browser if requested."""
     if json:
         import json as json_module
 

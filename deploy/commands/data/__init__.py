@@ -1,1 +1,1 @@
-"""Commands on logs and other tools' formats."""
+"""Commands for logs and for other tools' file formats."""

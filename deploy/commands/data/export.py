@@ -1,4 +1,4 @@
-"""`syncline export`: results in other tools' formats, and logs as session folders."""
+"""`syncline export`: writes results in other tools' formats, and logs as session folders."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def export(
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
-    """Write a calibration or a path in another tool's format, or a log as a session folder.
+    """Write a calibration or a trajectory in another tool's format, or a log as a session folder.
 
-    aniposelib, caliscope, pose2sim, freemocap: one TOML file in the units that the tool means. kalibr: a camchain YAML
-    with timeshift_cam_imu. opencv: CAMERA.yml a camera for cv2.FileStorage. colmap: cameras.txt, images.txt,
-    points3D.txt. trc: a path for OpenSim, in the world's own axes. session: rig.toml and observations.csv of a log.
-    What a format cannot hold is told.
+    aniposelib, caliscope, pose2sim, freemocap: one TOML file in the units that the tool expects. kalibr: a camchain
+    YAML with timeshift_cam_imu. opencv: one CAMERA.yml per camera for cv2.FileStorage. colmap: cameras.txt, images.txt,
+    points3D.txt. trc: a trajectory for OpenSim, in the world frame. session: rig.toml and observations.csv of a log.
+    Information that a format cannot represent is listed in a warning.
 
     Example: syncline export out/calibration.toml --to caliscope --out camera_array.toml
 
@@ -39,19 +39,19 @@ def export(
     source
         calibration.toml; trajectory.csv or track.csv for trc; a .mcap log for session.
     to
-        The format; of a .mcap log always session.
+        The format; for a .mcap log always session.
     out
-        The folder for opencv, colmap and session, the file for all others.
+        The folder for opencv, colmap and session; the file for all others.
     units
-        Of the lengths in a path, for trc.
+        Length unit of a trajectory, for trc.
     json
         Print a summary as JSON.
     seed
-        Accepted as everywhere; nothing here is drawn at random.
+        Accepted for consistency; this command uses no random numbers.
     """
     from deploy.offline import exports
-    from deploy.offline.sessions import is_log
     from protocols.core.files import check_folder, write_together
+    from protocols.log.read.session import is_log
 
     log = is_log(source)
     if to is None and not log:
@@ -67,7 +67,7 @@ def export(
         check_folder(out)
         cameras, rows, warnings = exports.export_log(source, out)
         files = [out / "rig.toml", out / "observations.csv"]
-        told = f"{cameras} cameras, {rows} observations"
+        summary = f"{cameras} cameras, {rows} observations"
     else:
         assert to is not None
         if to in exports.IN_FOLDERS:
@@ -75,18 +75,18 @@ def export(
         elif out.is_dir():
             raise InputError("a folder of this name is in the way", file=out, remedy="give --out the name of a file")
         if to == "trc":
-            texts = exports.path_files(source, out, units)
+            texts = exports.trajectory_files(source, out, units)
         else:
             texts, warnings = exports.calibration_files(source, to, out)
         write_together(texts)
-        files, told = list(texts), ""
+        files, summary = list(texts), ""
     if json:
         import json as json_module
 
         print(json_module.dumps({"files": [str(file) for file in files], "warnings": list(warnings)}))
         return EXIT_DONE
-    if told:
-        print(told)
+    if summary:
+        print(summary)
     for warning in warnings:
         print(f"warning: {warning}")
     print(f"written: {', '.join(str(file) for file in files)}")

@@ -1,4 +1,4 @@
-"""`syncline import`: other tools' calibrations and tracks, and session folders, into Syncline's own files."""
+"""`syncline import`: converts other tools' calibrations and tracks, and session folders, to Syncline's own files."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def import_(
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
-    """Read what another tool wrote: a calibration, 2-D tracks, or a session folder that becomes a log.
+    """Convert another tool's calibration or 2-D tracks, or a session folder.
 
     Calibrations (aniposelib, caliscope, Pose2Sim, FreeMoCap, OpenCV YAML, Kalibr camchain, COLMAP text) become a
-    rig.toml; with all poses in it, it is a calibration.toml too. Tracks (caliscope CSV, DeepLabCut CSV, mvus text)
-    become an observations.csv, a session folder a .mcap log. What a file is, its content tells.
+    rig.toml, which also serves as a calibration.toml if it has all poses. Tracks (caliscope CSV, DeepLabCut CSV, mvus
+    text) become an observations.csv, and a session folder becomes a .mcap log. The format is detected from the content.
 
     Example: syncline import camchain.yaml --out rig.toml
 
@@ -50,25 +50,26 @@ def import_(
     Parameters
     ----------
     sources
-        Files, one a camera where the format is such, or a folder of them.
+        Files, one per camera if the format requires it, or a folder of them.
     out
         The rig.toml, observations.csv or .mcap to write.
     format
-        What the sources are, if their content does not tell.
+        Format of the sources, if it cannot be detected from the content.
     units
-        Of a calibration's lengths, instead of what the format means.
+        Length unit of a calibration, instead of the format's own.
     fps
-        Frames a second, for tracks that only count frames.
+        Frame rate in Hz, for tracks with frame numbers only.
     videos
-        The tracked videos, each named after its camera: their own frame times are taken (variable frame rates).
+        Folder of the tracked videos, each named after its camera: frame times are read from them (variable frame
+        rates).
     likelihood
-        DeepLabCut's points that are less likely are left out.
+        DeepLabCut points with a smaller likelihood are discarded.
     camera
         The camera's name, for tracks in one file; default: the file's name.
     json
         Print a summary as JSON.
     seed
-        Accepted as everywhere; nothing here is drawn at random.
+        Accepted for consistency; this command uses no random numbers.
     """
     if not sources:
         raise InputError("nothing to import", remedy="give files, or a folder")
@@ -79,37 +80,39 @@ def import_(
     if not 0.0 <= likelihood <= 1.0:
         raise InputError(f"--likelihood {likelihood:g} is out of range", remedy="give 0 to 1")
     if fps is not None and videos is not None:
-        raise InputError("--fps and --videos each tell the frames' times", remedy="keep one")
+        raise InputError("--fps and --videos each give the frames' times", remedy="keep one")
     from deploy.offline import imports
     from protocols.core.files import write_atomically
     from protocols.session.folder import read_folder, write_observations
 
-    source = imports.recognise(list(sources), format)
+    source = imports.detect_source(list(sources), format)
     _check_suffix(source.kind, out)
     warnings: tuple[str, ...] = ()
     if source.kind == "session":
         rig, seen = read_folder(source.files[0])
         count = imports.session_to_log(rig, seen, out)
         warnings = seen.warnings
-        if rig.wands:
-            warnings += ("a log does not hold the wand: tell it again in the rig.toml of its export",)
-        told = f"{len(rig.cameras)} cameras, {len(seen)} observations, {count} messages"
+        if rig.scale_bars:
+            warnings += ("a log does not store the scale bar: add it to the rig.toml of its export",)
+        summary = f"{len(rig.cameras)} cameras, {len(seen)} observations, {count} messages"
         cameras = list(rig.cameras)
     elif source.kind in imports.POINTS:
         seen = imports.read_points(source, imports.frame_clock(fps, videos), likelihood, camera)
         write_observations(out, seen)
         warnings = seen.warnings
-        told = f"{len(seen)} observations of {len(seen.labels)} points by {', '.join(seen.cameras)}"
+        summary = f"{len(seen)} observations of {len(seen.labels)} points by {', '.join(seen.cameras)}"
         cameras = seen.cameras
     else:
-        foreign = imports.read_calibration_of(source)
+        foreign = imports.read_foreign_calibration(source)
         write_atomically(out, imports.calibration_text(foreign, units, source.files[0]))
         posed = sum(one.pose is not None for one in foreign.cameras.values())
         timed = sum(one.time_map is not None for one in foreign.cameras.values())
         warnings = foreign.warnings
         if units is None and foreign.units is None and posed:
-            warnings += ("the file tells no units: its lengths are taken for metres (--units)",)
-        told = f"{len(foreign.cameras)} cameras ({', '.join(foreign.cameras)}), {posed} with poses, {timed} with clocks"
+            warnings += ("the file states no units: its lengths are taken as metres (--units)",)
+        summary = (
+            f"{len(foreign.cameras)} cameras ({', '.join(foreign.cameras)}), {posed} with poses, {timed} with clocks"
+        )
         cameras = list(foreign.cameras)
     if json:
         import json as json_module
@@ -117,7 +120,7 @@ def import_(
         document = {"out": str(out), "format": source.kind, "cameras": cameras, "warnings": list(warnings)}
         print(json_module.dumps(document, allow_nan=False))
         return EXIT_DONE
-    print(f"{source.kind}: {told}")
+    print(f"{source.kind}: {summary}")
     for warning in warnings:
         print(f"warning: {warning}")
     print(f"written: {out}")
@@ -125,7 +128,7 @@ def import_(
 
 
 def _check_suffix(kind: str, out: Path) -> None:
-    """A calibration under the name of a log would be read by nobody."""
+    """Raise InputError if the suffix of ``out`` does not fit its content: it could not be read back."""
     wanted = {"session": ".mcap", "caliscope-points": ".csv", "deeplabcut": ".csv", "mvus": ".csv"}.get(kind, ".toml")
     if out.suffix.lower() != wanted:
         raise InputError(f"{kind} becomes a {wanted} file", file=out, remedy=f"give --out a name that ends in {wanted}")

@@ -1,4 +1,4 @@
-"""`syncline replay`, `recover` and `info`: what to do with a log."""
+"""`syncline replay`, `recover` and `info`: commands for recorded logs."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
 
 
 def info(path: Path, /, *, json: Annotated[bool, Parameter(negative="")] = False) -> int:
-    """Show what is in a log (topics, counts, times, damage) or in a session folder.
+    """Show the contents of a log (topics, counts, times, damage) or of a session folder.
 
     Example: syncline info demo-out/demo.mcap
 
     Parameters
     ----------
     path
-        A .mcap log, the folder or the first part of one in several files, or a session folder.
+        A .mcap log, the folder or the first part of a log in several files, or a session folder.
     json
-        Print it as JSON.
+        Print the description as JSON.
     """
-    from deploy.offline.sessions import is_log
+    from protocols.log.read.session import is_log
 
     if path.is_dir() and not is_log(path):
         from deploy.offline.session_info import print_session
@@ -47,20 +47,20 @@ def info(path: Path, /, *, json: Annotated[bool, Parameter(negative="")] = False
 
 
 def recover(log: Path, /, *, out: Path, json: Annotated[bool, Parameter(negative="")] = False) -> int:
-    """Make a whole log of one that is damaged, was cut off or never closed, and say what was lost.
+    """Recover a log that is damaged, truncated or was never closed, and report what was lost.
 
     Example: syncline recover flight.mcap --out fixed.mcap
 
-    The result is read back with every checksum before it gets its name. Exit status 3 if no message is whole.
+    The result is read back with all checksums before it is renamed to --out. Exit status 3 if no message is intact.
 
     Parameters
     ----------
     log
-        The .mcap log; the folder or the first part of one in several files, which become one.
+        The .mcap log; the folder or the first part of a log in several files, which are merged.
     out
         The new log; must not exist.
     json
-        Print what was saved and lost as JSON.
+        Print what was recovered and lost as JSON.
     """
     from protocols.log.read.recovery import recover as make_whole
 
@@ -108,13 +108,13 @@ def replay(
     connect: list[str] | None = None,
     json: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
-    """Publish the messages of a log onto the bus again, as they came; or compare two logs.
+    """Publish the messages of a log on the bus at their recorded times, or compare two logs.
 
     Example: syncline replay demo-out/demo.mcap --rate 2
     Example: syncline replay a.mcap --compare b.mcap --topics track --tolerance track.position=1e-6
     Example: syncline replay demo-out/demo.mcap --through hub --out again.mcap
 
-    A comparison shows count, order and every field beyond its tolerance; exit status 3 if the logs differ.
+    A comparison reports count, order and every field beyond its tolerance; exit status 3 if the logs differ.
 
     Parameters
     ----------
@@ -123,22 +123,22 @@ def replay(
     rate
         1 = as recorded, 2 = twice as fast, max = as fast as possible.
     start
-        Seconds from the log's beginning to leave out.
+        Seconds to skip at the beginning of the log.
     loop
-        Begin again at the end, until stopped; every round looks like agents that were restarted.
+        Start again at the end, until stopped; every round has new boot ids, as if the agents had been restarted.
     topics
         Only these topics of the catalogue; default: all.
     compare
         Publish nothing; compare with this log instead.
     tolerance
-        topic.field=greatest difference in the field's own unit, for --compare; default: 0 for every field.
+        topic.field=largest difference in the field's own unit, for --compare; default: 0 for every field.
     through
-        Publish nothing; let this estimator hear the log, without clock or bus, and write what it says to --out. uav
-        needs a log with pictures.
+        Publish nothing; pass the log through this estimator, without clock or bus, and write its output to --out. uav
+        needs a log with images.
     out
         The new log for --through; must not exist.
     calibration
-        For --through hub: a calibration.toml to follow people with, instead of solving.
+        For --through hub: a calibration.toml to track with, instead of calibrating.
     site
         Site to publish on.
     connect
@@ -165,13 +165,13 @@ def replay(
         )
     if through is not None and out is not None:
         if compare is not None or topics:
-            raise InputError("--through hears a whole log", remedy="leave out --compare and --topics")
+            raise InputError("--through processes a whole log", remedy="leave out --compare and --topics")
         if through == "uav":
             from deploy.logs.replay_uav import replay_through_uav
 
             count, missing = replay_through_uav(log, out)
             if missing:
-                text = f"{missing} inputs were not recorded: not all that was said comes again"
+                text = f"{missing} inputs were not recorded: the output differs from the original"
                 print(f"syncline: {log}: {text}", file=sys.stderr)
         else:
             from deploy.logs.replay_hub import replay_through_hub
@@ -190,9 +190,9 @@ def replay(
     from protocols.bus.transport.zenoh_bus import open_bus
     from protocols.log.read.reader import LogReader
 
-    damage = LogReader(log).summary().reason  # told before, not after, an hour of replay
+    damage = LogReader(log).summary().reason  # reported before an hour of replay, not after it
     if damage:
-        print(f"syncline: {log}: damaged: {damage}; only its good part is played", file=sys.stderr)
+        print(f"syncline: {log}: damaged: {damage}; only its intact part is played", file=sys.stderr)
     stop = stop_on_signals()
     try:
         with open_bus(site, BusConfig(connect=tuple(connect or ())), stop=stop.is_set) as bus:

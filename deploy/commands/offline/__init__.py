@@ -1,1 +1,1 @@
-"""Commands that work on sessions and videos."""
+"""Offline commands for sessions and videos."""

@@ -1,25 +1,20 @@
-"""`syncline calibrate`: timing and poses offline."""
+"""`syncline calibrate`: offline estimation of clock offsets and poses."""
 
 from __future__ import annotations
 
 import shlex
 import sys
-import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from deploy.agents.malloc_tuning import keep_heap
-from deploy.offline.outputs import write_outputs, write_refusal
+from deploy.agents.malloc_tuning import retain_freed_memory
 from deploy.offline.progress import progress_bar
-from deploy.offline.sessions import load_session
 from protocols.core.errors import EXIT_DONE, InputError, Refused
 from protocols.core.files import check_folder
-from protocols.session.calibration import Known, read_calibration
-from protocols.session.observations import Observations
-from protocols.session.rig import Rig
+from protocols.log.read.session import load_session
+from protocols.session.session import Session
 
 
 def calibrate(
@@ -35,14 +30,14 @@ def calibrate(
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
-    """Find when each camera of a session really fired, where it stands, and the path of what moved.
+    """Estimate clock offset and pose of each camera of a session, and the trajectory of the moving target.
 
     Writes calibration.toml, trajectory.csv, result.json and report.html to --out. Exit status 0 if at least
-    two cameras are solved, 3 if the data hold no trustworthy answer (then only result.json and report.html).
+    two cameras are solved, 3 if the data allow no reliable result (then only result.json and report.html).
 
-    Of a folder of videos, one a camera and named after it, each is looked through for the marker first; the session
-    that comes of it is kept in --out as session/, and videos that have not changed are not looked through again.
-    A rig.toml among the videos tells their lenses (`syncline intrinsics`).
+    In a folder of videos, one per camera and named after it, the marker is first detected in each video. The resulting
+    session is stored in --out as session/, and the detections of unchanged videos are reused. A rig.toml in the folder
+    gives the cameras' intrinsics (`syncline intrinsics`).
 
     Example: syncline calibrate my-session --out out
 
@@ -57,43 +52,37 @@ def calibrate(
     observations
         Another observations file to use instead of the session's own.
     solver
-        joint: everything in one adjustment. distributed: poses by pose nodes that talk with their
-        neighbours, in one process. paper: the paper's alternating method.
+        joint: one bundle adjustment over all parameters. distributed: poses by pose nodes that exchange messages with
+        their neighbours, in one process. paper: the alternating method of the paper.
     from_known
-        A calibration.toml whose intrinsics and poses are kept; only timing and path are found.
+        A calibration.toml whose intrinsics and poses are kept fixed; only timing and trajectory are estimated.
     marker
-        Of videos: what the marker looks like, as `syncline detect --teach` wrote it. Default: marker.toml among
-        the videos, or else the orange ball of the demo.
+        For videos: appearance of the marker, as written by `syncline detect --teach`. Default: marker.toml in the
+        folder of videos, otherwise the orange ball of the demo.
     detector
-        Of videos: what moves in them. person, vehicle: one at a time, before fixed cameras.
+        For videos: what moves in them. person, vehicle: only one at a time in view, with fixed cameras.
     json
         Print the result as JSON on standard output.
     seed
-        Of the pose nodes' random samples (--solver distributed); the other solvers draw nothing at random.
+        Seed of the pose nodes' random samples (--solver distributed); the other solvers use no random numbers.
     """
-    check_folder(out)
-    if from_known is not None and solver != "joint":
-        raise InputError("--from-known goes with --solver joint", remedy="leave one of the two out")
-    rig, seen, warnings = _load(session, observations, out, marker, detector, json)
-    known = None
-    if from_known is not None:
-        known, rig = _known(from_known, rig)
-    command = shlex.join(["syncline", *sys.argv[1:]])
-    keep_heap()
-    from hub.calibration.pipeline import calibrate as solve
+    from hub.api import CalibrationOptions
+    from hub.api import calibrate as solve
 
-    began = time.process_time()
+    check_folder(out)
+    options = CalibrationOptions(solver, from_known, seed=seed)
+    read = _load(session, observations, out, marker, detector, json)
+    command = shlex.join(["syncline", *sys.argv[1:]])
+    retain_freed_memory()
+    from deploy.offline.outputs import report_refusal, report_result
+
     try:
-        with progress_bar(f"calibrating {session.name}", quiet=json) as tell:
-            result = solve(rig, seen, tell, solver=solver, known=known, thorough=True, seed=seed)
+        with progress_bar(f"calibrating {session.name}", quiet=json) as progress:
+            result = solve(read, options, progress)
     except Refused as refusal:
-        spent = time.process_time() - began
-        write_refusal(
-            out, refusal, rig, seen, command, solver=solver, cpu_seconds=spent, warnings=warnings, echo_json=json
-        )
+        report_refusal(refusal, read, out, command, solver, echo_json=json)
         raise
-    result = replace(result, cpu_seconds=time.process_time() - began, warnings=warnings + result.warnings)
-    write_outputs(out, result, rig, seen, command, echo_json=json)
+    report_result(result, out, command, echo_json=json)
     return EXIT_DONE
 
 
@@ -104,19 +93,19 @@ def _load(
     marker: Path | None,
     detector: Literal["marker", "person", "vehicle"],
     quiet: bool,
-) -> tuple[Rig, Observations, tuple[str, ...]]:
-    """A session as it is, or one made of a folder of videos. Raises InputError."""
+) -> Session:
+    """Read a session, or make one from a folder of videos. Raises InputError."""
     if observations is None and session.is_dir() and not (session / "observations.csv").exists():
-        from deploy.offline.video_folder import SESSION, gather_session, holds_videos
+        from deploy.offline.video_folder import SESSION, is_video_folder, session_from_videos
 
-        if holds_videos(session):
+        if is_video_folder(session):
             if marker is not None and detector != "marker":
                 raise InputError(f"--marker means nothing with --detector {detector}", remedy="leave one of them out")
-            with progress_bar(f"looking for the {detector}", quiet=quiet) as tell:
-                gathered = gather_session(session, out / SESSION, tell, marker, detector)
-            for line in () if quiet else gathered.told:
+            with progress_bar(f"looking for the {detector}", quiet=quiet) as progress:
+                gathered = session_from_videos(session, out / SESSION, progress, marker, detector)
+            for line in () if quiet else gathered.summaries:
                 print(line)
-            return gathered.rig, gathered.observations, gathered.warnings
+            return gathered
         if not (session / "rig.toml").exists():
             remedy = "put one video a camera in it, or rig.toml and observations.csv"
             raise InputError("this folder holds neither videos nor a session", file=session, remedy=remedy)
@@ -125,17 +114,3 @@ def _load(
     if detector != "marker":
         raise InputError("--detector goes with a folder of videos", remedy="leave it out for a session")
     return load_session(session, observations)
-
-
-def _known(file: Path, rig: Rig) -> tuple[Known, Rig]:
-    """The given poses, and the rig in their units: the answer's world is theirs."""
-    given, cameras = read_calibration(file)
-    both = {name: camera for name, camera in cameras.items() if name in rig.cameras}
-    if len(both) < 2:
-        raise InputError(
-            f"knows only {len(both)} of the session's cameras ({', '.join(rig.cameras)})",
-            file=file,
-            remedy="use a calibration of this rig",
-        )
-    scale = str(given.metadata.get("scale", "metric"))
-    return Known(both, scale), replace(rig, units=given.units)

@@ -1,4 +1,4 @@
-"""`syncline detect`: one detector over one video."""
+"""`syncline detect`: detections of a marker, people or vehicles in a video, as observations.csv."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from deploy.offline.progress import progress_bar
-from edge.detectors.base import Detection, Detector
 from protocols.core.errors import EXIT_DONE, InputError, Refused
+from protocols.core.names import check_name, name_from_file
 
 _REMEDIES = {
     "marker": "use a brightly coloured ball that is whole in the picture, or show it with --teach --target x,y,w,h",
@@ -43,15 +43,15 @@ def detect(
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
-    """Find a marker, people or vehicles in every frame of a video, and write when and where they were seen.
+    """Detect a marker, people or vehicles in every frame of a video, and write the times and pixels.
 
-    Writes camera,frame,time,u,v,size,label,score to --out: time as the file says (variable frame rates are kept),
-    u, v and size in pixels. Exit status 3 if nothing is in any frame.
+    Writes camera,frame,time,u,v,size,label,score to --out: time is the file's presentation time (variable frame rates
+    are kept), u, v and size are in pixels. Exit status 3 if nothing is detected in any frame.
 
-    People and vehicles are what moves before the background; person: u, v is the representative point, size the
-    distance from head to foot, label p0, p1, ... one a person as far as this video tells (person where there is never
-    more than one). vehicle: u, v is the box's centre, label t0, t1, ... one a vehicle; the camera may be moving. Both
-    have further columns: head_u,head_v,foot_u,foot_v,box_x,box_y,box_w,box_h (x, y of the top left).
+    People and vehicles are detected as motion before the background. person: u, v is the representative point, size the
+    distance from head to foot; label p0, p1, ... is one per track in this video (person where there is never more than
+    one). vehicle: u, v is the box's centre; label t0, t1, ... is one per track; the camera may be moving. Both have
+    further columns: head_u,head_v,foot_u,foot_v,box_x,box_y,box_w,box_h (x, y of the top left).
 
     Example: syncline detect marker cam0.mp4 --out observations.csv
 
@@ -72,15 +72,15 @@ def detect(
     camera
         The camera's name in it; default: the video's name.
     mode
-        Of a marker. colour: a ball. bright: an LED, or a retro-reflector beside the camera's lamp, in a picture that is
-        darker otherwise. tag: AprilTags or ArUco tags, each labelled by its number: tag7; u, v is the tag's centre,
-        size the side that it would have seen straight on.
+        Kind of marker. colour: a ball. bright: an LED, or a retro-reflector beside the camera's lamp, in an otherwise
+        darker picture. tag: AprilTags or ArUco tags, each labelled by its number: tag7; u, v is the tag's centre, size
+        its side as seen face on.
     threshold
         Grey level from 30 to 254 that a bright marker exceeds; 200 by default.
     dictionary
         Family of the tags: apriltag_36h11 by default, apriltag_16h5, 4x4_50, 5x5_100, 6x6_250, ...
     teach
-        Learn the marker's colour from --target first, and keep it as marker.toml beside --out.
+        Learn the marker's colour from --target first, and write it to marker.toml beside --out.
     target
         The marker's box in frame --start, x,y,w,h in pixels; x,y is its top left.
     start
@@ -88,19 +88,19 @@ def detect(
     marker
         A marker.toml that --teach wrote. Default: the orange ball of the demo.
     colour
-        The marker's colour instead, red,green,blue from 0 to 255.
+        The marker's colour in place of that file, red,green,blue from 0 to 255.
     rig
         A rig.toml with this camera's matrix: a large ball's centre is then corrected for perspective.
     fps
-        Frame rate, instead of the file's time stamps; of pictures 30 by default.
+        Frame rate [Hz] in place of the file's time stamps; 30 by default for a folder of pictures.
     overlay
-        A video to write, with what was found drawn into it.
+        A video to write: a copy with the detections drawn into it.
     background
-        Model of the background for people and vehicles: mog2 or knn.
+        OpenCV's background model for people and vehicles: mog2 or knn.
     json
         Print a summary as JSON.
     seed
-        Accepted as everywhere; nothing here is drawn at random.
+        Accepted by every command; nothing here is random.
     """
     shown = {"--teach": teach or None, "--target": target, "--marker": marker, "--colour": colour, "--rig": rig}
     if what != "marker" and (useless := [option for option, value in shown.items() if value is not None]):
@@ -117,57 +117,40 @@ def detect(
         raise InputError("--teach and --target go together", remedy=remedy)
     if sum((teach, marker is not None, colour is not None)) > 1:
         raise InputError("--teach, --marker and --colour each say what the marker looks like", remedy="keep one")
-    from deploy.offline import detect as detecting
     from deploy.offline.track import choose_camera, parse_target
     from edge.detectors.marker.ball import MarkerModel
-    from edge.devices.base import check_size
-    from edge.devices.playback.video_reader import Film
+    from edge.devices.playback.video_reader import VideoReader
+    from edge.offline.video import MARKER_FILE, detect_video, learn_marker_from_frame, marker_toml
     from protocols.core.files import write_together
 
-    film = Film(video, fps)
-    name = video.stem if camera is None else camera
-    if not name or name != name.strip() or '"' in name or name == "metadata":
-        raise InputError(f"{name!r} is no name for a camera", remedy="give --camera letters, digits, - and _")
-    lens = choose_camera(rig, Path(f"{name}.mp4")).intrinsics if rig is not None else None
-    check_size(lens, *film.info.size, str(video))
+    name = name_from_file(video.stem, video) if camera is None else check_name(camera, "--camera")
     files: dict[Path, str] = {}
-    model = MarkerModel.default()
+    model: MarkerModel | Path | None = marker
     if target is not None:
         box = parse_target(target)
-        model = detecting.teach_from(film, (box.x, box.y, box.width, box.height), start)
-        files[out.parent / detecting.MARKER_FILE] = detecting.marker_text(model)
-    elif marker is not None:
-        model = detecting.read_marker(marker)
+        model = learn_marker_from_frame(VideoReader(video, fps), (box.x, box.y, box.width, box.height), start)
+        files[out.parent / MARKER_FILE] = marker_toml(model)
     elif colour is not None:
         model = MarkerModel.of_colour(*_colour(colour))
-    extra = ""
-    with progress_bar(f"looking through {video.name}", quiet=json) as tell:
-        total = film.info.frames
-
-        def told(frame: int) -> None:
-            tell(f"frame {frame}" + (f" of {total}" if total else ""), frame / total if total else 0.0)
-
-        if what == "marker":
-            detector: Detector = (
-                detecting.marker_detector(model, lens, film.info.size)
-                if mode == "colour"
-                else detecting.other_marker(mode, threshold or 200, dictionary or "apriltag_36h11")
-            )
-            drawn: dict[int, list[tuple[str, Detection]]] = {}
-            found = detecting.detect_in(film, name, detector, told, seen=drawn if overlay else None)
-            if overlay is not None:
-                found = detecting.with_overlay(film, found, drawn, overlay)
-        else:
-            from deploy.offline import detect_moving
-
-            extra = detect_moving.HEADER_EXTRA
-            moving = detect_moving.make_detector(what, background, film.info.fps)
-            found = detect_moving.find_moving(film, name, moving, tell, overlay)
+    with progress_bar(f"looking through {video.name}", quiet=json) as progress:
+        found = detect_video(
+            video,
+            mode if mode != "colour" else what,
+            camera=name,
+            marker=model,
+            intrinsics=None if rig is None else choose_camera(rig, Path(f"{name}.mp4")).intrinsics,
+            fps=fps,
+            threshold=threshold or 200,
+            dictionary=dictionary or "apriltag_36h11",
+            background=background,
+            overlay=overlay,
+            progress=progress,
+        )
     if not found.rows:
         raise Refused(
             f"{video}: no {what} in any of {found.frames} frames; {_REMEDIES[mode if mode in _REMEDIES else what]}"
         )
-    write_together({**files, out: detecting.observations_text(found.rows, extra)})
+    write_together({**files, out: found.to_csv()})
     warnings = [f"{video}: {warning}" for warning in found.warnings]
     if json:
         import json as json_module
@@ -180,7 +163,7 @@ def detect(
             "size": list(found.size),
             "fps": found.fps,
             "frames": found.frames,
-            "frames_with_detection": found.seen,
+            "frames_with_detection": found.frames_with_detection,
             "corrupt": found.corrupt,
             "repaired": found.repaired,
             "warnings": warnings,
@@ -189,7 +172,7 @@ def detect(
         return EXIT_DONE
     if overlay is not None:
         files[overlay] = ""
-    print(f"{name}: seen in {found.seen} of {found.frames} frames, {found.fps:.3f} frames a second")
+    print(f"{name}: seen in {found.frames_with_detection} of {found.frames} frames, {found.fps:.3f} frames a second")
     for warning in warnings:
         print(f"warning: {warning}")
     print(f"written: {', '.join(str(file) for file in (out, *files))}")
@@ -199,7 +182,7 @@ def detect(
 def _check_mode(
     what: str, mode: str, shown: Mapping[str, object], threshold: int | None, dictionary: str | None
 ) -> None:
-    """Raise InputError for options that mean nothing together."""
+    """Check that the options fit together. Raises InputError."""
     if mode != "colour" and what != "marker":
         raise InputError(f"--mode means nothing for `detect {what}`", remedy="leave it out")
     if mode != "colour" and (useless := [option for option, value in shown.items() if value is not None]):

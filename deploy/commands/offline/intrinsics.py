@@ -1,4 +1,4 @@
-"""`syncline intrinsics`: a camera's lens from a video of a board."""
+"""`syncline intrinsics`: camera calibration from a video of a board."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from cyclopts import Parameter
 
 from deploy.offline.progress import progress_bar
 from protocols.core.errors import EXIT_DONE, InputError
+from protocols.core.names import check_name, name_from_file
 
-_TRIED = 250  # frames that are looked at, at the most
-_A_SECOND = 5.0  # … of each second
+_MAX_FRAMES = 250  # most frames in which the board is searched
+_MAX_RATE_HZ = 5.0  # most of them per second of video
 
 
 def intrinsics(
@@ -31,16 +32,16 @@ def intrinsics(
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
-    """Measure a lens with a printed board: camera matrix and distortion, into a rig.toml.
+    """Calibrate a camera's intrinsics (camera matrix and distortion) with a printed board, into a rig.toml.
 
-    Film the flat board for half a minute so that it comes into all parts of the picture, tilted in different
-    directions, near and far, with zoom and focus as they will be used. Exit status 3 if the views do not fix the lens.
-    An existing rig.toml keeps everything else that stands in it, except its comments.
+    Film the flat board for half a minute so that it covers all parts of the image, tilted in different directions,
+    near and far, with the zoom and focus that will be used. Exit status 3 if the views do not determine the intrinsics.
+    All other entries of an existing rig.toml are kept, except comments.
 
     Example: syncline intrinsics board.mp4 --camera cam0 --board charuco --squares 8x5 --out rig.toml
 
-    Without a board, --model or --field-of-view tell what the maker says. Such a lens is a guess and its table says so
-    (focal_std): `calibrate` then finds the focal length from the marker's path, or refuses the camera.
+    Without a board, --model or --field-of-view give the manufacturer's figure. Such intrinsics are approximate and are
+    marked so (focal_std): `calibrate` then estimates the focal length from the marker's motion, or refuses the camera.
 
     Example: syncline intrinsics cam0.mp4 --model gopro-wide --out rig.toml
 
@@ -49,29 +50,29 @@ def intrinsics(
     Parameters
     ----------
     video
-        A video file of the board, or a folder of pictures.
+        A video file of the board, or a folder of images.
     out
-        The rig.toml to write or to complete.
+        The rig.toml to write or to update.
     camera
         The camera's name in it; default: the video's name.
     board
-        charuco: markers in the white squares; may be cut by the picture's border. chessboard: plain.
+        charuco: ChArUco board, which may be partly outside the image. chessboard: plain chessboard.
     squares
-        Across x down, as printed: 8x5.
+        Number of squares, columns x rows, as printed: 8x5.
     dictionary
-        Of a ChArUco board's markers, as OpenCV calls it: 4X4_50, 5X5_100, APRILTAG_36H11, …
+        Marker dictionary of a ChArUco board, by its OpenCV name: 4X4_50, 5X5_100, APRILTAG_36H11, …
     ratio
-        A ChArUco marker's side as a share of a square's.
+        Side of a ChArUco marker divided by the side of a square.
     fisheye
-        OpenCV's fisheye model, for lenses of more than about 110 degrees.
+        Use OpenCV's fisheye model, for fields of view of more than about 110 degrees.
     field_of_view
-        Without a board: the picture's width in degrees, from the data sheet; distortion is taken as none.
+        Without a board: horizontal field of view in degrees, from the data sheet; distortion is assumed to be zero.
     model
-        Without a board: the camera, as gopro-wide, oak-d, pixel-main, logitech-c920, raspberry-pi-camera-3.
+        Without a board: the camera model, such as gopro-wide, oak-d, pixel-main, logitech-c920, raspberry-pi-camera-3.
     json
         Print a summary as JSON.
     seed
-        Accepted as everywhere; nothing here is drawn at random.
+        Accepted for consistency; this command uses no random numbers.
     """
     if out.is_dir():
         raise InputError("a folder of this name is in the way", file=out, remedy="give --out the name of a rig.toml")
@@ -85,38 +86,38 @@ def intrinsics(
         what = f"--field-of-view {field_of_view:g} is out of range"
         raise InputError(what, remedy=f"give 5 to {widest:g} degrees")
     if model is not None and field_of_view is not None:
-        raise InputError("--model and --field-of-view each tell the field of view", remedy="keep one")
-    from edge.devices.playback.video_reader import Film
-    from edge.lens.board import Charuco, Chessboard, View, views_of
-    from edge.lens.models import UNKNOWN_STD, angle_across, find_model
-    from edge.lens.solve import LensFit, coverage_map, lens_from_angle, solve_lens
+        raise InputError("--model and --field-of-view each give the field of view", remedy="keep one")
+    from edge.devices.playback.video_reader import VideoReader
+    from edge.lens.board import BoardView, CharucoBoard, Chessboard, board_views
+    from edge.lens.models import FIELD_OF_VIEW_STD, find_lens_model, horizontal_field_of_view
+    from edge.lens.solve import LensCalibration, calibrate_lens, coverage_map, intrinsics_from_field_of_view
     from protocols.core.files import write_atomically
 
-    name = video.stem if camera is None else camera
-    if not name or name != name.strip() or '"' in name or name == "metadata":
-        raise InputError(f"{name!r} is no name for a camera", remedy="give --camera letters, digits, - and _")
-    known = None if model is None else find_model(model)
-    film = Film(video)
-    fit: LensFit | None = None
+    name = name_from_file(video.stem, video) if camera is None else check_name(camera, "--camera")
+    known = None if model is None else find_lens_model(model)
+    reader = VideoReader(video)
+    fit: LensCalibration | None = None
     guess_std = 0.0
     if known is not None:
-        lens = lens_from_angle(film.info.size, angle_across(known, film.info.size), known.fisheye)
+        lens = intrinsics_from_field_of_view(
+            reader.info.size, horizontal_field_of_view(known, reader.info.size), known.fisheye
+        )
         guess_std = known.std
     elif field_of_view is not None:
-        lens, guess_std = lens_from_angle(film.info.size, field_of_view, fisheye), UNKNOWN_STD
+        lens, guess_std = intrinsics_from_field_of_view(reader.info.size, field_of_view, fisheye), FIELD_OF_VIEW_STD
     else:
         grid = int(numbers[1]), int(numbers[2])
-        finder = Chessboard(grid) if board == "chessboard" else Charuco(grid, dictionary, ratio)
-        total = film.info.frames
-        step = max(1, round(film.info.fps / _A_SECOND), -(-total // _TRIED))
+        finder = Chessboard(grid) if board == "chessboard" else CharucoBoard(grid, dictionary, ratio)
+        total = reader.info.frames
+        step = max(1, round(reader.info.fps / _MAX_RATE_HZ), -(-total // _MAX_FRAMES))
         step = 1 if video.is_dir() else step
-        views: list[View] = []
-        with progress_bar(f"looking for the board in {video.name}", quiet=json) as tell:
-            for view in views_of(finder, film, step, film.info.size[0]):
+        views: list[BoardView] = []
+        with progress_bar(f"looking for the board in {video.name}", quiet=json) as progress:
+            for view in board_views(finder, reader, step, reader.info.size[0]):
                 views.append(view)
-                tell(f"{len(views)} views, frame {view.frame}", min(view.frame / total, 1.0) if total else 0.0)
-        fit = solve_lens(views, film.info.size, fisheye)
-        lens = fit.lens
+                progress(f"{len(views)} views, frame {view.frame}", min(view.frame / total, 1.0) if total else 0.0)
+        fit = calibrate_lens(views, reader.info.size, fisheye)
+        lens = fit.intrinsics
     table: dict[str, Any] = {
         "name": name,
         "size": [lens.width, lens.height],
@@ -145,10 +146,10 @@ def intrinsics(
     model = "fisheye" if lens.fisheye else "pinhole"
     if fit is None:
         print(f"{name}: {model}, focal length {lens.focal:.1f} px ± {100 * guess_std:.0f} % from the field of view")
-        print("a guess: `syncline calibrate` finds it from the marker's path, a board tells it better")
+        print("approximate: `syncline calibrate` refines it from the marker's motion; a board is more precise")
     else:
         print(f"{name}: {model}, focal length {lens.focal:.2f} px ± {100 * fit.focal_std:.2g} %, {fit.views} views")
-        print(f"corners fit to {fit.rms_px:.3f} px; corners in each part of the picture ({100 * fit.coverage:.0f} %):")
+        print(f"corners fit to {fit.rms_px:.3f} px; corners in each part of the image ({100 * fit.coverage:.0f} %):")
         for row in coverage_map(fit.cells):
             print(row)
     print(f"written: {out}")
@@ -156,14 +157,14 @@ def intrinsics(
 
 
 def _completed(file: Path, name: str, table: dict[str, Any]) -> str:
-    """The rig file's text with this camera's lens in it; everything else stays. Raises InputError."""
+    """The rig file's text with this camera's intrinsics; all other entries are kept. Raises InputError."""
     import tomli_w
 
     from protocols.session.rig import read_rig, read_toml
 
     values: dict[str, Any] = {}
     if file.exists():
-        read_rig(file)  # what is wrong in it is told before anything is written
+        read_rig(file)  # errors in it are raised before anything is written
         values, _ = read_toml(file, "rig file")
     key = next((k for k, old in values.items() if k != "metadata" and old.get("name", k) == name), name)
     kept = {k: v for k, v in values.get(key, {}).items() if k not in ("matrix", "distortions", "fisheye", "focal_std")}

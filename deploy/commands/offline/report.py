@@ -1,4 +1,4 @@
-"""`syncline report`: what an answer is worth, as one file."""
+"""`syncline report`: quality report of a calibration as one HTML file."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ def report(
     json: Annotated[bool, Parameter(negative="")] = False,
     browser: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
-    """Write report.html of results, of a session or of a log: the verdict first, then the evidence.
+    """Write report.html for a result folder, a session or a log: the quality assessment first, then the evidence.
 
-    One file that opens offline and prints. A folder that `syncline calibrate`, `hub` or `demo` wrote is reported as
-    it is; a log or a session is solved first. What has no answer has a report too, of why.
+    The report is one self-contained file for viewing offline and printing. A folder that `syncline calibrate`, `hub`
+    or `demo` wrote is reported as it is; a log or a session is calibrated first. If the calibration was refused, the
+    report explains why.
 
     Example: syncline report demo-out/demo.mcap --out report.html
 
@@ -36,39 +37,51 @@ def report(
     source
         A folder with result.json, a session folder, or a .mcap log.
     out
-        The file to write. Default: report.html in the folder of results, else in the present one.
+        The file to write. Default: report.html in the result folder, else in the current folder.
     session
-        Where the session of a folder of results is, if it is not where it was when it was solved.
+        The session of a result folder, if it has been moved since the calibration.
     json
-        Print file and verdict as JSON.
+        Print the file and the assessment as JSON.
     browser
-        Open it.
+        Open the report in a browser.
     """
     from deploy.offline.progress import progress_bar
-    from deploy.offline.report import load_answer
+    from deploy.offline.report_input import load_report_input
     from hub.report import build_report
-    from hub.report.measures import usage
-    from hub.report.quality_assessment import judge, judge_refusal
+    from hub.report.measures import row_usage
+    from hub.report.quality_assessment import assess_quality, assess_refusal
     from protocols.core.files import write_atomically
 
     file = out or (source / "report.html" if (source / "result.json").is_file() else Path("report.html"))
     if file.suffix.lower() not in (".html", ".htm"):
         raise InputError("a report is an .html file", file=file, remedy="choose another --out")
-    with progress_bar(f"solving {source.name}", quiet=json) as tell:
-        answer = load_answer(source, session, tell)
-    command = answer.command or shlex.join(["syncline", *sys.argv[1:]])
-    outcome = answer.outcome
-    write_atomically(file, build_report(outcome, answer.rig, answer.observations, command, answer.history))
+    with progress_bar(f"solving {source.name}", quiet=json) as progress:
+        report_input = load_report_input(source, session, progress)
+    command = report_input.command or shlex.join(["syncline", *sys.argv[1:]])
+    outcome = report_input.outcome
+    write_atomically(
+        file, build_report(outcome, report_input.rig, report_input.observations, command, report_input.history)
+    )
     if isinstance(outcome, Refused):
-        verdict = judge_refusal(outcome, answer.rig)
+        assessment = assess_refusal(outcome, report_input.rig)
     else:
-        verdict = judge(outcome, answer.rig, answer.observations, usage(outcome, answer.rig, answer.observations))
+        assessment = assess_quality(
+            outcome,
+            report_input.rig,
+            report_input.observations,
+            row_usage(outcome, report_input.rig, report_input.observations),
+        )
     if json:
-        told = {"report": str(file), "level": verdict.level, "verdict": verdict.headline, "todo": verdict.todo}
-        print(json_module.dumps(told, ensure_ascii=False))
+        summary = {
+            "report": str(file),
+            "level": assessment.level,
+            "verdict": assessment.headline,
+            "todo": assessment.actions,
+        }
+        print(json_module.dumps(summary, ensure_ascii=False))
     else:
-        print(verdict.headline)
-        for line in verdict.todo:
+        print(assessment.headline)
+        for line in assessment.actions:
             print(f"to do: {line}")
         print(f"written: {file}")
     if browser:

@@ -1,4 +1,4 @@
-"""`syncline simulate`: a session of a shipped scene, or a flight over the town, with its truth beside it."""
+"""`syncline simulate`: writes a session of a simulated scene or a flight over the town, with its ground truth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from protocols.core.errors import EXIT_DONE, InputError
 from protocols.core.files import check_folder
 
 _SECONDS, _NOISE_PX = 60.0, 0.5
-_BODY_NOISE_PX = 2.0  # a head's top and a foot point are not as sharp as a ball
+_BODY_NOISE_PX = 2.0  # head tops and foot points are located less precisely than a ball
 _PEOPLE = "people"
 
 
@@ -35,15 +35,16 @@ def simulate(
     render: Annotated[bool, Parameter(negative="")] = False,
     json: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
-    """Write a session of a simulated scene: rig.toml, observations.csv and the truth.
+    """Write a session of a simulated scene: rig.toml, observations.csv and the ground truth.
 
-    The truth is in truth_calibration.toml and truth_trajectory.csv (true time of the first camera's clock).
+    The ground truth is in truth_calibration.toml and truth_trajectory.csv (times on the first camera's clock).
 
-    Scene people is walkers in a room: observations.csv has the head tops and foot points of everybody, as labels
-    person0-head, person0-foot, ...; truth_trajectory.csv their places, truth_boxes.csv the bodies in every picture.
+    Scene people has people walking in a room: observations.csv contains everyone's head tops and foot points, with the
+    labels person0-head, person0-foot, ...; truth_trajectory.csv their 3-D positions, truth_boxes.csv the bounding boxes
+    in every frame.
 
-    Scene town:SCENARIO is a drone that follows a car and loses it: video.mp4, rig.toml, telemetry.csv and truth.csv
-    (the car in every frame, also out of the picture). Scenarios: exit-bend (the usual one), exit-straight,
+    Scene town:SCENARIO is a drone that follows a car until it leaves the view: video.mp4, rig.toml, telemetry.csv and
+    truth.csv (the car in every frame, also out of view). Scenarios: exit-bend (the default), exit-straight,
     turn-out-of-view, yaw, distractors, trees, bridge, lighting, off-road, partial, paper-3.3, paper-4.4.
 
     Example: syncline simulate marker --cameras 5 --seed 3 --out my-session
@@ -57,48 +58,48 @@ def simulate(
     scene
         Name of the scene: marker (a room), marker-outdoor (a field), people (a room), or town:SCENARIO (a flight).
     out
-        Folder to write; made if need be.
+        Folder to write; created if it does not exist.
     seconds
         Length of the recording (default 60); not for town.
     cameras
         Number of cameras, at least 2; default: the scene's own; not for town.
     seed
-        Same seed, same session.
+        Random seed: the same seed gives the same session.
     noise_px
-        Detector noise, std of each coordinate (default 0.5, of people 2); not for town.
+        Detector noise, std of each coordinate in pixels (default 0.5, for people 2); not for town.
     outliers
-        Share of false detections, 0 to 1 (default 0); only for marker scenes.
+        Fraction of false detections, 0 to 1 (default 0); only for marker scenes.
     drops
-        Share of lost frames, 0 to 1; default: the scene's own; not for town.
+        Fraction of lost frames, 0 to 1; default: the scene's own; not for town.
     frames
-        For how many frames the car is out of the picture; default: the scenario's own; only for town.
+        Number of frames for which the car is out of view; default: the scenario's own; only for town.
     size
-        Of the picture, default 640x480; only for town.
+        Image size, default 640x480; only for town.
     telemetry_hz
         Rate of the telemetry, 1 to 50 Hz (default 30); only for town.
     people
-        How many walk about, 1 to 12 (default 5); only for people.
+        Number of people, 1 to 12 (default 5); only for people.
     render
-        Also write every camera's pictures, cam0.mp4, ...; only for people.
+        Also write every camera's video, cam0.mp4, ...; only for people.
     json
         Print what was written as JSON.
     """
     check_folder(out)
     if seed < 0:
         raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
-    marker: dict[str, object] = {
+    marker_options: dict[str, object] = {
         "--seconds": seconds,
         "--cameras": cameras,
         "--noise-px": noise_px,
         "--outliers": outliers,
     }
-    town: dict[str, object] = {"--frames": frames, "--size": size, "--telemetry-hz": telemetry_hz}
-    crowd: dict[str, object] = {"--people": people, "--render": render or None}
+    town_options: dict[str, object] = {"--frames": frames, "--size": size, "--telemetry-hz": telemetry_hz}
+    people_options: dict[str, object] = {"--people": people, "--render": render or None}
     if scene.partition(":")[0] == "town":
-        _refuse(marker | crowd | {"--drops": drops}, scene)
+        _refuse(marker_options | people_options | {"--drops": drops}, scene)
         return _fly(scene, out, seed, frames, size, 30.0 if telemetry_hz is None else telemetry_hz, json)
-    useless: dict[str, object] = {"--outliers": outliers} if scene == _PEOPLE else crowd
-    _refuse(town | useless, scene)
+    unused_options: dict[str, object] = {"--outliers": outliers} if scene == _PEOPLE else people_options
+    _refuse(town_options | unused_options, scene)
     seconds = _SECONDS if seconds is None else seconds
     if noise_px is None:
         noise_px = _BODY_NOISE_PX if scene == _PEOPLE else _NOISE_PX
@@ -162,7 +163,7 @@ def _fly(
         print(json.dumps({"out": str(out), **written}))
     else:
         begin, end = written["out_of_picture"]
-        where = f"the car out of the picture in frames {begin} to {end - 1}" if end else "the car always in the picture"
+        where = f"the car out of view in frames {begin} to {end - 1}" if end else "the car always in view"
         print(f"{written['frames']} frames in {written['video']}, {where}")
         target = ",".join(f"{value:g}" for value in written["target"])
         print(

@@ -1,4 +1,4 @@
-"""`syncline sync`: per-frame reference times of videos, and copies that line up."""
+"""`syncline sync`: reference times of all frames, and synchronised copies of the videos."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def sync(
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
-    """Tell when every frame of every video was taken on one clock, and write videos that line up.
+    """Compute the time of every frame of every video on one reference clock, and write synchronised videos.
 
-    Writes CAMERA.csv (frame,time,reference_time in seconds) a video, and CAMERA.mp4 over the span that all share.
-    retime: all of one constant rate and length, frame for frame at the same time; synchronised.csv tells which
-    source frame each shows. trim: every source frame once, stamped with its reference time. Sound is left out.
-    Needs the extra "video" (PyAV). Exit status 3 if the videos share no time.
+    Writes one CAMERA.csv (frame,time,reference_time in seconds) per video, and CAMERA.mp4 over their common time span.
+    retime: all videos have the same constant frame rate and length, and equal frame numbers show the same time;
+    synchronised.csv lists the source frames. trim: every source frame once, stamped with its reference time. Audio is
+    dropped. Needs the extra "video" (PyAV). Exit status 3 if the videos do not overlap in time.
 
     Example: syncline sync my-videos --calibration out/calibration.toml --out synchronised
 
@@ -40,13 +40,13 @@ def sync(
     out
         Folder for the results.
     videos
-        retime, trim, or none: only the tables.
+        retime, trim, or none (only the tables).
     fps
-        Frame rate of retimed videos; default: that of the fastest video.
+        Frame rate of retimed videos; default: the highest frame rate of the videos.
     json
         Print a summary as JSON.
     seed
-        Accepted as everywhere; nothing here is drawn at random.
+        Accepted for consistency; this command uses no random numbers.
     """
     from protocols.core.files import check_folder, write_together
 
@@ -59,7 +59,7 @@ def sync(
         raise InputError("--out is the folder of the videos", file=out, remedy="choose another --out")
     from deploy.offline import sync as syncing
     from deploy.offline.video_folder import list_videos
-    from edge.devices.playback.video_reader import Film, has_pyav
+    from edge.devices.playback.video_reader import VideoReader, has_pyav
     from protocols.session.calibration import csv_cell, read_calibration
 
     if not has_pyav():
@@ -71,29 +71,29 @@ def sync(
     if not used:
         names = ", ".join(known)
         raise InputError(f"no video is named after a camera ({names})", file=folder, remedy="rename the videos")
-    films = {video.camera: Film(video.path) for video in used}
+    films = {video.camera: VideoReader(video.path) for video in used}
     maps = {name: known[name].time_map for name in films}
-    spans = {name: syncing.span_of(film, maps[name]) for name, film in films.items()}
+    spans = {name: syncing.reference_span(film, maps[name]) for name, film in films.items()}
     rate = fps or max(film.info.fps for film in films.values())
-    grid = syncing.common_grid(spans, rate)
-    done: dict[str, syncing.Retimed] = {}
+    grid = syncing.common_time_grid(spans, rate)
+    done: dict[str, syncing.SynchronisedVideo] = {}
     total = sum(max(film.info.frames, 1) for film in films.values())
     before = 0
-    with progress_bar("synchronising", quiet=json) as tell:
+    with progress_bar("synchronising", quiet=json) as progress:
         for name, film in films.items():
 
-            def told(frame: int, name: str = name, before: int = before) -> None:
-                tell(f"{name} frame {frame}", min((before + frame) / total, 1.0))
+            def report(frame: int, name: str = name, before: int = before) -> None:
+                progress(f"{name} frame {frame}", min((before + frame) / total, 1.0))
 
             target = out / f"{name}.mp4"
             if videos == "trim":
                 span = syncing.Span(max(s.first for s in spans.values()), min(s.last for s in spans.values()))
-                done[name] = syncing.trim(film, maps[name], span, target, told)
+                done[name] = syncing.trim(film, maps[name], span, target, report)
             else:
                 target_or_none = target if videos == "retime" else None
-                done[name] = syncing.retime(film, maps[name], grid, target_or_none, rate, told)
+                done[name] = syncing.retime(film, maps[name], grid, target_or_none, rate, report)
             before += film.info.frames
-            warnings += [f"{film.path.name}: {text}" for text in _troubles(film)]
+            warnings += [f"{film.path.name}: {text}" for text in _reader_warnings(film)]
     files = {out / f"{name}.csv": syncing.times_text(video) for name, video in done.items()}
     if videos != "trim":
         files[out / "synchronised.csv"] = syncing.grid_text(grid, done, csv_cell)
@@ -111,7 +111,7 @@ def sync(
             "fps": rate,
             "begin": float(grid[0]),
             "end": float(grid[-1]),
-            "frames": {name: len(video.shown) for name, video in done.items()},
+            "frames": {name: len(video.source_frames) for name, video in done.items()},
             "largest_error_s": {name: float(abs(video.error).max(initial=0.0)) for name, video in done.items()},
             "time_offset_std": {name: known[name].time_offset_std for name in done},
             "warnings": warnings,
@@ -132,9 +132,9 @@ def sync(
     return EXIT_DONE
 
 
-def _troubles(film: object) -> list[str]:
-    from edge.devices.playback.video_reader import Film
+def _reader_warnings(film: object) -> list[str]:
+    from edge.devices.playback.video_reader import VideoReader
 
-    assert isinstance(film, Film)
-    told = [f"{film.corrupt} frames could not be decoded and were skipped"] if film.corrupt else []
-    return told + ([f"{film.repaired} frames have no usable time stamp"] if film.repaired else [])
+    assert isinstance(film, VideoReader)
+    warnings = [f"{film.corrupt} frames could not be decoded and were skipped"] if film.corrupt else []
+    return warnings + ([f"{film.repaired} frames have no usable time stamp"] if film.repaired else [])

@@ -1,4 +1,4 @@
-"""`syncline track`: follow one car in a video, also while it is out of the picture."""
+"""`syncline track`: tracks one car in a video, also while it is out of view."""
 
 from __future__ import annotations
 
@@ -31,49 +31,49 @@ def track(
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
-    """Follow one car from the air, also while it is hidden or out of the picture, and say what is known of it.
+    """Track one car in an aerial video, also while it is occluded or out of view, with uncertainty.
 
-    Writes track.csv (one row a frame: visible, coasting or lost, with a std) and hypotheses.csv to --out.
+    Writes track.csv (one row per frame: visible, coasting or lost, with a std) and hypotheses.csv to --out.
 
     Example: syncline track flight.mp4 --target 312,200,44,20 --out tracked --overlay
 
     Parameters
     ----------
     video
-        A video file, a folder of pictures in the order of their names, or a .mcap log of a UAV agent with [images],
-        which also knows the lens and the mounting.
+        A video file, a folder of images sorted by name, or a .mcap log of a UAV agent with [images], which also
+        contains the intrinsics and body_from_camera.
     target
-        The car's box in the first tracked frame, x,y,w,h in pixels; x,y is its top left.
+        The car's bounding box in the first tracked frame, x,y,w,h in pixels; x,y is the top left corner.
     out
         Folder for the results.
     start
-        Index of that frame; 0 is the first.
+        Index of the first tracked frame; 0 is the first frame of the video.
     rig
-        A rig.toml with the camera: matrix, distortions, fps, body_from_camera. One camera, or the video's name.
+        A rig.toml with the camera: matrix, distortions, fps, body_from_camera. One camera, or one named like the video.
     telemetry
         The drone's telemetry.csv: time,qw,qx,qy,qz[,north,east,down], on the video's clock; or a .tlog or .mcap, whose
-        clock is found by the video's own turning. The ground model refuses it without matrix and body_from_camera
-        in --rig: it could not use it.
+        clock offset is estimated from the rotation seen in the video. The ground model cannot use telemetry without
+        matrix and body_from_camera in --rig, and refuses it.
     model
-        ground: on the ground plane, the best. paper, plain: the paper's, for comparison.
+        ground: tracks on the ground plane; the most accurate. paper, plain: the paper's models, for comparison.
     fps
         Frame rate, instead of the file's time stamps or rig.toml's.
     overlay
-        Also write overlay.mp4: particles, road and estimate on a canvas larger than the picture.
+        Also write overlay.mp4: particles, road and estimate on a canvas larger than the image.
     csv_truth
-        A CSV with frame,x,y[,width,height][,inside][,visible]: prints how well the track fits it.
+        Ground truth CSV with frame,x,y[,width,height][,inside][,visible]: prints the track's scores.
     json
         Print a summary as JSON.
     seed
-        Of the tracker's random numbers.
+        Seed of the tracker's random numbers.
     """
     check_folder(out)
     _check(video, start, fps, seed)
     from deploy.evaluation.track_scores import read_truth, score
     from deploy.offline import track as tracking
-    from deploy.offline.track_log import LoggedPictures, open_pictures
+    from deploy.offline.track_log import LoggedFlightImages, open_recording
     from deploy.offline.track_overlay import Overlay
-    from edge.uav import models
+    from edge.uav import tracker_factory
     from edge.uav.tracker import Telemetry
 
     box = tracking.parse_target(target)
@@ -84,70 +84,70 @@ def track(
     warnings: list[str] = []
     samples: tuple[Telemetry, ...] = ()
     own_clock = telemetry is not None and telemetry.suffix.lower() in (".tlog", ".mcap")
-    told: tracking.TelemetryFile | None = None
+    recorded: tracking.TelemetryFile | None = None
     if telemetry is not None and own_clock:
-        from deploy.offline.telemetry_files import read_own_clock
+        from deploy.offline.telemetry_files import read_telemetry_log
 
-        told = read_own_clock(telemetry)
+        recorded = read_telemetry_log(telemetry)
     elif telemetry is not None:
-        told = tracking.read_telemetry(telemetry)
+        recorded = tracking.read_telemetry(telemetry)
     rate = fps
     if rate is None and camera is not None and camera.fps > 0 and video.is_dir():
         rate = camera.fps
-    recording, counted = open_pictures(video, rate, lens)
+    recording, counted = open_recording(video, rate, lens)
     same_log = False
-    if isinstance(recording, LoggedPictures):
+    if isinstance(recording, LoggedFlightImages):
         lens = recording.lens
         mounting = recording.body_from_camera if mounting is None else mounting
         same_log = telemetry is not None and telemetry.resolve() == video.resolve()
-    if told is not None and telemetry is not None:
+    if recorded is not None and telemetry is not None:
         if model == "ground" and (lens is None or mounting is None):
-            what = "telemetry says nothing without the camera's matrix and body_from_camera"
+            what = "telemetry cannot be used without the camera's matrix and body_from_camera"
             raise InputError(what, file=telemetry, remedy="give both in --rig, or leave --telemetry out")
-        if told.left_out:
-            warnings.append(f"{telemetry}: {told.left_out} rows hold no sample and were left out")
-        samples = told.samples
+        if recorded.left_out:
+            warnings.append(f"{telemetry}: {recorded.left_out} rows hold no sample and were left out")
+        samples = recorded.samples
     size = (recording.info.width, recording.info.height)
     count = tracking.count_frames(video) if counted is None else counted
-    if told is not None and same_log and isinstance(recording, LoggedPictures):
-        # The agent has put both on one clock already.
+    if recorded is not None and same_log and isinstance(recording, LoggedFlightImages):
+        # The agent has already put both on one clock.
         first_s = recording.first_s
-        samples = tuple(replace(sample, time=sample.time - first_s) for sample in told.samples)
-    elif told is not None and own_clock:
+        samples = tuple(replace(sample, time=sample.time - first_s) for sample in recorded.samples)
+    elif recorded is not None and own_clock:
         samples = ()
         if lens is not None and mounting is not None:
-            from deploy.offline.telemetry_files import onto_video
+            from deploy.offline.telemetry_files import align_to_video
 
-            with progress_bar(f"looking for the telemetry's clock in {video.name}", quiet=json) as tell:
-                samples, line = onto_video(
-                    told, video, rate, lens, mounting, lambda i: tell(f"frame {i}", i / count if count else 0.0)
+            with progress_bar(f"looking for the telemetry's clock in {video.name}", quiet=json) as progress:
+                samples, line = align_to_video(
+                    recorded, video, rate, lens, mounting, lambda i: progress(f"frame {i}", i / count if count else 0.0)
                 )
             if not samples:
                 warnings.append(line)
-    elif told is not None and telemetry is not None:
+    elif recorded is not None and telemetry is not None:
         end = count / recording.info.fps if count else float("inf")
-        tracking.check_clock(told, telemetry, start / recording.info.fps, end)
-    tracker = models.get(model, size, lens, mounting, recording.info.fps, seed)
-    rows: list[tracking.Tracked] = []
+        tracking.check_clock(recorded, telemetry, start / recording.info.fps, end)
+    tracker = tracker_factory.get(model, size, lens, mounting, recording.info.fps, seed)
+    rows: list[tracking.TrackedFrame] = []
     with ExitStack() as stack:
-        tell = stack.enter_context(progress_bar(f"tracking in {video.name}", quiet=json))
+        progress = stack.enter_context(progress_bar(f"tracking in {video.name}", quiet=json))
         film = stack.enter_context(Overlay(out / tracking.OVERLAY, recording.info.fps)) if overlay else None
         stack.callback(recording.close)
 
-        def told_frame(index: int) -> None:
-            tell(f"frame {index}" + (f" of {count}" if count else ""), index / count if count else 0.0)
+        def frame_done(index: int) -> None:
+            progress(f"frame {index}" + (f" of {count}" if count else ""), index / count if count else 0.0)
 
-        for row in tracking.follow(
+        for row in tracking.track_recording(
             recording,
             tracker,
             box,
             start=start,
             telemetry=samples,
             show=film.show if film is not None else None,
-            tell=told_frame,
+            progress=frame_done,
         ):
-            # Particles and layers were for the overlay; a long video would fill the memory with them.
-            rows.append(tracking.without_layers(row))
+            # Particles and layers are only for the overlay, and would fill the memory for a long video.
+            rows.append(tracking.without_overlay_data(row))
         write_together(
             {
                 out / tracking.TRACK: tracking.track_text(rows),
@@ -161,7 +161,7 @@ def track(
     if recording.repaired:
         warnings.append(f"{video}: {recording.repaired} frames have no usable time stamp")
     scores = score(rows, truth, size) if truth is not None else None
-    _tell(out, rows, model, seed, overlay, warnings, scores, json)
+    _print_summary(out, rows, model, seed, overlay, warnings, scores, json)
     return EXIT_DONE
 
 
@@ -174,7 +174,7 @@ def _check(video: Path, start: int, fps: float | None, seed: int) -> None:
         raise InputError(f"--fps {fps:g} is out of range", remedy="give frames a second")
 
 
-def _tell(
+def _print_summary(
     out: Path,
     rows: list[Any],
     model: str,
@@ -184,7 +184,7 @@ def _tell(
     scores: dict[str, float | int] | None,
     as_json: bool,
 ) -> None:
-    """The summary: frames by state, the scores, and where the files are."""
+    """Print the summary: number of frames by state, scores, and output files."""
     states = Counter(row.estimate.state.value for row in rows)
     names = ["track.csv", "hypotheses.csv", *(["overlay.mp4"] if overlay else [])]
     if as_json:

@@ -1,1 +1,1 @@
-"""Commands that set up and examine machines and sites."""
+"""Commands that install, diagnose and administer machines and sites."""

@@ -1,4 +1,4 @@
-"""`syncline bundle`: an offline wheelhouse."""
+"""`syncline bundle`: builds an offline wheelhouse."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def bundle(
     out: Path | None = None,
     json: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
-    """Gather everything that a board without a network needs: wheels, and a script that installs them there.
+    """Collect the wheels that a board without a network needs, and a script that installs them there.
 
-    Only what the role imports is on it. Prints the installed size; a camera (without OAK) or UAV over 350 MB is
-    refused. On the board: sh install.sh
+    Only packages that the role imports are included. Prints the installed size; more than 350 MB for a camera (without
+    OAK) or a UAV is refused. On the board: sh install.sh
 
     Example: syncline bundle --platform aarch64 --python 3.11 --role camera --out camera-bundle
 
@@ -34,12 +34,12 @@ def bundle(
     python
         The board's Python (`python3 --version`).
     role
-        What the board will run.
+        The agent that the board will run.
     extra
-        What to take along besides: oak, v4l2 (driver "usb"), video (driver "rtsp"), view; or a package, such as scipy
-        for the detectors of people and vehicles. May be given several times.
+        Additional extras: oak, v4l2 (driver "usb"), video (driver "rtsp"), view; or a package, such as scipy for the
+        detectors of people and vehicles. May be given several times.
     out
-        Folder to carry over; by default named by version, role and platform.
+        Folder to write and copy to the board; by default named by version, role and platform.
     json
         Print sizes as JSON.
     """
@@ -63,9 +63,8 @@ def bundle(
         )
         return EXIT_DONE
     largest = sorted(made.sizes.items(), key=lambda item: -item[1])[:5]
-    told = ", ".join(f"{name.partition('-')[0]} {size / 1e6:.0f}" for name, size in largest)
-    print(
-        f"{role}, {platform}, Python {python}: {made.installed_mb:.0f} MB installed ({told}), {len(made.sizes)} wheels"
-    )
+    largest_mb = ", ".join(f"{name.partition('-')[0]} {size / 1e6:.0f}" for name, size in largest)
+    installed = f"{made.installed_mb:.0f} MB installed ({largest_mb}), {len(made.sizes)} wheels"
+    print(f"{role}, {platform}, Python {python}: {installed}")
     print(f"{made.carried_mb:.0f} MB to carry over in {made.out}; there: sh install.sh")
     return EXIT_DONE

@@ -1,4 +1,4 @@
-"""`syncline doctor`: what is wrong, and what to do."""
+"""`syncline doctor`: diagnostics of a machine and its agents, with remedies."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ def doctor(
     role: Literal["camera", "uav", "hub", "recorder", "router"] | None = None,
     json: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
-    """Check this machine, and with a configuration the agent: one line a check, with the remedy.
+    """Check this machine and, with a configuration, its agent: one line per check, with a remedy.
 
-    Python, processor, packages, disk, clock, USB speed, the camera and its frames, certificates, the way through the
-    router and back, access rules, an autopilot's heartbeat, the last crash. Exit status 0: nothing failed (warnings
-    may be there); 2: something is set up wrongly; 3: all is set up, but something does not answer.
+    Checks Python, processor, packages, disk, clock, USB speed, the camera and its frames, certificates, the round trip
+    through the router, access rules, an autopilot's heartbeat, and the last crash. Exit status 0: no failure (there may
+    be warnings); 2: something is misconfigured; 3: the configuration is correct, but something does not respond.
 
     Example: syncline doctor cam0.toml
 
@@ -29,25 +29,24 @@ def doctor(
     config
         An agent's TOML file; without it only the machine is checked.
     role
-        What the file is of, if its name does not tell (hub*.toml, recorder*.toml, router*.toml, uav*.toml; else a
-        camera).
+        Role of the agent, if it does not follow from the file's name (hub*.toml, recorder*.toml, router*.toml,
+        uav*.toml; any other is a camera).
     json
         Print a list of check, verdict, text, remedy and exit_status.
     """
     from dataclasses import asdict
 
-    from deploy.site.doctor.examine import examine
-    from deploy.site.doctor.finding import exit_status
+    from deploy.site.doctor.check_result import exit_status
+    from deploy.site.doctor.selection import run_checks
 
-    findings = []
-    for finding in examine(config, role):
-        findings.append(finding)
+    results = []
+    for result in run_checks(config, role):
+        results.append(result)
         if not json:
             print(
-                f"{finding.verdict:<5}{finding.check}: {finding.text}"
-                + (f"; {finding.remedy}" if finding.remedy else ""),
+                f"{result.verdict:<5}{result.check}: {result.text}" + (f"; {result.remedy}" if result.remedy else ""),
                 flush=True,
             )
     if json:
-        print(jsons.dumps([asdict(finding) for finding in findings]))
-    return exit_status(findings)
+        print(jsons.dumps([asdict(result) for result in results]))
+    return exit_status(results)

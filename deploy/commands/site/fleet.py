@@ -1,4 +1,4 @@
-"""`syncline fleet`: a whole rig on one machine."""
+"""`syncline fleet`: runs all agents of a rig on one machine."""
 
 from __future__ import annotations
 
@@ -29,26 +29,27 @@ def fleet(
     out: Path = Path("fleet-out"),
     json: Flag = False,
 ) -> int:
-    """Start all agents of a rig on this machine, watch them, restart what dies, stop them in order.
+    """Start all agents of a rig on this machine, supervise them, restart those that exit, and stop them in order.
 
-    A rig is a folder: rig.toml, one TOML file an agent, fleet.toml. Shipped ones go by name: webcams-room, drone-cage,
-    oak-array, companion. Ctrl-C, or `fleet down` from elsewhere, stops the cameras first, then hubs, recorder and
-    router. Exit status 3 if with --seconds a camera never gave a frame or an agent was down at the end.
+    A rig is a folder with rig.toml, one TOML file per agent, and fleet.toml. Shipped rigs are given by name:
+    webcams-room, drone-cage, oak-array, companion. Ctrl-C, or `fleet down` from elsewhere, stops the cameras first,
+    then hubs, recorder and router. With --seconds, exit status 3 if a camera never delivered a frame or an agent was
+    down at the end.
 
     Example: syncline fleet up webcams-room --simulated --seconds 20
 
     Parameters
     ----------
     action
-        up: start, until stopped. status: of the fleet in --out. down: stop it.
+        up: start, and run until stopped. status: show the state of the fleet in --out. down: stop it.
     rig
         The rig's folder or name, for `up`.
     simulated
-        Simulated cameras in place of the real ones, in the world that fleet.toml names.
+        Simulated cameras instead of the real ones, in the scene that fleet.toml names.
     seconds
-        Stop this long after all cameras were heard; without it, run until stopped.
+        Stop this long after the first frames of all cameras; without it, run until stopped.
     out
-        Folder for logs, recordings, calibrations and the fleet's state.
+        Folder for logs, recordings, calibrations and the fleet's state file.
     json
         Print the result as JSON.
     """
@@ -61,9 +62,9 @@ def fleet(
     if rig is not None or simulated or seconds is not None:
         raise InputError(f"`fleet {action}` takes only --out and --json", remedy="give the --out of `fleet up`")
     if action == "down":
-        from deploy.site.fleet import bring_down
+        from deploy.site.fleet import stop_fleet
 
-        done = bring_down(out)
+        done = stop_fleet(out)
         print(jsons.dumps({"done": done}) if json else "\n".join(done))
         return EXIT_DONE
     return _status(out, json)
@@ -78,10 +79,10 @@ def _up(name: str, simulated: bool, seconds: float | None, out: Path, json: bool
     rig = read_rig_folder(find_rig(name))
     stop = stop_on_signals()
 
-    def tell(line: str) -> None:
+    def report(line: str) -> None:
         print(line, file=sys.stderr if json else sys.stdout, flush=True)
 
-    fleet = Fleet(rig, out, simulated=simulated, tell=tell)
+    fleet = Fleet(rig, out, simulated=simulated, report=report)
     if not json:
         numbers = {role: len(rig.of(role)) for role in ("camera", "uav", "hub", "recorder", "router")}
         counts = ", ".join(f"{number} {role}" for role, number in numbers.items() if number)
@@ -125,14 +126,14 @@ def _summary(fleet: Fleet, json: bool, silent: list[str], failed: list[str]) -> 
 
 
 def _status(out: Path, json: bool) -> int:
-    from deploy.site.fleet import read_state, runs
+    from deploy.site.fleet import is_running, read_state
 
     state = read_state(out)
     if state is None:
         raise InputError("no fleet was started here", file=out, remedy="give the --out of `syncline fleet up`")
-    state["up"] = runs(state["pid"], state["started"])
+    state["up"] = is_running(state["pid"], state["started"])
     for seen in state["agents"].values():
-        seen["runs"] = runs(seen["pid"], seen["started"])
+        seen["runs"] = is_running(seen["pid"], seen["started"])
     if json:
         print(jsons.dumps(state))
     else:
@@ -148,7 +149,7 @@ def _table(agents: dict[str, dict[str, object]]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table("agent", "role", "state", "restarts", "frames", "seen", "says")
+    table = Table("agent", "role", "state", "restarts", "frames", "detections", "message")
     for name, seen in agents.items():
         counters = seen["counters"]
         assert isinstance(counters, dict)
@@ -159,7 +160,7 @@ def _table(agents: dict[str, dict[str, object]]) -> None:
 
 
 def _lines(quiet: bool) -> Callable[[Fleet], None]:
-    """One line each five seconds."""
+    """A function that prints one status line every five seconds."""
     printed = -10.0
 
     def show(fleet: Fleet) -> None:
@@ -168,9 +169,9 @@ def _lines(quiet: bool) -> Callable[[Fleet], None]:
             return
         printed = time.monotonic()
         cameras = [seen for seen in fleet.seen.values() if seen.role in ("camera", "uav")]
-        heard = sum(bool(seen.counters.get("frames")) for seen in cameras)
+        active = sum(bool(seen.counters.get("frames")) for seen in cameras)
         frames = sum(seen.counters.get("frames", 0) for seen in cameras)
         hubs = "; ".join(f"{hub} {text}" for hub, text in fleet.calibrations.items())
-        print(f"{fleet.elapsed:6.1f} s  {heard}/{len(cameras)} cameras, {frames} frames  {hubs[:160]}", flush=True)
+        print(f"{fleet.elapsed:6.1f} s  {active}/{len(cameras)} cameras, {frames} frames  {hubs[:160]}", flush=True)
 
     return show

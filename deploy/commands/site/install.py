@@ -26,28 +26,28 @@ def install(
     dry_run: Flag = False,
     json: Flag = False,
 ) -> int:
-    """Install an agent as a systemd service that starts at boot and is restarted for ever.
+    """Install an agent as a systemd service that starts at boot and is always restarted.
 
-    Writes its unit, /etc/syncline/ROLE-ID with the configuration and the files it names, sysusers, tmpfiles and udev
-    rules; its state is below /var/lib/syncline. A second time it changes only what is different. A configuration that
-    the agent would refuse is refused here, before anything is touched.
+    Writes its unit, /etc/syncline/ROLE-ID with the configuration and the files it refers to, and sysusers, tmpfiles and
+    udev rules; its state is below /var/lib/syncline. A repeated installation changes only what differs. A configuration
+    that the agent would refuse is refused here, before anything is changed.
 
     Example: sudo syncline install camera --config cam0.toml
 
     Parameters
     ----------
     role
-        What to install.
+        The kind of agent to install.
     config
-        The agent's TOML file, as `syncline camera FILE` takes it.
+        The agent's TOML file, as for `syncline camera FILE`.
     root
-        Of an image that is being made; nothing is started then.
+        Root folder of a system image that is being built; nothing is started then.
     program
-        Path of `syncline` on the target; by default the one that runs now.
+        Path of `syncline` on the target; by default that of the running program.
     dry_run
-        Print what would be written and run, and do nothing.
+        Print what would be written and run, and change nothing.
     json
-        Print it as JSON, with all contents.
+        Print JSON, with --dry-run including the contents of all files.
     """
     from deploy.site.install.plan import apply, plan_install
 
@@ -56,8 +56,8 @@ def install(
     if dry_run:
         _show(plan, root, json)
         return EXIT_DONE
-    told = apply(plan, root)
-    _tell(plan, told, json)
+    changes = apply(plan, root)
+    _print_changes(plan, changes, json)
     return EXIT_DONE
 
 
@@ -70,7 +70,7 @@ def uninstall(
     dry_run: Flag = False,
     json: Flag = False,
 ) -> int:
-    """Stop agents and take their services away. Recordings and other state are kept.
+    """Stop agents and remove their services. Recordings and other state are kept.
 
     Example: sudo syncline uninstall camera-cam0
 
@@ -79,13 +79,13 @@ def uninstall(
     names
         Agents as ROLE-ID; none = all, with the shared rules.
     root
-        Of an image.
+        Root folder of a system image.
     purge
-        Take the configuration below /etc/syncline away too.
+        Also remove the configuration below /etc/syncline.
     dry_run
-        Print what would be taken away, and do nothing.
+        Print what would be removed, and change nothing.
     json
-        Print it as JSON.
+        Print JSON.
     """
     from deploy.site.install.plan import apply, plan_uninstall
 
@@ -94,8 +94,8 @@ def uninstall(
     if dry_run:
         _show(plan, root, json)
         return EXIT_DONE
-    told = apply(plan, root)
-    _tell(plan, [*told, *plan.notes], json)
+    changes = apply(plan, root)
+    _print_changes(plan, [*changes, *plan.notes], json)
     return EXIT_DONE
 
 
@@ -131,9 +131,9 @@ def _show(plan: Plan, root: Path, as_json: bool) -> None:
         print(note)
 
 
-def _tell(plan: Plan, told: list[str], as_json: bool) -> None:
+def _print_changes(plan: Plan, changes: list[str], as_json: bool) -> None:
     if as_json:
-        print(jsons.dumps({"name": plan.name, "done": told}))
+        print(jsons.dumps({"name": plan.name, "done": changes}))
         return
-    for line in told or ["nothing to change"]:
+    for line in changes or ["nothing to change"]:
         print(line)

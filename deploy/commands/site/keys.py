@@ -1,4 +1,4 @@
-"""`syncline keys`: a site's certificates, and the rules of who may say and hear what."""
+"""`syncline keys`: certificates of a site, and access rules for publishing and subscribing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Role = Literal["camera", "uav", "hub", "record", "view", "router"]
 
 KEYS = App(
     name="keys",
-    help="Certificates: who may say and hear what.\n\n"
+    help="Certificates of a site, and access rules for publishing and subscribing.\n\n"
     "Example: syncline keys init keys --site yard\n\n"
     "Example: syncline keys issue keys --role router --id r0 --listen tls/192.168.1.5:7447\n\n"
     "Example: syncline keys issue keys --role camera --id cam0\n\n"
@@ -29,16 +29,16 @@ KEYS = App(
 
 @KEYS.command
 def init(folder: Path, /, *, site: str, json: Json = False) -> int:
-    """Make the authority of a new site.
+    """Create the certificate authority of a new site.
 
     Example: syncline keys init keys --site yard
 
     Parameters
     ----------
     folder
-        Where the authority is kept. Whoever has ca-key.pem of it can be anybody.
+        Folder of the authority. Whoever has its ca-key.pem can impersonate any agent.
     site
-        The site's name, as in the agents' configurations.
+        Name of the site, as in the agents' configurations.
     json
         Print JSON.
     """
@@ -65,7 +65,7 @@ def issue(
     host: Many = (),
     json: Json = False,
 ) -> int:
-    """Make or renew an agent's certificate, and write every router's rules anew.
+    """Issue or renew an agent's certificate, and rewrite the access rules of all routers.
 
     Example: syncline keys issue keys --role camera --id cam0 --days 7
 
@@ -74,17 +74,17 @@ def issue(
     folder
         The authority, from `keys init`.
     role
-        What the agent is, and with it what it may say and hear.
+        Role of the agent, which determines what it may publish and subscribe to.
     id
         The agent's id, as in its configuration.
     days
-        How long the certificate is valid.
+        Validity of the certificate in days.
     connect
-        Endpoints of routers to connect to; default: those issued here.
+        Endpoints of routers to connect to; default: the routers issued here.
     listen
-        Of a router: where it listens; default tls/127.0.0.1:7447.
+        For a router: endpoints to listen on; default tls/127.0.0.1:7447.
     host
-        Of a router: further names or addresses by which others reach it.
+        For a router: additional host names or addresses for its certificate.
     json
         Print JSON.
     """
@@ -104,10 +104,10 @@ def issue(
 
 @KEYS.command
 def revoke(folder: Path, /, *, role: Role, id: str, json: Json = False) -> int:
-    """Take an agent's certificates back: routers that have the new rules let them say and hear nothing.
+    """Revoke an agent's certificates: routers with the new rules let them neither publish nor subscribe.
 
-    Zenoh reads no lists of revoked certificates, so a revoked one still opens a connection until it expires: keep
-    --days short. Its name is never used again; `keys issue` gives the agent a new one.
+    Zenoh does not read certificate revocation lists, so a revoked certificate can still open a connection until it
+    expires: keep --days short. Its name is never used again; `keys issue` gives the agent a new one.
 
     Example: syncline keys revoke keys --role camera --id cam0
 
@@ -116,9 +116,9 @@ def revoke(folder: Path, /, *, role: Role, id: str, json: Json = False) -> int:
     folder
         The authority, from `keys init`.
     role
-        What the agent is.
+        Role of the agent.
     id
-        Its id.
+        The agent's id.
     json
         Print JSON.
     """
@@ -130,15 +130,16 @@ def revoke(folder: Path, /, *, role: Role, id: str, json: Json = False) -> int:
         return EXIT_DONE
     print(f"{role} {id}: revoked")
     for file in files:
-        print(f"bring {file} to its router: `syncline router` takes it up by itself, zenohd when it is started again")
+        print(f"copy {file} to its router: `syncline router` reloads it automatically, zenohd must be restarted")
     return EXIT_DONE
 
 
 @KEYS.command
 def check(folder: Path, /, *, json: Json = False) -> int:
-    """Try, over real connections on this machine, what every certificate may and may not do.
+    """Test, over real connections on this machine, what every certificate may and may not do.
 
-    Also whom the router turns away: no, a wrong, an expired certificate, plain TCP, and what they are told.
+    It also tests which clients the router refuses, and with which message: a missing, wrong or expired certificate, and
+    plain TCP.
 
     Example: syncline keys check keys
 

@@ -1,1 +1,1 @@
-"""What is wrong with a machine, a camera or a bus, and what to do about it. Each check stands alone."""
+"""Diagnostics of a machine, a camera, the bus and the vehicle, with remedies; the checks are independent."""

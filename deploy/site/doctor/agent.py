@@ -1,4 +1,4 @@
-"""Checks of one agent: its configuration, camera, bus, certificates, rights and vehicle."""
+"""Checks of one agent: configuration, camera, bus, certificates, access rules and vehicle."""
 
 from __future__ import annotations
 
@@ -9,25 +9,26 @@ from typing import Any
 
 import numpy as np
 
-from deploy.site.doctor.finding import Finding, missing, ok, skip, warn, wrong
+from deploy.site.doctor.check_result import CheckResult, misconfigured, ok, skip, unavailable, warn
 from edge.devices.base import Device
-from protocols.bus.settings import BusConfig, is_loopback, open_to_others
+from protocols.bus.settings import BusConfig, is_loopback, unprotected_listeners
 from protocols.core.errors import InputError
+from protocols.core.names import key_segment
 
-_SMALL, _LARGE = 1024, 1_000_000
+_SMALL, _LARGE = 1024, 1_000_000  # sizes of test messages [bytes]
 _EXPIRES_SOON_DAYS = 7.0
-_HEARS_ALL = ("hub", "recorder", "uav")
+_SUBSCRIBES_TO_ALL = ("hub", "recorder", "uav")
 CERTIFICATE_ROLES = {"recorder": "record"}
 
 
 def camera(
     device: Device, *, patience_s: float = 5.0, measure_s: float = 1.0, now: Callable[[], float] = time.monotonic
-) -> Finding:
-    """Open it, see a frame, measure its rate and its light."""
+) -> CheckResult:
+    """Open the camera, and measure its frame rate and mean brightness."""
     try:
         device.open()
     except InputError as error:
-        return missing("camera", error.what, error.remedy or "check that it is plugged in")
+        return unavailable("camera", error.what, error.remedy or "check that it is plugged in")
     try:
         info = device.info
         began, first, frames, image = now(), 0.0, 0, None
@@ -37,9 +38,9 @@ def camera(
                 image, frames = frame.image, frames + 1
                 first = first or now()
         if image is None:
-            return missing(
+            return unavailable(
                 "camera",
-                f"{info.driver} opens, but gives no frame within {patience_s:g} s",
+                f"{info.driver} opens, but delivers no frame within {patience_s:g} s",
                 "unplug it and plug it in again; if it goes on, another cable, socket or a smaller size",
             )
         rate = (frames - 1) / max(now() - first, 1e-9)
@@ -58,15 +59,15 @@ def camera(
     return ok("camera", text)
 
 
-def certificates(bus: BusConfig, role: str, agent: str) -> Finding:
-    """Dates and names of what [bus.tls] points at."""
+def certificates(bus: BusConfig, role: str, agent: str) -> CheckResult:
+    """Check validity period and names of the certificates in [bus.tls]."""
     if bus.tls is None:
-        beyond = [end for end in bus.connect if not is_loopback(end)] + list(open_to_others(bus))
+        beyond = [end for end in bus.connect if not is_loopback(end)] + list(unprotected_listeners(bus))
         if beyond:
             return warn(
                 "certificates",
                 f"none, and {beyond[0]} is beyond this machine",
-                "make some with `syncline keys`: anybody in that network may say anything",
+                "make some with `syncline keys`: anybody in that network can publish anything",
             )
         return skip("certificates", "none: everything stays on this machine")
     from protocols.bus.security.tls import check_files, check_owner, days_left
@@ -76,7 +77,7 @@ def certificates(bus: BusConfig, role: str, agent: str) -> Finding:
         check_owner(bus.tls, CERTIFICATE_ROLES.get(role, role), agent)
     except InputError as error:
         place = "" if error.file is None else f"{error.file}: "
-        return wrong("certificates", place + error.what, error.remedy)
+        return misconfigured("certificates", place + error.what, error.remedy)
     left = days_left(bus.tls.certificate)
     if left < _EXPIRES_SOON_DAYS:
         return warn(
@@ -85,8 +86,11 @@ def certificates(bus: BusConfig, role: str, agent: str) -> Finding:
     return ok("certificates", f"valid for {left:.0f} days, names {role} {agent}")
 
 
-def bus_path(bus: BusConfig, site: str, role: str, agent: str, patience_s: float = 10.0) -> Finding:
-    """A canary there and back through the router, small and large; for an agent that may not hear, a listener."""
+def bus_path(bus: BusConfig, site: str, role: str, agent: str, patience_s: float = 10.0) -> CheckResult:
+    """Round trip of a small and a large test message through the router; if the agent may not subscribe, a subscriber.
+
+    patience_s: timeout of the large message [s].
+    """
     from protocols.bus.base import BusDead
 
     if role == "router":
@@ -96,24 +100,24 @@ def bus_path(bus: BusConfig, site: str, role: str, agent: str, patience_s: float
         return skip("bus", "a peer that waits for others: nothing to connect to")
     where = ", ".join(config.endpoints()[0])
     try:
-        if bus.tls is not None and role not in _HEARS_ALL:
-            return _matched(config, site, agent, where)
+        if bus.tls is not None and role not in _SUBSCRIBES_TO_ALL:
+            return _check_subscriber(config, site, agent, where)
         from protocols.bus.router.probe import round_trip
 
         prefix = _own_prefix(site, role, agent) if bus.tls is not None else f"syncline/{site}/canary/doctor"
         small = round_trip(config, prefix, _SMALL)
         if small is None:
-            return missing(
+            return unavailable(
                 "bus",
-                f"{where} lets us in, but nothing comes through",
+                f"{where} accepts the connection, but relays no messages",
                 "restart the router (`systemctl restart syncline-router-…`); with certificates, issue them again",
             )
         large = round_trip(config, prefix, _LARGE, timeout_s=patience_s)
     except (InputError, BusDead) as error:
         remedy = getattr(error, "remedy", "") or "restart the router"
-        return missing("bus", getattr(error, "what", str(error)), remedy)
+        return unavailable("bus", getattr(error, "what", str(error)), remedy)
     if large is None:
-        return missing(
+        return unavailable(
             "bus",
             f"{where}: {_SMALL} bytes pass, {_LARGE} don't",
             "packets beyond the path's MTU vanish: one MTU on all links (`ip link`), and let ICMP through firewalls",
@@ -127,101 +131,103 @@ def bus_path(bus: BusConfig, site: str, role: str, agent: str, patience_s: float
     return ok("bus", f"{where}: {1e3 * small:.1f} ms, 1 MB in {1e3 * large:.0f} ms")
 
 
-def _matched(config: BusConfig, site: str, agent: str, where: str) -> Finding:
+def _check_subscriber(config: BusConfig, site: str, agent: str, where: str) -> CheckResult:
     from protocols.bus.transport.zenoh_bus import open_bus
     from protocols.topics import OBSERVATION
 
     with open_bus(site, config, timeout_s=5.0) as bus:
         if bus.publisher(OBSERVATION, agent).wait_matched(3.0):
-            return ok("bus", f"{where}: somebody listens to {agent}")
-    return missing(
+            return ok("bus", f"{where}: {agent} has a subscriber")
+    return unavailable(
         "bus",
-        f"{where} lets us in, but nobody listens to {agent}",
-        "start a hub or recorder; if one runs, the router's rules don't know this agent: `syncline keys issue`, and "
+        f"{where} accepts the connection, but {agent} has no subscriber",
+        "start a hub or recorder; if one runs, the router's rules lack this agent: `syncline keys issue`, and "
         "copy zenoh.json5 to it",
     )
 
 
-def rights(bus: BusConfig, site: str, role: str, agent: str, seconds: float = 2.5) -> Finding:
-    """Whether the router holds this certificate to its own keys."""
+def access_rights(bus: BusConfig, site: str, role: str, agent: str, seconds: float = 2.5) -> CheckResult:
+    """Check that the router restricts this certificate to its own keys."""
     from protocols.bus.base import BusDead
-    from protocols.bus.router.probe import hears, round_trip
+    from protocols.bus.router.probe import count_received, round_trip
 
     config = _as_client(bus)
     if bus.tls is None or config is None:
-        return skip("access rules", "no certificates: everyone may say everything")
+        return skip("access rules", "no certificates: everyone may publish everything")
     if role == "router":
         return skip("access rules", "the router's own certificate may do everything")
     remedy = "give the router `access` = the zenoh.json5 that `syncline keys` wrote, and restart it"
     try:
-        if role in _HEARS_ALL:
-            foreign = round_trip(config, f"syncline/{site}/camera/not-{agent[:50]}/doctor", _SMALL, timeout_s=1.5)
+        if role in _SUBSCRIBES_TO_ALL:
+            foreign = round_trip(
+                config, f"syncline/{site}/camera/not-{key_segment(agent)[:50]}/doctor", _SMALL, timeout_s=1.5
+            )
             if foreign is not None:
-                return wrong("access rules", f"{agent} may speak for others", remedy)
-            return ok("access rules", f"{agent} cannot speak for others")
-        if hears(config, f"syncline/{site}/agent/*/status", seconds, own=f"/{agent}/"):
-            return wrong("access rules", f"{agent} hears what it may not", remedy)
+                return misconfigured("access rules", f"{agent} may publish for others", remedy)
+            return ok("access rules", f"{agent} cannot publish for others")
+        if count_received(config, f"syncline/{site}/agent/*/status", seconds, own=f"/{key_segment(agent)}/"):
+            return misconfigured("access rules", f"{agent} receives messages that it may not receive", remedy)
     except (InputError, BusDead) as error:
         return skip("access rules", f"not tried: {getattr(error, 'what', error)}")
-    return ok("access rules", f"{agent} hears nothing of others")
+    return ok("access rules", f"{agent} receives no messages of others")
 
 
 def mavlink(
     link: Any, hello: Any = None, patience_s: float = 3.0, now: Callable[[], float] = time.monotonic
-) -> Finding:
-    """A heartbeat of an autopilot.
+) -> CheckResult:
+    """Wait for an autopilot's heartbeat.
 
-    link: an ``edge.mavlink.link`` connection that lets HEARTBEAT in. hello: a message that is sent each second, for
-    autopilots that answer only who has called them; None = only listen.
+    link: an ``edge.mavlink.link`` connection that accepts HEARTBEAT. hello: a message that is sent each second, for
+    autopilots that reply only to known senders; None = only receive. patience_s: timeout [s].
     """
     began = now()
     called = 0.0
     while now() - began < patience_s:
-        heartbeats = [heard for heard in link.poll() if heard.kind == "HEARTBEAT"]
+        heartbeats = [received for received in link.poll() if received.kind == "HEARTBEAT"]
         if heartbeats:
             return ok("mavlink", f"heartbeat of system {heartbeats[0].system}")
         if hello is not None and now() - began >= called and link.send(hello):
             called += 1.0
         link.wait(0.1)
     if "in use" in link.problem:
-        return missing("mavlink", str(link.problem), "stop the agent (or whoever holds that port) and ask again")
+        return unavailable("mavlink", str(link.problem), "stop the agent (or whoever holds that port) and ask again")
     if link.problem:
-        return missing(
+        return unavailable(
             "mavlink", str(link.problem), "check device, baud rate and rights (group dialout), or the address"
         )
     refused = sum(count for name, count in link.counters.items() if name not in ("received", "bytes", "opened", "sent"))
     if refused:
-        return missing(
+        return unavailable(
             "mavlink",
-            f"bytes come, but no heartbeat that may be let in ({dict(link.counters)})",
+            f"bytes arrive, but no acceptable heartbeat ({dict(link.counters)})",
             "check the baud rate, MAVLink 2 (SERIALx_PROTOCOL = 2), and the signing key",
         )
-    return missing(
+    return unavailable(
         "mavlink",
         f"no heartbeat within {patience_s:g} s",
         "check the wiring (TX to RX), port and baud rate, and that the autopilot sends there (SERIALx_PROTOCOL = 2)",
     )
 
 
-def configuration(file: Path, role: str) -> tuple[Finding, Any]:
-    """Read it as the agent would."""
+def configuration(file: Path, role: str) -> tuple[CheckResult, Any]:
+    """Read the configuration as the agent would."""
     from deploy.config.file import load
-    from deploy.site.install.plan import config_kind
+    from deploy.site.install.plan import config_type
 
     try:
-        config = load(file, config_kind(role))
+        config = load(file, config_type(role))
     except InputError as error:
         place = f"{error.file or file}" + (f":{error.line}" if error.line else "")
-        return wrong("configuration", f"{place}: {error.what}", error.remedy or "correct it"), None
+        return misconfigured("configuration", f"{place}: {error.what}", error.remedy or "correct it"), None
     return ok("configuration", f"{role} {getattr(config, 'id', '')} of site {getattr(config, 'site', '')}"), config
 
 
 def _own_prefix(site: str, role: str, agent: str) -> str:
-    return f"syncline/{site}/agent/{agent}/doctor"
+    return f"syncline/{site}/agent/{key_segment(agent)}/doctor"
 
 
 def _as_client(bus: BusConfig) -> BusConfig | None:
-    """How to reach the router that this agent uses; None for a peer that only listens."""
+    """Client settings for the router that this agent uses; None for a peer that only listens."""
     connect, _ = bus.endpoints()
     if not connect:
         return None

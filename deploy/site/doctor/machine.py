@@ -1,6 +1,6 @@
-"""Checks of the computer itself: Python, packages, processor, heat, disk, USB, clock, what crashed last.
+"""Checks of the computer: Python, packages, processor, temperature, disk, USB, clock, last crash.
 
-Everything is read below ``root`` and through the arguments, so that each answer can be made in a test.
+All inputs are files below ``root`` or arguments, so that tests can simulate every case.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from deploy.site.doctor.finding import Finding, ok, skip, warn, wrong
+from deploy.site.doctor.check_result import CheckResult, misconfigured, ok, skip, warn
 from edge.agents.clock_quality import kernel_clock
 
 PACKAGES: dict[str, tuple[str, ...]] = {
@@ -29,68 +29,74 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "rtsp": ("av",),
     "log": ("mcap",),
 }
-_BETTER = {"usb": (("linuxpy", "frames are stamped on arrival, and lost ones are not seen"),)}
-"""What a driver goes without, but worse."""
+_RECOMMENDED = {"usb": (("linuxpy", "frames are stamped on arrival, and lost ones are not seen"),)}
+"""Optional packages of a driver, and what is lost without them."""
 _EXTRAS = {"pymavlink": "uav", "serial": "uav", "depthai": "oak", "linuxpy": "v4l2", "av": "video"}
-_HOT_C = 80.0
-_LOW_MB = 2000.0
-_SANE_UNIX_S = 1_735_689_600.0  # 2025: before that a clock was never set
+_MAX_TEMPERATURE_C = 80.0  # boards throttle above about this
+_LOW_DISK_MB = 2000.0  # about two hours of four cameras
+_MIN_UNIX_S = 1_735_689_600.0  # 2025: before that a clock was never set
 Run = Callable[[Sequence[str]], tuple[int, str]]
 
 
 def python(
     version: Sequence[int] = tuple(sys.version_info[:3]), bits: int = 8 * ctypes.sizeof(ctypes.c_void_p)
-) -> Finding:
-    """3.11 or newer, 64 bits."""
+) -> CheckResult:
+    """Check for Python 3.11 or newer, 64 bits."""
     text = f"Python {'.'.join(map(str, version))}, {bits} bits"
     if tuple(version[:2]) < (3, 11):
-        return wrong("python", text, "install Python 3.11 or newer (Debian 12 and Raspberry Pi OS bookworm have it)")
+        return misconfigured(
+            "python", text, "install Python 3.11 or newer (Debian 12 and Raspberry Pi OS bookworm have it)"
+        )
     if bits < 64:
-        return wrong("python", text, "install a 64-bit system: there are no packages for 32 bits")
+        return misconfigured("python", text, "install a 64-bit system: there are no packages for 32 bits")
     return ok("python", text)
 
 
-def packages(kinds: Sequence[str], there: Callable[[str], bool] = lambda name: find_spec(name) is not None) -> Finding:
-    """What the role imports. kinds: keys of PACKAGES."""
+def packages(
+    kinds: Sequence[str], there: Callable[[str], bool] = lambda name: find_spec(name) is not None
+) -> CheckResult:
+    """Check the packages that the role imports. kinds: keys of PACKAGES."""
     wanted = [name for kind in ("", *kinds) for name in PACKAGES.get(kind, ())]
-    gone = [name for name in wanted if not _there(name, there)]
+    gone = [name for name in wanted if not _is_installed(name, there)]
     if not gone:
-        worse = [one for kind in kinds for one in _BETTER.get(kind, ()) if not _there(one[0], there)]
+        worse = [one for kind in kinds for one in _RECOMMENDED.get(kind, ()) if not _is_installed(one[0], there)]
         for name, what in worse:
             return warn("packages", f"{name} missing: {what}", f'pip install "syncline[{_EXTRAS[name]}]"')
-        return ok("packages", f"{len(wanted)} of {len(wanted)} are there")
+        return ok("packages", f"{len(wanted)} of {len(wanted)} are installed")
     extras = sorted({_EXTRAS[name] for name in gone if name in _EXTRAS})
     how = f'pip install "syncline[{",".join(extras)}]"' if extras else "pip install --force-reinstall syncline"
-    return wrong("packages", f"{', '.join(gone)} missing", f"{how}, or make a bundle for this role (`syncline bundle`)")
+    return misconfigured(
+        "packages", f"{', '.join(gone)} missing", f"{how}, or make a bundle for this role (`syncline bundle`)"
+    )
 
 
-def _there(name: str, there: Callable[[str], bool]) -> bool:
+def _is_installed(name: str, there: Callable[[str], bool]) -> bool:
     try:
         return there(name)
     except ImportError:  # the parent of a dotted name
         return False
 
 
-def cpu(root: Path = Path("/"), machine: str | None = None) -> Finding:
-    """Features that the wheels were built for; number of cores and heat."""
+def cpu(root: Path = Path("/"), machine: str | None = None) -> CheckResult:
+    """Check the processor features that the wheels require, and the temperature."""
     kind = machine or platform.machine()
     needed = {"x86_64": ("sse4_2", "popcnt"), "aarch64": ("asimd",)}.get(kind)
     if needed is None:
-        return wrong("cpu", f"{kind} is not supported", "use a 64-bit ARM or x86 board with a 64-bit system")
+        return misconfigured("cpu", f"{kind} is not supported", "use a 64-bit ARM or x86 board with a 64-bit system")
     try:
         words = (root / "proc/cpuinfo").read_text(encoding="utf-8", errors="replace").split()
     except OSError:
         return skip("cpu", f"{kind}; /proc/cpuinfo cannot be read")
     lacking = [name for name in needed if name not in words]
     if lacking:
-        return wrong(
+        return misconfigured(
             "cpu",
             f"{kind} without {', '.join(lacking)}",
             "use a newer processor: NumPy and OpenCV end with SIGILL here",
         )
     hot = max((_celsius(file) for file in root.glob("sys/class/thermal/thermal_zone*/temp")), default=0.0)
     cores = words.count("processor")
-    if hot >= _HOT_C:
+    if hot >= _MAX_TEMPERATURE_C:
         return warn(
             "cpu", f"{kind}, {cores} cores, {hot:.0f} °C", "cool it: it slows down when hot, and frames are lost"
         )
@@ -104,28 +110,30 @@ def _celsius(file: Path) -> float:
         return 0.0
 
 
-def disk(folder: Path, least_mb: float = 0.0, free: Callable[[Path], int] | None = None) -> Finding:
-    """Room where an agent writes. least_mb: a recorder's min_free_mb."""
+def disk(folder: Path, least_mb: float = 0.0, free: Callable[[Path], int] | None = None) -> CheckResult:
+    """Check free space and permissions of an agent's output folder. least_mb: a recorder's min_free_mb."""
     place = next(parent for parent in (folder, *folder.absolute().parents) if parent.is_dir())
     left = (free(place) if free else shutil.disk_usage(place).free) / 1e6
     text = f"{left / 1000.0:.1f} GB free at {place}"
     if left < max(least_mb, 50.0):
-        return wrong(
+        return misconfigured(
             "disk", text, f"make room or mount a larger disk there; recording ends below {max(least_mb, 50.0):.0f} MB"
         )
     if not os.access(place, os.W_OK):
-        return wrong("disk", f"{place} cannot be written", "give this user rights there, or set out to another folder")
-    if left < _LOW_MB:
+        return misconfigured(
+            "disk", f"{place} cannot be written", "give this user rights there, or set out to another folder"
+        )
+    if left < _LOW_DISK_MB:
         return warn(
             "disk",
             text,
-            "make room: an hour of four cameras takes about 1 GB; part_s and part_mb make parts to move away",
+            "make room: an hour of four cameras takes about 1 GB; part_s and part_mb split the log into movable parts",
         )
     return ok("disk", text)
 
 
-def usb(source: str, root: Path = Path("/")) -> Finding:
-    """Speed of a USB camera's plug, and how many cameras share it. source: /dev/…, or a number."""
+def usb(source: str, root: Path = Path("/")) -> CheckResult:
+    """Check the USB speed of a camera, and how many cameras share the bus. source: /dev/…, or a number."""
     name = Path(os.path.realpath(root / source.lstrip("/"))).name if source.startswith("/") else f"video{source}"
     device = (root / "sys/class/video4linux" / name / "device").resolve()
     speed = _speed_above(device)
@@ -139,34 +147,34 @@ def usb(source: str, root: Path = Path("/")) -> Finding:
     )
     text = f"{name}: {speed:g} Mbit/s, {sharing} camera{'s' if sharing != 1 else ''} on bus {controller}"
     if speed < 480.0:
-        return wrong(
-            "usb", text, "use another cable or socket, without a hub: pictures need at least USB 2's 480 Mbit/s"
+        return misconfigured(
+            "usb", text, "use another cable or socket, without a hub: images need at least USB 2's 480 Mbit/s"
         )
     if speed < 5000.0 and sharing > 2:
         return warn("usb", text, "spread the cameras over other sockets or a second controller, or lower size and fps")
     return ok("usb", text)
 
 
-def oak_usb(root: Path = Path("/")) -> Finding:
-    """OAK boards on USB and their speed."""
+def oak_usb(root: Path = Path("/")) -> CheckResult:
+    """Check OAK boards on USB and their speed."""
     boards = []
     for file in root.glob("sys/bus/usb/devices/*/idVendor"):
         if _text(file) == "03e7":
             boards.append((file.parent.name, float(_text(file.parent / "speed") or 0.0)))
     if not boards:
-        return missing_oak()
+        return no_oak_board()
     slow = [name for name, speed in boards if speed < 5000.0]
     text = f"{len(boards)} OAK on USB: " + ", ".join(f"{name} {speed:g} Mbit/s" for name, speed in sorted(boards))
     if slow:
         return warn(
-            "usb", text, "use a USB 3 cable in a blue socket: at 480 Mbit/s only small or slow pictures get through"
+            "usb", text, "use a USB 3 cable in a blue socket: 480 Mbit/s allows only small images or low frame rates"
         )
     return ok("usb", text)
 
 
-def missing_oak() -> Finding:
-    """No board is plugged in."""
-    return wrong(
+def no_oak_board() -> CheckResult:
+    """The failure that no OAK board is connected."""
+    return misconfigured(
         "usb",
         "no OAK board (vendor 03e7) on USB",
         "check cable and power; a PoE board needs device = its address in [oak]",
@@ -199,12 +207,12 @@ def _text(file: Path) -> str:
 
 def clock(
     certificates: bool, state: Callable[[], tuple[bool, float]] = kernel_clock, now: Callable[[], float] = time.time
-) -> Finding:
-    """The machine's Unix time. Timing between cameras needs none; certificates and names of logs do."""
-    if now() < _SANE_UNIX_S:
+) -> CheckResult:
+    """Check the machine's Unix time. Certificates and log names need it; timing between cameras does not."""
+    if now() < _MIN_UNIX_S:
         remedy = "set it: `sudo timedatectl set-ntp true` with a network, `sudo date -s …` without one"
-        text = f"the clock says {time.strftime('%Y-%m-%d', time.gmtime(now()))}: it was never set"
-        return wrong("clock", text, remedy) if certificates else warn("clock", text, remedy)
+        text = f"the clock is at {time.strftime('%Y-%m-%d', time.gmtime(now()))}: it was never set"
+        return misconfigured("clock", text, remedy) if certificates else warn("clock", text, remedy)
     synchronised, error = state()
     if not synchronised:
         return warn(
@@ -216,7 +224,7 @@ def clock(
 
 
 def run(command: Sequence[str]) -> tuple[int, str]:
-    """(exit status, output) of a command; status 127 where it is not there."""
+    """(exit status, output) of a command; status 127 if it does not exist."""
     try:
         ended = subprocess.run(list(command), capture_output=True, text=True, timeout=10.0, check=False)
     except (OSError, subprocess.TimeoutExpired):
@@ -225,21 +233,21 @@ def run(command: Sequence[str]) -> tuple[int, str]:
 
 
 _CRASHES = {
-    "watchdog": "no data flowed: camera unplugged or hanging? `journalctl -u {unit}` says when",
+    "watchdog": "no data flowed: camera unplugged or hanging? `journalctl -u {unit}` shows when",
     "oom-kill": "the memory was full: fewer or smaller cameras on this board, or window_s of a hub shorter",
     "core-dump": "it crashed in a driver or library: update Syncline, and report `coredumpctl info {unit}`",
     "signal": "somebody or something killed it: `journalctl -u {unit}`",
-    "exit-code": "it refused to run: `journalctl -u {unit} -n 20` has the line that says why",
+    "exit-code": "it refused to run: `journalctl -u {unit} -n 20` shows the reason",
     "timeout": "it did not start in time: is the router up? `journalctl -u {unit}`",
 }
 
 
-def crash(unit: str, run: Run = run) -> Finding:
-    """How the service ended last, and how often it was restarted. unit: its name, patterns allowed."""
+def crash(unit: str, run: Run = run) -> CheckResult:
+    """Check how a service last ended, and how often it was restarted. unit: its name; patterns are allowed."""
     status, text = run(["systemctl", "show", unit, "--property=Id,Result,NRestarts,ActiveState,ExecMainStatus"])
     if status == 127:
         return skip("last crash", "no systemd here")
-    worst: Finding | None = None
+    worst: CheckResult | None = None
     count = 0
     for block in text.strip().split("\n\n"):
         fields = dict(line.partition("=")[::2] for line in block.splitlines())

@@ -1,1 +1,1 @@
-"""Puts agents into systemd's hands: units, users, device rules, configuration. No agent imports it."""
+"""Installation of agents as systemd services: units, users, udev rules, configuration. No agent imports it."""

@@ -1,4 +1,4 @@
-"""What an installation writes and runs; made whole and checked before anything is touched."""
+"""Installation and removal plans: files to write and commands to run, complete and checked before any change."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ import tomli_w
 from deploy.config.file import Source, load
 from deploy.site.install import units
 from protocols.core.errors import InputError, Refused
+from protocols.core.names import key_segment
 from protocols.session.rig import read_rig
 
 CONFIG, STATE, UNITS = "/etc/syncline", "/var/lib/syncline", "/etc/systemd/system"
@@ -28,12 +29,12 @@ SHARED = {
 }
 _SIGNING_TIMES = ("mavlink", "key_state")
 _CREDENTIAL_BYTES = 256 * 1024
-"""systemd takes 1 MB of credentials a unit; a larger file is read where it lies."""
+"""systemd allows 1 MB of credentials per unit; a larger file is read from its place in /etc/syncline."""
 
 
 @dataclass(slots=True)
 class Plan:
-    """Files by their place in the target (text or link target), their modes, and commands to run afterwards."""
+    """Files and links by their path in the target system, file modes, and commands to run afterwards."""
 
     name: str
     files: dict[str, bytes] = field(default_factory=dict)
@@ -44,13 +45,13 @@ class Plan:
     notes: list[str] = field(default_factory=list)
 
     def add(self, place: str, content: bytes | str, mode: int = 0o644) -> None:
-        """A file to write."""
+        """Add a file to write."""
         self.files[place] = content.encode() if isinstance(content, str) else content
         self.modes[place] = mode
 
 
-def config_kind(role: str) -> type[msgspec.Struct]:
-    """The configuration struct of a role. Raises InputError for one that this version does not have."""
+def config_type(role: str) -> type[msgspec.Struct]:
+    """The configuration struct of a role. Raises InputError for an unknown role."""
     from deploy.config import agents
 
     if role == "uav":
@@ -69,15 +70,16 @@ def config_kind(role: str) -> type[msgspec.Struct]:
 
 
 def plan_install(role: str, file: Path, program: str | None = None) -> Plan:
-    """Read and check everything that installing an agent needs.
+    """Read and check everything that the installation of an agent needs.
 
-    program: path of `syncline` on the target; None = the one that runs now. Raises InputError for a configuration
-    that the agent itself would not take, and for what a service could not reach.
+    program: path of `syncline` on the target; None = that of the running program. Raises InputError for a configuration
+    that the agent would refuse, and for paths that a service cannot access.
     """
-    kind = config_kind(role)
+    kind = config_type(role)
     config = load(file, kind)
     table = tomllib.loads(file.read_text(encoding="utf-8"))
-    name = f"{role}-{getattr(config, 'id', role)}"
+    # A unit's name allows ASCII letters, digits and a few marks; `%` is an escape character in unit files.
+    name = f"{role}-{key_segment(getattr(config, 'id', role)).replace('%', '.')}"
     plan = Plan(name)
     folder = f"{CONFIG}/{name}"
     credentials = [("config.toml", f"{folder}/config.toml")]
@@ -103,7 +105,7 @@ def plan_install(role: str, file: Path, program: str | None = None) -> Plan:
                 plan.modes[place] = 0o644
             _set(table, path, base if small else place)
     if _get(table, ("mavlink", "key")) is not None:
-        # Times of signing are written while it runs, and the key lies where nothing may be written.
+        # Signing time stamps are written at run time, and the folder of the key is read-only for the service.
         _set(table, _SIGNING_TIMES, f"{STATE}/{name}/signing-times.json")
     if getattr(config, "rig", None) is not None:
         read_rig(config.rig)  # type: ignore[attr-defined]
@@ -127,9 +129,9 @@ def plan_install(role: str, file: Path, program: str | None = None) -> Plan:
 
 
 def plan_uninstall(names: list[str], root: Path, purge: bool) -> Plan:
-    """What to take away: the named config (``camera-cam0``), or all. State is never taken away.
+    """Plan the removal of the named agents (``camera-cam0``), or of all. State is never removed.
 
-    Raises InputError for one that is not installed.
+    Raises InputError for an agent that is not installed.
     """
     folder = _in(root, UNITS)
     there = sorted(
@@ -159,30 +161,30 @@ def plan_uninstall(names: list[str], root: Path, purge: bool) -> Plan:
 
 
 def apply(plan: Plan, root: Path) -> list[str]:
-    """Carry out a plan below ``root``; returns what was changed, in words. Unchanged files are left alone.
+    """Carry out a plan below ``root``; returns descriptions of the changes. Unchanged files are not rewritten.
 
-    Files are written beside and renamed. Raises InputError where the target cannot be written, Refused where a
-    command fails. Commands run on the running system only.
+    Files are replaced atomically. Raises InputError if the target cannot be written, Refused if a command fails.
+    Commands are executed on the running system only.
     """
-    told: list[str] = []
+    changes: list[str] = []
     live = root == Path("/") and Path("/run/systemd/system").is_dir()
     now: Path = root
     try:
         if plan.remove and live:
-            _run([command for command in plan.commands if command[0] == "systemctl"], told)
+            _run([command for command in plan.commands if command[0] == "systemctl"], changes)
         for place in plan.remove:
             now = _in(root, place)
             if now.is_dir() and not now.is_symlink():
                 shutil.rmtree(now)
             else:
                 now.unlink(missing_ok=True)
-            told.append(f"removed {place}")
+            changes.append(f"removed {place}")
         for place, content in plan.files.items():
             now = _in(root, place)
             if now.is_file() and now.read_bytes() == content and now.stat().st_mode & 0o777 == plan.modes[place]:
                 continue
             _write(now, content, plan.modes[place])
-            told.append(f"wrote {place}")
+            changes.append(f"wrote {place}")
         for place, target in plan.links.items():
             now = _in(root, place)
             if now.is_symlink() and str(now.readlink()) == target:
@@ -190,19 +192,19 @@ def apply(plan: Plan, root: Path) -> list[str]:
             now.parent.mkdir(parents=True, exist_ok=True)
             now.unlink(missing_ok=True)
             now.symlink_to(target)
-            told.append(f"linked {place}")
+            changes.append(f"linked {place}")
     except OSError as error:
         remedy = "run it as root (sudo), or give --root of an image that you may write"
         raise InputError(f"cannot be changed: {error.strerror}", file=now, remedy=remedy) from None
     if live:
-        _run(_commands(plan, changed=bool(told)), told)
+        _run(_commands(plan, changed=bool(changes)), changes)
     elif root == Path("/") and plan.files:
-        told.append("systemd does not run here: the agent starts at the next boot of a machine that has it")
-    return told
+        changes.append("systemd does not run here: the agent starts at the next boot of a machine that has it")
+    return changes
 
 
 def _commands(plan: Plan, *, changed: bool) -> list[list[str]]:
-    """What is left to run once the files are there; an agent that is as it was is not torn out of its work."""
+    """Commands to run after the files are written; an agent whose files have not changed is not restarted."""
     if not plan.files:
         return [["systemctl", "daemon-reload"]] if plan.remove else []
     if changed:
@@ -227,16 +229,16 @@ def _write(place: Path, content: bytes, mode: int) -> None:
         beside.unlink(missing_ok=True)
 
 
-def _run(commands: list[list[str]], told: list[str]) -> None:
+def _run(commands: list[list[str]], changes: list[str]) -> None:
     for command in commands:
         if shutil.which(command[0]) is None:
-            told.append(f"left out: {' '.join(command)} ({command[0]} is not here)")
+            changes.append(f"left out: {' '.join(command)} ({command[0]} is not here)")
             continue
         ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
         if ended.returncode:
             lines = (ended.stderr or ended.stdout).strip().splitlines()
             raise Refused(f"`{' '.join(command)}` failed: {lines[-1] if lines else f'status {ended.returncode}'}")
-        told.append(f"ran {' '.join(command)}")
+        changes.append(f"ran {' '.join(command)}")
 
 
 def _in(root: Path, place: str) -> Path:
@@ -244,7 +246,7 @@ def _in(root: Path, place: str) -> Path:
 
 
 def _paths(config: msgspec.Struct) -> Iterator[tuple[tuple[str, ...], Path | Source]]:
-    """Every file that a configuration names, with its dotted key."""
+    """Every file that a configuration refers to, with its key path."""
     for item in msgspec.structs.fields(config):
         value = getattr(config, item.name)
         if isinstance(value, msgspec.Struct):
@@ -270,7 +272,7 @@ def _set(table: dict[str, Any], path: tuple[str, ...], value: str) -> None:
 
 
 def _state_path(given: str | None, name: str, file: Path) -> str:
-    """Where an agent writes: below its own state folder, which is all that it may write."""
+    """The output path of an agent: below its own state folder, the only one that it may write to."""
     state = f"{STATE}/{name}"
     if given is None:
         return state
@@ -299,7 +301,7 @@ def _source(value: Source, file: Path, path: tuple[str, ...]) -> str:
 
 
 def _referenced(value: Path, file: Path, path: tuple[str, ...], folder: str, taken: set[str]) -> tuple[str, bytes]:
-    """(place, content) of a file that goes along with the configuration."""
+    """(path, content) of a file that is installed with the configuration."""
     key = ".".join(path)
     try:
         content = value.read_bytes()

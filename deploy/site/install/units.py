@@ -1,4 +1,4 @@
-"""The texts of systemd's, udev's, sysusers' and tmpfiles' files. Pure: names and paths in, text out."""
+"""Texts of the systemd unit, udev, sysusers and tmpfiles files; pure functions of names and paths."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ HEADER = "# Written by `syncline install`: the next one writes it anew; a drop-i
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """What a role needs of the machine.
+    """System requirements of a role.
 
-    command: of `syncline`. watchdog_s: silence of the data path after which systemd restarts it; a hub solves in that
-    path, and speaks at every step of the solver. stop_s: for ending in order; a hub that still solves then asks for
-    more, a minute at a time. devices: classes of device nodes it may open. groups: that own those nodes.
+    command: subcommand of `syncline`. watchdog_s: time without data flow after which systemd restarts the agent; a hub
+    sends heartbeats at every solver step. stop_s: time for a clean stop; a hub that is still solving extends it by a
+    minute at a time. devices: classes of device nodes that it may open. groups: groups that own those nodes.
     """
 
     command: str
@@ -66,10 +66,10 @@ UMask=0027
 
 
 def service(name: str, role: str, program: str, credentials: Sequence[tuple[str, str]]) -> str:
-    """A unit. name: ``camera-cam0``. program: path of `syncline`. credentials: (name, file) of what it may read.
+    """Text of a unit. name: ``camera-cam0``. program: path of `syncline`. credentials: (name, file) that it may read.
 
-    The configuration is the credential ``config.toml``, so that /etc/syncline may stay closed to everyone; files
-    that it names by a relative path lie beside it.
+    The configuration is the credential ``config.toml``, so that /etc/syncline can be readable by root only; files
+    that it refers to by a relative path are credentials too.
     """
     kind = ROLES[role]
     load = "".join(f"LoadCredential={credential}:{file}\n" for credential, file in credentials)
@@ -78,7 +78,7 @@ def service(name: str, role: str, program: str, credentials: Sequence[tuple[str,
         f"Description=Syncline {role} {name.removeprefix(role + '-')}\n"
         "Wants=network-online.target\n"
         "After=network-online.target time-sync.target\n"
-        # Restarted for ever: a camera that is plugged in again after a week works again.
+        # Always restarted: a camera that is reconnected after a week works again.
         "StartLimitIntervalSec=0\n"
         "\n[Service]\n"
         "Type=notify\n"
@@ -109,26 +109,27 @@ def _devices(kind: Role) -> str:
 
 
 def _quoted(path: str) -> str:
-    """A path as a unit file takes it: % is its own escape character."""
+    """A path quoted for a unit file, in which % is an escape character."""
     text = path.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
     return f'"{text}"' if any(c.isspace() or c in "\"'\\" for c in path) else text
 
 
 def sysusers() -> str:
-    """The group that owns OAK boards' device nodes; the agents' users are dynamic."""
+    """sysusers file: the group that owns OAK boards' device nodes; the agents' users are dynamic."""
     return f"{HEADER}g syncline -\n"
 
 
 def tmpfiles() -> str:
-    """Where configuration lies (it names certificates: root's alone), and where state will lie."""
+    """tmpfiles file: the folders of configurations (readable by root only: they contain keys) and of state."""
     return f"{HEADER}d /etc/syncline 0750 root syncline -\nd /var/lib/syncline 0755 root root -\n"
 
 
 def udev_rules() -> str:
-    """Stable names below /dev/syncline, and the group of OAK boards.
+    """udev rules: stable device names below /dev/syncline, and the group of OAK boards.
 
-    usb-SERIAL names a camera wherever it is plugged in; cheap ones all have one serial, for those port-PATH names the
-    socket. 60-persistent-v4l.rules has found serial and path before. 03e7 is Movidius, the maker of OAK's chip.
+    usb-SERIAL names a camera independently of its port; cheap cameras share one serial number, and for these port-PATH
+    names the port. 60-persistent-v4l.rules has set both properties before. 03e7 is the vendor Movidius, the maker of
+    OAK's chip.
     """
     camera = 'SUBSYSTEM=="video4linux", KERNEL=="video[0-9]*", ATTR{index}=="0"'
     oak = 'SUBSYSTEM=="usb", ENV{DEVTYPE}=="usb_device", ATTR{idVendor}=="03e7"'

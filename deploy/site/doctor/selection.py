@@ -1,4 +1,4 @@
-"""Which checks make sense for a machine or an agent, in the order in which one thing needs the other."""
+"""Selection of the checks for a machine or an agent, in the order of their dependencies."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Any
 
 from deploy.site.doctor import agent as agents
 from deploy.site.doctor import machine
-from deploy.site.doctor.finding import Finding, missing, skip, wrong
+from deploy.site.doctor.check_result import CheckResult, misconfigured, skip, unavailable
 from deploy.site.install import units
 from deploy.site.rig_folder import role_of
 from protocols.core.errors import InputError
 
 
-def examine(file: Path | None, role: str | None = None) -> Iterator[Finding]:
-    """All findings, each as soon as it is known. file: an agent's configuration; None = the machine alone."""
+def run_checks(file: Path | None, role: str | None = None) -> Iterator[CheckResult]:
+    """Yield the result of each check as soon as it is known. file: an agent's configuration; None = machine only."""
     yield machine.python()
     yield machine.cpu()
     if file is None:
@@ -24,7 +24,7 @@ def examine(file: Path | None, role: str | None = None) -> Iterator[Finding]:
         yield machine.clock(certificates=False)
         yield machine.crash("syncline-*")
         return
-    kind = role or told_role(file)
+    kind = role or role_from_path(file)
     found, config = agents.configuration(file, kind)
     yield found
     if config is None:
@@ -33,22 +33,22 @@ def examine(file: Path | None, role: str | None = None) -> Iterator[Finding]:
     yield machine.packages((kind, driver))
     yield machine.disk(getattr(config, "out", None) or Path.cwd(), getattr(config, "min_free_mb", 0.0))
     yield machine.clock(certificates=config.bus.tls is not None)
-    yield from _sight(config, driver)
+    yield from _check_camera(config, driver)
     yield agents.certificates(config.bus, kind, config.id)
     yield agents.bus_path(config.bus, config.site, kind, config.id)
-    yield agents.rights(config.bus, config.site, kind, config.id)
+    yield agents.access_rights(config.bus, config.site, kind, config.id)
     if kind == "uav":
-        yield _vehicle(config)
+        yield _check_autopilot(config)
     yield machine.crash(f"syncline-{kind}-{config.id}.service")
 
 
-def told_role(file: Path) -> str:
-    """The role by the file's name, or by its folder's as `syncline install` makes it."""
+def role_from_path(file: Path) -> str:
+    """The role by the file's name, or by its folder's name as `syncline install` creates it."""
     folder = file.absolute().parent.name.partition("-")[0]
     return folder if file.name == "config.toml" and folder in units.ROLES else role_of(file)
 
 
-def _sight(config: Any, driver: str) -> Iterator[Finding]:
+def _check_camera(config: Any, driver: str) -> Iterator[CheckResult]:
     if not driver:
         return
     if driver == "oak" and not (config.oak and config.oak.device):
@@ -63,12 +63,12 @@ def _sight(config: Any, driver: str) -> Iterator[Finding]:
 
     if not isinstance(config, CameraConfig):
         if driver == "simulated":
-            return  # a whole flight, not only its camera
+            return  # a simulated flight cannot be started only for its camera
         config = CameraConfig(id=config.id, driver=config.driver, video=config.video, oak=config.oak)
     try:
         device = make_device(config, None)
     except InputError as error:
-        yield missing("camera", error.what, error.remedy or "correct the configuration")
+        yield unavailable("camera", error.what, error.remedy or "correct the configuration")
         return
     except ImportError as error:
         yield skip("camera", f"not tried: {error.name or error} is missing")
@@ -76,17 +76,17 @@ def _sight(config: Any, driver: str) -> Iterator[Finding]:
     yield agents.camera(device)
 
 
-def _vehicle(config: Any, patience_s: float = 3.0) -> Finding:
+def _check_autopilot(config: Any, patience_s: float = 3.0) -> CheckResult:
     try:
         from edge.mavlink.dialect import CAMERA, mavlink
         from edge.mavlink.link.connection import Link
-        from edge.mavlink.link.transport import parse
+        from edge.mavlink.link.transport import parse_url
 
-        url = parse(config.mavlink.url)
+        url = parse_url(config.mavlink.url)
     except InputError as error:
-        return wrong("mavlink", error.what, error.remedy)
-    # Unsigned: only whether somebody is there is asked. As the vehicle's camera and never as a ground station (255):
-    # an autopilot that hears one, and then no more, takes it for a lost link and flies home.
+        return misconfigured("mavlink", error.what, error.remedy)
+    # Unsigned, because only the presence of a heartbeat is checked. It identifies as the vehicle's camera and never as
+    # a ground station (255): an autopilot whose ground station falls silent assumes a lost link and returns home.
     link = Link(url, system=None, component=CAMERA, allowed=("HEARTBEAT",))
     hello = mavlink.MAVLink_heartbeat_message(
         mavlink.MAV_TYPE_CAMERA, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3

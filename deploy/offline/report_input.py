@@ -1,4 +1,4 @@
-"""report.html once more: of a folder that `calibrate` or `hub` wrote, or of a log or session that is solved for it."""
+"""Input of a report: read from a result folder of `calibrate` or `hub`, or computed from a log or session."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ import json
 import math
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from deploy.offline.outputs import CALIBRATION, RESULT, TRAJECTORY
-from deploy.offline.sessions import is_log, load_session
-from hub.report.convergence import Step
+from hub.api import CALIBRATION, RESULT, TRAJECTORY, calibrate
+from hub.report.convergence import OffsetStdSample
 from protocols import topics
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
+from protocols.core.pair_report import PairReport
 from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
+from protocols.log.read.session import is_log, load_session
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import (
     AdjustmentStep,
     Calibration,
     CameraCalibration,
-    PairReport,
     TrajectoryTable,
     read_calibration,
 )
@@ -33,67 +33,68 @@ from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 from protocols.session.trajectory import read_trajectory
 
-_GAP_S = 0.25  # a path with a longer hole is two
-_FAR = 6.0  # times the camera's own rms: a row so far off did not count
+_MAX_GAP_S = 0.25  # a trajectory with a longer gap is split
+_OUTLIER_RMS_FACTOR = 6.0  # times the camera's own rms: rows with a larger residual were rejected as outliers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answer:
-    """What a report is about. command: as it was typed when the answer was made. missing: what could not be found."""
+class ReportInput:
+    """Data of a report. command: the command line that made the result. missing: what could not be found.
+
+    history: offset std over the time of a recording, for logs.
+    """
 
     outcome: Calibration | Refused
     rig: Rig
     observations: Observations
     command: str
     missing: str = ""
-    history: tuple[Step, ...] = ()
+    history: tuple[OffsetStdSample, ...] = ()
 
 
-def load_answer(source: Path, session: Path | None, tell: Callable[[str, float], None]) -> Answer:
-    """The answer in a folder of outputs, or that of a session or log, which is solved now. Raises InputError."""
+def load_report_input(source: Path, session: Path | None, progress: Callable[[str, float], None]) -> ReportInput:
+    """The results in an output folder, or those of a session or log, which is calibrated now. Raises InputError."""
     if not source.exists():
         raise InputError("there is no such file or folder", file=source, remedy="name a result folder or a log")
     if (source / RESULT).is_file():
-        return _from_folder(source, session)
+        return _input_from_folder(source, session)
     if session is not None:
         raise InputError("--session goes with a folder of results", file=source, remedy="leave it out")
     if not is_log(source) and not (source / "rig.toml").exists():
         remedy = f"name a folder with {RESULT}, a session folder or a .mcap log"
         raise InputError("neither results nor a session", file=source, remedy=remedy)
-    rig, observations, warnings = load_session(source)
-    from hub.calibration.pipeline import calibrate
-
+    read = load_session(source)
     outcome: Calibration | Refused
     try:
-        found = calibrate(rig, observations, tell, thorough=True)
-        outcome = replace(found, warnings=warnings + found.warnings)
+        outcome = calibrate(read, progress=progress).calibration
     except Refused as refused:
-        outcome = Refused(refused.reason, refused.cameras, refused.pairs, (*warnings, *refused.warnings))
-    return Answer(outcome, rig, observations, "", history=history_of(source))
+        outcome = refused
+    return ReportInput(outcome, read.rig, read.observations, "", history=offset_std_history(source))
 
 
-def _from_folder(folder: Path, session: Path | None) -> Answer:
+def _input_from_folder(folder: Path, session: Path | None) -> ReportInput:
     document = _document(folder / RESULT)
     command = str(document.get("command") or "")
     metadata = _table(document.get("metadata"))
-    place = session or _session_of(folder, command)
+    place = session or _find_session(folder, command)
     rig: Rig | None = None
     observations = Observations({}, ())
     missing = ""
     if place is not None:
-        rig, observations, _ = load_session(place)
+        read = load_session(place)
+        rig, observations = read.rig, read.observations
     else:
-        missing = "the session is not here any more: figures that need what the cameras saw are left out (--session)"
+        missing = "the session is no longer here: figures that need the observations are left out (--session)"
     refused = {str(name): str(why) for name, why in _table(metadata.get("refused")).items()}
     warnings = tuple(str(text) for text in document.get("warnings") or ())
     pairs = tuple(_pair(pair) for pair in document.get("pairs") or ())
     if document.get("status") != "solved":
         if rig is None:
             raise InputError(
-                "refused, and its session is not here any more", file=folder, remedy="give the session with --session"
+                "refused, and its session is no longer here", file=folder, remedy="give the session with --session"
             )
-        reason = str(document.get("reason") or "no reason told")
-        return Answer(Refused(reason, refused, pairs, warnings), rig, observations, command, missing)
+        reason = str(document.get("reason") or "no reason given")
+        return ReportInput(Refused(reason, refused, pairs, warnings), rig, observations, command, missing)
     known, cameras = read_calibration(folder / CALIBRATION)
     file = folder / TRAJECTORY
     tables = read_trajectory(file) if file.exists() else ()
@@ -110,51 +111,53 @@ def _from_folder(folder: Path, session: Path | None) -> Answer:
         warnings=warnings + ((missing,) if missing else ()),
         cpu_seconds=float(document.get("cpu_seconds") or 0.0),
         convergence=_steps(document.get("convergence")),
-        residuals={name: residuals_of(camera, tables, observations) for name, camera in cameras.items()},
+        residuals={name: camera_residuals(camera, tables, observations) for name, camera in cameras.items()},
     )
-    return Answer(calibration, rig or known, observations, command, missing, history_of(place))
+    return ReportInput(calibration, rig or known, observations, command, missing, offset_std_history(place))
 
 
-def history_of(log: Path | None) -> tuple[Step, ...]:
-    """What a hub answered while a log was recorded; nothing for a session that is none."""
+def offset_std_history(log: Path | None) -> tuple[OffsetStdSample, ...]:
+    """Offset std of the calibrations that a hub published during a recording; empty for a session folder."""
     if log is None or not is_log(log):
         return ()
-    steps: list[Step] = []
+    steps: list[OffsetStdSample] = []
     first: int | None = None
     for logged in LogReader(log).messages([topics.OBSERVATION, topics.CALIBRATION]):
         first = logged.log_time_ns if first is None else first
         message = logged.message
         if isinstance(message, pb.Calibration) and message.status == "solved":
             stds = {camera.camera: camera.time_offset_std for camera in message.cameras}
-            steps.append(Step((logged.log_time_ns - first) / NANOSECONDS, stds))
+            steps.append(OffsetStdSample((logged.log_time_ns - first) / NANOSECONDS, stds))
     return tuple(steps)
 
 
-def residuals_of(camera: CameraCalibration, tables: tuple[TrajectoryTable, ...], observations: Observations) -> Floats:
-    """(n, 5): camera time, u, v, du, dv of one camera's rows against the path; far ones did not count."""
+def camera_residuals(
+    camera: CameraCalibration, tables: tuple[TrajectoryTable, ...], observations: Observations
+) -> Floats:
+    """Residuals (n, 5) of one camera from the trajectory: camera time [s], u, v, du, dv [px]; without outliers."""
     out = []
     for table in tables:
         track = observations.tracks.get((camera.name, table.label))
         if track is None or len(table.time) < 4:
             continue
         moments = camera.time_map.clock_rate * track.time + camera.time_map.time_offset
-        place = _places(table, moments)
+        place = _interpolated_positions(table, moments)
         good = np.isfinite(place).all(axis=1)
         seen = camera.pose.camera_from_world(place[good])
         front = seen[:, 2] > 0
         pixels = track.pixels[good][front]
         off = pixels - camera.intrinsics.project(seen[front])
-        near = np.hypot(off[:, 0], off[:, 1]) < max(_FAR * camera.rms_px, 1.0)
+        near = np.hypot(off[:, 0], off[:, 1]) < max(_OUTLIER_RMS_FACTOR * camera.rms_px, 1.0)
         out.append(np.column_stack([track.time[good][front], pixels, off])[near])
     return np.concatenate(out) if out else np.zeros((0, 5))
 
 
-def _places(table: TrajectoryTable, moments: Floats) -> Floats:
-    """(n, 3) where the point was, NaN where no path is told."""
+def _interpolated_positions(table: TrajectoryTable, moments: Floats) -> Floats:
+    """Interpolated positions (n, 3) of a trajectory, NaN in its gaps."""
     from scipy.interpolate import CubicSpline
 
     out = np.full((len(moments), 3), np.nan)
-    breaks = np.flatnonzero(np.diff(table.time) > _GAP_S) + 1
+    breaks = np.flatnonzero(np.diff(table.time) > _MAX_GAP_S) + 1
     for part in np.split(np.arange(len(table.time)), breaks):
         if len(part) < 4:
             continue
@@ -165,8 +168,8 @@ def _places(table: TrajectoryTable, moments: Floats) -> Floats:
     return out
 
 
-def _session_of(folder: Path, command: str) -> Path | None:
-    """Where what the cameras saw may be: kept in the folder, a log in it, or what the command named."""
+def _find_session(folder: Path, command: str) -> Path | None:
+    """The session of a result folder: stored in it, a log in it, or the one that the command line named."""
     if (folder / "session" / "observations.csv").is_file():
         return folder / "session"
     logs = sorted(folder.glob("*.mcap"))
@@ -193,7 +196,7 @@ def _document(file: Path) -> dict[str, Any]:
     except (ValueError, RecursionError):
         raise InputError("is not JSON", file=file, remedy=remedy) from None
     if not isinstance(document, dict) or document.get("status") not in ("solved", "refused"):
-        raise InputError("is no result of `syncline calibrate`", file=file, remedy=remedy)
+        raise InputError("is not a result of `syncline calibrate`", file=file, remedy=remedy)
     return document
 
 
@@ -221,7 +224,7 @@ def _pair(pair: Any) -> PairReport:
 
 
 def _steps(value: Any) -> tuple[AdjustmentStep, ...]:
-    """The adjustment's steps; what is none is left out, as in files of older versions."""
+    """The adjustment's steps; invalid entries, as in files of older versions, are skipped."""
     steps = []
     for one in value if isinstance(value, list) else []:
         residual = one.get("residual_px") if isinstance(one, dict) else None
