@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
     from edge.detectors.base import Detection
     from edge.devices.base import Frame
-    from edge.devices.open_camera import open_camera
+    from edge.devices.camera import open_camera
     from edge.offline.video import detect_video
 
 __all__ = ["Detection", "Frame", "detect_video", "open_camera"]
@@ -20,7 +20,7 @@ _MODULES = {
     "Detection": "edge.detectors.base",
     "Frame": "edge.devices.base",
     "detect_video": "edge.offline.video",
-    "open_camera": "edge.devices.open_camera",
+    "open_camera": "edge.devices.camera",
 }
 
 

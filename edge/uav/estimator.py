@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from google.protobuf.message import Message
 
-from edge.uav import models
+from edge.uav import tracker_factory
 from edge.uav.georeference import Georeference
 from edge.uav.navigation import Origin, rotation_from_quaternion
 from edge.uav.tracker import Box, Estimate, Image, Telemetry, Tracker, TrackState
@@ -130,7 +130,9 @@ class TargetEstimator:
         if self._image is None:
             self.refused += 1
             return []
-        tracker = models.get(self._model, self._size, self._lens, self._mounting, self._fps, self._seed + self._targets)
+        tracker = tracker_factory.get(
+            self._model, self._size, self._lens, self._mounting, self._fps, self._seed + self._targets
+        )
         for sample in self._samples:
             tracker.handle_telemetry(sample)
         try:

@@ -16,8 +16,8 @@ from edge.uav.ground.image_plane import apply_homography
 from edge.uav.ground.layers import LazyLayers
 from edge.uav.ground.localisation import CameraLocaliser
 from edge.uav.ground.road_map import RoadMap
+from edge.uav.prediction import particle_filter as pf
 from edge.uav.prediction import particle_set
-from edge.uav.prediction import particles as pf
 from edge.uav.prediction.driver_model import DriverModel
 from edge.uav.prediction.occlusion import OcclusionPredictor
 from edge.uav.prediction.particle_set import ParticleSet

@@ -22,7 +22,7 @@ from hub.distributed.network.host import NodeHost
 from hub.distributed.solver import node_calibration, with_node_poses
 from hub.live.messages import calibration_message, refusal_message, track_messages
 from hub.tracking.calibration.people import PeopleTracklets
-from hub.tracking.camera_frame import tracked_kind
+from hub.tracking.detections import tracked_kind
 from hub.tracking.live_tracking import LiveTracking
 from protocols.core.errors import InputError, Refused
 from protocols.core.version import VERSION

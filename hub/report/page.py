@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hub.report import convergence, image_maps, measures, pair_graph, scene, tables, time_figures
+from hub.report import convergence, image_maps, measures, pair_graph, rig_figure, tables, time_figures
 from hub.report.convergence import OffsetStdSample
 from hub.report.measures import RowUsage
 from hub.report.quality_assessment import (
@@ -73,7 +73,7 @@ def _calibration_page(
 ) -> str:
     used = measures.row_usage(calibration, rig, observations)
     assessment = assess_quality(calibration, rig, observations, used)
-    drawn = scene.build_rig_figure(calibration, rig)
+    drawn = rig_figure.build_rig_figure(calibration, rig)
     counts = {name: len(measures.camera_rows(observations, name)) for name in calibration.refused}
     several = f" over {len(calibration.trajectories)} points" if len(calibration.trajectories) > 1 else ""
     parts = [
@@ -103,7 +103,7 @@ def _calibration_page(
             "Scene",
             f"Camera poses and the trajectory of the point{several}. Drag to rotate, scroll to zoom; "
             "the trajectory starts at the circle and ends at the diamond.",
-            f'<div class="frame screen"><div id="{scene.DIV}"></div></div>{scene.plan_and_side(drawn)}',
+            f'<div class="frame screen"><div id="{rig_figure.DIV}"></div></div>{rig_figure.plan_and_side(drawn)}',
         ),
         _section(
             "Residuals in the image",
@@ -130,7 +130,7 @@ def _calibration_page(
         "Lengths": calibration.units if calibration.scale == "metric" else "arbitrary: the first baseline is 1",
     }
     parts.append(_section("Provenance", "", tables.provenance(facts, rig, command)))
-    return _document("Calibration report", assessment, parts, scene.rig_figure_script(drawn))
+    return _document("Calibration report", assessment, parts, rig_figure.rig_figure_script(drawn))
 
 
 def _refusal_page(refused: Refused, rig: Rig, observations: Observations, command: str) -> str:

@@ -11,7 +11,7 @@ from google.protobuf.message import Message
 
 from hub.tracking.association.initiation import LengthScale
 from hub.tracking.calibration.vertical import VerticalEstimator
-from hub.tracking.camera_frame import TrackingCamera, tracked_kind
+from hub.tracking.detections import TrackingCamera, tracked_kind
 from hub.tracking.filter.kalman import LOG_SIZE
 from hub.tracking.filter.target_models import PERSON
 from hub.tracking.filter.target_states import MultiTargetState

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from hub.tracking.camera_frame import TrackingCamera
+from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY
 from hub.tracking.filter.measurement import POINT, predict_measurement
 from hub.tracking.filter.target_models import TARGET_MODELS
 from hub.tracking.filter.target_states import LostTrack, Targets
-from hub.tracking.filter.update import TrackerParameters, track_label
+from hub.tracking.frame_update import TrackerParameters, track_label
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb

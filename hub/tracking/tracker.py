@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from hub.tracking.camera_frame import FrameDetections, TrackingCamera, frame_detections
+from hub.tracking.detections import FrameDetections, TrackingCamera, frame_detections
 from hub.tracking.filter.target_states import MultiTargetState, Targets
-from hub.tracking.filter.update import TrackerParameters, predict_targets, process_frame
+from hub.tracking.frame_update import TrackerParameters, predict_targets, process_frame
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.pose import Similarity
 from protocols.messages import syncline_pb2 as pb

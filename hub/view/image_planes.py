@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hub.view.page import draw_detections
-from hub.view.scene import decode_jpeg
+from hub.view.scene_renderer import decode_jpeg
 from hub.view.state import ViewState
 from protocols.geometry.types import Floats
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from hub.view.export import calibration_file
 from hub.view.panels import camera_details, camera_table, overview
-from hub.view.scene import DisplayOptions, decode_jpeg
+from hub.view.scene_renderer import DisplayOptions, decode_jpeg
 from hub.view.state import CameraView, ViewState
 from hub.view.uav_overlay import draw_uav, pad_to_aspect, uav_panel_html
 from hub.view.uav_state import UavView

@@ -17,7 +17,7 @@ import viser
 from hub.view.access_control import AccessControl, is_local
 from hub.view.page import ACTIONS, ViewPage, new_id
 from hub.view.player import Player, Recording
-from hub.view.scene import DisplayOptions, SceneRenderer
+from hub.view.scene_renderer import DisplayOptions, SceneRenderer
 from hub.view.state import ViewState
 from protocols.bus.base import Bus, Subscription
 from protocols.core.clocks import NANOSECONDS

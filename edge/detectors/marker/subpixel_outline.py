@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.detectors.moving.static_background import is_known
+from edge.detectors.marker.static_background import is_known
 from protocols.geometry.types import Bools, Floats
 
 Image = npt.NDArray[np.uint8]

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.detectors.base import Detection, Prediction
+from edge.detectors.moving.association import match_predictions
 from edge.detectors.moving.foreground import BackgroundSubtractor, SubtractorName
-from edge.detectors.moving.gating import match_predictions
 from edge.detectors.moving.tracklets import ImageTracklet, ShortTermTracker
 from protocols.geometry.types import Floats
 

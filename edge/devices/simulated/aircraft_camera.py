@@ -7,7 +7,7 @@ import numpy as np
 from edge.devices.base import DeviceInfo, Frame, Image
 from edge.devices.playback.playback_clock import PlaybackClock
 from edge.devices.simulated.aircraft import SimulatedAircraft
-from edge.uav.world.world import FlightWorld
+from edge.uav.world.flight_world import FlightWorld
 from protocols.core.clocks import NANOSECONDS
 
 _TRANSFER_S = 0.004

@@ -12,7 +12,7 @@ from edge.devices.base import DeviceInfo, Frame
 from edge.devices.playback.playback_clock import PlaybackClock, RealTime
 from edge.scenes import renderer_for
 from edge.scenes.common.base import Renderer, SimulatedClock, SimulatedScene
-from edge.scenes.common.scaled import rescale_scene
+from edge.scenes.common.rescaling import rescale_scene
 from protocols.core.clocks import NANOSECONDS
 
 _DAY_S = 86_400.0

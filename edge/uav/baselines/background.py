@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.prediction import particles as pf
+from edge.uav.prediction import particle_filter as pf
 from edge.uav.tracker import Box
 from protocols.geometry.types import Bools, Floats
 

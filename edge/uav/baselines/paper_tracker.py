@@ -15,13 +15,13 @@ import numpy.typing as npt
 
 from edge.uav.baselines import histograms, regions
 from edge.uav.baselines.background import BackgroundFilter, BackgroundMotion
-from edge.uav.baselines.car import BackgroundAwareModel, FrameObservation, RoadSteeredModel
+from edge.uav.baselines.car_models import BackgroundAwareModel, FrameObservation, RoadSteeredModel
+from edge.uav.baselines.input_checks import check_image, check_target, has_frame_format, visible_share
 from edge.uav.baselines.plain_tracker import AppearanceTest
 from edge.uav.baselines.road import RoadCourse, RoadMidline, extrapolated_course
 from edge.uav.baselines.road_filter import RoadFilter, line_support
-from edge.uav.baselines.target import check_image, check_target, has_frame_format, visible_share
 from edge.uav.baselines.white_lines import EdgeDistance, find_sections
-from edge.uav.prediction import particles as pf
+from edge.uav.prediction import particle_filter as pf
 from edge.uav.tracker import Box, Estimate, Hypothesis, Image, Telemetry, TrackState
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats

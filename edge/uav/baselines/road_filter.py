@@ -14,7 +14,7 @@ from scipy.ndimage import uniform_filter1d
 
 from edge.uav.baselines.road import RoadMidline
 from edge.uav.baselines.white_lines import DISTANCE_CAP, EdgeDistance, RoadSection
-from edge.uav.prediction import particles as pf
+from edge.uav.prediction import particle_filter as pf
 from protocols.geometry.types import Floats
 
 _PARTICLES = 120

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.uav.ground.image_plane import ImagePlane, apply_homography, inverse
-from edge.uav.ground.plane_motion import PlaneCamera, PlaneHomography, PlanePose
+from edge.uav.ground.plane_pose import PlaneCamera, PlaneHomography, PlanePose
 from protocols.geometry import so3
 from protocols.geometry.types import Bools, Floats
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from edge.uav.ground.road_map import RoadMap
+from edge.uav.prediction import particle_filter as pf
 from edge.uav.prediction import particle_set
-from edge.uav.prediction import particles as pf
 from edge.uav.prediction.driver_model import DriverModel
 from edge.uav.prediction.particle_set import ParticleSet
 from edge.uav.prediction.paths import RoadPath, road_edges, trace_paths

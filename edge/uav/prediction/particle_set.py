@@ -8,7 +8,7 @@ import numpy as np
 
 from edge.uav.ground.image_plane import apply_homography
 from edge.uav.prediction.driver_model import DriverModel
-from edge.uav.prediction.particles import KldSampleSize, effective_sample_size, systematic_resample
+from edge.uav.prediction.particle_filter import KldSampleSize, effective_sample_size, systematic_resample
 from edge.uav.prediction.paths import RoadPath
 from edge.uav.target.motion_history import MotionFit
 from protocols.geometry.types import Floats, Ints

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from edge.uav.ground.localisation import CameraLocaliser
-from edge.uav.prediction import particles as pf
+from edge.uav.prediction import particle_filter as pf
 from edge.uav.prediction.particle_set import ParticleSet
 from edge.uav.target import footprint
 from edge.uav.target.target import Target

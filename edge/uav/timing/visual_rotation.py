@@ -13,7 +13,7 @@ import numpy as np
 
 from edge.uav.ground.ego_motion import EgoMotion
 from edge.uav.ground.image_plane import ImagePlane
-from edge.uav.ground.plane_motion import PlanePose
+from edge.uav.ground.plane_pose import PlanePose
 from edge.uav.timing.telemetry_offset import RelativeRotations
 from edge.uav.tracker import Image, Telemetry
 from protocols.geometry import so3

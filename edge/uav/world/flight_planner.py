@@ -9,8 +9,8 @@ import numpy as np
 
 from edge.uav.world import cars
 from edge.uav.world.flight import Disturbance, DisturbanceLevels, Flight, flight_over, grid_times, sample_disturbance
+from edge.uav.world.flight_world import camera_poses, longest_run, share_in_image
 from edge.uav.world.roads import Curve, arc_length_over_time
-from edge.uav.world.world import camera_poses, longest_run, share_in_image
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 

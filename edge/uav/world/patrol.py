@@ -9,13 +9,13 @@ import numpy as np
 from edge.uav.world import cars
 from edge.uav.world.flight import GRID_HZ, DisturbanceLevels, Flight, flight_over, grid_times, sample_disturbance
 from edge.uav.world.flight_planner import FPS, CameraSetup, cosine_ramp, ramp_duration
-from edge.uav.world.ground import Area
+from edge.uav.world.flight_world import FlightWorld
+from edge.uav.world.ground_texture import Area
 from edge.uav.world.noise import smoothed_noise
 from edge.uav.world.rendering import Illumination
 from edge.uav.world.roads import LANE, STEP, Bend, Curve, Road, arc_length_over_time, curve_from_bends, straight_curve
 from edge.uav.world.scenario_builder import sample_camera
 from edge.uav.world.town import build_town
-from edge.uav.world.world import FlightWorld
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 

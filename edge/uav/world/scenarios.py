@@ -11,13 +11,13 @@ import numpy as np
 from edge.uav.world import cars, scenarios_exit, scenarios_in_view
 from edge.uav.world.flight import Flight
 from edge.uav.world.flight_planner import FPS, CameraSetup
-from edge.uav.world.ground import Area
+from edge.uav.world.flight_world import FlightWorld, camera_poses
+from edge.uav.world.ground_texture import Area
 from edge.uav.world.noise import smoothed_noise
 from edge.uav.world.rendering import Illumination
 from edge.uav.world.roads import LANE, Road
 from edge.uav.world.scenario_builder import ScenarioInputs, ScenarioPlan, sample_camera
 from edge.uav.world.town import build_town
-from edge.uav.world.world import FlightWorld, camera_poses
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from edge.uav.world import occluders
 from edge.uav.world.cars import COLOURS_BGR, Car
-from edge.uav.world.ground import Area, GroundTexture, paint_ground
+from edge.uav.world.ground_texture import Area, GroundTexture, paint_ground
 from edge.uav.world.occluders import Occluder, Occluders
 from edge.uav.world.roads import Curve, Road
 from protocols.geometry.types import Floats

@@ -23,7 +23,7 @@ from hub.distributed.factors.initialise import (
     robust_sums,
     robust_weight,
 )
-from hub.distributed.factors.linearise import (
+from hub.distributed.factors.two_view_model import (
     LinearisedObservations,
     RelativeTransform,
     linearise_observations,

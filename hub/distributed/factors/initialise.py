@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from hub.distributed.factors.linearise import LinearisedObservations, RelativeTransform, linearise_observations
+from hub.distributed.factors.two_view_model import LinearisedObservations, RelativeTransform, linearise_observations
 from hub.two_view.relative_pose import decompose_essential
 from protocols.geometry import so3
 from protocols.geometry.types import Bools, Floats

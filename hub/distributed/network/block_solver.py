@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hub.distributed.factors.factor import QuadraticFactor
-from hub.distributed.factors.linearise import RelativeTransform, small_log
+from hub.distributed.factors.two_view_model import RelativeTransform, small_log
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats

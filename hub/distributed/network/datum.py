@@ -11,7 +11,7 @@ import numpy as np
 
 from hub.bundle.datum import control_outliers
 from hub.distributed.factors.factor import QuadraticFactor
-from hub.distributed.factors.linearise import RelativeTransform
+from hub.distributed.factors.two_view_model import RelativeTransform
 from hub.distributed.network.messages import Anchor
 from protocols.geometry import so3
 from protocols.geometry.pose import Similarity

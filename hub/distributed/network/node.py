@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from hub.distributed.factors.factor import RAW_CAPACITY, Edge, QuadraticFactor, Window, stream_pending
-from hub.distributed.factors.linearise import RelativeTransform
+from hub.distributed.factors.two_view_model import RelativeTransform
 from hub.distributed.network.association import MAX_GAP_S, Associator
 from hub.distributed.network.block_solver import (
     FactorTerm,

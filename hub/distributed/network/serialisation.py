@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from hub.distributed.factors.factor import QuadraticFactor
-from hub.distributed.factors.linearise import RelativeTransform
+from hub.distributed.factors.two_view_model import RelativeTransform
 from hub.distributed.network.messages import Anchor, ControlPoint, StateMessage
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose

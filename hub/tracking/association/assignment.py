@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from hub.tracking.camera_frame import FrameDetections, TrackingCamera
+from hub.tracking.detections import FrameDetections, TrackingCamera
 from hub.tracking.filter.kalman import LOG_SIZE
 from hub.tracking.filter.measurement import FOOT, HEAD, LOG_IMAGE_SIZE, POINT, PredictedMeasurement
 from hub.tracking.filter.target_models import TARGET_MODELS

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hub.tracking.camera_frame import FrameDetections, TrackingCamera
+from hub.tracking.detections import FrameDetections, TrackingCamera
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM, VELOCITY
 from hub.tracking.filter.measurement import (
     BLOCKS,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hub.tracking.camera_frame import FrameDetections
+from hub.tracking.detections import FrameDetections
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hub.tracking.camera_frame import FrameDetections, TrackingCamera
+from hub.tracking.detections import FrameDetections, TrackingCamera
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM, VELOCITY
 from hub.tracking.filter.target_models import PERSON, TARGET_MODELS
 from protocols.geometry.types import Bools, Floats, Ints

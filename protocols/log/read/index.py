@@ -13,7 +13,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel
 
-from protocols.log.read.frames import MAGIC
+from protocols.log.read.mcap_records import MAGIC
 
 _HEAD = struct.Struct("<BQ")
 _FOOTER = struct.Struct("<BQQQI")

@@ -14,7 +14,7 @@ from mcap.records import Metadata
 
 from protocols.core.errors import InputError
 from protocols.log.layout import FORMAT_RECORD, part_path, with_checksum
-from protocols.log.read.frames import Damage, open_log, read_records
+from protocols.log.read.mcap_records import Damage, open_log, read_records
 
 _PART = re.compile(r"(?P<stem>.+)-(?P<number>\d{3,6})\Z")
 

@@ -21,7 +21,8 @@ from mcap.records import Metadata as MetadataRecord
 
 from protocols.core.errors import InputError
 from protocols.log.layout import CHANNEL_RECORD, channel_record
-from protocols.log.read.frames import (
+from protocols.log.read.index import read_index
+from protocols.log.read.mcap_records import (
     Damage,
     McapRecord,
     RawMessage,
@@ -31,7 +32,6 @@ from protocols.log.read.frames import (
     open_log,
     read_records,
 )
-from protocols.log.read.index import read_index
 from protocols.log.read.migration import upgrades_for
 from protocols.log.read.parts import find_parts, log_format
 from protocols.log.schemas import is_foxglove

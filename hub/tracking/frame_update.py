@@ -19,7 +19,7 @@ from hub.tracking.association.assignment import (
 )
 from hub.tracking.association.initiation import LengthScale, TrackCandidate, best_candidate, unassociated_detections
 from hub.tracking.association.reidentification import reidentify, store_lost_tracks
-from hub.tracking.camera_frame import FrameDetections, TrackingCamera
+from hub.tracking.detections import FrameDetections, TrackingCamera
 from hub.tracking.filter import kalman
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION
 from hub.tracking.filter.manoeuvre import ManoeuvreHypothesis, can_manoeuvre, gpb1_update, manoeuvre_hypothesis
