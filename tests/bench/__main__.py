@@ -5,8 +5,8 @@
 `make bench`, `make bench QUICK=1`, `make bench KEEP=1`. Each section runs in a process of its own, one after the other.
 Ratio: how many times better ours is, above 1 we are ahead; CPU seconds wherever a process computes, wall where
 processes talk or start. Every run is written to bench-out/ with the machine's facts; --keep makes it the one that later
-runs are compared with (tests/bench/kept/): what fell by more than a fifth is shown. What was not run is told, and why.
-Leaves with status 1 if a section could not be run at all; a missed figure is a figure.
+runs are compared with (tests/bench/kept/): what fell by more than a fifth is shown. Sections that were
+not run are listed with the reason. Exit status 1 if a section could not be run at all, not for a missed figure.
 """
 
 from __future__ import annotations

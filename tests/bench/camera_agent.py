@@ -81,7 +81,7 @@ def stamps(seed: int, count: int = 300) -> np.ndarray:
     """Error [s] of the simulated driver's stamps against the world's clock, by drawing what it was asked to draw."""
     errors = []
     for camera in ("cam0", "cam1"):
-        scene = scenes.get("marker", seed)
+        scene = scenes.get_marker_scene("marker", seed)
         device = SimulatedDevice(scene, camera, seed, AsFastAsPossible(50.0), duration_s=count / 30.0)
         device.open()
         clock = scene.camera(camera).clock
@@ -104,7 +104,9 @@ def main() -> None:
     options = arguments.parse_args()
     cv2.setNumThreads(1)
     os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[-1]})
-    renderer = scenes.get("marker", options.seed).renderer("cam0", np.random.default_rng(options.seed))
+    renderer = scenes.renderer_for(
+        scenes.get_marker_scene("marker", options.seed), "cam0", np.random.default_rng(options.seed)
+    )
     pictures = [
         np.asarray(cv2.resize(renderer.render(moment), SIZE), dtype=np.uint8) for moment in np.linspace(1.0, 20.0, 60)
     ]

@@ -1,6 +1,6 @@
-"""How time and memory grow with the work: one small picture for tests/bench/README.md.
+"""How time and memory grow with the work: one small figure for tests/bench/README.md.
 
-    python -m tests.bench.growth [--quick] [--out tests/bench/growth.png]
+    python -m tests.bench.growth [--quick] [--out docs/pictures/growth.png]
 
 CPU of the adjustment against observations and cameras, of pair timing against the length of the tracks and against the
 number of pairs, of the live hub an observation against cameras, of the UAV tracker against particles, of the marker
@@ -40,7 +40,7 @@ class Curve:
     y: list[float] = field(default_factory=list)
 
     def add(self, x: float, y: float) -> None:
-        """One point; told at once."""
+        """One point; printed at once."""
         self.x.append(x)
         self.y.append(y)
         print(f"{self.title}: {x:g} {self.x_name} → {y:.4g} {self.y_name}", flush=True)
@@ -72,32 +72,32 @@ def _peak_mb(work: Callable[[], object]) -> float:
 
 def adjustment(quick: bool) -> list[Curve]:
     """The joint adjustment: rows at six cameras, and cameras at the same length."""
-    from tests.bench.speed.joint import make, ours
+    from tests.bench.speed.joint import make_trial, ours
 
     rows = Curve("adjustment", "observations", "s of CPU")
     memory = Curve("adjustment, memory", "observations", "MB")
     for seconds in (15, 30, 60, 120) if quick else (30, 60, 120, 240, 480):
-        task = make(7, seconds, 6)
+        task = make_trial(7, seconds, 6)
         rows.add(task.rows, _cpu(lambda task=task: ours(task)))  # type: ignore[misc]
         memory.add(task.rows, _peak_mb(lambda task=task: ours(task)))  # type: ignore[misc]
     cameras = Curve("adjustment of 20 s", "cameras", "s of CPU")
     for count in (4, 8, 16) if quick else (4, 8, 16, 32, 64):
-        task = make(8, 20.0, count)
+        task = make_trial(8, 20.0, count)
         cameras.add(count, _cpu(lambda task=task: ours(task)))  # type: ignore[misc]
     return [rows, memory, cameras]
 
 
 def pairs(quick: bool) -> list[Curve]:
     """Timing: seconds of two tracks (lags within them all), and all pairs of a number of cameras."""
+    from hub.bundle.preprocessing import prepare
     from hub.calibration.pair_network import solve_pairs
-    from hub.calibration.preprocessing import prepare
-    from tests import rigs
     from tests.bench import pair_timing
-    from tests.bench.pair_trials import Regime, make
+    from tests.bench.pair_trials import Regime, make_trial
+    from tests.support import rigs
 
     length = Curve("pair timing", "s of track", "s of CPU")
     for span in (10, 20, 40, 80) if quick else (10, 20, 40, 80, 160, 320):
-        trials = [make(Regime(span=float(span)), seed) for seed in range(30_000, 30_003)]
+        trials = [make_trial(Regime(span=float(span)), seed) for seed in range(30_000, 30_003)]
         length.add(span, _cpu(lambda trials=trials: [pair_timing.run(t, True) for t in trials], 1) / len(trials))  # type: ignore[misc]
     count = Curve("timing of all pairs, 20 s", "pairs", "s of CPU")
     for cameras in (3, 5, 8) if quick else (3, 5, 8, 12, 17):
@@ -139,8 +139,8 @@ def hub(quick: bool) -> list[Curve]:
 
 
 def particles(quick: bool) -> list[Curve]:
-    """The tracker in the picture plane (`--model plain`), whose cloud has a fixed size."""
-    from edge.uav import models
+    """The image-plane tracker (`--model plain`), which has a fixed number of particles."""
+    from edge.uav import tracker_factory
     from edge.uav.baselines import plain_tracker
     from edge.uav.world import scenarios
 
@@ -150,7 +150,7 @@ def particles(quick: bool) -> list[Curve]:
     for count in (100, 800, 6400) if quick else (100, 400, 1600, 6400, 25600):
 
         def run() -> None:
-            tracker = models.get("plain", world.size, fps=world.fps, seed=1)
+            tracker = tracker_factory.get("plain", world.size, fps=world.fps, seed=1)
             tracker.begin(images[0], world.time(0), world.truth(0).box)
             for i in range(1, len(images)):
                 tracker.handle_frame(images[i], world.time(i))
@@ -161,11 +161,11 @@ def particles(quick: bool) -> list[Curve]:
 
 
 def pixels(quick: bool) -> list[Curve]:
-    """The marker detector against the picture's size."""
+    """The marker detector against the image size."""
     from edge import scenes
     from edge.detectors.marker.ball import MarkerDetector
 
-    renderer = scenes.get("marker", 0).renderer("cam0", np.random.default_rng(0))
+    renderer = scenes.renderer_for(scenes.get_marker_scene("marker", 0), "cam0", np.random.default_rng(0))
     drawn = [renderer.render(moment) for moment in np.linspace(1.0, 30.0, 10)]
     curve = Curve("marker detector", "megapixels", "ms of CPU a frame")
     sizes = ((320, 240), (640, 480), (1280, 960), (2560, 1920))
@@ -209,7 +209,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--only", default="", help="parts of functions' names, by comma")
-    parser.add_argument("--out", type=Path, default=REPOSITORY / "tests" / "bench" / "growth.png")
+    parser.add_argument("--out", type=Path, default=REPOSITORY / "docs" / "pictures" / "growth.png")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     wanted = [name for name in options.only.split(",") if name]

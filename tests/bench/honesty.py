@@ -1,12 +1,12 @@
-"""What is claimed against what is true: sessions without an answer, and the stds of those with one.
+"""Acceptance of degenerate sessions, and calibration of the reported stds against the truth.
 
     python -m tests.bench.honesty [--sessions 100] [--runs 200] [--start 0] [--jobs 2] [--only degenerate,stds]
 
-degenerate: eleven kinds of session in which something cannot be known; asked: wrong but accepted at most 0.1 %. An
-answer counts as wrong if a camera's clock is more than 5 ms off in the middle of what it saw, or its orientation more
+degenerate: eleven kinds of session with an unobservable quantity; required: wrong but accepted at most 0.1 %. A
+result counts as wrong if a camera's clock is more than 5 ms off in the middle of what it saw, or its orientation more
 than 3 degrees. The kinds take turns, so that an interrupted run has as many of each. stds: over random rigs a regime,
-how often the truth lies within 1.96 stds; asked: 93 to 97 %. Paths are judged once a second, for neighbouring samples
-err together.
+how often the truth lies within 1.96 stds; required: 93 to 97 %. Paths are evaluated once a second, as the errors of
+neighbouring samples are correlated.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry.pose import Pose, Similarity  # noqa: E402
 from protocols.geometry.types import Floats  # noqa: E402
 from protocols.session.calibration import Calibration  # noqa: E402
-from tests import rigs  # noqa: E402
+from tests.support import rigs  # noqa: E402
 
 _WRONG_S, _WRONG_RAD = 0.005, np.deg2rad(3.0)
 _WITHIN = 1.96
-_TELL_EACH = 5  # sessions of each kind
+_REPORT_EACH = 5  # sessions of each kind
 Make = Callable[[int], rigs.Session]
 
 
@@ -94,12 +94,12 @@ def too_slow(seed: int) -> rigs.Session:
 
 
 def noise_only(seed: int) -> rigs.Session:
-    """The detector reports anything but the marker."""
+    """The detector reports only outliers."""
     return rigs.simulate(seed, 2, outliers=1.0, seconds=20.0)
 
 
-def strangers(seed: int) -> rigs.Session:
-    """Every camera watches a thing of its own."""
+def unrelated_tracks(seed: int) -> rigs.Session:
+    """Every camera observes a different, unrelated track."""
     parts = [rigs.simulate(seed + 7_000_000 * k, seconds=20.0) for k in range(3)]
     first = parts[0]
     pixels = np.concatenate([p.pixels[[c == f"cam{k}" for c in p.camera]] for k, p in enumerate(parts)])
@@ -110,7 +110,7 @@ def strangers(seed: int) -> rigs.Session:
 
 
 def no_clock(seed: int) -> rigs.Session:
-    """One camera's times are no clock's: they stagger by a third of a second, or jump again and again."""
+    """One camera's times follow no clock: they scatter by a third of a second, or step repeatedly."""
     rng = np.random.default_rng([seed, 8])
     session = rigs.simulate(seed, 2, seconds=20.0)
     mine = np.array([name == "cam1" for name in session.camera])
@@ -148,39 +148,39 @@ DEGENERATE: tuple[tuple[str, Make, bool], ...] = (
     ("0.5 to 3 s in common", short, True),
     ("10 fps, 3 to 5 Hz", too_slow, True),
     ("noise only", noise_only, False),
-    ("each its own thing", strangers, False),
+    ("each its own thing", unrelated_tracks, False),
     ("one clock is none", no_clock, False),
     ("two cameras in one place", one_place, False),
 )
-"""Name, session, and whether a right answer may exist (else any answer counts as wrong)."""
+"""Name, session, and whether a correct result may exist (else any result counts as wrong)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """One session without an answer. verdict: "refused", "right" or "wrong". cpu_s: of the whole command [s]."""
+class DegenerateResult:
+    """One degenerate session. outcome: "refused", "right" or "wrong". cpu_s: of the whole command [s]."""
 
     kind: int
     seed: int
-    verdict: str
+    outcome: str
     clock_ms: float
     turn_degrees: float
     cpu_s: float
 
 
-def judge(kind: int, seed: int) -> Judged:
-    """Calibrate one session as the command does, and hold the answer, if any, against the truth."""
+def evaluate_session(kind: int, seed: int) -> DegenerateResult:
+    """Calibrate one session as the command does, and compare the result, if any, with the truth."""
     _, make, answerable = DEGENERATE[kind]
     session = make(seed)
     begin = time.process_time()
     try:
         found = calibrate(session.rig, session.observations(), thorough=True)
     except Refused:
-        return Judged(kind, seed, "refused", 0.0, 0.0, time.process_time() - begin)
+        return DegenerateResult(kind, seed, "refused", 0.0, 0.0, time.process_time() - begin)
     spent = time.process_time() - begin
     lag = max(abs(session.clock_error(n, found.reference, c.time_map)) for n, c in found.cameras.items())
     turn = session.turn_error({name: camera.pose for name, camera in found.cameras.items()})
     right = answerable and lag < _WRONG_S and turn < _WRONG_RAD
-    return Judged(kind, seed, "right" if right else "wrong", 1e3 * lag, float(np.degrees(turn)), spent)
+    return DegenerateResult(kind, seed, "right" if right else "wrong", 1e3 * lag, float(np.degrees(turn)), spent)
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,8 +244,8 @@ def scores(regime: int, seed: int) -> tuple[int, list[float], list[float], list[
     places: list[float] = []
     for name, camera in found.cameras.items():
         off = camera.pose.position - world.points(session.poses[name].position[None])[0]
-        told = camera.position_std > 1e-9
-        places += (off[told] / camera.position_std[told]).tolist()
+        estimated = camera.position_std > 1e-9
+        places += (off[estimated] / camera.position_std[estimated]).tolist()
     path: list[float] = []
     for table in found.trajectories:
         step = max(1, round(1.0 / float(np.median(np.diff(table.time)))))
@@ -271,32 +271,32 @@ def _histogram(z: Floats) -> str:
     return "".join(bars[round(8 * c / max(counts.max(), 1))] for c in counts)
 
 
-def tabled(told: list[Judged]) -> dict[str, object]:
-    """Counts of each verdict, and the seeds of the wrong ones, by kind."""
+def counts_by_kind(judged: list[DegenerateResult]) -> dict[str, object]:
+    """Counts of each outcome, and the seeds of the wrong ones, by kind."""
     return {
-        DEGENERATE[kind][0]: dict(Counter(one.verdict for one in told if one.kind == kind))
-        | {"bad": [one.seed for one in told if one.kind == kind and one.verdict == "wrong"]}
-        for kind in sorted({one.kind for one in told})
+        DEGENERATE[kind][0]: dict(Counter(one.outcome for one in judged if one.kind == kind))
+        | {"bad": [one.seed for one in judged if one.kind == kind and one.outcome == "wrong"]}
+        for kind in sorted({one.kind for one in judged})
     }
 
 
-def _summary(told: list[Judged]) -> str:
-    wrong = sum(one.verdict == "wrong" for one in told)
-    share = 100.0 * wrong / max(len(told), 1)
-    return f"wrong but accepted: {wrong} of {len(told)} ({share:.2f} %; asked 0.1 %)"
+def _summary(judged: list[DegenerateResult]) -> str:
+    wrong = sum(one.outcome == "wrong" for one in judged)
+    share = 100.0 * wrong / max(len(judged), 1)
+    return f"wrong but accepted: {wrong} of {len(judged)} ({share:.2f} %; required 0.1 %)"
 
 
-def _print_degenerate(told: list[Judged]) -> None:
-    for kind in sorted({one.kind for one in told}):
-        mine = [one for one in told if one.kind == kind]
-        counts = Counter(one.verdict for one in mine)
-        bad = [f"{one.seed}: {one.clock_ms:.1f} ms, {one.turn_degrees:.1f}°" for one in mine if one.verdict == "wrong"]
+def _print_degenerate(judged: list[DegenerateResult]) -> None:
+    for kind in sorted({one.kind for one in judged}):
+        mine = [one for one in judged if one.kind == kind]
+        counts = Counter(one.outcome for one in mine)
+        bad = [f"{one.seed}: {one.clock_ms:.1f} ms, {one.turn_degrees:.1f}°" for one in mine if one.outcome == "wrong"]
         print(
             f"{DEGENERATE[kind][0]:30} refused {counts['refused']:4}  right {counts['right']:4}  wrong "
             f"{counts['wrong']:3}  {np.mean([one.cpu_s for one in mine]):5.2f} s of CPU each"
             + (f"   ({'; '.join(bad[:6])})" if bad else "")
         )
-    print(_summary(told), flush=True)
+    print(_summary(judged), flush=True)
 
 
 def _keep(path: Path | None, kept: dict[str, object]) -> None:
@@ -326,26 +326,26 @@ def main() -> None:
         if "degenerate" in arguments.only:
             kinds = chosen([name for name, _, _ in DEGENERATE])
             todo = [(kind, seed) for seed in seeds[: arguments.sessions] for kind in kinds]
-            told: list[Judged] = []
+            judged: list[DegenerateResult] = []
             try:
-                for one in pool.map(judge, *zip(*todo, strict=True)):
-                    told.append(one)
-                    if one.verdict == "wrong":
+                for one in pool.map(evaluate_session, *zip(*todo, strict=True)):
+                    judged.append(one)
+                    if one.outcome == "wrong":
                         print(f"wrong: {DEGENERATE[one.kind][0]}, {one}", flush=True)
-                    if len(told) % (_TELL_EACH * len(kinds)) == 0:
-                        kept |= tabled(told)
-                        print(f"{len(told)} of {len(todo)} sessions, {_summary(told)}", flush=True)
+                    if len(judged) % (_REPORT_EACH * len(kinds)) == 0:
+                        kept |= counts_by_kind(judged)
+                        print(f"{len(judged)} of {len(todo)} sessions, {_summary(judged)}", flush=True)
                         _keep(arguments.json, kept)
             except KeyboardInterrupt:
-                print(f"interrupted after {len(told)} of {len(todo)} sessions", flush=True)
+                print(f"interrupted after {len(judged)} of {len(todo)} sessions", flush=True)
                 pool.shutdown(cancel_futures=True)
-            kept |= tabled(told)
-            _print_degenerate(told)
+            kept |= counts_by_kind(judged)
+            _print_degenerate(judged)
             _keep(arguments.json, kept)
-            if len(told) < len(todo):
+            if len(judged) < len(todo):
                 return
         if "stds" in arguments.only:
-            print("\nwithin 1.96 std (asked 93 to 97 %), and the histogram of z from -4 to 4")
+            print("\nwithin 1.96 std (required 93 to 97 %), and the histogram of z from -4 to 4")
             for regime in chosen([r.name for r in REGIMES]):
                 runs = list(pool.map(partial(scores, regime), seeds[: arguments.runs]))
                 parts = [np.array([z for run in runs for z in (run[1], run[2], run[3])[k]]) for k in range(3)]

@@ -1,11 +1,12 @@
-"""Four cameras far from a drone whose labels' errors last for seconds, with and without that being counted.
+"""Calibration of four cameras far from a drone under correlated label errors, with and without modelling them.
 
     python -m tests.bench.lasting_errors [--sessions 10] [--first 8000] [--exact-lenses] [--compare]
 
-180 s from 35 to 70 m away. Labels err by 0.4 px from row to row and by 0.2 to 2 px that stay alike for 0.5 to 5 s; a
-fifth of the rows is missing; lenses are told wrong as in `drone_pairs`, or exactly; no shutter rolls. Paths are judged
-after a similarity and a time map, lags in the middle of what a camera saw. --compare: the same sessions once more
-without `with_lasting_errors`; errors and lags are then of the sessions in which both tie in all four cameras.
+180 s from 35 to 70 m away. Label errors: white noise of 0.4 px plus a Gauss-Markov process of 0.2 to 2 px with a time
+constant of 0.5 to 5 s; a fifth of the rows is missing; given intrinsics are wrong as in `drone_pairs`, or exact; global
+shutters. Paths are compared after a similarity and a time map, lags in the middle of a camera's span. --compare: the
+same sessions once more without `refit_with_correlated_noise`; errors and lags are then of the sessions in which both
+settings solve all four cameras.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import numpy as np  # noqa: E402
 from scipy.signal import lfilter  # noqa: E402
 
-from hub.bundle.correlated_noise import with_lasting_errors  # noqa: E402
-from hub.bundle.problem import Problem, State  # noqa: E402
+from hub.bundle.correlated_noise import refit_with_correlated_noise  # noqa: E402
+from hub.bundle.problem import AdjustmentState, Problem  # noqa: E402
 from hub.calibration.pipeline import calibrate  # noqa: E402
 from protocols.core.clocks import TimeMap  # noqa: E402
 from protocols.core.errors import Refused  # noqa: E402
@@ -31,9 +32,9 @@ from protocols.geometry.types import Floats  # noqa: E402
 from protocols.session.calibration import Calibration  # noqa: E402
 from protocols.session.observations import Observations, Track  # noqa: E402
 from protocols.session.rig import Rig, RigCamera  # noqa: E402
-from tests import rigs  # noqa: E402
 from tests.bench import scoring  # noqa: E402
 from tests.bench.drone_pairs import FPS, SIZE, flight, lenses  # noqa: E402
+from tests.support import rigs  # noqa: E402
 
 CAMERAS = 4
 SECONDS = 180.0
@@ -45,7 +46,7 @@ _STDS = 1.96
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Session:
-    """What the cameras were told and saw; the drone's path and each camera's clock from true time."""
+    """Rig and observations; the drone's true path and each camera's clock from true time."""
 
     rig: Rig
     observations: Observations
@@ -55,7 +56,7 @@ class Session:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Run:
-    """One answer. error: mean 3-D error [m]. lags, stds: (k,) [s] against the reference. cpu: [s]."""
+    """One result. error: mean 3-D error [m]. lags, stds: (k,) [s] against the reference. cpu: [s]."""
 
     refused: int
     cpu: float
@@ -65,7 +66,7 @@ class Run:
 
 
 def session(seed: int, exact_lenses: bool = False) -> Session:
-    """One session, a pure function of its arguments; labels are the same whatever is told of the lenses."""
+    """One session, a pure function of its arguments; observations do not depend on ``exact_lenses``."""
     rng = np.random.default_rng([seed, 77])
     path, bearing = flight(rng), float(rng.uniform(0.0, 2.0 * np.pi))
     cameras, tracks, clocks = {}, {}, {}
@@ -74,7 +75,7 @@ def session(seed: int, exact_lenses: bool = False) -> Session:
         at, away = bearing + number * rng.uniform(0.4, 1.2), rng.uniform(35.0, 70.0)
         place = np.array([away * np.cos(at), away * np.sin(at), rng.uniform(-12.0, -2.0)])
         pose = rigs.looking_at(place, rng.normal(0.0, 1.5, 3), float(rng.normal(0.0, 0.03)))
-        true, told = lenses(rng)
+        true, nominal = lenses(rng)
         rate = min(float(rng.choice(FPS)), _LARGEST_FPS)
         clock = TimeMap(1.0 + 1e-6 * rng.uniform(-100.0, 100.0), rng.uniform(0.0, 1e3))
         instant = rng.uniform(0.0, 1.0 / rate) + np.arange(int(SECONDS * rate)) / rate
@@ -83,33 +84,34 @@ def session(seed: int, exact_lenses: bool = False) -> Session:
             seen = ((pixels >= 0) & (pixels < SIZE)).all(axis=1)
         seen &= rng.random(len(instant)) > _DROPPED
         shown, rows = clock.time_offset + clock.clock_rate * instant[seen], pixels[seen]
-        cameras[name] = RigCamera(name, SIZE, fps=rate, intrinsics=true if exact_lenses else told)
+        cameras[name] = RigCamera(name, SIZE, fps=rate, intrinsics=true if exact_lenses else nominal)
         tracks[name, "marker"] = Track(name, "marker", np.flatnonzero(seen), shown, rows, np.full(len(rows), np.nan))
         clocks[name] = clock
     return Session(Rig(cameras), Observations(tracks), path, clocks)
 
 
 def _noise(rng: np.random.Generator, count: int, rate: float) -> Floats:
-    """Labels' errors (n, 2) [px]: each row's own, and a Gauss-Markov process of this camera's size and duration."""
-    seconds, lasting = rng.uniform(0.5, 5.0), rng.uniform(0.2, 2.0)
-    alike = np.exp(-1.0 / (rate * seconds))
-    fresh = rng.normal(0.0, lasting, (count, 2))
-    fresh[1:] *= np.sqrt(1.0 - alike**2)
-    stays = lfilter([1.0], [1.0, -alike], fresh, axis=0)
-    return np.asarray(stays + rng.normal(0.0, _WHITE_PX, (count, 2)))
+    """Label errors (n, 2) [px]: white noise plus a Gauss-Markov process with this camera's std and time constant."""
+    time_constant, std = rng.uniform(0.5, 5.0), rng.uniform(0.2, 2.0)
+    correlation = np.exp(-1.0 / (rate * time_constant))
+    innovation = rng.normal(0.0, std, (count, 2))
+    innovation[1:] *= np.sqrt(1.0 - correlation**2)
+    correlated_errors = lfilter([1.0], [1.0, -correlation], innovation, axis=0)
+    return np.asarray(correlated_errors + rng.normal(0.0, _WHITE_PX, (count, 2)))
 
 
-def as_rows_of_their_own(problem: Problem, state: State) -> tuple[Problem, State]:
-    """In place of `with_lasting_errors`: the adjustment stays as it is."""
+def without_refit(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
+    """Replaces `refit_with_correlated_noise`: the adjustment stays unchanged."""
     return problem, state
 
 
-def run(one: Session, counted: bool) -> Run:
-    """One calibration, judged. counted: whether errors that last are looked for."""
+def run(one: Session, correlated: bool) -> Run:
+    """One calibration, evaluated. correlated: whether correlated noise is modelled."""
     began = time.process_time()
     try:
         with mock.patch(
-            "hub.calibration.pipeline.with_lasting_errors", with_lasting_errors if counted else as_rows_of_their_own
+            "hub.calibration.pipeline.refit_with_correlated_noise",
+            refit_with_correlated_noise if correlated else without_refit,
         ):
             found = calibrate(one.rig, one.observations)
     except Refused:
@@ -126,7 +128,7 @@ def run(one: Session, counted: bool) -> Run:
 
 
 def _error(one: Session, found: Calibration) -> float:
-    """Mean 3-D error [m] of the path; infinite where nothing of it is the truth's."""
+    """Mean 3-D error [m] of the path; infinite where it cannot be aligned with the truth."""
     instant, table = np.arange(0.0, SECONDS, 0.2), found.trajectories[0]
     try:
         return float(scoring.align(table.time, table.position, instant, one.path.at(instant)).error.mean())
@@ -135,17 +137,17 @@ def _error(one: Session, found: Calibration) -> float:
 
 
 def _lag(one: Session, found: Calibration, name: str) -> float:
-    """By how much [s] a camera's map to the reference clock is off in the middle of what the camera saw."""
+    """Error [s] of a camera's map to the reference clock in the middle of the camera's span."""
     shown = one.observations.tracks[name, "marker"].time
     middle = 0.5 * float(shown[0] + shown[-1])
-    clock, reference, told = one.clocks[name], one.clocks[found.reference], found.cameras[name].time_map
+    clock, reference, nominal = one.clocks[name], one.clocks[found.reference], found.cameras[name].time_map
     instant = (middle - clock.time_offset) / clock.clock_rate
     truth = reference.clock_rate * instant + reference.time_offset
-    return told.clock_rate * middle + told.time_offset - truth
+    return nominal.clock_rate * middle + nominal.time_offset - truth
 
 
 def row(setting: str, runs: list[Run], whole: list[int]) -> str:
-    """One setting's figures; whole: the sessions of which errors and lags are told."""
+    """One setting's table row; whole: indices of the sessions whose errors and lags are reported."""
     refused, cpu = sum(one.refused for one in runs), np.mean([one.cpu for one in runs])
     if whole:
         errors = 100.0 * np.array([runs[i].error for i in whole])
@@ -163,19 +165,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sessions", type=int, default=10)
     parser.add_argument("--first", type=int, default=8000, help="first seed")
-    parser.add_argument("--exact-lenses", action="store_true", help="lenses are as told")
-    parser.add_argument("--compare", action="store_true", help="once more without lasting errors")
+    parser.add_argument("--exact-lenses", action="store_true", help="given intrinsics are exact")
+    parser.add_argument("--compare", action="store_true", help="once more without modelling correlated noise")
     options = parser.parse_args()
-    settings = {"lasting errors": True} | ({"without": False} if options.compare else {})
+    settings = {"correlated noise": True} | ({"without": False} if options.compare else {})
     runs: dict[str, list[Run]] = {setting: [] for setting in settings}
     for seed in range(options.first, options.first + options.sessions):
         one = session(seed, options.exact_lenses)
-        for setting, counted in settings.items():
-            runs[setting].append(run(one, counted))
+        for setting, correlated in settings.items():
+            runs[setting].append(run(one, correlated))
     whole = [i for i in range(options.sessions) if all(made[i].refused == 0 for made in runs.values())]
     print(
         f"seeds {options.first} to {options.first + options.sessions - 1}, lenses "
-        f"{'exactly as told' if options.exact_lenses else 'told a little wrong'}; errors and lags of the "
+        f"{'given exactly' if options.exact_lenses else 'given slightly wrong'}; errors and lags of the "
         f"{len(whole)} of {options.sessions} sessions with all {CAMERAS} cameras"
         f"{' in both settings' if options.compare else ''}"
     )

@@ -1,8 +1,8 @@
-"""Lenses that nobody measured: how well the common path tells them, over random rigs.
+"""Lens self-calibration from the common path: accuracy over random rigs.
 
     python -m tests.bench.lenses [--sessions 12] [--cameras 4] [--start 50]
 
-Sessions of 30 s, 0.5 px, no lens known (``tests/rigs.py``: 53° to 67° across, principal points 8 px (std) from the
+Sessions of 30 s, 0.5 px, no lens known (``tests/support/rigs.py``: 53° to 67°, principal points 8 px (std) from the
 middle, k1, k2, p1, p2, fy 0.2 % off fx). ``z``: the error over its std, 1 (rms) if the stds are right.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from hub.calibration.pipeline import calibrate
 from protocols.core.errors import Refused
-from tests.rigs import simulate
+from tests.support.rigs import simulate
 
 
 def main() -> int:

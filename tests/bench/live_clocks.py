@@ -1,15 +1,15 @@
-"""The live hub's clocks: against the offline answer on the same rows, while a clock drifts, and when one steps.
+"""Clock estimates of the live hub: against the offline result on the same rows, under clock drift, after clock steps.
 
     python -m tests.bench.live_clocks [--sessions 8] [--start 0] [--only window,drift,step,steady,links]
 
-Three cameras, 0.5 px, clocks of any epoch; messages arrive in the order in which they were made. window: error of the
-live hub's last clocks over 20 s, over that of `calibrate` on the rows of those 20 s as they were made (asked: 1.2).
+Three cameras, 0.5 px, clocks of any origin; messages arrive in the order in which they were made. window: error of the
+live hub's last clocks over 20 s, over that of `calibrate` on the rows of those 20 s as they were made (required: 1.2).
 drift: one clock runs 200 ppm faster from the 30th second on; the largest error of the published map at that camera's
-present time (asked: 1 ms), when it is published, and whenever a frame comes while it is the newest; and the same where
-nothing drifts. step: one clock jumps by 0.3 to 30 s (asked: told within 5 s, both sides kept apart). steady: no clock
-changes, and frames are 5 to 30 ms late; published maps against those of the same hub that hears of no arrivals, which
-can correct nothing. links: the watch over clocks alone, ten minutes a session over each of several links: alarms that
-are false, and when 200 ppm are told.
+present time (required: 1 ms), when it is published, and whenever a frame comes while it is the newest; and the same
+without drift. step: one clock jumps by 0.3 to 30 s (required: detected within 5 s, both sides separate). steady: no
+clock changes, and frames are 5 to 30 ms late; published maps against those of the same hub without arrival times, which
+cannot detect changes. links: the change detector alone, ten minutes per session over several links: false alarms,
+and the delay until 200 ppm are detected.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ import numpy as np  # noqa: E402
 from scipy.signal import lfilter  # noqa: E402
 
 from hub.calibration.pipeline import calibrate  # noqa: E402
-from hub.clocks.change_detector import ClockWatch  # noqa: E402
+from hub.clocks.change_detector import ClockChangeDetector  # noqa: E402
 from hub.live.live_hub import LiveHub, LiveSettings  # noqa: E402
 from protocols.core.clocks import NANOSECONDS  # noqa: E402
 from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry.types import Floats  # noqa: E402
 from protocols.messages import syncline_pb2 as pb  # noqa: E402
-from tests import rigs  # noqa: E402
+from tests.support import rigs  # noqa: E402
 
 CHANGED = "cam1"
 CHANGES_AT_S = 30.0
@@ -43,13 +43,13 @@ _DELAY_S, _SCATTER_S = 2e-3, 3e-4
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What happens to the clock of CHANGED after CHANGES_AT_S: a jump [s], another rate (less 1)."""
+    """Change of the clock of CHANGED after CHANGES_AT_S: a step [s], and a rate change."""
 
     step_s: float = 0.0
     rate: float = 0.0
 
     def shown(self, own: float, true: float) -> float:
-        """What the clock shows where it would have shown ``own``."""
+        """The clock reading after the change, where it would have been ``own``."""
         after = true - CHANGES_AT_S
         return own if after <= 0.0 else own + self.step_s + self.rate * after
 
@@ -95,7 +95,7 @@ def stream(
 
 
 def window(seeds: range) -> None:
-    """Live against offline, on the same rows."""
+    """Live against offline calibration on the same rows."""
     live: list[float] = []
     offline: list[float] = []
     refused = 0
@@ -126,8 +126,8 @@ def window(seeds: range) -> None:
         if found is None or hub.calibration is None or hub.refusal is not None:
             refused += 1
             continue
-        for told, answer in ((live, hub.calibration), (offline, found)):
-            told += [
+        for clock_errors, answer in ((live, hub.calibration), (offline, found)):
+            clock_errors += [
                 late.clock_error(name, answer.reference, camera.time_map)
                 for name, camera in answer.cameras.items()
                 if name != answer.reference
@@ -135,20 +135,20 @@ def window(seeds: range) -> None:
     rms = [1e3 * float(np.sqrt(np.mean(np.square(errors)))) for errors in (live, offline)]
     print(
         f"window of {WINDOW_S:.0f} s, {len(seeds)} sessions: clocks live {rms[0]:.3f} ms, offline {rms[1]:.3f} ms "
-        f"(rms), ratio {rms[0] / rms[1]:.3f} (asked 1.2); {refused} refused by either",
+        f"(rms), ratio {rms[0] / rms[1]:.3f} (required 1.2); {refused} refused by either",
         flush=True,
     )
 
 
 @dataclass(frozen=True, slots=True)
-class Followed:
-    """How a change went: seconds after it until it was told and until the map was right again (None = never).
+class ChangeResult:
+    """Result of one clock change: seconds until it was detected, and until the map was correct again (None = never).
 
     errors: (seconds after the change, error [ms] at the camera's present time) of each published map; aged: the same at
-    every frame of the camera, of the newest map. counts: of the watch's alarms.
+    every frame of the camera, of the newest map. counts: of the detector's alarms.
     """
 
-    told_s: float | None
+    detected_s: float | None
     right_s: float | None
     errors: list[tuple[float, float]]
     aged: list[tuple[float, float]]
@@ -156,16 +156,21 @@ class Followed:
     drifts: int
 
 
-def follow(
-    seed: int, change: Change, seconds: float, right_ms: float, scatter_s: float = _SCATTER_S, heard: bool = True
-) -> Followed:
-    """One session in which a clock changes; the map of every calibration is judged at once.
+def run_session(
+    seed: int,
+    change: Change,
+    seconds: float,
+    right_ms: float,
+    scatter_s: float = _SCATTER_S,
+    with_arrivals: bool = True,
+) -> ChangeResult:
+    """One session with a clock change; the map of every calibration is evaluated at once.
 
-    heard: whether the hub knows when messages arrived.
+    with_arrivals: whether the hub gets arrival times.
     """
     session = rigs.simulate(seed, 3, seconds, late=2.0, fps=(30.0,))
     hub = LiveHub(LiveSettings(window_s=30.0, interval_s=4.0))
-    told = right = None
+    detected = right = None
     errors: list[tuple[float, float]] = []
     aged: list[tuple[float, float]] = []
     newest: tuple[pb.CameraCalibration, str] | None = None
@@ -177,10 +182,10 @@ def follow(
         return 1e3 * abs(float(camera.clock_rate) * shown + float(camera.time_offset) - session.shown(reference, true))
 
     for true, message in stream(session, change, seed, scatter_s):
-        hub.handle(message, true + _DELAY_S if heard else None)
+        hub.handle(message, true + _DELAY_S if with_arrivals else None)
         after = true - CHANGES_AT_S
-        if told is None and hub.counters["clock_steps"] + hub.counters["clock_drifts"]:
-            told = after
+        if detected is None and hub.counters["clock_steps"] + hub.counters["clock_drifts"]:
+            detected = after
         for out in hub.tick(true):
             if not isinstance(out, pb.Calibration) or out.status != "solved":
                 continue
@@ -193,60 +198,62 @@ def follow(
                 right = after
         if newest is not None and message.camera == CHANGED:
             aged.append((after, off_ms(true)))
-    return Followed(told, right, errors, aged, hub.counters["clock_steps"], hub.counters["clock_drifts"])
+    return ChangeResult(detected, right, errors, aged, hub.counters["clock_steps"], hub.counters["clock_drifts"])
 
 
 def drift(seeds: range, jitter_s: float) -> None:
-    """A change of rate of 200 ppm, either way."""
+    """A rate change of 200 ppm in either direction."""
     for seed in seeds:
-        found = follow(seed, Change(rate=2e-4 if seed % 2 else -2e-4), 75.0, 1.0, jitter_s)
-        even = follow(seed, Change(), 75.0, 1.0, jitter_s)
+        found = run_session(seed, Change(rate=2e-4 if seed % 2 else -2e-4), 75.0, 1.0, jitter_s)
+        even = run_session(seed, Change(), 75.0, 1.0, jitter_s)
         usual = max((e for at, e in even.aged if at > 0.0), default=float("nan"))
         before = max((e for at, e in found.errors if at <= 0.0), default=float("nan"))
         worst = max((e for at, e in found.errors if at > 0.0), default=float("nan"))
-        settled = max((e for at, e in found.errors if at > 20.0), default=float("nan"))
+        converged = max((e for at, e in found.errors if at > 20.0), default=float("nan"))
         between = max((e for at, e in found.aged if at > 0.0), default=float("nan"))
-        told = "never told" if found.told_s is None else f"told after {found.told_s:.1f} s"
+        detected = "never detected" if found.detected_s is None else f"detected after {found.detected_s:.1f} s"
         print(
-            f"drift of 200 ppm, session {seed}: {told}, {found.drifts} alarms of drift, {found.steps} of steps; map "
-            f"{before:.2f} ms off before, {worst:.2f} ms at worst after, {settled:.2f} ms from 20 s on (asked 1 ms); "
-            f"{between:.2f} ms at worst between two maps, {usual:.2f} if nothing drifts",
+            f"drift of 200 ppm, session {seed}: {detected}, {found.drifts} alarms of drift, {found.steps} of steps; "
+            f"map {before:.2f} ms off before, {worst:.2f} ms at worst after, {converged:.2f} ms from 20 s on "
+            f"(required 1 ms); {between:.2f} ms at worst between two maps, {usual:.2f} if nothing drifts",
             flush=True,
         )
 
 
 def step(seeds: range) -> None:
-    """A jump either way."""
+    """A clock step in either direction."""
     for seed in seeds:
         size = float(np.random.default_rng([seed, 21]).choice([-30.0, -1.0, -0.3, 0.3, 1.0, 30.0]))
-        found = follow(seed, Change(step_s=size), 40.0, 5.0)
-        told = "never told" if found.told_s is None else f"told after {found.told_s:.2f} s"
+        found = run_session(seed, Change(step_s=size), 40.0, 5.0)
+        detected = "never detected" if found.detected_s is None else f"detected after {found.detected_s:.2f} s"
         right = "never" if found.right_s is None else f"after {found.right_s:.2f} s"
-        worst = max((e for at, e in found.errors if at > (found.told_s or 0.0)), default=float("nan"))
+        worst = max((e for at, e in found.errors if at > (found.detected_s or 0.0)), default=float("nan"))
         print(
-            f"step of {size:+.1f} s, session {seed}: {told} (asked 5 s), {found.steps} alarms of steps, {found.drifts} "
-            f"of drift; map right {right}, at worst {worst:.2f} ms off from then on",
+            f"step of {size:+.1f} s, session {seed}: {detected} (required 5 s), {found.steps} alarms of steps, "
+            f"{found.drifts} of drift; map right {right}, at worst {worst:.2f} ms off from then on",
             flush=True,
         )
 
 
 def steady(seeds: range) -> None:
-    """Clocks that change nothing, behind links that hold frames up."""
+    """Constant clocks behind links with varying delay."""
     for seed in seeds:
         scatter_s = float(np.random.default_rng([seed, 22]).uniform(5e-3, 30e-3))
-        told, plain = (follow(seed, Change(), 60.0, 1.0, scatter_s, heard) for heard in (True, False))
-        worst = [max((e for _, e in found.aged), default=float("nan")) for found in (told, plain)]
-        rms = [float(np.sqrt(np.mean([e**2 for _, e in found.aged]))) for found in (told, plain)]
+        detected, plain = (
+            run_session(seed, Change(), 60.0, 1.0, scatter_s, with_arrivals) for with_arrivals in (True, False)
+        )
+        worst = [max((e for _, e in found.aged), default=float("nan")) for found in (detected, plain)]
+        rms = [float(np.sqrt(np.mean([e**2 for _, e in found.aged]))) for found in (detected, plain)]
         print(
-            f"steady, frames {1e3 * scatter_s:.0f} ms late, session {seed}: {told.drifts} alarms of drift, "
-            f"{told.steps} of steps; map {rms[0]:.3f} ms off (rms; {worst[0]:.3f} at worst), "
+            f"steady, frames {1e3 * scatter_s:.0f} ms late, session {seed}: {detected.drifts} alarms of drift, "
+            f"{detected.steps} of steps; map {rms[0]:.3f} ms off (rms; {worst[0]:.3f} at worst), "
             f"{rms[1]:.3f} ({worst[1]:.3f}) without arrivals",
             flush=True,
         )
 
 
 Link = Callable[[np.random.Generator, Floats], Floats]
-"""How late frames of true times (n,) [s] arrive [s]."""
+"""Delay [s] of frames with true times (n,) [s]."""
 
 
 def _jitter(mean_s: float) -> Link:
@@ -254,7 +261,7 @@ def _jitter(mean_s: float) -> Link:
 
 
 def _wandering(tau_s: float, spread_s: float) -> Link:
-    """Delays that come and go within tau_s, as those of a busy machine do."""
+    """Delays correlated over tau_s, as on a busy machine."""
 
     def late(rng: np.random.Generator, true: Floats) -> Floats:
         keeps = float(np.exp(-1.0 / tau_s))
@@ -266,14 +273,14 @@ def _wandering(tau_s: float, spread_s: float) -> Link:
 
 
 def _routes(rng: np.random.Generator, true: Floats) -> Floats:
-    """Every 20 s or so the way is another one, up to a millisecond longer."""
+    """Route changes about every 20 s, with delays up to a millisecond longer."""
     at = np.sort(rng.uniform(0.0, true[-1], rng.poisson(true[-1] / 20.0)))
     level = np.append(0.0, rng.uniform(0.0, 1e-3, len(at)))
     return np.asarray(2e-3 + level[np.searchsorted(at, true)] + rng.exponential(3e-4, len(true)))
 
 
 def _loads(rng: np.random.Generator, true: Floats) -> Floats:
-    """Every 30 s or so a load begins within 0.5 to 5 s, which makes frames a millisecond late, and ends again."""
+    """About every 30 s a load builds up within 0.5 to 5 s, delays frames by a millisecond, and ends again."""
     late = 2e-3 + rng.exponential(3e-4, len(true))
     for at in rng.uniform(0.0, true[-1], rng.poisson(true[-1] / 30.0)):
         rise, stay = rng.uniform(0.5, 5.0), rng.uniform(1.0, 20.0)
@@ -297,27 +304,27 @@ LINKS: dict[str, Link] = {
 
 
 def links(seeds: range) -> None:
-    """The watch alone: ten minutes without a change and one drift of 200 ppm for each seed."""
+    """The change detector alone: ten minutes without a change and one drift of 200 ppm for each seed."""
     for name, link in LINKS.items():
-        false, told = 0, list[float]()
+        false, detected = 0, list[float]()
         for seed in seeds:
             false += len(_alarms(link, seed, 600.0, 0.0))
             begins = CHANGES_AT_S + float(np.random.default_rng([seed, 23]).uniform(0.0, 1.0))
             alarms = _alarms(link, seed, begins + 30.0, 2e-4 if seed % 2 else -2e-4, begins)
             right = [at - begins for at in alarms if at > begins]
             false += len(alarms) - len(right)
-            told += right[:1]
-        when = f"after {np.median(told):.1f} s (at most {max(told):.1f})" if told else "never"
+            detected += right[:1]
+        when = f"after {np.median(detected):.1f} s (at most {max(detected):.1f})" if detected else "never"
         print(
-            f"{name:34} {false} false alarms in {len(seeds) / 6:.1f} h; 200 ppm told in {len(told)} of {len(seeds)}, "
-            + when,
+            f"{name:34} {false} false alarms in {len(seeds) / 6:.1f} h; 200 ppm detected in "
+            f"{len(detected)} of {len(seeds)}, " + when,
             flush=True,
         )
 
 
 def _alarms(link: Link, seed: int, seconds: float, rate: float, begins: float = 0.0) -> list[float]:
     """True times of the alarms of one camera's clock, 30 fps, up to 200 ppm off from the beginning."""
-    rng, watch, alarms = np.random.default_rng([seed, 24]), ClockWatch(), list[float]()
+    rng, watch, alarms = np.random.default_rng([seed, 24]), ClockChangeDetector(), list[float]()
     true = np.arange(round(30.0 * seconds)) / 30.0
     shown = true * (1.0 + rng.uniform(-2e-4, 2e-4)) + rate * np.maximum(0.0, true - begins)
     arrival = np.maximum.accumulate(true + link(rng, true))
@@ -329,7 +336,7 @@ def _alarms(link: Link, seed: int, seconds: float, rate: float, begins: float = 
 
 
 def main() -> None:
-    """Print the rows that are asked for."""
+    """Print the requested rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sessions", type=int, default=8)
     parser.add_argument("--start", type=int, default=0, help="first seed")

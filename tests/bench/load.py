@@ -6,7 +6,7 @@ The cameras are spread over ten processes' worth of sessions in one feeding proc
 the live hub's estimator (gathering, clocks, no solving, which depends on the rig and not on the load) in a process of
 its own. Latency: from put to the moment at which the hub's process has it, on one machine's clock. Memory: resident
 size of the hub's process, and a straight line through it after a third of the time as warm-up, with its standard
-error as the scatter tells it in ten pieces.
+error from the scatter of ten pieces.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from protocols.bus.router.zenoh_router import Router, free_endpoint
-from protocols.bus.security.sender_identity import GuardedBus
+from protocols.bus.security.sender_identity import SenderCheckedBus
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.messages import syncline_pb2 as pb
@@ -41,16 +41,16 @@ def resident_mb(pid: int | str = "self") -> float:
 
 def hub(endpoint: str, site: str = "local") -> None:
     """The hub's process: counts, latencies and memory as lines of JSON, one a second, until its input ends."""
-    from hub.live.agent import settle_memory
+    from hub.live.agent import freeze_garbage_collector
     from hub.live.live_hub import LiveHub, LiveSettings
 
     estimator = LiveHub(LiveSettings(window_s=10.0, interval_s=1e9))
     with open_bus(site, BusConfig(mode="client", connect=(endpoint,)), timeout_s=10.0) as bus:
-        guarded = GuardedBus(bus, time.monotonic)
+        guarded = SenderCheckedBus(bus, time.monotonic)
         subscriptions = [guarded.subscribe(topic) for topic in (CAMERA_INFO, OBSERVATION)]
         ended = threading.Event()
         threading.Thread(target=lambda: (sys.stdin.read(), ended.set()), daemon=True).start()
-        settle_memory()
+        freeze_garbage_collector()
         print(json.dumps({"ready": True}), flush=True)
         next_line, latencies, loop = time.monotonic() + 1.0, [], [0.0]
         while not ended.is_set():

@@ -1,9 +1,9 @@
-"""What logs cost and what they survive: rates beside the raw MCAP writer, kill -9, cuts, flipped bytes.
+"""Cost and robustness of logs: rates beside the raw MCAP writer, kill -9, cuts, flipped bytes.
 
     python -m tests.bench.logs [--quick] [--load-minutes 10]
 
 Rates are the median of interleaved rounds in one process on one core. kill -9 goes to a real recorder behind a
-Zenoh router that hears 200 observations a second; lost: from the last one in the log to the kill.
+Zenoh router that receives 200 observations a second; lost: from the last one in the log to the kill.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from protocols.log.write.writer import CHUNK_SIZE, LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import FLIGHT_IMAGE, OBSERVATION, STATUS
 from protocols.validation.codec import encode
-from tests.integration.test_record_replay import RECORDER
+from tests.integration.logs.test_record_replay import RECORDER
 
 KEY = OBSERVATION.key_for("local", "cam0")
 
@@ -59,8 +59,8 @@ def messages(count: int) -> list[pb.Observation]:
     return out
 
 
-def pictures(count: int, size: int = 100_000) -> list[pb.FlightImage]:
-    """Pictures of 100 KB that compress no further, as JPEGs do, 30 a second."""
+def image_messages(count: int, size: int = 100_000) -> list[pb.FlightImage]:
+    """Images of 100 KB that compress no further, as JPEGs do, 30 a second."""
     generator = random.Random(5)
     return [
         pb.FlightImage(
@@ -134,8 +134,8 @@ def rates(folder: Path, count: int, rounds: int) -> None:
 
 
 def bandwidth(folder: Path, count: int, rounds: int) -> None:
-    """Pictures of 100 KB, ours beside mcap's own writer."""
-    items = pictures(count)
+    """Images of 100 KB, ours beside mcap's own writer."""
+    items = image_messages(count)
 
     def ours(path: Path, views: bool) -> None:
         with LogWriter(path, views=views) as log:
@@ -156,7 +156,7 @@ def bandwidth(folder: Path, count: int, rounds: int) -> None:
             run(path)
             times[name].append(time.process_time() - began)
     medians = {name: statistics.median(values) for name, values in times.items()}
-    print(f"{count} pictures of 100 KB; CPU time, median of {rounds}")
+    print(f"{count} images of 100 KB; CPU time, median of {rounds}")
     for name, seconds in medians.items():
         print(f"  {name:34} {count * 0.1 / seconds:>10,.0f} MB/s")
     raw, plain, viewed = medians.values()
@@ -189,9 +189,9 @@ def seek(folder: Path, megabytes: int) -> None:
 
 
 def load(folder: Path, seconds: float, rate_hz: int = 5000, streams: int = 4, picture_hz: int = 5) -> None:
-    """Ten cameras, 5,000 observations a second in all, and four of 100 KB pictures, to a real recorder over Zenoh."""
+    """Ten cameras, 5,000 observations a second in all, and four of 100 KB images, to a real recorder over Zenoh."""
     endpoint, path, cameras = free_endpoint(), folder / "load.mcap", [f"cam{i}" for i in range(10)]
-    items, shown = messages(2000), pictures(20)
+    items, shown = messages(2000), image_messages(20)
     rounds, every = int(seconds * rate_hz / len(cameras)), rate_hz // len(cameras) // picture_hz
     with Router(endpoint), open_bus("local", BusConfig(mode="client", connect=(endpoint,))) as bus:
         publishers = {name: bus.publisher(OBSERVATION, name, rate_hz=rate_hz / len(cameras)) for name in cameras}
@@ -203,7 +203,7 @@ def load(folder: Path, seconds: float, rate_hz: int = 5000, streams: int = 4, pi
         for publisher in (*publishers.values(), *images.values()):
             publisher.wait_matched(10.0)  # what is put before anybody listens is no loss of the recorder's
         began, sent_images = time.monotonic(), 0
-        told: list[Any] = []
+        status: list[Any] = []
         for number in range(rounds):
             item = items[number % len(items)]
             item.sequence = item.frame = number
@@ -218,15 +218,15 @@ def load(folder: Path, seconds: float, rate_hz: int = 5000, streams: int = 4, pi
                     sent_images += 1
             time.sleep(max(0.0, began + (number + 1) * len(cameras) / rate_hz - time.monotonic()))
             if number % 500 == 0:
-                told = [received.message for received in statuses.drain()] or told
+                status = [received.message for received in statuses.drain()] or status
         took = time.monotonic() - began
         # What is still on its way is no loss: the recorder is stopped when it has had nothing new for two seconds.
-        heard, quiet = -1, time.monotonic()
+        recorded, quiet = -1, time.monotonic()
         while time.monotonic() - quiet < 2.0 and time.monotonic() - began < took + 60.0:
             time.sleep(0.1)
-            told = [received.message for received in statuses.drain()] or told
-            if told and told[-1].counters["recorded"] - told[-1].sequence != heard:
-                heard, quiet = told[-1].counters["recorded"] - told[-1].sequence, time.monotonic()
+            status = [received.message for received in statuses.drain()] or status
+            if status and status[-1].counters["recorded"] - status[-1].sequence != recorded:
+                recorded, quiet = status[-1].counters["recorded"] - status[-1].sequence, time.monotonic()
         before = os.times()
         process.send_signal(signal.SIGTERM)
         process.communicate()
@@ -238,12 +238,12 @@ def load(folder: Path, seconds: float, rate_hz: int = 5000, streams: int = 4, pi
     }
     sent = rounds * len(cameras)
     print(
-        f"{sent / took:,.0f} observations/s and {streams} streams of {picture_hz} pictures/s for {took:.0f} s: ", end=""
+        f"{sent / took:,.0f} observations/s and {streams} streams of {picture_hz} images/s for {took:.0f} s: ", end=""
     )
     print(f"{sent - counts['observation']} of {sent} and {sent_images - counts['image']} of {sent_images} ", end="")
     print(f"not in the log; recorder {cpu / took:.0%} of a core, log {path.stat().st_size / 1e6:.0f} MB")
-    if told:
-        print(f"  the recorder itself counted: {dict(told[-1].counters)}")
+    if status:
+        print(f"  the recorder itself counted: {dict(status[-1].counters)}")
     path.unlink()
 
 
@@ -294,7 +294,7 @@ def damaged(content: bytes, count: int) -> Iterator[tuple[str, bytes]]:
 
 
 def damage(folder: Path, count: int) -> None:
-    """Damaged copies of one log of 40 chunks: are they told, made whole, and how much is left?"""
+    """Damaged copies of one log of 40 chunks: are they reported, repaired, and how much is left?"""
     items = messages(4000)
     with LogWriter(folder / "d.mcap") as log:
         for index, item in enumerate(items):
@@ -304,7 +304,7 @@ def damage(folder: Path, count: int) -> None:
     content = (folder / "d.mcap").read_bytes()
     written = {item.sequence: item for item in items}
     found: dict[str, list[float]] = {}
-    told = wrong = refused = 0
+    reported = wrong = refused = 0
     for kind, data in damaged(content, count):
         (folder / "x.mcap").write_bytes(data)
         out = folder / "y.mcap"
@@ -313,9 +313,9 @@ def damage(folder: Path, count: int) -> None:
             recovery = recover(folder / "x.mcap", out)
         except Refused:
             refused += 1
-            told += 1
+            reported += 1
             continue
-        told += bool(recovery.damage)
+        reported += bool(recovery.damage)
         with out.open("rb") as stream:
             for _, _, message in make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False):
                 read = pb.Observation.FromString(message.data)
@@ -323,7 +323,7 @@ def damage(folder: Path, count: int) -> None:
         share = recovery.messages / (len(items) * (len(data) / len(content) if kind == "cut" else 1.0))
         found.setdefault(kind, []).append(share)
     total = 3 * count
-    print(f"{total} damaged copies of a log of 40 chunks: {told} told, {wrong} messages changed, {refused} refused")
+    print(f"{total} damaged copies of a 40-chunk log: {reported} reported, {wrong} messages changed, {refused} refused")
     for kind, shares in found.items():
         print(f"  {kind:16} left of what stood there: median {statistics.median(shares):.1%}, least {min(shares):.1%}")
 

@@ -1,12 +1,12 @@
-"""How well and how fast the shipped marker detector works on rendered frames, whose truth is known.
+"""Accuracy and speed of the shipped marker detectors on rendered frames with ground truth.
 
     python -m tests.bench.marker_detector [--quick] [--only ball|others] [--frames 100] [--seeds 4] [--first-seed 0]
 
 Errors are against the projection of the ball's centre at mid-exposure. ``nees`` is the squared error divided by the
-reported covariance, 1 if the covariance is right. Look-alikes (balls and boxes of other hues, wood) are in every frame;
-of as many frames more the ball itself is missing. ``--frames``: of each of a world's three cameras; of lights and tags
-as many are drawn a case as all worlds together have, in two dozen rooms that are mirrored and change colours. Films
-are consecutive frames through an encoder, "ultrafast" as ``tests/films.py`` writes them, and back.
+reported covariance, 1 if the covariance is right. Distractors (balls and boxes of other hues, wood) are in every frame;
+the ball is missing in as many further frames. ``--frames``: per camera of a scene's three cameras; of lights and tags
+as many are rendered per case as all scenes together have, in two dozen rooms that are mirrored and change colours.
+Videos are consecutive frames through an encoder, "ultrafast" as ``tests/support/films.py`` writes them, and a decoder.
 """
 
 from __future__ import annotations
@@ -27,19 +27,23 @@ from edge import scenes
 from edge.detectors.marker.ball import MarkerDetector
 from edge.detectors.marker.bright import BrightDetector
 from edge.detectors.marker.tag import TagDetector
+from edge.scenes import renderer_for
 from edge.scenes.marker.renderer import MarkerRenderer
 from edge.scenes.marker.scene import MarkerScene
 from protocols.geometry.types import Floats
-from tests.films import write_film_of
-from tests.rendered_markers import Image, add_look_alikes, add_spot, add_tag, dim_room, exposed, tag_image
+from tests.support.films import write_video_frames
+from tests.support.rendered_markers import Image, add_distractors, add_spot, add_tag, dim_room, exposed, tag_image
 
 _ROOMS = 24  # drawn for lights and tags, each used mirrored and with its colours exchanged
 
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """Over frames in which the ball lies whole in the image. error: (n, 2) [px]. nees, size_ratio, smear [px],
-    seconds: (n,). missed: frames without a detection. false: detections more than 5 px away, of all looked_at."""
+    """Results over frames in which the ball is entirely in the image.
+
+    error: (n, 2) [px]. nees, size_ratio, smear [px], seconds: (n,). missed: frames without a detection. false:
+    detections more than 5 px away, of all looked_at.
+    """
 
     error: Floats
     nees: Floats
@@ -53,7 +57,7 @@ class Result:
 
     @property
     def rms(self) -> float:
-        """Of one coordinate [px], look-alikes touching the ball and all."""
+        """RMS of one coordinate [px], including frames in which distractors touch the ball."""
         return float(np.sqrt(np.mean(self.error**2)))
 
 
@@ -66,11 +70,11 @@ def measure(
     exposure_s: float | None = None,
     crf: int | None = None,
 ) -> Result:
-    """Detect the ball in rendered frames of three cameras of each world; crf: consecutive ones, through H.264."""
+    """Detect the ball in rendered frames of three cameras of each scene; crf: consecutive ones, through H.264."""
     rows: list[tuple[float, ...]] = []
     total = missed = false = 0
     for seed in seeds:
-        scene = scenes.get(name, seed)
+        scene = scenes.get_marker_scene(name, seed)
         if exposure_s is not None:
             cameras = tuple(dataclasses.replace(camera, exposure_s=exposure_s) for camera in scene.cameras)
             scene = dataclasses.replace(scene, cameras=cameras)
@@ -80,10 +84,10 @@ def measure(
             moments = np.linspace(1.0, 60.0, frames) + 0.013 * seed
             if crf is not None:
                 moments = 2.0 + 0.37 * seed + np.arange(frames) / 30.0
-            pictures: Iterator[Image] = (renderer.render(moment) for moment in moments)
+            images: Iterator[Image] = (renderer.render(moment) for moment in moments)
             if crf is not None:
-                pictures = _filmed(pictures, (camera.intrinsics.width, camera.intrinsics.height), crf)
-            for moment, image in zip(moments, pictures, strict=True):
+                images = _compressed(images, (camera.intrinsics.width, camera.intrinsics.height), crf)
+            for moment, image in zip(moments, images, strict=True):
                 began = time.process_time()
                 found = detector.detect(image)
                 seconds = time.process_time() - began
@@ -106,24 +110,24 @@ def measure(
     )
 
 
-def _filmed(pictures: Iterator[Image], size: tuple[int, int], crf: int) -> Iterator[Image]:
-    """What is left of consecutive pictures after an encoder."""
+def _compressed(images: Iterator[Image], size: tuple[int, int], crf: int) -> Iterator[Image]:
+    """Consecutive images after an encoder and decoder."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "film.mp4"
-        write_film_of(file, size, ((index / 30.0, one) for index, one in enumerate(pictures)), crf=str(crf))
+        write_video_frames(file, size, ((index / 30.0, one) for index, one in enumerate(images)), crf=str(crf))
         with av.open(str(file)) as container:
             for frame in container.decode(video=0):
                 yield np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
 
 
 def without_ball(name: str, *, seeds: range, frames: int, noise: float = 4.0) -> tuple[int, int]:
-    """(frames, detections) of worlds from which the ball has gone: what is found there is a look-alike.
+    """(frames, detections) of scenes without the ball: all detections are false.
 
-    Look-alikes and the light differ from world to world, the noise from frame to frame.
+    Distractors and the light differ from scene to scene, the noise from frame to frame.
     """
     total = found = 0
     for seed in seeds:
-        scene = scenes.get(name, seed)
+        scene = scenes.get_marker_scene(name, seed)
         scene = dataclasses.replace(scene, path=dataclasses.replace(scene.path, centre=np.array([0.0, 0.0, 5000.0])))
         for camera in scene.cameras[:3]:
             renderer = MarkerRenderer(scene, camera.name, np.random.default_rng([seed, 1]), noise_std=noise)
@@ -147,8 +151,8 @@ def _truth(scene: MarkerScene, name: str, moment: float) -> tuple[Floats, float,
 
 def _speed(width: int, height: int, frames: int) -> float:
     """Median seconds of one detection at an image size."""
-    scene = scenes.get("marker", 0)
-    renderer = scene.renderer("cam0", np.random.default_rng(0))
+    scene = scenes.get_marker_scene("marker", 0)
+    renderer = renderer_for(scene, "cam0", np.random.default_rng(0))
     detector = MarkerDetector()
     taken = []
     for moment in np.linspace(1.0, 30.0, frames):
@@ -160,9 +164,9 @@ def _speed(width: int, height: int, frames: int) -> float:
 
 
 def _others(frames: int, seed: int) -> None:
-    """Points of light and tags: drawn into textured rooms with look-alikes, noise 4, seeds of their own.
+    """Points of light and tags: rendered in textured rooms with distractors, noise 4, seeds of their own.
 
-    The last row of each kind is of rooms without any: what is found there is false too.
+    The last row of each kind is of rooms without any: all detections there are false.
     """
     rng = np.random.default_rng(seed)
     rooms = [dim_room(seed + index, 640, 480, 50.0) for index in range(min(_ROOMS, frames))]
@@ -189,7 +193,7 @@ def _others(frames: int, seed: int) -> None:
             picture = picture[..., rng.permutation(3)].copy()
             truth, turn = rng.uniform((90, 90), (550, 390)), rng.uniform(0.0, 2.0 * np.pi)
             smear = what[-1] * np.array([np.cos(turn), np.sin(turn)])
-            add_look_alikes(picture, rng, (truth[0], truth[1]))
+            add_distractors(picture, rng, (truth[0], truth[1]))
             if title.startswith("no "):
                 pass
             elif len(what) == 3:
@@ -227,8 +231,8 @@ def _others(frames: int, seed: int) -> None:
 
 
 def _render_speed(frames: int) -> float:
-    scene = scenes.get("marker", 0)
-    renderer = scene.renderer("cam0", np.random.default_rng(0))
+    scene = scenes.get_marker_scene("marker", 0)
+    renderer = renderer_for(scene, "cam0", np.random.default_rng(0))
     taken = []
     for moment in np.linspace(1.0, 30.0, frames):
         began = time.perf_counter()
@@ -242,8 +246,8 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument("--quick", action="store_true", help="a quarter of the frames")
     arguments.add_argument("--only", choices=("ball", "others"), help="the coloured ball; lights and tags")
-    arguments.add_argument("--frames", type=int, default=100, help="of each camera of a world")
-    arguments.add_argument("--seeds", type=int, default=4, help="worlds")
+    arguments.add_argument("--frames", type=int, default=100, help="of each camera of a scene")
+    arguments.add_argument("--seeds", type=int, default=4, help="scenes")
     arguments.add_argument("--first-seed", type=int, default=0)
     options = arguments.parse_args()
     cv2.setNumThreads(1)
@@ -273,7 +277,7 @@ def main() -> None:
             f"{1e3 * np.median(result.seconds):6.1f}  {title}",
             flush=True,
         )
-    for name in scenes.NAMES:
+    for name in scenes.MARKER_SCENES:
         total, found = without_ball(name, seeds=seeds, frames=frames)
         print(f"{total:6d}  {'–':>6}  {found:5d} of {total:6d}  {name} without the ball", flush=True)
     for width, height in ((640, 480), (1280, 720), (1920, 1080)):

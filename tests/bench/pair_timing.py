@@ -1,12 +1,11 @@
-"""Timing of two cameras over random rigs: success, error over the floor, wrong answers, and time a pair.
+"""Synchronisation of two cameras over random rigs: success, lag error over its bound, wrong solutions, CPU time.
 
     python -m tests.bench.pair_timing [--trials 100] [--regimes clean,short] [--uncalibrated] [--jobs 2]
 
-Success: time map within 5 ms RMS over the overlap **and** F within 2 px, and accepted. Wrong: accepted and over
-20 ms or 10 px off; strangers: pairs that watched different things, of which none may be accepted.
-The lag's error is the RMS at mid-overlap of all accepted answers that are not wrong, as it is and each over
-its own floor (`tests.bench.pair_trials.floor`); ms are CPU time of smoothing both tracks and solving the pair
-on one core.
+Success: accepted, with a time map within 5 ms RMS over the overlap and F within 2 px. Wrong: accepted and over 20 ms or
+10 px off. Unrelated: pairs that saw different motions, of which none may be accepted. The lag error is the RMS at
+mid-overlap of all accepted solutions that are not wrong, in ms and over each one's Cramér-Rao bound
+(`tests.bench.pair_trials.lag_bound`); ms are CPU time of smoothing both tracks and of solving the pair on one core.
 """
 
 from __future__ import annotations
@@ -34,11 +33,11 @@ from tests.bench.pair_trials import (  # noqa: E402
     MATRIX,
     Regime,
     Trial,
-    floor,
     geometry_error,
-    make,
-    map_error,
-    stranger,
+    lag_bound,
+    make_trial,
+    time_map_error,
+    unrelated_trial,
 )
 
 GOOD_S, GOOD_PX = 5e-3, 2.0
@@ -47,13 +46,13 @@ WRONG_S, WRONG_PX = 20e-3, 10.0
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A regime of the table. must, reach: shares of success; floor_must: lag error over the floor (or in ms)."""
+    """A regime of the table. required, target: success rates. max_over_bound, max_lag_ms: of the lag error."""
 
     regime: Regime
-    must: float | None = None
-    reach: float | None = None
-    floor_must: float | None = None
-    lag_must_ms: float | None = None
+    required: float | None = None
+    target: float | None = None
+    max_over_bound: float | None = None
+    max_lag_ms: float | None = None
 
 
 ROWS: dict[str, Row] = {
@@ -66,25 +65,25 @@ ROWS: dict[str, Row] = {
         Regime(late=10, fps=(30.0, 25.0), ppm=200, noise=1.0, dropped=0.2, outliers=0.1, gaps=3),
         0.98,
         0.999,
-        lag_must_ms=0.8,
+        max_lag_ms=0.8,
     ),
-    "(a)": Row(Regime(paper_path=True, span=11, late=0.5), None, None, lag_must_ms=3.1),
+    "(a)": Row(Regime(paper_path=True, span=11, late=0.5), None, None, max_lag_ms=3.1),
     "overlap 3 s of 10": Row(Regime(span=10, overlap=3), 0.95, 0.99),
     "40 % outliers, 30 % dropped": Row(Regime(outliers=0.4, dropped=0.3), 0.60, 0.95),
-    "second thing 20 %": Row(Regime(second=0.2), 0.80, 0.95),
-    "second thing 40 %": Row(Regime(second=0.4), None, 0.80),
+    "second thing 20 %": Row(Regime(second_object=0.2), 0.80, 0.95),
+    "second thing 40 %": Row(Regime(second_object=0.4), None, 0.80),
     "10 fps, 3 Hz": Row(Regime(fps=(10.0, 10.0), slowest=0.5, fastest=3.0), None, 0.80),
     "120 s, ±5000 ppm": Row(Regime(span=120, ppm=5000)),
-    "25 fps told as 30": Row(Regime(fps=(25.0, 30.0), told_fps=(30.0, 30.0))),
-    "59.94 fps told as 25": Row(Regime(fps=(30.0, 59.94), told_fps=(30.0, 25.0))),
-    "29.97 fps told as 30": Row(Regime(fps=(30.0, 29.97), told_fps=(30.0, 30.0))),
+    "25 fps told as 30": Row(Regime(fps=(25.0, 30.0), assumed_fps=(30.0, 30.0))),
+    "59.94 fps told as 25": Row(Regime(fps=(30.0, 59.94), assumed_fps=(30.0, 25.0))),
+    "29.97 fps told as 30": Row(Regime(fps=(30.0, 29.97), assumed_fps=(30.0, 30.0))),
     "rolling shutter 20 ms": Row(Regime(readout=0.02)),
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """One trial. lag_s, map_s: error at mid-overlap and RMS; f_px; floor_s; ms: CPU of smoothing and solving."""
+    """Result of a trial. lag_s, map_s: error at mid-overlap, RMS. f_px: of epipolar lines. floor_s: bound of lag_s."""
 
     status: str
     lag_s: float
@@ -108,7 +107,7 @@ class Outcome:
 
 
 def run(trial: Trial, calibrated: bool, related: bool = True) -> Outcome:
-    """Smooth, solve and score one trial. related: whether there is an answer at all."""
+    """Smooth, solve and score one trial. related: whether the two cameras saw the same motion."""
     begin = time.process_time()
     tracks = []
     for view in trial.views:
@@ -124,29 +123,27 @@ def run(trial: Trial, calibrated: bool, related: bool = True) -> Outcome:
     if answer.fit is None or not related:
         return Outcome(answer.status, np.inf, np.inf, np.inf, np.nan, *spent)
     rate = answer.fit.rate
-    lag, error = map_error(trial, rate, answer.fit.offset + a.epoch - rate * b.epoch)
+    lag, error = time_map_error(trial, rate, answer.fit.offset + a.time_origin - rate * b.time_origin)
     found = fundamental_from(answer.fit.geometry, MATRIX, MATRIX)
-    return Outcome(answer.status, lag, error, geometry_error(trial, found), floor(trial, calibrated), *spent)
+    return Outcome(answer.status, lag, error, geometry_error(trial, found), lag_bound(trial, calibrated), *spent)
 
 
 def _one(name: str, calibrated: bool, job: tuple[int, bool]) -> Outcome:
     cv2.setNumThreads(1)
     seed, related = job
     row = ROWS[name]
-    trial = make(row.regime, seed)
+    trial = make_trial(row.regime, seed)
     if not related:
-        trial = stranger(trial, row.regime, seed)
+        trial = unrelated_trial(trial, row.regime, seed)
     return run(trial, calibrated, related)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=100)
-    parser.add_argument(
-        "--start", type=int, default=10_000, help="first seed; seeds below 1000 were used while building"
-    )
+    parser.add_argument("--start", type=int, default=10_000, help="first seed")
     parser.add_argument("--regimes", default="", help="parts of their names, separated by commas")
-    parser.add_argument("--strangers", type=int, default=5, help="pairs that watched different things, a regime")
+    parser.add_argument("--strangers", type=int, default=5, help="pairs that saw different motions, per regime")
     parser.add_argument("--uncalibrated", action="store_true", help="without intrinsics: F in place of E")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--json", type=Path, help="every trial, for figures of your own")
@@ -155,23 +152,23 @@ def main() -> None:
     names = [name for name in ROWS if not wanted or any(part in name for part in wanted)]
     print(f"{options.trials} random rigs a regime, {'unknown' if options.uncalibrated else 'known'} intrinsics, 0.5 px")
     print(
-        f"{'':27s} {'success':>8s} {'must':>5s} {'reach':>6s} {'wrong':>6s} {'strangers':>10s} {'lag RMS':>9s} "
-        f"{'/ floor':>8s} {'must':>8s} {'F px':>6s} {'smooth':>7s} {'pair':>7s}"
+        f"{'':27s} {'success':>8s} {'need':>5s} {'target':>6s} {'wrong':>6s} {'unrelated':>10s} {'lag RMS':>9s} "
+        f"{'/ bound':>8s} {'need':>8s} {'F px':>6s} {'smooth':>7s} {'pair':>7s}"
     )
-    kept: dict[str, object] = {}
+    results: dict[str, object] = {}
     with ProcessPoolExecutor(options.jobs) as pool:
         for name in names:
             trials = options.trials
             jobs = [(options.start + k, True) for k in range(trials)]
             jobs += [(options.start + k, False) for k in range(options.strangers)]
             done = list(pool.map(partial(_one, name, not options.uncalibrated), jobs, chunksize=4))
-            kept[name] = [asdict(one) for one in done]
+            results[name] = [asdict(one) for one in done]
             _print(name, done[:trials], done[trials:])
     if options.json:
-        options.json.write_text(json.dumps(kept, indent=1))
+        options.json.write_text(json.dumps(results, indent=1))
 
 
-def _print(name: str, done: list[Outcome], strangers: list[Outcome]) -> None:
+def _print(name: str, done: list[Outcome], unrelated: list[Outcome]) -> None:
     row = ROWS[name]
     good = [one for one in done if one.success]
     share = len(good) / len(done)
@@ -179,10 +176,10 @@ def _print(name: str, done: list[Outcome], strangers: list[Outcome]) -> None:
     lag = np.sqrt(np.mean([one.lag_s**2 for one in counted])) if counted else np.nan
     over = np.sqrt(np.mean([(one.lag_s / one.floor_s) ** 2 for one in counted])) if counted else np.nan
     pixels = np.median([one.f_px for one in good]) if good else np.nan
-    limit = f"{row.floor_must:.2f}" if row.floor_must else f"{row.lag_must_ms:.1f} ms" if row.lag_must_ms else ""
+    limit = f"{row.max_over_bound:.2f}" if row.max_over_bound else f"{row.max_lag_ms:.1f} ms" if row.max_lag_ms else ""
     print(
-        f"{name:27s} {100 * share:6.1f} % {_percent(row.must):>5s} {_percent(row.reach):>6s} "
-        f"{sum(one.wrong for one in done):6d} {sum(one.accepted for one in strangers):3d} of {len(strangers):3d} "
+        f"{name:27s} {100 * share:6.1f} % {_percent(row.required):>5s} {_percent(row.target):>6s} "
+        f"{sum(one.wrong for one in done):6d} {sum(one.accepted for one in unrelated):3d} of {len(unrelated):3d} "
         f"{1e3 * lag:6.3f} ms {over:8.2f} {limit:>8s} {pixels:6.2f} "
         f"{np.mean([one.smooth_ms for one in done]):4.0f} ms {np.mean([one.pair_ms for one in done]):4.0f} ms",
         flush=True,
@@ -190,8 +187,8 @@ def _print(name: str, done: list[Outcome], strangers: list[Outcome]) -> None:
     reasons: dict[str, int] = {}
     for one in done:
         if not one.success:
-            told = one.status if not one.accepted else f"accepted, {1e3 * one.map_s:.1f} ms, {one.f_px:.1f} px off"
-            reasons[told[:100]] = reasons.get(told[:100], 0) + 1
+            text = one.status if not one.accepted else f"accepted, {1e3 * one.map_s:.1f} ms, {one.f_px:.1f} px off"
+            reasons[text[:100]] = reasons.get(text[:100], 0) + 1
     for reason, count in sorted(reasons.items(), key=lambda item: -item[1])[:4]:
         print(f"{'':6s}{count} × {reason}")
 

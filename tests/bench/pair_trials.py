@@ -1,7 +1,7 @@
-"""Random pairs of cameras for the timing bench: what they saw, the truth, and the floor under the lag's error.
+"""Random pairs of unsynchronised cameras with ground truth, and the Cramér-Rao bound of their lag.
 
-Two pinhole cameras stand anywhere 30° to 150° apart round a cube of ±120 (the paper's size) in which one
-marker moves; each has a clock of its own. No rig, path or clock is used twice.
+Two pinhole cameras stand 30° to 150° apart around a cube of ±120 (the paper's size) in which one marker moves; each has
+its own clock. Rig, path and clocks differ in every trial.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hub.two_view.relative_pose import RelativePose, fundamental_from, relative_pose, tangent_basis
+from hub.two_view.relative_pose import RelativePose, fundamental_from, relative_pose_between, tangent_basis
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
-from tests.rigs import looking_at
+from tests.support.rigs import looking_at
 
 FOCAL = 700.0
 SIZE = (800, 600)
@@ -27,7 +27,7 @@ PathOf = Callable[[Floats], Floats]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What one camera recorded: time (n,) on its clock [s], pixels (n, 2); good: rows of the marker itself."""
+    """Observations of one camera. time: (n,) on its clock [s]. pixels: (n, 2). good: (n,) rows of the marker itself."""
 
     time: Floats
     pixels: Floats
@@ -36,33 +36,33 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trial:
-    """Two views and the truth. The clocks: ``true = (shown - epoch) / drift``. noise: [px]."""
+    """Two views and the ground truth. Clocks: ``true = (shown - clock_offset) / clock_rate``. noise: std [px]."""
 
     views: tuple[View, View]
     poses: tuple[Pose, Pose]
-    drift: tuple[float, float]
-    epoch: tuple[float, float]
+    clock_rate: tuple[float, float]
+    clock_offset: tuple[float, float]
     path: PathOf
     noise: float
 
     def shown(self, camera: int, true: Floats) -> Floats:
         """What a camera's clock shows at true times (n,)."""
-        return self.epoch[camera] + self.drift[camera] * true
+        return self.clock_offset[camera] + self.clock_rate[camera] * true
 
     def true(self, camera: int, shown: Floats) -> Floats:
         """True times (n,) at which a camera's clock shows ``shown``."""
-        return (shown - self.epoch[camera]) / self.drift[camera]
+        return (shown - self.clock_offset[camera]) / self.clock_rate[camera]
 
     @property
     def overlap(self) -> tuple[float, float]:
-        """True times from which to which both recorded."""
+        """True times [s] of the begin and end of the common recording."""
         spans = [self.true(k, view.time[[0, -1]]) for k, view in enumerate(self.views)]
         return max(float(s[0]) for s in spans), min(float(s[1]) for s in spans)
 
     @property
     def pose(self) -> RelativePose:
         """The true relative pose, b from a."""
-        return relative_pose(*self.poses)
+        return relative_pose_between(*self.poses)
 
     @property
     def fundamental(self) -> Floats:
@@ -72,13 +72,13 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Regime:
-    """Under what conditions a trial is made; times in seconds, shares of all rows.
+    """Conditions of a trial; times in seconds, fractions of all rows.
 
-    span: of each recording. late: camera b begins within ±late of a, or, with ``overlap``, so that exactly
-    that many seconds are common. ppm: largest error of a clock's rate. told_fps: frame rates from which the times
-    were made, if wrong ones. readout: of the rolling shutter [s]. second: share of a view in
-    which the detector follows another thing.
-    paper_path: the paper's trajectory (a) before the paper's cameras.
+    span: of each recording. late: camera b begins within ±late of a, or, with ``overlap``, so that exactly that many
+    seconds are common. ppm: largest clock-rate error. dropped, outliers: fractions. gaps: number. slowest, fastest:
+    frequencies of the motion [Hz]. assumed_fps: frame rates from which the timestamps were made, if wrong ones.
+    readout: of the rolling shutter [s]. second_object: fraction of a view in which the detector follows another
+    object. paper_path: the paper's trajectory (a) in front of the paper's cameras.
     """
 
     span: float = 20.0
@@ -90,48 +90,50 @@ class Regime:
     dropped: float = 0.0
     outliers: float = 0.0
     gaps: int = 0
-    second: float = 0.0
+    second_object: float = 0.0
     slowest: float = 0.05
     fastest: float = 1.2
     readout: float = 0.0
-    told_fps: tuple[float, float] | None = None
+    assumed_fps: tuple[float, float] | None = None
     paper_path: bool = False
 
 
-def make(regime: Regime, seed: int) -> Trial:
+def make_trial(regime: Regime, seed: int) -> Trial:
     """One trial, a pure function of its arguments."""
     rng = np.random.default_rng([20_240, seed])
     r = regime
     if r.paper_path:
-        poses, path = _paper_rig(), _paper_a
+        poses, path = _paper_rig(), _paper_trajectory_a
     else:
         poses, path = _random_rig(rng), _random_path(rng, r.slowest, r.fastest)
     other = _random_path(rng, r.slowest, r.fastest)
-    drift = tuple(1.0 + 1e-6 * float(d) for d in rng.uniform(-r.ppm, r.ppm, 2))
-    if r.told_fps is not None:
-        drift = tuple(d * actual / told for d, actual, told in zip(drift, r.fps, r.told_fps, strict=True))
-    epoch = tuple(float(e) for e in rng.choice([0.0, 1.7e9, 86_400.5, -250.0, 3.2e6], 2))
+    clock_rate = tuple(1.0 + 1e-6 * float(d) for d in rng.uniform(-r.ppm, r.ppm, 2))
+    if r.assumed_fps is not None:
+        clock_rate = tuple(
+            d * actual / assumed for d, actual, assumed in zip(clock_rate, r.fps, r.assumed_fps, strict=True)
+        )
+    clock_offset = tuple(float(e) for e in rng.choice([0.0, 1.7e9, 86_400.5, -250.0, 3.2e6], 2))
     late = (
         float(rng.uniform(-r.late, r.late)) if r.overlap is None else float(rng.choice([-1, 1])) * (r.span - r.overlap)
     )
-    style = int(rng.integers(3))  # of the second thing: own episodes a view, common episodes, single frames
-    episodes = [_episodes(rng, r.span + 2 * abs(late), -abs(late), r.second) for _ in range(2)]
+    style = int(rng.integers(3))  # of the second object: separate episodes per view, common episodes, single frames
+    episodes = [_episodes(rng, r.span + 2 * abs(late), -abs(late), r.second_object) for _ in range(2)]
     views = []
     for k in range(2):
         begin = (0.0, late)[k] + float(rng.uniform(0, 1.0 / r.fps[k]))
         true = begin + np.arange(int(r.span * r.fps[k])) / r.fps[k]
         places = path(true)
-        strange = np.zeros(len(true), dtype=np.bool_)
-        if r.second:
+        switched = np.zeros(len(true), dtype=np.bool_)
+        if r.second_object:
             if style == 2:
-                strange = rng.random(len(true)) < r.second
+                switched = rng.random(len(true)) < r.second_object
             else:
                 for a, b in episodes[k if style == 0 else 0]:
-                    strange |= (true >= a) & (true < b)
-            places[strange] = other(true[strange])
+                    switched |= (true >= a) & (true < b)
+            places[switched] = other(true[switched])
         pixels = _project(poses[k], places)
         if r.readout:
-            # The row is exposed before or after the middle row, whose time the frame bears.
+            # The frame's time is that of the middle row; the marker's row is exposed before or after it.
             pixels = _project(poses[k], path(true + r.readout * (pixels[:, 1] / SIZE[1] - 0.5)))
         pixels = pixels + rng.normal(0, r.noise, pixels.shape)
         wrong = rng.random(len(true)) < r.outliers
@@ -140,24 +142,25 @@ def make(regime: Regime, seed: int) -> Trial:
         for _ in range(r.gaps):
             at = float(rng.uniform(true[0], true[-1]))
             keep &= ~((true > at) & (true < at + rng.uniform(0.3, 1.5)))
-        views.append(View(epoch[k] + drift[k] * true[keep], pixels[keep], ~(wrong | strange)[keep]))
-    return Trial((views[0], views[1]), poses, (drift[0], drift[1]), (epoch[0], epoch[1]), path, r.noise)
+        views.append(View(clock_offset[k] + clock_rate[k] * true[keep], pixels[keep], ~(wrong | switched)[keep]))
+    return Trial(
+        (views[0], views[1]), poses, (clock_rate[0], clock_rate[1]), (clock_offset[0], clock_offset[1]), path, r.noise
+    )
 
 
-def stranger(trial: Trial, regime: Regime, seed: int) -> Trial:
-    """The same trial, but camera b watched something else: nothing may be answered."""
-    other = make(replace(regime, paper_path=False), seed + 500_000)
+def unrelated_trial(trial: Trial, regime: Regime, seed: int) -> Trial:
+    """The same trial, but camera b saw an unrelated motion: it must be refused."""
+    other = make_trial(replace(regime, paper_path=False), seed + 500_000)
     swapped = replace(trial, poses=(trial.poses[0], other.poses[1]))
     return replace(swapped, views=(trial.views[0], other.views[1]))
 
 
-def floor(trial: Trial, calibrated: bool) -> float:
-    """Least standard deviation [s] of the lag at mid-overlap (Cramér-Rao) for points that are not smoothed.
+def lag_bound(trial: Trial, calibrated: bool) -> float:
+    """Cramér-Rao bound: least std [s] of the lag at mid-overlap for points that are not smoothed.
 
-    Each good frame of the camera that has fewer gives one epipolar equation, with the noise of both
-    points, as if the other camera had fired at that very instant, if that one saw the marker within 0.2 s
-    before and after. Unknown beside the lag: the clock rate
-    and 5 (calibrated) or 7 parameters of the geometry.
+    Each good frame of the camera with fewer of them gives one epipolar equation with the noise of both points, as if
+    the other camera had exposed at the same instant, if that one saw the marker within 0.2 s before and after. Unknown
+    beside the lag: the clock rate and 5 (calibrated) or 7 parameters of the geometry.
     """
     begin, end = trial.overlap
     times = []
@@ -175,8 +178,8 @@ def floor(trial: Trial, calibrated: bool) -> float:
     f = trial.fundamental
     ha, hb = np.column_stack([a, np.ones(len(a))]), np.column_stack([b, np.ones(len(b))])
     line_b, line_a = ha @ f, hb @ f.T
-    over = 1.0 / (trial.noise * np.sqrt((line_a[:, :2] ** 2).sum(1) + (line_b[:, :2] ** 2).sum(1)))
-    along = (line_b[:, :2] * speed).sum(1) * over
+    inverse_noise = 1.0 / (trial.noise * np.sqrt((line_a[:, :2] ** 2).sum(1) + (line_b[:, :2] ** 2).sum(1)))
+    along = (line_b[:, :2] * speed).sum(1) * inverse_noise
     columns = [along, along * (true - 0.5 * (begin + end))]
     inverse = np.linalg.inv(MATRIX)
     pose = trial.pose
@@ -190,7 +193,7 @@ def floor(trial: Trial, calibrated: bool) -> float:
         changes = [so3.hat(axis) @ f for axis in np.eye(3)] + [f @ so3.hat(axis) for axis in np.eye(3)]
         changes.append((u * np.array([-d[1], d[0], 0.0])) @ vt)
     for change in changes:
-        column = ((ha @ change) * hb).sum(1) * over
+        column = ((ha @ change) * hb).sum(1) * inverse_noise
         columns.append(column / max(float(np.abs(column).max()), 1e-300))
     jacobian = np.column_stack(columns)
     return float(np.sqrt(np.linalg.pinv(jacobian.T @ jacobian, hermitian=True, rcond=1e-14)[0, 0]))
@@ -208,8 +211,8 @@ def geometry_error(trial: Trial, fundamental: Floats) -> float:
     )
 
 
-def map_error(trial: Trial, rate: float, offset: float) -> tuple[float, float]:
-    """Of a found ``t_a = rate * t_b + offset``: error at mid-overlap and RMS over the overlap [s]."""
+def time_map_error(trial: Trial, rate: float, offset: float) -> tuple[float, float]:
+    """Errors of an estimated ``t_a = rate * t_b + offset``: at mid-overlap, and RMS over the overlap [s]."""
     true = np.linspace(*trial.overlap, 51)
     error = rate * trial.shown(1, true) + offset - trial.shown(0, true)
     return float(error[25]), float(np.sqrt((error**2).mean()))
@@ -223,14 +226,15 @@ def _project(pose: Pose, points: Floats) -> Floats:
 def _random_rig(rng: np.random.Generator) -> tuple[Pose, Pose]:
     """Two cameras that see the cube, their directions 30° to 150° apart."""
     while True:
-        ways = rng.normal(size=(2, 3))
-        ways /= np.linalg.norm(ways, axis=1)[:, None]
-        ways[:, 2] = np.clip(ways[:, 2], -0.3, 0.85)  # nobody films from below, or straight from above
-        ways /= np.linalg.norm(ways, axis=1)[:, None]
-        if 30.0 <= np.rad2deg(np.arccos(ways[0] @ ways[1])) <= 150.0:
+        directions = rng.normal(size=(2, 3))
+        directions /= np.linalg.norm(directions, axis=1)[:, None]
+        directions[:, 2] = np.clip(directions[:, 2], -0.3, 0.85)  # not from below, nor straight from above
+        directions /= np.linalg.norm(directions, axis=1)[:, None]
+        if 30.0 <= np.rad2deg(np.arccos(directions[0] @ directions[1])) <= 150.0:
             break
     return tuple(  # type: ignore[return-value]
-        looking_at(way * rng.uniform(500, 900), rng.normal(0, 15, 3), rng.normal(0, 0.15)) for way in ways
+        looking_at(direction * rng.uniform(500, 900), rng.normal(0, 15, 3), rng.normal(0, 0.15))
+        for direction in directions
     )
 
 
@@ -247,7 +251,7 @@ def _random_path(rng: np.random.Generator, slowest: float, fastest: float) -> Pa
 
 
 def _episodes(rng: np.random.Generator, length: float, begin: float, share: float) -> list[tuple[float, float]]:
-    """Spans of 0.3 to 2 s that fill ``share`` of the time."""
+    """Intervals of 0.3 to 2 s that fill ``share`` of the time."""
     out: list[tuple[float, float]] = []
     if share <= 0:
         return out
@@ -272,7 +276,9 @@ def _paper_rig() -> tuple[Pose, Pose]:
     return poses[0], poses[1]
 
 
-def _paper_a(time: Floats) -> Floats:
+def _paper_trajectory_a(time: Floats) -> Floats:
     """The paper's trajectory (a)."""
-    swell = np.sin(np.pi / 11 * time)
-    return np.column_stack([18 * (time - 5.5), 140 * np.sin(np.pi * time) * swell, 100 * np.cos(np.pi * time) * swell])
+    envelope = np.sin(np.pi / 11 * time)
+    return np.column_stack(
+        [18 * (time - 5.5), 140 * np.sin(np.pi * time) * envelope, 100 * np.cos(np.pi * time) * envelope]
+    )

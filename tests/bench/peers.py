@@ -2,7 +2,7 @@
 
     python -m tests.bench.peers
 
-A package that this machine cannot have is told and left out: its rows then say that they were not run. opencv-contrib
+A package that cannot be installed is reported and left out: its rows then state that they were not run. opencv-contrib
 and opencv-python-headless are both ``cv2``, so the former goes into a folder of its own in the environment.
 """
 

@@ -1,17 +1,16 @@
-"""The person detector on rendered rooms whose truth is known, beside the plain background model.
+"""The person detector on rendered rooms with ground truth, compared with the plain background model.
 
     python -m tests.bench.people_detector [--seeds 3] [--first-seed 700] [--seconds 30] [--people 5]
     python -m tests.bench.people_detector --labels LABELS.csv --detections PEOPLE.csv
 
-Precision and recall at an overlap (intersection over union) of 0.5, as pedestrian benchmarks judge: people of whom less
-than half is in view and people whom the picture's border cuts neither count nor harm. Files: looked through twice, as
-`syncline detect person` does; live: the first time, from the first frame on. MOG2: its silhouettes as they come.
-Noise 4, shadows on. CPU milliseconds a frame. Seeds from 700 on are not looked at while anything is adjusted.
-Also the squared error of the representative point over its covariance, across and down, of who stands alone and of who
-is among others, against that point of the true silhouette's part in view.
+Precision and recall at an overlap (intersection over union) of 0.5, as in pedestrian benchmarks: people less than half
+visible and people truncated by the image border are ignored. file: two passes, as in `syncline detect person`; live:
+one pass from the first frame on; MOG2 alone: its silhouettes without further processing. Noise 4, shadows on. CPU
+milliseconds per frame. Also the squared error of the representative point over its covariance, across and down, of
+isolated people and of people in groups, against that point of the visible part of the true silhouette.
 
-The second form judges what `syncline detect person FILM --out PEOPLE.csv` found in a film of your own, in the frames
-that LABELS.csv has boxes for: frame,x,y,w,h,ignore (1 = neither counts nor harms).
+The second form evaluates the output of `syncline detect person VIDEO --out PEOPLE.csv` on a video of your own, in the
+frames that have boxes in LABELS.csv: frame,x,y,w,h,ignore (1 = ignored).
 """
 
 from __future__ import annotations
@@ -31,22 +30,26 @@ from edge.detectors.people.person import PersonDetector, silhouette_features
 from edge.scenes.people.renderer import PeopleRenderer
 from edge.scenes.people.scene import PeopleScene
 from protocols.geometry.types import Bools, Floats
-from tests.people_boxes import judge, overlap, truth
+from tests.support.people_boxes import overlap, score_boxes, truth
 
 Image = npt.NDArray[np.uint8]
 _BAR = 0.9
 _NOISE = 4.0
 
 
-def film(seed: int, people: int, seconds: float) -> tuple[list[Image], list[tuple[Floats, Bools]], list[Floats], float]:
-    """Frames, their truth, the representative points (n, 2) of who counts in it, and their rate; camera 0 of a room."""
-    scene: PeopleScene = scenes.get_people(seed, None, people)
+def render_video(
+    seed: int, people: int, seconds: float
+) -> tuple[list[Image], list[tuple[Floats, Bools]], list[Floats], float]:
+    """Rendered frames, their ground truth, the representative points (n, 2) of evaluated people, and the frame rate;
+    camera 0 of a room.
+    """
+    scene: PeopleScene = scenes.get_people_scene(seed, None, people)
     camera = scene.cameras[0]
     renderer = PeopleRenderer(scene, camera.name, np.random.default_rng([seed, 1]), _NOISE)
-    pictures, boxes, middles = [], [], []
+    images, boxes, middles = [], [], []
     for index in range(int(seconds * camera.fps)):
-        picture, owners = renderer.render_with_owners(index / camera.fps)
-        pictures.append(picture)
+        image, owners = renderer.render_with_owners(index / camera.fps)
+        images.append(image)
         boxes.append(truth(scene, camera.name, index / camera.fps, owners))
         who = np.flatnonzero(np.isfinite(scene.boxes(camera.name, index / camera.fps)).all(axis=1))
         points = np.full((len(who), 2), np.nan)
@@ -55,24 +58,24 @@ def film(seed: int, people: int, seconds: float) -> tuple[list[Image], list[tupl
                 mask = np.where(owners == one + 1, 255, 0).astype(np.uint8)
                 points[row] = silhouette_features(mask, tuple(box)).middle
         middles.append(points)
-    return pictures, boxes, middles, camera.fps
+    return images, boxes, middles, camera.fps
 
 
-def from_file(pictures: list[Image], fps: float) -> tuple[list[list[Detection]], float]:
-    """People in each frame of a film that is looked through twice, and CPU ms a frame of the second time."""
-    detector = PersonDetector("mog2", fps, sure_only=False)
-    detector.prime(pictures[:: max(len(pictures) // 48, 1)])
-    for index, picture in enumerate(pictures[:400]):
-        detector.detect(picture, index / fps)
+def from_file(images: list[Image], fps: float) -> tuple[list[list[Detection]], float]:
+    """People in each frame of a video by the two-pass detector, and CPU ms per frame of the second pass."""
+    detector = PersonDetector("mog2", fps, confirmed_only=False)
+    detector.initialise(images[:: max(len(images) // 48, 1)])
+    for index, image in enumerate(images[:400]):
+        detector.detect(image, index / fps)
     detector.rewind()
     begun = time.process_time()
-    seen = [detector.detect(picture, index / fps) for index, picture in enumerate(pictures)]
-    spent = 1e3 * (time.process_time() - begun) / len(pictures)
-    return [[one for one in shown if detector.is_sure(one.label)] for shown in seen], spent
+    seen = [detector.detect(image, index / fps) for index, image in enumerate(images)]
+    spent = 1e3 * (time.process_time() - begun) / len(images)
+    return [[one for one in shown if detector.is_confirmed(one.label)] for shown in seen], spent
 
 
 def errors(boxes: tuple[Floats, Bools], middles: Floats, shown: list[Detection]) -> list[tuple[bool, float, float]]:
-    """Of each that counts and was found: whether it seemed to stand alone, squared errors over variances, u and v."""
+    """Of each evaluated and detected person: whether it was isolated, squared errors over variances, u and v."""
     found = []
     for box, counts, middle in zip(*boxes, middles, strict=True):
         near = [one for one in shown if one.box is not None and overlap(box, one.box) >= 0.5]
@@ -85,30 +88,30 @@ def errors(boxes: tuple[Floats, Bools], middles: Floats, shown: list[Detection])
     return found
 
 
-def live(pictures: list[Image], fps: float) -> tuple[list[list[Detection]], float]:
+def live(images: list[Image], fps: float) -> tuple[list[list[Detection]], float]:
     """The same of a camera that has just been switched on."""
     detector = PersonDetector("mog2", fps)
     begun = time.process_time()
-    seen = [detector.detect(picture, index / fps) for index, picture in enumerate(pictures)]
-    spent = 1e3 * (time.process_time() - begun) / len(pictures)
+    seen = [detector.detect(image, index / fps) for index, image in enumerate(images)]
+    spent = 1e3 * (time.process_time() - begun) / len(images)
     return seen, spent
 
 
-def plain(pictures: list[Image], fps: float) -> tuple[list[list[Floats]], float]:
-    """MOG2 with its own shadow test, primed alike; every silhouette of some size is somebody."""
+def plain(images: list[Image], fps: float) -> tuple[list[list[Floats]], float]:
+    """MOG2 with its own shadow test, initialised from the same images; every silhouette of some size is a person."""
     model = cv2.createBackgroundSubtractorMOG2(500, 16.0, True)
-    for picture in pictures[:: max(len(pictures) // 48, 1)]:
-        model.apply(picture, learningRate=0.03)
+    for image in images[:: max(len(images) // 48, 1)]:
+        model.apply(image, learningRate=0.03)
     begun, found = time.process_time(), []
-    for picture in pictures:
-        figure = cv2.medianBlur((model.apply(picture) == 255).astype(np.uint8), 5)
-        _, _, stats, _ = cv2.connectedComponentsWithStats(figure)
+    for image in images:
+        foreground = cv2.medianBlur((model.apply(image) == 255).astype(np.uint8), 5)
+        _, _, stats, _ = cv2.connectedComponentsWithStats(foreground)
         found.append([row[:4].astype(np.float64) for row in stats[1:] if row[4] > 400])
-    return found, 1e3 * (time.process_time() - begun) / len(pictures)
+    return found, 1e3 * (time.process_time() - begun) / len(images)
 
 
 def read_boxes(file: Path, prefix: str = "") -> dict[int, tuple[Floats, Bools]]:
-    """By frame, boxes (n, 4) x, y, w, h of a table, and which count (n,)."""
+    """By frame, boxes (n, 4) x, y, w, h of a table, and which are evaluated (n,)."""
     rows: dict[int, list[list[float]]] = {}
     with file.open(encoding="utf-8", newline="") as lines:
         for row in csv.DictReader(lines):
@@ -121,13 +124,13 @@ def read_boxes(file: Path, prefix: str = "") -> dict[int, tuple[Floats, Bools]]:
     return out
 
 
-def judge_film(labels: Path, detections: Path) -> int:
-    """What was found in a film against its labels; prints it, and returns the exit status."""
+def evaluate_video(labels: Path, detections: Path) -> int:
+    """Compare detections in a video with its labels; prints the result, and returns the exit status."""
     true, found = read_boxes(labels), read_boxes(detections, "box_")
     total: list[tuple[int, int, int, float]] = []
     for frame, (boxes, counts) in true.items():
         shown = list(found[frame][0]) if frame in found else []
-        total.append(judge(boxes, counts, shown))
+        total.append(score_boxes(boxes, counts, shown))
     right, wrong, missed = (sum(int(one[part]) for one in total) for part in range(3))
     precision, recall = right / max(right + wrong, 1), right / max(right + missed, 1)
     print(f"{len(true)} frames, {right + missed} people: precision {precision:.3f}, recall {recall:.3f}")
@@ -140,26 +143,26 @@ def main() -> int:
     parser.add_argument("--first-seed", type=int, default=700)
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--people", type=int, default=5)
-    parser.add_argument("--labels", type=Path, help="boxes of people in some frames of a film")
-    parser.add_argument("--detections", type=Path, help="what `syncline detect person` found in it")
+    parser.add_argument("--labels", type=Path, help="boxes of people in some frames of a video")
+    parser.add_argument("--detections", type=Path, help="output of `syncline detect person` for it")
     options = parser.parse_args()
     if (options.labels is None) != (options.detections is None):
         parser.error("--labels and --detections belong together")
     if options.labels is not None:
-        return judge_film(options.labels, options.detections)
+        return evaluate_video(options.labels, options.detections)
     cv2.setNumThreads(1)
-    ways = {"file": from_file, "live": live, "MOG2 alone": plain}
-    rows: dict[str, list[tuple[int, int, int, float, float]]] = {name: [] for name in ways}
+    methods = {"file": from_file, "live": live, "MOG2 alone": plain}
+    rows: dict[str, list[tuple[int, int, int, float, float]]] = {name: [] for name in methods}
     spread: list[tuple[bool, float, float]] = []
     for seed in range(options.first_seed, options.first_seed + options.seeds):
-        pictures, boxes, middles, fps = film(seed, options.people, options.seconds)
-        for name, way in ways.items():
-            found, spent = way(pictures, fps)
+        images, boxes, middles, fps = render_video(seed, options.people, options.seconds)
+        for name, method in methods.items():
+            found, spent = method(images, fps)
             if name == "file":
                 for true, points, shown in zip(boxes, middles, found, strict=True):
                     spread += errors(true, points, shown)
-            told = [[np.array(getattr(one, "box", one)) for one in shown] for shown in found]
-            total = [judge(*true, shown) for true, shown in zip(boxes, told, strict=True)]
+            boxes_found = [[np.array(getattr(one, "box", one)) for one in shown] for shown in found]
+            total = [score_boxes(*true, shown) for true, shown in zip(boxes, boxes_found, strict=True)]
             right, wrong, missed = (sum(int(one[part]) for one in total) for part in range(3))
             rows[name].append((right, wrong, missed, sum(one[3] for one in total), spent))
     print(f"seeds {options.first_seed} to {options.first_seed + options.seeds - 1}, {options.people} people")

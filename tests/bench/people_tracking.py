@@ -1,8 +1,8 @@
-"""People followed through cameras that share no clock: ``python -m tests.bench.people_tracking [--rendered]``.
+"""Tracking of people with asynchronous cameras: ``python -m tests.bench.people_tracking [--rendered]``.
 
-Prints how well five people are followed in a simulated room (CLEAR MOT), what the clocks are worth (the asynchronous
-filter against triangulation of the nearest frames), and how well a network calibrates itself by people who walk.
-Seeds begin at 9001: nothing was chosen by them.
+Prints tracking scores of five people in a simulated room (CLEAR MOT), the benefit of known clocks (the asynchronous
+filter against triangulation of the nearest frames), and the accuracy of people-based calibration.
+Seeds begin at 9001: no parameter was tuned on them.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from deploy.evaluation.clear_mot import Moment, Scores, clear_mot
+from deploy.evaluation.clear_mot import EvaluationFrame, MotScores, clear_mot
 from edge import scenes
-from edge.agents.predictions import Predictions
+from edge.agents.predictions import PredictionSubscriber
+from edge.scenes import renderer_for
 from edge.scenes.people.scene import PeopleScene
 from hub.calibration.pipeline import calibrate
-from hub.tracking.calibration.people import Walkers
-from hub.tracking.camera_frame import TrackingCamera
-from hub.tracking.filter.update import World, label_of
+from hub.tracking.calibration.people import PeopleTracklets
+from hub.tracking.detections import TrackingCamera
+from hub.tracking.frame_update import TrackerParameters, track_label
 from hub.tracking.messages import prediction_message
 from hub.tracking.tracker import Tracker
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
@@ -38,26 +39,26 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration
 from protocols.session.rig import Rig, RigCamera
 from protocols.topics import PREDICTION
-from tests.people_traffic import Faults, Traffic, cameras_of, film
-from tests.rigs import looking_at
+from tests.support.people_traffic import Faults, Traffic, cameras_of, film
+from tests.support.rigs import looking_at
 
 UP = np.array([0.0, 0.0, 1.0])
 REACH_M = 0.5
 START_S = 6.0
-"""When the cameras are switched on: at 0 everybody stands."""
-TOLD_S, INTERVAL_S = 0.01, 0.05
-"""How long a prediction takes, and how often one is made."""
+"""Time at which the cameras are switched on: at 0 everybody stands still."""
+LATENCY_S, INTERVAL_S = 0.01, 0.05
+"""Latency of a prediction, and the interval between two."""
 EVERY_S = 0.1
 BEGUN_S = 5.0
-"""What rendered runs are also scored without: the time in which cameras learn the place."""
+"""Initial time left out of a second score of rendered runs: the detectors learn the background."""
 FIRST_SEED = 9001
 _RGB = ("red", "green", "blue")
 
 
-def followed(traffic: Traffic, every_s: float = EVERY_S) -> tuple[list[Moment], float]:
-    """What was told every ``every_s``, as a hub does, beside the truth, and CPU seconds a frame."""
+def followed(traffic: Traffic, every_s: float = EVERY_S) -> tuple[list[EvaluationFrame], float]:
+    """Confirmed tracks every ``every_s`` with the truth, and CPU seconds per frame."""
     scene = traffic.scene
-    tracker = Tracker(World(up=UP))
+    tracker = Tracker(TrackerParameters(up=UP))
     tracker.calibrate(cameras_of(scene, traffic.reference))
     moments = []
     due = traffic.arrivals[0][0]
@@ -70,24 +71,24 @@ def followed(traffic: Traffic, every_s: float = EVERY_S) -> tuple[list[Moment], 
         if state is None or state.time_ns is None:
             continue
         due += every_s
-        known = state.targets.kept(state.targets.confirmed)
+        known = state.targets.select(state.targets.confirmed)
         truth = scene.centres(np.array([traffic.true_time_ns(state.time_ns)]))[0]
-        names = tuple(label_of(int(k), int(n)) for k, n in zip(known.kind, known.number, strict=True))
-        moments.append(Moment(tuple(p.name for p in scene.people), truth, names, known.mean[:, :3]))
+        names = tuple(track_label(int(k), int(n)) for k, n in zip(known.kind, known.number, strict=True))
+        moments.append(EvaluationFrame(tuple(p.name for p in scene.people), truth, names, known.mean[:, :3]))
     return moments, cpu / len(traffic.arrivals)
 
 
-def scores(moments: list[Moment]) -> tuple[Scores, Scores]:
-    """On the floor and in space."""
-    flat = [Moment(m.truth_names, m.truth[:, :2], m.found_names, m.found[:, :2]) for m in moments]
+def scores(moments: list[EvaluationFrame]) -> tuple[MotScores, MotScores]:
+    """Scores on the floor and in space."""
+    flat = [EvaluationFrame(m.truth_names, m.truth[:, :2], m.estimate_labels, m.found[:, :2]) for m in moments]
     return clear_mot(flat, REACH_M), clear_mot(moments, REACH_M)
 
 
 def rendered(scene: PeopleScene, seconds: float, seed: int, kept: float = 1.0) -> Traffic:
-    """What the shipped detector finds in rendered frames: cameras switched on while people walk before them.
+    """Detections of the shipped detector in rendered frames; cameras are switched on while people walk.
 
-    The tracking's predictions come back to the detectors, as over the bus: from what had arrived ``TOLD_S`` before a
-    frame was taken. kept: share of the frames that a busy machine comes to look at; which, chance decides.
+    The tracking's predictions come back to the detectors, as over the bus: from what had arrived ``LATENCY_S`` before a
+    frame was taken. kept: fraction of the frames that a busy machine processes, drawn at random.
     """
     from edge.detectors.people.person import PersonDetector
 
@@ -97,24 +98,28 @@ def rendered(scene: PeopleScene, seconds: float, seed: int, kept: float = 1.0) -
     publisher = bus.publisher(PREDICTION, "hub")
     for index, camera in enumerate(scene.cameras):
         rng = np.random.default_rng([seed, 5, index])
-        predictions = Predictions(bus.subscribe(PREDICTION), camera.name, "boot0")
-        cameras.append((camera, rng, scene.renderer(camera.name, rng), PersonDetector(fps=camera.fps), predictions))
+        predictions = PredictionSubscriber(bus.subscribe(PREDICTION), camera.name, "boot0")
+        cameras.append(
+            (camera, rng, renderer_for(scene, camera.name, rng), PersonDetector(fps=camera.fps), predictions)
+        )
         times = camera.capture_times(START_S + 0.02 * index, 0, int(seconds * camera.fps), rng)
         frames += [(moment, index, number) for number, moment in enumerate(times.tolist())]
-    tracker = Tracker(World(up=UP))
+    tracker = Tracker(TrackerParameters(up=UP))
     tracker.calibrate(cameras_of(scene, reference))
     waiting: list[tuple[float, int, pb.Observation]] = []
     arrivals = []
     due = 0.0
     chosen = np.random.default_rng([seed, 6]).random(len(frames)) < kept
     for moment, index, number in [one for one, looked in zip(sorted(frames), chosen, strict=True) if looked]:
-        while waiting and waiting[0][0] + TOLD_S <= moment:
+        while waiting and waiting[0][0] + LATENCY_S <= moment:
             tracker.handle(heapq.heappop(waiting)[2])
         if moment >= due and tracker.advance().time_ns is not None:
             due = moment + INTERVAL_S
             ahead = (tracker.time_ns or 0) + round(0.1 * NANOSECONDS)
-            told = prediction_message(tracker.at(ahead), ahead, tracker.cameras, tracker.boots, tracker.world, number)
-            publisher.put(told)
+            figures = prediction_message(
+                tracker.at(ahead), ahead, tracker.cameras, tracker.boots, tracker.world, number
+            )
+            publisher.put(figures)
         camera, rng, renderer, detector, predictions = cameras[index]
         stamp = camera.clock.device_time_ns(moment)
         message = pb.Observation(
@@ -154,7 +159,7 @@ def nearest_frames(seed: int, seconds: float = 25.0, fps: float = 10.0, noise_px
             (pixel,) = lens.project(camera.pose.camera_from_world(path(moment)[None]))
             frames.append((moment, name, number, pixel + rng.normal(0, noise_px, 2)))
     frames.sort(key=lambda one: one[0])
-    tracker = Tracker(World(up=UP))
+    tracker = Tracker(TrackerParameters(up=UP))
     tracker.calibrate(cameras)
     seen: dict[str, list[tuple[float, Floats]]] = {name: [] for name in cameras}
     by_filter: list[float] = []
@@ -164,7 +169,7 @@ def nearest_frames(seed: int, seconds: float = 25.0, fps: float = 10.0, noise_px
         while asked and asked[0] + 0.5 / fps < moment:
             wanted = asked.pop(0)
             known = tracker.at(round(wanted * NANOSECONDS))
-            known = known.kept(known.confirmed)
+            known = known.select(known.confirmed)
             if wanted > 3.0:
                 by_filter.append(float(np.linalg.norm(known.mean[0, :3] - path(wanted))))
                 nearest.append(float(np.linalg.norm(_triangulated(cameras, seen, wanted) - path(wanted))))
@@ -181,8 +186,8 @@ def nearest_frames(seed: int, seconds: float = 25.0, fps: float = 10.0, noise_px
 
 
 def _walk(seed: int) -> Callable[[float], Floats]:
-    """A point that goes the way of one of the scene's walkers at 1.4 m/s, without his rests."""
-    paths = scenes.get_people(seed, 2, 1).paths
+    """A point that follows the path of one of the scene's people at 1.4 m/s, without pauses."""
+    paths = scenes.get_people_scene(seed, 2, 1).paths
     fine = np.linspace(5.0, 120.0, 6000)
     way = paths.at(fine)[0][:, 0]
     gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
@@ -196,7 +201,7 @@ def _walk(seed: int) -> Callable[[float], Floats]:
 def _triangulated(
     cameras: dict[str, TrackingCamera], seen: dict[str, list[tuple[float, Floats]]], when: float
 ) -> Floats:
-    """The point nearest to the rays of each camera's frame nearest in time, weighed by depth once."""
+    """Triangulation from each camera's frame nearest in time, weighted by depth once."""
     left, right = np.zeros((3, 3)), np.zeros(3)
     for name, camera in cameras.items():
         if not seen[name]:
@@ -212,12 +217,12 @@ def _triangulated(
 
 
 def self_calibrated(seed: int, people: int, seconds: float = 60.0, faults: Faults | None = None) -> dict[str, Any]:
-    """A network that knows nothing but its lenses, calibrated by people who walk."""
-    scene = scenes.get_people(seed, 5, people)
+    """Calibration from walking people with known intrinsics only."""
+    scene = scenes.get_people_scene(seed, 5, people)
     traffic = film(scene, seconds, seed, faults or Faults(false=0.02))
-    walkers = Walkers(seconds)
+    tracklets = PeopleTracklets(seconds)
     for message in traffic.messages():
-        walkers.handle(message)
+        tracklets.handle(message)
     rig = Rig(
         {
             c.name: RigCamera(c.name, (c.intrinsics.width, c.intrinsics.height), c.fps, c.intrinsics)
@@ -226,14 +231,14 @@ def self_calibrated(seed: int, people: int, seconds: float = 60.0, faults: Fault
     )
     begun = time.process_time()
     try:
-        found = calibrate(rig, walkers.observations())
+        found = calibrate(rig, tracklets.observations())
     except Refused as refused:
         return {"seed": seed, "people": people, "cameras": 0, "refused": refused.reason}
     return {"seed": seed, "people": people, "cpu_s": time.process_time() - begun, **_errors(scene, found, seconds)}
 
 
 def _errors(scene: PeopleScene, found: Calibration, seconds: float) -> dict[str, float]:
-    """Errors of poses after one similarity, of clocks in the middle of the film."""
+    """Pose errors after a similarity alignment, clock errors at mid-recording."""
     names = list(found.cameras)
     if len(names) < 3:
         return {"cameras": len(names)}
@@ -260,7 +265,7 @@ def _errors(scene: PeopleScene, found: Calibration, seconds: float) -> dict[str,
     }
 
 
-def in_words(flat: Scores, space: Scores) -> str:
+def in_words(flat: MotScores, space: MotScores) -> str:
     """Scores in one line."""
     return (
         f"MOTA {flat.mota:.3f}, IDF1 {flat.idf1:.3f}, switches {flat.switches}, "
@@ -278,7 +283,7 @@ def main() -> None:
     parser.add_argument(
         "--rendered", action="store_true", help="also from rendered frames through the shipped detector"
     )
-    parser.add_argument("--kept", type=float, default=1.0, help="share of the rendered frames that are looked at")
+    parser.add_argument("--kept", type=float, default=1.0, help="fraction of the rendered frames that are processed")
     parser.add_argument("--only", choices=("tracking", "clocks", "walkers"))
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--quick", action="store_true")
@@ -288,7 +293,7 @@ def main() -> None:
     out: dict[str, Any] = {"tracking": [], "clocks": [], "walkers": []}
     if options.only in (None, "tracking"):
         for seed in seeds:
-            scene = scenes.get_people(seed, 5, 5)
+            scene = scenes.get_people_scene(seed, 5, 5)
             runs = [("geometry", film(scene, options.seconds, seed))]
             if options.rendered:
                 runs.append(("rendered", rendered(scene, options.seconds, seed, options.kept)))
@@ -323,9 +328,9 @@ def main() -> None:
                 row = self_calibrated(seed, people)
                 out["walkers"].append(row)
                 if not options.json:
-                    told = ", ".join(f"{k} {v:.2f}" for k, v in row.items() if isinstance(v, float))
+                    figures = ", ".join(f"{k} {v:.2f}" for k, v in row.items() if isinstance(v, float))
                     print(
-                        f"{people} walker(s), seed {seed}: {row['cameras']} of 5 cameras; {told or row.get('refused')}",
+                        f"{people} people, seed {seed}: {row['cameras']} of 5 cameras; {figures or row.get('refused')}",
                         flush=True,
                     )
     if options.json:

@@ -1,4 +1,4 @@
-"""Runs pose nodes over simulated sightings: deterministic message traffic, with or without losses."""
+"""Runs pose nodes on simulated sightings with deterministic message traffic, with or without losses."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hub.distributed.network.messages import Notice, Reference, SharedObservation, StateMessage
+from hub.distributed.network.messages import ControlPoint, Notice, SharedObservation, StateMessage
 from hub.distributed.network.node import PoseNode
 from protocols.geometry.pose import Pose
-from tests.bench.pose_worlds import Sightings, World
+from tests.bench.pose_worlds import Sightings, SimulatedRig
 
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """What happens to messages between cameras. lost, duplicated: shares. delay: at most, in events.
+    """Disturbances of messages between cameras. lost, duplicated: shares. delay: at most, in events.
 
     repeat: how many earlier observations each message carries again.
     """
@@ -29,9 +29,9 @@ class Traffic:
 
 @dataclass(slots=True, eq=False)
 class Network:
-    """Nodes, and what is under way between them.
+    """Pose nodes and the messages in transit between them.
 
-    record: if a list, every observation delivered is added. arrived: points that one camera heard of from another.
+    record: if a list, every delivered observation is appended. arrived: points received by one camera from another.
     """
 
     nodes: dict[int, PoseNode]
@@ -48,7 +48,7 @@ class Network:
     _last: dict[tuple[int, int], deque[SharedObservation]] = field(default_factory=dict)
 
     def send(self, to: int, message: SharedObservation | StateMessage | tuple[SharedObservation, ...]) -> None:
-        """Between cameras: may be lost, doubled, late."""
+        """Send a message between cameras: it may be lost, duplicated or delayed."""
         t = self.traffic
         if t.lost == 0.0 and t.duplicated == 0.0 and t.delay == 0:
             self._deliver(to, message)
@@ -75,7 +75,7 @@ class Network:
         self.notices += [(self.points, item) for item in out if isinstance(item, Notice)]
 
     def observe(self, cameras: tuple[int, int], seen: np.ndarray, sigma: float, size_sigma: float) -> None:
-        """One point in two cameras: to themselves, and to each other."""
+        """One point observed by two cameras: delivered to both, and sent to each other."""
         self.points += 1
         self._pass_time()
         made = []
@@ -103,14 +103,14 @@ class Network:
         self._share(cameras[1], cameras[0], made[1])
 
     def _pass_time(self) -> None:
-        """One event later: what is due arrives."""
+        """Advance by one event and deliver due messages."""
         self.now += 1
         while self._queue and self._queue[0][0] <= self.now:
             _, _, to, message = heapq.heappop(self._queue)
             self._deliver(to, message)
 
     def _share(self, sender: int, to: int, seen: SharedObservation) -> None:
-        """Where messages are lost, each carries the last ones again: 24 B apiece, and duplicates are dropped anyway."""
+        """With message loss each message repeats the previous ones: 24 B each, and duplicates are dropped anyway."""
         if self.traffic.repeat == 0:
             self.send(to, seen)
             return
@@ -119,7 +119,7 @@ class Network:
         self.send(to, tuple(last))
 
     def tick(self) -> None:
-        """One update of every node, then their states travel."""
+        """One update of every node, then their states are sent."""
         self._pass_time()
         states = []
         for node in self.nodes.values():
@@ -130,21 +130,21 @@ class Network:
             for neighbour in self.nodes[state.camera].neighbours():
                 self.send(neighbour, state)
 
-    def published(self) -> list[Pose | None]:
-        """Poses in the world, by camera; None where not known."""
-        return [node.published() for node in self.nodes.values()]
+    def world_poses(self) -> list[Pose | None]:
+        """Poses in the world by camera; None where unknown."""
+        return [node.world_pose() for node in self.nodes.values()]
 
 
-def section_4_references(world: World) -> dict[int, Reference]:
+def section_4_control_points(world: SimulatedRig) -> dict[int, ControlPoint]:
     """Camera 1's pose and camera 2's position."""
     first, second = world.poses[:2]
-    return {0: Reference(first.position, first.rotation), 1: Reference(second.position)}
+    return {0: ControlPoint(first.position, first.rotation), 1: ControlPoint(second.position)}
 
 
-def network(world: World, traffic: Traffic | None = None, seed: int = 0) -> Network:
-    """Fresh nodes for every camera of the world."""
-    references = section_4_references(world)
-    nodes = {k: PoseNode(k, reference=references.get(k), seed=seed) for k in range(len(world.poses))}
+def network(world: SimulatedRig, traffic: Traffic | None = None, seed: int = 0) -> Network:
+    """New nodes for every camera of the rig."""
+    references = section_4_control_points(world)
+    nodes = {k: PoseNode(k, control_point=references.get(k), seed=seed) for k in range(len(world.poses))}
     return Network(nodes, traffic or Traffic(), np.random.default_rng([seed, 77]))
 
 

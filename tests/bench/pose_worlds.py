@@ -1,6 +1,6 @@
-"""Simulated networks of cameras for the bench of the pose nodes, and the joint optimum over the same observations.
+"""Simulated camera rigs for the pose node benchmark, and the joint optimum over the same observations.
 
-Lengths in cm, as the paper. Each point is seen by two cameras; ``Sightings`` holds one row a point.
+Lengths in cm, as in the paper. Each point is seen by two cameras; ``Sightings`` holds one row a point.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ TARGET = 30.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class World:
+class SimulatedRig:
     """True poses of all cameras."""
 
     poses: list[Pose]
     reach: float = 600.0
-    """Depth [cm] up to which a target is seen."""
+    """Depth [cm] up to which a target is visible."""
 
     def visible(self, points: Floats) -> Floats:
         """(cameras, n) whether each point lies in each image, and its depths (cameras, n)."""
@@ -44,10 +44,10 @@ class World:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sightings:
-    """What was seen of each point by its two cameras.
+    """Measurements of each point by its two cameras.
 
     cameras: (n, 2). seen: (n, 2, 3) x, y (normalised) and log size (normalised; with bearings only, nan).
-    sigma: std of x and y. size_sigma: std of the log size, inf for bearings only. wrong: (n,) made outliers.
+    sigma: std of x and y. size_sigma: std of the log size, inf for bearings only. wrong: (n,) simulated outliers.
     """
 
     cameras: Ints
@@ -75,7 +75,7 @@ def look_at(position: Floats, target: Floats, roll: float = 0.0) -> Pose:
     return Pose(so3.exp(np.array([0.0, 0.0, roll])) @ np.stack([x, np.cross(z, x), z]), position)
 
 
-def section_4(rng: np.random.Generator, cameras: int = 5) -> World:
+def section_4(rng: np.random.Generator, cameras: int = 5) -> SimulatedRig:
     """Cameras about a cube of 150 cm (its centre is the origin), 250 to 350 cm away, spread in azimuth."""
     poses = []
     turn = rng.uniform(0, 2 * np.pi)
@@ -86,11 +86,11 @@ def section_4(rng: np.random.Generator, cameras: int = 5) -> World:
         flat = np.cos(elevation)
         position = distance * np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
         poses.append(look_at(position, rng.uniform(-20, 20, 3), rng.uniform(-0.2, 0.2)))
-    return World(poses)
+    return SimulatedRig(poses)
 
 
-def hall(rng: np.random.Generator, cameras: int, spacing: float = 250.0) -> World:
-    """Cameras on a jittered square grid under a ceiling, looking aslant to the floor: only neighbours share views."""
+def hall(rng: np.random.Generator, cameras: int, spacing: float = 250.0) -> SimulatedRig:
+    """Cameras on a jittered square grid below a ceiling, looking obliquely down: only neighbours share views."""
     side = int(np.ceil(np.sqrt(cameras)))
     cells = [(i, j) for i in range(side) for j in range(side)][:cameras]
     poses = []
@@ -99,18 +99,18 @@ def hall(rng: np.random.Generator, cameras: int, spacing: float = 250.0) -> Worl
         aim = np.clip(position + rng.uniform(-120, 120, 3), 0.0, [max(side - 1, 1) * spacing] * 3)
         aim[2] = 60.0
         poses.append(look_at(position, aim, rng.uniform(-0.3, 0.3)))
-    return World(poses)
+    return SimulatedRig(poses)
 
 
 def observe(
-    world: World,
+    world: SimulatedRig,
     rng: np.random.Generator,
     points: Floats,
     pixels: float = 1.0,
     size: float = 0.02,
     outliers: float = 0.0,
 ) -> Sightings:
-    """Each point in two of the cameras that see it, at random; points that fewer see are left out.
+    """Each point in two randomly chosen cameras in which it is visible; points visible in fewer are left out.
 
     pixels: std [px]. size: relative std, inf = bearings only. outliers: share of points of which one camera
     reports a random place in its image.
@@ -147,7 +147,7 @@ def cube(rng: np.random.Generator, n: int) -> Floats:
     return rng.uniform(-75.0, 75.0, (n, 3))
 
 
-def floor(rng: np.random.Generator, world: World, n: int) -> Floats:
+def floor(rng: np.random.Generator, world: SimulatedRig, n: int) -> Floats:
     """Points (n, 3) where people are: under the cameras, up to 180 cm high."""
     centres = np.array([pose.position for pose in world.poses])
     low, high = centres.min(axis=0) - 150.0, centres.max(axis=0) + 150.0
@@ -157,8 +157,8 @@ def floor(rng: np.random.Generator, world: World, n: int) -> Floats:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Joint:
-    """The optimum over all observations. poses: in the world of the references. cost: half of chi2."""
+class JointOptimum:
+    """The optimum over all observations. poses: in the frame of the control points. cost: half of chi2."""
 
     poses: list[Pose]
     cost: float
@@ -166,10 +166,12 @@ class Joint:
     covariance: Floats | None = None
 
 
-def joint_optimum(world: World, sightings: Sightings, start: list[Pose] | None = None, spread: bool = False) -> Joint:
+def joint_optimum(
+    world: SimulatedRig, sightings: Sightings, start: list[Pose] | None = None, spread: bool = False
+) -> JointOptimum:
     """Gauss-Newton over every pose and point; camera 1's pose and camera 2's position are exact (section 4).
 
-    start: first poses in the true world; the true ones by default: the optimum nearest to the truth is the yardstick.
+    start: initial poses in the true world; by default the true ones, so that the optimum nearest to the truth is found.
     The target's size is an unknown too. spread: also the covariance of the camera parameters.
     """
     poses = list(start or world.poses)
@@ -210,7 +212,7 @@ def joint_optimum(world: World, sightings: Sightings, start: list[Pose] | None =
             _reduced(system, sightings, width)[0].toarray()[np.ix_(free, free)]
         )
     del last
-    return Joint(
+    return JointOptimum(
         [Pose(r, t) for r, t in zip(state[0], state[1], strict=True)], float(system[-1]), iteration, covariance
     )
 
@@ -304,8 +306,8 @@ def _moved(state, step: Floats, point_step: Floats):  # type: ignore[no-untyped-
     return so3.exp(cameras[:, :3]) @ rotations, centres + cameras[:, 3:], points + point_step, log_size + step[-1]
 
 
-def errors(world: World, poses: list[Pose | None]) -> tuple[float, float]:
-    """Mean error of position [cm] and attitude [deg] over cameras that no reference holds; nan if one is missing."""
+def errors(world: SimulatedRig, poses: list[Pose | None]) -> tuple[float, float]:
+    """Mean error of position [cm] and attitude [deg] over cameras without control points; nan if one is missing."""
     far, turn = [], []
     for truth, found in zip(world.poses, poses, strict=True):
         if found is None:

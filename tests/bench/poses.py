@@ -1,10 +1,10 @@
-"""How the pose nodes do against the joint optimum over the same observations: the table of distributed poses.
+"""Accuracy of the pose nodes relative to the joint optimum over the same observations: table of distributed poses.
 
     python -m tests.bench.poses [--seeds N] [--first SEED] [--quick] [--rows section4,bearings,...]
 
 Ratio: mean position error of all cameras over that of the joint optimum (all observations in one Gauss-Newton, started
-from the truth); with outliers, the joint optimum is told which they are. 1 px and 2 % size unless said. Seeds
-from 1000 on are held out: nothing was chosen by them. "obs." counts a camera's own shared observations.
+from the truth); with outliers, the joint optimum excludes them. 1 px and 2 % size unless stated otherwise. Seeds from
+1000 on are held out from parameter selection. "obs." counts a camera's own shared observations.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import numpy as np
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from tests.bench.pose_runs import Network, Traffic, feed, network
-from tests.bench.pose_worlds import World, cube, errors, floor, hall, joint_optimum, observe, section_4
+from tests.bench.pose_worlds import SimulatedRig, cube, errors, floor, hall, joint_optimum, observe, section_4
 
 EVERY = 20
 """Points between two updates."""
-SETTLE = 60
-"""Updates after the last point."""
+FINAL_UPDATES = 60
+"""Updates after the last point, for convergence."""
 POINTS = 10_000
 
 
@@ -47,36 +47,36 @@ def ratio(
     traffic: Traffic | None = None,
     arrived: bool = False,
 ) -> float:
-    """Section 4's world once. arrived: the joint optimum of what reached the other camera, either way."""
+    """One run of the paper's section 4. arrived: joint optimum of the points whose messages were delivered."""
     rng = np.random.default_rng(seed)
     world = section_4(rng)
     sightings = observe(world, rng, cube(rng, points), size=size, outliers=outliers)
     net = network(world, traffic, seed)
     feed(net, sightings, EVERY)
-    for _ in range(SETTLE):
+    for _ in range(FINAL_UPDATES):
         net.tick()
     left_out = sightings.wrong.astype(bool)
     if arrived:
         left_out = left_out | ~np.isin(np.arange(1, points + 1)[: len(left_out)], list(net.arrived))
     best = errors(world, joint_optimum(world, sightings.without(left_out)).poses)[0]
-    # The yardstick begins at the truth: one that took no step (a point that starts behind a camera) is none.
-    return errors(world, net.published())[0] / best if best > 0.0 else float("nan")
+    # The joint optimum is started at the truth: one that took no step (a point behind a camera) is invalid.
+    return errors(world, net.world_poses())[0] / best if best > 0.0 else float("nan")
 
 
-def _told(values: list[float]) -> str:
+def _summary(values: list[float]) -> str:
     good = [v for v in values if np.isfinite(v)]
     unmeasured = sum(np.isnan(v) for v in values)
     failed = len(values) - len(good) - unmeasured + sum(v > 3.0 for v in good)
     if not good:
         return f"all {len(values)} failed"
-    without = f", {unmeasured} without a yardstick" if unmeasured else ""
+    without = f", {unmeasured} without a joint optimum" if unmeasured else ""
     return f"{np.mean(good):.3f} / {np.max(good):.2f}, failed {failed} of {len(values)}{without}"
 
 
-def growing(seed: int) -> list[float]:
-    """Ratios at 200, 500, 1000, 2000 and 5000 points; an update at each of the first 500 points, as the paper has it.
+def ratios_by_points(seed: int) -> list[float]:
+    """Ratios at 200, 500, 1000, 2000 and 5000 points; an update at each of the first 500 points, as in the paper.
 
-    After that every 5, from 1000 on every ``EVERY``: 200 points at every fifth are 40 updates, too few to settle.
+    After that every 5, from 1000 on every ``EVERY``: 200 points at every fifth are 40 updates, too few to converge.
     """
     rng = np.random.default_rng(seed)
     world = section_4(rng)
@@ -87,15 +87,15 @@ def growing(seed: int) -> list[float]:
         feed(net, sightings, 1 if n <= 500 else 5 if n <= 1000 else EVERY, last, n)
         last = n
         best = joint_optimum(world, sightings.first(n))
-        out.append(errors(world, net.published())[0] / errors(world, best.poses)[0])
+        out.append(errors(world, net.world_poses())[0] / errors(world, best.poses)[0])
     return out
 
 
-def bump(seed: int, shift: float, turn: float, after: int = 2500) -> tuple[int | None, int | None, bool]:
+def moved_camera(seed: int, shift: float, turn: float, after: int = 2500) -> tuple[int | None, int | None, bool]:
     """A camera moved by ``shift`` [cm] and ``turn`` [deg] after 5,000 points.
 
-    Returns its observations until it noticed, and until its position is back within 1.5 cm for good; whether anybody
-    was wrongly told before, or somebody else after.
+    Returns its observations until detection, and until its position stays within 1.5 cm; and whether there was a false
+    alarm before the motion, or of another camera after it.
     """
     rng = np.random.default_rng(seed)
     world = section_4(rng)
@@ -106,7 +106,7 @@ def bump(seed: int, shift: float, turn: float, after: int = 2500) -> tuple[int |
     way, axis = way * shift / np.linalg.norm(way), axis * np.radians(turn) / np.linalg.norm(axis)
     poses = list(world.poses)
     poses[camera] = Pose(so3.exp(axis) @ poses[camera].rotation, poses[camera].position + way)
-    moved = World(poses)
+    moved = SimulatedRig(poses)
     sightings = observe(moved, rng, cube(rng, after))
     mine = np.cumsum((sightings.cameras == camera).any(axis=1))
     begun, seen, back = len(net.notices), None, None
@@ -116,7 +116,7 @@ def bump(seed: int, shift: float, turn: float, after: int = 2500) -> tuple[int |
             found = [now for now, notice in net.notices[begun:] if notice.kind == "bumped" and notice.camera == camera]
             seen = int(mine[min(found[0] - 5001, after - 1)]) if found else None
         if seen is not None:
-            pose = net.nodes[camera].published()
+            pose = net.nodes[camera].world_pose()
             near = pose is not None and float(np.linalg.norm(pose.position - poses[camera].position)) < 1.5
             back = (back if back is not None else int(mine[i + 4])) if near else None
     wrong = [n for _, n in net.notices if n.kind == "bumped" and n.camera != camera]
@@ -125,7 +125,7 @@ def bump(seed: int, shift: float, turn: float, after: int = 2500) -> tuple[int |
 
 
 def false_alarms(seed: int, points: int) -> tuple[int, int]:
-    """Alarms of cameras that stand still, and the observations that they saw."""
+    """False alarms of static cameras, and their number of observations."""
     rng = np.random.default_rng(seed)
     world = section_4(rng)
     net = network(world, None, seed)
@@ -145,11 +145,11 @@ def large(seed: int, cameras: int, points: int, updates: int) -> tuple[float, fl
     while net.nodes[0].updates < updates:
         net.tick()
     spent = time.process_time() - begin
-    return errors(world, net.published())[0] / errors(world, joint_optimum(world, sightings).poses)[0], spent
+    return errors(world, net.world_poses())[0] / errors(world, joint_optimum(world, sightings).poses)[0], spent
 
 
 def cost(seed: int) -> tuple[float, float, int, int]:
-    """CPU [µs] of one observation and of one update with 4 neighbours, and bytes a neighbour, settled and at most."""
+    """CPU [µs] of one observation and of one update with 4 neighbours, and bytes per neighbour, final and maximal."""
     rng = np.random.default_rng(seed)
     world = section_4(rng)
     net = network(world, None, seed)
@@ -179,27 +179,27 @@ def _bytes(net: Network) -> int:
 
 def _row_section_4(seeds: range, quick: bool) -> list[Row]:
     del quick
-    return [Row("section 4, mean / worst", "≤ 1.10 / 1.5", "≤ 1.02 / 1.2", _told([ratio(s) for s in seeds]))]
+    return [Row("section 4, mean / worst", "≤ 1.10 / 1.5", "≤ 1.02 / 1.2", _summary([ratio(s) for s in seeds]))]
 
 
 def _row_growing(seeds: range, quick: bool) -> list[Row]:
     del quick
-    means = np.mean([growing(s) for s in seeds[: max(3, len(seeds) // 2)]], axis=0)
+    means = np.mean([ratios_by_points(s) for s in seeds[: max(3, len(seeds) // 2)]], axis=0)
     text = ", ".join(f"{m:.3f}" for m in means)
     return [Row("mean at 200, 500, 1,000, 2,000, 5,000 points", "≤ 1.2", "≤ 1.05", text)]
 
 
 def _row_bearings(seeds: range, quick: bool) -> list[Row]:
     del quick
-    return [Row("bearings only", "≤ 1.15", "≤ 1.02", _told([ratio(s, size=np.inf) for s in seeds[:20]]))]
+    return [Row("bearings only", "≤ 1.15", "≤ 1.02", _summary([ratio(s, size=np.inf) for s in seeds[:20]]))]
 
 
 def _row_losses(seeds: range, quick: bool) -> list[Row]:
     del quick
     seeds = seeds[:20]
-    again = _told([ratio(s, traffic=Traffic(0.2, 0.2, 50, 3)) for s in seeds])
-    bare = _told([ratio(s, traffic=Traffic(0.2, 0.2, 50)) for s in seeds])
-    same = _told([ratio(s, traffic=Traffic(0.2, 0.2, 50), arrived=True) for s in seeds])
+    again = _summary([ratio(s, traffic=Traffic(0.2, 0.2, 50, 3)) for s in seeds])
+    bare = _summary([ratio(s, traffic=Traffic(0.2, 0.2, 50)) for s in seeds])
+    same = _summary([ratio(s, traffic=Traffic(0.2, 0.2, 50), arrived=True) for s in seeds])
     name = "20 % lost + 20 % duplicated + ≤ 50 events late"
     return [
         Row(name + ", last 4 a message", "≤ 1.15", "≤ 1.03", again),
@@ -211,22 +211,22 @@ def _row_losses(seeds: range, quick: bool) -> list[Row]:
 def _row_outliers(seeds: range, quick: bool) -> list[Row]:
     del quick
     return [
-        Row("5 % outliers", "no failure, ≤ 1.5", "", _told([ratio(s, outliers=0.05) for s in seeds])),
-        Row("20 % outliers", "", "≤ 1.1", _told([ratio(s, outliers=0.2) for s in seeds[:20]])),
+        Row("5 % outliers", "no failure, ≤ 1.5", "", _summary([ratio(s, outliers=0.05) for s in seeds])),
+        Row("20 % outliers", "", "≤ 1.1", _summary([ratio(s, outliers=0.2) for s in seeds[:20]])),
     ]
 
 
-def _row_bump(seeds: range, quick: bool) -> list[Row]:
+def _row_moved_camera(seeds: range, quick: bool) -> list[Row]:
     rows = []
     for name, shift, turn, must, reach in (
-        ("bump 5 cm, 2°: seen / back, obs., worst", 5.0, 2.0, "≤ 60 / 500", "≤ 15 / 250"),
-        ("bump 0.3°: seen, obs., worst", 0.0, 0.3, "≤ 1000", "≤ 150"),
+        ("moved 5 cm, 2°: detected / recovered, obs., worst", 5.0, 2.0, "≤ 60 / 500", "≤ 15 / 250"),
+        ("moved 0.3°: detected, obs., worst", 0.0, 0.3, "≤ 1000", "≤ 150"),
     ):
-        runs = [bump(s, shift, turn) for s in seeds]
+        runs = [moved_camera(s, shift, turn) for s in seeds]
         seen = [r[0] if r[0] is not None else 10**6 for r in runs]
         back = [r[1] if r[1] is not None else 10**6 for r in runs]
         wrong = sum(r[2] for r in runs)
-        text = f"{max(seen)} / {max(back)} (median {np.median(seen):.0f} / {np.median(back):.0f}), wrong alarms {wrong}"
+        text = f"{max(seen)} / {max(back)} (median {np.median(seen):.0f} / {np.median(back):.0f}), false alarms {wrong}"
         rows.append(Row(name, must, reach, text + f" of {len(runs)}"))
     alarms, seen_in_all = false_alarms(seeds[0], 10_000 if quick else 50_000)
     rows.append(Row("false alarms", "0 in 1e5 obs.", "", f"{alarms} in {seen_in_all:.0e} obs."))
@@ -236,7 +236,7 @@ def _row_bump(seeds: range, quick: bool) -> list[Row]:
 def _row_50(seeds: range, quick: bool) -> list[Row]:
     runs = [large(s, 50, 20_000, 600) for s in seeds[: 1 if quick else 5]]
     return [
-        Row("50 cameras, 600 updates", "≤ 1.15", "≤ 1.03", _told([r[0] for r in runs]) + f", {runs[0][1]:.0f} s CPU")
+        Row("50 cameras, 600 updates", "≤ 1.15", "≤ 1.03", _summary([r[0] for r in runs]) + f", {runs[0][1]:.0f} s CPU")
     ]
 
 
@@ -249,7 +249,7 @@ def _row_500(seeds: range, quick: bool) -> list[Row]:
 
 def _row_cost(seeds: range, quick: bool) -> list[Row]:
     del quick
-    handled, update, settled, most = cost(seeds[0])
+    handled, update, converged, most = cost(seeds[0])
     return [
         Row(
             "CPU an observation at 4 neighbours",
@@ -257,7 +257,7 @@ def _row_cost(seeds: range, quick: bool) -> list[Row]:
             "≤ 3 µs",
             f"{handled:.1f} µs, and {update:.0f} µs an update",
         ),
-        Row("state a neighbour", "≤ 4 kB", "≤ 0.5 kB", f"{settled} B settled, {most} B at most"),
+        Row("state a neighbour", "≤ 4 kB", "≤ 0.5 kB", f"{converged} B converged, {most} B at most"),
     ]
 
 
@@ -267,7 +267,7 @@ ROWS: dict[str, Callable[[range, bool], list[Row]]] = {
     "bearings": _row_bearings,
     "losses": _row_losses,
     "outliers": _row_outliers,
-    "bump": _row_bump,
+    "bump": _row_moved_camera,
     "50": _row_50,
     "500": _row_500,
     "cost": _row_cost,

@@ -1,9 +1,9 @@
-"""Sessions as people bring them: every trouble that real cameras make, alone and mixed, on simulated rigs.
+"""Realistic sessions: every defect of real cameras, alone and mixed, on simulated rigs.
 
     python -m tests.bench.real_life [--sessions 8] [--start 0] [--only hover,lenses] [--each]
 
-A marker is carried about a room, or hovers as a drone does; each row adds one trouble, the last rows mix them over 2
-to 20 cameras. Asked: every camera tied in that can be, none wrong. A camera's answer counts as wrong if its clock is
+A marker is carried about a room, or hovers as a drone does; each row adds one defect, the last rows mix them over 2
+to 20 cameras. Required: every camera localised that can be, none wrong. A camera's result is wrong if its clock is
 more than 20 ms off in the middle of what it saw, or its orientation more than 3 degrees; a camera without a clock at
 all counts as wrong if it is not refused by name.
 """
@@ -30,7 +30,7 @@ from protocols.geometry.pose import Pose  # noqa: E402
 from protocols.geometry.types import Bools, Floats  # noqa: E402
 from protocols.session.observations import DEFAULT_LABEL  # noqa: E402
 from protocols.session.rig import Rig, RigCamera  # noqa: E402
-from tests import rigs  # noqa: E402
+from tests.support import rigs  # noqa: E402
 
 _WRONG_S, _WRONG_RAD = 0.02, np.deg2rad(3.0)
 _STEP = 0.005  # s, of the table of a path that pauses
@@ -45,7 +45,7 @@ class Trouble:
     hover: share of the time in which the marker stands. gaps: times a camera loses it for 5 to 20 s. glimpse: mean
     seconds [s] for which it is seen at a time, 0 = always. jitter: how far [share of an interval] a phone's frame
     intervals wander about their mean; times are true. stamps: std [s] by which the stamp of a frame is off. focal,
-    centre_px, k1: std of what is told of a lens less what is true (log, px, 1). every: only each n-th frame has a
+    centre_px, k1: std of the given intrinsics minus the true ones (log, px, 1). every: only each n-th frame has a
     label. outliers: share of false detections, half of them in one place for a while. numbers: cameras with random
     frame numbers. stagger: cameras whose times are no clock's. chain: whether a camera sees together with the two
     before it and the two after it only. readout_s: longest readout of a rolling shutter.
@@ -110,8 +110,8 @@ def session(seed: int, trouble: Trouble) -> rigs.Session:
     for i, pose in enumerate(poses):
         name = f"cam{i}"
         lens, rate = rigs.random_lens(rng), float(rng.choice(_FPS))
-        drift, epoch = 1.0 + 1e-6 * float(rng.uniform(-200, 200)), rigs.EPOCHS[i % len(rigs.EPOCHS)]
-        clocks[name] = TimeMap(1.0 / drift, -epoch / drift)
+        drift, clock_origin = 1.0 + 1e-6 * float(rng.uniform(-200, 200)), rigs.EPOCHS[i % len(rigs.EPOCHS)]
+        clocks[name] = TimeMap(1.0 / drift, -clock_origin / drift)
         table[name] = RigCamera(name, rigs.SIZE, rate, _told(rng, lens, t))
         interval = np.full(int(t.seconds * rate) + 1, 1.0 / rate)
         if t.jitter > 0.0:
@@ -129,7 +129,7 @@ def session(seed: int, trouble: Trouble) -> rigs.Session:
         where = np.repeat(rng.uniform((0, 0), rigs.SIZE, (len(true) // 20 + 1, 2)), 20, axis=0)[: len(true)]
         sticky = np.repeat(rng.random(len(true) // 20 + 1) < 0.5 * t.outliers, 20)[: len(true)]
         pixels[sticky] = where[sticky] + rng.normal(0, t.noise, (int(sticky.sum()), 2))
-        shown = epoch + drift * true
+        shown = clock_origin + drift * true
         if t.stamps > 0.0:  # frames keep their order
             shown = np.sort(shown + rng.normal(0, t.stamps, len(shown)))
         if i >= t.cameras - t.stagger:
@@ -175,7 +175,7 @@ def _windows(t: Trouble) -> list[tuple[float, float]]:
     """True times in which each camera sees.
 
     In a chain never more than three see together: a third of the time of the last two and of the next two. (With two at
-    a time nothing would tell how far apart the next two stand.)
+    a time the baseline of the next two would not be observable.)
     """
     if not t.chain:
         return [(0.0, t.seconds)] * t.cameras
@@ -259,11 +259,11 @@ ROWS: dict[str, Make] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """One session: cameras that could be tied in, that were, wrong ones (told with why), errors and CPU [s]."""
+class SessionResult:
+    """One session: cameras that could be localised, that were, wrong ones (with the reason), errors and CPU [s]."""
 
-    can: int
-    tied: int
+    localisable: int
+    localised: int
     wrong: tuple[str, ...]
     lag_ms: tuple[float, ...]
     turn_degrees: tuple[float, ...]
@@ -271,16 +271,16 @@ class Judged:
     cpu_s: float
 
 
-def judge(seed: int, trouble: Trouble) -> Judged:
-    """Calibrate one session as the command does and hold every camera against the truth."""
+def evaluate_session(seed: int, trouble: Trouble) -> SessionResult:
+    """Calibrate one session as the command does and compare every camera with the truth."""
     made = session(seed, trouble)
     clockless = {f"cam{i}" for i in range(trouble.cameras - trouble.stagger, trouble.cameras)}
-    can = trouble.cameras - len(clockless)
+    localisable = trouble.cameras - len(clockless)
     begin = time.process_time()
     try:
         found = calibrate(made.rig, made.observations(), thorough=True)
     except Refused as refusal:
-        return Judged(can, 0, (), (), (), refusal.cameras, time.process_time() - begin)
+        return SessionResult(localisable, 0, (), (), (), refusal.cameras, time.process_time() - begin)
     spent = time.process_time() - begin
     lags, turns, wrong = [], [], []
     first = next((name for name in found.cameras if name not in clockless), found.reference)
@@ -299,8 +299,8 @@ def judge(seed: int, trouble: Trouble) -> Judged:
             lags.append(1e3 * lag)
         if name != first:
             turns.append(float(np.degrees(turn)))
-    tied = len([name for name in found.cameras if name not in clockless])
-    return Judged(can, tied, tuple(wrong), tuple(lags), tuple(turns), found.refused, spent)
+    localised = len([name for name in found.cameras if name not in clockless])
+    return SessionResult(localisable, localised, tuple(wrong), tuple(lags), tuple(turns), found.refused, spent)
 
 
 def main() -> None:
@@ -308,24 +308,24 @@ def main() -> None:
     parser.add_argument("--sessions", type=int, default=8)
     parser.add_argument("--start", type=int, default=0, help="first seed")
     parser.add_argument("--only", default="", help="rows whose name contains one of these")
-    parser.add_argument("--each", action="store_true", help="tell of every session in which something is missing")
+    parser.add_argument("--each", action="store_true", help="report every session in which something is missing")
     options = parser.parse_args()
     print(f"{options.sessions} sessions a row from seed {options.start}")
-    print(f"{'':52} tied in        wrong  lag ms, median, worst   rotation °     CPU s")
+    print(f"{'':52} localised      wrong  lag ms, median, worst   rotation °     CPU s")
     for name, make in ROWS.items():
         if not any(part in name for part in options.only.split(",")):
             continue
         answers = []
         for seed in range(options.start, options.start + options.sessions):
-            answer = judge(seed, make(seed))
+            answer = evaluate_session(seed, make(seed))
             answers.append(answer)
-            if options.each and (answer.wrong or answer.tied < answer.can):
+            if options.each and (answer.wrong or answer.localised < answer.localisable):
                 print(f"  seed {seed}: {make(seed)}\n    wrong {answer.wrong}, refused {answer.refused}", flush=True)
-        can, tied = sum(one.can for one in answers), sum(one.tied for one in answers)
+        localisable, localised = sum(one.localisable for one in answers), sum(one.localised for one in answers)
         lags = [value for one in answers for value in one.lag_ms]
         turns = [value for one in answers for value in one.turn_degrees]
         print(
-            f"{name:52} {tied:4d} of {can:4d}   {sum(len(one.wrong) for one in answers):4d}  "
+            f"{name:52} {localised:4d} of {localisable:4d}   {sum(len(one.wrong) for one in answers):4d}  "
             f"{_told_figures(lags)}   {_told_figures(turns)}   {np.mean([one.cpu_s for one in answers]):6.2f}",
             flush=True,
         )

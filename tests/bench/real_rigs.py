@@ -2,7 +2,7 @@
 
 `python -m tests.bench.real_rigs --data FOLDER`: every session folder in it that has a truth_trajectory.csv (RTK),
 and webcams/session. The recordings are not part of the project; where FOLDER is
-absent this says so and leaves with status 0.
+absent this is reported, with exit status 0.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from protocols.core.clocks import TimeMap
 from protocols.geometry.types import Floats
 from protocols.session.calibration import (
     CameraCalibration,
-    Known,
+    FixedCalibration,
     read_calibration,
     write_calibration,
     write_trajectory,
@@ -209,14 +209,15 @@ def _lags(run: Run, seen: Observations, fit: scoring.Alignment, table: Floats) -
         return Lags((*lines, "no two cameras could be resected on the truth"), float("inf"))
     sizes = np.abs(list(differences.values()))
     median, worst = float(np.median(sizes)), float(sizes.max())
-    told = ", ".join(f"{a}–{b} {value:+.1f}" for (a, b), value in differences.items())
-    lines.append(f"lags against resection on the truth: median {median:.1f} ms, worst {worst:.1f} ms ({told})")
-    told = "; ".join(
+    texts = ", ".join(f"{a}–{b} {value:+.1f}" for (a, b), value in differences.items())
+    lines.append(f"lags against resection on the truth: median {median:.1f} ms, worst {worst:.1f} ms ({texts})")
+    texts = "; ".join(
         f"{name} {part.median_px:.2f} px, focal × {part.focal_scale:.4f}, time ± {_MS * part.time_std:.1f} ms, errors "
-        f"{part.errors.white_px:.2f} px white, {part.errors.lasting_px:.2f} px lasting {part.errors.seconds:.1f} s"
+        f"{part.errors.white_px:.2f} px white, {part.errors.correlated_px:.2f} px correlated over "
+        f"{part.errors.time_constant:.1f} s"
         for name, part in found.items()
     )
-    return Lags((*lines, f"resection: {told}"), worst)
+    return Lags((*lines, f"resection: {texts}"), worst)
 
 
 def webcams(session: Path) -> bool:
@@ -273,21 +274,21 @@ def webcams(session: Path) -> bool:
 
 
 def _with_given_poses(session: Path) -> str:
-    """Offsets [ms] that the pictures tell where the given poses are held and only clocks and paths are sought."""
+    """Offsets [ms] estimated from the images with the given poses fixed."""
     rig = read_rig(session / "rig.toml")
     seen = read_observations(session / "observations.csv", rig.cameras)
     _, given = read_calibration(session / "truth_calibration.toml")
-    found = calibrate(rig, seen, known=Known(given, "metric"))
-    told = []
+    found = calibrate(rig, seen, known=FixedCalibration(given, "metric"))
+    texts = []
     for name, camera in found.cameras.items():
         middle = float(np.median(np.concatenate([track.time for track in seen.of_camera(name)])))
         offset = camera.time_map.clock_rate * middle + camera.time_map.time_offset - middle
-        told.append(f"{name} {_MS * offset:+.1f} ms, {camera.rms_px:.2f} px")
-    return f"with the given poses held: {'; '.join(told)}"
+        texts.append(f"{name} {_MS * offset:+.1f} ms, {camera.rms_px:.2f} px")
+    return f"with the given poses held: {'; '.join(texts)}"
 
 
 def _board_lags(session: Path, offsets: dict[str, float]) -> list[str]:
-    """What the board's attitude alone says of each camera's pictures against its stamps, beside the offsets [ms]."""
+    """Offset of each camera's images against its stamps from the board's attitude alone, beside the offsets [ms]."""
     rig = read_rig(session / "rig.toml")
     seen = read_observations(session / "observations.csv", rig.cameras)
     turns = {
@@ -299,9 +300,9 @@ def _board_lags(session: Path, offsets: dict[str, float]) -> list[str]:
     for a, b in itertools.combinations(turns, 2):
         found = board_rotation.lag(turns[a], turns[b])
         if found is not None:
-            told = f"{-_MS * found[0]:+.0f} ± {_MS * found[1]:.0f} ms"
+            texts = f"{-_MS * found[0]:+.0f} ± {_MS * found[1]:.0f} ms"
             lines.append(
-                f"{b} against {a}: {told} by the board's attitude alone, {offsets[b] - offsets[a]:+.0f} ms here"
+                f"{b} against {a}: {texts} by the board's attitude alone, {offsets[b] - offsets[a]:+.0f} ms here"
             )
     return lines
 

@@ -1,8 +1,8 @@
-"""One camera fitted to a surveyed path by itself: a yardstick for its clock and pose that uses no other camera.
+"""Resection of one camera from a surveyed path: reference values of its clock and pose without any other camera.
 
-Detectors and lenses err alike for seconds, so successive frames tell less than their number says, and a fit that
-takes them as independent follows those errors with its clock. Here the errors of each image axis are white noise
-plus a first-order Gauss-Markov process, whose three figures are found by maximum likelihood. The process has a
+Errors of detectors and lenses are correlated over seconds, so the effective sample size is smaller than the number of
+frames, and a fit that assumes independence biases the clock. Here the errors of each image axis are white noise plus a
+first-order Gauss-Markov process, whose three parameters are estimated by maximum likelihood. The process has a
 tridiagonal inverse covariance, which makes the generalised least squares linear in the number of rows.
 """
 
@@ -23,24 +23,24 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
 
-_LEAST_ROWS = 30
-_MARGIN = 2.0  # of the truth before the first row and after the last [s]: the time map still moves
-_SET_ASIDE = 5.0  # robust stds
+_MIN_ROWS = 30
+_MARGIN = 2.0  # of the truth before the first row and after the last [s], as the time map still changes
+_OUTLIER_SIGMA = 5.0  # robust stds
 _MEDIAN_NORM = 1.1774  # of two unit normals
 _ROUNDS, _STEPS = 20, 8
-_SETTLED = 0.1  # what a last round may still move [stds]
-# a turn [rad] and a shift [truth's unit] of the world, seconds, rate [1e-3], focal length [%]
+_CONVERGED = 0.1  # parameter change of a converged round [stds]
+# rotation [rad] and translation [truth's unit] of the world, time [s], rate [1e-3], focal length [%]
 _DIFFERENCES = np.array([1e-6] * 3 + [1e-4] * 3 + [1e-4, 1e-3, 1e-3])
 _TIME = 6
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorModel:
-    """Errors of one image axis: white_px [px] from row to row, lasting_px [px] alike for ``seconds`` [s] (1/e)."""
+    """Noise of one image axis: white_px [px], and Gauss-Markov with correlated_px [px] and ``time_constant`` [s]."""
 
     white_px: float
-    lasting_px: float
-    seconds: float
+    correlated_px: float
+    time_constant: float
 
 
 _FIRST_MODEL = ErrorModel(0.45, 1.0, 1.0)
@@ -49,11 +49,11 @@ _SMALLEST, _LARGEST = ErrorModel(0.1, 0.1, 0.1), ErrorModel(10.0, 30.0, 60.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Resection:
-    """One camera fitted to the truth by itself.
+    """Resection of one camera from the true path.
 
     time_map: truth's clock from the camera's; time_std: its std [s] at the median of the camera's times.
     pose: in the truth's frame and unit. focal_scale: by which the lens's focal length is multiplied.
-    median_px: median residual [px] of all rows. errors: what the residuals are made of.
+    median_px: median residual [px] of all rows. errors: noise model of the residuals.
     """
 
     time_map: TimeMap
@@ -67,20 +67,19 @@ class Resection:
 def resect(
     lens: Intrinsics, time: Floats, pixels: Floats, start: TimeMap, truth_time: Floats, truth: Floats
 ) -> Resection:
-    """Pose, focal length and time map of one camera against the truth's path, with errors that last.
+    """Pose, focal length and time map of one camera from the true path, with correlated errors.
 
-    time: (n,) camera times [s]; pixels: (n, 2); start: a first guess of truth time from camera time, good to
-    about half a second; truth_time, truth: (m,) sorted [s], (m, 3). Nothing else of the answer that is being
-    judged goes in. Raises ValueError where too few rows lie within the truth, no pose fits, or the fit does
-    not settle.
+    time: (n,) camera times [s]; pixels: (n, 2); start: initial map from camera time to truth time, accurate to about
+    half a second; truth_time, truth: (m,) sorted [s], (m, 3). Nothing else of the estimate under evaluation is used.
+    Raises ValueError where too few rows lie within the truth, no pose fits, or the fit does not converge.
     """
     seen = start.clock_rate * time + start.time_offset
     rows = np.argsort(time)
     rows = rows[(seen[rows] > truth_time[0] + _MARGIN) & (seen[rows] < truth_time[-1] - _MARGIN)]
-    if len(rows) < _LEAST_ROWS:
+    if len(rows) < _MIN_ROWS:
         raise ValueError(f"only {len(rows)} rows lie within the truth")
     view = _View(lens, CubicSpline(truth_time, truth), start, float(np.median(time)), time[rows], pixels[rows])
-    parameters, std, model = _settle(view, _independent(view))
+    parameters, std, model = _fit_alternately(view, _independent(view))
     turn = so3.exp(parameters[:3])
     return Resection(
         view.time_map(parameters),
@@ -94,10 +93,10 @@ def resect(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _View:
-    """What one camera saw of the path: time (n,) sorted [s], pixels (n, 2); middle: a camera time [s].
+    """Observations of the path by one camera: time (n,) sorted [s], pixels (n, 2); middle: a camera time [s].
 
-    Nine parameters: rotation vector and translation (camera from world), seconds at the middle and 1e-3 of rate
-    on top of the start, per cent of focal length.
+    Nine parameters: rotation vector and translation (camera from world), time at the middle [s] and rate [1e-3]
+    relative to the start, focal length [%].
     """
 
     lens: Intrinsics
@@ -113,7 +112,7 @@ class _View:
         return TimeMap(rate, at_middle - rate * self.middle)
 
     def residual(self, parameters: Floats) -> Floats:
-        """Predicted less seen (n, 2) [px]."""
+        """Predicted minus observed (n, 2) [px]."""
         clock = self.time_map(parameters)
         points = self.path(clock.clock_rate * self.time + clock.time_offset)
         points = points @ so3.exp(parameters[:3]).T + parameters[3:6]
@@ -123,7 +122,7 @@ class _View:
         return np.asarray(replace(self.lens, matrix=matrix).project(points) - self.pixels)
 
     def derivatives(self, parameters: Floats) -> Floats:
-        """Of the residual by the parameters (n, 2, 9), by central differences."""
+        """Jacobian (n, 2, 9) of the residual by the parameters, by central differences."""
         columns = [
             (self.residual(parameters + step) - self.residual(parameters - step)) / (2 * step.sum())
             for step in np.diag(_DIFFERENCES)
@@ -135,10 +134,10 @@ class _View:
 
 
 def _independent(view: _View) -> Floats:
-    """Parameters (9,) with no guess of the pose, robustly, each row's error taken as its own."""
-    there = view.path(view.start.clock_rate * view.time + view.start.time_offset)
+    """Robust initial parameters (9,) by PnP RANSAC and least squares with independent errors."""
+    points = view.path(view.start.clock_rate * view.time + view.start.time_offset)
     found, rotation, translation, _ = cv2.solvePnPRansac(
-        there, view.pixels, view.lens.matrix, view.lens.distortions, reprojectionError=12.0, iterationsCount=500
+        points, view.pixels, view.lens.matrix, view.lens.distortions, reprojectionError=12.0, iterationsCount=500
     )
     if not found:
         raise ValueError("no pose fits the truth")
@@ -152,33 +151,33 @@ def _independent(view: _View) -> Floats:
     return np.asarray(fit.x)
 
 
-def _settle(view: _View, parameters: Floats) -> tuple[Floats, Floats, ErrorModel]:
-    """Parameters (9,), their stds (9,) and the error model, each found with the other held, in turn."""
+def _fit_alternately(view: _View, parameters: Floats) -> tuple[Floats, Floats, ErrorModel]:
+    """Parameters (9,), their stds (9,) and the error model, estimated alternately."""
     model = _FIRST_MODEL
     for _ in range(_ROUNDS):
         residual = view.residual(parameters)
         norms = np.linalg.norm(residual, axis=1)
-        keep = norms < _SET_ASIDE * float(np.median(norms)) / _MEDIAN_NORM
+        keep = norms < _OUTLIER_SIGMA * float(np.median(norms)) / _MEDIAN_NORM
         kept = view.only(keep)
-        model = _likeliest(kept.time, residual[keep], model)
+        model = _maximum_likelihood(kept.time, residual[keep], model)
         precision = _Precision(model, kept.time)
         before = parameters
         for _ in range(_STEPS):
             derivatives = kept.derivatives(parameters)
-            weighed = precision.times(derivatives.reshape(len(kept.time), -1)).reshape(derivatives.shape)
-            normal = np.einsum("nai,naj->ij", weighed, derivatives)
-            step = -np.linalg.solve(normal, np.einsum("nai,na->i", weighed, kept.residual(parameters)))
+            weighted = precision.times(derivatives.reshape(len(kept.time), -1)).reshape(derivatives.shape)
+            normal = np.einsum("nai,naj->ij", weighted, derivatives)
+            step = -np.linalg.solve(normal, np.einsum("nai,na->i", weighted, kept.residual(parameters)))
             parameters = parameters + step
-            if step @ normal @ step < (0.1 * _SETTLED) ** 2:
+            if step @ normal @ step < (0.1 * _CONVERGED) ** 2:
                 break
         moved = parameters - before
-        if moved @ normal @ moved < _SETTLED**2:
+        if moved @ normal @ moved < _CONVERGED**2:
             return parameters, np.sqrt(np.diag(np.linalg.inv(normal))), model
-    raise ValueError("the fit to the truth does not settle")
+    raise ValueError("the fit to the truth does not converge")
 
 
-def _likeliest(time: Floats, residual: Floats, start: ErrorModel) -> ErrorModel:
-    """The model under which residuals (n, 2) [px] at sorted times (n,) are likeliest, both axes alike."""
+def _maximum_likelihood(time: Floats, residual: Floats, start: ErrorModel) -> ErrorModel:
+    """Maximum-likelihood noise model of residuals (n, 2) [px] at sorted times (n,), the same for both axes."""
     low, high = _logs(_SMALLEST), _logs(_LARGEST)
 
     def model(logs: Floats) -> ErrorModel:
@@ -194,29 +193,32 @@ def _likeliest(time: Floats, residual: Floats, start: ErrorModel) -> ErrorModel:
 
 
 def _logs(model: ErrorModel) -> Floats:
-    return np.log([model.white_px, model.lasting_px, model.seconds])
+    return np.log([model.white_px, model.correlated_px, model.time_constant])
 
 
 class _Precision:
     """Inverse covariance (n, n) of one axis's errors at sorted times (n,), and the covariance's log determinant.
 
-    With K the lasting part's covariance and w white variance: inv(w I + K) = (I - inv(w inv(K) + I)) / w.
+    With K the correlated part's covariance and w white variance: inv(w I + K) = (I - inv(w inv(K) + I)) / w.
     """
 
     def __init__(self, model: ErrorModel, time: Floats) -> None:
-        white, lasting = model.white_px**2, model.lasting_px**2
-        alike = np.exp(-np.diff(time) / model.seconds)
-        fresh = np.maximum(lasting * (1.0 - alike**2), 1e-12)  # rows at one time must not divide by 0
+        white, correlated = model.white_px**2, model.correlated_px**2
+        correlation = np.exp(-np.diff(time) / model.time_constant)
+        innovation = np.maximum(correlated * (1.0 - correlation**2), 1e-12)  # rows at one time must not divide by 0
         band = np.zeros((2, len(time)))
-        band[0, 1:] = -alike / fresh
+        band[0, 1:] = -correlation / innovation
         band[1] = 1.0 / white
-        band[1, 0] += 1.0 / lasting
-        band[1, :-1] += alike**2 / fresh
-        band[1, 1:] += 1.0 / fresh
+        band[1, 0] += 1.0 / correlated
+        band[1, :-1] += correlation**2 / innovation
+        band[1, 1:] += 1.0 / innovation
         self._white = white
         self._root = cholesky_banded(band)
         self.log_determinant = float(
-            len(time) * np.log(white) + np.log(lasting) + np.log(fresh).sum() + 2.0 * np.log(self._root[1]).sum()
+            len(time) * np.log(white)
+            + np.log(correlated)
+            + np.log(innovation).sum()
+            + 2.0 * np.log(self._root[1]).sum()
         )
 
     def times(self, values: Floats) -> Floats:

@@ -128,7 +128,7 @@ def run(hubs: int, cameras: int, hz: float, seconds: float) -> Load:
     )  # fmt: skip
 
 
-def told(load: Load) -> str:
+def summary(load: Load) -> str:
     """One line of the table."""
     return (
         f"| {load.hubs} | {load.cameras:,} | {load.rate:,.0f} | {load.lost} | {load.p50_ms:.1f} / {load.p99_ms:.0f} | "
@@ -173,7 +173,7 @@ def needed(hub: Cost, router: Cost, hz: float, cameras: int = _ASKED) -> tuple[i
 
 
 def main() -> None:
-    """Measure, tell, check."""
+    """Measure, report, check."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--hubs", type=int, default=4)
     parser.add_argument("--cameras", type=int, default=250, help="of each hub")
@@ -192,11 +192,11 @@ def main() -> None:
     small = run(1, words.cameras // 4, words.hz, seconds)
     head = "hubs | cameras | obs/s | lost | p50 / p99 ms | hub µs/obs | busiest hub | MB | router µs/obs | router | MB"
     print(f"| {head} |\n|{'---|' * 11}")
-    print(told(small), flush=True)
+    print(summary(small), flush=True)
     one = run(1, words.cameras, words.hz, seconds)
-    print(told(one), flush=True)
+    print(summary(one), flush=True)
     large = run(words.hubs, words.cameras, words.hz, seconds)
-    print(told(large))
+    print(summary(large))
     hub = Cost.through(small.cameras * words.hz, small.hub_share, one.cameras * words.hz, one.hub_share)
     router = Cost.through(small.cameras * words.hz, small.router_share, one.cameras * words.hz, one.router_share)
     print(f"a hub: {hub}; a router: {router}")

@@ -1,4 +1,4 @@
-"""How good an answer is: trajectories, coverage, lags and poses against independent truth.
+"""Scores of a result: trajectories, coverage, lags and poses against independent truth.
 
 A trajectory is mapped to the truth with one similarity and one affine time map (rate within 2e-3 of 1), no
 row is left out as an outlier, and only the time counts in which the truth moves.

@@ -1,11 +1,11 @@
-"""Figures on rigs of which everything is known: five cameras in a room, twenty along a field, real pairs cut short.
+"""Figures on rigs with full ground truth: five cameras in a room, twenty along a field, real pairs cut short.
 
     python -m tests.bench.simulated_rigs [--sessions 20] [--first 500] [--seconds 600] [--data FOLDER] [--only five,cut]
 
-five: 20 s, 5 cameras, clean; asked: 0.13 ms and 0.07° in the median. twenty: 20 cameras of which a third of the
-pairs see nothing in common; asked: all tied in, within 60 s. cut: every pair of the two drone flights (labels
+five: 20 s, 5 cameras, clean; required: 0.13 ms and 0.07° in the median. twenty: 20 cameras of which a third of the
+pairs see nothing in common; required: all localised, within 60 s. cut: every pair of the two drone flights (labels
 by hand), the first camera's recording ended and the second's begun so that they have 60 or 20 s in common, in
-windows of which both see a third in motion; asked: 97 and 60 % solved, none wrong (20 ms off the whole session;
+windows of which both see a third in motion; required: 97 and 60 % solved, none wrong (20 ms off the whole session;
 those over 30 ms, three of the stds that a clock may have, are counted too).
 """
 
@@ -23,9 +23,9 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import numpy as np  # noqa: E402
 
-from deploy.agents.malloc_tuning import keep_heap  # noqa: E402
+from deploy.agents.malloc_tuning import retain_freed_memory  # noqa: E402
+from hub.bundle.preprocessing import prepare  # noqa: E402
 from hub.calibration.pipeline import calibrate  # noqa: E402
-from hub.calibration.preprocessing import prepare  # noqa: E402
 from hub.trajectory.image_tracks import SmoothTrack  # noqa: E402
 from protocols.core.clocks import TimeMap  # noqa: E402
 from protocols.core.errors import Refused  # noqa: E402
@@ -34,8 +34,8 @@ from protocols.geometry.types import Floats  # noqa: E402
 from protocols.session.calibration import Calibration  # noqa: E402
 from protocols.session.observations import DEFAULT_LABEL, Observations, Track, read_observations  # noqa: E402
 from protocols.session.rig import Rig, RigCamera, read_rig  # noqa: E402
-from tests import rigs  # noqa: E402
 from tests.bench.real_rigs import DEFAULT_DATA  # noqa: E402
+from tests.support import rigs  # noqa: E402
 
 _WRONG_S, _FAR_S = 0.02, 0.03
 _MOVING_PX = 20.0
@@ -56,8 +56,8 @@ def five(sessions: int, first: int) -> None:
         turns.append(np.degrees(session.turn_error({name: one.pose for name, one in found.cameras.items()})))
     print(
         f"5 cameras, 20 s, clean, {sessions} rooms: lag {np.median(lags):.3f} ms median, {max(lags):.2f} worst "
-        f"(asked 0.13); rotation {np.median(turns):.3f}° median of the worst camera, {max(turns):.2f} worst "
-        f"(asked 0.07); {refused} cameras refused"
+        f"(required 0.13); rotation {np.median(turns):.3f}° median of the worst camera, {max(turns):.2f} worst "
+        f"(required 0.07); {refused} cameras refused"
     )
 
 
@@ -76,8 +76,8 @@ def twenty(seed: int, seconds: float) -> None:
     turn = np.degrees(session.turn_error({name: one.pose for name, one in found.cameras.items()}))
     print(
         f"20 cameras, {seconds:.0f} s, {100 * np.mean(blind):.0f} % of the pairs without common view, "
-        f"{len(observations)} rows: {len(found.cameras)} of {len(seen)} tied in, "
-        f"{cpu:.1f} s CPU, {wall:.1f} s wall (asked 60); "
+        f"{len(observations)} rows: {len(found.cameras)} of {len(seen)} localised, "
+        f"{cpu:.1f} s CPU, {wall:.1f} s wall (required 60); "
         f"lag {np.median(lags):.3f} ms median, {max(lags):.2f} worst; rotation {turn:.3f}° worst"
     )
 
@@ -116,8 +116,8 @@ def field(seed: int, cameras: int = 20, seconds: float = 600.0, length: float = 
         place = np.array([along, (1 if i % 2 else -1) * rng.uniform(6, 8), rng.uniform(1, 3)])
         poses[name] = rigs.looking_at(place, np.array([along + rng.normal(), 0.0, 0.0]), rng.normal(0, 0.05))
         lens, rate = rigs.random_lens(rng), (30.0, 25.0, 29.97, 50.0)[i % 4]
-        drift, epoch = 1.0 + 1e-6 * rng.uniform(-100, 100), rigs.EPOCHS[i % len(rigs.EPOCHS)]
-        clocks[name] = TimeMap(1.0 / drift, -epoch / drift)
+        drift, clock_origin = 1.0 + 1e-6 * rng.uniform(-100, 100), rigs.EPOCHS[i % len(rigs.EPOCHS)]
+        clocks[name] = TimeMap(1.0 / drift, -clock_origin / drift)
         table[name] = RigCamera(name, rigs.SIZE, rate, lens)
         begin = rng.uniform(0, 10)
         frame = np.arange(int((seconds - begin) * rate))
@@ -127,7 +127,7 @@ def field(seed: int, cameras: int = 20, seconds: float = 600.0, length: float = 
         with np.errstate(invalid="ignore"):
             keep = ((pixels >= 0) & (pixels < rigs.SIZE)).all(axis=1) & (local[:, 2] < 12.0)
         keep &= rng.random(len(true)) > 0.02
-        rows.append((name, frame[keep], epoch + drift * true[keep], pixels[keep]))
+        rows.append((name, frame[keep], clock_origin + drift * true[keep], pixels[keep]))
     camera = [name for name, frame, _, _ in rows for _ in frame]
     return rigs.Session(
         Rig(table),
@@ -156,14 +156,14 @@ class _Seen:
         """Seconds of motion within a span of reference time."""
         times = np.arange(begin, end, 0.1)
         shown = (times - self.clock.time_offset) / self.clock.clock_rate
-        speed = np.linalg.norm(self.smooth.at(shown - self.smooth.epoch, 1), axis=1) * self.lens.focal
+        speed = np.linalg.norm(self.smooth.at(shown - self.smooth.time_origin, 1), axis=1) * self.lens.focal
         with np.errstate(invalid="ignore"):
             return 0.1 * float((speed > _MOVING_PX).sum())
 
 
 def cut(data: Path) -> None:
     """Pairs of the drone flights with little in common."""
-    for seconds, asked in ((60.0, 97), (20.0, 60)):
+    for seconds, required in ((60.0, 97), (20.0, 60)):
         errors = []
         for flight in ("drone1", "drone2"):
             rig = read_rig(data / flight / "rig.toml")
@@ -177,13 +177,13 @@ def cut(data: Path) -> None:
                     if min(seen.moving(first, last) for seen in (a, b)) < seconds / 3:
                         continue
                     errors.append(_solve_cut(rig, observations, {one: a, other: b}, first, last))
-        told = [error for error in errors if error is not None]
-        wrong = sum(error > _WRONG_S for error in told)
-        far = sum(error > _FAR_S for error in told)
-        worst = ", ".join(f"{1e3 * error:.1f}" for error in sorted(told)[-3:])
+        solved = [error for error in errors if error is not None]
+        wrong = sum(error > _WRONG_S for error in solved)
+        far = sum(error > _FAR_S for error in solved)
+        worst = ", ".join(f"{1e3 * error:.1f}" for error in sorted(solved)[-3:])
         print(
-            f"drone pairs with {seconds:.0f} s in common: {100 * (len(told) - wrong) / len(errors):.0f} % of "
-            f"{len(errors)} solved (asked {asked}), {wrong} wrong, {far} of them "
+            f"drone pairs with {seconds:.0f} s in common: {100 * (len(solved) - wrong) / len(errors):.0f} % of "
+            f"{len(errors)} solved (required {required}), {wrong} wrong, {far} of them "
             f"over {1e3 * _FAR_S:.0f} ms; worst {worst} ms"
         )
 
@@ -201,7 +201,7 @@ def _all_seen(rig: Rig, observations: Observations) -> dict[str, _Seen]:
 
 
 def _solve_cut(rig: Rig, observations: Observations, seen: dict[str, _Seen], first: float, last: float) -> float | None:
-    """Error [s] of the lag in mid-overlap as `calibrate` tells it of two cameras alone, or None where it refuses."""
+    """Error [s] of the lag in mid-overlap as `calibrate` estimates it from two cameras, or None if refused."""
     tracks = {}
     for (name, camera), ended in zip(seen.items(), (True, False), strict=True):
         for track in observations.of_camera(name):
@@ -216,11 +216,11 @@ def _solve_cut(rig: Rig, observations: Observations, seen: dict[str, _Seen], fir
     except Refused:
         return None
     middle = 0.5 * (first + last)
-    told = []
+    solved = []
     for name, camera in seen.items():
         shown = (middle - camera.clock.time_offset) / camera.clock.clock_rate
-        told.append(found.cameras[name].time_map.clock_rate * shown + found.cameras[name].time_map.time_offset)
-    return abs(told[0] - told[1])
+        solved.append(found.cameras[name].time_map.clock_rate * shown + found.cameras[name].time_map.time_offset)
+    return abs(solved[0] - solved[1])
 
 
 def main() -> None:
@@ -232,7 +232,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=DEFAULT_DATA)
     parser.add_argument("--only", default="five,twenty,cut")
     options = parser.parse_args()
-    keep_heap()  # as the command does
+    retain_freed_memory()  # as the command does
     wanted = options.only.split(",")
     if "five" in wanted:
         five(options.sessions, options.first)

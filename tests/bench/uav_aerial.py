@@ -1,10 +1,10 @@
-"""How well the UAV tracker follows real cars that drive out of view, without telemetry and without knowing the lens.
+"""UAV tracking of real cars that drive out of view, without telemetry and intrinsics.
 
     python -m tests.bench.uav_aerial [--data ../shared/data] [--models ground,plain,paper,csrt,kcf] [--json]
 
-A drone's video of a crossroads (aerial-traffic in the data folder) is cropped to a window a frame, placed so that the
-car itself leaves the picture; after a while the window moves after it. The video is no part of the project; where it is
-absent this says so and leaves with status 0.
+A drone video of a crossroads (aerial-traffic in the data folder) is cropped to one window per frame, placed so that the
+car itself leaves the image; after a while the window follows it. The video is not part of the project; where it is
+absent, the bench says so and exits with status 0.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edge.uav.tracker import Box, Estimate, Image, State, Tracker
+from edge.uav.tracker import Box, Estimate, Image, Tracker, TrackState
 from protocols.geometry.types import Floats
 from tests.bench import uav_rivals
 from tests.bench.real_rigs import DEFAULT_DATA
@@ -30,9 +30,9 @@ SIZE = (400, 225)
 FPS = 30.0
 FOLDER, VIDEO = "aerial-traffic", "traffic.mp4"
 AFTER_S = 0.8
-"""How long after the car has left its distance is taken [s]."""
-_NEAR = 20.0
-_RUN, _WITHIN = 5, 60  # frames running that make a re-acquisition; within so many of being half visible
+"""Time after the exit at which the error is evaluated [s]."""
+_NEAR_PX = 20.0
+_RUN, _WITHIN = 5, 60  # consecutive frames for a re-acquisition; within so many of half visible
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,10 +60,10 @@ class Window:
 class Result:
     """One car and one tracker.
 
-    reacquired: 20 px for 5 frames running within 60 of half visible, after ``delay`` frames. lengths_after: distance
-    0.8 s after it has left [car lengths], nan where lost. claims: frames out that claim ``visible``, of out.
-    in_near: share of the frames with the car's centre in the window that are within 20 px. ms: CPU a frame.
-    crash: what it raised; from there on it counts as lost.
+    reacquired: 20 px for 5 consecutive frames within 60 of half visible, after ``delay`` frames. lengths_after: error
+    0.8 s after it has left [car lengths], nan where lost. claims: frames out that are reported ``visible``, of out.
+    in_near: share of the frames with the car's centre in the window that are within 20 px. ms: CPU per frame.
+    crash: the exception raised; from there on the target counts as lost.
     """
 
     car: str
@@ -102,8 +102,8 @@ def read_video(file: Path) -> list[Image]:
         frames.append(np.asarray(image, np.uint8))
 
 
-def cropped(image: Image, corner: Floats) -> Image:
-    """The window of a frame; beyond the frame it is black."""
+def crop(image: Image, corner: Floats) -> Image:
+    """The window of a frame; black beyond the frame."""
     width, height = SIZE
     out = np.zeros((height, width, 3), np.uint8)
     x, y = (round(float(value)) for value in corner)
@@ -113,33 +113,33 @@ def cropped(image: Image, corner: Floats) -> Image:
     return out
 
 
-def follow(window: Window, video: list[Image], tracker: Tracker, model: str) -> Result:
-    """Feed one window to a tracker and score it."""
+def track(window: Window, video: list[Image], tracker: Tracker, model: str) -> Result:
+    """Run a tracker on one window and score it."""
     estimates: list[Estimate] = []
     seconds, crash = 0.0, ""
     for i in range(len(window.visible)):
-        image = cropped(video[i], window.corner[i])
+        image = crop(video[i], window.corner[i])
         began = time.process_time()
         try:
             if i == 0:
                 new = tracker.begin(image, 0.0, Box(*(float(value) for value in window.box[0])))
             else:
                 new = tracker.handle_frame(image, i / FPS)
-        except Exception as error:  # noqa: BLE001 - a crash is a figure of the bench
+        except Exception as error:  # noqa: BLE001 - crashes are counted by the bench
             crash = f"frame {i}: {type(error).__name__}: {error}"
             nan = math.nan
-            estimates += [Estimate(i / FPS, State.LOST, nan, nan, nan, nan, nan, nan)] * (len(window.visible) - i)
+            estimates += [Estimate(i / FPS, TrackState.LOST, nan, nan, nan, nan, nan, nan)] * (len(window.visible) - i)
             break
         seconds += time.process_time() - began
         estimates.append(new)
-    return _scored(window, estimates, model, 1e3 * seconds / len(estimates), crash)
+    return _score(window, estimates, model, 1e3 * seconds / len(estimates), crash)
 
 
-def _scored(window: Window, estimates: list[Estimate], model: str, ms: float, crash: str) -> Result:
-    guess = np.array([(math.nan, math.nan) if e.state == State.LOST else (e.x, e.y) for e in estimates])
+def _score(window: Window, estimates: list[Estimate], model: str, ms: float, crash: str) -> Result:
+    guess = np.array([(math.nan, math.nan) if e.state == TrackState.LOST else (e.x, e.y) for e in estimates])
     error = np.hypot(*(guess - window.centre).T)
-    near = np.where(np.isnan(error), np.inf, error) < _NEAR
-    says = np.array([e.state == State.VISIBLE for e in estimates])
+    near = np.where(np.isnan(error), np.inf, error) < _NEAR_PX
+    visible = np.array([e.state == TrackState.VISIBLE for e in estimates])
     out = window.visible == 0.0
     gone = np.flatnonzero(out)
     first_out, last_out = int(gone[0]), int(gone[-1])
@@ -153,7 +153,7 @@ def _scored(window: Window, estimates: list[Estimate], model: str, ms: float, cr
         reacquired=found is not None,
         delay=math.nan if found is None else float(found - half),
         lengths_after=float(error[after] / window.length),
-        claims=int((says & out).sum()),
+        claims=int((visible & out).sum()),
         out=int(out.sum()),
         in_near=float(near[within].mean()),
         ms=ms,
@@ -162,16 +162,16 @@ def _scored(window: Window, estimates: list[Estimate], model: str, ms: float, cr
 
 
 def make(model: str) -> Tracker:
-    """A tracker that knows nothing of the camera."""
+    """A tracker without any knowledge of the camera."""
     if model in uav_rivals.NAMES:
-        return uav_rivals.Rival(model)
-    from edge.uav import models
+        return uav_rivals.OpenCvTracker(model)
+    from edge.uav import tracker_factory
 
-    return models.get(model, SIZE, fps=FPS)
+    return tracker_factory.get(model, SIZE, fps=FPS)
 
 
 def main() -> None:
-    """Follow and print."""
+    """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=DEFAULT_DATA)
     parser.add_argument("--models", default=",".join(MODELS))
@@ -186,7 +186,7 @@ def main() -> None:
     absent = [name for name in wanted if name in uav_rivals.NAMES and not uav_rivals.available(name)]
     video = read_video(folder / VIDEO)
     results = [
-        follow(window, video, make(model), model)
+        track(window, video, make(model), model)
         for model in wanted
         if model not in absent
         for window in read_windows(folder)

@@ -1,14 +1,15 @@
-"""The UAV agent: how quick it is, how well it finds the telemetry's clock, and whether its loops close.
+"""The UAV agent: latency, accuracy of the telemetry clock offset, and closed-loop control.
+
 
     python -m tests.bench.uav_agent [--only latency,offset,tlog,gimbal,follow,fixed] [--seeds 4] [--first-seed 700]
 
-latency: CPU from a frame's arrival to its status on the link, 640x480 with a target. offset: error of the map from the
-vehicle's clock to the camera's, 26 s after the start, on the simulated aircraft, and errors over stds of all answers
-until then. tlog: the same on flight/plane.tlog, beside frames drawn from its attitude, 40 s at a time; standing on the
-ground: refused, or true. gimbal, follow: pushes that take the car out of the picture, and how often the agent's own
-commands bring it back within 12 s; gimbal: it is turned away; follow: a gust of 20 m/s carries an aircraft away whose
-camera hangs level and looks down, and is not pointed. fixed (only if asked for): the same with the camera on the
-airframe, which looks away from where it accelerates. Leaves with status 1 if a figure is missed.
+latency: CPU time from a frame's arrival to its status on the link, 640x480 with a target. offset: error of the
+estimated offset from the vehicle's clock to the camera's, 26 s after the start, on the simulated aircraft, and errors
+over stds of all estimates until then. tlog: the same on flight/plane.tlog, with frames rendered from its attitude, 40 s
+at a time; on the ground: rejected, or correct. gimbal, follow: disturbances that take the car out of the image, and how
+often the agent's own commands bring it back within 12 s; gimbal: it is turned away; follow: a gust of 20 m/s displaces
+an aircraft whose camera is level and looks down, and is not pointed. fixed (only on request): the same with the camera
+fixed to the airframe, which looks away from the direction of acceleration. Exits with status 1 if a limit is missed.
 """
 
 from __future__ import annotations
@@ -22,39 +23,39 @@ import numpy as np
 
 from deploy.config.uav import ControlConfig
 from edge.devices.base import Frame
-from edge.devices.simulated.aircraft import Push
-from edge.mavlink.link.connection import Heard
+from edge.devices.simulated.aircraft import Disturbance
+from edge.mavlink.link.connection import ReceivedMessage
 from edge.mavlink.link.tlog import read_tlog
 from edge.uav.timing.telemetry_offset import find_offset
-from edge.uav.timing.visual_rotation import SeenTurning, usual_tilt
+from edge.uav.timing.visual_rotation import VisualRotationEstimator, median_tilt_rotation
 from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA
-from edge.uav.world.patrol import patrol
+from edge.uav.world.patrol import patrol_world
 from protocols.geometry.camera import Intrinsics
 from protocols.messages import syncline_pb2 as pb
 from tests.bench.real_rigs import DEFAULT_DATA
-from tests.uav_flights import Flight
+from tests.support.uav_flights import Flight
 
 FPS = 30.0
-_BACK_S = 12.0
+_MAX_RETURN_S = 12.0
 _PITCH = np.deg2rad(-62.0)
 _HEIGHT = 62.0
 _PUSHES_S, _FLIGHT_S = (8.0, 24.0), 40.0
 _GUST = 20.0  # m/s
-_IN_THE_AIR = (574.0, 595.0, 616.0)  # s since its start; before, plane.tlog's aircraft stands on the ground
-_ON_THE_GROUND = 300.0
-_LOOKED_AT_S = 40.0
+_AIRBORNE_S = (574.0, 595.0, 616.0)  # s since its start; before, the aircraft of plane.tlog is on the ground
+_ON_GROUND_S = 300.0
+_SEGMENT_S = 40.0
 
 
 def latency(seeds: list[int]) -> bool:
-    """CPU a frame of the agent alone: link, estimator, alignment, statuses."""
+    """CPU time per frame of the agent alone: link, estimator, alignment, status messages."""
     spent = []
-    flight = Flight(patrol(seeds[0], 16.0), seed=seeds[0])
+    flight = Flight(patrol_world(seeds[0], 16.0), seed=seeds[0])
     step = flight.agent.step
 
-    def timed(heard: list[Heard], frame: Frame | None) -> None:
+    def timed(heard: list[ReceivedMessage], frame: Frame | None) -> None:
         began = time.process_time()
         step(heard, frame)
-        if frame is not None and flight.agent.follower.following:
+        if frame is not None and flight.agent.estimator.has_target:
             spent.append(time.process_time() - began)
 
     flight.agent.step = timed  # type: ignore[method-assign]
@@ -67,33 +68,33 @@ def latency(seeds: list[int]) -> bool:
 
 
 def offset(seeds: list[int]) -> bool:
-    """Simulated aircraft: vehicle clock to camera clock; and whether the stds on the way there are honest."""
+    """Simulated aircraft: vehicle clock to camera clock; and whether the stds of all estimates are consistent."""
     good = True
     scores: list[float] = []
     for seed in seeds:
-        flight = Flight(patrol(seed, 30.0), seed=seed)
+        flight = Flight(patrol_world(seed, 30.0), seed=seed)
         true = flight.camera_ahead_s - flight.boot_s
-        answers: list[tuple[float, float, int]] = []  # error, std [s], frame since when
+        estimates: list[tuple[float, float, int]] = []  # error, std [s], frame since when
 
-        def watch(frame: int, flight: Flight = flight, true: float = true, answers: list = answers) -> None:
-            found = None if flight.agent.aligner is None else flight.agent.aligner.found
-            told = next((m for m in reversed(flight.published) if isinstance(m, pb.VehicleTelemetry)), None)
-            if found is None or told is None:
+        def watch(frame: int, flight: Flight = flight, true: float = true, estimates: list = estimates) -> None:
+            found = None if flight.agent.aligner is None else flight.agent.aligner.estimate
+            sample = next((m for m in reversed(flight.published) if isinstance(m, pb.VehicleTelemetry)), None)
+            if found is None or sample is None:
                 return
-            error = (told.device_time_ns - told.vehicle_time_ns) / 1e9 - true
-            if not answers or abs(error - answers[-1][0]) > 1e-6 or found.std != answers[-1][1]:
-                answers.append((error, found.std, frame))
+            error = (sample.device_time_ns - sample.vehicle_time_ns) / 1e9 - true
+            if not estimates or abs(error - estimates[-1][0]) > 1e-6 or found.std != estimates[-1][1]:
+                estimates.append((error, found.std, frame))
 
         flight.on_frame = watch
         flight.run(26.0)
-        if not answers:
+        if not estimates:
             print(f"offset: seed {seed}: not found")
             good = False
             continue
-        error, std, _ = answers[-1]
-        # Between an answer and the first sample that goes by it, the two do not belong together.
-        ends = [*(later for *_, later in answers[1:]), flight.frame]
-        scores += [e / s for (e, s, since), end in zip(answers, ends, strict=True) if end - since > 5]
+        error, std, _ = estimates[-1]
+        # Until the first sample that uses a new estimate, error and std belong to different estimates.
+        ends = [*(later for *_, later in estimates[1:]), flight.frame]
+        scores += [e / s for (e, s, since), end in zip(estimates, ends, strict=True) if end - since > 5]
         print(f"offset: seed {seed}: {1e3 * error:+.1f} ms, says +-{1e3 * std:.1f} ms (asked for: 5 ms)", flush=True)
         good &= abs(error) <= 0.005
     if scores:
@@ -103,7 +104,7 @@ def offset(seeds: list[int]) -> bool:
 
 
 def tlog(data: Path) -> bool:
-    """A real flight's attitude: frames drawn from it, and its clock found again over the whole log."""
+    """A real flight's attitude: frames rendered from it, and its clock offset estimated over the whole log."""
     file = data / "flight" / "plane.tlog"
     if not file.exists():
         print(f"tlog: left out, there is no {file}")
@@ -112,27 +113,27 @@ def tlog(data: Path) -> bool:
     times = np.array([sample.time for sample in samples])
     from scipy.spatial.transform import Rotation, RotationSpline
 
-    # As an aircraft turns: smoothly through its samples, which are half a second and more apart.
+    # Smooth interpolation of the attitude samples, which are half a second and more apart.
     turned = RotationSpline(times, Rotation.from_matrix(np.array([sample.ned_from_body for sample in samples])))
     lens = Intrinsics(640, 480, np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 239.5], [0.0, 0.0, 1.0]]))
     ground = _texture()
     good = True
-    for begin in (*_IN_THE_AIR, _ON_THE_GROUND):
-        seen = SeenTurning((640, 480), lens)
-        tilt = usual_tilt(samples, BODY_FROM_DOWN_CAMERA)
-        for k in range(round(_LOOKED_AT_S * FPS)):
+    for begin in (*_AIRBORNE_S, _ON_GROUND_S):
+        seen = VisualRotationEstimator((640, 480), lens)
+        tilt = median_tilt_rotation(samples, BODY_FROM_DOWN_CAMERA)
+        for k in range(round(_SEGMENT_S * FPS)):
             moment = begin + 0.1234 + k / FPS
             camera = BODY_FROM_DOWN_CAMERA.T @ turned(moment).as_matrix().T
             place = np.array([3.0 * np.sin(0.2 * moment), 12.0 * k / FPS - 200.0, -80.0])
             seen.update(_draw(ground, lens, camera, place), k / FPS, tilt)
-        answer = find_offset(seen.turning(), samples, BODY_FROM_DOWN_CAMERA)
-        if isinstance(answer, str):
-            print(f"tlog: from {begin:.0f} s: refused: {answer}", flush=True)
-            good &= begin == _ON_THE_GROUND
+        result = find_offset(seen.relative_rotations(), samples, BODY_FROM_DOWN_CAMERA)
+        if isinstance(result, str):
+            print(f"tlog: from {begin:.0f} s: refused: {result}", flush=True)
+            good &= begin == _ON_GROUND_S
             continue
-        error = answer.offset - begin - 0.1234
-        print(f"tlog: from {begin:.0f} s: {1e3 * error:+.1f} ms, says +-{1e3 * answer.std:.1f} ms (asked for: 5 ms)")
-        good &= abs(error) <= (3.0 * answer.std if begin == _ON_THE_GROUND else 0.005)
+        error = result.offset - begin - 0.1234
+        print(f"tlog: from {begin:.0f} s: {1e3 * error:+.1f} ms, says +-{1e3 * result.std:.1f} ms (asked for: 5 ms)")
+        good &= abs(error) <= (3.0 * result.std if begin == _ON_GROUND_S else 0.005)
     return good
 
 
@@ -153,22 +154,24 @@ def _draw(ground: np.ndarray, lens: Intrinsics, camera_from_ned: np.ndarray, pla
 
 
 def loops(seeds: list[int], kind: str) -> bool:
-    """Push the camera away from the car; count how often it comes back by the agent's own commands."""
+    """Disturb the camera's view; count how often the agent's own commands bring the car back."""
     back = exits = 0
     longest = 0.0
     for seed in seeds:
-        world = patrol(seed, _FLIGHT_S + 0.5)
+        world = patrol_world(seed, _FLIGHT_S + 0.5)
         rng = np.random.default_rng(seed)
         yaw = float(world.target.course[0])
         start = np.array([*world.target.ground[0], -_HEIGHT])
-        pushes = []
+        disturbances = []
         for begin in _PUSHES_S:
             angle = rng.uniform(-np.pi, np.pi)
             if kind == "gimbal":
                 turn = (float(rng.choice([-1.0, 1.0]) * 0.1), float(rng.choice([-1.0, 1.0]) * rng.uniform(0.7, 1.0)))
-                pushes.append(Push(begin, 0.9, turn=turn))
+                disturbances.append(Disturbance(begin, 0.9, turn=turn))
             else:
-                pushes.append(Push(begin, 3.0, velocity=(_GUST * float(np.cos(angle)), _GUST * float(np.sin(angle)))))
+                disturbances.append(
+                    Disturbance(begin, 3.0, velocity=(_GUST * float(np.cos(angle)), _GUST * float(np.sin(angle))))
+                )
         gimbal = None
         if kind == "gimbal":
             start[:2] -= _HEIGHT / np.tan(-_PITCH) * np.array([np.cos(yaw), np.sin(yaw)])
@@ -177,8 +180,8 @@ def loops(seeds: list[int], kind: str) -> bool:
             gimbal = (-0.5 * np.pi, yaw)
         control = ControlConfig(gimbal=kind == "gimbal", follow=kind != "gimbal", coast_s=15.0)
         flight = Flight(
-            world, control=control, flies="follow", gimbal=gimbal, start=start, yaw=yaw, pushes=tuple(pushes),
-            seed=seed, piloted=kind != "gimbal",
+            world, control=control, flies="follow", gimbal=gimbal, start=start, yaw=yaw,
+            disturbances=tuple(disturbances), seed=seed, piloted=kind != "gimbal",
         )  # fmt: skip
         inside: list[tuple[float, float]] = []
 
@@ -189,13 +192,15 @@ def loops(seeds: list[int], kind: str) -> bool:
         flight.run(1.5)
         if not flight.select():
             print(f"{kind}: seed {seed}: no target could be selected")
-            exits += len(pushes)
+            exits += len(disturbances)
             continue
         flight.run(_FLIGHT_S)
         table = np.array(inside)
-        for push in pushes:
-            # Up to the next push at most: what that one does is not this one's.
-            until = min([push.begin + push.seconds + _BACK_S, *(p.begin for p in pushes if p.begin > push.begin)])
+        for push in disturbances:
+            # At most up to the next disturbance.
+            until = min(
+                [push.begin + push.seconds + _MAX_RETURN_S, *(p.begin for p in disturbances if p.begin > push.begin)]
+            )
             after = (table[:, 0] > push.begin) & (table[:, 0] < until)
             away = table[after & (table[:, 1] == 0.0), 0]
             if not len(away):

@@ -1,4 +1,4 @@
-"""OpenCV's CSRT and KCF behind the trackers' interface. They need opencv-contrib, which only the benches use.
+"""OpenCV's CSRT and KCF trackers behind the tracker interface. They need opencv-contrib, which only the benches use.
 
 opencv-contrib-python-headless and opencv-python-headless are both ``cv2`` and can't share an environment. Put the
 former, of the same version as the latter, into a folder of its own and that folder first on the path:
@@ -14,7 +14,7 @@ from typing import Any
 
 import cv2
 
-from edge.uav.tracker import Box, Estimate, Image, State, Telemetry
+from edge.uav.tracker import Box, Estimate, Image, Telemetry, TrackState
 
 NAMES = ("csrt", "kcf")
 
@@ -29,8 +29,8 @@ def _maker(name: str) -> Any:
     return getattr(cv2, title, None) or getattr(getattr(cv2, "legacy", None), title, None)
 
 
-class Rival:
-    """One of OpenCV's trackers. It says ``visible`` as long as OpenCV reports success, else ``lost``."""
+class OpenCvTracker:
+    """One of OpenCV's trackers. It reports ``visible`` as long as OpenCV reports success, else ``lost``."""
 
     def __init__(self, name: str) -> None:
         self._tracker = _maker(name)()
@@ -41,14 +41,14 @@ class Rival:
         return _estimate(time, True, box)
 
     def handle_telemetry(self, sample: Telemetry) -> None:
-        """They have no use for it."""
+        """Unused."""
 
     def handle_frame(self, image: Image | None, time: float) -> Estimate:
         if image is None:
             return _estimate(time, False, (0.0, 0.0, 0.0, 0.0))
         try:
             found, box = self._tracker.update(image)
-        except cv2.error:  # a box that has left the picture altogether
+        except cv2.error:  # a box that is entirely outside the image
             found, box = False, (0.0, 0.0, 0.0, 0.0)
         return _estimate(time, bool(found), box)
 
@@ -57,5 +57,5 @@ def _estimate(time: float, found: bool, box: Any) -> Estimate:
     x, y, w, h = (float(value) for value in box)
     if not found:
         x = y = w = h = math.nan
-    state = State.VISIBLE if found else State.LOST
+    state = TrackState.VISIBLE if found else TrackState.LOST
     return Estimate(time, state, x + (w - 1) / 2, y + (h - 1) / 2, w, h, math.nan, math.nan)

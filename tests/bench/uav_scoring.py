@@ -1,6 +1,6 @@
-"""How well a tracker followed one car: the estimates of all frames against the truth of all frames.
+"""Scores of a tracker on one car: the estimates of all frames against ground truth.
 
-``out`` is a frame that shows no part of the car, ``in`` one in which its centre lies in the picture, hidden or not.
+``out`` is a frame that shows no part of the car, ``in`` one in which its centre lies in the image, occluded or not.
 """
 
 from __future__ import annotations
@@ -10,30 +10,30 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from edge.uav.tracker import Estimate, State
-from edge.uav.world.world import Truth
+from edge.uav.tracker import Estimate, TrackState
+from edge.uav.world.flight_world import GroundTruth
 from protocols.geometry.types import Bools, Floats
 
 NEAR = 20.0
-"""Pixels within which an estimate is right."""
-_RUN = 5  # frames running that make a re-acquisition, or an identity swap
+"""Position error [px] below which an estimate is correct."""
+_RUN = 5  # consecutive frames for a re-acquisition, or an identity swap
 _WITHIN = 60  # frames after the car is half visible
-_HIDDEN = 0.05  # share of the car that is still seen when it counts as wholly hidden
-_GRACE = 2  # frames of an exit in which the claim to see it is not counted
-_BRIEF = 3  # frames; a shorter time out is no exit
-_INSIDE_95 = 2.448  # stds of one coordinate that hold 95 % of a round 2-D Gaussian
+_HIDDEN = 0.05  # visible share below which the car counts as fully occluded
+_GRACE_FRAMES = 2  # first frames of an exit in which the state visible is not counted
+_MIN_EXIT_FRAMES = 3  # a shorter absence is no exit
+_INSIDE_95 = 2.448  # stds of one coordinate that contain 95 % of an isotropic 2-D Gaussian
 
 
 @dataclass(slots=True)
 class Score:
-    """Counts, so that the scores of several flights add up.
+    """Counts, which add up over several flights.
 
-    Pairs are (how many, of how many). out_length, out_near: estimates within one car length, 20 px, while out;
-    out_any: the estimate or one of the hypotheses within a length. in_near: within 20 px while in.
-    claims_out: says visible while out, from an exit's third frame; says_in: says visible, at least half visible.
-    claims_hidden: says visible while in and wholly hidden. std_95: while out, truth within 2.448 std.
-    reacquired: of exits; delays: frames from half visible to re-acquired. swaps: runs on another car.
-    seconds, frames: CPU of the tracker and how many frames it was fed.
+    Pairs are (count, of total). out_length, out_near: estimates within one car length, 20 px, while out; out_any: the
+    estimate or one of the hypotheses within a length. in_near: within 20 px while in. claims_out: reported visible
+    while out, from an exit's third frame; says_in: reported visible, at least half visible. claims_hidden: reported
+    visible while in and fully occluded. std_95: while out, truth within 2.448 std. reacquired: of exits; delays: frames
+    from half visible to re-acquired. swaps: runs on another car. seconds, frames: CPU time of the tracker and number of
+    frames.
     """
 
     out_length: tuple[int, int] = (0, 0)
@@ -52,7 +52,7 @@ class Score:
     frames: int = 0
 
     def add(self, other: Score) -> None:
-        """Take in the counts of another flight."""
+        """Add the counts of another flight."""
         for name in PAIRS:
             a, b = getattr(self, name), getattr(other, name)
             setattr(self, name, (a[0] + b[0], a[1] + b[1]))
@@ -63,7 +63,7 @@ class Score:
         self.frames += other.frames
 
     def percent(self, name: str) -> float:
-        """A pair as a percentage; nan where there is nothing to count."""
+        """A pair as a percentage; nan if the total is 0."""
         good, total = getattr(self, name)
         return 100.0 * good / total if total else float("nan")
 
@@ -91,11 +91,11 @@ PAIRS = (
 )
 
 
-def score(truths: Sequence[Truth], estimates: Sequence[Estimate], size: tuple[int, int]) -> Score:
-    """Score one flight. truths, estimates: of the same frames; the first one, which was given, does not count."""
+def score(truths: Sequence[GroundTruth], estimates: Sequence[Estimate], size: tuple[int, int]) -> Score:
+    """Score one flight. truths, estimates: of the same frames; the first one, which is given, is not counted."""
     truths, estimates = truths[1:], estimates[1:]
     true = np.array([(t.x, t.y) for t in truths])
-    lost = np.array([e.state == State.LOST for e in estimates])
+    lost = np.array([e.state == TrackState.LOST for e in estimates])
     guess = np.array([(e.x, e.y) for e in estimates])
     guess[lost] = np.nan
     with np.errstate(invalid="ignore"):
@@ -104,33 +104,33 @@ def score(truths: Sequence[Truth], estimates: Sequence[Estimate], size: tuple[in
     out = np.array([t.inside == 0.0 for t in truths])
     within = ((true > -0.5) & (true < np.array(size) - 0.5)).all(axis=1)
     seen = np.array([t.visible for t in truths])
-    says = np.array([e.state == State.VISIBLE for e in estimates])
+    visible = np.array([e.state == TrackState.VISIBLE for e in estimates])
     length = np.array([t.length for t in truths])
-    exits = [run for run in runs(out) if run[1] - run[0] >= _BRIEF]
-    late = np.zeros(len(out), bool)
+    exits = [run for run in runs(out) if run[1] - run[0] >= _MIN_EXIT_FRAMES]
+    settled = np.zeros(len(out), bool)
     for begin, end in exits:
-        late[begin + _GRACE : end] = True
+        settled[begin + _GRACE_FRAMES : end] = True
     std = np.array([e.std for e in estimates])
     with np.errstate(invalid="ignore"):
         covered = error < _INSIDE_95 * std
     result = Score(
         out_length=_pair(error < length, out),
         out_near=_pair(error < NEAR, out),
-        out_any=_pair(_closest(true, estimates, error) < length, out),
+        out_any=_pair(_best_hypothesis_error(true, estimates, error) < length, out),
         in_near=_pair(error < NEAR, within),
-        claims_out=_pair(says, late),
-        says_in=_pair(says, seen >= 0.5),
-        claims_hidden=_pair(says, within & (seen < _HIDDEN)),
+        claims_out=_pair(visible, settled),
+        says_in=_pair(visible, seen >= 0.5),
+        claims_hidden=_pair(visible, within & (seen < _HIDDEN)),
         std_95=_pair(covered, out & ~lost),
     )
     for _, end in exits:
-        _reacquire(result, error, seen, end)
-    result.swaps = _swaps(truths, guess, error, says)
+        _count_reacquisition(result, error, seen, end)
+    result.swaps = _identity_swaps(truths, guess, error, visible)
     return result
 
 
 def runs(mask: Bools) -> list[tuple[int, int]]:
-    """Begin and end (not included) of all runs of True."""
+    """Start and end (exclusive) of all runs of True."""
     edges = np.flatnonzero(np.diff(np.r_[False, mask, False]))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
@@ -139,8 +139,8 @@ def _pair(good: Bools, counted: Bools) -> tuple[int, int]:
     return int((good & counted).sum()), int(counted.sum())
 
 
-def _closest(true: Floats, estimates: Sequence[Estimate], error: Floats) -> Floats:
-    """Distance of the nearest of estimate and hypotheses."""
+def _best_hypothesis_error(true: Floats, estimates: Sequence[Estimate], error: Floats) -> Floats:
+    """Smallest error of the estimate and the hypotheses."""
     best = error.copy()
     for k, estimate in enumerate(estimates):
         for hypothesis in estimate.hypotheses:
@@ -148,11 +148,11 @@ def _closest(true: Floats, estimates: Sequence[Estimate], error: Floats) -> Floa
     return best
 
 
-def _reacquire(result: Score, error: Floats, seen: Floats, end: int) -> None:
-    """Count one exit that ends at frame ``end``: 20 px for 5 frames running within 60 of being half visible."""
+def _count_reacquisition(result: Score, error: Floats, seen: Floats, end: int) -> None:
+    """Count one exit that ends at frame ``end``: 20 px for 5 consecutive frames within 60 of half visible."""
     half = np.flatnonzero(seen[end:] >= 0.5)
     if not len(half) or end + half[0] + _RUN > len(error):
-        return  # it does not come back in this flight: nothing to re-acquire
+        return  # it does not return in this flight: nothing to re-acquire
     first = end + int(half[0])
     good = error < NEAR
     found = next((k for k in range(first, first + _WITHIN) if good[k : k + _RUN].sum() == _RUN), None)
@@ -161,10 +161,10 @@ def _reacquire(result: Score, error: Floats, seen: Floats, end: int) -> None:
         result.delays.append(found - first)
 
 
-def _swaps(truths: Sequence[Truth], guess: Floats, error: Floats, says: Bools) -> int:
-    """How often it followed another car for 5 frames running and said that it saw it."""
+def _identity_swaps(truths: Sequence[GroundTruth], guess: Floats, error: Floats, visible: Bools) -> int:
+    """Number of times it tracked another car for 5 consecutive frames and reported it visible."""
     on_other = np.zeros(len(truths), bool)
     for k, truth in enumerate(truths):
-        if says[k] and error[k] > NEAR and len(truth.others):
+        if visible[k] and error[k] > NEAR and len(truth.others):
             on_other[k] = np.hypot(*(truth.others - guess[k]).T).min() < NEAR
     return sum(end - begin >= _RUN for begin, end in runs(on_other))

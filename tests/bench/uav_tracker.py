@@ -1,9 +1,9 @@
-"""How well the UAV tracker follows a car that leaves the picture, side by side with other trackers.
+"""UAV tracking of a car that leaves the image, in comparison with other trackers.
 
     python -m tests.bench.uav_tracker [--seeds 10] [--models ground,plain,paper,csrt,kcf] [--scenarios exit-bend,yaw]
         [--no-telemetry] [--rate HZ] [--offset] [--jobs 2] [--json FILE]
 
-Simulated flights with known truth (edge/uav/world), the telemetry with 0.2° noise, 0.4° bias, one frame late. Scores as
+Simulated flights with ground truth (edge/uav/world); telemetry with 0.2° noise, 0.4° bias, one frame late. Scores as
 in ``uav_scoring``. CSRT and KCF need opencv-contrib: ``uav_rivals`` says how to get it; without it they are left out,
 and the bench says so.
 """
@@ -23,7 +23,7 @@ import cv2
 
 from edge.uav.tracker import Estimate, Telemetry, Tracker
 from edge.uav.world import scenarios
-from edge.uav.world.world import World
+from edge.uav.world.flight_world import FlightWorld
 from tests.bench import uav_rivals
 from tests.bench.uav_scoring import PAIRS, Score, score
 
@@ -33,7 +33,7 @@ _HD = (1280, 720)
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One kind of flight. group: the row of the table that it counts in."""
+    """One kind of flight. group: the row of the table in which it is counted."""
 
     group: str
     scenario: str
@@ -71,30 +71,32 @@ CASES = (
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Of a run. rate_hz: of the telemetry; any_offset: its clock is off by an unknown constant within ±0.5 s.
+    """Options of a run. rate_hz: of the telemetry; any_offset: its clock has an unknown constant offset within ±0.5 s.
 
-    blind_lens: whether a tracker without telemetry is told the lens.
+    blind_lens: whether a tracker without telemetry is given the intrinsics.
     """
 
-    models: tuple[str, ...]
+    tracker_factory: tuple[str, ...]
     rate_hz: float = 30.0
     any_offset: bool = False
     blind_lens: bool = False
 
 
-def make(model: str, world: World, telemetry: bool, options: Options) -> Tracker:
-    """A tracker for a flight, told as much as a user would tell it."""
+def make(model: str, world: FlightWorld, telemetry: bool, options: Options) -> Tracker:
+    """A tracker for a flight, given what a user would give."""
     if model in uav_rivals.NAMES:
-        return uav_rivals.Rival(model)
-    from edge.uav import models
+        return uav_rivals.OpenCvTracker(model)
+    from edge.uav import tracker_factory
 
     lens = world.lens if telemetry or options.blind_lens else None
     body = world.body_from_camera if telemetry else None
-    return models.get(model, world.size, lens=lens, body_from_camera=body, fps=world.fps, seed=world.seed)
+    return tracker_factory.get(model, world.size, lens=lens, body_from_camera=body, fps=world.fps, seed=world.seed)
 
 
-def fly(world: World, trackers: dict[str, Tracker], samples: Sequence[Telemetry], offset: float) -> dict[str, Score]:
-    """Feed one flight to several trackers and score each; one that raises loses the rest of the flight."""
+def fly(
+    world: FlightWorld, trackers: dict[str, Tracker], samples: Sequence[Telemetry], offset: float
+) -> dict[str, Score]:
+    """Run several trackers on one flight and score each; one that raises loses the rest of the flight."""
     truths = [world.truth(i) for i in range(world.length)]
     estimates: dict[str, list[Estimate]] = {name: [] for name in trackers}
     scores = {name: Score() for name in trackers}
@@ -116,7 +118,7 @@ def fly(world: World, trackers: dict[str, Tracker], samples: Sequence[Telemetry]
                     new = tracker.begin(image, world.time(0), truths[0].box)
                 else:
                     new = tracker.handle_frame(image, world.time(i))
-            except Exception as error:  # noqa: BLE001 - a crash is a figure of the bench
+            except Exception as error:  # noqa: BLE001 - crashes are counted by the bench
                 failed[name] = f"{world.name} seed {world.seed} frame {i}: {type(error).__name__}: {error}"
                 continue
             scores[name].seconds += (time.process_time() - began) * (i > 0)
@@ -147,7 +149,7 @@ def _percents(*names: str) -> Figure:
     return lambda s: " / ".join(f"{s.percent(name):.1f}" for name in names) + " %"
 
 
-def _back(s: Score) -> str:
+def _reacquired(s: Score) -> str:
     return f"{s.reacquired[0]}/{s.reacquired[1]}, {s.delay:.1f}"
 
 
@@ -164,7 +166,7 @@ ROWS: tuple[tuple[str, tuple[str, ...], str, str, Figure], ...] = (
     ("lighting, off-road, partial: in frame", ("hard to see",), "95", "99", _percents("in_near")),
     ("cut at first, tenfold scale, 10 px: in frame", ("size",), "", "", _percents("in_near")),
     ("the last two without telemetry: in frame", ("size blind",), "", "", _percents("in_near")),
-    ("re-acquired, mean frames", ("*",), "95 %, 3", "100 %, 1", _back),
+    ("re-acquired, mean frames", ("*",), "95 %, 3", "100 %, 1", _reacquired),
     ("claims visible while out", ("*",), "2", "0.2", _percents("claims_out")),
     ("says visible while in", ("*",), "90", "98", _percents("says_in")),
     ("no telemetry, 60 frames: length", ("no telemetry",), "80", "", _percents("out_length")),
@@ -187,14 +189,14 @@ def total(scores: dict[tuple[Case, str], Score], groups: tuple[str, ...], model:
     return out
 
 
-def table(scores: dict[tuple[Case, str], Score], models: Sequence[str]) -> str:
-    """The issue's table, and one line a case and model below it."""
+def table(scores: dict[tuple[Case, str], Score], tracker_factory: Sequence[str]) -> str:
+    """The table of requirements, and below it one line per case and model."""
     flown = {case.group for case, _ in scores}
-    lines = [f"{'':44s}{'must':>9s}{'reach':>10s}" + "".join(f"{model:>18s}" for model in models)]
+    lines = [f"{'':44s}{'must':>9s}{'reach':>10s}" + "".join(f"{model:>18s}" for model in tracker_factory)]
     for title, groups, must, reach, figure in ROWS:
         if not ("*" in groups or flown.intersection(groups)):
             continue
-        cells = "".join(f"{figure(total(scores, groups, model)):>18s}" for model in models)
+        cells = "".join(f"{figure(total(scores, groups, model)):>18s}" for model in tracker_factory)
         lines.append(f"{title:44s}{must:>9s}{reach:>10s}{cells}")
     lines += [
         "",
@@ -223,8 +225,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--scenarios", default="", help="only these scenarios or groups, by comma")
     parser.add_argument("--no-telemetry", action="store_true", help="in all cases")
     parser.add_argument("--rate", type=float, default=30.0, help="of the telemetry [Hz]")
-    parser.add_argument("--offset", action="store_true", help="telemetry's clock off by an unknown constant")
-    parser.add_argument("--blind-lens", action="store_true", help="tell the lens also where there is no telemetry")
+    parser.add_argument("--offset", action="store_true", help="unknown constant offset of the telemetry's clock")
+    parser.add_argument("--blind-lens", action="store_true", help="give the intrinsics also without telemetry")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--json", type=Path, help="write all counts to this file, - for the screen")
     return parser.parse_args()
@@ -252,7 +254,7 @@ def _models(names: str) -> tuple[str, ...]:
 
 
 def main() -> None:
-    """Fly and print."""
+    """Run and print."""
     arguments = _arguments()
     options = Options(_models(arguments.models), arguments.rate, arguments.offset, arguments.blind_lens)
     cases = _chosen(arguments.scenarios, arguments.no_telemetry)

@@ -1,4 +1,4 @@
-"""From six videos on a card to 3-D: how good without measured lenses, and how fast.
+"""From six videos to 3-D: accuracy without measured lenses, and speed.
 
     python -m tests.bench.video_folder [--seconds 60] [--cameras 6] [--size 1920x1080] [--seed 400] [--crf 20]
                                        [--cache FOLDER]
@@ -34,6 +34,7 @@ import numpy as np
 import tomli_w
 
 from edge import scenes
+from edge.scenes import renderer_for
 from edge.scenes.common.base import SimulatedCamera
 from edge.scenes.marker.scene import MarkerScene
 from protocols.geometry import so3
@@ -41,15 +42,15 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import fit_similarity
 from protocols.geometry.types import Floats
 from protocols.session.calibration import read_calibration
-from tests.films import write_film_of
+from tests.support.films import write_video_frames
 
 FISHEYES = (1, 4)
 _TRUTH = "truth.json"
 
 
 def the_scene(seed: int, cameras: int, size: tuple[int, int]) -> MarkerScene:
-    """The shipped scene with pictures of ``size`` and a fisheye on two of its cameras."""
-    scene = scenes.get("marker", seed, cameras, mixed_fps=True)
+    """The shipped scene with images of ``size`` and a fisheye on two of its cameras."""
+    scene = scenes.get_marker_scene("marker", seed, cameras, mixed_fps=True)
     rng = np.random.default_rng([seed, 7])
     changed = [_camera(one, size, number in FISHEYES, rng) for number, one in enumerate(scene.cameras)]
     return dataclasses.replace(scene, cameras=tuple(changed))
@@ -78,10 +79,10 @@ def render(job: tuple[int, int, tuple[int, int], float, int, int, Path]) -> tupl
     begin = float(rng.uniform(0.0, 2.0))
     times = camera.capture_times(begin, 0, int((seconds - begin) * camera.fps), rng)
     times = times[(rng.random(len(times)) > camera.drop_fraction) | (np.arange(len(times)) == 0)]
-    renderer = scene.renderer(camera.name, rng)
+    renderer = renderer_for(scene, camera.name, rng)
     own = (times - times[0]) * camera.clock.rate
     frames = ((float(shown), renderer.render(float(at))) for shown, at in zip(own, times, strict=True))
-    write_film_of(folder / f"{camera.name}.mp4", size, frames, crf=str(crf))
+    write_video_frames(folder / f"{camera.name}.mp4", size, frames, crf=str(crf))
     return camera.name, times.tolist()
 
 
@@ -114,13 +115,13 @@ def rig_tables(scene: MarkerScene, known: bool) -> dict[str, Any]:
         if known:
             table |= {"matrix": lens.matrix.tolist(), "distortions": lens.distortions.tolist()}
         elif lens.fisheye:
-            from edge.lens.solve import lens_from_angle
+            from edge.lens.solve import intrinsics_from_field_of_view
 
             # To 5 degrees, as such figures are printed.
             corner = 2.0 * np.rad2deg(
                 np.arctan(lens.unproject(np.array([[lens.width - 1.0, lens.matrix[1, 2]]]))[0, 0])
             )
-            sheet = lens_from_angle((lens.width, lens.height), 5.0 * round(float(corner) / 5.0), True)
+            sheet = intrinsics_from_field_of_view((lens.width, lens.height), 5.0 * round(float(corner) / 5.0), True)
             table |= {"matrix": sheet.matrix.tolist(), "distortions": [0.0] * 4, "focal_std": 0.1}
         if lens.fisheye:
             table["fisheye"] = True
@@ -261,15 +262,15 @@ def main() -> int:
     )
     ratio = free.path_mm / figures["true lenses"].path_mm
     print(f"path without lenses over that with: {ratio:.2f} (must 2)")
-    pace = f"{recorded / free.seconds:.1f} x real time, all videos counted (must 1)"
+    speed_factor = f"{recorded / free.seconds:.1f} x real time, all videos counted (must 1)"
     spent = f"{free.seconds:.0f} s ({free.cpu / recorded:.2f} CPU seconds a second of video)"
-    print(f"{given.cameras} videos of {given.seconds:.0f} s in {spent}: {pace}")
+    print(f"{given.cameras} videos of {given.seconds:.0f} s in {spent}: {speed_factor}")
     say("synchronising")
     estimate, truth, took = line_up(
         folder, folder.parent / "out-no" / "calibration.toml", folder.parent / "sync", scene, times
     )
-    told = f"{estimate:.3f} by the estimate, {truth:.3f} by the truth (must 0.5)"
-    print(f"synchronised videos: shown frames from the grid, in the source's intervals: {told}; {took:.0f} s")
+    shares = f"{estimate:.3f} by the estimate, {truth:.3f} by the truth (must 0.5)"
+    print(f"synchronised videos: shown frames from the grid, in the source's intervals: {shares}; {took:.0f} s")
     lenses = max(abs(value) for value in free.focal.values())
     if given.seconds < 60 or given.cameras < 6 or width < 1920:
         return 0  # the figures that are asked for are of six minutes at 1080p

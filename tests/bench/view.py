@@ -1,4 +1,4 @@
-"""How quick the first minutes are: help, first calibration, first paint, what watching costs.
+"""Start-up times and view load: help, first calibration, first paint, CPU of the view.
 
 `python -m tests.bench.view [--quick]` prints the figures that deploy/README.md and hub/README.md state. The browser is
 Chromium with software rendering, so that its own work is on the same cores; what is charged to the view is its process.
@@ -24,7 +24,7 @@ from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, PICTURE, TRACK
-from tests.samples import MATRIX
+from tests.support.samples import MATRIX
 
 _SYNCLINE = (sys.executable, "-m", "deploy")
 
@@ -49,7 +49,7 @@ def first_calibration_s(folder: Path) -> float:
 
 
 class Cameras:
-    """Cameras that stand in a ring and see a point at 30 fps, with pictures, and a hub that knows them."""
+    """Simulated cameras that observe a point at 30 fps, with images, and a hub that has calibrated them."""
 
     def __init__(self, endpoint: str, count: int) -> None:
         self._endpoint, self._count = endpoint, count
@@ -223,10 +223,10 @@ def main() -> None:
             playwright = sync_playwright().start()
             browser = playwright.chromium.launch(executable_path=chromium_path(), args=list(FLAGS))
     except ImportError:
-        print("no Playwright: nothing is painted")
+        print("no Playwright: first paint is not measured")
     for count, asked in ((6, "10 %"), (50, "")):
         found = watching(count, 6.0 if quick else 15.0, browser)
-        rows.append((f"{count} cameras: the view's CPU, nobody looks", f"{found['alone_percent']:.1f} %", asked))
+        rows.append((f"{count} cameras: the view's CPU, no browser", f"{found['alone_percent']:.1f} %", asked))
         if "first_paint_s" in found:
             paint = "3 s" if count == 6 else ""
             rows.append(

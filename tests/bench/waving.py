@@ -1,6 +1,6 @@
-"""How long and how fast to wave: four webcams in the shipped room, marker filmed for so many seconds at such a speed.
+"""Accuracy against duration and speed of the marker's motion: four webcams in the shipped room.
 
-python -m tests.bench.waving      seeds from 7000 on, on which nothing was adjusted
+python -m tests.bench.waving      seeds from 7000 on, not used for tuning
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from deploy.simulation.session import observations_of, rig_of
+from deploy.simulation.session import observations_from_tracks, rig_from_tracks
 from edge import scenes
-from edge.scenes.marker.session import simulated_session
+from edge.scenes.marker.session import simulate_tracks
 from hub.calibration.pipeline import calibrate
 from protocols.core.clocks import CameraTime
 from protocols.core.errors import Refused
@@ -25,26 +25,26 @@ CAMERAS = 4
 
 @dataclass(frozen=True)
 class Paced:
-    """A path walked at another speed."""
+    """A path traversed at another speed."""
 
     path: Any
-    pace: float
+    rate: float
 
     def position(self, times: Floats) -> Floats:
         """(n, 3) [m]."""
-        return np.asarray(self.path.position(self.pace * times))
+        return np.asarray(self.path.position(self.rate * times))
 
 
-def one(seed: int, seconds: float, pace: float) -> tuple[float, int, float]:
+def one(seed: int, seconds: float, rate: float) -> tuple[float, int, float]:
     """Mean speed [m/s], cameras solved, largest error of an offset [ms] (NaN where fewer than two are solved)."""
-    scene = scenes.get("marker", seed, CAMERAS)
-    scene = replace(scene, path=Paced(scene.path, pace))
-    filmed = simulated_session(scene, seconds, seed, pixel_noise=0.5, outlier_fraction=0.02, drop_fraction=None)
+    scene = scenes.get_marker_scene("marker", seed, CAMERAS)
+    scene = replace(scene, path=Paced(scene.path, rate))
+    filmed = simulate_tracks(scene, seconds, seed, pixel_noise=0.5, outlier_fraction=0.02, drop_fraction=None)
     times = np.linspace(filmed.start, filmed.end, 200)
     positions = scene.marker_position(times)
     speed = float(np.mean(np.linalg.norm(np.diff(positions, axis=0), axis=1)) / (times[1] - times[0]))
     try:
-        found = calibrate(rig_of(filmed), observations_of(filmed))
+        found = calibrate(rig_from_tracks(filmed), observations_from_tracks(filmed))
     except Refused:
         return speed, 0, float("nan")
     reference = found.reference
@@ -64,12 +64,12 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=4)
     arguments = parser.parse_args()
     print("seconds  speed m/s  rigs with all 4 cameras  worst offset ms: median, largest")
-    for seconds, pace in ((5, 1.0), (10, 1.0), (20, 1.0), (40, 1.0), (20, 0.5), (20, 0.25)):
-        rows = [one(FIRST_SEED + k, seconds, pace) for k in range(arguments.seeds)]
+    for seconds, rate in ((5, 1.0), (10, 1.0), (20, 1.0), (40, 1.0), (20, 0.5), (20, 0.25)):
+        rows = [one(FIRST_SEED + k, seconds, rate) for k in range(arguments.seeds)]
         speed = np.mean([row[0] for row in rows])
         whole = [row[2] for row in rows if row[1] == CAMERAS]
-        told = f"{np.median(whole):.3f}, {max(whole):.3f}" if whole else "-"
-        print(f"{seconds:7d}  {speed:9.2f}  {len(whole)} of {len(rows)}  {told}", flush=True)
+        error_text = f"{np.median(whole):.3f}, {max(whole):.3f}" if whole else "-"
+        print(f"{seconds:7d}  {speed:9.2f}  {len(whole)} of {len(rows)}  {error_text}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A headless Chromium (Debian's), and where its pictures are kept."""
+"""A headless Chromium (Debian's), and its screenshots."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _HARMLESS = ("GPU stall due to ReadPixels", "software WebGL", "Automatic fallbac
 
 
 def chromium_path() -> str:
-    """Where Chromium is; "" where there is none."""
+    """Path of Chromium; "" if there is none."""
     return next(
         (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""
     )
@@ -44,7 +44,7 @@ def chromium() -> Iterator[Any]:
 
 
 class Tab:
-    """One page, everything that went wrong in it, and its screenshots."""
+    """One page, its errors and requests, and its screenshots."""
 
     def __init__(self, browser: Any, size: tuple[int, int] = (1100, 700)) -> None:
         self.context = browser.new_context(viewport={"width": size[0], "height": size[1]}, accept_downloads=True)
@@ -68,7 +68,7 @@ class Tab:
 
 @pytest.fixture
 def tab(chromium: Any) -> Iterator[Tab]:
-    """A new page; the test fails if anything in it did."""
+    """A new page; the test fails if the page had an error."""
     one = Tab(chromium)
     yield one
     one.context.close()

@@ -20,14 +20,14 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import read_calibration
 from protocols.topics import CALIBRATION, STATUS
 from tests.browser.conftest import Tab
-from tests.samples import eventually
+from tests.support.samples import eventually
 
 NAMES = ("cam0", "cam1", "cam2")
 
 
 @dataclass
 class Demo:
-    """A demo that runs: where its view is, and its bus."""
+    """A running demo: the address of its view, and its bus."""
 
     out: Path
     address: str
@@ -65,35 +65,35 @@ def test_the_view_of_a_running_demo(demo: Demo, tab: Tab) -> None:
         tab.shot("live")
         assert "3 cameras calibrated" in page.inner_text("[data-syncline=headline]")
 
-        # What the panel says of cam1 is what the hub has published.
-        told: set[str] = set()
+        # The panel shows of cam1 what the hub has published.
+        shown: set[str] = set()
 
         def same() -> bool:
             for received in answers.drain():
                 assert isinstance(received.message, pb.Calibration)
-                told.update(
+                shown.update(
                     f"{found.time_offset:+.6f} s ± {1e3 * found.time_offset_std:.3f} ms · "
                     f"{1e6 * (found.clock_rate - 1.0):+.1f} ppm · {found.rms_px:.2f} px"
                     for found in received.message.cameras
                     if found.camera == "cam1"
                 )
-            return page.inner_text("[data-clock=cam1]") in told
+            return page.inner_text("[data-clock=cam1]") in shown
 
-        assert eventually(same, 30.0), (page.inner_text("[data-clock=cam1]"), told)
+        assert eventually(same, 30.0), (page.inner_text("[data-clock=cam1]"), shown)
         rate = float(page.locator("[data-camera=cam1] td").nth(1).inner_text())
-        assert 0.0 < rate < 60.0, "frames arrive; how many a second is the machine's business"
+        assert 0.0 < rate < 60.0, "frames arrive; the rate depends on the machine"
 
-        # The camera's picture arrives while somebody looks.
+        # The camera's image arrives while a browser is open.
         page.wait_for_function("Array.from(document.images).some(image => image.naturalWidth >= 300)")
 
-        # Export: a file for the browser, and files of the hub's own.
+        # Export: a file for the browser, and the hub's own files.
         with page.expect_download() as download:
             page.get_by_role("button", name="Export").click()
         file = Path(download.value.path())
         assert sorted(read_calibration(file)[1]) == list(NAMES)
         assert eventually((demo.out / "result.json").exists, 30.0)
 
-        # Stop: the log is whole. Start: another one begins.
+        # Stop: the log is complete. Start: a new log.
         page.get_by_role("button", name="Stop recording").click()
         page.get_by_text("paused after demo.mcap").wait_for()
         reader = LogReader(demo.out / "demo.mcap")
@@ -112,4 +112,4 @@ def test_the_view_of_a_running_demo(demo: Demo, tab: Tab) -> None:
 
         assert eventually(asked, 30.0)
     outside = [url for url in tab.requests if not url.startswith((demo.address, "data:", "blob:"))]
-    assert outside == [], "the page asks nobody else for anything"
+    assert outside == [], "the page sends no requests elsewhere"

@@ -1,4 +1,4 @@
-"""`syncline quick` with its page: pictures with rings, a click that teaches, and a calibration at the end."""
+"""`syncline quick` with its page: marked detections, a click that trains the detector, and a calibration."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_two_simulated_webcams_from_the_page_to_a_calibration(tab: Tab, tmp_path
         page.wait_for_timeout(1000)
         tab.shot("quick")
         page.wait_for_function("document.querySelectorAll('[data-state=solved]').length === 2")
-        with contextlib.suppress(Error):  # by now it may have ended by itself
+        with contextlib.suppress(Error):  # it may have ended already
             page.get_by_role("button", name="Finish").click(timeout=10_000)
         rest, _ = process.communicate(timeout=120)
         assert process.returncode == 0, rest
@@ -44,5 +44,5 @@ def test_two_simulated_webcams_from_the_page_to_a_calibration(tab: Tab, tmp_path
         if process.poll() is None:
             process.kill()
             process.communicate()
-        # The page's server has gone: its socket's complaint is the end, no error.
+        # The page's server has ended: the socket error is expected.
         tab.errors = [text for text in tab.errors if "WebSocket" not in text and "ERR_CONNECTION" not in text]

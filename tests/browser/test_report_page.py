@@ -41,12 +41,12 @@ NAMES = ("good", "weak", "refused")
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_report_opens_offline_and_asks_nobody_for_anything(name: str, reports: dict[str, Path], tab: Tab) -> None:
+def test_a_report_opens_offline_without_requests(name: str, reports: dict[str, Path], tab: Tab) -> None:
     tab.context.set_offline(True)
     tab.page.goto(reports[name].as_uri())
     heading = tab.page.inner_text("h1")
     assert heading.startswith("Refused" if name == "refused" else ("Good", "Usable"))
-    assert tab.page.locator("section").first.locator("h1").count() == 1, "the verdict comes first"
+    assert tab.page.locator("section").first.locator("h1").count() == 1, "the quality assessment comes first"
     if name != "refused":
         tab.page.wait_for_selector("#scene-3d .main-svg, #scene-3d canvas")
     tab.shot(f"report-{name}", full_page=True)
@@ -54,8 +54,8 @@ def test_a_report_opens_offline_and_asks_nobody_for_anything(name: str, reports:
     assert reports[name].stat().st_size <= SIZE_LIMIT
 
 
-def test_figures_can_be_told_apart_without_colour(reports: dict[str, Path], tab: Tab) -> None:
-    """Every mark of a finding keeps its letter, and lines of pairs their dashes, when all colour is taken away."""
+def test_figures_are_distinguished_without_colour(reports: dict[str, Path], tab: Tab) -> None:
+    """Marks of findings keep their letters, and lines of pairs their dashes, without colour."""
     page = tab.page
     page.goto(reports["weak"].as_uri())
     marks = page.evaluate(
@@ -80,7 +80,7 @@ def test_figures_can_be_told_apart_without_colour(reports: dict[str, Path], tab:
 def test_a_report_prints_on_paper_without_its_scripts(reports: dict[str, Path], tab: Tab) -> None:
     tab.page.goto(reports["good"].as_uri())
     tab.page.emulate_media(media="print")
-    assert tab.page.locator("#scene-3d").is_hidden(), "a scene that turns is not for paper"
+    assert tab.page.locator("#scene-3d").is_hidden(), "the interactive figure is not printed"
     assert tab.page.get_by_text("From above").is_visible()
     file = tab.page.pdf(format="A4")
     assert file.startswith(b"%PDF")
@@ -89,12 +89,12 @@ def test_a_report_prints_on_paper_without_its_scripts(reports: dict[str, Path], 
     assert 0.005 < float((image < 128).mean()) < 0.5
 
 
-def test_the_page_forbids_itself_the_network(reports: dict[str, Path], chromium: Any) -> None:
+def test_the_page_forbids_network_access(reports: dict[str, Path], chromium: Any) -> None:
     tab = Tab(chromium)
     try:
         tab.page.goto(reports["good"].as_uri())
-        told = tab.page.evaluate("fetch('https://example.org/').then(() => 'sent', () => 'refused')")
-        assert told == "refused"
+        outcome = tab.page.evaluate("fetch('https://example.org/').then(() => 'sent', () => 'refused')")
+        assert outcome == "refused"
         assert any("Content Security Policy" in text for text in tab.errors)
     finally:
         tab.context.close()

@@ -1,4 +1,4 @@
-"""The 3-D scene itself: what is told on the bus moves in the picture; a log replays; the report opens offline."""
+"""The 3-D scene in a browser: published poses are drawn, a log replays, access needs the token."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from hub.view.server import ViewServer, run_replay, run_view
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, PICTURE, TARGET, UAV_INFO
 from tests.browser.conftest import Tab
-from tests.integration.test_view_server import TOKEN, solved
-from tests.samples import camera_info, eventually, observation, picture, target_state, uav_info
-from tests.unit.test_view_state import log_of
+from tests.integration.live.test_view_server import TOKEN, solved
+from tests.support.samples import camera_info, eventually, observation, picture, target_state, uav_info
+from tests.unit.hub.view.test_state import log_of
 
 _BLUE = np.array([190, 110, 30])  # BGR of a camera that is solved
 
 
 def blue(tab: Tab, name: str) -> tuple[int, np.ndarray[Any, Any]]:
-    """How many pixels of the scene have the frusta's colour, and their mean place; waits for what fades in."""
+    """Number and mean position of the pixels with the frusta's colour; waits for fade-in."""
     for _ in range(40):
         tab.page.wait_for_timeout(1200)
         count, place = _blue(tab, name)
@@ -43,7 +43,7 @@ def _blue(tab: Tab, name: str) -> tuple[int, np.ndarray[Any, Any]]:
     return len(places), places.mean(axis=0) if len(places) else np.zeros(2)
 
 
-def test_a_frustum_moves_in_the_picture_when_its_camera_has_moved(tab: Tab) -> None:
+def test_a_frustum_moves_when_its_camera_has_moved(tab: Tab) -> None:
     network, stop, view = MemoryHub(), threading.Event(), ViewServer(port=0)
     with MemoryBus(network) as agents, MemoryBus(network) as bus:
         loop = threading.Thread(target=run_view, args=(bus, view, stop))
@@ -56,7 +56,7 @@ def test_a_frustum_moves_in_the_picture_when_its_camera_has_moved(tab: Tab) -> N
             tab.page.goto(view.address)
             tab.page.wait_for_function("document.querySelectorAll('[data-state=solved]').length === 2")
             count, place = blue(tab, "frusta-before")
-            assert count > 100, "the frusta are in the picture"
+            assert count > 100, "the frusta are in view"
             hub.put(solved((0, 0, 0), (2, 0.6, 0), revision=2))
             assert eventually(lambda: np.allclose(view.scene._frusta["cam1"].position, [2, 0.6, 0]))
             moved, elsewhere = blue(tab, "frusta-after")
@@ -70,7 +70,7 @@ def test_a_frustum_moves_in_the_picture_when_its_camera_has_moved(tab: Tab) -> N
 
 
 def film(agents: MemoryBus, stop: threading.Event) -> None:
-    """Two cameras that see something, 20 times a second."""
+    """Two cameras with detections, 20 times a second."""
     publishers = {name: agents.publisher(OBSERVATION, name) for name in ("cam0", "cam1")}
     infos = {name: agents.publisher(CAMERA_INFO, name) for name in publishers}
     index = 0
@@ -82,8 +82,8 @@ def film(agents: MemoryBus, stop: threading.Event) -> None:
         index += 1
 
 
-def test_a_drones_picture_with_the_car_outside_it(tab: Tab) -> None:
-    """The panel says it in words, and the page shows the estimate where it is: to the right of the picture."""
+def test_a_drone_with_the_target_outside_its_image(tab: Tab) -> None:
+    """The panel describes it, and the page draws the estimate to the right of the image."""
     network, stop, view = MemoryHub(), threading.Event(), ViewServer(port=0)
     good, data = cv2.imencode(".jpg", np.full((240, 320, 3), 128, np.uint8))
     assert good
@@ -102,7 +102,9 @@ def test_a_drones_picture_with_the_car_outside_it(tab: Tab) -> None:
 
         try:
             tab.page.goto(view.address)
-            assert eventually(lambda: publishers[PICTURE].wait_matched(0.0)), "pictures are asked for while one looks"
+            assert eventually(lambda: publishers[PICTURE].wait_matched(0.0)), (
+                "images are subscribed to while a browser is open"
+            )
             publishers[UAV_INFO].put(uav_info("drone"))
             for number, (state, x) in enumerate((("visible", 100.0), ("coasting", 780.0))):
                 fly(state, x, number)
@@ -124,7 +126,7 @@ def test_a_drones_picture_with_the_car_outside_it(tab: Tab) -> None:
             view.close()
 
 
-def test_without_the_token_the_browser_sees_nothing(chromium: Any) -> None:
+def test_without_the_token_the_browser_has_no_access(chromium: Any) -> None:
     view = ViewServer(port=0, token=TOKEN)
     tab = Tab(chromium)
     try:
@@ -140,7 +142,7 @@ def test_without_the_token_the_browser_sees_nothing(chromium: Any) -> None:
         view.close()
 
 
-def test_a_log_is_moved_along_its_timeline(tab: Tab, tmp_path: Path) -> None:
+def test_a_log_can_be_moved_along_its_timeline(tab: Tab, tmp_path: Path) -> None:
     stop = threading.Event()
     views: list[ViewServer] = []
 
@@ -168,7 +170,7 @@ def test_a_log_is_moved_along_its_timeline(tab: Tab, tmp_path: Path) -> None:
         time.fill("1")
         time.press("Enter")
         page.wait_for_selector("[data-state=collecting]")
-        assert page.get_by_role("button", name="Recalibrate").count() == 0, "nothing can be asked of a recording"
+        assert page.get_by_role("button", name="Recalibrate").count() == 0, "a recording accepts no commands"
     finally:
         stop.set()
         loop.join(20.0)

@@ -1,7 +1,7 @@
 """Runs the fault tests and prints the matrix: `python -m tests.faults [pytest arguments]`; `make faults`.
 
-What failed is tried once more, one test after the other: these tests kill, freeze and impair processes, and two of them
-at once on two cores impair each other. What passes only then is told.
+Failed tests are run once more, one after the other: these tests kill, freeze and impair processes, and two of them
+at once on two cores disturb each other. Tests that pass only then are reported.
 """
 
 from __future__ import annotations

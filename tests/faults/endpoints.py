@@ -17,7 +17,7 @@ from collections import defaultdict
 from typing import Any
 
 from protocols.bus.base import Bus
-from protocols.bus.security.sender_identity import GuardedBus
+from protocols.bus.security.sender_identity import SenderCheckedBus
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.messages import syncline_pb2 as pb
@@ -87,7 +87,7 @@ def main() -> None:
         if role == "publish":
             publish(bus, rest[0], float(rest[1]))
         else:
-            receive(GuardedBus(bus, time.monotonic))
+            receive(SenderCheckedBus(bus, time.monotonic))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Random damage for everything that decodes what others send; `make fuzz` does a million and more.
+"""Fuzzing of every decoder of received data with randomly damaged inputs; `make fuzz` does a million and more.
 
     python -m tests.faults.fuzz [--count N] [--seed S]
 
@@ -21,7 +21,7 @@ from typing import Any
 from google.protobuf.message import Message
 
 from protocols.validation.codec import Rejected, admit, sender
-from tests.samples import SAMPLES
+from tests.support.samples import SAMPLES
 
 _EXTREME = (
     struct.pack("<d", math.nan), struct.pack("<d", math.inf), struct.pack("<d", -1e308), b"\xff" * 10, b"\x0b" * 200,
@@ -60,7 +60,7 @@ _TEXTS = ("", "cam0", "cam?", "**", "a" * 5000, "\x00", "\u202e", "-", "Cam0")
 
 
 def spoiled(rng: random.Random, message: Message) -> bytes:
-    """One input: a message that is well-formed to protobuf, with one to three fields that say something absurd."""
+    """One input: a message that is well-formed to protobuf, with one to three fields set to invalid values."""
     copy = type(message)()
     copy.CopyFrom(message)
     for _ in range(rng.randint(1, 3)):
@@ -123,7 +123,7 @@ def all_finite(message: Message) -> bool:
 
 
 def fuzz_gate(count: int, seed: int) -> dict[str, Counter[str]]:
-    """``count`` inputs for every topic's decoder; counts by topic and reason ("" = let in)."""
+    """``count`` inputs for every topic's decoder; counts by topic and reason ("" = accepted)."""
     out: dict[str, Counter[str]] = {}
     payloads = {topic.name: make().SerializeToString() for topic, make in SAMPLES.items()}
     for topic, make in SAMPLES.items():
@@ -149,21 +149,21 @@ def fuzz_gate(count: int, seed: int) -> dict[str, Counter[str]]:
 
 def fuzz_mavlink(count: int, seed: int) -> Counter[str]:
     """``count`` inputs for the MAVLink link: random damage to real frames; only finite messages come through."""
-    from tests.faults.mavlink_frames import frames, heard_of
+    from tests.faults.mavlink_frames import frames, message_receiver
 
     rng, counts = random.Random(f"{seed} mavlink"), Counter[str]()
     valid = frames()
-    hear = heard_of()
+    receive = message_receiver()
     for _ in range(count):
         data = damaged(rng, valid)
         try:
-            heard = hear(data)
+            received = receive(data)
         except Exception as error:
             raise AssertionError(f"mavlink: {type(error).__name__} on {data.hex()}") from error
-        for one in heard:
+        for one in received:
             values = [v for v in one.message.to_dict().values() if isinstance(v, float)]
             assert all(map(math.isfinite, values)), f"mavlink: not finite: {data.hex()}"
-        counts["let in" if heard else "refused"] += 1
+        counts["let in" if received else "refused"] += 1
     return counts
 
 
@@ -209,20 +209,20 @@ def main() -> None:
     began, total = time.process_time(), 0
     print(f"seed {words.seed}")
 
-    def tell(name: str, counts: Counter[str]) -> None:
+    def report(name: str, counts: Counter[str]) -> None:
         nonlocal total
         total += sum(counts.values())
         reasons = ", ".join(f"{number} {reason}" for reason, number in counts.most_common())
         print(f"{name}: {sum(counts.values())} inputs: {reasons}", flush=True)
 
     for name, counts in fuzz_gate(words.count, words.seed).items():
-        tell(name, counts)
+        report(name, counts)
     others: tuple[tuple[str, Callable[[int, int], Counter[str]], int], ...] = (
         ("mavlink", fuzz_mavlink, words.count),
         ("config", fuzz_config, max(1, words.count // 10)),
     )
     for name, run, count in others:
-        tell(name, run(count, words.seed))
+        report(name, run(count, words.seed))
     print(f"{total} inputs, 0 crashes, 0 non-finite values past the gate, {time.process_time() - began:.0f} s of CPU")
 
 

@@ -1,4 +1,4 @@
-"""A bad network between two namespaces, in user space: every packet goes through a TUN device and this process.
+"""Network impairment between two namespaces, in user space: every packet goes through a TUN device and this process.
 
     python -m tests.faults.impair NS_A NS_B CONTROL
 

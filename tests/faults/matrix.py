@@ -13,7 +13,7 @@ VARIABLE = "SYNCLINE_FAULT_MATRIX"
 def measured(fault: str, required: str, text: str, within: bool = True) -> None:
     """Note one row's figure; printed at once and, under `python -m tests.faults`, in the table at the end.
 
-    within: whether it keeps what is required. Times depend on what else the machine does, so they are told and do
+    within: whether it keeps what is required. Times depend on the load of the machine, so they are reported and do
     not decide; what decides is asserted.
     """
     text = text if within else f"OVER: {text}"

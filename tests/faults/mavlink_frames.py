@@ -1,4 +1,4 @@
-"""Real MAVLink bytes, signed or not, and a link that hears them."""
+"""Real MAVLink bytes, signed or not, and a link that receives them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from edge.mavlink.dialect import mavlink
-from edge.mavlink.link.connection import Heard, Link
+from edge.mavlink.link.connection import Link, ReceivedMessage
 from edge.mavlink.link.signing import Signing, ticks
 from edge.mavlink.link.transport import Address
 
@@ -68,20 +68,20 @@ def frames() -> list[bytes]:
 
 
 def link(wire: Wire, signing: Signing | None = None) -> Link:
-    """A link on a wire, at a fixed moment."""
+    """A link on a test transport, at a fixed time."""
     return Link(
         None, system=None, component=100, allowed=ALLOWED, signing=signing, transport=wire,
         now_ns=lambda: 1_000_000_000, unix_s=lambda: UNIX_S,
     )  # fmt: skip
 
 
-def heard_of() -> Callable[[bytes], list[Heard]]:
-    """Feeds bytes to one unsigned link that goes on from input to input."""
+def message_receiver() -> Callable[[bytes], list[ReceivedMessage]]:
+    """Feeds bytes to one unsigned link that keeps its state between inputs."""
     wire = Wire()
     listening = link(wire)
 
-    def hear(data: bytes) -> list[Heard]:
+    def received_from(data: bytes) -> list[ReceivedMessage]:
         wire.waiting.append((data, VEHICLE))
         return listening.poll()
 
-    return hear
+    return received_from

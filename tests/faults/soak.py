@@ -71,8 +71,8 @@ def main() -> None:
     for agent, rows in sizes.items():
         warm = np.array([row for row in rows if row[0] > words.seconds / 3.0])
         slope = float(np.polyfit(warm[:, 0] / 3600.0, warm[:, 1], 1)[0])
-        told = ", ".join(f"{min(rows, key=lambda row: abs(row[0] - mark))[1]:.1f}" for mark in marks)
-        print(f"| {agent} | {told} | {slope:+.1f} |")
+        at_marks = ", ".join(f"{min(rows, key=lambda row: abs(row[0] - mark))[1]:.1f}" for mark in marks)
+        print(f"| {agent} | {at_marks} | {slope:+.1f} |")
     if words.csv:
         with words.csv.open("w", encoding="utf-8") as file:
             file.write("process,seconds,megabytes\n")

@@ -1,6 +1,6 @@
 """Bundles on an offline board: made for this machine, carried over, installed without an index, and run.
 
-Making one needs a package index, once; without one these tests step aside, loudly.
+Making one needs a package index, once; without one these tests are skipped with a message.
 """
 
 from __future__ import annotations

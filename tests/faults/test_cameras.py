@@ -1,4 +1,4 @@
-"""Cameras that stall, freeze, go black, are unplugged: told in time, and nothing stale is published."""
+"""Cameras that stall, freeze, go black, are unplugged: reported in time, and nothing stale is published."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import pytest
 from edge.agents.camera import run_camera_agent
 from edge.detectors.base import Detection
 from edge.devices.base import DeviceInfo, Frame
-from edge.devices.live.opencv_capture import LiveCamera
-from hub.clocks.change_detector import ClockWatch
+from edge.devices.live.opencv_capture import OpenCvCamera
+from hub.clocks.change_detector import ClockChangeDetector
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.errors import InputError
 from protocols.messages import syncline_pb2 as pb
@@ -28,7 +28,7 @@ PERIOD_S = 1 / 30
 
 
 class Flawed:
-    """A live camera at 30 Hz with noise in its pictures, until ``flaw`` is set."""
+    """A live camera at 30 Hz with noise in its images, until ``flaw`` is set."""
 
     def __init__(self, flaw: str) -> None:
         self.info = DeviceInfo(64, 48, 30.0, "video", "monotonic")
@@ -65,7 +65,7 @@ class Flawed:
 
 
 class Bright:
-    """Sees a marker in every picture that is not black."""
+    """Detects a marker in every image that is not black."""
 
     def detect(self, image: np.ndarray, *_: object) -> list[Detection]:
         return [Detection(1.0, 2.0)] if image.max() > 20 else []
@@ -80,27 +80,27 @@ class Bright:
         ("unplugged", "no frame for"),
     ],
 )
-def test_a_camera_that_does_not_see_is_told_and_publishes_nothing_stale(kind: str, words: str) -> None:
+def test_a_camera_without_usable_frames_is_reported_and_publishes_nothing_stale(kind: str, words: str) -> None:
     hub = MemoryHub()
     device, stop = Flawed(kind), threading.Event()
     observations, statuses = MemoryBus(hub).subscribe(OBSERVATION), MemoryBus(hub).subscribe(STATUS)
     agent = threading.Thread(target=_run, args=(device, MemoryBus(hub), stop), daemon=True)
     agent.start()
-    told: list[pb.AgentStatus] = []
+    received: list[pb.AgentStatus] = []
 
-    def hears(condition: Callable[[pb.AgentStatus], bool]) -> Callable[[], bool]:
-        def heard() -> bool:
-            told.extend(item.message for item in statuses.drain())  # type: ignore[misc]
-            return any(condition(status) for status in told)
+    def has_received(condition: Callable[[pb.AgentStatus], bool]) -> Callable[[], bool]:
+        def check() -> bool:
+            received.extend(item.message for item in statuses.drain())  # type: ignore[misc]
+            return any(condition(status) for status in received)
 
-        return heard
+        return check
 
-    _until(hears(lambda status: status.state == "running"))
+    _until(has_received(lambda status: status.state == "running"))
     time.sleep(0.5)
     assert len(observations.drain()) > 5
     device.flaw.set()
     began = time.monotonic()
-    seconds = _until(hears(lambda status: status.state == "degraded" and words in status.message))
+    seconds = _until(has_received(lambda status: status.state == "degraded" and words in status.message))
     time.sleep(1.0)
     stale = [
         item.message
@@ -108,20 +108,23 @@ def test_a_camera_that_does_not_see_is_told_and_publishes_nothing_stale(kind: st
         if item.message.device_time_ns * 1e-9 > began + 2 * PERIOD_S and len(item.message.detections)  # type: ignore[attr-defined]
     ]
     if kind not in ("stalled", "unplugged"):
-        told.clear()
+        received.clear()
         device.flaw.clear()
-        _until(hears(lambda status: status.state == "running"))
+        _until(has_received(lambda status: status.state == "running"))
         assert len(observations.drain()) >= 0
     stop.set()
     agent.join(10.0)
     measured(
-        f"camera {kind}", "told ≤ 2 s, nothing stale published", f"{seconds:.2f} s, {len(stale)} stale", seconds <= 2.0
+        f"camera {kind}",
+        "reported ≤ 2 s, nothing stale published",
+        f"{seconds:.2f} s, {len(stale)} stale",
+        seconds <= 2.0,
     )
     assert stale == []
 
 
 class _Stream(BaseHTTPRequestHandler):
-    """An IP camera: 25 noisy pictures a second, as MJPEG."""
+    """An IP camera: 25 noisy images per second, as MJPEG."""
 
     def do_GET(self) -> None:
         self.send_response(200)
@@ -160,40 +163,40 @@ def test_a_network_camera_that_was_unplugged_comes_back_in_the_same_run_of_its_a
     server = _plugged()
     hub = MemoryHub()
     observations, statuses = MemoryBus(hub).subscribe(OBSERVATION), MemoryBus(hub).subscribe(STATUS)
-    camera, stop = LiveCamera(f"http://127.0.0.1:{server.server_port}/"), threading.Event()
+    camera, stop = OpenCvCamera(f"http://127.0.0.1:{server.server_port}/"), threading.Event()
     agent = threading.Thread(
         target=run_camera_agent, args=(camera, Bright(), MemoryBus(hub), "cam0", stop), daemon=True
     )
     agent.start()
     seen: list[pb.Observation] = []
-    told: list[pb.AgentStatus] = []
+    received: list[pb.AgentStatus] = []
 
-    def heard() -> None:
+    def check() -> None:
         seen.extend(item.message for item in observations.drain())  # type: ignore[misc]
-        told.extend(item.message for item in statuses.drain())  # type: ignore[misc]
+        received.extend(item.message for item in statuses.drain())  # type: ignore[misc]
 
     def until(condition: Callable[[], bool]) -> float:
-        return _until(lambda: (heard(), condition())[1])  # type: ignore[func-returns-value]
+        return _until(lambda: (check(), condition())[1])  # type: ignore[func-returns-value]
 
     try:
         until(lambda: len(seen) > 25)
         _pull(server)
-        flagged = until(lambda: bool(told) and told[-1].state == "degraded")
-        until(lambda: camera.away)
+        flagged = until(lambda: bool(received) and received[-1].state == "degraded")
+        until(lambda: camera.disconnected)
         time.sleep(2.5)  # for several tries in vain
-        heard()
+        check()
         before, count = seen[-1], len(seen)
         server = _plugged(server.server_port)
         back = until(lambda: len(seen) > count + 10)
-        until(lambda: told[-1].state == "running" and told[-1].counters["reconnections"] == 1)
+        until(lambda: received[-1].state == "running" and received[-1].counters["reconnections"] == 1)
     finally:
         stop.set()
         agent.join(10.0)
         _pull(server)
     measured(
         "camera unplugged and back",
-        "told ≤ 2 s, back ≤ 5 s, same run",
-        f"told {flagged:.2f} s, back {back:.2f} s",
+        "reported ≤ 2 s, back ≤ 5 s, same run",
+        f"reported {flagged:.2f} s, back {back:.2f} s",
         flagged <= 2.0 and back <= 5.5,
     )
     after = seen[count]
@@ -202,12 +205,10 @@ def test_a_network_camera_that_was_unplugged_comes_back_in_the_same_run_of_its_a
     assert all(b.device_time_ns > a.device_time_ns for a, b in pairwise(seen))
     missed = after.frame - before.frame - 1
     away_s = (after.device_time_ns - before.device_time_ns) * 1e-9
-    assert missed == pytest.approx(25.0 * away_s, rel=0.35), (
-        "pictures that were missed, of 25 or somewhat fewer a second"
-    )
-    assert told[-1].counters["dropped"] >= missed
-    # The hub's watch over clocks takes the outage for what it is: no step, no new epoch.
-    clock = ClockWatch()
+    assert missed == pytest.approx(25.0 * away_s, rel=0.35), "frames that were missed, of 25 or somewhat fewer a second"
+    assert received[-1].counters["dropped"] >= missed
+    # The hub's watch over clocks does not report the outage as a clock change: no step, no new clock segment.
+    clock = ClockChangeDetector()
     for message in seen:
         arrival = message.device_time_ns * 1e-9 + 0.01
         _, event = clock.handle(

@@ -1,4 +1,4 @@
-"""Who may come in and what they may say, over real TLS sessions; and what the operator is told, and how soon."""
+"""Authentication and access control over real TLS sessions, and how soon the operator gets which report."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from deploy.site.keys_check import check_site, tls_of
 from protocols.bus.base import Publisher
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.security.access import access_rules
-from protocols.bus.security.tls import why_refused
-from protocols.bus.settings import BusConfig, parts_of
+from protocols.bus.security.tls import refusal_reason
+from protocols.bus.settings import BusConfig, split_endpoint
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.topics import OBSERVATION
 from tests.faults.matrix import measured
 from tests.faults.processes import ROOT, Process, wait_until
-from tests.integration.receiving import collect, sequences
-from tests.samples import observation
+from tests.support.receiving import collect, sequences
+from tests.support.samples import observation
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_the_self_test_finds_every_rule_kept(site: Path, capsys: pytest.CaptureF
     orders = {who for who, what in allowed if what.endswith(" command")}
     records = {who for who, what in allowed if what.endswith(" target_command")}
     assert orders == {"view v0"}, "what agents obey: only a view's own"
-    assert records == {"uav d0"}, "what a drone was told by radio: only its own record of it"
+    assert records == {"uav d0"}, "what a drone received by radio: only its own record of it"
 
 
 def test_a_revoked_certificate_may_do_nothing_and_its_successor_everything(site: Path, tmp_path: Path) -> None:
@@ -95,14 +95,14 @@ def test_a_revoked_certificate_may_do_nothing_and_its_successor_everything(site:
             subscription = hub.subscribe(OBSERVATION)
             stealing, number = thief.publisher(OBSERVATION, "cam0"), 0
 
-            def heard(publisher: Publisher) -> bool:
+            def is_received(publisher: Publisher) -> bool:
                 nonlocal number
                 publisher.put(observation("cam0", number))
                 number += 1
                 time.sleep(0.05)
                 return bool(subscription.drain())
 
-            wait_until(lambda: heard(stealing))
+            wait_until(lambda: is_received(stealing))
             began = time.monotonic()
             assert run(["keys", "revoke", str(copy), "--role", "camera", "--id", "cam0"]) == 0
             assert process.line().startswith("relays at"), "the router has taken up the new rules"
@@ -111,10 +111,10 @@ def test_a_revoked_certificate_may_do_nothing_and_its_successor_everything(site:
             assert process.line().startswith("relays at")
             with open_bus("yard", client(copy / "camera-cam0"), timeout_s=10.0) as camera:
                 own = camera.publisher(OBSERVATION, "cam0")
-                wait_until(lambda: heard(own))
+                wait_until(lambda: is_received(own))
             while subscription.drain():
                 time.sleep(0.5)
-            assert not any(heard(stealing) for _ in range(40))
+            assert not any(is_received(stealing) for _ in range(40))
     tried = [finding for finding in check_site(copy) if finding.who == "camera cam0 (revoked)"]
     assert len(tried) > 20
     assert [finding.what for finding in tried if finding.found] == ["connects"]
@@ -126,7 +126,7 @@ def test_a_revoked_certificate_may_do_nothing_and_its_successor_everything(site:
     )
 
 
-def test_revoking_twice_is_once_and_a_damaged_authority_is_told(
+def test_revoking_is_idempotent_and_a_damaged_authority_is_reported(
     site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     import shutil
@@ -191,7 +191,7 @@ def test_observations_go_through_with_certificates_and_late_joiners_get_their_hi
 
 
 @pytest.mark.parametrize("what", ["plain TCP", "wrong authority", "expired", "another's", "no certificate"])
-def test_who_may_not_come_in_is_told_why_within_a_second(site: Path, tmp_path: Path, what: str) -> None:
+def test_a_rejected_client_gets_the_reason_within_a_second(site: Path, tmp_path: Path, what: str) -> None:
     endpoint = free_endpoint().replace("tcp/", "tls/")
     place = site / "router-r0"
     config = BusConfig(mode="router", listen=(endpoint,), tls=tls_of(place), access=place / keys.ZENOH_FILE)
@@ -227,7 +227,7 @@ def test_who_may_not_come_in_is_told_why_within_a_second(site: Path, tmp_path: P
         )  # fmt: skip
         seconds = time.monotonic() - began
         if what == "expired":
-            refused = why_refused(endpoint, tls_of(folder))
+            refused = refusal_reason(endpoint, tls_of(folder))
             assert "expired" in refused, "the router itself turns it away too"
     assert done.returncode == 2
     assert words in done.stderr
@@ -240,12 +240,12 @@ def test_who_may_not_come_in_is_told_why_within_a_second(site: Path, tmp_path: P
     )
 
 
-def test_a_stranger_without_any_certificate_is_turned_away_by_the_router(site: Path) -> None:
+def test_a_client_without_a_certificate_is_rejected_by_the_router(site: Path) -> None:
     endpoint = free_endpoint().replace("tcp/", "tls/")
     place = site / "router-r0"
     config = BusConfig(mode="router", listen=(endpoint,), tls=tls_of(place), access=place / keys.ZENOH_FILE)
     with Router(config=config):
-        _, host, port = parts_of(endpoint)
+        _, host, port = split_endpoint(endpoint)
         context = ssl.create_default_context(cafile=site / keys.CA_FILE)
         began = time.monotonic()
         raw = socket.create_connection((host, port), timeout=3.0)
@@ -262,7 +262,7 @@ def test_a_stranger_without_any_certificate_is_turned_away_by_the_router(site: P
     )
 
 
-def test_an_agent_that_the_rules_do_not_name_is_told_that_nobody_hears_it(site: Path, tmp_path: Path) -> None:
+def test_an_agent_without_a_rule_reports_that_it_has_no_subscriber(site: Path, tmp_path: Path) -> None:
     """A denied put returns normally: the agent's status line says that nobody is subscribed."""
     endpoint = free_endpoint().replace("tcp/", "tls/")
     place = site / "router-r0"
@@ -276,11 +276,11 @@ def test_an_agent_that_the_rules_do_not_name_is_told_that_nobody_hears_it(site: 
     with Router(config=config), open_bus("yard", hub, timeout_s=5.0) as bus:
         subscription = bus.subscribe(OBSERVATION)
         with Process("-m", "deploy", "camera", str(agent), stderr=errors):
-            wait_until(lambda: "nobody hears" in errors.read_text(encoding="utf-8"))
+            wait_until(lambda: "no subscriber" in errors.read_text(encoding="utf-8"))
             assert subscription.drain() == []
     text = errors.read_text(encoding="utf-8")
     assert "access rules" in text
-    measured("wrong access rules", "refused, the reason reaches the operator", "status line: nobody hears this camera")
+    measured("wrong access rules", "refused, the reason reaches the operator", "status line: no subscriber")
 
 
 def test_keys_are_private_and_rules_deny(site: Path) -> None:
@@ -303,7 +303,7 @@ def test_a_key_that_others_may_read_is_refused(site: Path, tmp_path: Path, capsy
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         (["init", "{there}", "--site", "yard"], "there is an authority here already"),
         (["init", "{new}", "--site", "Yard!"], "site 'Yard!' is not usable"),
@@ -317,11 +317,11 @@ def test_a_key_that_others_may_read_is_refused(site: Path, tmp_path: Path, capsy
         (["revoke", "{there}", "--role", "camera", "--id", "cam7"], "camera 'cam7' has no certificate"),
     ],
 )
-def test_bad_use_is_told_in_one_line(
-    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], told: str
+def test_wrong_usage_is_reported_in_one_line(
+    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], expected: str
 ) -> None:
     places = {"there": str(site), "new": str(tmp_path / "new")}
     assert run(["keys", *(word.format(**places) for word in words)]) == 2
     text = capsys.readouterr().err
-    assert told in text
+    assert expected in text
     assert len(text.strip().splitlines()) == 1

@@ -1,4 +1,4 @@
-"""A camera's clock that steps or changes its rate while the hub listens: told, kept apart, the offset found again."""
+"""Steps and rate changes of a camera's clock: reported, both segments kept separate, the offset estimated again."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edge import scenes
-from edge.scenes.marker.session import simulated_session
+from edge.scenes.marker.session import simulate_tracks
 from hub.live.live_hub import LiveHub, LiveSettings
 from protocols.messages import syncline_pb2 as pb
 from tests.faults.matrix import measured
@@ -16,8 +16,8 @@ STEP_AT_S = 20.0
 
 def stream(seconds: float, change: str, size: float) -> list[tuple[float, pb.Observation | pb.CameraInfo]]:
     """(true time, message) of three cameras; the clock of cam1 changes after STEP_AT_S."""
-    scene = scenes.get("marker", 3, 3)
-    filmed = simulated_session(scene, seconds, 3, pixel_noise=0.3, outlier_fraction=0.0, drop_fraction=0.0)
+    scene = scenes.get_marker_scene("marker", 3, 3)
+    filmed = simulate_tracks(scene, seconds, 3, pixel_noise=0.3, outlier_fraction=0.0, drop_fraction=0.0)
     out: list[tuple[float, pb.Observation | pb.CameraInfo]] = []
     rng = np.random.default_rng(1)
     for camera in filmed.cameras:
@@ -45,7 +45,7 @@ def stream(seconds: float, change: str, size: float) -> list[tuple[float, pb.Obs
 
 
 @pytest.mark.parametrize("size", [10.0, -10.0])
-def test_a_step_is_told_at_once_and_the_offset_follows(size: float) -> None:
+def test_a_step_is_reported_at_once_and_the_offset_follows(size: float) -> None:
     hub = LiveHub(LiveSettings(interval_s=4.0, window_s=30.0))
     flagged = right = None
     before: float | None = None
@@ -53,9 +53,9 @@ def test_a_step_is_told_at_once_and_the_offset_follows(size: float) -> None:
         hub.handle(message, 1000.0 + true)
         if flagged is None and hub.counters["clock_steps"]:
             flagged = true - STEP_AT_S
-        for told in hub.tick(true):
-            if isinstance(told, pb.Calibration) and told.status == "solved":
-                found = {camera.camera: camera for camera in told.cameras}.get("cam1")
+        for alarm in hub.tick(true):
+            if isinstance(alarm, pb.Calibration) and alarm.status == "solved":
+                found = {camera.camera: camera for camera in alarm.cameras}.get("cam1")
                 if found is None:
                     continue
                 if found.boot_id == "boot-cam1":
@@ -68,16 +68,16 @@ def test_a_step_is_told_at_once_and_the_offset_follows(size: float) -> None:
     assert hub.counters["clock_steps"] == 1
     measured(
         f"clock step of {size:+.0f} s",
-        "told, both sides apart, offset again ≤ 5 s",
-        f"told after {flagged:.2f} s, offset after {right:.2f} s to {abs(error) * 1e3:.2f} ms",
+        "reported, both sides separate, offset again ≤ 5 s",
+        f"reported after {flagged:.2f} s, offset after {right:.2f} s to {abs(error) * 1e3:.2f} ms",
         right <= 5.0,
     )
     assert abs(error) < 0.01
     assert right <= 5.0
 
 
-def test_a_change_of_rate_by_200_ppm_is_told() -> None:
-    """The hub's own clock is the only one that can tell; delays scatter by 0.3 ms here."""
+def test_a_rate_change_of_200_ppm_is_reported() -> None:
+    """Only the hub's own clock makes this observable; delays scatter by 0.3 ms here."""
     hub = LiveHub(LiveSettings(interval_s=1e9))
     flagged = None
     for true, message in stream(STEP_AT_S + 20.0, "drift", 2e-4):
@@ -87,12 +87,12 @@ def test_a_change_of_rate_by_200_ppm_is_told() -> None:
     assert flagged is not None
     assert hub.counters["clock_drifts"] == 1
     assert hub.counters["clock_steps"] == 0
-    told = hub.clocks.alarms["cam1"]
-    measured("clock drift of 200 ppm", "told, both sides apart", f"told after {flagged:.1f} s: {told}")
-    assert 100 < float(told.split()[-2]) < 300
+    alarm = hub.clocks.alarms["cam1"]
+    measured("clock drift of 200 ppm", "reported, both sides separate", f"reported after {flagged:.1f} s: {alarm}")
+    assert 100 < float(alarm.split()[-2]) < 300
 
 
-def test_steady_clocks_are_left_alone() -> None:
+def test_steady_clocks_raise_no_alarm() -> None:
     hub = LiveHub(LiveSettings(interval_s=1e9))
     for true, message in stream(40.0, "step", 0.0):
         hub.handle(message, 1000.0 + true)

@@ -33,8 +33,10 @@ CASES = {
 
 
 @pytest.mark.parametrize("what", CASES)
-def test_it_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str) -> None:
-    role, text, told = CASES[what]
+def test_an_invalid_configuration_is_reported_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str
+) -> None:
+    role, text, expected = CASES[what]
     file = tmp_path / "agent.toml"
     file.write_text(text, encoding="utf-8")
     done = subprocess.run(
@@ -46,12 +48,12 @@ def test_it_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[st
         cwd=ROOT,
     )
     assert done.returncode == 2, done.stderr
-    assert told in done.stderr
+    assert expected in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1, done.stderr
-    measured(f"configuration: {what}", "refused at start with line and remedy", f"exit 2: …{told}")
+    measured(f"configuration: {what}", "refused at start with line and remedy", f"exit 2: …{expected}")
 
 
-def test_what_is_right_is_accepted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_valid_configuration_is_accepted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "hub.toml"
     file.write_text('[bus]\noutage_s = 120.0\n[health]\nlisten = "127.0.0.1:9100"\n', encoding="utf-8")
     assert run(["hub", str(file), "--print-config"]) == 0

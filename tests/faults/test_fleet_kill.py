@@ -1,4 +1,4 @@
-"""A fleet whose agents are killed: each is started again, told, and nothing is left behind."""
+"""A fleet whose agents are killed: each is restarted and reported, and no process is left behind."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import signal
 from pathlib import Path
 
 from deploy.logs.info import describe_log
-from deploy.site.fleet import runs
-from tests.integration.test_fleet import fleet, frames, mini, start, state, until
+from deploy.site.fleet import is_running
+from tests.integration.site.test_fleet import fleet, frames, mini, start, state, until
 
 
 def test_a_killed_agent_is_started_again(tmp_path: Path) -> None:
@@ -19,12 +19,12 @@ def test_a_killed_agent_is_started_again(tmp_path: Path) -> None:
     try:
         until(lambda: frames(out, "cam0") > 5 and frames(out, "cam1") > 5)
         asked = fleet("status", "--out", str(out), "--json")
-        told = json.loads(asked.stdout)
-        assert told["up"]
-        assert all(agent["runs"] for agent in told["agents"].values())
+        status = json.loads(asked.stdout)
+        assert status["up"]
+        assert all(agent["runs"] for agent in status["agents"].values())
         again = fleet("up", str(rig), "--simulated", "--out", str(out))
         assert (again.returncode, "is up in" in again.stderr) == (3, True)
-        victim = told["agents"]["cam1"]
+        victim = status["agents"]["cam1"]
         os.kill(victim["pid"], signal.SIGKILL)
         until(lambda: state(out)["agents"]["cam1"]["restarts"] == 1)
         until(lambda: state(out)["agents"]["cam1"]["pid"] not in (0, victim["pid"]))
@@ -34,11 +34,11 @@ def test_a_killed_agent_is_started_again(tmp_path: Path) -> None:
         down = fleet("down", "--out", str(out))
         assert (down.returncode, down.stdout) == (0, "stopped 4 agents\n")
         assert up.wait(60) == 0
-        assert not any(runs(*one) for one in pids.values())
+        assert not any(is_running(*one) for one in pids.values())
         printed = (tmp_path / "log.txt").read_text()
         assert re.search(r"cam1 ended \(SIGKILL\): .*; again in 1 s", printed)
         assert not fleet("status", "--out", str(out), "--json").stdout.count('"runs": true')
-        # In order: the recorder, stopped after the cameras, has heard the last word of each of them.
+        # In order: the recorder, stopped after the cameras, has received the last message of each of them.
         (log,) = (out / "recordings").glob("*.mcap")
         description = describe_log(log)
         assert not description.damage

@@ -1,4 +1,4 @@
-"""Payloads meant to break who reads them: refused, counted by reason and source, and everything else goes on."""
+"""Hostile payloads: refused, counted by reason and source, and everything else continues."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from protocols.bus.router.zenoh_router import Router, free_endpoint
-from protocols.bus.security.sender_identity import GuardedBus
+from protocols.bus.security.sender_identity import SenderCheckedBus
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.session import open_session
 from protocols.bus.transport.zenoh_bus import open_bus
@@ -18,8 +18,8 @@ from protocols.topics import OBSERVATION
 from tests.faults.fuzz import fuzz_config, fuzz_gate, fuzz_mavlink
 from tests.faults.matrix import measured
 from tests.faults.processes import wait_until
-from tests.integration.receiving import collect, matched, sequences
-from tests.samples import observation
+from tests.support.receiving import collect, matched, sequences
+from tests.support.samples import observation
 
 IN_CI = 10_000
 
@@ -61,7 +61,7 @@ def test_hostile_payloads_are_refused_and_counted_by_reason_and_source() -> None
     config = BusConfig(mode="client", connect=(endpoint,))
     with ExitStack() as stack:
         stack.enter_context(Router(endpoint))
-        receiving = GuardedBus(stack.enter_context(open_bus("local", config, timeout_s=5.0)), time.monotonic)
+        receiving = SenderCheckedBus(stack.enter_context(open_bus("local", config, timeout_s=5.0)), time.monotonic)
         subscription = receiving.subscribe(OBSERVATION)
         sending = stack.enter_context(open_bus("local", config, timeout_s=5.0))
         hostile = matched(sending.publisher(OBSERVATION, "cam0"))
@@ -73,8 +73,10 @@ def test_hostile_payloads_are_refused_and_counted_by_reason_and_source() -> None
             expected[reason, "cam0"] = expected.get((reason, "cam0"), 0) + 1
         assert sequences(collect(subscription, len(HOSTILE))) == list(range(len(HOSTILE)))
         wait_until(lambda: subscription.drain() == [] and receiving.refusals_by_source() == expected)
-    told = ", ".join(f"{count} {reason}" for (reason, _), count in expected.items())
-    measured("hostile payloads", "refused, counted by reason and source", f"{len(HOSTILE)} of {len(HOSTILE)}: {told}")
+    reasons = ", ".join(f"{count} {reason}" for (reason, _), count in expected.items())
+    measured(
+        "hostile payloads", "refused, counted by reason and source", f"{len(HOSTILE)} of {len(HOSTILE)}: {reasons}"
+    )
 
 
 def test_a_message_of_100_mb_does_no_harm() -> None:
@@ -116,6 +118,6 @@ def test_random_damage_never_gets_through_mavlink() -> None:
     measured("fuzz: MAVLink", "10⁴: 0 crashes, 0 non-finite", text)
 
 
-def test_random_damage_to_a_configuration_is_told_in_one_line() -> None:
+def test_random_damage_to_a_configuration_is_reported_in_one_line() -> None:
     counts = fuzz_config(IN_CI // 5, 1)
     measured("fuzz: configuration", "one line each", f"{sum(counts.values())} inputs, {counts['refused']} refused")

@@ -1,4 +1,4 @@
-"""Two agents with one id, a forger, a plain publisher: told, refused, counted; and the counters reach the operator."""
+"""Two agents with one id, a forger, a plain publisher: reported, refused, counted; counters reach the operator."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from pathlib import Path
 import pytest
 
 from protocols.bus.router.zenoh_router import Router, free_endpoint
-from protocols.bus.security.sender_identity import GuardedBus
+from protocols.bus.security.sender_identity import SenderCheckedBus
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.session import open_session
 from protocols.bus.transport.zenoh_bus import ZenohBus, open_bus
 from protocols.topics import OBSERVATION, STATUS
 from tests.faults.matrix import measured
 from tests.faults.processes import Process, wait_until
-from tests.integration.receiving import collect, matched, sequences
-from tests.samples import observation
+from tests.support.receiving import collect, matched, sequences
+from tests.support.samples import observation
 
 
 class Site:
-    """A router, a guarded receiver, and buses to speak from."""
+    """A router, a guarded receiver, and buses to publish from."""
 
     def __init__(self, stack: ExitStack) -> None:
         self.stack, self.endpoint = stack, free_endpoint()
         stack.enter_context(Router(self.endpoint))
-        self.receiving = GuardedBus(self.bus(), time.monotonic)
+        self.receiving = SenderCheckedBus(self.bus(), time.monotonic)
         self.subscription = self.receiving.subscribe(OBSERVATION)
 
     def bus(self) -> ZenohBus:
@@ -50,7 +50,7 @@ def site() -> Iterator[Site]:
         yield Site(stack)
 
 
-def test_of_two_agents_with_one_id_the_first_is_heard(site: Site) -> None:
+def test_of_two_agents_with_one_id_the_first_is_accepted(site: Site) -> None:
     site.agent("boot-1")
     first = site.publisher
     first.put(observation("cam0", 0, "boot-1"))
@@ -60,15 +60,15 @@ def test_of_two_agents_with_one_id_the_first_is_heard(site: Site) -> None:
     for index in range(1, 21):
         site.publisher.put(observation("cam0", index, "boot-2"))
         first.put(observation("cam0", index, "boot-1"))
-    heard = collect(site.subscription, 20)
+    received = collect(site.subscription, 20)
     wait_until(lambda: site.subscription.drain() is None or site.receiving.guard.alarms())
-    told = time.monotonic() - began
+    alarm_delay = time.monotonic() - began
     wait_until(
         lambda: site.subscription.drain() is None or site.subscription.counters.get("rejected.second_agent") == 20
     )
-    assert {item.message.boot_id for item in heard} == {"boot-1"}  # type: ignore[attr-defined]
+    assert {item.message.boot_id for item in received} == {"boot-1"}  # type: ignore[attr-defined]
     assert site.receiving.guard.alarms() == ["camera cam0 runs 2 times; only the first is heard"]
-    measured("two agents with one id", "alarm, refused, counted", f"alarm after {told:.2f} s, 20 of 20 refused")
+    measured("two agents with one id", "alarm, refused, counted", f"alarm after {alarm_delay:.2f} s, 20 of 20 refused")
 
 
 def test_a_forger_and_a_plain_publisher_are_refused(site: Site) -> None:
@@ -137,7 +137,7 @@ def test_every_refusal_is_a_counter_on_metrics_and_in_the_status(tmp_path: Path)
     refused = next(line for line in lines if line["event"] == "refused")
     assert (refused["camera"], refused["sequence"], refused["reason"]) == ("cam7", 17, "not_finite")
     measured(
-        "every refusal is told",
+        "every refusal is reported",
         "on /metrics and in the status ≤ 5 s; a log line with camera and sequence",
         f"/metrics {seconds:.2f} s, status {in_status:.2f} s",
         max(seconds, in_status) <= 5.0,

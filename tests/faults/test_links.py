@@ -1,4 +1,4 @@
-"""Links that are cut, lossy, slow, reordering, duplicating: no observation is lost, or their number is told."""
+"""Links that are cut, lossy, slow, reordering, duplicating: no observation is lost, or their number is reported."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def ends(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Ends]:
         yield sending, receiving, link
 
 
-def settled(receiving: Process, patience_s: float = 20.0) -> dict:
+def final_counts(receiving: Process, patience_s: float = 20.0) -> dict:
     """What was received, once nothing more comes."""
     last, since = -1, time.monotonic()
     while True:
@@ -51,7 +51,7 @@ def test_a_partition_of_a_minute_loses_nothing(ends: Ends) -> None:
     healed = time.monotonic()
     time.sleep(6.0)
     put = sending.ask("stop")["put"]
-    answer = settled(receiving)
+    answer = final_counts(receiving)
     (sequences,), (arrivals,) = answer["sequences"].values(), answer["arrivals"].values()
     flowing = min(arrival for arrival in arrivals if arrival > healed) - healed
     lost = put - len(set(sequences))
@@ -67,7 +67,7 @@ def test_a_partition_of_a_minute_loses_nothing(ends: Ends) -> None:
 
 
 @pytest.mark.parametrize("ends", [4.0], indirect=True)
-def test_beyond_the_cache_the_exact_number_is_told(ends: Ends) -> None:
+def test_beyond_the_cache_the_exact_number_is_reported(ends: Ends) -> None:
     """Cache for 4 s and half as much again, a cut of 15 s."""
     sending, receiving, link = ends
     time.sleep(2.0)
@@ -76,12 +76,12 @@ def test_beyond_the_cache_the_exact_number_is_told(ends: Ends) -> None:
     link.set()
     time.sleep(6.0)
     put = sending.ask("stop")["put"]
-    answer = settled(receiving)
+    answer = final_counts(receiving)
     (sequences,) = answer["sequences"].values()
-    missing, told = put - len(sequences), answer["counters"]["lost"]
-    measured("cut of 15 s, cache for 4 s", "the exact number of lost ones", f"{missing} missing, {told} told")
+    missing, reported = put - len(sequences), answer["counters"]["lost"]
+    measured("cut of 15 s, cache for 4 s", "the exact number of lost ones", f"{missing} missing, {reported} reported")
     assert missing > 0
-    assert told == missing
+    assert reported == missing
     assert sequences == sorted(set(sequences))
 
 
@@ -102,7 +102,7 @@ def test_a_bad_link_loses_nothing(ends: Ends, name: str, rules: dict[str, float]
     healed = time.monotonic()
     time.sleep(4.0)
     put = sending.ask("stop")["put"]
-    answer = settled(receiving)
+    answer = final_counts(receiving)
     (sequences,), (arrivals,) = answer["sequences"].values(), answer["arrivals"].values()
     flowing = min(arrival for arrival in arrivals if arrival > healed) - healed
     p99 = rows(answer["latencies"], 0.99)

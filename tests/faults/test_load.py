@@ -1,4 +1,4 @@
-"""A thousand cameras on one hub: nothing is lost; how late it is and what it costs is told."""
+"""A thousand cameras on one hub: nothing is lost; latency and cost are reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MAVLink that is not to be believed: refused with a reason, counted; and a restart forgets nothing."""
+"""Untrusted MAVLink messages: refused with a reason, counted; the signing state survives a restart."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ def test_unsigned_wrong_replayed_future_nan_and_garbage_are_refused(tmp_path: Pa
     wire, vehicle = Wire(), Vehicle(KEY)
     listening = link(wire, Signing(KEY, tmp_path / "signing.json"))
 
-    def hear(*data: bytes) -> list[str]:
+    def receive(*data: bytes) -> list[str]:
         wire.waiting += [(one, VEHICLE) for one in data]
-        return [heard.kind for heard in listening.poll()]
+        return [received.kind for received in listening.poll()]
 
-    assert hear(vehicle.heartbeat()) == ["HEARTBEAT"]
+    assert receive(vehicle.heartbeat()) == ["HEARTBEAT"]
     good = vehicle.attitude()
-    assert hear(good) == ["ATTITUDE_QUATERNION"]
-    assert hear(Vehicle().attitude()) == []
-    assert hear(Vehicle(OTHER).attitude()) == []
-    assert hear(good) == []
-    assert hear(vehicle.attitude(at=ticks(UNIX_S + 60.0))) == []
-    assert hear(vehicle.attitude(float("nan"))) == []
-    assert hear(random.Random(0).randbytes(5000)) == []
-    after = [kind for _ in range(10) for kind in hear(vehicle.attitude())]
+    assert receive(good) == ["ATTITUDE_QUATERNION"]
+    assert receive(Vehicle().attitude()) == []
+    assert receive(Vehicle(OTHER).attitude()) == []
+    assert receive(good) == []
+    assert receive(vehicle.attitude(at=ticks(UNIX_S + 60.0))) == []
+    assert receive(vehicle.attitude(float("nan"))) == []
+    assert receive(random.Random(0).randbytes(5000)) == []
+    after = [kind for _ in range(10) for kind in receive(vehicle.attitude())]
     assert "ATTITUDE_QUATERNION" in after, "what began like a frame in the garbage may cost a few, not all"
     counts = listening.counters
     expected = {"unsigned": 1, "wrong_key": 1, "replayed": 1, "future": 1, "not_finite": 1}
@@ -56,5 +56,5 @@ def test_the_state_of_signing_survives_a_restart(tmp_path: Path) -> None:
     assert second.poll() == []
     assert second.counters["refused.replayed"] == 2
     wire.waiting.append((vehicle.heartbeat(), VEHICLE))
-    assert [heard.kind for heard in second.poll()] == ["HEARTBEAT"]
+    assert [received.kind for received in second.poll()] == ["HEARTBEAT"]
     measured("MAVLink: restart", "signing state survives", "2 of 2 old messages refused as replayed")

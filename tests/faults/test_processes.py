@@ -1,4 +1,4 @@
-"""Processes that are killed, frozen, or alive and of no use."""
+"""Processes that are killed, frozen, or alive without doing their work."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from protocols.core.errors import InputError
 from protocols.topics import OBSERVATION
 from tests.faults.matrix import measured
 from tests.faults.processes import Process, publisher, receiver, router, wait_until
-from tests.integration.receiving import collect, matched
-from tests.samples import observation
+from tests.support.receiving import collect, matched
+from tests.support.samples import observation
 
 
 def arrivals(receiving: Process) -> list[float]:

@@ -64,9 +64,9 @@ def test_a_disk_that_fills_up_ends_the_recording_with_a_whole_log(tmp_path: Path
     with LogReader(log) as reader:
         kept = sum(1 for _ in reader.messages())
     share = 100.0 * shutil.disk_usage(small_disk).free / shutil.disk_usage(small_disk).total
-    told = errors.read_text(encoding="utf-8")
+    text = errors.read_text(encoding="utf-8")
     assert status == 2
-    assert "min_free_percent is 5; the log is whole" in told
+    assert "min_free_percent is 5; the log is whole" in text
     assert kept > 20
     assert sequences == list(range(put))
     measured(

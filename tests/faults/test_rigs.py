@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from deploy.logs.info import describe_log
-from deploy.site.fleet import bring_down, read_state
+from deploy.site.fleet import read_state, stop_fleet
 from deploy.site.rig_folder import find_rig, read_rig_folder
 
 SECONDS = {"webcams-room": 15, "drone-cage": 20, "oak-array": 25, "companion": 15}
@@ -30,9 +30,9 @@ def test_a_rig_runs_with_simulated_devices(name: str, tmp_path: Path) -> None:
 
     def enough() -> bool:
         state = read_state(out) or {"elapsed_s": 0.0, "calibrations": {}}
-        told = [state["calibrations"].get(solver) for solver in solvers]
+        status = [state["calibrations"].get(solver) for solver in solvers]
         return state["elapsed_s"] >= SECONDS[name] and all(
-            text == f"{len(cameras)} cameras calibrated" for text in told
+            text == f"{len(cameras)} cameras calibrated" for text in status
         )
 
     with subprocess.Popen(
@@ -45,21 +45,21 @@ def test_a_rig_runs_with_simulated_devices(name: str, tmp_path: Path) -> None:
         while not enough() and fleet.poll() is None and time.monotonic() - began < PATIENCE_S:
             time.sleep(0.2)
         if fleet.poll() is None:
-            bring_down(out)
+            stop_fleet(out)
         stdout, stderr = fleet.communicate(timeout=60)
     assert fleet.returncode == 0, stdout[-2000:] + stderr[-2000:]
-    told = json.loads(stdout)
-    assert told["failed"] == told["silent"] == []
+    status = json.loads(stdout)
+    assert status["failed"] == status["silent"] == []
     for agent in rig.agents:
-        assert told["agents"][agent.name]["state"] == "stopped"
-        assert told["agents"][agent.name]["restarts"] == 0, (out / "logs" / f"{agent.name}.txt").read_text()
+        assert status["agents"][agent.name]["state"] == "stopped"
+        assert status["agents"][agent.name]["restarts"] == 0, (out / "logs" / f"{agent.name}.txt").read_text()
     (log,) = (out / "recordings").glob("*.mcap")
     description = describe_log(log)
     assert not description.damage
     assert {camera.camera for camera in description.cameras} == set(cameras)
     if rig.of("uav"):
-        assert {"uav_info", "telemetry"} <= {topic.topic for topic in description.topics}, "no autopilot was heard"
+        assert {"uav_info", "telemetry"} <= {topic.topic for topic in description.topics}, "no autopilot was received"
     for name_of_solver in solvers:
         calibration = tomllib.loads((out / name_of_solver / "calibration.toml").read_text())
-        assert set(cameras) <= calibration.keys(), told["calibrations"]
+        assert set(cameras) <= calibration.keys(), status["calibrations"]
         assert calibration["metadata"]["scale"] == "metric"

@@ -7,16 +7,16 @@ import random
 import numpy as np
 
 from edge.mavlink.dialect import mavlink
-from edge.uav.world.patrol import patrol
+from edge.uav.world.patrol import patrol_world
 from protocols.messages import syncline_pb2 as pb
-from tests.uav_flights import Flight
+from tests.support.uav_flights import Flight
 
 SIZE = (320, 240)
 
 
 def flown(noise: bool) -> Flight:
     """Three seconds with a target; with noise, 10^6 random bytes come over the same wire meanwhile."""
-    flight = Flight(patrol(3, 10.0, SIZE), jpeg_quality=90)
+    flight = Flight(patrol_world(3, 10.0, SIZE), jpeg_quality=90)
     flight.run(1.5)
     assert flight.select()
     rng = random.Random(1)
@@ -42,8 +42,8 @@ def test_a_million_garbled_bytes_change_nothing() -> None:
     assert said[0] == said[1]
 
 
-def test_a_silent_vehicle_and_a_dark_camera_are_told_and_got_over() -> None:
-    flight = Flight(patrol(3, 20.0, SIZE))
+def test_a_silent_vehicle_and_a_dark_camera_are_reported_and_recovered_from() -> None:
+    flight = Flight(patrol_world(3, 20.0, SIZE))
     flight.run(1.5)
     assert flight.select()
     flight.run(2.0)
@@ -56,14 +56,14 @@ def test_a_silent_vehicle_and_a_dark_camera_are_told_and_got_over() -> None:
     flight.frames_lost = lambda frame: 5.1 < frame / 30.0 < 5.4
     flight.run(5.95)
     assert flight.agent.status(1).state == "running"
-    last = flight.said(pb.TargetState)[-1]
+    last = flight.messages(pb.TargetState)[-1]
     truth = flight.world.truth(last.frame)
     assert last.centre
     assert np.hypot(last.centre[0] - truth.x, last.centre[1] - truth.y) < 20.0
 
 
 def test_an_attitude_of_nan_is_refused_and_the_flight_goes_on() -> None:
-    flight = Flight(patrol(3, 10.0, SIZE))
+    flight = Flight(patrol_world(3, 10.0, SIZE))
     flight.run(1.5)
     assert flight.select()
     codec = mavlink.MAVLink(None, 1, 1)
@@ -80,6 +80,6 @@ def test_an_attitude_of_nan_is_refused_and_the_flight_goes_on() -> None:
             wire.send(bytes(bad.pack(codec)), None)
         flight.run(flight.time + 0.02)
     assert flight.link.counters["refused.not_finite"] == 100
-    last = flight.said(pb.TargetState)[-1]
+    last = flight.messages(pb.TargetState)[-1]
     truth = flight.world.truth(last.frame)
     assert np.hypot(last.centre[0] - truth.x, last.centre[1] - truth.y) < 10.0

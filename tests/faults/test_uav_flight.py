@@ -1,4 +1,4 @@
-"""The UAV agent in a time of its own: replay, faults of the link, and what it commands."""
+"""The UAV agent in simulated time: replay, faults of the link, and what it commands."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ import numpy as np
 import pytest
 
 from deploy.config.uav import ControlConfig
-from deploy.demo.flight_outcome import compare
+from deploy.demo.flight_outcome import compare_log_with_world
 from deploy.demo.flight_report import write_report
 from deploy.logs.replay_uav import replay_through_uav
 from edge.agents.uav import TOPICS
-from edge.mavlink.roles.autopilot import Faults
-from edge.uav.tracker import State
-from edge.uav.world.patrol import patrol
-from edge.uav.world.world import World
+from edge.mavlink.roles.autopilot import LinkFaults
+from edge.uav.tracker import TrackState
+from edge.uav.world.flight_world import FlightWorld
+from edge.uav.world.patrol import patrol_world
 from protocols.core.errors import InputError
 from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
-from tests.uav_flights import Flight, mavlink
+from tests.support.uav_flights import Flight, mavlink
 
 SIZE = (320, 240)
 SHOWN = (pb.TargetState, pb.TargetCloud, pb.RoadMap)
 
 
 @pytest.fixture(scope="module")
-def world() -> World:
-    return patrol(3, 20.0, SIZE)
+def world() -> FlightWorld:
+    return patrol_world(3, 20.0, SIZE)
 
 
 def recorded(flight: Flight, log: Path, keep: Callable[[object], bool] = lambda message: True) -> Path:
@@ -41,7 +41,7 @@ def recorded(flight: Flight, log: Path, keep: Callable[[object], bool] = lambda 
     return log
 
 
-def test_a_replay_says_what_the_agent_said_to_the_byte(world: World, tmp_path: Path) -> None:
+def test_a_replay_gives_the_agents_messages_to_the_byte(world: FlightWorld, tmp_path: Path) -> None:
     flight = Flight(world, jpeg_quality=90)
     flight.run(1.5)
     assert flight.select()
@@ -68,34 +68,35 @@ def test_a_replay_says_what_the_agent_said_to_the_byte(world: World, tmp_path: P
         )
 
 
-def test_a_link_that_drops_delays_doubles_and_garbles_costs_little(world: World) -> None:
-    faults = Faults(drop=0.2, duplicate=0.2, garble=0.1, delay_s=0.05, jitter_s=0.05)
+def test_a_link_that_drops_delays_doubles_and_garbles_costs_little(world: FlightWorld) -> None:
+    faults = LinkFaults(drop=0.2, duplicate=0.2, garble=0.1, delay_s=0.05, jitter_s=0.05)
     flight = Flight(world, faults=faults)
     flight.run(1.5)
     assert any(flight.select(0.4) for _ in range(5))  # an order may be lost on the way
     flight.run(4.5)
-    states = flight.said(pb.TargetState)
+    states = flight.messages(pb.TargetState)
     errors = [np.hypot(s.centre[0] - world.truth(s.frame).x, s.centre[1] - world.truth(s.frame).y) for s in states]
     assert np.median(errors) < 4.0
     assert flight.link.counters["garbled_bytes"] > 0
 
 
-def test_an_autopilot_that_starts_anew_and_a_clock_that_jumps_are_noticed(world: World) -> None:
-    flight = Flight(world, faults=Faults(reboot_at=(2.0,), steps=((5.0, 30.0),)))
+def test_an_autopilot_restart_and_a_clock_step_are_detected(world: FlightWorld) -> None:
+    flight = Flight(world, faults=LinkFaults(reboot_at=(2.0,), steps=((5.0, 30.0),)))
     flight.run(8.0)
     clock = flight.agent._vehicle.clock
     assert (clock.reboots, clock.steps) == (1, 1)
-    newest = flight.said(pb.VehicleTelemetry)[-1]
+    newest = flight.messages(pb.VehicleTelemetry)[-1]
     # The vehicle has been up for 6 s, and its clock is 30 s ahead of that; the camera's clock is its own.
     assert newest.vehicle_time_ns / 1e9 == pytest.approx(8.0 - 2.0 + 30.0, abs=0.3)
     assert newest.device_time_ns / 1e9 == pytest.approx(8.0 + flight.camera_ahead_s, abs=0.3)
     # The rates are asked for again.
     assert (
-        len([m for m in flight.said(pb.VehicleTelemetry) if m.device_time_ns / 1e9 - flight.camera_ahead_s > 7.0]) > 20
+        len([m for m in flight.messages(pb.VehicleTelemetry) if m.device_time_ns / 1e9 - flight.camera_ahead_s > 7.0])
+        > 20
     )
 
 
-def test_nothing_is_commanded_unless_it_is_allowed(world: World) -> None:
+def test_nothing_is_commanded_unless_it_is_allowed(world: FlightWorld) -> None:
     flight = Flight(world)
     flight.run(1.5)
     assert flight.select()
@@ -103,7 +104,9 @@ def test_nothing_is_commanded_unless_it_is_allowed(world: World) -> None:
     assert flight.autopilot.counters["follow_targets"] == flight.autopilot.counters["pointed"] == 0
 
 
-def test_an_aircraft_that_may_be_told_to_follow_is_told_and_stops_when_the_operator_says_so(world: World) -> None:
+def test_an_aircraft_with_permission_is_commanded_to_follow_and_stops_on_the_operators_order(
+    world: FlightWorld,
+) -> None:
     start = np.array([*world.target.ground[0], -62.0])
     flight = Flight(
         world, control=ControlConfig(follow=True), flies="follow", start=start, yaw=float(world.target.course[0])
@@ -113,10 +116,10 @@ def test_an_aircraft_that_may_be_told_to_follow_is_told_and_stops_when_the_opera
     flight.run(3.0)
     sent = flight.autopilot.counters["follow_targets"]
     assert sent > 10
-    told = flight.station.last("CAMERA_TRACKING_GEO_STATUS")
-    north, east, _ = flight.autopilot.origin.local(1e-7 * told.lat, 1e-7 * told.lon, 0.0)
-    lately = world.target.ground[flight.frame - 10 : flight.frame + 1]  # it is told five times a second
-    assert np.hypot(*(lately - [north, east]).T).min() < min(max(3.0 * told.h_acc, 0.5), 3.0)
+    geo_status = flight.station.last("CAMERA_TRACKING_GEO_STATUS")
+    north, east, _ = flight.autopilot.origin.to_ned(1e-7 * geo_status.lat, 1e-7 * geo_status.lon, 0.0)
+    lately = world.target.ground[flight.frame - 10 : flight.frame + 1]  # it is reported five times a second
+    assert np.hypot(*(lately - [north, east]).T).min() < min(max(3.0 * geo_status.h_acc, 0.5), 3.0)
     moment, place, _ = flight.aircraft._target  # type: ignore[misc]
     assert np.hypot(*(place[:2] - world.target_at(moment)[0])) < 2.0
     car = world.target.ground[flight.frame] - world.target.ground[flight.frame - 30]
@@ -130,29 +133,31 @@ def test_an_aircraft_that_may_be_told_to_follow_is_told_and_stops_when_the_opera
     assert flight.agent.status(0).message == "stopped by the operator"
 
 
-def test_the_demos_report_shows_map_and_pictures_of_what_was_recorded(world: World, tmp_path: Path) -> None:
+def test_the_demos_report_shows_map_and_images_of_what_was_recorded(world: FlightWorld, tmp_path: Path) -> None:
     flight = Flight(world, jpeg_quality=80, camera_ahead_s=0.0)
     flight.run(1.5)
     assert flight.select()
     flight.run(16.0)
     log = recorded(flight, tmp_path / "demo.mcap")
-    outcome = compare(log, world, flight.boot_s)
+    outcome = compare_log_with_world(log, world, flight.boot_s)
     assert outcome.out_frames > 10, "the flight loses the car every 12 s"
     write_report(tmp_path / "report.html", log, outcome, world)
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/jpeg;base64,") == 4
-    assert "found again" in page
-    assert page.count("<circle") > 0.9 * outcome.frames  # every place that was told
-    assert f"out of it ({outcome.out_frames} frames)" in page
+    assert "reacquired" in page
+    assert page.count("<circle") > 0.9 * outcome.frames  # every position that was reported
+    assert f"out of view ({outcome.out_frames} frames)" in page
     assert "://" not in page.replace("http://www.w3.org", "")  # one file that needs nothing else
 
 
-def test_commands_stop_while_the_link_is_silent_or_no_frames_come_and_when_the_target_is_lost(world: World) -> None:
+def test_commands_stop_while_the_link_is_silent_or_no_frames_come_and_when_the_target_is_lost(
+    world: FlightWorld,
+) -> None:
     start = np.array([*world.target.ground[0], -62.0])
     flight = Flight(
         world, control=ControlConfig(follow=True), flies="follow", start=start, yaw=float(world.target.course[0])
     )
-    control = flight.agent._control
+    control = flight.agent._guidance
 
     def sent(seconds: float) -> int:
         before = control.counters["follow_targets"]
@@ -165,18 +170,18 @@ def test_commands_stop_while_the_link_is_silent_or_no_frames_come_and_when_the_t
     step, flight.autopilot.step = flight.autopilot.step, lambda time: None  # type: ignore[method-assign]
     flight.run(4.1)
     assert sent(0.5) == 0
-    assert control.why == "the link is stale"
+    assert control.hold_reason == "the link is stale"
     flight.autopilot.step = step  # type: ignore[method-assign]
     flight.run(5.0)
     assert sent(0.5) > 0
-    estimate = flight.agent.follower.estimate
+    estimate = flight.agent.estimator.estimate
     assert estimate is not None
     flight.frames_lost = lambda frame: True
-    flight.agent.follower.estimate = replace(estimate, state=State.LOST)
+    flight.agent.estimator.estimate = replace(estimate, state=TrackState.LOST)
     assert sent(0.5) == 0
-    assert control.why == "the target is lost"
-    flight.agent.follower.estimate = estimate
+    assert control.hold_reason == "the target is lost"
+    flight.agent.estimator.estimate = estimate
     assert sent(0.5) > 0
     flight.run(flight.time + 1.2)  # more than two seconds without a frame
     assert sent(0.5) == 0
-    assert control.why == "no frames"
+    assert control.hold_reason == "no frames"

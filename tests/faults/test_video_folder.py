@@ -1,7 +1,7 @@
-"""What is dear to try of folders of videos: one of another day among them, and lenses found from outlines.
+"""Expensive tests of video folders: an unrelated video among them, and lens self-calibration from outlines.
 
-Here and not among the commands' tests because a camera that nothing ties is sought dearly, at every rate, and because
-lenses that nobody measured are sought twice.
+Here and not among the commands' tests because the lag of an unconnected camera is searched exhaustively at every rate,
+and unknown lenses are estimated twice.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import tomli_w
 
 from deploy.cli import run
 from hub.calibration.pipeline import calibrate
-from tests.films import film_scene
-from tests.unit.test_ball_outline import ball_session
+from tests.support.films import record_scene_videos
+from tests.unit.protocols.test_sphere_projection import ball_session
 
 
 def test_a_video_of_another_day_is_refused_by_name_and_the_rest_goes_on(tmp_path: Path) -> None:
     videos, before, out = tmp_path / "videos", tmp_path / "before", tmp_path / "out"
-    film_scene(videos, 6.0, 2, 4)
-    film_scene(before, 6.0, 2, 9)
+    record_scene_videos(videos, 6.0, 2, 4)
+    record_scene_videos(before, 6.0, 2, 9)
     (before / "cam0.mp4").rename(videos / "yesterday.mp4")
     tables = tomllib.loads((videos / "rig.toml").read_text())
     tables["yesterday"] = tomllib.loads((before / "rig.toml").read_text())["cam0"] | {"name": "yesterday"}
@@ -31,13 +31,13 @@ def test_a_video_of_another_day_is_refused_by_name_and_the_rest_goes_on(tmp_path
     assert run(["calibrate", str(videos), "--out", str(out)]) == 0
     found = tomllib.loads((out / "calibration.toml").read_text())
     assert set(found) == {"cam0", "cam1", "metadata"}
-    assert "could not be tied to any camera (with cam0:" in found["metadata"]["refused"]["yesterday"]
+    assert "could not be connected to any camera (with cam0:" in found["metadata"]["refused"]["yesterday"]
     with (out / "session" / "observations.csv").open(newline="") as file:
         seen = [row for row in csv.DictReader(file) if row["camera"] == "yesterday"]
     assert len(seen) > 50  # the ball is in it: only the motion is another
 
 
-def test_without_any_lens_outlines_tell_the_same_lenses_as_centres() -> None:
+def test_without_intrinsics_outlines_give_the_same_lenses_as_centres() -> None:
     full, seen = ball_session(0.25)
     focal: list[list[float]] = []
     for outline, observations in ((True, seen), (False, full.observations())):

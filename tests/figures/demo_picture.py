@@ -1,6 +1,6 @@
-"""The picture at the top of the README: what three cameras film, and what comes out.
+"""Figure at the top of the README: images of three cameras, and the result.
 
-``python -m tests.figures.demo_picture`` films the demo's world, calibrates it and writes tests/figures/demo.png.
+``python -m tests.figures.demo_picture`` films the demo's world, calibrates it and writes docs/pictures/demo.png.
 """
 
 from __future__ import annotations
@@ -9,16 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.simulation.session import observations_of, rig_of
+from deploy.simulation.session import observations_from_tracks, rig_from_tracks
 from edge import scenes
+from edge.scenes import renderer_for
 from edge.scenes.marker.scene import MarkerScene
-from edge.scenes.marker.session import SimulatedTracks, simulated_session
+from edge.scenes.marker.session import SimulatedTracks, simulate_tracks
 from hub.calibration.pipeline import calibrate
 from protocols.geometry.pose import Pose, fit_similarity
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration
 
-OUT = Path(__file__).with_name("demo.png")
+OUT = Path(__file__).resolve().parents[2] / "docs" / "pictures" / "demo.png"
 SEED, CAMERAS, SECONDS, SHOWN = 1, 3, 20.0, 6.0
 
 
@@ -29,9 +30,9 @@ def draw(out: Path = OUT) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    scene = scenes.get("marker", SEED, CAMERAS)
-    filmed = simulated_session(scene, SECONDS, SEED)
-    calibration = calibrate(rig_of(filmed), observations_of(filmed))
+    scene = scenes.get_marker_scene("marker", SEED, CAMERAS)
+    filmed = simulate_tracks(scene, SECONDS, SEED)
+    calibration = calibrate(rig_from_tracks(filmed), observations_from_tracks(filmed))
     figure = plt.figure(figsize=(12.6, 4.6), dpi=90)
     colours = ["#0072b2", "#d55e00", "#009e73"]
     for i, camera in enumerate(scene.cameras):
@@ -45,7 +46,7 @@ def draw(out: Path = OUT) -> None:
 
 def _draw_frame(axes, scene: MarkerScene, filmed: SimulatedTracks, name: str, colour: str) -> None:  # type: ignore[no-untyped-def]
     """One rendered frame with the track behind the marker."""
-    image = scene.renderer(name, np.random.default_rng(0)).render(SHOWN)
+    image = renderer_for(scene, name, np.random.default_rng(0)).render(SHOWN)
     axes.imshow(image[:, :, ::-1])
     track = filmed.tracks[name]
     behind = (track.true_time > SHOWN - 1.5) & (track.true_time <= SHOWN)

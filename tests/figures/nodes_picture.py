@@ -1,4 +1,4 @@
-"""The picture of the pose nodes' convergence in hub/README.md.
+"""Figure of the convergence of the pose nodes.
 
 ``python -m tests.figures.nodes_picture [FILE]``: section 4's world. After 3,000 points a sixth camera joins, after
 6,000 one is bumped by 5 cm and 2°; 1 px, 2 % size, an update every 20 points.
@@ -15,11 +15,11 @@ import numpy as np
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from tests.bench.pose_runs import feed, network
-from tests.bench.pose_worlds import World, cube, errors, joint_optimum, observe, section_4
+from tests.bench.pose_worlds import SimulatedRig, cube, errors, joint_optimum, observe, section_4
 
 SEED = 1000
 STEP = 100
-DEFAULT = Path(__file__).resolve().parents[2] / "hub" / "pictures" / "nodes_convergence.png"
+DEFAULT = Path(__file__).resolve().parents[2] / "docs" / "pictures" / "nodes_convergence.png"
 
 
 def run() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -32,14 +32,14 @@ def run() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     turn, shift = so3.exp(np.radians(2.0) * np.array([0.6, 0.8, 0.0])), np.array([3.0, 0.0, 4.0])
     poses[3] = Pose(turn @ poses[3].rotation, poses[3].position + shift)
     at, rows, joint = [], [], []
-    parts = ((World(world.poses[:5]), world), (world, world), (World(poses), World(poses)))
+    parts = ((SimulatedRig(world.poses[:5]), world), (world, world), (SimulatedRig(poses), SimulatedRig(poses)))
     for part, (seen_by, truth) in enumerate(parts):
         if part == 1:
             net.nodes[5] = late
         sightings = observe(seen_by, rng, cube(rng, 3000))
         for i in range(0, 3000, STEP):
             feed(net, sightings, 20, i, i + STEP)
-            found = {k: node.published() for k, node in net.nodes.items()}
+            found = {k: node.world_pose() for k, node in net.nodes.items()}
             known = [found.get(k) for k in range(6)]
             at.append(3000 * part + i + STEP)
             rows.append(

@@ -1,7 +1,7 @@
-"""The picture of the pair bench: success by regime, and the lag's error trial by trial.
+"""Figure of the pair bench: success rate by regime, and the lag error of each trial.
 
 python -m tests.bench.pair_timing --json pairs.json
-python -m tests.figures.pair_timing_picture pairs.json hub/pictures/pair_timing.png
+python -m tests.figures.pair_timing_picture pairs.json docs/pictures/pair_timing.png
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def main() -> None:
         share = 100 * len(good) / len(done)
         left.barh(row, share, color="0.75", edgecolor="0.3")
         left.text(2, row, f"{share:.0f} % of {len(done)}", va="center")
-        for wanted, mark in ((ROWS[name].must, "|"), (ROWS[name].reach, "D")):
+        for wanted, mark in ((ROWS[name].required, "|"), (ROWS[name].target, "D")):
             if wanted is not None:
                 left.plot(100 * wanted, row, mark, color="k", markersize=14 if mark == "|" else 5)
         errors = np.array([1e3 * abs(one["lag_s"]) for one in good])

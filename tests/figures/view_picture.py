@@ -1,6 +1,6 @@
-"""The README's pictures of the live view and of the report: a demo that runs, in a headless Chromium.
+"""Screenshots of the live view and of the report for the README: a running demo in a headless Chromium.
 
-`python -m tests.figures.view_picture` writes view.jpg and report.jpg beside this file.
+`python -m tests.figures.view_picture` writes view.jpg and report.jpg into docs/pictures.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from playwright.sync_api import sync_playwright
 
 from tests.browser.conftest import FLAGS, chromium_path
 
-HERE = Path(__file__).parent
+PICTURES = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 _QUALITY = 82
 
 
 def main() -> int:
-    """Make both pictures."""
+    """Make both screenshots."""
     path = chromium_path()
     if not path:
         print("no chromium here: apt-get install chromium", file=sys.stderr)
@@ -37,19 +37,19 @@ def main() -> int:
             page.set_default_timeout(180_000)
             page.goto(address)
             page.wait_for_function("document.querySelectorAll('[data-state=solved]').length === 4")
-            page.wait_for_timeout(15_000)  # some of the path, and pictures in every frustum
+            page.wait_for_timeout(15_000)  # part of the path, and images in every frustum
             notice = page.locator(".mantine-Notification-closeButton")
             if notice.count():
                 notice.first.click()  # that this machine renders in software is nobody's business
             page.wait_for_timeout(1_000)
-            page.screenshot(path=str(HERE / "view.jpg"), type="jpeg", quality=_QUALITY)
+            page.screenshot(path=str(PICTURES / "view.jpg"), type="jpeg", quality=_QUALITY)
             page.get_by_role("button", name="Export").click()
             page.get_by_text("exported to").wait_for()
             page.close()
             report = browser.new_page(viewport={"width": 1100, "height": 1250})
             report.goto((out / "report.html").as_uri())
             report.wait_for_timeout(2_000)
-            report.screenshot(path=str(HERE / "report.jpg"), type="jpeg", quality=_QUALITY)
+            report.screenshot(path=str(PICTURES / "report.jpg"), type="jpeg", quality=_QUALITY)
         finally:
             process.send_signal(signal.SIGINT)
             process.communicate(timeout=120)

@@ -1,11 +1,11 @@
-"""Section 4 of the paper on distributed poses, reproduced: figure 7, and how often to update.
+"""Reproduction of section 4 of the distributed pose paper: figure 7, and how often to update.
 
 ``python -m tests.papers.poses_paper [--seeds N] [--out DIR]`` prints the error against the number of points for the
-paper's method (corrected) and for the pose nodes beside the joint optimum and the paper's figures, then the answer to
+paper's method (corrected) and for the pose nodes beside the joint optimum and the paper's figures, then the result for
 the paper's open question (section 3.3), how often to update; it writes figure 7 as PNG. About a minute on one core.
 
 Deviations: the paper prints neither its noise, its cameras nor its constants. Here: 1 px; size with 5 % and u = 1.1,
-or 2 % and u = 1; cameras 250 to 350 cm from the middle of the cube; first guesses 50 cm and 0.3 rad off (std). u counts
+or 2 % and u = 1; cameras 250 to 350 cm from the middle of the cube; initial poses 50 cm and 0.3 rad off (std). u counts
 updates.
 """
 
@@ -17,23 +17,23 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from hub.baselines.recursive_poses import PaperNode, PaperSettings
+from hub.baselines.recursive_poses import RecursivePoseNode, RecursivePoseSettings
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from tests.bench.pose_runs import feed, network
-from tests.bench.pose_worlds import Sightings, World, cube, errors, joint_optimum, observe, section_4
+from tests.bench.pose_worlds import Sightings, SimulatedRig, cube, errors, joint_optimum, observe, section_4
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEFAULT_OUT = REPOSITORY / "out" / "poses_paper"
 PRINTED = (7.35, 0.85)
-"""The paper's last errors: position [cm], attitude [deg]."""
+"""The paper's final errors: position [cm], attitude [deg]."""
 MARKS = (100, 200, 500, 1000, 2000, 5000, 10_000)
 CASES = {"2 %, u = 1": (0.02, 1.0), "5 %, u = 1.1": (0.05, 1.1)}
 EVERY = {"each event": 1, "every 10": 10, "every second (30 Hz)": 30}
 
 
-def made(seed: int, size: float, points: int = MARKS[-1]) -> tuple[World, Sightings, np.random.Generator]:
-    """Section 4's world and what is seen in it."""
+def made(seed: int, size: float, points: int = MARKS[-1]) -> tuple[SimulatedRig, Sightings, np.random.Generator]:
+    """The world of section 4 and its observations."""
     rng = np.random.default_rng(seed)
     world = section_4(rng)
     return world, observe(world, rng, cube(rng, points), size=size), rng
@@ -44,13 +44,13 @@ def paper_run(
 ) -> list[tuple[float, float]]:
     """Errors [cm], [deg] of the paper's method at each mark, updating after every ``every`` points."""
     world, sightings, rng = made(seed, size, marks[-1])
-    settings = PaperSettings(forget=forget)
+    settings = RecursivePoseSettings(forget=forget)
     nodes = []
     for k, pose in enumerate(world.poses):
         turn = so3.exp(0.3 * rng.standard_normal(3)) if k else np.eye(3)
         shift = 50.0 * rng.standard_normal(3) if k > 1 else np.zeros(3)
         start = Pose(turn @ pose.rotation, pose.position + shift)
-        nodes.append(PaperNode(start, position_known=k < 2, attitude_known=k == 0, settings=settings))
+        nodes.append(RecursivePoseNode(start, position_known=k < 2, attitude_known=k == 0, settings=settings))
     out: list[tuple[float, float]] = []
     fresh: dict[int, set[int]] = {}
     for i, (a, b) in enumerate(sightings.cameras.tolist()):
@@ -76,7 +76,7 @@ def node_run(seed: int, size: float, every: int, marks: tuple[int, ...] = MARKS)
     for mark in marks:
         feed(net, sightings, every, last, mark)
         last = mark
-        out.append(errors(world, net.published()))
+        out.append(errors(world, net.world_poses()))
     return out
 
 

@@ -1,20 +1,21 @@
-"""The default pair method on the paper's own tracks, so that both stand in one table.
+"""The default pair solver on the simulated tracks of the asynchronous calibration paper, for comparison.
 
-It knows the focal length (the paper's method does not need it) and neither the lag nor the rate, which it fits.
+It is given the focal length, which the paper's method does not need, and estimates lag and clock rate.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from hub.sync.pair_solver import PairSolution, solve_pair
+from hub.sync.hypothesis import PairSolution
+from hub.sync.pair_solver import solve_pair
 from hub.trajectory.image_tracks import smooth_track
 from hub.two_view.relative_pose import fundamental_from
 from tests.papers.timing_rig import FOCAL, Filmed, LagResult, evaluation_error
 
 
 def default_method(filmed: Filmed) -> LagResult:
-    """Cubic splines, scan of all lags, refinement (hub/sync); a refusal keeps its best alignment's errors."""
+    """The default solver (hub/sync): splines, lag scan, refinement. A refusal keeps its best alignment's errors."""
     tracks = [smooth_track(filmed.time, pixels / FOCAL, FOCAL) for pixels in (filmed.a, filmed.b)]
     if tracks[0] is None or tracks[1] is None:
         return LagResult(filmed.tau, float("nan"), float("nan"), "no track")
@@ -32,8 +33,8 @@ def default_method(filmed: Filmed) -> LagResult:
 
 
 def lag_of(solution: PairSolution) -> float:
-    """By how much camera 1's clock is ahead of camera 2's in the middle of the common motion [s]."""
+    """``t_1 - t_2`` [s] at the middle of the common motion; nan without an alignment."""
     if solution.fit is None:
         return float("nan")
     fit = solution.fit
-    return float(fit.middle - (fit.middle - fit.offset) / fit.rate)
+    return float(fit.mid_time - (fit.mid_time - fit.offset) / fit.rate)

@@ -35,7 +35,7 @@ _STYLES: Sequence[dict[str, Any]] = (
     {"color": _BLUE, "marker": "+", "ls": ":", "lw": 0.6, "ms": 7},
 )
 _REFUSED: dict[str, Any] = {"color": _INK, "marker": "D", "mfc": "none", "ls": "", "ms": 8.5, "mew": 0.8}
-_DOUBTED = "refused: its best guess"
+_REFUSED_LABEL = "refused: its best alignment"
 _FLOORS = (1e-3, 1e-3)  # ms and px below which an error is drawn at the edge
 _SUBJECT = {"1": "trajectory 1, eq. (24)", "a": "trajectory (a)", "b": "trajectory (b)", "c": "trajectory (c)"}
 _DPI, _COLOURS = 80, 64
@@ -61,15 +61,15 @@ def residuals(out: Path, results: Sequence[LagResult]) -> Path:
             whole.annotate(f"lag {result.tau:.2f} s", (0, result.distances[0]), (-4, 0), **_beside("right"))
     wrong = [result for result in results if not result.right]
     if wrong:
-        told = "\n".join(f"lag {result.tau:.2f} s: {1e3 * result.tau_error:+.0f} ms off" for result in wrong)
+        text = "\n".join(f"lag {result.tau:.2f} s: {1e3 * result.tau_error:+.0f} ms off" for result in wrong)
         end = wrong[0].distances[: last + 1]
-        whole.annotate(told, (len(end) - 1, end[-1]), (14, 0), **_beside("left", _RED))
+        whole.annotate(text, (len(end) - 1, end[-1]), (14, 0), **_beside("left", _RED))
     whole.tick_params(axis="y", pad=52)
     whole.set(title=f"Figure 11: trajectory 1, all {len(results)} lags from 0.01 to 0.39 s", ylim=(0, None))
     detail.set(title="Figure 12: detail near 0, here on a logarithmic axis", yscale="log", ylim=(_LEAST_E, 2e3))
     detail.plot([], [], **_FOUND, label="lag found within 5 ms, F within 2 px")
     detail.plot([], [], **_WHOLE, label="found; a lag of whole frames, nothing to interpolate")
-    detail.plot([], [], **_WRONG, label="ends in a wrong answer")
+    detail.plot([], [], **_WRONG, label="converges to a wrong result")
     detail.legend(loc="upper right", fontsize=9)
     return _save(figure, out / "timing_paper_fig11_12.png")
 
@@ -83,10 +83,10 @@ def errors(out: Path, comparison: Comparison, methods: Sequence[str]) -> Path:
             lags = [r.tau for r in results]
             _log(axes[0, column], lags, [1e3 * abs(r.tau_error) for r in results], _FLOORS[0], style, method)
             _log(axes[1, column], lags, [r.f_error for r in results], _FLOORS[1], style, method)
-            doubted = [r for r in results if r.refused]
-            both = [1e3 * abs(r.tau_error) for r in doubted], [r.f_error for r in doubted]
+            refused = [r for r in results if r.refused]
+            both = [1e3 * abs(r.tau_error) for r in refused], [r.f_error for r in refused]
             for axis, values, floor in zip(axes[:, column], both, _FLOORS, strict=True):
-                _log(axis, [r.tau for r in doubted], values, floor, _REFUSED, _DOUBTED)
+                _log(axis, [r.tau for r in refused], values, floor, _REFUSED, _REFUSED_LABEL)
         axes[0, column].set_title(_SUBJECT[name])
         axes[1, column].set_xlabel("true lag [s]")
         for row in range(2):
@@ -103,7 +103,7 @@ def errors(out: Path, comparison: Comparison, methods: Sequence[str]) -> Path:
     axes[0, 0].set_ylim(_FLOORS[0] / 1.5, 2e3)
     axes[1, 0].set_ylim(_FLOORS[1] / 1.5, 3e2)
     known = {label: line for one in axes.flat for line, label in zip(*one.get_legend_handles_labels(), strict=True)}
-    known |= {name: known.pop(name) for name in [_DOUBTED] if name in known}  # last
+    known |= {name: known.pop(name) for name in [_REFUSED_LABEL] if name in known}  # last
     figure.legend(list(known.values()), list(known), loc="outside lower center", ncols=5)
     figure.suptitle("Figure 13, with (a) to (c) and the default method: error against lag (under 0.001: at the edge)")
     return _save(figure, out / "timing_paper_fig13.png")
@@ -143,8 +143,8 @@ def real(out: Path, filmed: RealRun, own_delay: float) -> Path | None:
 
     own_delay: what camera 2 itself is late by the calibrated poses [s].
     """
-    turns = [filmed.turn(n) for n in SHOWN]
-    if filmed.result is None or any(turn is None for turn in turns):
+    iterations = [filmed.iteration(n) for n in SHOWN]
+    if filmed.result is None or any(iteration is None for iteration in iterations):
         return None
     figure = plt.figure(figsize=(12.5, 6.4), layout="constrained")
     grid = figure.add_gridspec(2, 4, width_ratios=(1.15, 1.0, 1.0, 1.0))
@@ -156,18 +156,20 @@ def real(out: Path, filmed: RealRun, own_delay: float) -> Path | None:
         image.set_title(f"Figure 16: {name}, corner {filmed.label}, 6 fps", fontsize=11)
         image.grid(alpha=0.25)
     asked, low, high = filmed.lag_by_stamps, -3, 4
-    surveyed = asked + own_delay / filmed.period
+    by_calibration = asked + own_delay / filmed.period
     share: Axes | None = None
-    for column, (wanted, turn) in enumerate(zip(SHOWN, turns, strict=True), 1):
-        if turn is None:
+    for column, (wanted, iteration) in enumerate(zip(SHOWN, iterations, strict=True), 1):
+        if iteration is None:
             continue
-        n, state = turn
+        n, state = iteration
         scatter = figure.add_subplot(grid[0, column])
         seen = np.flatnonzero(np.isfinite(state.lags))
         inside = np.clip(state.lags[seen], low, high)
         scatter.plot(seen, inside, "o", ms=4, mfc="none", color=_INK, label="f_i of one frame")
         scatter.axhline(asked, color=_BLUE, ls="--", lw=1.2, label=f"by the stamps: {asked:.2f}")
-        scatter.axhline(surveyed, color=_INK, ls=":", lw=1.4, label=f"by the calibrated poses: {surveyed:.2f}")
+        scatter.axhline(
+            by_calibration, color=_INK, ls=":", lw=1.4, label=f"by the calibrated poses: {by_calibration:.2f}"
+        )
         scatter.axhline(state.lag, color=_RED, lw=1.2, label=f"f, mean of the fullest bin: {state.lag:.2f}")
         ended = "" if n == wanted else " (the last)"
         e = float(misfit(filmed, state).mean())
@@ -180,7 +182,7 @@ def real(out: Path, filmed: RealRun, own_delay: float) -> Path | None:
         share = bars
         bars.hist(state.lags[seen], bins=list(range(low, high + 1)), color="#d8d8d8", edgecolor=_INK)
         bars.axvline(asked, color=_BLUE, ls="--", lw=1.2)
-        bars.axvline(surveyed, color=_INK, ls=":", lw=1.4)
+        bars.axvline(by_calibration, color=_INK, ls=":", lw=1.4)
         bars.axvline(state.lag, color=_RED, lw=1.2)
         beyond = int(((state.lags[seen] < low) | (state.lags[seen] >= high)).sum())
         bars.set(xlabel=f"f_i [frames]; {beyond} beyond the axis", xticks=range(low, high + 1))

@@ -1,17 +1,17 @@
-"""Section 3.2 on real tracks: one corner of a moving board before two webcams, the clock of one shifted.
+"""Section 3.2 of the asynchronous calibration paper on real tracks: a board corner, two webcams, one clock shifted.
 
 The paper's own recording is not public; this one is `webcams/session` of the data folder: 9 s at 6 fps, about 0.17 s
-between frames whose stamps jitter, clocks that agree but for what the cameras themselves delay. What is done:
+between frames whose timestamps jitter, clocks that agree except for the cameras' own delays. Procedure:
 
 * cameras and label: the pair of cameras and the corner that share most frames, the first of equals;
 * the second camera's clock is set ahead by ``SHIFT``; both recordings begin at one reading of their clocks and are
-  numbered from there, and nothing but these numbers goes into the method (section 2.2);
-* pixels are freed of lens distortion, with nothing resampled or smoothed;
+  numbered from there, and only these numbers go into the method (section 2.2);
+* pixels are undistorted, but not resampled or smoothed;
 * the lag in time is the mean difference of the stamps of frames of one number plus f frame intervals, as the paper
   compares its result with the mean of the stamps.
 
-What the cameras themselves delay is inside the error against the shift; with the board's calibration the same
-crossings, taken through the F that belongs to it, tell how much that is (``delay``).
+The cameras' own delays are part of the error against the shift; with the F of the board's calibration the same
+crossings measure them (``delay``).
 """
 
 from __future__ import annotations
@@ -22,11 +22,17 @@ from pathlib import Path
 
 import numpy as np
 
-from hub.baselines.alternating_lag import PaperResult, Turn, alternate, corresponding, point_lags
+from hub.baselines.alternating_lag import (
+    AlternatingLagResult,
+    Iteration,
+    corresponding_points,
+    estimate_alternately,
+    point_lags,
+)
 from hub.sync.pair_solver import solve_pair
 from hub.trajectory.image_tracks import SmoothTrack, smooth_track
 from hub.two_view.fundamental import epipolar_lines, line_distances
-from hub.two_view.relative_pose import fundamental_from, relative_pose
+from hub.two_view.relative_pose import fundamental_from, relative_pose_between
 from protocols.core.errors import Refused
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
@@ -60,7 +66,7 @@ class RealRun:
     stamps: float
     a: Floats
     b: Floats
-    result: PaperResult | None
+    result: AlternatingLagResult | None
     refused: str = ""
 
     @property
@@ -73,12 +79,12 @@ class RealRun:
         """f that the shift and the stamps ask for [frames]."""
         return (self.shift - self.stamps) / self.period
 
-    def turn(self, n: int) -> tuple[int, Turn] | None:
+    def iteration(self, n: int) -> tuple[int, Iteration] | None:
         """The iteration that holds the f_i seen through F⁽ⁿ⁾, or the last one where it ended before."""
         if self.result is None:
             return None
-        index = min(n + 1, len(self.result.turns) - 1)
-        return index - 1, self.result.turns[index]
+        index = min(n + 1, len(self.result.iterations) - 1)
+        return index - 1, self.result.iterations[index]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,7 +140,7 @@ def run(recording: Recording, cameras: tuple[str, str], label: str, shift: float
     period = float(np.mean([np.polyfit(frame.astype(np.float64), time, 1)[0] for frame, time, _ in numbered]))
     difference = float(np.nanmean(clocks[1] - clocks[0]))
     try:
-        result, refused = alternate(points[0], points[1]), ""
+        result, refused = estimate_alternately(points[0], points[1]), ""
     except Refused as refusal:
         result, refused = None, str(refusal)
     return RealRun(cameras, label, shift, period, difference, points[0], points[1], result, refused)
@@ -148,7 +154,7 @@ def delay(recording: Recording, cameras: tuple[str, str]) -> float:
     one, two = (recording.camera(name) for name in cameras)
     if one.intrinsics is None or two.intrinsics is None:
         return float("nan")
-    pose = relative_pose(_pose(one), _pose(two))
+    pose = relative_pose_between(_pose(one), _pose(two))
     fundamental = fundamental_from(pose, one.intrinsics.matrix, two.intrinsics.matrix)
     labels = recording.observations.by_label(cameras[0]).keys() & recording.observations.by_label(cameras[1]).keys()
     found: list[float] = []
@@ -181,14 +187,14 @@ def default_shift(recording: Recording, cameras: tuple[str, str], shift: float) 
                     out[label] = fit
         smooth.append(out)
     solution = solve_pair(smooth[0], smooth[1], cameras)
-    epochs = [next(iter(tracks.values())).epoch for tracks in smooth]
-    return epochs[1] - epochs[0] - lag_of(solution), solution.status
+    origins = [next(iter(tracks.values())).time_origin for tracks in smooth]
+    return origins[1] - origins[0] - lag_of(solution), solution.status
 
 
-def misfit(filmed: RealRun, turn: Turn) -> Floats:
+def misfit(filmed: RealRun, iteration: Iteration) -> Floats:
     """Distances (n,) of b's points from their lines at an iteration [px]."""
-    first, second, _ = corresponding(filmed.a, filmed.b, turn.lag)
-    return np.abs(line_distances(epipolar_lines(turn.fundamental, first), second))
+    first, second, _ = corresponding_points(filmed.a, filmed.b, iteration.lag)
+    return np.abs(line_distances(epipolar_lines(iteration.fundamental, first), second))
 
 
 def _undistorted(camera: RigCamera, track: Track) -> Floats:

@@ -1,4 +1,4 @@
-"""The simulation of the paper on timing, section 3.1: two cameras, a marker on four trajectories, a lag.
+"""Simulation of the asynchronous calibration paper, section 3.1: two cameras, a marker on four trajectories, a lag.
 
 Eq. (23) fixes the convention: it reproduces only with phi and theta swapped against the text,
 ``X_cam = Rz(phi) Ry(theta) X + d e_x``, optical axis = camera x, u = 700 y/x, v = 700 z/x, origin of the pixels
@@ -13,8 +13,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hub.baselines.alternating_lag import alternate
-from hub.two_view.fundamental import epipolar_lines, line_distances, maximum_likelihood
+from hub.baselines.alternating_lag import estimate_alternately
+from hub.two_view.fundamental import epipolar_lines, line_distances, maximum_likelihood_fundamental
 from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
@@ -30,8 +30,8 @@ PRINTED_F = np.array(
 """Eq. (23)."""
 LAGS: tuple[float, ...] = tuple(round(0.01 * k, 2) for k in range(1, 40))
 """The paper's sweep: 0.01 to 0.39 s by 0.01 s."""
-RIGHT_TIME, RIGHT_F = 5e-3, 2.0
-"""An answer counts as right up to this error of the lag [s] and of F [px]; what fails is far beyond both."""
+MAX_LAG_ERROR, MAX_F_ERROR = 5e-3, 2.0
+"""Errors of the lag [s] and of F [px] up to which a result is correct; failures are far beyond both."""
 
 
 def project(camera: tuple[float, float, float], points: Floats) -> Floats:
@@ -44,27 +44,27 @@ def project(camera: tuple[float, float, float], points: Floats) -> Floats:
 
 def trajectory_1(time: Floats) -> Floats:
     """Eq. (24)."""
-    swell = np.sin(np.pi / 11.0 * time)
-    y = 120.0 * np.sin(np.pi * time) * swell
-    return np.column_stack([10.0 * (time - 5.5), y, 100.0 * np.cos(1.5 * np.pi * time) * swell])
+    envelope = np.sin(np.pi / 11.0 * time)
+    y = 120.0 * np.sin(np.pi * time) * envelope
+    return np.column_stack([10.0 * (time - 5.5), y, 100.0 * np.cos(1.5 * np.pi * time) * envelope])
 
 
 def trajectory_a(time: Floats) -> Floats:
-    """(a) of section 3.1.2: an even turn, y and z at one frequency."""
-    swell = np.sin(np.pi / 11.0 * time)
-    y = 140.0 * np.sin(np.pi * time) * swell
-    return np.column_stack([18.0 * (time - 5.5), y, 100.0 * np.cos(np.pi * time) * swell])
+    """(a) of section 3.1.2: uniform rotation, y and z at one frequency."""
+    envelope = np.sin(np.pi / 11.0 * time)
+    y = 140.0 * np.sin(np.pi * time) * envelope
+    return np.column_stack([18.0 * (time - 5.5), y, 100.0 * np.cos(np.pi * time) * envelope])
 
 
 def trajectory_b(time: Floats) -> Floats:
     """(b) of section 3.1.2: close to a plane, y within ±20 cm."""
-    swell = np.sin(np.pi / 11.0 * time)
-    y = 20.0 * np.sin(np.pi * time) * swell
-    return np.column_stack([18.0 * (time - 5.5), y, 100.0 * np.cos(1.5 * np.pi * time) * swell])
+    envelope = np.sin(np.pi / 11.0 * time)
+    y = 20.0 * np.sin(np.pi * time) * envelope
+    return np.column_stack([18.0 * (time - 5.5), y, 100.0 * np.cos(1.5 * np.pi * time) * envelope])
 
 
 def trajectory_c(time: Floats) -> Floats:
-    """(c) of section 3.1.2: alike in all directions, and several times as fast."""
+    """(c) of section 3.1.2: isotropic, and several times as fast."""
     turn = np.cos(3.9 * time)
     return 120.0 * np.column_stack(
         [np.sin(3.9 * time), turn * np.sin(3.1 * time), turn * np.cos(3.1 * time) * np.cos(4.7 * time)]
@@ -77,7 +77,7 @@ TRAJECTORIES: dict[str, Trajectory] = {"1": trajectory_1, "a": trajectory_a, "b"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Filmed:
-    """What the two cameras saw. time: (n,) of the frames on either clock [s]; a, b: (n, 2) [px].
+    """Tracks of the two cameras. time: (n,) of the frames on either clock [s]; a, b: (n, 2) [px].
 
     Camera 2's frame of time t shows the marker at t + tau.
     """
@@ -111,16 +111,16 @@ def evaluation_error(fundamental: Floats) -> float:
 def printed_fundamental() -> Floats:
     """F from the evaluation points, with eq. (23)'s sign."""
     points = evaluation_points()
-    matrix = maximum_likelihood(project(CAMERA_1, points), project(CAMERA_2, points))
+    matrix = maximum_likelihood_fundamental(project(CAMERA_1, points), project(CAMERA_2, points))
     return np.asarray(matrix * np.sign(float((matrix * PRINTED_F).sum())))
 
 
 @dataclass(frozen=True, slots=True)
 class LagResult:
-    """One lag and what a method made of it.
+    """Result of a method at one lag.
 
     tau: the lag [s]. tau_error: found less true [s]. f_error: mean distance of the evaluation points [px].
-    refused: the reason where the method gave no answer, else "". distances: E(n) [px], n = 0 on (eq. 21), and
+    refused: the reason of a refusal, else "". distances: E(n) [px], n = 0 on (eq. 21), and
     tau_errors: of every iteration [s]; both empty for a method without iterations.
     """
 
@@ -133,14 +133,14 @@ class LagResult:
 
     @property
     def right(self) -> bool:
-        """Whether the method answered, and rightly."""
-        return not self.refused and abs(self.tau_error) < RIGHT_TIME and self.f_error < RIGHT_F
+        """Whether the method gave a result, and a correct one."""
+        return not self.refused and abs(self.tau_error) < MAX_LAG_ERROR and self.f_error < MAX_F_ERROR
 
     @property
-    def settled(self) -> int | None:
+    def converged_at(self) -> int | None:
         """The iteration n from which the lag stays within a tenth of a frame of the truth; None for never."""
-        off = [n for n, error in enumerate(self.tau_errors) if not abs(error) < 0.1 * PERIOD]
-        first = off[-1] + 1 if off else 0
+        outside = [n for n, error in enumerate(self.tau_errors) if not abs(error) < 0.1 * PERIOD]
+        first = outside[-1] + 1 if outside else 0
         return first if first < len(self.tau_errors) else None
 
 
@@ -150,12 +150,12 @@ Method: TypeAlias = Callable[[Filmed], LagResult]
 def paper_method(filmed: Filmed) -> LagResult:
     """The alternating method (hub/baselines/alternating_lag.py) on frame indices."""
     try:
-        found = alternate(filmed.a, filmed.b)
+        found = estimate_alternately(filmed.a, filmed.b)
     except Refused as refusal:
         return LagResult(filmed.tau, float("nan"), float("nan"), str(refusal))
     # Camera 2's index runs tau / period behind: f = -tau / period.
-    errors = tuple(-turn.lag * PERIOD - filmed.tau for turn in found.turns)
-    distances = tuple(turn.distance for turn in found.turns)
+    errors = tuple(-one.lag * PERIOD - filmed.tau for one in found.iterations)
+    distances = tuple(one.distance for one in found.iterations)
     return LagResult(
         filmed.tau,
         -found.lag * PERIOD - filmed.tau,
@@ -178,13 +178,13 @@ def sweep(
 def bin_bias(lag_frames: float, noise: float = 0.5, seeds: int = 6) -> float:
     """Mean error of the paper's method [s] at one lag [frames] of trajectory 1 over several draws of noise [px].
 
-    Eq. (18) takes the mean inside a fixed bin one frame wide: what noise carries over the bin's edge is left out,
-    so that the answer is biased towards the bin's middle.
+    Eq. (18) takes the mean inside a fixed bin one frame wide. Values that noise moves across the bin's edge are left
+    out, so that the estimate is biased towards the bin's middle.
     """
     tau = lag_frames * PERIOD
     return float(np.mean([paper_method(film(trajectory_1, tau, noise, seed)).tau_error for seed in range(seeds)]))
 
 
 def first_failure(results: Iterable[LagResult]) -> float:
-    """The smallest lag [s] that was not answered rightly; infinity for none."""
+    """The smallest lag [s] without a correct result; infinity for none."""
     return min((result.tau for result in results if not result.right), default=float("inf"))

@@ -1,9 +1,9 @@
-"""The figures of the paper on following a car, on the simulated town: pictures, and numbers beside them.
+"""Reproduction of the background-aware tracking paper on simulated flights: its figures, and numbers.
 
 ``python -m tests.papers.uav_paper --out DIR`` draws figures 1 to 5 and 7 and writes numbers.txt. Section 3.3 (figure
 1): a winding road, a drone that keeps the estimate in the middle; without and with the road. Section 4.1 (figures 2 to
 5): the frame, its regions by colour, the road's shape, the regions corrected by it. Section 4.4 (figure 7): the town.
-The paper shows pictures only; the numbers are the means over several seeds of the same scenario.
+The paper shows images only; the numbers are the means over several seeds of the same scenario.
 """
 
 from __future__ import annotations
@@ -19,45 +19,45 @@ import numpy as np
 from edge.uav.baselines import regions
 from edge.uav.baselines.paper_tracker import PaperTracker
 from edge.uav.baselines.plain_tracker import PlainTracker
-from edge.uav.tracker import Estimate, Image, State, Tracker
+from edge.uav.tracker import Estimate, Image, Tracker, TrackState
 from edge.uav.world import scenarios
-from edge.uav.world.world import World
+from edge.uav.world.flight_world import FlightWorld
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
 WINDING, TOWN = "paper-3.3", "paper-4.4"
 NEAR = 20.0
-"""px: an estimate this near is right."""
-_CANVAS = 1.9  # the pictures show so many times what the camera sees
-_SAME_ROAD = 0.94  # cosine of the most that a road may have turned to be the same one
-_DIM = 0.55  # what the camera does not see is drawn darker
+"""Largest error [px] of a correct estimate."""
+_CANVAS = 1.9  # size of the figures relative to the camera's image
+_SAME_ROAD = 0.94  # cosine of the largest turn of a road that counts as the same one
+_DIM = 0.55  # brightness outside the camera's image
 _YELLOW, _CYAN, _RED, _GREEN, _WHITE = (0, 230, 255), (255, 200, 0), (40, 40, 255), (60, 230, 60), (255, 255, 255)
 
-Maker = Callable[[World, int], Tracker]
+Maker = Callable[[FlightWorld, int], Tracker]
 
 
-def plain(world: World, seed: int) -> Tracker:
+def plain(world: FlightWorld, seed: int) -> Tracker:
     """Section 2."""
     return PlainTracker(world.size, fps=world.fps, seed=seed)
 
 
-def road_steered(world: World, seed: int) -> PaperTracker:
+def road_steered(world: FlightWorld, seed: int) -> PaperTracker:
     """Section 3.2."""
     return PaperTracker(world.size, fps=world.fps, seed=seed, section=3)
 
 
-def background_aware(world: World, seed: int) -> PaperTracker:
+def background_aware(world: FlightWorld, seed: int) -> PaperTracker:
     """Section 4.3."""
     return PaperTracker(world.size, fps=world.fps, seed=seed)
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """How one run went. Shares 0..1, nan where there was no such frame.
+    """Scores of one run. Fractions 0..1, nan without such frames.
 
-    seen_near: of the frames with the car in the picture, off by less than 20 px. out_near, out_car: of those with no
-    part of it in the picture, off by less than 20 px, or less than its length. false_visible: of those, called visible.
-    back: whether it was within 20 px in the last 20 frames' median, the car being in the picture then.
+    seen_near: of the frames with the car in the image, off by less than 20 px. out_near, out_car: of those with no
+    part of it in the image, off by less than 20 px, or less than its length. false_visible: of those, called visible.
+    back: whether it was within 20 px in the last 20 frames' median, with the car in the image then.
     """
 
     seen_near: float
@@ -71,7 +71,7 @@ class Score:
 class Run:
     """Estimates and errors (n,) [px] of a tracker over a world."""
 
-    world: World
+    world: FlightWorld
     estimates: list[Estimate]
     errors: Floats
 
@@ -79,7 +79,7 @@ class Run:
         truths = [self.world.truth(k) for k in range(self.world.length)]
         inside = np.array([truth.inside for truth in truths])
         length = np.array([max(truth.width, truth.height) for truth in truths])
-        claimed = np.array([estimate.state is State.VISIBLE for estimate in self.estimates])
+        claimed = np.array([estimate.state is TrackState.VISIBLE for estimate in self.estimates])
         errors = np.where(np.isnan(self.errors), np.inf, self.errors)
         out, seen, tail = inside == 0.0, inside > 0.5, np.arange(len(inside)) >= len(inside) - 20
         after = tail & seen
@@ -92,7 +92,9 @@ class Run:
         )
 
 
-def run(world: World, tracker: Tracker, frames: int | None = None, look: Callable[[int], None] | None = None) -> Run:
+def run(
+    world: FlightWorld, tracker: Tracker, frames: int | None = None, look: Callable[[int], None] | None = None
+) -> Run:
     """Follow the world's target from its first frame on. look is called with each frame's number, after it."""
     truth = world.truth(0)
     estimates = [tracker.begin(world.frame(0), world.time(0), truth.box)]
@@ -106,21 +108,21 @@ def run(world: World, tracker: Tracker, frames: int | None = None, look: Callabl
     return Run(world, estimates, np.array(errors))
 
 
-def route(world: World, frame: int) -> Floats:
+def route(world: FlightWorld, frame: int) -> Floats:
     """The target's whole route (n, 2) in the pixels of one frame, nan behind the camera: its lane."""
     pose = world.truth(frame).camera
     ground = np.column_stack([world.target.ground[:, :2], np.zeros(len(world.target.ground))])
     return world.lens.project((ground - pose.position) @ pose.rotation.T)
 
 
-def canvas(world: World, frame: int) -> tuple[Image, Floats]:
-    """What lies around the picture, drawn darker, with the picture framed; and where its pixel (0, 0) is (2,)."""
+def canvas(world: FlightWorld, frame: int) -> tuple[Image, Floats]:
+    """The image on a larger, darker rendering of its surroundings; and the position (2,) of its pixel (0, 0)."""
     width, height = world.size
     wide, high = int(width * _CANVAS), int(height * _CANVAS)
     origin = np.array([(wide - width) // 2, (high - height) // 2], dtype=np.float64)
     matrix = world.lens.matrix.copy()
     matrix[:2, 2] += origin
-    around = replace(world, lens=Intrinsics(wide, high, matrix)).draw(frame)
+    around = replace(world, lens=Intrinsics(wide, high, matrix)).render(frame)
     result = (around * _DIM).astype(np.uint8)
     x, y = origin.astype(int)
     result[y : y + height, x : x + width] = world.frame(frame)
@@ -128,7 +130,7 @@ def canvas(world: World, frame: int) -> tuple[Image, Floats]:
     return result, origin
 
 
-def drawn(world: World, frame: int, estimate: Estimate, title: str) -> Image:
+def drawn(world: FlightWorld, frame: int, estimate: Estimate, title: str) -> Image:
     """One panel: particles, road, estimate and truth on the canvas."""
     image, origin = canvas(world, frame)
     for name, points in estimate.layers.items():
@@ -149,7 +151,7 @@ def drawn(world: World, frame: int, estimate: Estimate, title: str) -> Image:
     return image
 
 
-def figure_1(world: World, seed: int, frames: Sequence[int]) -> tuple[Image, list[str]]:
+def figure_1(world: FlightWorld, seed: int, frames: Sequence[int]) -> tuple[Image, list[str]]:
     """Columns: (a) without, (b) with the road's shape. Rows: the frames."""
     columns, lines = [], []
     for title, maker in (("(a) colour only", plain), ("(b) with the road", road_steered)):
@@ -160,50 +162,52 @@ def figure_1(world: World, seed: int, frames: Sequence[int]) -> tuple[Image, lis
     return np.hstack(columns), lines
 
 
-def figures_2_to_5(world: World, frame: int, seed: int) -> tuple[dict[str, Image], list[str]]:
+def figures_2_to_5(world: FlightWorld, frame: int, seed: int) -> tuple[dict[str, Image], list[str]]:
     """The frame, its regions, the road's shape in it and the corrected regions."""
     tracker = background_aware(world, seed)
     run(world, tracker, frame + 1)
-    view = tracker.view
+    diagnostics = tracker.diagnostics
     image = world.frame(frame)
     size = world.size
     shape = image.copy()
-    if view.course is not None:
-        known = view.course.points[view.course.known]
-        normal = np.column_stack([-np.sin(view.course.headings), np.cos(view.course.headings)])[view.course.known]
-        for side in (-view.course.half_width, 0.0, view.course.half_width):
+    if diagnostics.course is not None:
+        known = diagnostics.course.points[diagnostics.course.known]
+        normal = np.column_stack([-np.sin(diagnostics.course.headings), np.cos(diagnostics.course.headings)])[
+            diagnostics.course.known
+        ]
+        for side in (-diagnostics.course.half_width, 0.0, diagnostics.course.half_width):
             line = np.rint((known + side * normal) * 8).astype(np.int32).reshape(-1, 1, 2)
             cv2.polylines(shape, [line], False, _YELLOW if side else _CYAN, 2, cv2.LINE_AA, 3)
-    pictures: dict[str, Image] = {
+    images: dict[str, Image] = {
         "figure-2.png": image,
-        "figure-3.png": _in_colours(view.labels, size),
+        "figure-3.png": _in_colours(diagnostics.labels, size),
         "figure-4.png": shape,
-        "figure-5.png": _in_colours(view.corrected, size),
+        "figure-5.png": _in_colours(diagnostics.corrected, size),
     }
-    return pictures, [
-        f"figure 3, frame {frame}: {road_share(world, frame, view.labels):.0%} of the car's route in the picture is "
-        f"road; of all pixels {_shares(view.labels)}",
+    return images, [
+        f"figure 3, frame {frame}: {road_share(world, frame, diagnostics.labels):.0%} of the car's route in the "
+        f"image is road; of all pixels {_shares(diagnostics.labels)}",
         "figure 4: the road's middle keeps its distance from the car's route to "
-        f"{lane_scatter(world, frame, tracker):.1f} px (std within the picture)",
-        f"figure 5: {road_share(world, frame, view.corrected):.0%} of the car's route is road; of all pixels "
-        f"{_shares(view.corrected)}",
+        f"{lane_scatter(world, frame, tracker):.1f} px (std within the image)",
+        f"figure 5: {road_share(world, frame, diagnostics.corrected):.0%} of the car's route is road; of all pixels "
+        f"{_shares(diagnostics.corrected)}",
     ]
 
 
-def road_share(world: World, frame: int, labels: regions.Labels) -> float:
-    """Share of the target's route within the picture that is labelled road."""
+def road_share(world: FlightWorld, frame: int, labels: regions.Labels) -> float:
+    """Share of the target's route within the image that is labelled road."""
     places = _seen_route(world, frame) / regions.SCALE
     index = np.clip(np.rint(places).astype(int), 0, np.array(labels.shape[::-1]) - 1)
     return float((labels[index[:, 1], index[:, 0]] == regions.ROAD).mean())
 
 
-def lane_scatter(world: World, frame: int, tracker: PaperTracker) -> float:
-    """Std [px] of the distance from the target's route in the picture to the road's middle: 0 if it is parallel."""
-    course = tracker.view.course
+def lane_scatter(world: FlightWorld, frame: int, tracker: PaperTracker) -> float:
+    """Std [px] of the distance from the target's route in the image to the road's midline: 0 if it is parallel."""
+    course = tracker.diagnostics.course
     return float("nan") if course is None else float(course.nearest(_seen_route(world, frame))[0].std())
 
 
-def figure_7(world: World, seed: int, frames: Sequence[int]) -> tuple[Image, list[str]]:
+def figure_7(world: FlightWorld, seed: int, frames: Sequence[int]) -> tuple[Image, list[str]]:
     """Four frames of the town."""
     done = run(world, background_aware(world, seed))
     panels = [drawn(world, k, done.estimates[k], "section 4") for k in frames]
@@ -226,9 +230,9 @@ def table(scenario: str, makers: dict[str, Maker], seeds: Sequence[int]) -> list
     return lines
 
 
-def exit_frames(world: World) -> tuple[int, int, int]:
-    """Before the car leaves the picture, the middle of its absence, and after its return, for the figures."""
-    first, end = world.out
+def exit_frames(world: FlightWorld) -> tuple[int, int, int]:
+    """Before the car leaves the image, the middle of its absence, and after its return, for the figures."""
+    first, end = world.out_of_view
     return max(first - 15, 1), (first + end) // 2, min(end + 15, world.length - 1)
 
 
@@ -236,17 +240,17 @@ def main() -> None:
     """Draw everything into --out."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--seed", type=int, default=0, help="of the worlds in the pictures")
+    parser.add_argument("--seed", type=int, default=0, help="of the worlds in the figures")
     parser.add_argument("--seeds", type=int, default=5, help="how many worlds the numbers are means of")
     chosen = parser.parse_args()
     chosen.out.mkdir(parents=True, exist_ok=True)
     winding, town = scenarios.get(WINDING, chosen.seed), scenarios.get(TOWN, chosen.seed)
     before, _, _ = exit_frames(town)
-    pictures, lines = figures_2_to_5(town, min(40, before), chosen.seed)
-    pictures["figure-1.png"], first = figure_1(winding, chosen.seed, exit_frames(winding))
-    pictures["figure-7.png"], last = figure_7(town, chosen.seed, (min(40, before), *exit_frames(town)))
-    for name, picture in pictures.items():
-        if not cv2.imwrite(str(chosen.out / name), picture):
+    images, lines = figures_2_to_5(town, min(40, before), chosen.seed)
+    images["figure-1.png"], first = figure_1(winding, chosen.seed, exit_frames(winding))
+    images["figure-7.png"], last = figure_7(town, chosen.seed, (min(40, before), *exit_frames(town)))
+    for name, image in images.items():
+        if not cv2.imwrite(str(chosen.out / name), image):
             raise OSError(f"cannot write {chosen.out / name}")
     makers: dict[str, Maker] = {
         "section 2 (plain)": plain,
@@ -260,8 +264,8 @@ def main() -> None:
     print("\n".join(numbers))
 
 
-def _seen_route(world: World, frame: int) -> Floats:
-    """The part of the route that is in the picture and on the road that the target drives on in this frame."""
+def _seen_route(world: FlightWorld, frame: int) -> Floats:
+    """The part of the route that is in the image and on the road that the target drives on in this frame."""
     turned = np.cos(world.target.course - world.target.course[frame])
     places = route(world, frame)[turned > _SAME_ROAD]
     inside = ((places > 0.0) & (places < np.array(world.size) - 1.0)).all(axis=1)

@@ -5,15 +5,15 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocols.session.builder import _REMEMBERED, _Boot
+from protocols.session.builder import _DUPLICATE_WINDOW, _BootBuffer
 
 
 @given(st.lists(st.integers(0, 40_000), max_size=200))
 def test_a_live_hub_knows_the_duplicates_that_a_set_knows(sequences: list[int]) -> None:
-    live, all_of_them = _Boot(), _Boot()
+    live, all_of_them = _BootBuffer(), _BootBuffer()
     highest = -1
     for sequence in sequences:
-        told, known = live.knows_lately(sequence), all_of_them.knows(sequence)
-        assert told == (known or sequence <= highest - _REMEMBERED)
+        duplicate, known = live.is_recent_duplicate(sequence), all_of_them.is_duplicate(sequence)
+        assert duplicate == (known or sequence <= highest - _DUPLICATE_WINDOW)
         highest = max(highest, sequence)
-    assert live.ring is None or len(live.ring) == _REMEMBERED // 8
+    assert live.ring is None or len(live.ring) == _DUPLICATE_WINDOW // 8

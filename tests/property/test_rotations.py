@@ -125,13 +125,13 @@ def test_the_angle_between_rotations_is_the_length_of_the_turn(r: Floats, w: Flo
 @given(points.filter(lambda p: float(np.linalg.norm(p)) > 1e-3), vectors)
 def test_taking_takes_one_direction_to_the_other(a: Floats, w: Floats) -> None:
     b = 3.0 * so3.exp(w) @ a
-    turned = so3.taking(a, b) @ (a / np.linalg.norm(a))
+    turned = so3.rotation_between(a, b) @ (a / np.linalg.norm(a))
     np.testing.assert_allclose(turned, b / np.linalg.norm(b), atol=1e-9)
 
 
 @given(points.filter(lambda p: float(np.linalg.norm(p)) > 1e-3))
 def test_taking_a_direction_to_its_opposite_is_half_a_turn(a: Floats) -> None:
-    turned = so3.taking(a, -a)
+    turned = so3.rotation_between(a, -a)
     np.testing.assert_allclose(turned @ a, -a, atol=1e-9)
     assert abs(np.linalg.det(turned) - 1) < 1e-9
 

@@ -1,4 +1,4 @@
-"""Tracks are a function of what was seen, not of the order in which it arrived."""
+"""Tracks depend on the observations, not on their order of arrival."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge import scenes
-from hub.tracking.filter.target_states import State
-from hub.tracking.filter.update import World
+from hub.tracking.filter.target_states import MultiTargetState
+from hub.tracking.frame_update import TrackerParameters
 from hub.tracking.tracker import Tracker
 from protocols.messages import syncline_pb2 as pb
-from tests.people_traffic import cameras_of, film
+from tests.support.people_traffic import cameras_of, film
 
 LAG_S = 0.5
-SCENE = scenes.get_people(3, 3, 2)
+SCENE = scenes.get_people_scene(3, 3, 2)
 
 
 @cache
@@ -29,14 +29,14 @@ def stream() -> tuple[pb.Observation, ...]:
 
 @cache
 def in_order() -> tuple[int, list[bytes]]:
-    """How many people are followed, and every bit of the state, with no frame out of place."""
+    """The number of confirmed people, and every bit of the state, with all frames in order."""
     tracker = run(list(stream()), [1] * len(stream()))
     assert tracker.counters["track.reordered"] == 0
     return int(tracker.targets.confirmed.sum()), bits(tracker.state)
 
 
 def run(messages: list[pb.Observation], batches: list[int]) -> Tracker:
-    tracker = Tracker(World(up=np.array([0.0, 0.0, 1.0])), LAG_S)
+    tracker = Tracker(TrackerParameters(up=np.array([0.0, 0.0, 1.0])), LAG_S)
     tracker.calibrate(cameras_of(SCENE, "cam0"))
     waits = set(np.cumsum(batches).tolist())
     for number, message in enumerate(messages):
@@ -47,12 +47,12 @@ def run(messages: list[pb.Observation], batches: list[int]) -> Tracker:
     return tracker
 
 
-def bits(state: State) -> list[bytes]:
+def bits(state: MultiTargetState) -> list[bytes]:
     """Every number of the targets, to the last bit."""
     targets = state.targets
     return [getattr(targets, name).tobytes() for name in targets.__slots__ if name != "seen_by"] + [
         str(sorted(zip(state.cameras, targets.seen_by.T.tolist(), strict=True))).encode(),
-        str((state.time_ns, state.next_identity, state.next_number, state.floor)).encode(),
+        str((state.time_ns, state.next_initiation_number, state.next_number, state.floor_height)).encode(),
     ]
 
 
@@ -74,7 +74,7 @@ def test_order_of_arrival_within_the_lag_changes_nothing(seed: int, late_s: floa
 
 @settings(max_examples=3, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_frames_that_come_twice_count_once(seed: int) -> None:
+def test_duplicate_frames_have_no_effect(seed: int) -> None:
     messages = list(stream())
     rng = np.random.default_rng(seed)
     doubled = [m for m in messages for _ in range(1 + int(rng.random() < 0.3))]

@@ -1,6 +1,6 @@
 """Writes the tiny log that is kept of each version: `python -m tests.replay.keep_log` before a release, once.
 
-A log that stands in logs/ is never written again: it is what users have on their disks.
+A log in logs/ is never rewritten: it stands for the logs that users have.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
 from protocols.topics import NODE_STATE, TOPICS
 from protocols.validation.codec import SCHEMA_VERSION
-from tests.samples import SAMPLES
+from tests.support.samples import SAMPLES
 
 LOGS = Path(__file__).parent / "logs"
 
 
 def content(path: Path) -> dict[str, Any]:
-    """What a log says, in a form that does not change when fields are added."""
+    """The content of a log, in a form that does not change when fields are added."""
     reader = LogReader(path)
     return {
         "messages": [
@@ -42,7 +42,7 @@ def content(path: Path) -> dict[str, Any]:
 
 
 def keep() -> Path:
-    """Write this version's log and what it says."""
+    """Write this version's log and its content."""
     path = LOGS / f"v{SCHEMA_VERSION}.mcap"
     with LogWriter(path, {"syncline": {"seed": "7"}}, views=True) as log:
         log.attach("rig.toml", "application/toml", b"[cam0]\nsize = [640, 480]\n")

@@ -1,7 +1,7 @@
-"""The shipped scenes as logs, made anew each time, and what hub and UAV agent said of them when it was last looked at.
+"""The shipped scenes as logs, generated each time, and the reference outputs of hub and UAV agent for them.
 
-`python -m tests.replay.scenes` keeps the answers of today in logs/: after a change that is meant to change them, and
-whose differences (`syncline replay OLD --compare NEW`) somebody has read.
+`python -m tests.replay.scenes` stores the current outputs in logs/ as references: after an intended change whose
+differences (`syncline replay OLD --compare NEW`) were reviewed.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from deploy.logs.replay_hub import replay_through_hub
 from deploy.logs.replay_uav import replay_through_uav
 from deploy.simulation.session import camera_tables
 from edge.agents.uav import TOPICS
-from edge.scenes import get_people
+from edge.scenes import get_people_scene
 from edge.scenes.people.scene import PeopleScene
-from edge.uav.world.patrol import patrol
-from edge.uav.world.world import World
+from edge.uav.world.flight_world import FlightWorld
+from edge.uav.world.patrol import patrol_world
 from hub.live.live_hub import LiveSettings
 from protocols.core.clocks import NANOSECONDS
 from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
 from protocols.topics import CAMERA_INFO, OBSERVATION, TARGET, TRACK, Topic
-from tests.people_traffic import film
-from tests.uav_flights import Flight
+from tests.support.people_traffic import film
+from tests.support.uav_flights import Flight
 
 LOGS = Path(__file__).parent / "logs"
 MARKER_SEED, MARKER_CAMERAS, MARKER_S = 11, 3, 12.0
@@ -46,18 +46,18 @@ def marker_log(folder: Path) -> Path:
 
 
 def marker_answer(log: Path, out: Path) -> Path:
-    """What a hub that solves every six seconds says of it."""
+    """Output of a hub that solves every six seconds."""
     replay_through_hub(log, out, LiveSettings(interval_s=6.0))
     return out
 
 
-def town() -> World:
+def town() -> FlightWorld:
     """The world that the drone flies over."""
-    return patrol(TOWN_SEED, TOWN_S + 2.0, (320, 240))
+    return patrol_world(TOWN_SEED, TOWN_S + 2.0, (320, 240))
 
 
 def town_log(folder: Path) -> Path:
-    """The town: pictures, telemetry and orders of a drone that follows a car and loses it from its picture."""
+    """The town: images, telemetry and orders of a drone that follows a car until it leaves the field of view."""
     flight = Flight(town(), jpeg_quality=90)
     flight.run(1.5)
     assert flight.select()
@@ -69,7 +69,7 @@ def town_log(folder: Path) -> Path:
 
 
 def town_answer(log: Path, out: Path) -> Path:
-    """What the UAV agent's estimator says of it: every estimate; particles and road only follow from them."""
+    """Output of the UAV agent's estimator: every estimate; particles and road only follow from them."""
     whole = out.with_name(f"whole-{out.name}")
     _, missing = replay_through_uav(log, whole)
     assert missing == 0
@@ -78,11 +78,11 @@ def town_answer(log: Path, out: Path) -> Path:
 
 def people() -> PeopleScene:
     """The room that three people walk about in."""
-    return get_people(PEOPLE_SEED, PEOPLE_CAMERAS, 3)
+    return get_people_scene(PEOPLE_SEED, PEOPLE_CAMERAS, 3)
 
 
 def people_log(folder: Path) -> Path:
-    """The room of people: what four cameras reported of them; beside it the calibration by which they are followed."""
+    """The room of people: what four cameras reported of them; beside it the calibration used for tracking."""
     scene = people()
     _, tables = camera_tables(scene, "people")
     tables["metadata"]["up"] = [0.0, 0.0, 1.0]
@@ -97,14 +97,14 @@ def people_log(folder: Path) -> Path:
 
 
 def people_answer(log: Path, out: Path) -> Path:
-    """Where a hub that knows the cameras says that everybody is."""
+    """Tracks of the people from a hub with known cameras."""
     whole = out.with_name(f"whole-{out.name}")
     replay_through_hub(log, whole, calibration=log.with_name("known.toml"))
     return only(TRACK, whole, out)
 
 
 def only(topic: Topic, whole: Path, out: Path) -> Path:
-    """One topic of a log, which goes."""
+    """One topic of a log, which is removed."""
     with LogWriter(out) as writer:
         for logged in LogReader(whole).messages([topic]):
             writer.write(topic, logged.agent, logged.site, logged.message, logged.log_time_ns)
@@ -124,7 +124,7 @@ def elsewhere(kind: str, log: Path, out: Path) -> Path:
 
 
 def main() -> int:
-    """Keep what is said today."""
+    """Store the current outputs as references."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for kind, log, answer in (

@@ -1,4 +1,4 @@
-"""Logs of every version are read for ever, and one of a newer version is refused with what to do."""
+"""Logs of every older version can be read, and one of a newer version is refused with a remedy."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.topics import TRACK, Topic
 from protocols.validation.codec import SCHEMA_VERSION
 from tests.replay.keep_log import LOGS, content
-from tests.samples import track
+from tests.support.samples import track
 
 
 @pytest.mark.parametrize("version", range(1, SCHEMA_VERSION + 1))
-def test_the_log_of_each_version_says_what_it_said(version: int) -> None:
+def test_the_log_of_each_version_has_its_reference_content(version: int) -> None:
     path = LOGS / f"v{version}.mcap"
     expected = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
     assert len(expected["messages"]) >= 6

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from protocols.bus.router.zenoh_router import free_endpoint
-from protocols.bus.security.sender_identity import GuardedBus
+from protocols.bus.security.sender_identity import SenderCheckedBus
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.messages import syncline_pb2 as pb
@@ -36,7 +36,7 @@ _QUIET_S = 1.0
 def _hear_ours(endpoint: str, count: int) -> dict[str, object]:
     latencies: list[float] = []
     with open_bus("local", BusConfig(listen=(endpoint,)), timeout_s=10.0) as bus:
-        guarded = GuardedBus(bus, time.monotonic)
+        guarded = SenderCheckedBus(bus, time.monotonic)
         subscription = guarded.subscribe(OBSERVATION)
         print("ready", flush=True)
         first = last = 0
@@ -69,11 +69,11 @@ def _hear_raw(endpoint: str, count: int) -> dict[str, object]:
 
     with zenoh.open(_config(listen=endpoint)) as session, session.declare_subscriber(KEY, take):
         print("ready", flush=True)
-        heard = -1
+        last_count = -1
         while not all_there.wait(_QUIET_S):
-            if len(moments) == heard and heard > 0:
+            if len(moments) == last_count and last_count > 0:
                 break
-            heard = len(moments)
+            last_count = len(moments)
     return {"latencies": latencies, "seconds": (moments[-1] - moments[0]) * 1e-9, "counters": {}}
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pyceres
 
 from hub.bundle.bordered_system import THIRD_DIFFERENCE
-from hub.bundle.problem import CAMERA_PARAMETERS, Freedom, State
+from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, FreeParameters
 from protocols.geometry.types import Floats, Ints
 from tests.bench.speed.joint import SIGMA_PX, Stacked
 
@@ -29,7 +29,7 @@ class Solved:
 
     alone_s: float
     whole_s: float
-    state: State
+    state: AdjustmentState
 
 
 class _Pass:
@@ -97,8 +97,8 @@ class _Pass:
             later, earlier = line.index > index, line.index < index
             weights[later] = np.pad(line.weights[later, :3], ((0, 0), (1, 0)))
             weights[earlier] = np.pad(line.weights[earlier, 1:], ((0, 0), (0, 1)))
-            by_path = line.by_point[:, :, None, :] * weights[:, None, :, None] / SIGMA_PX
-            self.lines.append((line.residual / SIGMA_PX, by_path, line.by_camera[:, :, :_OF_A_CAMERA] / SIGMA_PX))
+            by_path = line.point_jacobian[:, :, None, :] * weights[:, None, :, None] / SIGMA_PX
+            self.lines.append((line.residual / SIGMA_PX, by_path, line.camera_jacobian[:, :, :_OF_A_CAMERA] / SIGMA_PX))
 
 
 class _Rows(pyceres.CostFunction):
@@ -112,14 +112,14 @@ class _Rows(pyceres.CostFunction):
 
     def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
         self.shared.ask(self.names, parameters)
-        residual, by_path, by_camera = self.shared.lines[self.number]
+        residual, by_path, camera_jacobian = self.shared.lines[self.number]
         residuals[:] = residual[self.rows].ravel()
         if jacobians is not None:
             for k in range(4):
                 if jacobians[k] is not None:
                     jacobians[k][:] = by_path[self.rows, :, k].ravel()
             if jacobians[4] is not None:
-                jacobians[4][:] = by_camera[self.rows].ravel()
+                jacobians[4][:] = camera_jacobian[self.rows].ravel()
         return True
 
 
@@ -147,7 +147,7 @@ class _Rate(pyceres.CostFunction):
 
     def __init__(self, begin: float) -> None:
         pyceres.CostFunction.__init__(self)
-        self.begin, self.std = begin, Freedom().rate_std
+        self.begin, self.std = begin, FreeParameters().rate_std
         self.set_num_residuals(1)
         self.set_parameter_block_sizes([_OF_A_CAMERA])
 

@@ -1,8 +1,8 @@
 """The joint adjustment of ten cameras, beside scipy's and Ceres' least squares on the same cost from the same start.
 
-One spline path, ten poses, nine time maps; noise and motion prior held, so that all minimise one and the same sum. The
+One spline path, ten poses, nine time maps; noise and motion prior fixed, so that all minimise the same cost. The
 start: true poses turned by 0.2° and shifted by 2 cm, clocks 2 ms off, the path triangulated from those. Each is
-timed until it stops; a peer that stops above our cost by more than 1e-4 of it is told so. Ceres is called from Python
+timed until it stops; a peer that stops above our cost by more than 1e-4 of it is marked. Ceres is called from Python
 (pyceres, ``ceres.py``), so its residuals are made by our own vectorised code; what is compared is its CPU without any
 evaluation of residuals and derivatives, ours with.
 """
@@ -18,17 +18,25 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.sparse import coo_array, csr_array
 
-from hub.bundle.adjustment import Linearised, MotionPrior, _minimise, build_system, linearise, motion_prior, moved
+from hub.bundle.adjustment import (
+    LinearisedResiduals,
+    SmoothnessPrior,
+    _minimise,
+    apply_step,
+    build_system,
+    estimate_smoothness,
+    linearise,
+)
 from hub.bundle.bordered_system import THIRD_DIFFERENCE, third_differences
-from hub.bundle.problem import CAMERA_PARAMETERS, GIVEN_PARAMETERS, RATE, Freedom, Problem, State
-from hub.calibration.clock_graph import ClockGraph, ClockGuess
-from hub.calibration.initialisation import _camera_state, settle
-from hub.calibration.preprocessing import prepare
+from hub.bundle.initialisation import _camera_state, triangulate_and_adjust
+from hub.bundle.preprocessing import prepare
+from hub.bundle.problem import CAMERA_PARAMETERS, GIVEN_PARAMETERS, RATE, AdjustmentState, FreeParameters, Problem
+from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats, Ints
-from tests import rigs
 from tests.bench.speed.rows import Limit, Row, Section
+from tests.support import rigs
 
 _CAMERAS = 10
 SIGMA_PX = 0.5
@@ -40,31 +48,31 @@ class Task:
     """One problem and where it is begun."""
 
     problem: Problem
-    start: State
-    prior: MotionPrior
+    start: AdjustmentState
+    prior: SmoothnessPrior
 
     @property
     def rows(self) -> int:
         """Observations that count."""
         return sum(int(part.use.sum()) for part in self.problem.rows)
 
-    def cost(self, state: State) -> float:
+    def cost(self, state: AdjustmentState) -> float:
         """The sum that all minimise."""
         return build_system(self.problem, state, self.prior, False)[1]
 
 
 def make(seed: int, seconds: float, cameras: int = _CAMERAS) -> Task:
-    """A rig of which everything is known, and a start that is a little off."""
+    """A rig with ground truth, and a perturbed start."""
     rng = np.random.default_rng([seed, 16])
     session = rigs.simulate(seed, cameras, seconds, fps=(30.0,), drops=0.0, late=0.5, noise=SIGMA_PX)
     prepared = prepare(session.rig, session.observations())
     clocks, poses, names = {}, {}, list(prepared.cameras)
     for name, camera in prepared.cameras.items():
         (track,) = camera.tracks.values()
-        true, epoch = session.clocks[name], prepared.epochs[name]
+        true, clock_origin = session.clocks[name], prepared.time_origins[name]
         centre = float(np.mean(track.time[[0, -1]]))
-        offset = true.clock_rate * (centre + epoch) + true.time_offset + rng.normal(0, 2e-3)
-        clocks[name] = ClockGuess(true.clock_rate, offset, centre)
+        offset = true.clock_rate * (centre + clock_origin) + true.time_offset + rng.normal(0, 2e-3)
+        clocks[name] = TimeMapEstimate(true.clock_rate, offset, centre)
         pose, turn = session.poses[name], so3.exp(np.radians(rng.normal(0, 0.2, 3)))
         poses[name] = Pose(turn @ pose.rotation, pose.position + rng.normal(0, 0.02, 3))
     apart = poses[names[1]].position - poses[names[0]].position
@@ -72,16 +80,18 @@ def make(seed: int, seconds: float, cameras: int = _CAMERAS) -> Task:
     poses = {name: Pose(pose.rotation @ turn.T, turn @ pose.position) for name, pose in poses.items()}
     graph = ClockGraph(clocks, (), ())
     placed = {name: _camera_state(prepared.cameras[name], graph, poses[name]) for name in poses}
-    scaffold = settle(prepared.cameras, placed, prepared.rows, prepared.labels, (names[0], names[1]), None)
-    state = replace(scaffold.state, sigma=np.full(len(names), SIGMA_PX))
-    problem = replace(scaffold.problem, freedom=Freedom())
+    reconstruction = triangulate_and_adjust(
+        prepared.cameras, placed, prepared.rows, prepared.labels, (names[0], names[1]), None
+    )
+    state = replace(reconstruction.state, sigma=np.full(len(names), SIGMA_PX))
+    problem = replace(reconstruction.problem, free_parameters=FreeParameters())
     basis = state.trajectories[0].basis
     rows = []
     for part in problem.rows:
         at = state.cameras[part.camera].reference_time(part.time)
         rows.append(part.using((at > basis.begin + _EDGE_S) & (at < basis.end - _EDGE_S)))
     problem = replace(problem, rows=tuple(rows))
-    return Task(problem, state, motion_prior(problem, state))
+    return Task(problem, state, estimate_smoothness(problem, state))
 
 
 def _onto_x(direction: Floats) -> Floats:
@@ -92,7 +102,7 @@ def _onto_x(direction: Floats) -> Floats:
     return np.stack([x, y, np.cross(x, y)])
 
 
-def ours(task: Task) -> State:
+def ours(task: Task) -> AdjustmentState:
     """The same loop as `adjust` runs, to its fine end."""
     return _minimise(task.problem, task.start, task.prior, False, 40, 1e-7, [], False)
 
@@ -114,13 +124,13 @@ class Stacked:
         self.place[self.columns] = self.path + np.arange(len(self.columns))
         self.root = np.sqrt(task.prior.weights[0])
 
-    def state(self, x: Floats) -> State:
+    def state(self, x: Floats) -> AdjustmentState:
         """The state that a vector means."""
         cameras = np.zeros(len(self.moves))
         cameras[self.moves] = x[self.path :]
-        return moved(self.task.problem, self.task.start, x[: self.path], cameras)
+        return apply_step(self.task.problem, self.task.start, x[: self.path], cameras)
 
-    def lines(self, x: Floats) -> list[Linearised]:
+    def lines(self, x: Floats) -> list[LinearisedResiduals]:
         """Residuals and derivatives by camera."""
         state = self.state(x)
         path = state.trajectories[0]
@@ -132,7 +142,7 @@ class Stacked:
         parts = [line.residual.ravel() / SIGMA_PX for line in self.lines(x)]
         path = state.trajectories[0]
         parts.append((self.root[:, None] * third_differences(path.basis, path.control)).ravel())
-        parts.append(np.array([(camera.rate - 1.0) / Freedom().rate_std for camera in state.cameras]))
+        parts.append(np.array([(camera.rate - 1.0) / FreeParameters().rate_std for camera in state.cameras]))
         return np.concatenate(parts)
 
     def jacobian(self, x: Floats) -> csr_array:
@@ -145,7 +155,7 @@ class Stacked:
             count = len(line.index)
             number = top + np.arange(2 * count).reshape(count, 2)
             at = 3 * (line.index[:, None] + np.arange(4))[:, :, None] + np.arange(3)
-            block = line.by_point[:, :, None, :] * line.weights[:, None, :, None] / SIGMA_PX
+            block = line.point_jacobian[:, :, None, :] * line.weights[:, None, :, None] / SIGMA_PX
             shape = (count, 2, 4, 3)
             rows.append(np.broadcast_to(number[:, :, None, None], shape).ravel())
             columns.append(np.broadcast_to(at[:, None], shape).ravel())
@@ -154,7 +164,7 @@ class Stacked:
             free = np.flatnonzero(mine >= 0)
             rows.append(np.repeat(number.ravel(), len(free)))
             columns.append(np.tile(mine[free], 2 * count))
-            values.append((line.by_camera[:, :, free] / SIGMA_PX).ravel())
+            values.append((line.camera_jacobian[:, :, free] / SIGMA_PX).ravel())
             top += 2 * count
         starts = self.task.start.trajectories[0].basis.interval_starts()
         number = top + np.arange(3 * len(starts)).reshape(-1, 3)
@@ -168,7 +178,7 @@ class Stacked:
             if column >= 0:
                 rows.append(np.array([top + camera]))
                 columns.append(np.array([column]))
-                values.append(np.array([1.0 / Freedom().rate_std]))
+                values.append(np.array([1.0 / FreeParameters().rate_std]))
         top += len(self.task.start.cameras)
         shape2 = (top, self.size)
         entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
@@ -188,7 +198,7 @@ class Stacked:
         return csr_array(coo_array((np.ones(len(at[0])), at), shape=filled.shape))
 
 
-def scipy_sparse(task: Task, limit_s: float, given: bool) -> tuple[float, State, bool]:
+def scipy_sparse(task: Task, limit_s: float, given: bool) -> tuple[float, AdjustmentState, bool]:
     """CPU, where it ended, and whether it ended by itself. given: our derivatives; else differences by its sparsity."""
     whole = Stacked(task)
     start = np.zeros(whole.size)
@@ -232,7 +242,7 @@ def measure(quick: bool, data: Path) -> Section:
     work = f"joint adjustment, {_CAMERAS} cameras × {length} at 30 fps"
     size = f"{task.rows} rows, {Stacked(task).size} unknowns"
 
-    def told(other: State, ended: bool = True) -> str:
+    def comparison(other: AdjustmentState, ended: bool = True) -> str:
         above = task.cost(other) / reached - 1.0
         late = "" if ended else ", out of time"
         return "" if ended and above < 1e-4 else f"stopped {100 * above:.2g} % above our cost{late}"
@@ -240,10 +250,10 @@ def measure(quick: bool, data: Path) -> Section:
     cpu, other, ended = scipy_sparse(task, (20.0 if quick else 30.0) * max(best, 0.5), given=False)
     found.rows.append(
         Row(work, best, "s", "scipy least_squares, its sparsity", cpu, must=Limit("ratio", 5.0),
-            note="; ".join(part for part in (size, told(other, ended)) if part))
+            note="; ".join(part for part in (size, comparison(other, ended)) if part))
     )  # fmt: skip
     cpu, other, ended = scipy_sparse(task, (20.0 if quick else 30.0) * max(best, 0.5), given=True)
-    found.rows.append(Row(work, best, "s", "scipy, given our derivatives", cpu, note=told(other, ended)))
+    found.rows.append(Row(work, best, "s", "scipy, given our derivatives", cpu, note=comparison(other, ended)))
     try:
         from tests.bench.speed import ceres
 
@@ -254,6 +264,6 @@ def measure(quick: bool, data: Path) -> Section:
     note = f"its own CPU without evaluations; {solved.whole_s:.2g} s with its residuals made in Python"
     found.rows.append(
         Row(work, best, "s", "Ceres alone (pyceres)", solved.alone_s, reach=Limit("ratio", 1.0),
-            note="; ".join(part for part in (note, told(solved.state)) if part))
+            note="; ".join(part for part in (note, comparison(solved.state)) if part))
     )  # fmt: skip
     return found

@@ -14,33 +14,33 @@ import numpy as np
 
 from tests.bench import poses
 from tests.bench.pose_runs import feed, network
-from tests.bench.pose_worlds import TARGET, Sightings, World, cube, observe, section_4
+from tests.bench.pose_worlds import TARGET, Sightings, SimulatedRig, cube, observe, section_4
 from tests.bench.speed.rows import Limit, Row, Section
 
 _SEED = 1016
 
 
-def stream(points: int) -> tuple[World, Sightings]:
+def stream(points: int) -> tuple[SimulatedRig, Sightings]:
     """Section 4's world and what was seen."""
     rng = np.random.default_rng(_SEED)
     world = section_4(rng)
     return world, observe(world, rng, cube(rng, points))
 
 
-def ours(world: World, sightings: Sightings) -> tuple[float, float]:
-    """CPU seconds of the second half, and the mean position error [cm] of the three cameras that are not told."""
+def ours(world: SimulatedRig, sightings: Sightings) -> tuple[float, float]:
+    """CPU seconds of the second half, and the mean position error [cm] of the three cameras without a given pose."""
     half = len(sightings.cameras) // 2
     net = network(world, None, _SEED)
     feed(net, sightings, poses.EVERY, 0, half)
     began = time.process_time()
     feed(net, sightings, poses.EVERY, half)
     spent = time.process_time() - began
-    found = net.published()
+    found = net.world_poses()
     off = [np.linalg.norm(a.position - b.position) if a else np.inf for a, b in zip(found, world.poses, strict=True)]
     return spent, float(np.mean(off[2:]))
 
 
-def isam2(world: World, sightings: Sightings) -> tuple[float, float]:
+def isam2(world: SimulatedRig, sightings: Sightings) -> tuple[float, float]:
     """The same of iSAM2. Raises ImportError where gtsam is not installed."""
     import gtsam
     from gtsam.symbol_shorthand import L, X
@@ -65,7 +65,7 @@ def isam2(world: World, sightings: Sightings) -> tuple[float, float]:
             began = time.process_time()
         for camera, row in zip(pair, seen, strict=True):
             graph.add(gtsam.GenericProjectionFactorCal3_S2(row[:2], pixel, X(int(camera)), L(i), lens))
-            # The size tells the depth, and with the direction the range.
+            # The apparent size gives the depth, and with the direction the range.
             distance = TARGET * float(np.exp(-row[2])) * float(np.sqrt(1.0 + row[0] ** 2 + row[1] ** 2))
             noise = gtsam.noiseModel.Isotropic.Sigma(1, sightings.size_sigma * distance)
             graph.add(gtsam.RangeFactor3D(X(int(camera)), L(i), distance, noise))
@@ -106,6 +106,6 @@ def measure(quick: bool, data: Path) -> Section:
         return found
     found.rows.append(
         Row(work, 1e6 * spent / seen, "µs", "gtsam iSAM2", 1e6 * theirs / seen,
-            note=f"mean error of the three poses not told: {off:.2f} cm, iSAM2 {their_off:.2f} cm")
+            note=f"mean error of the three unknown poses: {off:.2f} cm, iSAM2 {their_off:.2f} cm")
     )  # fmt: skip
     return found

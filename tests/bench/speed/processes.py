@@ -43,10 +43,10 @@ def first_frame(endpoint: str, file: Path) -> tuple[float, subprocess.Popen[byte
     """Seconds from the agent's start to its first observation on the bus; the agent runs on."""
     stack = ExitStack()
     bus = stack.enter_context(open_bus("local", BusConfig(mode="client", connect=(endpoint,)), timeout_s=10.0))
-    heard = bus.subscribe(OBSERVATION, "cam0")
+    received = bus.subscribe(OBSERVATION, "cam0")
     began = time.monotonic()
     agent = _start(stack, "deploy", "camera", str(file))
-    while not heard.wait(0.5):
+    while not received.wait(0.5):
         if agent.poll() is not None or time.monotonic() - began > _TOO_LONG_S:
             stack.close()
             raise RuntimeError("the agent said nothing")
@@ -75,8 +75,8 @@ def measure(quick: bool, data: Path) -> Section:
                 running.close()
         found.rows.append(Row("start: agent to first frame on the bus, wall", best, "s", must=Limit("ours", 2.0)))
         stack.enter_context(running)
-        with open_bus("local", BusConfig(mode="client", connect=(endpoint,)), timeout_s=10.0) as ear:
-            statuses = ear.subscribe(STATUS, "hub")
+        with open_bus("local", BusConfig(mode="client", connect=(endpoint,)), timeout_s=10.0) as observer:
+            statuses = observer.subscribe(STATUS, "hub")
             hub = _start(stack, "deploy", "hub", str(folder / "hub.toml"))
             if not statuses.wait(_TOO_LONG_S):
                 raise RuntimeError("the hub said nothing")

@@ -11,7 +11,7 @@ from protocols.log.schemas import schema_of
 from protocols.log.write.writer import LogWriter
 from protocols.topics import FLIGHT_IMAGE, OBSERVATION, Topic
 from protocols.validation.codec import encode
-from tests.bench.logs import KEY, messages, pictures, raw_writer
+from tests.bench.logs import KEY, image_messages, messages, raw_writer
 from tests.bench.speed.rows import Limit, Row, Section, interleaved
 
 
@@ -44,7 +44,7 @@ def measure(quick: bool, data: Path) -> Section:
     found = Section()
     kinds: tuple[tuple[str, Topic, list[Any]], ...] = (
         ("200 B", OBSERVATION, messages(5_000 if quick else 50_000)),
-        ("100 KB", FLIGHT_IMAGE, pictures(60 if quick else 500)),
+        ("100 KB", FLIGHT_IMAGE, image_messages(60 if quick else 500)),
     )
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "x.mcap"
@@ -57,17 +57,17 @@ def measure(quick: bool, data: Path) -> Section:
 
                 return run
 
-            ways: dict[str, Callable[[], None]] = {
+            methods: dict[str, Callable[[], None]] = {
                 "ours": fresh(lambda topic=topic, items=items: _ours(path, topic, items)),  # type: ignore[misc]
                 "raw": fresh(lambda items=items: raw_writer(path, [encode(item) for item in items])),  # type: ignore[misc]
             }
             try:
                 import foxglove  # noqa: F401
 
-                ways["foxglove"] = fresh(lambda items=items: _foxglove(path, items))  # type: ignore[misc]
+                methods["foxglove"] = fresh(lambda items=items: _foxglove(path, items))  # type: ignore[misc]
             except ImportError:
                 found.missing.append(f"recorder, {title}, beside foxglove-sdk: not installed (extra dev)")
-            seconds = interleaved(ways, 3 if quick else 5)
+            seconds = interleaved(methods, 3 if quick else 5)
             rate = {way: len(items) / value for way, value in seconds.items()}
             work = f"recorder, {title} messages"
             found.rows.append(

@@ -1,4 +1,4 @@
-"""One comparison: what ours costs, what the other costs on the same work in the same run, and what is asked."""
+"""One comparison: what ours costs, what the other costs on the same work in the same run, and the required limits."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FELL = 0.8
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """What is asked of ours itself (in its unit) or of the ratio. Which side is meant follows from the row."""
+    """A limit on ours itself (in its unit) or on the ratio. Which side is meant follows from the row."""
 
     of: Literal["ours", "ratio"]
     value: float
@@ -64,7 +64,7 @@ class Row:
             return None if self.ratio is None else self.ratio >= limit.value
         return self.ours <= limit.value if self.less else self.ours >= limit.value
 
-    def told(self, limit: Limit | None) -> str:
+    def formatted(self, limit: Limit | None) -> str:
         """A limit as it is printed."""
         if limit is None:
             return ""
@@ -114,9 +114,9 @@ def table(rows: Sequence[Row]) -> str:
                 row.beside or "–",
                 "" if row.theirs is None else f"{number(row.theirs)} {row.unit}",
                 "" if row.ratio is None else f"{number(row.ratio)}×",
-                row.told(row.must),
+                row.formatted(row.must),
                 {None: "", True: "yes", False: "**no**"}[met],
-                row.told(row.reach) + ("" if row.holds(row.reach) is not True else " ✓"),
+                row.formatted(row.reach) + ("" if row.holds(row.reach) is not True else " ✓"),
             )
         )
     widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
@@ -176,10 +176,10 @@ def cpu_of(work: Callable[[], object]) -> float:
     return time.process_time() - began
 
 
-def interleaved(ways: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Least CPU seconds of each way over some rounds, one after the other in each: what else runs hits all alike."""
-    best = dict.fromkeys(ways, float("inf"))
+def interleaved(methods: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    """Least CPU seconds of each method over some rounds, one after the other in each: what else runs hits all alike."""
+    best = dict.fromkeys(methods, float("inf"))
     for _ in range(rounds):
-        for name, way in ways.items():
-            best[name] = min(best[name], cpu_of(way))
+        for name, method in methods.items():
+            best[name] = min(best[name], cpu_of(method))
     return best

@@ -13,12 +13,12 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from hub.baselines.alternating_lag import alternate
-from hub.two_view.relative_pose import RelativePose, decompose, homogeneous, sampson
+from hub.baselines.alternating_lag import estimate_alternately
+from hub.two_view.relative_pose import RelativePose, decompose_essential, homogeneous, sampson
 from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
 from tests.bench import pair_timing
-from tests.bench.pair_trials import FOCAL, MATRIX, Regime, Trial, make, map_error
+from tests.bench.pair_trials import FOCAL, MATRIX, Regime, Trial, make_trial, time_map_error
 from tests.bench.speed.rows import Limit, Row, Section, cpu_of
 
 _RIGHT_S = 2e-3
@@ -30,12 +30,12 @@ def basic(trial: Trial) -> bool:
     """The paper's method on tracks by frame index; whether its lag is right."""
     a, b = (view.pixels for view in trial.views)
     try:
-        found = alternate(a, b)
+        found = estimate_alternately(a, b)
     except Refused:
         return False
     # Index i of a and i + lag of b are one instant; both cameras are nominally 30 frames a second.
     offset = trial.views[0].time[0] - trial.views[1].time[0] - found.lag / 30.0
-    return map_error(trial, 1.0, offset)[1] < _RIGHT_S
+    return time_map_error(trial, 1.0, offset)[1] < _RIGHT_S
 
 
 def plain(trial: Trial) -> bool:
@@ -62,14 +62,14 @@ def plain(trial: Trial) -> bool:
     _, rate, offset = best
     # time_b = rate * time_a + offset; map_error wants time_a of time_b.
     slow = 1.0 / rate
-    return map_error(trial, slow, a.time[0] - slow * (b.time[0] + offset))[1] < _RIGHT_S
+    return time_map_error(trial, slow, a.time[0] - slow * (b.time[0] + offset))[1] < _RIGHT_S
 
 
 def _refined(
     one: Floats, other: CubicSpline, time_a: Floats, time_b: Floats, lag: float, essential: Floats, x: Floats, y: Floats
 ) -> tuple[float, float, float]:
     """Mean cost, rate and offset of least squares on the Sampson distance from one start."""
-    start = decompose(essential, x, y)
+    start = decompose_essential(essential, x, y)
     inside = (time_a + lag >= 0.2) & (time_a + lag <= time_b[-1] - 0.2)
     mine, at = one[inside], time_a[inside]
     middle = float(at.mean())
@@ -92,25 +92,25 @@ def ours(trial: Trial) -> bool:
 def measure(quick: bool, data: Path) -> Section:
     """Median CPU of one pair."""
     del data
-    trials = [make(Regime(), seed) for seed in range(20_000, 20_000 + (6 if quick else 20))]
-    ways = {"ours": ours, "basic": basic, "plain": plain}
-    spent: dict[str, list[float]] = {name: [] for name in ways}
-    right = dict.fromkeys(ways, 0)
-    ours(make(Regime(), 19_999))  # what is imported and cached at the first call
+    trials = [make_trial(Regime(), seed) for seed in range(20_000, 20_000 + (6 if quick else 20))]
+    methods = {"ours": ours, "basic": basic, "plain": plain}
+    spent: dict[str, list[float]] = {name: [] for name in methods}
+    right = dict.fromkeys(methods, 0)
+    ours(make_trial(Regime(), 19_999))  # what is imported and cached at the first call
     for trial in trials:
-        for name, way in ways.items():
+        for name, method in methods.items():
             box: list[bool] = []
-            spent[name].append(1e3 * cpu_of(lambda way=way, trial=trial, box=box: box.append(way(trial))))  # type: ignore[misc]
+            spent[name].append(1e3 * cpu_of(lambda method=method, trial=trial, box=box: box.append(method(trial))))  # type: ignore[misc]
             right[name] += box[0]
     ms = {name: float(np.median(values)) for name, values in spent.items()}
-    told = {name: f"right in {right[name]} of {len(trials)}" for name in ways}
+    notes = {name: f"right in {right[name]} of {len(trials)}" for name in methods}
     work = "pair timing, 20 s tracks, ±5 s"
     return Section(
         [
             Row(work, ms["ours"], "ms", "a plain scipy solve", ms["plain"],
                 must=Limit("ours", 50.0), reach=Limit("ours", 5.0),
-                note=f"ours {told['ours']}, scipy {told['plain']}; CPU from pixels, smoothing included"),
+                note=f"ours {notes['ours']}, scipy {notes['plain']}; CPU from pixels, smoothing included"),
             Row(work, ms["ours"], "ms", "the paper's basic method", ms["basic"],
-                note=f"begun at lag 0, good for ±0.3 s: {told['basic']}"),
+                note=f"begun at lag 0, good for ±0.3 s: {notes['basic']}"),
         ]
     )  # fmt: skip

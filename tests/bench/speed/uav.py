@@ -1,4 +1,4 @@
-"""The UAV tracker beside OpenCV's CSRT, KCF and MIL on the same flight: CPU a frame while the car is in the picture.
+"""The UAV tracker beside OpenCV's CSRT, KCF and MIL on the same flight: CPU per frame while the car is in the image.
 
 Run with a folder that holds opencv-contrib first on the path (``make bench`` makes it): ours then runs on it too.
 """
@@ -16,16 +16,16 @@ from tests.bench import uav_rivals
 from tests.bench.speed.rows import Limit, Row, Section
 from tests.bench.uav_tracker import Options, make
 
-_RIVALS = ("csrt", "kcf", "mil")
+_OPENCV_TRACKERS = ("csrt", "kcf", "mil")
 _LIMITS = {(640, 480): (10.0, 3.0), (1280, 720): (15.0, 5.0)}
 
 
-def flight(size: tuple[int, int], frames: int, rivals: tuple[str, ...]) -> dict[str, float]:
-    """CPU ms a frame of each tracker over one flight; the car goes round a bend and leaves the picture."""
+def flight(size: tuple[int, int], frames: int, opencv_names: tuple[str, ...]) -> dict[str, float]:
+    """CPU ms a frame of each tracker over one flight; the car takes a bend and leaves the image."""
     world = scenarios.get("exit-bend", 16, size=size, frames=30)
     samples = world.telemetry(30.0, time_offset=0.0)
     trackers: dict[str, Tracker] = {"ground": make("ground", world, True, Options(("ground",)))}
-    trackers |= {name: uav_rivals.Rival(name) for name in rivals}
+    trackers |= {name: uav_rivals.OpenCvTracker(name) for name in opencv_names}
     spent = dict.fromkeys(trackers, 0.0)
     count = dict.fromkeys(trackers, 0)
     arrived = 0
@@ -51,20 +51,20 @@ def flight(size: tuple[int, int], frames: int, rivals: tuple[str, ...]) -> dict[
 
 
 def measure(quick: bool, data: Path) -> Section:
-    """Both sizes, the rivals that this OpenCV has."""
+    """Both sizes, with the OpenCV trackers that are available."""
     del data
     cv2.setNumThreads(1)
-    rivals = tuple(name for name in _RIVALS if uav_rivals.available(name))
+    opencv_names = tuple(name for name in _OPENCV_TRACKERS if uav_rivals.available(name))
     found = Section()
-    for name in _RIVALS:
-        if name not in rivals:
+    for name in _OPENCV_TRACKERS:
+        if name not in opencv_names:
             found.missing.append(f"UAV tracker beside {name.upper()}: needs opencv-contrib (`make bench` fetches it)")
     for size, (must, reach) in _LIMITS.items():
-        ms = flight(size, 60 if quick else 150, rivals)
+        ms = flight(size, 60 if quick else 150, opencv_names)
         limits = {"must": Limit("ours", must), "reach": Limit("ours", reach)}
         work = f"UAV tracker {size[0]}×{size[1]}, a frame"
-        if not rivals:
+        if not opencv_names:
             found.rows.append(Row(work, ms["ground"], "ms", **limits))
-        for number, name in enumerate(rivals):
+        for number, name in enumerate(opencv_names):
             found.rows.append(Row(work, ms["ground"], "ms", name.upper(), ms[name], **(limits if number == 0 else {})))
     return found

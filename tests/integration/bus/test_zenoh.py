@@ -1,0 +1,292 @@
+"""What only the bus over Zenoh can show: floods, outages, killed processes, addresses, panics."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+import zenoh
+
+from protocols.bus.base import AgentEvent, Bus, BusDead, BusStopped, Received
+from protocols.bus.router.zenoh_router import Router, free_endpoint
+from protocols.bus.settings import BusConfig
+from protocols.bus.transport.backfill import RecoveryQuery
+from protocols.bus.transport.inbox import MAX_BYTES, Inbox
+from protocols.bus.transport.zenoh_bus import ZenohSubscription, open_bus
+from protocols.core.errors import InputError
+from protocols.messages import syncline_pb2 as pb
+from protocols.topics import FLIGHT_IMAGE, OBSERVATION
+from tests.support.receiving import collect, matched, sequences
+from tests.support.samples import eventually, observation
+
+
+def test_a_history_that_begins_in_the_middle_is_made_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zenoh 1.10.2 sometimes delivers a late joiner's history from the middle on, and counts no loss."""
+    take = ZenohSubscription._take
+
+    def from_the_middle(self: ZenohSubscription, sample: zenoh.Sample) -> None:
+        if sample.source_info is not None and sample.source_info.source_sn >= 60:
+            take(self, sample)
+
+    monkeypatch.setattr(ZenohSubscription, "_take", from_the_middle)
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        publishers = {camera: sending.publisher(OBSERVATION, camera) for camera in ("cam0", "cam1")}
+        for index in range(100):
+            for camera, publisher in publishers.items():
+                publisher.put(observation(camera, index))
+        subscription = receiving.subscribe(OBSERVATION)
+        received = collect(subscription, 200)
+        for camera, publisher in publishers.items():
+            own = [item for item in received if item.agent == camera]
+            assert sequences(own) == list(range(100))
+            publisher.put(observation(camera, 100))
+        assert sequences(collect(subscription, 2)) == [100, 100]
+
+
+def test_a_gap_that_zenoh_gave_up_is_asked_for_until_the_cache_has_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A connection that breaks ends Zenoh's own question without an answer, and what was missing would be lost."""
+    take, ask = ZenohSubscription._take, ZenohSubscription._ask
+    asked: list[RecoveryQuery[tuple[str, int]]] = []
+
+    def with_a_gap(self: ZenohSubscription, sample: zenoh.Sample) -> None:
+        if sample.source_info is None or not 10 <= sample.source_info.source_sn < 30:
+            take(self, sample)
+
+    def broken_at_first(self: ZenohSubscription, question: RecoveryQuery[tuple[str, int]]) -> None:
+        asked.append(question)
+        if len(asked) == 1:
+            self._backfill.finish(question.source, question.number, served=False)
+        else:
+            ask(self, question)
+
+    monkeypatch.setattr(ZenohSubscription, "_take", with_a_gap)
+    monkeypatch.setattr(ZenohSubscription, "_ask", broken_at_first)
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(OBSERVATION)
+        publisher = matched(sending.publisher(OBSERVATION, "cam0"))
+        for index in range(100):
+            publisher.put(observation("cam0", index))
+        assert sequences(collect(subscription, 100)) == list(range(100))
+        assert len(asked) == 2
+        assert subscription.counters["lost"] == 0
+
+
+def test_keys_that_messages_arrive_under_are_declared_once_and_forgotten() -> None:
+    """Else Zenoh seeks the way of every message anew among all keys."""
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(OBSERVATION)
+        for camera in ("cam0", "cam1"):
+            publisher = matched(sending.publisher(OBSERVATION, camera))
+            for index in range(5):
+                publisher.put(observation(camera, index))
+        collect(subscription, 10)
+        subscription.drain()
+        keys = subscription._keys
+        assert sorted(map(str, keys._declared)) == [OBSERVATION.key_for("local", name) for name in ("cam0", "cam1")]
+        subscription.close()
+        assert keys._declared == []
+
+
+def test_what_cannot_be_recovered_is_counted_exactly() -> None:
+    """A flood far beyond the cache: every message is received, dropped by the queue, or counted as lost."""
+    endpoint, total = free_endpoint(), 20_000
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(OBSERVATION)
+        publisher = matched(sending.publisher(OBSERVATION, "cam0"))
+        for index in range(total):
+            publisher.put(observation("cam0", index))
+        received: list[Received] = []
+
+        def accounted() -> bool:
+            received.extend(subscription.drain())
+            counters = subscription.counters
+            return len(received) + counters["lost"] + counters["dropped"] == total
+
+        assert eventually(accounted), (len(received), subscription.counters)
+        assert sequences(received) == sorted(set(sequences(received)))
+        assert sequences(received)[-1] == total - 1
+
+
+def test_pictures_that_the_link_had_no_room_for_are_counted() -> None:
+    """Of a topic of which the newest counts nothing is fetched again, but what never came is no secret."""
+    endpoint, data = free_endpoint(), b"\xff\xd8" + bytes(400_000) + b"\xff\xd9"
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(FLIGHT_IMAGE)
+        publisher = matched(sending.publisher(FLIGHT_IMAGE, "drone"))
+        image = pb.FlightImage(schema_version=1, agent="drone", boot_id="b", width=640, height=480, jpeg=data)
+        orders: list[int] = []
+
+        def send() -> None:
+            image.frame = image.order = image.order + 1
+            publisher.put(image)
+            orders.extend(item.message.order for item in subscription.drain())  # type: ignore[attr-defined]
+
+        def accounted() -> bool:
+            send()  # until one arrives, nobody can know of those before it
+            counters = subscription.counters
+            return bool(orders) and len(orders) + counters.get("skipped", 0) + counters["dropped"] == orders[-1]
+
+        for _ in range(400):
+            send()
+        assert eventually(accounted), (orders[-10:], len(orders), subscription.counters)
+        assert orders == sorted(set(orders))
+        assert subscription.counters["lost"] == 0
+
+
+def test_a_gap_of_a_topic_that_is_not_recovered_is_counted_once() -> None:
+    with open_bus("local", BusConfig(mode="peer")) as bus:
+        subscription = bus.subscribe(FLIGHT_IMAGE)
+        for number in (5, 6, 9, 8, 10, 10):  # who comes late hears nothing of what was before
+            subscription._count_gap(("session", 1), number)
+        subscription._count_gap(("other", 1), 400)
+        assert subscription.counters["skipped"] == 2
+
+
+def test_a_reader_that_stands_still_holds_so_many_bytes_and_no_more() -> None:
+    inbox = Inbox(OBSERVATION)
+    for index in range(100):
+        inbox.push("syncline/local/camera/cam0/observation", bytes([index]) * 1_000_000)
+    kept = MAX_BYTES // 1_000_000
+    assert inbox.counters["dropped"] == 100 - kept
+    inbox.drain()
+    for index in range(kept):
+        inbox.push("syncline/local/camera/cam0/observation", bytes([index]) * 1_000_000)
+    assert inbox.counters["dropped"] == 100 - kept
+
+
+def test_an_outage_of_the_router_loses_nothing() -> None:
+    """Observations put while the router is down arrive after it is back, in order."""
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    router = Router(endpoint)
+    with open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(OBSERVATION)
+        publisher = matched(sending.publisher(OBSERVATION, "cam0"))
+        for index in range(20):
+            publisher.put(observation("cam0", index))
+        received = collect(subscription, 20)
+        router.close()
+        assert eventually(lambda: not publisher.wait_matched(0.0))
+        for index in range(20, 60):
+            publisher.put(observation("cam0", index))
+        with Router(endpoint):
+            assert matched(publisher)
+            publisher.put(observation("cam0", 60))
+            received += collect(subscription, 41, timeout_s=15.0)
+            assert sequences(received) == list(range(61))
+            assert subscription.counters["lost"] == 0
+
+
+AGENT = """
+import sys, time
+from protocols.bus.settings import BusConfig
+from protocols.bus.transport.zenoh_bus import open_bus
+with open_bus("local", BusConfig(mode="client", connect=(sys.argv[1],)), timeout_s=10.0) as bus:
+    with bus.announce("camera", "cam0", "boot-1"):
+        print("ready", flush=True)
+        sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("end", ["kill -9", "in order"])
+def test_an_agents_end_is_seen_at_once(end: str) -> None:
+    endpoint = free_endpoint()
+    with Router(endpoint), open_bus("local", BusConfig(mode="client", connect=(endpoint,))) as bus:
+        watch = bus.watch_agents()
+        events: list[AgentEvent] = []
+        agent = subprocess.Popen(
+            [sys.executable, "-c", AGENT, endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        try:
+            assert agent.stdout is not None
+            assert agent.stdin is not None
+            assert agent.stdout.readline() == "ready\n"
+            assert eventually(lambda: bool(events.extend(watch.drain()) or events))
+            assert events == [AgentEvent("camera", "cam0", "boot-1", True)]
+            began = time.monotonic()
+            if end == "kill -9":
+                agent.send_signal(signal.SIGKILL)
+            else:
+                agent.stdin.close()
+            assert eventually(lambda: bool(events.extend(watch.drain()) or len(events) == 2))
+            assert time.monotonic() - began < 1.5
+            assert events[1] == AgentEvent("camera", "cam0", "boot-1", False)
+            assert agent.wait(10.0) == (-signal.SIGKILL if end == "kill -9" else 0)
+        finally:
+            agent.kill()
+            agent.wait()
+            for pipe in (agent.stdin, agent.stdout):
+                assert pipe is not None
+                pipe.close()
+
+
+def test_a_client_waits_for_its_router() -> None:
+    endpoint = free_endpoint()
+    opened: list[Bus] = []
+    config = BusConfig(mode="client", connect=(endpoint,))
+    opening = threading.Thread(target=lambda: opened.append(open_bus("local", config, timeout_s=20.0)))
+    opening.start()
+    opening.join(0.3)
+    assert opening.is_alive(), "there is no router yet"
+    with Router(endpoint):
+        opening.join(10.0)
+        assert len(opened) == 1
+        opened[0].close()
+
+
+def test_a_client_without_a_router_gives_up_when_told_to() -> None:
+    config = BusConfig(mode="client", connect=(free_endpoint(),))
+    with pytest.raises(InputError, match=r"no router answers at tcp/127.0.0.1:[0-9]+ .*; start one there") as error:
+        open_bus("local", config, timeout_s=0.2)
+    assert "\n" not in str(error.value)
+    asked: list[None] = []
+
+    def stop() -> bool:
+        asked.append(None)
+        return len(asked) > 2
+
+    with pytest.raises(BusStopped):
+        open_bus("local", config, stop=stop)
+
+
+def test_an_address_that_is_taken_is_told_in_one_line() -> None:
+    endpoint = free_endpoint()
+    with (
+        Router(endpoint),
+        pytest.raises(InputError, match=r"Address already in use.*; check connect = ") as error,
+    ):
+        Router(endpoint)
+    assert "\n" not in str(error.value)
+    assert ".rs:" not in str(error.value)
+
+
+def test_a_panic_in_the_transport_is_fatal_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zenoh's panics are no Exception, so a plain ``except Exception`` would let them through."""
+    panic = type("PanicException", (BaseException,), {})
+
+    class Panicking:
+        def put(self, payload: bytes) -> None:
+            raise panic("called `Option::unwrap()` on a `None` value")
+
+        def undeclare(self) -> None:
+            raise panic("again")
+
+    endpoint = free_endpoint()
+    with Router(endpoint), open_bus("local", BusConfig(mode="client", connect=(endpoint,))) as bus:
+        publisher = bus.publisher(OBSERVATION, "cam0")
+        monkeypatch.setattr(publisher, "_publisher", Panicking())
+        with pytest.raises(BusDead, match="the transport panicked"):
+            publisher.put(observation("cam0"))
+        publisher.close()

@@ -1,0 +1,60 @@
+"""The demo's processes over real Zenoh: cameras, hub and recorder, ending with a comparison with the ground truth."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from deploy.cli import run
+from deploy.logs.info import describe_log
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, object]]:
+    """The demo's folder and its printed table, three cameras for 12 s."""
+    out = tmp_path_factory.mktemp("demo") / "demo-out"
+    arguments = ["demo", "--seconds", "12", "--cameras", "3", "--json", "--out", str(out)]
+    ended = subprocess.run([sys.executable, "-m", "deploy", *arguments], capture_output=True, text=True, timeout=180)
+    assert ended.returncode == 0, ended.stderr + ended.stdout
+    return out, json.loads(ended.stdout)
+
+
+def test_the_demo_recovers_clock_offsets_and_poses(demo: tuple[Path, dict[str, object]]) -> None:
+    _, table = demo
+    cameras = table["cameras"]
+    assert isinstance(cameras, list)
+    assert [camera["camera"] for camera in cameras] == ["cam0", "cam1", "cam2"]
+    for camera in cameras[1:]:
+        assert abs(camera["true_offset"]) > 1.0, "nothing to find"
+        assert abs(camera["offset_error_ms"]) < 1.0
+        assert camera["rotation_error_deg"] < 0.3
+        assert camera["direction_error_deg"] < 0.5
+
+
+def test_its_log_is_complete_and_gives_the_same_calibration(
+    demo: tuple[Path, dict[str, object]], tmp_path: Path
+) -> None:
+    out, _ = demo
+    description = describe_log(out / "demo.mcap")
+    assert not description.damage
+    assert {camera.camera for camera in description.cameras} == {"cam0", "cam1", "cam2"}
+    assert all(camera.missing == 0 for camera in description.cameras)
+    topics = {topic.topic for topic in description.topics}
+    assert {"observation", "camera_info", "calibration", "track", "status"} <= topics
+    for name in ("one", "two"):
+        assert run(["calibrate", str(out / "demo.mcap"), "--out", str(tmp_path / name)]) == 0
+    first = (tmp_path / "one" / "calibration.toml").read_bytes()
+    assert first == (tmp_path / "two" / "calibration.toml").read_bytes()
+    live, again = tomllib.loads((out / "calibration.toml").read_text()), tomllib.loads(first.decode())
+    for name in ("cam1", "cam2"):
+        # Both speak of the same clocks: compare where they film, not at the epoch of the clock.
+        rows = (tmp_path / "one" / "trajectory.csv").read_text().splitlines()[1:]
+        middle = float(rows[len(rows) // 2].split(",")[0])
+        own = (middle - live[name]["time_offset"]) / live[name]["clock_rate"]
+        mapped = again[name]["clock_rate"] * own + again[name]["time_offset"]
+        assert abs(mapped - middle) < 2.0 * live[name]["time_offset_std"]

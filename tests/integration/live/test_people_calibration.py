@@ -1,0 +1,126 @@
+"""A newcomer's walk: the commands of the READMEs, run as they are written, and every option they name."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from deploy.cli import COMMANDS, build_app
+from protocols.session.calibration import read_calibration
+
+ROOT = Path(__file__).parents[3]
+READMES = ("README.md", "deploy/README.md", "hub/README.md", "edge/README.md", "protocols/README.md", "hub/FAQ.md")
+NAMES = {name for name, _, _ in COMMANDS}
+_SPAN = re.compile(r"`(syncline [^`]+)`")
+
+
+def command_lines(text: str) -> list[str]:
+    """Every `syncline …` of a README: prompts in blocks and spans in sentences, without comments."""
+    found = []
+    for line in text.splitlines():
+        prompt = re.match(r"\$ (syncline .*)", line.strip())
+        found += [prompt[1]] if prompt else _SPAN.findall(line)
+    return [re.split(r"\s+#|\s+&&?\s*$|\s+>|\s+\|", line)[0].strip() for line in found]
+
+
+@cache
+def help_of(name: str) -> str:
+    """What `syncline NAME --help` prints."""
+    result = subprocess.run(
+        [sys.executable, "-m", "deploy", name, "--help"], capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    return result.stdout
+
+
+def in_readmes() -> list[tuple[str, str]]:
+    return [(file, line) for file in READMES for line in command_lines((ROOT / file).read_text(encoding="utf-8"))]
+
+
+def test_the_readmes_name_commands() -> None:
+    assert len(in_readmes()) > 20
+
+
+def test_every_command_and_option_in_the_readmes_exists() -> None:
+    wrong = []
+    for file, line in in_readmes():
+        words = [word for word in line.split()[1:] if word not in ("…", "...")]
+        if not words or words[0].startswith(("-", "<")) or words[0] in ("X", "COMMAND"):
+            continue
+        name = words[0].rstrip(".,;:")
+        if name not in NAMES:
+            wrong.append(f"{file}: no command in {line!r}")
+            continue
+        text = help_of(name)
+        for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", " ".join(words[1:])):
+            # A command with commands of its own lists its options one level down.
+            if not re.search(rf"{option}(?![\w-])", text) and option != "--help" and "COMMAND" not in text:
+                wrong.append(f"{file}: {name} has no {option} ({line!r})")
+    assert wrong == []
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_every_command_shows_an_example_that_its_own_options_allow(name: str) -> None:
+    text = " ".join(help_of(name).split())
+    end = "(?= Example:| [╭┌]| Arguments| Parameters|$)"
+    examples = re.findall(rf"Example: (?:sudo )?(syncline {name}\b.*?){end}", text)
+    assert examples, "its help shows an example"
+    for example in examples:
+        for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", example):
+            assert re.search(rf"{option}(?![\w-])", text.replace(example, "")) or "Commands" in text, option
+
+
+def run_as_written(line: str, folder: Path) -> str:
+    """Run one command line in a folder, with `syncline` as the environment has it; it must succeed."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    result = subprocess.run(
+        ["/bin/sh", "-c", line],
+        cwd=folder,
+        env={**os.environ, "PATH": path},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert result.returncode == 0, f"{line}: {result.stderr}"
+    return result.stdout
+
+
+def line_with(text: str, *words: str) -> str:
+    """The README's command that holds all of these words."""
+    (line,) = sorted({line for line in command_lines(text) if all(word in line for word in words)}, key=len)[:1]
+    return line
+
+
+def test_from_the_readme_to_a_session_a_calibration_a_report_and_other_tools(tmp_path: Path) -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    run_as_written(line_with(text, "simulate marker", "my-session"), tmp_path)
+    assert (tmp_path / "my-session" / "rig.toml").exists()
+    printed = run_as_written(line_with(text, "calibrate my-session"), tmp_path)
+    assert "3 cameras" in printed
+    _, cameras = read_calibration(tmp_path / "out" / "calibration.toml")
+    assert len(cameras) == 3
+    assert "Good: all 3 cameras calibrated" in run_as_written("syncline report out", tmp_path)
+    example = " ".join(help_of("export").split())
+    line = re.search(r"Example: (syncline export out/trajectory\.csv \S+ \S+ \S+ \S+)", example)
+    assert line is not None
+    run_as_written(line[1], tmp_path)
+    written = tmp_path / shlex.split(line[1])[-1]
+    assert len(written.read_text(encoding="utf-8").splitlines()) > 100
+    run_as_written("syncline export out/calibration.toml --to opencv --out for-opencv", tmp_path)
+    assert len(list((tmp_path / "for-opencv").iterdir())) == 3
+
+
+def test_the_overview_lists_every_command() -> None:
+    app = build_app()
+    result = subprocess.run(
+        [sys.executable, "-m", "deploy", "--help"], capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    assert all(re.search(rf"^[│ ]*{name}\b", result.stdout, re.MULTILINE) for name in NAMES)
+    assert app is not None

@@ -1,0 +1,138 @@
+"""Tracking of people by the hub: from a log with a given calibration, and live over Zenoh."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+
+from deploy.cli import run
+from deploy.demo.people import score_log
+from deploy.simulation.session import camera_tables
+from edge import scenes
+from hub.live.agent import run_hub
+from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
+from protocols.bus.router.zenoh_router import Router, free_endpoint
+from protocols.bus.settings import BusConfig
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.core.clocks import NANOSECONDS
+from protocols.log.read.reader import LogReader
+from protocols.log.write.writer import LogWriter
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.calibration import read_calibration
+from protocols.topics import CAMERA_INFO, OBSERVATION, PREDICTION, TRACK
+from tests.support.people_traffic import Traffic, film
+from tests.support.samples import eventually
+
+SCENE = scenes.get_people_scene(21, 4, 3)
+
+
+@pytest.fixture(scope="module")
+def traffic() -> Traffic:
+    """Eight seconds."""
+    return film(SCENE, 8.0, 21)
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene's own calibration, z up."""
+    _, tables = camera_tables(SCENE, "people")
+    tables["metadata"]["up"] = [0.0, 0.0, 1.0]
+    file = tmp_path_factory.mktemp("known") / "known.toml"
+    file.write_text(tomli_w.dumps(tables), encoding="utf-8")
+    return file
+
+
+@pytest.fixture(scope="module")
+def log(traffic: Traffic, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The messages of the cameras, as written by a recorder."""
+    file = tmp_path_factory.mktemp("log") / "people.mcap"
+    with LogWriter(file, {}) as writer:
+        for info in traffic.infos:
+            writer.write(CAMERA_INFO, info.camera, "yard", info, 0)
+        for arrival, message in traffic.arrivals:
+            writer.write(OBSERVATION, message.camera, "yard", message, round(arrival * NANOSECONDS))
+    return file
+
+
+def test_a_replayed_log_tracks_everybody_with_equal_bytes(log: Path, known: Path, tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        arguments = ["replay", str(log), "--through", "hub", "--calibration", str(known)]
+        assert run([*arguments, "--out", str(tmp_path / f"{name}.mcap")]) == 0
+    messages = [
+        [
+            (m.topic.name, m.log_time_ns, m.message.SerializeToString(deterministic=True))
+            for m in LogReader(f).messages()
+        ]
+        for f in (tmp_path / "one.mcap", tmp_path / "two.mcap")
+    ]
+    assert messages[0] == messages[1]
+    both = tmp_path / "both.mcap"
+    with LogWriter(both, {}) as writer:
+        for file in (log, tmp_path / "one.mcap"):
+            for logged in LogReader(file).messages():
+                writer.write(logged.topic, logged.agent, "yard", logged.message, logged.log_time_ns)
+    comparison, rows = score_log(both, SCENE)
+    assert comparison.on_floor.mota > 0.85, "confirmation takes 0.4 s of eight"
+    assert comparison.on_floor.switches == 0
+    assert comparison.on_floor.error < 0.10
+    assert comparison.on_floor.truths - comparison.begun.truths == 50 * comparison.people, "5 s, ten times a second"
+    assert comparison.begun.mota > comparison.on_floor.mota
+    assert len(rows) > 100
+    heads = [m.message for m in LogReader(tmp_path / "one.mcap").messages([PREDICTION])]
+    assert any(target.face for message in heads for camera in message.cameras for target in camera.targets)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("through", [[], ["--through", "uav"]])
+def test_a_calibration_is_for_the_hub_only(
+    log: Path, known: Path, tmp_path: Path, through: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", str(tmp_path / "x.mcap")] if through else []
+    assert run(["replay", str(log), *through, *out, "--calibration", str(known)]) == 2
+    assert "--calibration goes with --through hub" in capsys.readouterr().err
+
+
+def test_tracks_and_predictions_come_over_the_bus(traffic: Traffic, known: Path) -> None:
+    """Observations in over a real router; tracks and predictions out."""
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    stop = threading.Event()
+    hub = LiveHub(LiveSettings(), known=KnownCalibration(*read_calibration(known)))
+    with Router(endpoint), open_bus("yard", config) as bus, open_bus("yard", config) as cameras:
+        thread = threading.Thread(target=run_hub, args=(hub, bus, "hub", stop))
+        tracks, predictions = cameras.subscribe(TRACK), cameras.subscribe(PREDICTION)
+        publishers = {c.name: cameras.publisher(OBSERVATION, c.name) for c in SCENE.cameras}
+        thread.start()
+        try:
+            for publisher in publishers.values():
+                assert publisher.wait_matched(20.0)
+            for number, message in enumerate(traffic.messages()):
+                publishers[message.camera].put(message)
+                if number % 20 == 0:
+                    stop.wait(0.05)
+            received_tracks: list[pb.Track] = []
+
+            def all_received() -> bool:
+                received_tracks.extend(r.message for r in tracks.drain() if isinstance(r.message, pb.Track))
+                return hub.tracking is not None and hub.tracking.counters["track.frames"] >= 0.9 * len(traffic.arrivals)
+
+            assert eventually(all_received, 60.0)
+            assert eventually(lambda: all_received() and len({t.label for t in received_tracks}) >= 3, 20.0)
+            last = predictions.drain()[-1].message
+        finally:
+            stop.set()
+            thread.join(30.0)
+            for publisher in publishers.values():
+                publisher.close()
+            tracks.close()
+            predictions.close()
+    assert {t.state for t in received_tracks} <= {"confirmed", "coasting", "lost"}
+    assert all(t.kind == "person" for t in received_tracks)
+    newest = max(received_tracks, key=lambda t: t.reference_time_ns)
+    truth = SCENE.centres(np.array([traffic.true_time_ns(newest.reference_time_ns)]))[0]
+    assert np.linalg.norm(truth[:, :2] - np.array(newest.position)[:2], axis=1).min() < 0.3
+    assert isinstance(last, pb.Prediction)
+    assert {camera.camera for camera in last.cameras} == {c.name for c in SCENE.cameras}

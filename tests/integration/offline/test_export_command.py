@@ -1,0 +1,89 @@
+"""`syncline export`: read back by OpenCV, and parsed by hand where no reader is available."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tomli_w
+
+from deploy.cli import run
+from protocols.geometry import so3
+
+
+@pytest.fixture
+def calibration(tmp_path: Path) -> tuple[Path, dict[str, Any]]:
+    camera = {
+        "name": "cam0",
+        "size": [640, 480],
+        "matrix": [[500.0, 0.0, 320.25], [0.0, 510.0, 240.5], [0.0, 0.0, 1.0]],
+        "distortions": [0.1, -0.05, 0.001, 0.002, 0.01],
+        "rotation": [0.3, -1.2, 2.1],
+        "translation": [1.0, -2.0, 3.0],
+        "time_offset": -12.5,
+        "clock_rate": 1.00001,
+    }
+    wide = {**camera, "name": "cam1", "fisheye": True, "distortions": [0.1, 0.0, 0.0, 0.01]}
+    file = tmp_path / "calibration.toml"
+    file.write_text(tomli_w.dumps({"cam0": camera, "cam1": wide, "metadata": {"units": "cm"}}))
+    return file, tomllib.loads(file.read_text())
+
+
+def test_opencv_reads_its_yaml(tmp_path: Path, calibration: tuple[Path, dict[str, Any]]) -> None:
+    file, tables = calibration
+    assert run(["export", str(file), "--to", "opencv", "--out", str(tmp_path / "out")]) == 0
+    storage = cv2.FileStorage(str(tmp_path / "out" / "cam0.yml"), cv2.FileStorage_READ)
+    np.testing.assert_array_equal(storage.getNode("camera_matrix").mat(), tables["cam0"]["matrix"])
+    np.testing.assert_array_equal(
+        storage.getNode("distortion_coefficients").mat().ravel(), tables["cam0"]["distortions"]
+    )
+    rotation, _ = cv2.Rodrigues(np.array(tables["cam0"]["rotation"]))
+    np.testing.assert_allclose(storage.getNode("R").mat(), rotation, atol=1e-12)
+    np.testing.assert_allclose(storage.getNode("T").mat().ravel(), tables["cam0"]["translation"], atol=1e-12)
+    assert storage.getNode("time_offset").real() == -12.5
+    assert storage.getNode("units").string() == "cm"
+
+
+def test_colmap_gets_its_models_pixels_and_quaternions(
+    tmp_path: Path, calibration: tuple[Path, dict[str, Any]]
+) -> None:
+    file, tables = calibration
+    assert run(["export", str(file), "--to", "colmap", "--out", str(tmp_path / "out")]) == 0
+    cameras = [line.split() for line in (tmp_path / "out" / "cameras.txt").read_text().splitlines()[1:]]
+    assert [words[1] for words in cameras] == ["FULL_OPENCV", "OPENCV_FISHEYE"]
+    assert [float(word) for word in cameras[0][4:8]] == [500.0, 510.0, 320.75, 241.0]
+    image = (tmp_path / "out" / "images.txt").read_text().splitlines()[1].split()
+    w, *xyz = (float(word) for word in image[1:5])
+    angle = 2 * np.arctan2(np.linalg.norm(xyz), w)
+    turn = np.array(xyz) / np.linalg.norm(xyz) * angle
+    np.testing.assert_allclose(so3.exp(turn), so3.exp(np.array(tables["cam0"]["rotation"])), atol=1e-12)
+    np.testing.assert_allclose([float(word) for word in image[5:8]], tables["cam0"]["translation"], atol=1e-12)
+
+
+def test_a_trajectory_becomes_trc_with_empty_gaps(tmp_path: Path) -> None:
+    csv = tmp_path / "track.csv"
+    rows = ["7.00,1,2,3,0.1,nose", "7.02,4,5,6,0.1,nose", "7.06,7,8,9,0.1,nose", "7.02,100,0,0,0.1,tail"]
+    csv.write_text("\n".join(["time,x,y,z,std,label", *rows]) + "\n")
+    out = tmp_path / "path.trc"
+    assert run(["export", str(csv), "--to", "trc", "--out", str(out), "--units", "cm"]) == 0
+    lines = [line.split("\t") for line in out.read_text().splitlines()]
+    assert lines[0] == ["PathFileType", "4", "(X/Y/Z)", "path.trc"]
+    assert lines[2][2:5] == ["4", "2", "m"]
+    assert float(lines[2][0]) == pytest.approx(50)
+    assert lines[3][2::3] == ["nose", "tail"]
+    table = lines[6:]
+    assert [row[0] for row in table] == ["1", "2", "3", "4"]
+    assert [float(row[1]) for row in table] == pytest.approx([0, 0.02, 0.04, 0.06])
+    assert table[1][2:] == ["0.04", "0.05", "0.06", "1", "0", "0"]
+    assert table[2][2:] == [""] * 6
+
+
+def test_a_file_of_another_kind_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.csv").write_text("time,x\n1,2\n")
+    assert run(["export", str(tmp_path / "a.csv"), "--to", "trc", "--out", str(tmp_path / "b.trc")]) == 2
+    assert "a.csv:1: column y, z is missing" in capsys.readouterr().err
+    assert not (tmp_path / "b.trc").exists()

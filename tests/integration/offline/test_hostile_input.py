@@ -1,0 +1,195 @@
+"""What users did to it: broken clocks, contradicting surveys, full disks, odd names; each once went wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deploy.cli import run
+from hub.calibration.pipeline import calibrate
+from protocols.core.errors import InputError
+from protocols.core.files import write_together
+from protocols.session.folder import write_observations
+from protocols.session.observations import Observations
+from tests.support.rigs import Session, simulate
+
+
+@pytest.fixture(scope="module")
+def filmed() -> Session:
+    return simulate(91, 3, 20)
+
+
+def write_session(folder: Path, session: Session, metadata: str = "", observations: Observations | None = None) -> Path:
+    folder.mkdir()
+    tables = [f"[metadata]\n{metadata}\n"]
+    for name, camera in session.rig.cameras.items():
+        lens = camera.intrinsics
+        assert lens is not None
+        tables.append(
+            f'[{name}]\nname = "{name}"\nsize = [{lens.width}, {lens.height}]\nfps = {camera.fps}\n'
+            f"matrix = {lens.matrix.tolist()}\ndistortions = {lens.distortions.tolist()}\n"
+        )
+    (folder / "rig.toml").write_text("\n".join(tables))
+    write_observations(folder / "observations.csv", observations or session.observations())
+    return folder
+
+
+def test_a_clock_that_is_set_while_recording_costs_its_shorter_side(filmed: Session) -> None:
+    """From uptime to Unix time in the middle of a recording: once asked for 253 GiB of memory."""
+    seen = filmed.observations()
+    tracks = dict(seen.tracks)
+    track = tracks["cam1", "marker"]
+    late = track.time > track.time[0] + 12.0
+    tracks["cam1", "marker"] = type(track)(
+        track.camera, track.label, track.frame, track.time + np.where(late, 1.7e9, 0.0), track.pixels, track.size
+    )
+    found = calibrate(filmed.rig, Observations(tracks))
+    assert any("cam1" in text and "clock step" in text for text in found.warnings)
+    for name, camera in found.cameras.items():
+        if name != "cam1":
+            assert abs(filmed.clock_error(name, found.reference, camera.time_map)) < 1e-3
+    # The middle of the span that was used, not of the one that jumps.
+    middle = float(np.median(track.time[~late]))
+    shown = found.cameras["cam1"].time_map
+    reference = shown.clock_rate * middle + shown.time_offset
+    assert filmed.true_time("cam1", middle) == pytest.approx(filmed.true_time(found.reference, reference), abs=1e-3)
+
+
+def test_contradicting_distances_are_refused(
+    filmed: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    metadata = 'distances = [["cam0", "cam1", 1.0], ["cam0", "cam2", 1000.0]]'
+    folder = write_session(tmp_path / "session", filmed, metadata)
+    assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 3
+    assert "contradict" in capsys.readouterr().err
+
+
+def test_an_answer_with_distances_is_plain_toml_in_the_rigs_units(filmed: Session, tmp_path: Path) -> None:
+    apart = float(np.linalg.norm(filmed.poses["cam0"].position - filmed.poses["cam1"].position))
+    metadata = f'units = "cm"\ndistances = [["cam0", "cam1", {100 * apart}]]'
+    folder = write_session(tmp_path / "session", filmed, metadata)
+    assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 0
+    found = tomllib.loads((tmp_path / "out" / "calibration.toml").read_text())
+    assert "distances" not in found["metadata"]
+    assert (found["metadata"]["units"], found["metadata"]["scale"]) == ("cm", "metric")
+    assert np.linalg.norm(found["cam1"]["translation"]) == pytest.approx(100 * apart, rel=1e-3)
+
+
+def test_known_poses_keep_their_own_scale_and_units(filmed: Session, tmp_path: Path) -> None:
+    folder = write_session(tmp_path / "session", filmed)
+    assert run(["calibrate", str(folder), "--out", str(tmp_path / "first")]) == 0
+    known = tmp_path / "first" / "calibration.toml"
+    assert run(["calibrate", str(folder), "--from-known", str(known), "--out", str(tmp_path / "again")]) == 0
+    assert tomllib.loads((tmp_path / "again" / "calibration.toml").read_text())["metadata"]["scale"] == "arbitrary"
+
+
+def test_an_earlier_answer_as_rig_brings_no_old_refusals(filmed: Session, tmp_path: Path) -> None:
+    folder = write_session(tmp_path / "session", filmed, 'refused = { cam7 = "long ago" }\nscale = "metric"')
+    assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 0
+    metadata = tomllib.loads((tmp_path / "out" / "calibration.toml").read_text())["metadata"]
+    assert "refused" not in metadata
+    assert metadata["scale"] == "arbitrary"
+
+
+@pytest.mark.parametrize("reference", ['"camX"', "7", '["cam0"]'])
+def test_a_reference_that_is_no_camera_is_bad_input(filmed: Session, tmp_path: Path, reference: str) -> None:
+    folder = write_session(tmp_path / "session", filmed, f"reference = {reference}")
+    assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 2
+
+
+def test_brackets_in_a_path_are_no_markup(filmed: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_session(tmp_path / "session", filmed)
+    assert run(["calibrate", str(folder), "--out", str(tmp_path / "o[bold]")]) == 0
+    shown = capsys.readouterr().out
+    assert "o[bold]" in shown
+    assert "[ms]" in shown
+
+
+def test_one_file_that_cannot_be_written_leaves_none(tmp_path: Path) -> None:
+    (tmp_path / "second").mkdir()
+    with pytest.raises(InputError, match="second"):
+        write_together({tmp_path / "first": "1", tmp_path / "second": "2", tmp_path / "third": "3"})
+    assert [path.name for path in tmp_path.iterdir()] == ["second"]
+
+
+@pytest.mark.parametrize("out", ["file", "file/below", "x" * 300])
+def test_an_output_folder_that_cannot_be_is_told_before_the_work(
+    filmed: Session, tmp_path: Path, out: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_session(tmp_path / "session", filmed)
+    (tmp_path / "file").write_text("")
+    assert run(["calibrate", str(folder), "--out", str(tmp_path / out)]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "rig",
+    ["size = [1" + "0" * 400 + ", 480]", "a = " + "[" * 5000, "fps = 1" + "0" * 5000, "position = [1e300, 0, 0]"],
+)
+def test_toml_beyond_all_measure_is_bad_input(tmp_path: Path, rig: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rig.toml").write_text(f"[cam0]\nsize = [640, 480]\n{rig}\n".replace("size = [640, 480]\nsize", "size"))
+    (tmp_path / "observations.csv").write_text("camera,frame,time,u,v\ncam0,0,0,1,1\n")
+    assert run(["calibrate", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("row", ["cam0,0,1e300,1,1", "cam0,0,1e12,1,1", "cam0,0,0,1e9,1"])
+def test_a_time_or_pixel_beyond_all_measure_is_bad_input(tmp_path: Path, row: str) -> None:
+    (tmp_path / "rig.toml").write_text("[cam0]\nsize = [640, 480]\n")
+    (tmp_path / "observations.csv").write_text(f"camera,frame,time,u,v\n{row}\n")
+    assert run(["calibrate", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+
+
+def test_swapped_coordinates_are_warned_of(filmed: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    seen = filmed.observations()
+    tracks = {
+        key: type(t)(t.camera, t.label, t.frame, t.time, t.pixels[:, ::-1] * [1.0, 1.0], t.size)
+        for key, t in seen.tracks.items()
+    }
+    folder = write_session(tmp_path / "session", filmed, observations=Observations(tracks))
+    run(["calibrate", str(folder), "--out", str(tmp_path / "out")])
+    document = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert any("outside its" in text for text in document["warnings"])
+
+
+def test_the_demo_takes_its_agents_along_when_it_is_ended(tmp_path: Path) -> None:
+    out = tmp_path / "demo-out"
+    demo = subprocess.Popen(
+        [sys.executable, "-m", "deploy", "demo", "--seconds", "60", "--out", str(out)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ},
+    )
+    try:
+        deadline = time.monotonic() + 60.0
+        while len(agents_of(out)) < 5 and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert len(agents_of(out)) == 5
+        demo.send_signal(signal.SIGTERM)
+        demo.wait(30.0)
+        assert agents_of(out) == []
+    finally:
+        demo.kill()
+
+
+def agents_of(out: Path) -> list[str]:
+    """Command lines of processes that were given a configuration in ``out``."""
+    found = []
+    for process in Path("/proc").iterdir():
+        if process.name.isdecimal():
+            try:
+                line = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+            except OSError:
+                continue
+            if f"{out}/config/" in line:
+                found.append(line)
+    return found

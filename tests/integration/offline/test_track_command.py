@@ -1,0 +1,193 @@
+"""`syncline track` as a command: outputs, their format, overlay, scores, and one line on bad input."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from deploy.cli import run
+
+SIZE = (320, 240)
+FRAMES = 45
+TARGET = "92,118,36,16"
+
+
+def render_frame(
+    i: int, background: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]
+) -> tuple[np.ndarray, tuple[float, float]]:
+    """Frame i of a car that moves 6 px a frame to the right and out of view; and its centre."""
+    image = background.copy()
+    x = 92 + 6 * i
+    image[118:134, x : x + 36] = (40, 40, 210)
+    image[120:132, x + 22 : x + 27] = (40, 30, 30)
+    noise = np.random.default_rng(i).integers(0, 5, (SIZE[1], SIZE[0], 3), np.uint8)
+    return image[:240, :320] + noise, (x + 17.5, 125.5)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder: pictures/000.png …, film.mp4, truth.csv, rig.toml, telemetry.csv."""
+    folder = tmp_path_factory.mktemp("film")
+    (folder / "pictures").mkdir()
+    rng = np.random.default_rng(3)
+    background = cv2.GaussianBlur(rng.uniform(0, 250, (240, 800, 3)).astype(np.float32), (0, 0), 2.0) * 2.0 - 125.0
+    background[100:150] = background[100:150] * 0.2 + 80.0
+    flat = np.clip(background, 0, 240).astype(np.uint8)
+    writer = cv2.VideoWriter(str(folder / "film.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 25.0, SIZE)
+    truth = ["frame,x,y,width,height,inside"]
+    for i in range(FRAMES):
+        image, (x, y) = render_frame(i, flat)
+        cv2.imwrite(str(folder / "pictures" / f"{i:03d}.png"), image)
+        writer.write(image)
+        truth.append(f"{i},{x},{y},36,16,{min(max((320 - (x - 18)) / 36, 0), 1)}")
+    writer.release()
+    (folder / "truth.csv").write_text("\n".join(truth) + "\n")
+    (folder / "rig.toml").write_text(
+        "[drone]\nname = 'drone'\nsize = [320, 240]\nfps = 20.0\n"
+        "matrix = [[300, 0, 159.5], [0, 300, 119.5], [0, 0, 1]]\n"
+        "body_from_camera = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]\n"
+    )
+    rows = ["time,qw,qx,qy,qz,north,east,down"] + [f"{k / 10},1,0,0,0,0,0,-30" for k in range(60)]
+    rows[20] = "nan,1,0,0,0,0,0,-30"
+    (folder / "telemetry.csv").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def table(file: Path) -> list[dict[str, str]]:
+    with file.open() as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_a_folder_of_images_is_tracked_until_out_of_view(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["track", str(recording / "pictures"), "--target", TARGET, "--out", str(tmp_path), "--json"]
+    assert run([*arguments, "--csv-truth", str(recording / "truth.csv")]) == 0
+    output = json.loads(capsys.readouterr().out)
+    header = (tmp_path / "track.csv").read_text().splitlines()[0]
+    assert header == "frame,time,state,x,y,width,height,heading,std"
+    rows = table(tmp_path / "track.csv")
+    assert [int(row["frame"]) for row in rows] == list(range(FRAMES))
+    assert float(rows[30]["time"]) == pytest.approx(1.0)
+    assert rows[20]["state"] == "visible"
+    assert rows[-1]["state"] == "coasting"
+    assert float(rows[-1]["x"]) == pytest.approx(92 + 6 * 44 + 17.5, abs=18)
+    assert float(rows[-1]["x"]) > 320
+    assert len(rows[10]["x"].replace(".", "")) >= 16
+    assert (tmp_path / "hypotheses.csv").read_text().splitlines()[0] == "frame,rank,weight,x,y"
+    assert output["frames"] == FRAMES
+    assert output["visible"] + output["coasting"] + output["lost"] == FRAMES
+    assert output["scores"]["visible_while_out"] == 0.0
+    assert output["scores"]["in_frame_20px"] == 1.0
+    assert output["scores"]["out_one_length"] == 1.0
+
+
+def test_telemetry_adds_ground_columns_and_start_selects_the_frame(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    extra = ["--rig", str(recording / "rig.toml"), "--telemetry", str(recording / "telemetry.csv"), "--start", "5"]
+    place = ["--target", "122,118,36,16", "--out", str(tmp_path)]
+    assert run(["track", str(recording / "pictures"), *place, *extra]) == 0
+    assert "1 rows hold no sample" in capsys.readouterr().out
+    rows = table(tmp_path / "track.csv")
+    assert list(rows[0])[-5:] == ["north", "east", "speed", "course", "std_m"]
+    assert int(rows[0]["frame"]) == 5
+    assert float(rows[0]["time"]) == pytest.approx(0.25)  # 20 fps, as rig.toml says
+    assert float(rows[20]["speed"]) == pytest.approx(12.0, abs=1.0)
+    assert float(rows[20]["course"]) == pytest.approx(np.pi / 2, abs=0.1)
+
+
+def test_a_video_file_gives_its_own_times_and_a_larger_overlay(recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert run(["track", str(recording / "film.mp4"), "--target", TARGET, "--out", str(out), "--overlay"]) == 0
+    rows = table(out / "track.csv")
+    assert float(rows[25]["time"]) == pytest.approx(1.0, abs=1e-3)
+    overlay = cv2.VideoCapture(str(out / "overlay.mp4"))
+    good, image = overlay.read()
+    assert good
+    assert image.shape[0] > 240
+    assert image.shape[1] > 320
+    assert overlay.get(cv2.CAP_PROP_FRAME_COUNT) == FRAMES
+    assert sorted(path.name for path in out.iterdir()) == ["hypotheses.csv", "overlay.mp4", "track.csv"]
+
+
+def test_the_same_seed_writes_the_same_bytes(recording: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        assert run(["track", str(recording / "pictures"), "--target", TARGET, "--out", str(tmp_path / name)]) == 0
+    for file in ("track.csv", "hypotheses.csv"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--target", "500,20,30,20"], "outside the image"),
+        (["--target", "50,20,2,2"], "too small"),
+        (["--target", "50,20,30"], "four"),
+        (["--target", "a,b,c,d"], "four numbers"),
+        (["--target", "50,20,-30,20"], "width or height"),
+        (["--target", TARGET, "--start", "900"], "before --start 900"),
+        (["--target", TARGET, "--start=-1"], "negative"),
+        (["--target", TARGET, "--fps", "0"], "out of range"),
+        (["--target", TARGET, "--telemetry", "telemetry.csv"], "body_from_camera"),
+        (["--target", TARGET, "--rig", "rig.toml", "--telemetry", "other_clock.csv"], "video's clock"),
+        (["--target", TARGET, "--rig", "rig.toml", "--telemetry", "all_nan.csv"], "no usable row"),
+        (["--target", TARGET, "--rig", "rig.toml", "--telemetry", "headless.csv"], "column"),
+        (["--target", TARGET, "--rig", "rig.toml", "--telemetry", "words.csv"], "words.csv:2"),
+        (["--target", TARGET, "--rig", "rig.toml", "--telemetry", "flight.tlog"], "tlog"),
+        (["--target", TARGET, "--rig", "rig.toml", "--telemetry", "missing.csv"], "does not exist"),
+        (["--target", TARGET, "--csv-truth", "headless.csv"], "column"),
+    ],
+)
+def test_bad_input_gives_one_line_and_exit_status_2(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    header = "time,qw,qx,qy,qz\n"
+    (recording / "other_clock.csv").write_text(header + "".join(f"{1.7e9 + k / 10},1,0,0,0\n" for k in range(30)))
+    (recording / "all_nan.csv").write_text(header + "nan,nan,nan,nan,nan\n")
+    (recording / "headless.csv").write_text("0,1,0,0,0\n")
+    (recording / "words.csv").write_text(header + "0,one,0,0,0\n")
+    (recording / "flight.tlog").write_bytes(b"\xfe\x00")
+    words = [str(recording / word) if word.endswith((".csv", ".toml", ".tlog")) else word for word in arguments]
+    assert run(["track", str(recording / "pictures"), "--out", str(tmp_path / "out"), *words]) == 2
+    output = capsys.readouterr().err.strip()
+    assert message in output
+    assert "\n" not in output
+    assert not (tmp_path / "out").exists()
+
+
+def test_files_that_are_no_video_are_rejected(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = tmp_path / "broken.mp4"
+    broken.write_bytes(b"not a video at all" * 50)
+    for video, message in ((broken, "no frame"), (tmp_path / "log.mcap", "log"), (tmp_path / "none.mp4", "not exist")):
+        assert run(["track", str(video), "--target", TARGET, "--out", str(tmp_path / "out")]) == 2
+        assert message in capsys.readouterr().err
+    del recording
+
+
+def test_a_damaged_video_is_tracked_as_far_as_it_can_be_decoded(recording: Path, tmp_path: Path) -> None:
+    whole = (recording / "film.mp4").read_bytes()
+    middle = bytearray(whole)
+    middle[len(whole) // 2 : len(whole) // 2 + 400] = b"\x5a" * 400
+    (tmp_path / "damaged.mp4").write_bytes(bytes(middle))
+    status = run(["track", str(tmp_path / "damaged.mp4"), "--target", TARGET, "--out", str(tmp_path / "out")])
+    assert status in (0, 2)
+    if status == 0:
+        assert len(table(tmp_path / "out" / "track.csv")) <= FRAMES
+
+
+def test_a_gap_in_the_telemetry_does_not_lose_the_target(recording: Path, tmp_path: Path) -> None:
+    rows = (recording / "telemetry.csv").read_text().splitlines()
+    (tmp_path / "gap.csv").write_text("\n".join(rows[:6] + rows[45:]) + "\n")
+    extra = ["--rig", str(recording / "rig.toml"), "--telemetry", str(tmp_path / "gap.csv")]
+    out = ["--target", TARGET, "--out", str(tmp_path / "out"), "--fps", "10"]
+    assert run(["track", str(recording / "pictures"), *out, *extra]) == 0
+    rows_out = table(tmp_path / "out" / "track.csv")
+    assert float(rows_out[30]["x"]) == pytest.approx(92 + 180 + 17.5, abs=6)

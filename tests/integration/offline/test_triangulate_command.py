@@ -1,0 +1,108 @@
+"""`syncline triangulate`: trajectories in the calibration's world with realistic stds, and refusals."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+
+from deploy.cli import run
+from protocols.geometry.types import Floats
+
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sessions") / "session"
+    arguments = ["simulate", "marker", "--cameras", "3", "--seconds", "12", "--seed", "4", "--outliers", "0.02"]
+    assert run([*arguments, "--out", str(folder)]) == 0
+    return folder
+
+
+def errors(track: Path, session: Path) -> tuple[Floats, Floats]:
+    """Errors (n, 3) [m] of a track against the truth, and its stds (n,)."""
+    found = np.genfromtxt(track, delimiter=",", skip_header=1, usecols=range(5))
+    truth = np.loadtxt(session / "truth_trajectory.csv", delimiter=",", skiprows=1)
+    expected = np.column_stack([np.interp(found[:, 0], truth[:, 0], truth[:, axis]) for axis in (1, 2, 3)])
+    return found[:, 1:4] - expected, found[:, 4]
+
+
+def moved(session: Path, out: Path, camera: str, **changes: object) -> Path:
+    """The true calibration with something of one camera changed."""
+    tables = tomllib.loads((session / "truth_calibration.toml").read_text())
+    tables[camera] |= changes
+    out.write_text(tomli_w.dumps(tables))
+    return out
+
+
+def test_the_trajectory_matches_the_truth_within_its_std(session: Path, tmp_path: Path, capsys: Capture) -> None:
+    out = tmp_path / "track.csv"
+    known = str(session / "truth_calibration.toml")
+    assert run(["triangulate", str(session), "--calibration", known, "--out", str(out), "--json"]) == 0
+    assert out.read_text().splitlines()[0] == "time,x,y,z,std,label"
+    off, std = errors(out, session)
+    assert len(std) > 0.8 * 12 * 30
+    assert np.sqrt(np.mean(off**2)) < 5e-3
+    assert 0.7 < np.sqrt(np.mean((off / std[:, None]) ** 2)) < 1.5
+    document = json.loads(capsys.readouterr().out)
+    assert (document["units"], document["reference"], document["labels"]) == ("m", "cam0", {"marker": len(std)})
+    assert all(0.3 < sigma < 0.8 for sigma in document["sigma_px"].values())  # simulated with 0.5
+
+
+def test_labels_of_other_trackers_are_triangulated_from_a_csv_file(session: Path, tmp_path: Path) -> None:
+    header, *lines = (session / "observations.csv").read_text().splitlines()
+    assert header == "camera,frame,time,u,v,size"
+    labelled = [line + ",nose" for line in lines] + [line + ',"tail, tip"' for line in lines if line.startswith("cam0")]
+    file = tmp_path / "labels.csv"
+    file.write_text("\n".join([header + ",label", *labelled]) + "\n")
+    out = tmp_path / "track.csv"
+    known = str(session / "truth_calibration.toml")
+    assert run(["triangulate", str(file), "--calibration", known, "--out", str(out)]) == 0
+    assert {line.rsplit(",", 1)[1] for line in out.read_text().splitlines()[1:]} == {"nose"}
+    off, _ = errors(out, session)
+    assert np.sqrt(np.mean(off**2)) < 5e-3
+
+
+def test_times_are_on_the_reference_clock_even_without_the_reference_camera(session: Path, tmp_path: Path) -> None:
+    header, *lines = (session / "observations.csv").read_text().splitlines()
+    file = tmp_path / "rows.csv"
+    file.write_text("\n".join([header, *(line for line in lines if not line.startswith("cam0"))]) + "\n")
+    out = tmp_path / "track.csv"
+    known = str(session / "truth_calibration.toml")
+    assert run(["triangulate", str(file), "--calibration", known, "--out", str(out)]) == 0
+    off, _ = errors(out, session)
+    assert np.sqrt(np.mean(off**2)) < 1e-2
+
+
+def test_a_camera_that_was_moved_is_reported_and_left_out(session: Path, tmp_path: Path, capsys: Capture) -> None:
+    known = moved(session, tmp_path / "known.toml", "cam2", rotation=[0.1, 0.9, -0.4])
+    out = tmp_path / "track.csv"
+    assert run(["triangulate", str(session), "--calibration", str(known), "--out", str(out), "--json"]) == 0
+    assert list(json.loads(capsys.readouterr().out)["unused"]) == ["cam2"]
+    off, _ = errors(out, session)
+    assert np.sqrt(np.mean(off**2)) < 1e-2
+
+
+@pytest.mark.parametrize("change", ["pose", "clock", "epoch"])
+def test_a_calibration_that_contradicts_the_rows_is_refused(
+    session: Path, tmp_path: Path, capsys: Capture, change: str
+) -> None:
+    two = tmp_path / "two"
+    shutil.copytree(session, two)
+    truth = tomllib.loads((session / "truth_calibration.toml").read_text())["cam1"]
+    offsets = {"clock": 0.4, "epoch": 5000.0}
+    turned = [truth["rotation"][0] + 0.15, *truth["rotation"][1:]]
+    changes = {"rotation": turned} if change == "pose" else {"time_offset": truth["time_offset"] + offsets[change]}
+    known = moved(session, tmp_path / "known.toml", "cam1", **changes)
+    lines = (two / "observations.csv").read_text().splitlines()
+    (two / "observations.csv").write_text("\n".join(line for line in lines if not line.startswith("cam2")) + "\n")
+    out = tmp_path / "track.csv"
+    assert run(["triangulate", str(two), "--calibration", str(known), "--out", str(out)]) == 3
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    assert not out.exists()

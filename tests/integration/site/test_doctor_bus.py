@@ -1,0 +1,191 @@
+"""`syncline doctor` on the bus: real routers on loopback, plain and with valid and invalid certificates."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from deploy.site.doctor import agent
+from protocols.bus.router import probe
+from protocols.bus.router.zenoh_router import Router, free_endpoint
+from protocols.bus.settings import BusConfig, TlsConfig
+from protocols.bus.transport.session import open_session
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.messages import syncline_pb2 as pb
+from protocols.topics import OBSERVATION, STATUS
+
+pytest.importorskip("cryptography", reason="the extra `keys` is not installed: access rules are not tested")
+from deploy.site.keys import issue, make_site
+
+SITE = "test"
+
+
+def test_the_path_through_a_router() -> None:
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint):
+        found = agent.bus_path(config, SITE, "camera", "cam0")
+        assert found.verdict == "ok", found
+        assert "1 MB in" in found.text
+
+
+def test_no_router() -> None:
+    found = agent.bus_path(BusConfig(mode="client", connect=(free_endpoint(),)), SITE, "camera", "cam0")
+    assert (found.verdict, found.exit_status) == ("fail", 3)
+    assert "start one there" in found.remedy
+
+
+def through_a_link(endpoint: str, change: Callable[[bytes], bytes]) -> str:
+    """A proxy to a router that changes what clients send; returns its own address."""
+    host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
+    listening = socket.create_server(("127.0.0.1", 0))
+
+    def pump(source: socket.socket, sink: socket.socket, changed: Callable[[bytes], bytes]) -> None:
+        with suppress(OSError):
+            while data := source.recv(65_536):
+                sink.sendall(changed(data))
+        for end in (source, sink):
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def serve() -> None:
+        with suppress(OSError):
+            while True:
+                client, _ = listening.accept()
+                there = socket.create_connection((host, int(port)))
+                threading.Thread(target=pump, args=(client, there, change), daemon=True).start()
+                threading.Thread(target=pump, args=(there, client, bytes), daemon=True).start()
+
+    threading.Thread(target=serve, daemon=True).start()
+    return f"tcp/127.0.0.1:{listening.getsockname()[1]}"
+
+
+def test_a_live_router_that_does_not_route() -> None:
+    """A declaration with a `?` ends all routing in Zenoh 1.10.2; the router still accepts connections."""
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint):
+        assert agent.bus_path(config, SITE, "camera", "cam0").verdict == "ok"
+        hostile = through_a_link(endpoint, lambda data: data.replace(b"camQ", b"cam?"))
+        poison = open_session(BusConfig(mode="client", connect=(hostile,)), timeout_s=5.0)
+        poison.declare_publisher("camQ/observation")
+        found = agent.bus_path(config, SITE, "camera", "cam0")
+        assert (found.verdict, found.exit_status) == ("fail", 3)
+        assert "relays no messages" in found.text
+        assert "restart the router" in found.remedy
+
+
+def test_a_path_that_drops_large_messages() -> None:
+    """Like a tunnel with a smaller MTU without ICMP: small packets pass, full-size ones are dropped."""
+    endpoint = free_endpoint()
+    with Router(endpoint):
+        narrow = through_a_link(endpoint, lambda data: data if len(data) < 20_000 else b"")
+        found = agent.bus_path(BusConfig(mode="client", connect=(narrow,)), SITE, "camera", "cam0", 2.0)
+    assert (found.verdict, "MTU" in found.remedy) == ("fail", True), found
+
+
+@pytest.mark.parametrize(
+    ("passes", "verdict", "remedy"),
+    [
+        ({1024: 0.001, 1_000_000: None}, "fail", "MTU"),
+        ({1024: 0.4, 1_000_000: 1.0}, "warn", "a cable"),
+    ],
+)
+def test_a_path_that_drops_all_messages(
+    passes: dict[int, float | None], verdict: str, remedy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def trip(config: BusConfig, prefix: str, size: int = 0, timeout_s: float = 3.0) -> float | None:
+        return passes[size]
+
+    monkeypatch.setattr(probe, "round_trip", trip)
+    found = agent.bus_path(BusConfig(mode="client"), SITE, "hub", "hub")
+    assert (found.verdict, remedy in found.remedy) == (verdict, True)
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> tuple[Path, str]:
+    """Certificates of a router, a camera and a hub; the router's endpoint."""
+    folder = tmp_path / "keys"
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    make_site(folder, SITE)
+    issue(folder, "router", "main", listen=[endpoint])
+    issue(folder, "camera", "cam0", connect=[endpoint])
+    issue(folder, "hub", "hub", connect=[endpoint])
+    return folder, endpoint
+
+
+def of(folder: Path, name: str) -> TlsConfig:
+    own = folder / name
+    return TlsConfig(ca=own / "ca.pem", certificate=own / "certificate.pem", key=own / "key.pem")
+
+
+def secured(folder: Path, endpoint: str, *, rules: bool) -> Router:
+    access = folder / "router-main" / "zenoh.json5" if rules else None
+    return Router(config=BusConfig(mode="router", listen=(endpoint,), tls=of(folder, "router-main"), access=access))
+
+
+def test_valid_certificates_and_access_rules(keys: tuple[Path, str]) -> None:
+    folder, endpoint = keys
+    camera = BusConfig(mode="client", connect=(endpoint,), tls=of(folder, "camera-cam0"))
+    hub = BusConfig(mode="client", connect=(endpoint,), tls=of(folder, "hub-hub"))
+    assert agent.certificates(camera, "camera", "cam0").verdict == "ok"
+    with secured(folder, endpoint, rules=True):
+        nobody = agent.bus_path(camera, SITE, "camera", "cam0")
+        assert (nobody.verdict, "start a hub or recorder" in nobody.remedy) == ("fail", True)
+        found = agent.bus_path(hub, SITE, "hub", "hub")
+        assert found.verdict == "ok", found
+        assert agent.access_rights(hub, SITE, "hub", "hub").verdict == "ok"
+        with open_bus(SITE, hub, timeout_s=5.0) as bus:
+            bus.subscribe(OBSERVATION)
+            publisher = bus.publisher(STATUS, "hub")
+            publisher.put(pb.AgentStatus(schema_version=1, agent="hub", role="hub", boot_id="b", state="running"))
+            assert agent.bus_path(camera, SITE, "camera", "cam0").verdict == "ok"
+            assert agent.access_rights(camera, SITE, "camera", "cam0", seconds=0.7).verdict == "ok"
+
+
+def test_a_router_without_rules_is_detected(keys: tuple[Path, str]) -> None:
+    folder, endpoint = keys
+    camera = BusConfig(mode="client", connect=(endpoint,), tls=of(folder, "camera-cam0"))
+    hub = BusConfig(mode="client", connect=(endpoint,), tls=of(folder, "hub-hub"))
+    with secured(folder, endpoint, rules=False), open_bus(SITE, hub, timeout_s=5.0) as bus:
+        publisher = bus.publisher(STATUS, "hub")
+        publisher.put(pb.AgentStatus(schema_version=1, agent="hub", role="hub", boot_id="b", state="running"))
+        speaks = agent.access_rights(hub, SITE, "hub", "hub")
+        assert (speaks.verdict, "publish for others" in speaks.text) == ("fail", True)
+        assert "zenoh.json5" in speaks.remedy
+
+        enough = threading.Event()
+
+        def talk() -> None:
+            while not enough.wait(0.1):
+                publisher.put(pb.AgentStatus(schema_version=1, agent="hub", role="hub", boot_id="b", state="running"))
+
+        thread = threading.Thread(target=talk)
+        thread.start()
+        try:
+            hears = agent.access_rights(camera, SITE, "camera", "cam0", seconds=3.0)
+        finally:
+            enough.set()
+            thread.join()
+        assert (hears.verdict, "receives messages that it may not receive" in hears.text) == ("fail", True)
+
+
+def test_a_foreign_an_expiring_and_a_readable_certificate(keys: tuple[Path, str]) -> None:
+    folder, endpoint = keys
+    config = BusConfig(mode="client", connect=(endpoint,), tls=of(folder, "camera-cam0"))
+    anothers = agent.certificates(config, "camera", "cam1")
+    assert (anothers.verdict, anothers.exit_status) == ("fail", 2)
+    assert "--id cam1" in anothers.remedy
+    issue(folder, "camera", "cam0", days=2.0)
+    assert "renew with `syncline keys issue`" in agent.certificates(config, "camera", "cam0").remedy
+    (folder / "camera-cam0/key.pem").chmod(0o644)
+    assert "chmod 600" in agent.certificates(config, "camera", "cam0").remedy
+    shutil.rmtree(folder / "camera-cam0")
+    gone = agent.certificates(config, "camera", "cam0")
+    assert (gone.verdict, "syncline keys issue" in gone.remedy) == ("fail", True)

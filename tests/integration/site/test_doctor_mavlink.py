@@ -1,0 +1,107 @@
+"""`syncline doctor` on real MAVLink links: without a peer, with garbage, and with a simulated autopilot."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("pymavlink", reason="the extra `uav` is not installed: DOCTOR IS NOT TESTED ON MAVLINK")
+from deploy.config.uav import MavlinkConfig, UavConfig
+from deploy.site.doctor import selection
+from deploy.site.doctor.check_result import CheckResult
+from edge.devices.playback.playback_clock import RealTime
+from edge.devices.simulated.aircraft import SimulatedAircraft
+from edge.mavlink.link.transport import Udp, Url
+from edge.mavlink.roles.autopilot import Autopilot
+
+
+def examine_link(url: str, patience_s: float = 0.5) -> CheckResult:
+    return selection._vehicle(UavConfig(id="drone", mavlink=MavlinkConfig(url=url)), patience_s)
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def looping(step: object) -> Iterator[None]:
+    stop = threading.Event()
+
+    def run() -> None:
+        while not stop.wait(0.01):
+            step()  # type: ignore[operator]
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_an_autopilot_that_waits_for_a_caller_is_found() -> None:
+    transport = Udp(Url("udpin", "127.0.0.1", 0), bound=True)
+    autopilot, clock = Autopilot(SimulatedAircraft(), transport, system=7), RealTime(time.time())
+    with looping(lambda: autopilot.step(clock.now())):
+        found = examine_link(f"udpout:127.0.0.1:{transport.port}", 20.0)
+    transport.close()
+    assert (found.verdict, found.text) == ("ok", "heartbeat of system 7")
+
+
+def test_a_missing_serial_port_is_a_failure() -> None:
+    found = examine_link("serial:/dev/ttyNOPE:921600")
+    assert (found.verdict, found.exit_status) == ("fail", 3)
+    assert "No such file" in found.text
+    assert "check device, baud rate and rights" in found.remedy
+
+
+def test_a_silent_link_is_a_failure() -> None:
+    found = examine_link(f"udpin:127.0.0.1:{free_port()}")
+    assert (found.verdict, found.exit_status) == ("fail", 3)
+    assert "TX to RX" in found.remedy
+
+
+def test_a_port_held_by_the_agent_itself_is_a_failure() -> None:
+    taken = Udp(Url("udpin", "127.0.0.1", 0), bound=True)
+    found = examine_link(f"udpin:127.0.0.1:{taken.port}")
+    taken.close()
+    assert found.verdict == "fail"
+    assert "stop the agent" in found.remedy
+
+
+def test_garbage_is_reported_as_a_wrong_baud_rate() -> None:
+    port = free_port()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+
+        def send_garbage() -> None:
+            with suppress(OSError):
+                line.sendto(b"\xfd\x09\x00\x00\x17\x01\x01\x00\x00\x00garbled bytes\xfe\x03", ("127.0.0.1", port))
+
+        with looping(send_garbage):
+            found = examine_link(f"udpin:127.0.0.1:{port}")
+    assert found.verdict == "fail"
+    assert "baud rate, MAVLink 2" in found.remedy, found.text
+
+
+def test_the_command_reports_the_failed_link(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from deploy.cli import run
+
+    file = tmp_path / "uav.toml"
+    file.write_text(
+        'id = "drone"\n[mavlink]\nurl = "tcp:127.0.0.1:1"\n[bus]\nmode = "peer"\nlisten = ["tcp/127.0.0.1:0"]\n'
+    )
+    assert run(["doctor", str(file), "--json"]) in (2, 3)
+    found = {one["check"]: one for one in json.loads(capsys.readouterr().out)}
+    assert found["mavlink"]["verdict"] == "fail"
+    assert found["mavlink"]["exit_status"] == 3
+    assert "refused" in found["mavlink"]["text"]

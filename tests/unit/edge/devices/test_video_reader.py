@@ -1,0 +1,92 @@
+"""``VideoReader``: frames of files and image folders with their times, upright, damaged frames counted."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from edge.devices.playback import video_reader
+from edge.devices.playback.video_reader import VideoReader
+from protocols.core.errors import InputError
+from tests.support.films import numbered_image, read_number, write_video
+
+TIMES = np.cumsum(np.r_[0.0, np.random.default_rng(5).uniform(0.01, 0.08, 39)])
+
+
+@pytest.mark.parametrize(("pyav", "within"), [(True, 1e-5), (False, 1.1e-3)])
+def test_a_variable_frame_rate_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pyav: bool, within: float
+) -> None:
+    write_video(tmp_path / "a.mp4", [numbered_image(i) for i in range(40)], TIMES)
+    monkeypatch.setattr(video_reader, "has_pyav", lambda: pyav)
+    frames = list(VideoReader(tmp_path / "a.mp4"))
+    assert [frame.frame for frame in frames] == list(range(40))
+    assert [read_number(frame.image()) for frame in frames] == list(range(40))
+    np.testing.assert_allclose([frame.time for frame in frames], TIMES, atol=within)
+
+
+def test_a_damaged_frame_is_skipped_and_counted_and_the_others_keep_their_times(tmp_path: Path) -> None:
+    file = tmp_path / "a.mkv"
+    write_video(file, [numbered_image(i) for i in range(40)], TIMES, codec="mjpeg")
+    bytes_ = bytearray(file.read_bytes())
+    starts = [i for i in range(len(bytes_) - 2) if bytes_[i : i + 3] == b"\xff\xd8\xff"]
+    bytes_[starts[17] : starts[18] - 12] = bytes(starts[18] - 12 - starts[17])
+    file.write_bytes(bytes_)
+    video = VideoReader(file)
+    frames = list(video)
+    assert video.corrupt == 1
+    left = [i for i in range(40) if i != 17]
+    assert [read_number(frame.image()) for frame in frames] == left
+    np.testing.assert_allclose([frame.time for frame in frames], TIMES[left], atol=1.1e-3)
+
+
+def test_a_truncated_file_gives_its_readable_frames(tmp_path: Path) -> None:
+    file = tmp_path / "a.ts"
+    write_video(file, [numbered_image(i) for i in range(40)], TIMES)
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    frames = list(VideoReader(file))
+    assert 10 < len(frames) < 40
+    assert [read_number(frame.image()) for frame in frames[:10]] == list(range(10))
+
+
+def test_portrait_videos_are_rotated_upright_as_opencv_does(tmp_path: Path) -> None:
+    """A phone held upright stores landscape images and a rotation matrix in the track header."""
+    write_video(tmp_path / "a.mp4", [numbered_image(5)] * 3, [0.0, 0.1, 0.2])
+    content = (tmp_path / "a.mp4").read_bytes()
+    lying = struct.pack(">9i", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
+    turned = struct.pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, 0, 0, 1 << 30)
+    at = content.index(lying, content.index(b"tkhd"))
+    (tmp_path / "b.mp4").write_bytes(content[:at] + turned + content[at + len(turned) :])
+    video = VideoReader(tmp_path / "b.mp4")
+    assert video.info.size == (32, 160)
+    good, expected = cv2.VideoCapture(str(tmp_path / "b.mp4")).read()
+    assert good
+    picture = next(iter(video)).image()
+    assert picture.shape == (160, 32, 3)
+    assert np.abs(picture.astype(int) - expected).mean() < 1.0
+
+
+def test_an_unreadable_image_of_a_folder_is_skipped_but_advances_the_time(tmp_path: Path) -> None:
+    for i in range(5):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), numbered_image(i))
+    (tmp_path / "2.png").write_bytes(b"no picture")
+    video = VideoReader(tmp_path, fps=10.0)
+    assert [(frame.frame, round(frame.time, 6), read_number(frame.image())) for frame in video] == [
+        (0, 0.0, 0),
+        (1, 0.1, 1),
+        (2, 0.3, 3),
+        (3, 0.4, 4),
+    ]
+    assert video.corrupt == 1
+
+
+@pytest.mark.parametrize("name", ["nothing.mp4", "text.mp4", "empty"])
+def test_unreadable_videos_are_refused_with_their_name(tmp_path: Path, name: str) -> None:
+    (tmp_path / "text.mp4").write_text("not a video")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=name):
+        VideoReader(tmp_path / name)

@@ -1,0 +1,208 @@
+"""The camera component as seen by a ground station: tracking status, commands and camera information."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge.mavlink.dialect import mavlink
+from edge.mavlink.link.connection import Link
+from edge.mavlink.link.transport import Pipe
+from edge.mavlink.roles.camera import CameraComponent, SelectTarget, StopTracking, VideoStream
+from protocols.geometry.camera import Intrinsics
+
+ACTIVE, ERROR, COASTING = 1, 2, 8
+LENS = Intrinsics(640, 480, np.array([[320.0, 0.0, 319.5], [0.0, 240.0, 239.5], [0.0, 0.0, 1.0]]))
+
+
+class CameraUnderTest:
+    """A vehicle and a ground station at the far end of a camera component's link."""
+
+    def __init__(
+        self,
+        on_command: Callable[[SelectTarget | StopTracking], bool] = lambda command: True,
+        stream: VideoStream | None = None,
+        stations: frozenset[int] = frozenset(),
+    ) -> None:
+        ours, self.pipe = Pipe.pair()
+        self.link = Link(
+            None,
+            system=None,
+            component=100,
+            allowed=("HEARTBEAT", "COMMAND_LONG", "COMMAND_INT"),
+            transport=ours,
+            now_ns=lambda: 0,
+        )
+        self.camera = CameraComponent(self.link, (640, 480), 30.0, LENS, stream, on_command, stations=stations)
+        self.now = 0.0
+        vehicle = mavlink.MAVLink(None, 1, 1)
+        self.pipe.send(bytes(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(vehicle)), None)
+        self.link.poll()
+        self._station = mavlink.MAVLink(None, 255, 190)
+
+    def command(self, command: int, *parameters: float, confirmation: int = 0, component: int = 100) -> list[Any]:
+        """Send a command to the camera; returns all its responses."""
+        filled = [*parameters, *([0.0] * (7 - len(parameters)))]
+        message = mavlink.MAVLink_command_long_message(1, component, command, confirmation, *filled)
+        self.pipe.send(bytes(message.pack(self._station)), None)
+        for received in self.link.poll():
+            self.camera.handle(received, self.now)
+        return self.received()
+
+    def result(self, command: int, *parameters: float, **options: Any) -> int:
+        """The result in the ACK of a command."""
+        (ack,) = [m for m in self.command(command, *parameters, **options) if m.get_type() == "COMMAND_ACK"]
+        assert (ack.target_system, ack.target_component) == (255, 190)
+        return int(ack.result)
+
+    def received(self) -> list[Any]:
+        """All messages since the last call, parsed by pymavlink."""
+        reader = mavlink.MAVLink(None)
+        out = []
+        for data, _ in self.pipe.receive():
+            out += reader.parse_buffer(data) or []
+        assert all((m.get_srcSystem(), m.get_srcComponent()) == (1, 100) for m in out)
+        return out
+
+    def status_message(self, kind: str) -> Any:
+        """The status message of a type, sent at once."""
+        self.camera.send_status_now()
+        return next(message for message in self.received() if message.get_type() == kind)
+
+
+@pytest.mark.parametrize(
+    ("state", "flags"), [("idle", 0), ("visible", ACTIVE), ("coasting", ACTIVE | COASTING), ("lost", ERROR)]
+)
+def test_the_tracking_state_is_encoded_in_the_status_flags(state: str, flags: int) -> None:
+    under_test = CameraUnderTest()
+    under_test.camera.status.state = state
+    assert under_test.status_message("CAMERA_TRACKING_IMAGE_STATUS").tracking_status == flags
+    assert under_test.status_message("CAMERA_TRACKING_GEO_STATUS").tracking_status == flags
+
+
+def test_a_box_is_clipped_to_the_image_and_a_target_outside_has_none() -> None:
+    under_test = CameraUnderTest()
+    status = under_test.camera.status
+    status.state, status.centre, status.half_size = "visible", (0.95, 0.5), (0.1, 0.2)
+    seen = under_test.status_message("CAMERA_TRACKING_IMAGE_STATUS")
+    corners = (seen.rec_top_x, seen.rec_top_y, seen.rec_bottom_x, seen.rec_bottom_y)
+    assert corners == pytest.approx((0.85, 0.3, 1.0, 0.7), abs=1e-6)
+    status.state, status.centre = "coasting", (1.05, 0.5)
+    away = under_test.status_message("CAMERA_TRACKING_IMAGE_STATUS")
+    assert all(math.isnan(value) for value in (away.point_x, away.rec_top_x, away.rec_bottom_y))
+
+
+def test_position_and_accuracy_are_reported_and_unknown_values_are_marked() -> None:
+    under_test = CameraUnderTest()
+    under_test.camera.status.state = "coasting"
+    unknown = under_test.status_message("CAMERA_TRACKING_GEO_STATUS")
+    assert (unknown.lat, unknown.lon) == (0x7FFFFFFF, 0x7FFFFFFF)
+    assert math.isnan(unknown.h_acc)
+    assert math.isnan(unknown.vel_n)
+    status = under_test.camera.status
+    status.geo, status.h_acc, status.velocity, status.course = (47.5, -8.25, 400.0), 3.5, (4.0, -3.0), -0.6435
+    status_message = under_test.status_message("CAMERA_TRACKING_GEO_STATUS")
+    assert (status_message.lat, status_message.lon) == (475000000, -82500000)
+    assert (status_message.h_acc, status_message.vel_n, status_message.vel_e) == (3.5, 4.0, -3.0)
+
+
+def test_tracking_status_is_sent_with_frames_and_only_while_there_is_a_target() -> None:
+    under_test = CameraUnderTest()
+    under_test.camera.tick(0.0, frame=True)
+    assert {m.get_type() for m in under_test.received()} == {"HEARTBEAT", "CAMERA_FOV_STATUS"}
+    under_test.camera.status.state = "visible"
+    under_test.camera.tick(0.1, frame=False)
+    assert under_test.received() == []
+    under_test.camera.tick(0.2, frame=True)
+    assert {m.get_type() for m in under_test.received()} == {
+        "CAMERA_TRACKING_IMAGE_STATUS",
+        "CAMERA_TRACKING_GEO_STATUS",
+    }
+
+
+def test_the_fields_of_view_follow_from_the_intrinsics() -> None:
+    under_test = CameraUnderTest()
+    under_test.camera.tick(0.0, frame=False)
+    (fov,) = [m for m in under_test.received() if m.get_type() == "CAMERA_FOV_STATUS"]
+    assert (fov.hfov, fov.vfov) == (90.0, 90.0)
+
+
+def test_a_rectangle_is_a_selection_whichever_corner_comes_first() -> None:
+    commands: list[SelectTarget | StopTracking] = []
+    under_test = CameraUnderTest(on_command=lambda command: commands.append(command) or True)  # type: ignore[func-returns-value]
+    assert (
+        under_test.result(mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, 0.75, 0.5, 0.25, 0.125) == mavlink.MAV_RESULT_ACCEPTED
+    )
+    assert under_test.result(mavlink.MAV_CMD_CAMERA_TRACK_POINT, 0.5, 0.25) == mavlink.MAV_RESULT_ACCEPTED
+    assert under_test.result(mavlink.MAV_CMD_CAMERA_STOP_TRACKING) == mavlink.MAV_RESULT_ACCEPTED
+    assert commands == [
+        SelectTarget(0.25, 0.125, 0.75, 0.5, 255),
+        SelectTarget(0.5, 0.25, 0.5, 0.25, 255),
+        StopTracking(255),
+    ]
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [(0.1, 0.1, 1.2, 0.2), (math.nan, 0.1, 0.2, 0.2), (-0.1, 0.1, 0.2, 0.2), (0.5, 0.1, 0.5, 0.2), (0.5,) * 4],
+)
+def test_an_invalid_box_is_denied_and_not_passed_on(corners: tuple[float, ...]) -> None:
+    commands: list[SelectTarget | StopTracking] = []
+    under_test = CameraUnderTest(on_command=lambda command: commands.append(command) or True)  # type: ignore[func-returns-value]
+    assert under_test.command(mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, *corners)[0].result == mavlink.MAV_RESULT_DENIED
+    assert commands == []
+    assert under_test.camera.counters["refused.box"] == 1
+
+
+def test_a_retransmitted_command_is_acknowledged_again_but_not_executed_again() -> None:
+    commands: list[SelectTarget | StopTracking] = []
+    under_test = CameraUnderTest(on_command=lambda command: commands.append(command) or True)  # type: ignore[func-returns-value]
+    box = (0.25, 0.25, 0.5, 0.5)
+    assert under_test.result(mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, *box) == mavlink.MAV_RESULT_ACCEPTED
+    again = under_test.result(mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, *box, confirmation=1)
+    assert again == mavlink.MAV_RESULT_ACCEPTED
+    assert len(commands) == 1
+    under_test.result(
+        mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, *box
+    )  # without the confirmation count it is a new command
+    assert len(commands) == 2
+
+
+def test_a_station_that_is_not_allowed_is_denied() -> None:
+    commands: list[SelectTarget | StopTracking] = []
+    under_test = CameraUnderTest(
+        on_command=lambda command: commands.append(command) or True,  # type: ignore[func-returns-value]
+        stations=frozenset({254}),
+    )
+    assert under_test.result(mavlink.MAV_CMD_CAMERA_TRACK_POINT, 0.5, 0.5) == mavlink.MAV_RESULT_DENIED
+    assert commands == []
+    assert under_test.camera.counters["refused.station"] == 1
+
+
+def test_other_commands_are_unsupported_and_ignored_in_a_broadcast() -> None:
+    under_test = CameraUnderTest()
+    assert under_test.result(mavlink.MAV_CMD_IMAGE_START_CAPTURE) == mavlink.MAV_RESULT_UNSUPPORTED
+    assert under_test.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, component=0) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "uri", "number"),
+    [
+        ("rtsp", "rtsp://10.0.0.7:8554/overlay", mavlink.VIDEO_STREAM_TYPE_RTSP),
+        ("mjpeg", "http://10.0.0.7:8560/stream.mjpg", mavlink.VIDEO_STREAM_TYPE_TCP_MPEG),
+    ],
+)
+def test_the_video_stream_is_described_only_where_there_is_one(kind: str, uri: str, number: int) -> None:
+    request = mavlink.MAV_CMD_REQUEST_MESSAGE
+    stream_id = mavlink.MAVLINK_MSG_ID_VIDEO_STREAM_INFORMATION
+    under_test = CameraUnderTest(stream=VideoStream(kind, uri))
+    ack, info = under_test.command(request, stream_id)
+    assert ack.result == mavlink.MAV_RESULT_ACCEPTED
+    assert (info.type, info.uri, info.resolution_h, info.hfov) == (number, uri, 640, 90)
+    encoding = mavlink.VIDEO_STREAM_ENCODING_H264 if kind == "rtsp" else mavlink.VIDEO_STREAM_ENCODING_UNKNOWN
+    assert info.encoding == encoding
+    assert CameraUnderTest().result(request, stream_id) == mavlink.MAV_RESULT_UNSUPPORTED

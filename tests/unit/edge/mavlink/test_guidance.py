@@ -1,0 +1,106 @@
+"""Guidance commands: none unless allowed, and never beyond the limits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge.mavlink.dialect import mavlink
+from edge.mavlink.link.connection import Link
+from edge.mavlink.link.transport import Pipe
+from edge.mavlink.roles.guidance import Guidance, GuidanceLimits, GuidanceTarget
+from edge.uav.navigation import Origin
+
+ORIGIN = Origin(47.4, 8.5, 480.0)
+VEHICLE, STILL = np.array([0.0, 0.0, -50.0]), np.zeros(3)
+TARGET = GuidanceTarget(0.0, np.array([30.0, 40.0]), np.array([8.0, 0.0]), 1.0, 0.0)
+
+
+class GuidanceUnderTest:
+    """A control on a link, and what an autopilot hears of it."""
+
+    def __init__(self, **limits: Any) -> None:
+        ours, self._pipe = Pipe.pair()
+        self._link = Link(None, system=1, component=100, allowed=("HEARTBEAT",), transport=ours, now_ns=lambda: 0)
+        vehicle = mavlink.MAVLink(None, 1, 1)
+        self._pipe.send(bytes(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(vehicle)), None)
+        self._link.poll()
+        self.guidance = Guidance(self._link, GuidanceLimits(**limits))
+        self.guidance.begin(VEHICLE)
+        self._pipe.receive()
+
+    def tick(self, now_s: float, target: GuidanceTarget = TARGET, vehicle: np.ndarray = VEHICLE) -> list[Any]:
+        """All messages sent at a time."""
+        self.guidance.tick(now_s, target, vehicle, STILL, ORIGIN)
+        reader = mavlink.MAVLink(None)
+        return [m for data, _ in self._pipe.receive() for m in reader.parse_buffer(data) or []]
+
+
+def kinds(messages: list[Any]) -> set[str]:
+    return {message.get_type() for message in messages}
+
+
+def test_nothing_is_sent_unless_enabled() -> None:
+    under_test = GuidanceUnderTest()
+    assert under_test.tick(0.0) == []
+    assert under_test.guidance.hold_reason == "off"
+    assert kinds(GuidanceUnderTest(follow=True).tick(0.0)) == {"FOLLOW_TARGET"}
+    assert kinds(GuidanceUnderTest(gimbal=True).tick(0.0)) == {"COMMAND_LONG", "GIMBAL_MANAGER_SET_PITCHYAW"}
+
+
+@pytest.mark.parametrize(
+    ("target", "vehicle", "reason"),
+    [
+        (replace(TARGET, unseen_s=8.1), VEHICLE, "not seen"),
+        (replace(TARGET, std_m=15.1), VEHICLE, "known only to"),
+        (replace(TARGET, std_m=math.nan), VEHICLE, "known only to"),
+        (replace(TARGET, position=np.array([301.0, 0.0])), VEHICLE, "farther"),
+        (replace(TARGET, position=np.array([math.nan, 0.0])), VEHICLE, "farther"),
+        (TARGET, np.array([0.0, 0.0, -0.5]), "on the ground"),
+    ],
+)
+def test_beyond_the_limits_nothing_is_sent_and_the_reason_is_given(
+    target: GuidanceTarget, vehicle: np.ndarray, reason: str
+) -> None:
+    under_test = GuidanceUnderTest(gimbal=True, follow=True)
+    assert under_test.tick(0.0) != []
+    assert under_test.tick(1.0, target, vehicle) == []
+    assert reason in under_test.guidance.hold_reason
+    assert under_test.tick(2.0) != []  # and it resumes within the limits
+
+
+def test_follow_target_has_the_extrapolated_position_and_a_limited_speed() -> None:
+    under_test = GuidanceUnderTest(follow=True, speed=5.0)
+    (follow_target,) = under_test.tick(0.5)
+    north, east, _ = ORIGIN.to_ned(1e-7 * follow_target.lat, 1e-7 * follow_target.lon, follow_target.alt)
+    assert (north, east) == pytest.approx((34.0, 40.0), abs=0.05)  # half a second on, at 8 m/s
+    assert follow_target.vel[:2] == pytest.approx([5.0, 0.0])
+    assert follow_target.est_capabilities == 0b11
+
+
+def test_a_stale_estimate_is_extrapolated_for_at_most_a_second() -> None:
+    (follow_target,) = GuidanceUnderTest(follow=True).tick(60.0)
+    assert ORIGIN.to_ned(1e-7 * follow_target.lat, 1e-7 * follow_target.lon, follow_target.alt)[0] == pytest.approx(
+        38.0, abs=0.05
+    )
+
+
+def test_the_gimbal_points_at_the_target_with_a_limited_rate() -> None:
+    under_test = GuidanceUnderTest(gimbal=True, rate=math.radians(30.0))
+    first = under_test.tick(0.0, replace(TARGET, velocity=np.zeros(2)))[-1]
+    assert first.yaw == pytest.approx(math.atan2(40.0, 30.0), abs=1e-5)
+    assert first.pitch == pytest.approx(-math.atan2(49.3, 50.0), abs=1e-5)
+    behind = replace(TARGET, position=np.array([-30.0, -40.0]), velocity=np.zeros(2))
+    second = under_test.tick(0.1, behind)[-1]
+    turned = (second.yaw - first.yaw + math.pi) % (2.0 * math.pi) - math.pi
+    assert abs(turned) == pytest.approx(math.radians(3.0), rel=0.01)
+    assert second.flags & mavlink.GIMBAL_MANAGER_FLAGS_YAW_IN_EARTH_FRAME
+
+
+def test_commands_come_ten_times_a_second_at_most() -> None:
+    under_test = GuidanceUnderTest(follow=True)
+    assert sum(len(under_test.tick(k / 100)) for k in range(100)) == pytest.approx(10, abs=1)

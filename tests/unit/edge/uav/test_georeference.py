@@ -1,0 +1,73 @@
+"""Georeferencing: the target's position in the vehicle's frame, from its pixel and telemetry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge.uav.georeference import Georeference
+from edge.uav.tracker import Estimate, Telemetry, TrackState
+from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA, rotation
+from protocols.geometry.camera import Intrinsics
+
+LENS = Intrinsics(640, 480, np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 239.5], [0.0, 0.0, 1.0]]))
+CAR = np.array([7.0, -12.0, -0.7])
+
+
+def attitude_at_pitch(pitch: float) -> np.ndarray:
+    return rotation(np.array([0.05]), np.array([pitch]), np.array([0.8]))[0]
+
+
+def pixel(attitude: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
+    x, y, z = BODY_FROM_DOWN_CAMERA.T @ attitude.T @ (CAR - centre)
+    return 600.0 * x / z + 319.5, 600.0 * y / z + 239.5
+
+
+def estimate_at(x: float, y: float, north: float, east: float) -> Estimate:
+    return Estimate(0.0, TrackState.VISIBLE, x, y, 40.0, 20.0, 0.0, 1.0, north=north, east=east, std_m=0.1)
+
+
+def simulate_flight(seconds: float, drift: np.ndarray, georeference: Georeference) -> Estimate:
+    """The last corrected estimate of a flight with oscillating pitch; ``drift``: (2,) of the tracker's frame [m]."""
+    out = None
+    for k in range(round(seconds * 30)):
+        time = k / 30.0
+        attitude, centre = attitude_at_pitch(0.2 * np.sin(3.0 * time)), np.array([2.0 * time, -5.0, -60.0])
+        georeference.add(Telemetry(time, attitude, centre))
+        x, y = pixel(attitude, centre)
+        north, east = CAR[:2] + drift
+        estimate = estimate_at(x, y, north, east)
+        out = georeference.corrected(estimate, time)
+    assert out is not None
+    return out
+
+
+def test_drift_of_the_ground_frame_is_corrected() -> None:
+    corrected = simulate_flight(1.0, np.array([6.0, -3.0]), Georeference(LENS, BODY_FROM_DOWN_CAMERA))
+    assert np.hypot(corrected.north - CAR[0], corrected.east - CAR[1]) < 0.1
+    assert 0.2 < corrected.std_m < 1.0  # an autopilot's roll and pitch are not exact
+
+
+def test_outside_the_image_the_last_correction_is_kept() -> None:
+    georeference = Georeference(LENS, BODY_FROM_DOWN_CAMERA)
+    corrected = simulate_flight(1.0, np.array([6.0, -3.0]), georeference)
+    far = replace(corrected, north=100.0, east=50.0, x=9e4, y=9e4)
+    extrapolated = georeference.corrected(far, 1.1)
+    assert (extrapolated.north, extrapolated.east) == pytest.approx((94.0, 53.0), abs=0.1)
+    georeference.reset()
+    assert georeference.corrected(far, 1.2) == far
+
+
+def test_no_correction_without_telemetry_metric_ground_or_a_steep_ray() -> None:
+    georeference = Georeference(LENS, BODY_FROM_DOWN_CAMERA)
+    estimate = estimate_at(320.0, 240.0, 1.0, 2.0)
+    assert georeference.corrected(estimate, 0.0) is estimate
+    simulate_flight(0.5, np.zeros(2), georeference)
+    unknown = replace(estimate, north=float("nan"), east=float("nan"))
+    assert georeference.corrected(unknown, 0.4) is unknown
+    assert georeference.locate(320.0, 240.0, 0.4) is not None
+    assert georeference.locate(float("nan"), 240.0, 0.4) is None
+    assert georeference.locate(320.0, -1200.0, 0.4) is None
+    assert georeference.locate(320.0, 240.0, 30.0) is None

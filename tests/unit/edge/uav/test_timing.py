@@ -1,0 +1,160 @@
+"""Clock alignment: the vehicle's clock to the host's, and the telemetry's to the camera's; navigation conversions."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from edge.uav.navigation import Origin
+from edge.uav.timing.telemetry_offset import OffsetEstimate, RelativeRotations, find_offset
+from edge.uav.timing.vehicle_clock import VehicleClock
+from edge.uav.tracker import Telemetry
+from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA, Flight, grid_times, rotation
+from edge.uav.world.noise import smoothed_noise
+from protocols.geometry import so3
+
+SECOND = 1_000_000_000
+
+
+def test_the_shortest_round_trip_bounds_the_offset_to_half_its_duration() -> None:
+    rng = np.random.default_rng(3)
+    clock = VehicleClock()
+    true = 123_456_789_012
+    for k in range(30):
+        sent = k * SECOND // 2
+        there, back = rng.integers(1_000_000, 40_000_000, 2)
+        clock.handle_round_trip(sent, sent + int(there) + true, sent + int(there) + int(back))
+    error = clock.offset_ns - true
+    assert abs(error) <= 1e9 * clock.std_s
+    assert clock.std_s < 0.015
+    assert clock.host_time(true + 5 * SECOND) == 5 * SECOND - error
+
+
+def test_without_round_trips_the_least_delayed_message_gives_the_offset() -> None:
+    rng = np.random.default_rng(4)
+    clock = VehicleClock()
+    for k in range(200):
+        stamped = k * SECOND // 20
+        clock.handle_message(stamped, stamped + 7 * SECOND + int(rng.integers(2_000_000, 80_000_000)))
+    assert -7 * SECOND - 5_000_000 < clock.offset_ns < -7 * SECOND
+    assert clock.std_s == pytest.approx(0.02)
+
+
+def test_a_vehicle_restart_is_detected_as_a_new_clock() -> None:
+    clock = VehicleClock()
+    clock.handle_round_trip(0, 500 * SECOND, 2_000_000)
+    assert clock.handle_message(501 * SECOND, SECOND)
+    assert not clock.handle_message(2 * SECOND, 10 * SECOND)
+    clock.handle_round_trip(10 * SECOND, 2 * SECOND, 10 * SECOND + 2_000_000)
+    assert clock.reboots == 1
+    assert clock.host_time(3 * SECOND) == pytest.approx(11 * SECOND, abs=2e6)
+
+
+def test_a_clock_step_is_detected_and_the_new_offset_is_used() -> None:
+    clock = VehicleClock()
+    for k in range(10):
+        assert clock.handle_round_trip(k * SECOND, k * SECOND + 5 * SECOND, k * SECOND + 1_000_000)
+    assert not clock.handle_round_trip(10 * SECOND, 18 * SECOND, 10 * SECOND + 1_000_000)
+    assert clock.steps == 1
+    assert clock.offset_ns == pytest.approx(8 * SECOND, abs=1e6)
+
+
+def test_round_trips_of_negative_or_excessive_duration_are_rejected() -> None:
+    clock = VehicleClock()
+    clock.handle_round_trip(10, 5, 0)
+    clock.handle_round_trip(0, 5, 2 * SECOND)
+    assert not clock.known
+    assert clock.rejected == 2
+    with pytest.raises(RuntimeError):
+        clock.host_time(0)
+
+
+def flight(seed: int, seconds: float) -> Flight:
+    """A flight with rotations of some degrees within a second."""
+    rng = np.random.default_rng(seed)
+    times = grid_times(seconds)
+    angles = np.column_stack([np.deg2rad(4.0) * smoothed_noise(rng, len(times), 1 / 120.0, 1.0, 0.6) for _ in range(3)])
+    return Flight(times, np.zeros((len(times), 3)), angles)
+
+
+def simulated_rotations_and_telemetry(
+    path: Flight, offset: float, rate: float, noise: float = 0.002
+) -> tuple[RelativeRotations, list[Telemetry]]:
+    """Rotations observed by a camera at 30 fps, and telemetry whose clock is ``offset`` ahead."""
+    rng = np.random.default_rng(9)
+    end = path.times[-1] - 0.5
+    frames = np.arange(0.0, end, 1 / 30.0)
+    camera = BODY_FROM_DOWN_CAMERA.T @ np.swapaxes(path.at(frames)[0], 1, 2)
+    turns = [so3.log(b @ a.T) for a, b in itertools.pairwise(camera)]
+    turns = np.array(turns) + 0.0001 * rng.standard_normal((len(turns), 3))
+    times = np.arange(-1.0, end, 1.0 / rate)
+    attitude = path.at(times)[0] @ so3.exp(noise * rng.standard_normal((len(times), 3)))
+    telemetry = [Telemetry(float(t) + offset, r) for t, r in zip(times, attitude, strict=True)]
+    return RelativeRotations(frames[:-1], frames[1:], turns), telemetry
+
+
+@pytest.mark.parametrize(("offset", "rate"), [(0.123, 30.0), (-0.31, 10.0), (7654.321, 30.0), (-1e5, 5.0)])
+def test_the_offset_is_accurate_to_five_milliseconds_for_any_clock_origin(offset: float, rate: float) -> None:
+    rotations, telemetry = simulated_rotations_and_telemetry(flight(1, 40.0), offset, rate)
+    result = find_offset(rotations, telemetry, BODY_FROM_DOWN_CAMERA)
+    assert isinstance(result, OffsetEstimate), result
+    assert result.offset == pytest.approx(offset, abs=0.005)
+    assert result.std < 0.005
+
+
+def test_a_short_video_is_located_within_a_long_flight() -> None:
+    path = flight(2, 120.0)
+    _, telemetry = simulated_rotations_and_telemetry(path, 500.0, 20.0)
+    rotations, _ = simulated_rotations_and_telemetry(path, 0.0, 20.0)
+    part = slice(1500, 2300)
+    video = RelativeRotations(rotations.starts[part] - 50.0, rotations.ends[part] - 50.0, rotations.vectors[part])
+    result = find_offset(video, telemetry, BODY_FROM_DOWN_CAMERA)
+    assert isinstance(result, OffsetEstimate), result
+    assert result.offset == pytest.approx(550.0, abs=3.0 * result.std)
+    assert result.std < 0.02
+
+
+def test_telemetry_of_another_flight_is_rejected() -> None:
+    rotations, _ = simulated_rotations_and_telemetry(flight(3, 40.0), 0.0, 30.0)
+    _, telemetry = simulated_rotations_and_telemetry(flight(4, 200.0), 0.0, 30.0)
+    result = find_offset(rotations, telemetry, BODY_FROM_DOWN_CAMERA)
+    assert isinstance(result, str)
+
+
+def test_without_camera_rotation_the_offset_is_not_observable() -> None:
+    _, telemetry = simulated_rotations_and_telemetry(flight(3, 20.0), 0.0, 30.0)
+    frames = np.arange(0.0, 15.0, 1 / 30.0)
+    stationary = RelativeRotations(
+        frames[:-1], frames[1:], 1e-5 * np.random.default_rng(0).standard_normal((len(frames) - 1, 3))
+    )
+    assert isinstance(find_offset(stationary, telemetry, BODY_FROM_DOWN_CAMERA), str)
+    assert isinstance(
+        find_offset(RelativeRotations(*np.zeros((2, 0)), np.zeros((0, 3))), telemetry, BODY_FROM_DOWN_CAMERA), str
+    )
+    assert isinstance(find_offset(stationary, telemetry[:3], BODY_FROM_DOWN_CAMERA), str)
+
+
+def test_an_offset_outside_the_search_window_is_rejected() -> None:
+    rotations, telemetry = simulated_rotations_and_telemetry(flight(1, 40.0), 3.0, 30.0)
+    assert isinstance(find_offset(rotations, telemetry, BODY_FROM_DOWN_CAMERA, (-0.7, 0.7)), str)
+
+
+def test_geodetic_conversion_round_trips() -> None:
+    origin = Origin(-33.9, 179.9999, 12.0)
+    position = np.array([1234.5, 2345.6, -78.9])
+    back = origin.to_ned(*origin.to_geodetic(*position))
+    np.testing.assert_allclose(back, position, atol=1e-6)
+    north = Origin(0.0, 0.0, 0.0).to_ned(1.0, 0.0, 0.0)[0]
+    assert north == pytest.approx(110_574.0, abs=30.0)  # a degree of latitude at the equator, WGS 84
+
+
+def test_rotation_conversions_agree_with_the_simulated_flight() -> None:
+    from edge.uav.navigation import quaternion_from_rotation, rotation_from_euler, rotation_from_quaternion
+
+    attitude = rotation_from_euler(0.1, -0.2, 2.5)
+    np.testing.assert_allclose(attitude, rotation(*(np.array([a]) for a in (0.1, -0.2, 2.5)))[0], atol=1e-12)
+    np.testing.assert_allclose(rotation_from_quaternion(quaternion_from_rotation(attitude)), attitude, atol=1e-12)
+    assert rotation_from_quaternion([0.0, 0.0, 0.0, 0.0]) is None
+    assert rotation_from_quaternion([np.nan, 0.0, 0.0, 1.0]) is None

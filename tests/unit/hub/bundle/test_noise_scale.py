@@ -1,0 +1,62 @@
+"""Noise scale: correction for redundancy and for autocorrelated residuals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hub.bundle.adjustment import adjust, build_system
+from hub.bundle.covariance import covariance
+from hub.bundle.noise_scale import _hat_matrix_trace, _serial_inflation, rescale_noise
+from protocols.geometry.types import Floats
+from tests.unit.hub.bundle.test_adjustment import dense, simulated_problem
+
+
+def test_the_absorbed_residuals_are_the_trace_of_the_dense_hat_matrix() -> None:
+    problem, state, prior = simulated_problem(3)
+    found = covariance(problem, state, prior)
+    mine = sum(_hat_matrix_trace(problem, state, found, rows) for rows in problem.rows)
+    whole = dense(build_system(problem, state, prior, robust=False)[0])
+    priors = dense(build_system(replace(problem, rows=()), state, prior, robust=False)[0])
+    scale = 1.0 / np.sqrt(np.diag(whole))  # one tolerance for metres, radians and seconds
+    whole, priors = whole * scale * scale[:, None], priors * scale * scale[:, None]
+    # The seven gauge directions have no information.
+    hat = np.linalg.pinv(whole, rcond=1e-11, hermitian=True) @ (whole - priors)
+    assert mine == pytest.approx(float(np.trace(hat)), rel=5e-3)
+
+
+def test_the_noise_of_simulated_cameras_is_recovered() -> None:
+    raw, corrected = [], []
+    for seed in range(8):
+        problem, state, _ = simulated_problem(seed)
+        problem, state, prior = adjust(problem, state)
+        raw.append(state.sigma)
+        corrected.append(rescale_noise(problem, state, prior).sigma)
+    assert np.mean(corrected) == pytest.approx(0.5, rel=0.03)
+    assert np.mean(raw) < 0.97 * np.mean(corrected)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.5, 0.9])
+def test_serial_inflation_matches_the_closed_form_of_an_ar1_process(correlation: float) -> None:
+    rng = np.random.default_rng(int(10 * correlation))
+    count = 20_000
+    fresh = rng.normal(0.0, np.sqrt(1.0 - correlation**2), (count, 2))
+    off: Floats = np.zeros((count, 2))
+    for i in range(1, count):
+        off[i] = correlation * off[i - 1] + fresh[i]
+    found = _serial_inflation([(np.arange(count) / 30.0, off)])
+    assert found == pytest.approx((1.0 + correlation) / (1.0 - correlation), rel=0.15)
+
+
+def test_lost_frames_and_the_order_of_rows_change_nothing() -> None:
+    rng = np.random.default_rng(1)
+    off = np.cumsum(rng.normal(size=(6000, 2)), axis=0)
+    off -= np.stack([np.convolve(column, np.ones(31) / 31, "same") for column in off.T], axis=1)
+    time, keep = np.arange(6000) / 30.0, np.sort(rng.permutation(6000)[:4500])
+    whole = _serial_inflation([(time, off)])
+    assert whole > 3.0
+    assert _serial_inflation([(time[keep], off[keep])]) == pytest.approx(whole, rel=0.15)
+    mixed = rng.permutation(6000)
+    assert _serial_inflation([(time[mixed], off[mixed])]) == whole

@@ -1,0 +1,124 @@
+"""Pair network: lags predicted through chains of solved pairs, and searches near predicted lags."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hub.calibration.pair_network
+from hub.bundle.preprocessing import PreparedSession, prepare
+from hub.calibration.pair_network import _SynchronisedGroups, solve_pairs
+from hub.sync.hypothesis import PairSolution
+from hub.sync.pair_ranking import ranking_score
+from hub.sync.pair_solver import _PairSearch, solve_pair
+from hub.sync.track_cache import TrackCache
+from hub.trajectory.image_tracks import smooth_only
+from tests.support.rigs import Session, simulate
+
+
+def prepared_of(session: Session) -> PreparedSession:
+    return prepare(session.rig, session.observations())
+
+
+def true_lag(session: Session, prepared: PreparedSession, a: str, b: str) -> float:
+    """t_a - t_b [s], times from the time origins, in the middle of the recording."""
+    middle = 15.0
+    return (session.shown(a, middle) - prepared.time_origins[a]) - (session.shown(b, middle) - prepared.time_origins[b])
+
+
+def test_a_chain_of_pairs_predicts_the_lag_of_its_ends() -> None:
+    session = simulate(3, 4, 30.0)
+    prepared = prepared_of(session)
+    groups = _SynchronisedGroups()
+    assert groups.lag(prepared, "cam0", "cam3") is None
+    for a, b in (("cam2", "cam3"), ("cam0", "cam1"), ("cam1", "cam2")):
+        tracks = [smooth_only(prepared.camera(name).tracks) for name in (a, b)]
+        groups.add(solve_pair(tracks[0], tracks[1], (a, b)))
+    for a, b in itertools.combinations(prepared.names, 2):
+        lag = groups.lag(prepared, a, b)
+        assert lag is not None
+        assert lag == pytest.approx(true_lag(session, prepared, a, b), abs=0.01)
+        back = groups.lag(prepared, b, a)
+        assert back is not None
+        assert back == pytest.approx(-lag, abs=1e-9)
+
+
+def test_a_search_near_the_right_lag_finds_it_and_near_a_wrong_one_does_not() -> None:
+    session = simulate(5, 2, 30.0)
+    prepared = prepared_of(session)
+    a, b = (smooth_only(prepared.camera(name).tracks) for name in ("cam0", "cam1"))
+    lag = true_lag(session, prepared, "cam0", "cam1")
+    there = solve_pair(a, b, ("cam0", "cam1"), predicted_lag=lag + 0.1)
+    assert there.solved
+    assert there.fit is not None
+    assert there.fit.lag == pytest.approx(lag, abs=0.005)
+    assert not solve_pair(a, b, ("cam0", "cam1"), predicted_lag=lag + 3.0).solved
+
+
+def test_a_pair_that_saw_the_same_object_has_a_higher_ranking_score() -> None:
+    prepared = prepared_of(simulate(6, 3, 30.0, strangers=[2]))
+    tracks = {name: smooth_only(prepared.camera(name).tracks) for name in prepared.names}
+    assert ranking_score(tracks["cam0"], tracks["cam1"]) > 1.5 * ranking_score(tracks["cam0"], tracks["cam2"])
+
+
+def test_pairs_of_many_cameras_are_returned_in_the_rigs_order() -> None:
+    prepared = prepared_of(simulate(8, 10, 20.0))
+    _, pairs = solve_pairs(prepared, lambda text, share: None)
+    assert [(pair.a, pair.b) for pair in pairs] == list(itertools.combinations(prepared.names, 2))
+    assert sum(pair.solved for pair in pairs) >= 9
+
+
+def test_a_search_over_all_lags_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thorough search continues from the refusal of the first one, with the same result as without it."""
+    prepared = prepared_of(simulate(9, 2, 12.0, strangers=[1]))
+    rates: list[float] = []
+    search_at_rate, solve = _PairSearch.search_at_rate, hub.calibration.pair_network._solve
+
+    def counted(
+        self: _PairSearch, names: tuple[str, str], rate: float, near: tuple[float, float] | None = None
+    ) -> PairSolution:
+        rates.append(rate)
+        return search_at_rate(self, names, rate, near)
+
+    def without_previous(*given: Any, unguided: PairSolution | None = None, **more: Any) -> PairSolution:
+        return solve(*given, **more)
+
+    monkeypatch.setattr(_PairSearch, "search_at_rate", counted)
+    _, (once,) = solve_pairs(prepared, lambda text, share: None, thorough=True)
+    assert not once.solved
+    assert len(rates) > 5
+    assert rates.count(1.0) == 1
+    monkeypatch.setattr(hub.calibration.pair_network, "_solve", without_previous)
+    _, (again,) = solve_pairs(prepared, lambda text, share: None, thorough=True)
+    assert rates.count(1.0) == 3
+    assert again.status == once.status
+    assert once.fit is not None
+    assert again.fit is not None
+    np.testing.assert_array_equal(again.fit.geometry.matrix, once.fit.geometry.matrix)
+    assert (again.fit.offset, again.fit.rate) == (once.fit.offset, once.fit.rate)
+
+
+def test_the_cache_distinguishes_tracks_and_their_time_scales() -> None:
+    prepared = prepared_of(simulate(3, 2, 20.0))
+    (track,) = smooth_only(prepared.camera("cam0").tracks).values()
+    cache = TrackCache()
+    grid = cache.grid([track], 0.05, 0.5)
+    assert cache.grid([track], 0.05, 0.5) is grid
+    assert cache.grid([track], 0.05, 1.0).sigma == pytest.approx(2.0 * grid.sigma)
+    assert cache.grid([track], 0.02, 0.5).step == 0.02
+    slower = track.scaled(2.0)
+    assert cache.bandwidth(slower) == pytest.approx(0.5 * cache.bandwidth(track))
+    assert cache.fast_image_speed(slower) == pytest.approx(0.5 * cache.fast_image_speed(track))
+    assert cache.grid([slower], 0.05, 0.5).points.shape[1] == pytest.approx(2 * grid.points.shape[1], abs=3)
+
+
+def test_no_scan_is_made_near_a_lag_without_overlap(monkeypatch: pytest.MonkeyPatch) -> None:
+    prepared = prepared_of(simulate(3, 2, 20.0))
+    tracks = [smooth_only(prepared.camera(name).tracks) for name in ("cam0", "cam1")]
+    monkeypatch.setattr("hub.sync.pair_solver.scan_lags", None)  # not to be called
+    solution = solve_pair(tracks[0], tracks[1], ("cam0", "cam1"), predicted_lag=100.0)
+    assert not solution.solved
+    assert "other lags were not searched" in solution.status

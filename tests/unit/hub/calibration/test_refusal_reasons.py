@@ -1,0 +1,235 @@
+"""One scenario for each kind of refusal: a session in which that reason must be reported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hub.bundle import initialisation
+from hub.calibration import pipeline as calibrating
+from hub.calibration.pipeline import calibrate
+from hub.calibration.triangulation import triangulate
+from hub.sync.pair_solver import _PairSearch, solve_pair
+from hub.sync.settings import PairSettings
+from hub.trajectory.image_tracks import SmoothTrack, smooth_track
+from protocols.core.errors import Refused
+from tests.support import rigs
+from tests.unit.hub.sync.test_acceptance import REFUSAL_KINDS, REJECTED
+
+Scenario = Callable[[pytest.MonkeyPatch], str]
+SECONDS = 12.0
+TWO_ALIKE = "two alignments are about as good"
+
+
+def refusal_texts(session: rigs.Session, solver: str = "joint") -> str:
+    """All refusal texts of a session: of the session or of its cameras, and the status of each pair."""
+    try:
+        found = calibrate(session.rig, session.observations(), solver=solver)
+    except Refused as refusal:
+        pairs = [pair.status for pair in refusal.pairs]
+        return "\n".join([refusal.reason, *refusal.cameras.values(), *pairs])
+    return "\n".join([*found.refused.values(), *(pair.status for pair in found.pairs)])
+
+
+def with_rows(session: rigs.Session, keep: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> rigs.Session:
+    at = np.flatnonzero(keep)
+    return replace(
+        session,
+        camera=[session.camera[i] for i in at],
+        label=[session.label[i] for i in at],
+        frame=session.frame[at],
+        time=session.time[at],
+        pixels=session.pixels[at],
+    )
+
+
+def rows_of(session: rigs.Session, camera: str) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    return np.array([name == camera for name in session.camera])
+
+
+def tracks(session: rigs.Session) -> tuple[dict[str, SmoothTrack], dict[str, SmoothTrack]]:
+    out = []
+    for name in ("cam0", "cam1"):
+        lens, (track,) = session.rig.cameras[name].intrinsics, session.observations().of_camera(name)
+        assert lens is not None
+        found = smooth_track(track.time, lens.unproject(track.pixels), lens.focal, float(track.time[0]))
+        assert found is not None
+        out.append({"marker": found})
+    return out[0], out[1]
+
+
+def pair_status(settings: PairSettings) -> str:
+    return solve_pair(*tracks(rigs.simulate(1, 2, SECONDS, late=0.5)), ("cam0", "cam1"), settings).status
+
+
+def still_marker(_: pytest.MonkeyPatch) -> str:
+    path = rigs.Path(np.full((1, 3), 0.1), np.zeros((1, 3)), np.zeros((1, 3)))
+    return refusal_texts(rigs.simulate(1, 2, SECONDS, path=path))
+
+
+def different_labels(_: pytest.MonkeyPatch) -> str:
+    return refusal_texts(rigs.simulate(1, 2, SECONDS, labels={"ball": [0], "bat": [1]}))
+
+
+def too_few_rows(_: pytest.MonkeyPatch) -> str:
+    a, b = tracks(rigs.simulate(1, 2, 2.2, fps=(5.0, 5.0), drops=0.0, late=0.0))
+    return solve_pair(a, b, ("cam0", "cam1")).status
+
+
+def imprecise_lag(_: pytest.MonkeyPatch) -> str:
+    return pair_status(PairSettings(max_lag_std=1e-9, max_slow_lag_std=1e-9))
+
+
+def imprecise_rotation(_: pytest.MonkeyPatch) -> str:
+    return pair_status(PairSettings(max_rotation_std=1e-9, max_rotation_std_certain_lag=1e-9))
+
+
+def ambiguous_rotation(_: pytest.MonkeyPatch) -> str:
+    return pair_status(PairSettings(max_rotation_ambiguity=-1.0))
+
+
+def imprecise_orientation(patch: pytest.MonkeyPatch) -> str:
+    patch.setattr(calibrating, "_MAX_ROTATION_STD", 1e-9)
+    return refusal_texts(rigs.simulate(1, 2, SECONDS, late=0.5))
+
+
+def imprecise_clock(patch: pytest.MonkeyPatch) -> str:
+    patch.setattr(calibrating, "_MAX_CLOCK_STD", 1e-9)
+    return refusal_texts(rigs.simulate(1, 2, SECONDS, late=0.5))
+
+
+def conflicting_lags(patch: pytest.MonkeyPatch) -> str:
+    patch.setattr(calibrating, "_MAX_LAG_CHANGE", 1e-9)
+    texts = refusal_texts(rigs.simulate(1, 2, SECONDS, late=0.5))
+    assert texts.splitlines()[-1].startswith("the trajectory puts its clock")  # nor is the pair's lag reported
+    return texts
+
+
+def imprecise_focal_length(patch: pytest.MonkeyPatch) -> str:
+    patch.setattr(calibrating, "MAX_FOCAL_STD", -1.0)
+    return refusal_texts(rigs.simulate(1, 2, SECONDS, late=0.5))
+
+
+def discontinuous_tracks(_: pytest.MonkeyPatch) -> str:
+    a, b = tracks(rigs.simulate(1, 2, 2.0, late=0.0))
+    search = _PairSearch(list(a.values()), list(b.values()), PairSettings(), None, True)
+    return search.search_lts(("cam0", "cam1")).status
+
+
+def inconsistent_camera(patch: pytest.MonkeyPatch) -> str:
+    patch.setattr(calibrating, "_MIN_INLIER_SHARE", 1.01)
+    return refusal_texts(rigs.simulate(1, 2, SECONDS, late=0.5))
+
+
+def no_position(patch: pytest.MonkeyPatch) -> str:
+    patch.setattr(initialisation, "_resect", lambda *_: None)
+    patch.setattr(initialisation, "_intersect_bearings", lambda *_: None)
+    return refusal_texts(rigs.simulate(1, 3, SECONDS, late=0.5))
+
+
+def too_short_track(_: pytest.MonkeyPatch) -> str:
+    session = rigs.simulate(1, 3, SECONDS, late=0.5)
+    mine = rows_of(session, "cam2")
+    return refusal_texts(with_rows(session, ~mine | (np.cumsum(mine) <= 3)))
+
+
+def unrelated_camera(_: pytest.MonkeyPatch) -> str:
+    return refusal_texts(rigs.simulate(1, 3, SECONDS, late=0.5, strangers=[2]))
+
+
+def disconnected_groups(_: pytest.MonkeyPatch) -> str:
+    return refusal_texts(rigs.simulate(1, 4, SECONDS, late=0.5, labels={"ball": [0, 1], "bat": [2, 3]}))
+
+
+def missing_intrinsics(_: pytest.MonkeyPatch) -> str:
+    session = rigs.simulate(1, 2, SECONDS, late=0.5)
+    blind = replace(session.rig.cameras["cam1"], intrinsics=None)
+    return refusal_texts(replace(session, rig=replace(session.rig, cameras=session.rig.cameras | {"cam1": blind})))
+
+
+def no_observations(_: pytest.MonkeyPatch) -> str:
+    session = rigs.simulate(1, 3, SECONDS, late=0.5)
+    return refusal_texts(with_rows(session, ~rows_of(session, "cam2")))
+
+
+def single_camera(_: pytest.MonkeyPatch) -> str:
+    return refusal_texts(rigs.simulate(1, 1, SECONDS))
+
+
+def only_one_with_observations(_: pytest.MonkeyPatch) -> str:
+    session = rigs.simulate(1, 2, SECONDS, late=0.5)
+    return refusal_texts(with_rows(session, rows_of(session, "cam0")))
+
+
+def no_common_instants(_: pytest.MonkeyPatch) -> str:
+    session = rigs.simulate(1, 2, SECONDS)  # epochs years apart
+    return refusal_texts(replace(session, rig=replace(session.rig, clock="shared")))
+
+
+def contradicting_control_points(_: pytest.MonkeyPatch) -> str:
+    session = rigs.simulate(1, 3, SECONDS, late=0.5)
+    off = {"cam0": 0.0, "cam1": 0.0, "cam2": 4.0}
+    cameras = {
+        name: replace(camera, position=session.poses[name].position + off[name])
+        for name, camera in session.rig.cameras.items()
+    }
+    return refusal_texts(replace(session, rig=replace(session.rig, cameras=cameras)))
+
+
+def moved_camera(_: pytest.MonkeyPatch) -> str:
+    session = rigs.simulate(1, 2, SECONDS, late=0.5)
+    found = calibrate(session.rig, session.observations())
+    late = replace(
+        found.cameras["cam1"],
+        time_map=replace(found.cameras["cam1"].time_map, time_offset=found.cameras["cam1"].time_map.time_offset + 1.5),
+    )
+    with pytest.raises(Refused) as refusal:
+        triangulate(session.rig, found.cameras | {"cam1": late}, session.observations())
+    return refusal.value.reason
+
+
+def paper_with_different_rates(_: pytest.MonkeyPatch) -> str:
+    return refusal_texts(rigs.simulate(1, 2, SECONDS, fps=(30.0, 50.0)), solver="paper")
+
+
+KINDS: dict[str, Scenario] = {
+    "hardly moves while both could have seen it": still_marker,
+    "no label that both cameras saw": different_labels,
+    "no alignment of the two tracks agrees with any geometry": too_few_rows,
+    "the motion determines the lag only to": imprecise_lag,
+    "the motion determines the relative rotation only to": imprecise_rotation,
+    "apart fit the motion equally well": ambiguous_rotation,
+    "determines its orientation only to": imprecise_orientation,
+    "determines its clock only to": imprecise_clock,
+    "from the lag of the epipolar geometry": conflicting_lags,
+    "determines its focal length only to": imprecise_focal_length,
+    "the tracks are discontinuous": discontinuous_tracks,
+    "fit the trajectory seen by the other cameras": inconsistent_camera,
+    "agrees with no position": no_position,
+    "too few connected observations": too_short_track,
+    "could not be connected to any camera": unrelated_camera,
+    "connected only to": disconnected_groups,
+    "no intrinsics": missing_intrinsics,
+    "no observations": no_observations,
+    "one camera only": single_camera,
+    "fewer than two cameras": only_one_with_observations,
+    "rows of the same time and label": no_common_instants,
+    "contradict each other": contradicting_control_points,
+    "contradict the calibration": moved_camera,
+    "frame rates differ": paper_with_different_rates,
+}
+
+
+@pytest.mark.parametrize("reason", KINDS)
+def test_the_reason_of_a_refusal_is_reported(reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert reason in KINDS[reason](monkeypatch)
+
+
+def test_every_kind_of_refusal_has_a_scenario() -> None:
+    """Those without a scenario here are rejections of an alignment, which are tested beside the table."""
+    assert not [
+        reason for reason in REFUSAL_KINDS if not any(reason in kind for kind in (*KINDS, *REJECTED, TWO_ALIKE))
+    ]

@@ -1,0 +1,139 @@
+"""The manoeuvre model: a marker that reverses, a ball that bounces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from hub.tracking.detections import TrackingCamera
+from hub.tracking.filter import kalman
+from hub.tracking.filter.kalman import STATE_DIM
+from hub.tracking.filter.manoeuvre import gpb1_update, manoeuvre_hypothesis
+from hub.tracking.filter.target_models import KIND_INDEX, MARKER
+from hub.tracking.filter.target_states import Targets
+from hub.tracking.frame_update import TrackerParameters
+from hub.tracking.tracker import Tracker
+from protocols.core.clocks import NANOSECONDS, TimeMap
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Floats
+from protocols.messages import syncline_pb2 as pb
+from tests.support.rigs import looking_at
+
+LENS = Intrinsics(640, 480, np.array([[450.0, 0, 319.5], [0, 450.0, 239.5], [0, 0, 1.0]]))
+FPS, SECONDS, CAMERAS, TURN_S = 10.0, 3.0, 5, 1.51
+Path = Callable[[float], Floats]
+
+
+def back_and_forth(t: float) -> Floats:
+    """At 3 m/s, and back on the same line."""
+    return np.array([1.5 - 3.0 * abs(t - TURN_S), 0.3, 1.2])
+
+
+def ball(t: float) -> Floats:
+    """Thrown up again by the floor every 0.9 s, at 4.4 m/s."""
+    since = (t + 0.9 - TURN_S) % 0.9
+    return np.array([0.4 * t - 0.6, 0.2, 4.905 * since * (0.9 - since)])
+
+
+def followed(path: Path) -> tuple[list[tuple[float, float]], int]:
+    """Time and position error [m] after every frame of cameras around ``path``, and the number of confirmed tracks."""
+    rng = np.random.default_rng(3)
+    cameras, frames = {}, []
+    for i in range(CAMERAS):
+        angle = 2 * np.pi * i / CAMERAS
+        place = np.array([5.0 * np.cos(angle), 5.0 * np.sin(angle), 2.0])
+        camera = TrackingCamera(f"cam{i}", LENS, looking_at(place, np.array([0.0, 0.0, 1.0])), TimeMap(), 1e-4)
+        cameras[camera.name] = camera
+        frames += [((number + i / CAMERAS) / FPS, number, camera) for number in range(int(SECONDS * FPS))]
+    tracker = Tracker(TrackerParameters(up=np.array([0.0, 0.0, 1.0])))
+    tracker.calibrate(cameras)
+    errors = []
+    for moment, number, camera in sorted(frames, key=lambda one: one[0]):
+        (pixel,) = LENS.project(camera.pose.camera_from_world(path(moment)[None])) + rng.normal(0.0, 1.0, 2)
+        message = pb.Observation(
+            schema_version=1, camera=camera.name, boot_id="b", sequence=number,
+            device_time_ns=round(moment * NANOSECONDS),
+        )  # fmt: skip
+        message.detections.add(u=pixel[0], v=pixel[1], kind="marker", covariance=[1.0, 0.0, 1.0])
+        tracker.handle(message)
+        targets = tracker.advance().targets
+        known = targets.select(targets.confirmed)
+        if len(known):
+            errors.append((moment, float(np.linalg.norm(known.mean[0, :3] - path(moment)))))
+    return errors, tracker.state.next_number - 1
+
+
+@pytest.mark.parametrize("path", [back_and_forth, ball])
+def test_a_manoeuvring_target_is_not_lost(path: Path) -> None:
+    """It keeps one track number, and three frames after the manoeuvre the error is small again."""
+    errors, names = followed(path)
+    assert names == 1
+    calm = [error for moment, error in errors if moment > 0.8 and (moment - TURN_S) % 0.9 > 0.3]
+    assert len(calm) > 40
+    assert max(calm) < 0.1
+    assert max(error for moment, error in errors if moment > 0.8) < 0.3
+
+
+def seen_before(kind: str, unseen_s: float) -> Targets:
+    """One target of a kind at 1 s, last seen ``unseen_s`` before."""
+    one = np.array([1])
+    seen = np.array([NANOSECONDS - round(unseen_s * NANOSECONDS)])
+    return Targets(
+        initiation_number=one, number=one, kind=np.array([KIND_INDEX[kind]]), mean=np.zeros((1, STATE_DIM)),
+        covariance=np.eye(STATE_DIM)[None], colour=np.zeros((1, 3)), colour_count=np.ones(1), born_ns=seen,
+        seen_ns=seen, hits=one, opportunities=one, detection_rate=np.ones(1), seen_by=seen[None], overlap_s=np.zeros(1),
+    )  # fmt: skip
+
+
+def test_the_manoeuvre_covariance_matches_sampling() -> None:
+    """Against sampled velocity changes at uniform times since the last detection."""
+    rng = np.random.default_rng(5)
+    unseen, units_per_m = 0.2, 100.0
+    jump = rng.normal(0.0, MARKER.manoeuvre_std_m_s * units_per_m, 400_000)
+    drawn = np.cov(jump * rng.uniform(0.0, unseen, jump.size), jump)
+    manoeuvre = manoeuvre_hypothesis(seen_before("marker", unseen), NANOSECONDS, units_per_m)
+    added = manoeuvre.covariance[0] - np.eye(STATE_DIM)
+    for axis in range(3):
+        rows = [axis, axis + 3]
+        np.testing.assert_allclose(added[np.ix_(rows, rows)], drawn, rtol=0.02)
+    assert manoeuvre.prior_odds[0] == pytest.approx(MARKER.manoeuvres_per_s * unseen, rel=0.1)
+    assert manoeuvre_hypothesis(seen_before("marker", 1.0), NANOSECONDS, units_per_m).prior_odds[0] == 0.0, (
+        "by then it could be anywhere"
+    )
+
+
+def test_people_have_no_manoeuvre_hypothesis() -> None:
+    manoeuvre = manoeuvre_hypothesis(seen_before("person", 0.2), NANOSECONDS, 1.0)
+    np.testing.assert_array_equal(manoeuvre.covariance[0], np.eye(STATE_DIM))
+    assert manoeuvre.prior_odds[0] == 0.0
+
+
+def test_the_more_likely_hypothesis_dominates() -> None:
+    """A measurement near the prediction selects the first hypothesis, a distant one the second."""
+    mean, tight, loose = np.zeros((1, STATE_DIM)), 0.01 * np.eye(STATE_DIM)[None], np.eye(STATE_DIM)[None]
+    jacobian, noise, used = np.eye(2, STATE_DIM)[None], 0.01 * np.eye(2)[None], np.ones((1, 2), dtype=np.bool_)
+    prior_odds = np.array([0.01])
+    for off, leads in ((0.05, tight), (1.5, loose)):
+        innovation = np.full((1, 2), off)
+        got = gpb1_update(mean, tight, loose, prior_odds, innovation, jacobian, noise, used)
+        alone = kalman.update(mean, leads, innovation, jacobian, noise, used)
+        np.testing.assert_allclose(got[0], alone[0], atol=0.01)
+        np.testing.assert_allclose(got[1], alone[1], atol=0.02)
+
+
+def test_moment_matching_preserves_mean_and_covariance() -> None:
+    rng = np.random.default_rng(6)
+    means = rng.normal(size=(2, 1, STATE_DIM))
+    roots = rng.normal(size=(2, STATE_DIM, STATE_DIM))
+    covariances = [root @ root.T for root in roots]
+    share = 0.3
+    mean, covariance = kalman.moment_match(
+        (means[0], covariances[0][None]), (means[1], covariances[1][None]), np.array([share])
+    )
+    # Second moments of the mixture, by their definition.
+    parts = zip((1.0 - share, share), means[:, 0], covariances, strict=True)
+    second = sum((weight * (c + np.outer(m, m)) for weight, m, c in parts), np.zeros((STATE_DIM, STATE_DIM)))
+    np.testing.assert_allclose(mean[0], (1.0 - share) * means[0, 0] + share * means[1, 0])
+    np.testing.assert_allclose(covariance[0], second - np.outer(mean[0], mean[0]), atol=1e-12)

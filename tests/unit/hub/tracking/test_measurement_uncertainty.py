@@ -1,0 +1,193 @@
+"""Robustness of tracking: head and foot outliers, ambiguous associations, clutter, false matches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hub.tracking.association.assignment import (
+    COLOUR_STD,
+    matching_colour_std,
+    misassociation_probability,
+    update_colour_variance,
+)
+from hub.tracking.detections import TrackingCamera, frame_detections
+from hub.tracking.filter.measurement import student_t_cost, student_t_inflation
+from hub.tracking.filter.target_states import MultiTargetState, Targets
+from hub.tracking.frame_update import TrackerParameters, process_frame
+from hub.tracking.tracker import Tracker
+from protocols.core.clocks import NANOSECONDS, TimeMap
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Floats
+from protocols.messages import syncline_pb2 as pb
+from tests.support.rigs import looking_at
+
+UP = np.array([0.0, 0.0, 1.0])
+TALL = 1.7
+LENS = Intrinsics(640, 480, np.array([[450.0, 0, 319.5], [0, 450.0, 239.5], [0, 0, 1.0]]))
+
+
+def ring(count: int) -> dict[str, TrackingCamera]:
+    """Cameras around a room whose clocks are all the reference."""
+    out = {}
+    for i in range(count):
+        angle = 2 * np.pi * i / count + 0.3
+        place = np.array([4.5 * np.cos(angle), 4.5 * np.sin(angle), 2.3])
+        out[f"cam{i}"] = TrackingCamera(f"cam{i}", LENS, looking_at(place, 0.9 * UP), TimeMap(), 1e-4)
+    return out
+
+
+def person(camera: TrackingCamera, middle: Floats, time_ns: int, number: int, missing: float = 0.0) -> pb.Observation:
+    """A person standing at ``middle``; a fraction of the height is missing at the foot, as behind a table."""
+    message = pb.Observation(
+        schema_version=1, camera=camera.name, boot_id="b", sequence=number, device_time_ns=camera.device_ns(time_ns)
+    )
+    shares = np.array([0.12, 0.5, missing - 0.5])
+    point, head, foot = LENS.project(camera.pose.camera_from_world(middle + shares[:, None] * TALL * UP))
+    message.detections.add(
+        u=point[0], v=point[1], head=head.tolist(), foot=foot.tolist(), size=float(np.linalg.norm(head - foot)),
+        kind="person", covariance=[9.0, 0.0, 36.0], colour=pb.Colour(red=90, green=120, blue=60),
+    )  # fmt: skip
+    return message
+
+
+def test_occluded_feet_do_not_prevent_initiation() -> None:
+    """Three of four cameras see no legs: points and heads determine the position."""
+    cameras = ring(4)
+    tracker = Tracker(TrackerParameters(up=UP))
+    tracker.calibrate(cameras)
+    middle = np.array([0.4, -0.3, 0.5 * TALL])
+    for number in range(10):
+        for index, camera in enumerate(cameras.values()):
+            time_ns = round((0.1 * number + 0.025 * index) * NANOSECONDS)
+            tracker.handle(person(camera, middle, time_ns, number, 0.4 if index else 0.0))
+    targets = tracker.advance().targets
+    assert targets.confirmed.sum() == 1
+    assert np.linalg.norm(targets.mean[targets.confirmed][0, :2] - middle[:2]) < 0.1
+
+
+def standing(cameras: dict[str, TrackingCamera], foot: float, seen_by: int) -> MultiTargetState:
+    """State with one person whose foot is at a given height, recently seen by some cameras; the floor is at 0."""
+    now = NANOSECONDS
+    seen = np.full((1, len(cameras)), -(2**62), dtype=np.int64)
+    seen[0, :seen_by] = now
+    one = np.array([1])
+    targets = Targets(
+        initiation_number=one, number=one, kind=np.array([0]),
+        mean=np.array([[0.4, -0.3, foot + 0.5 * TALL, 0.0, 0.0, 0.0, np.log(TALL)]]),
+        covariance=np.diag([0.01, 0.01, 0.01, 0.1, 0.1, 0.1, 0.002])[None],
+        colour=np.array([[90.0, 120.0, 60.0]]), colour_count=np.array([9.0]), born_ns=np.array([0]),
+        seen_ns=np.array([now]), hits=np.array([50]), opportunities=np.array([50]), detection_rate=np.ones(1),
+        seen_by=seen, overlap_s=np.zeros(1),
+    )  # fmt: skip
+    empty = MultiTargetState.empty()
+    return replace(
+        empty,
+        time_ns=now,
+        cameras=tuple(cameras),
+        targets=targets,
+        next_initiation_number=2,
+        next_number=2,
+        floor_weight=1e3,
+    )
+
+
+def test_a_target_off_the_floor_seen_by_two_cameras_is_deleted() -> None:
+    """Two cameras that see different people can create a false match; a target that three cameras agree on is kept."""
+    cameras = ring(5)
+    for foot, seen_by, kept in ((0.0, 2, 1), (-0.7, 2, 0), (0.7, 2, 0), (-0.7, 4, 1)):
+        camera = cameras["cam4"]
+        empty = pb.Observation(schema_version=1, camera="cam4", boot_id="b", device_time_ns=NANOSECONDS + 1)
+        after = process_frame(
+            standing(cameras, foot, seen_by), frame_detections(camera, empty), cameras, TrackerParameters(up=UP)
+        )
+        assert len(after.targets) == kept, (foot, seen_by)
+        assert len(after.lost_tracks) == 1 - kept, "it is kept for re-identification"
+
+
+def test_mismatch_probability_follows_from_the_next_best_assignment() -> None:
+    rows, columns = np.array([0, 1]), np.array([0, 1])
+    no_clutter = np.full(2, np.inf)
+    clear = misassociation_probability(np.array([[4.0, 200.0], [200.0, 4.0]]), rows, columns, no_clutter)
+    assert clear.max() < 1e-6
+    even = misassociation_probability(np.array([[4.0, 5.0], [6.0, 7.0]]), rows, columns, no_clutter)
+    assert np.allclose(even, 0.5)
+    alone = misassociation_probability(np.array([[4.0], [np.inf]]), rows[:1], columns[:1], no_clutter[:1])
+    assert alone.max() < 1e-6
+    either = misassociation_probability(np.array([[4.0], [4.0]]), rows[:1], columns[:1], no_clutter[:1])
+    assert np.allclose(either, 0.5), "an unassigned target may own the detection"
+    poor = misassociation_probability(np.array([[4.0, np.inf], [np.inf, 40.0]]), rows, columns, np.full(2, 40.0))
+    assert poor[0] < 1e-3
+    assert np.allclose(poor[1], 0.5), "a poor fit may be clutter"
+
+
+def test_clutter_does_not_pull_a_track_away() -> None:
+    """An untracked person in other clothes half a metre aside does not move the target."""
+    cameras = ring(3)
+    camera = cameras["cam0"]
+    before = standing(cameras, 0.0, 3)
+    loose = np.diag([0.04, 0.04, 0.01, 0.1, 0.1, 0.1, 0.002])[None]
+    before = replace(before, targets=replace(before.targets, covariance=loose))
+    mean = before.targets.mean[0, :3]
+    moved = []
+    for aside, colour in ((0.15, (90, 120, 60)), (0.5, (160, 60, 140))):
+        message = person(camera, mean + aside * camera.pose.rotation[0], NANOSECONDS + 1, 1)
+        red, green, blue = colour
+        message.detections[0].colour.CopyFrom(pb.Colour(red=red, green=green, blue=blue))
+        after = process_frame(before, frame_detections(camera, message), cameras, TrackerParameters(up=UP)).targets
+        moved.append(float(np.linalg.norm(after.mean[0, :2] - mean[:2])))
+    assert moved[0] > 0.1, "its own detection does"
+    assert moved[1] < 0.15
+
+
+def test_an_ambiguous_detection_moves_no_target() -> None:
+    """One detection between two targets: without the second, the first would move half of the way to it."""
+    cameras = ring(3)
+    camera = cameras["cam0"]
+    side = camera.pose.rotation[0]
+    alone = standing(cameras, 0.0, 3)
+    alone = replace(alone, targets=replace(alone.targets, kind=np.array([2]), covariance=0.02 * np.eye(7)[None]))
+    first = alone.targets
+    twin = replace(first, initiation_number=np.array([2]), number=np.array([2]))
+    shift = np.zeros((1, 7))
+    shift[0, :3] = 0.5 * side
+    twin = replace(twin, mean=first.mean + shift)
+    both = replace(alone, targets=first.concatenate(twin))
+    (pixel,) = LENS.project(camera.pose.camera_from_world(first.mean[:, :3] + 0.25 * side))
+    message = pb.Observation(schema_version=1, camera="cam0", boot_id="b", device_time_ns=NANOSECONDS + 1)
+    message.detections.add(u=pixel[0], v=pixel[1], kind="marker", covariance=[4.0, 0.0, 4.0])
+    moved = []
+    for state in (alone, both):
+        after = process_frame(state, frame_detections(camera, message), cameras, TrackerParameters(up=UP)).targets
+        moved.append(float(np.linalg.norm(after.mean[:, :3] - state.targets.mean[:, :3], axis=1).max()))
+    assert moved[0] > 0.2
+    assert moved[1] < 0.2 * moved[0]
+
+
+def test_the_student_t_weight_is_the_derivative_of_its_cost() -> None:
+    squared = np.array([0.5, 1.9, 2.1, 10.0, 300.0])
+    derivative = (student_t_cost(squared + 1e-6) - student_t_cost(squared - 1e-6)) / 2e-6
+    assert np.allclose(derivative, 1.0 / student_t_inflation(squared), rtol=1e-6)
+    assert student_t_inflation(np.array([np.nan])) == 1.0
+
+
+def adapted_colour_std(off: float, doubtful: float) -> float:
+    """After 3000 pairs whose channels are wrong by ``off``, up or down."""
+    rng = np.random.default_rng(7)
+    variance = MultiTargetState.empty().colour_variance
+    for _ in range(1000):
+        known = rng.uniform(20.0, 230.0, (3, 3))
+        observed = known + off * rng.choice([-1.0, 1.0], (3, 3))
+        observed[rng.integers(3)] = np.nan
+        variance = update_colour_variance(variance, observed, known, np.full(3, doubtful))
+    return matching_colour_std(variance)
+
+
+def test_the_colour_variance_between_cameras_is_adapted() -> None:
+    """If cameras agree, a small colour difference is significant; under different light it is not."""
+    strict, usual, loose = (adapted_colour_std(off, 0.0) for off in (3.0, 10.0, 40.0))
+    assert strict == 14.0
+    assert 18.0 < usual < 22.0
+    assert loose == COLOUR_STD
+    assert adapted_colour_std(3.0, 0.4) == COLOUR_STD, "ambiguous pairs are not used"

@@ -1,0 +1,153 @@
+"""Whoever begins in the middle is asked for the beginning, whoever leaves a gap is asked until it is closed."""
+
+from __future__ import annotations
+
+from protocols.bus.transport.backfill import GAP_TIMEOUT_S, JOIN_TIMEOUT_S, RETRY_S, Backfill, RecoveryQuery
+
+
+class Stage:
+    """A backfill between a recorded output and recorded questions, on a clock of its own."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.out: list[str] = []
+        self.asked: list[RecoveryQuery[str]] = []
+        self.lost = 0
+        self.backfill: Backfill[str] = Backfill(
+            lambda source, key, payload: self.out.append(payload.decode()),
+            self.asked.append,
+            self.count_lost,
+            self.time,
+        )
+
+    def time(self) -> float:
+        return self.now
+
+    def count_lost(self, count: int) -> None:
+        self.lost += count
+
+    def take(self, source: str, *numbers: int) -> None:
+        for number in numbers:
+            self.backfill.take(source, number, f"key-{source}", f"{source}{number}".encode())
+
+    def answer(self, *numbers: int, served: bool = True) -> None:
+        """The answers to the last question, and their end."""
+        source = self.asked[-1].source
+        for number in numbers:
+            self.backfill.answer(source, number, f"key-{source}", f"{source}{number}".encode())
+        self.backfill.finish(source, self.asked[-1].number, served)
+
+    def after(self, seconds: float) -> None:
+        self.now += seconds
+        self.backfill.poll()
+
+
+def names(*numbers: int, source: str = "a") -> list[str]:
+    return [f"{source}{number}" for number in numbers]
+
+
+def test_who_begins_at_the_beginning_is_not_asked() -> None:
+    stage = Stage()
+    stage.take("a", 0, 1, 2, 3)
+    assert stage.out == names(0, 1, 2, 3)
+    assert stage.asked == []
+
+
+def test_what_came_before_is_fetched_once_and_put_first() -> None:
+    stage = Stage()
+    stage.take("a", 3, 4)
+    assert [(q.key, q.source, q.low, q.high, q.witness) for q in stage.asked] == [("key-a", "a", 0, 2, None)]
+    stage.take("b", 0)
+    assert stage.out == ["b0"], "others do not wait"
+    stage.take("a", 5)
+    stage.answer(2, 0, 1, 3, served=False)
+    stage.take("a", 6)
+    assert stage.out == ["b0", *names(0, 1, 2, 3, 4, 5, 6)]
+    assert len(stage.asked) == 1
+    assert stage.lost == 0
+
+
+def test_a_late_joiner_without_an_answer_loses_nothing_but_time() -> None:
+    stage = Stage()
+    stage.take("a", 3)
+    stage.after(0.0)
+    assert stage.out == []
+    stage.after(JOIN_TIMEOUT_S + 0.1)
+    assert stage.out == names(3)
+    stage.answer(2)
+    stage.take("a", 4)
+    assert stage.out == names(3, 4), "an answer that comes too late is left out"
+    assert stage.lost == 0, "nobody promised a late joiner what was before"
+
+
+def test_a_gap_is_asked_for_again_when_the_question_was_lost() -> None:
+    stage = Stage()
+    stage.take("a", 0, 1, 5, 6)
+    assert stage.out == names(0, 1)
+    assert (stage.asked[0].low, stage.asked[0].high, stage.asked[0].witness) == (2, 4, 5)
+    stage.answer(3, served=False)  # the connection broke
+    stage.after(0.9 * RETRY_S)
+    assert len(stage.asked) == 1
+    stage.after(0.2 * RETRY_S)
+    assert (stage.asked[1].low, stage.asked[1].high, stage.asked[1].witness) == (2, 4, 6)
+    stage.answer(2, 3, 4, served=False)
+    assert stage.out == names(0, 1, 2, 3, 4, 5, 6), "whole, so no witness is needed"
+    assert stage.lost == 0
+
+
+def test_what_the_cache_does_not_have_any_more_is_counted() -> None:
+    stage = Stage()
+    stage.take("a", 0, 5)
+    stage.answer(3, 4)
+    stage.take("a", 6)
+    assert stage.out == names(0, 3, 4, 5, 6)
+    assert stage.lost == 2
+
+
+def test_the_end_of_an_older_question_is_no_answer() -> None:
+    stage = Stage()
+    stage.take("a", 0, 3)
+    stage.answer(served=False)
+    stage.after(2 * RETRY_S)
+    first, second = stage.asked
+    stage.backfill.finish("a", first.number, served=True)
+    assert stage.out == names(0)
+    stage.backfill.finish("a", second.number, served=True)
+    assert stage.out == names(0, 3)
+    assert stage.lost == 2
+
+
+def test_a_second_gap_while_the_first_one_waits_is_asked_for_too() -> None:
+    stage = Stage()
+    stage.take("a", 0, 2, 3, 6, 7)
+    stage.answer(1)
+    assert stage.out == names(0, 1, 2, 3)
+    assert (stage.asked[1].low, stage.asked[1].high) == (4, 5)
+    stage.answer(4, 5)
+    stage.take("a", 8)
+    assert stage.out == names(*range(9))
+    assert stage.lost == 0
+
+
+def test_who_never_answers_holds_its_messages_up_for_a_while_only() -> None:
+    stage = Stage()
+    stage.take("a", 0, 3)
+    stage.answer(served=False)
+    while stage.now < 0.9 * GAP_TIMEOUT_S:
+        stage.after(1.0)
+        if len(stage.asked) < 100:
+            stage.answer(served=False)
+    assert stage.out == names(0)
+    assert len(stage.asked) > 5
+    stage.after(0.2 * GAP_TIMEOUT_S)
+    assert stage.out == names(0, 3)
+    assert stage.lost == 2
+
+
+def test_what_comes_twice_is_left_out() -> None:
+    stage = Stage()
+    stage.take("a", 0, 1, 2, 1, 0, 3)
+    stage.take("a", 5, 5, 4, 6)
+    stage.answer(4, 4, served=False)
+    assert stage.out == names(0, 1, 2, 3, 4, 5, 6)
+    assert stage.lost == 0

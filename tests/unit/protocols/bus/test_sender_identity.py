@@ -1,0 +1,60 @@
+"""Sender checks without a bus: ids in use twice, boots that publish over another connection."""
+
+from __future__ import annotations
+
+from protocols.bus.base import AgentEvent, Received
+from protocols.bus.security.sender_identity import SOURCE_TIMEOUT_S, SenderValidator
+from protocols.topics import OBSERVATION
+from protocols.validation.codec import RejectionReason
+from tests.support.samples import observation
+
+
+def message(boot: str, source: str = "a") -> Received:
+    return Received(OBSERVATION, "cam0", observation("cam0", 0, boot), 0, source)
+
+
+def alive(boot: str, yes: bool = True) -> AgentEvent:
+    return AgentEvent("camera", "cam0", boot, yes)
+
+
+def reason(guard: SenderValidator, received: Received, now: float = 0.0) -> RejectionReason | None:
+    why = guard.refuse(received, now)
+    return None if why is None else why[0]
+
+
+def test_without_an_announcement_everyone_is_believed() -> None:
+    assert reason(SenderValidator(), message("boot-1")) is None
+
+
+def test_the_first_of_two_is_heard_until_it_is_gone() -> None:
+    guard = SenderValidator()
+    guard.handle(alive("boot-1"))
+    guard.handle(alive("boot-2"))
+    assert reason(guard, message("boot-1")) is None
+    assert reason(guard, message("boot-2", "b")) is RejectionReason.SECOND_AGENT
+    assert len(guard.alarms()) == 1
+    guard.handle(alive("boot-1", False))
+    assert reason(guard, message("boot-2", "b")) is None
+    assert reason(guard, message("boot-1")) is None, "what it said before may still come, recovered"
+    assert guard.alarms() == []
+
+
+def test_a_run_that_nobody_announced_is_refused_while_its_agent_lives() -> None:
+    guard = SenderValidator()
+    guard.handle(alive("boot-1"))
+    assert reason(guard, message("boot-9", "b")) is RejectionReason.WRONG_SOURCE
+
+
+def test_a_run_speaks_through_one_connection_until_that_is_silent() -> None:
+    guard = SenderValidator()
+    assert reason(guard, message("boot-1", "a"), 0.0) is None
+    assert reason(guard, message("boot-1", "b"), 1.0) is RejectionReason.WRONG_SOURCE
+    assert reason(guard, message("boot-1", "a"), 2.0) is None
+    assert reason(guard, message("boot-1", "b"), 2.0 + SOURCE_TIMEOUT_S) is None
+
+
+def test_a_flood_of_invented_runs_does_not_fill_the_memory() -> None:
+    guard = SenderValidator()
+    for number in range(10_000):
+        reason(guard, message(f"boot-{number}"), 0.0)
+    assert len(guard._sources) <= 4096
