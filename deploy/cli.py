@@ -146,15 +146,20 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         # A full disk, a file name that is too long, missing permissions: the state of the machine, not a bug.
         place = f"{error.filename}: " if error.filename else ""
-        print(f"syncline: {place}{error.strerror or error}; check the path, the disk and its rights", file=sys.stderr)
+        print(f"syncline: {place}{error.strerror or error}; check path, disk and permissions", file=sys.stderr)
         return EXIT_INPUT
     return result if isinstance(result, int) else EXIT_DONE
 
 
 def _unknown_command(arguments: Sequence[str]) -> str:
     # Cyclopts would import every subcommand to suggest one.
-    word = next((word for word in arguments if not word.startswith("-")), "")
-    close = difflib.get_close_matches(word, [name for name, _, _ in COMMANDS], 1)
+    words = [word for word in arguments if not word.startswith("-")]
+    known = {name for name, _, _ in COMMANDS}
+    if words and words[0] in known:  # a command of commands, as `keys`
+        unknown = words[1] if len(words) > 1 else ""
+        return f"there is no command {unknown!r} of `{words[0]}`; see syncline {words[0]} --help"
+    word = words[0] if words else ""
+    close = difflib.get_close_matches(word, known, 1)
     return f"there is no command {word!r}" + (f": did you mean {close[0]}?" if close else "")
 
 

@@ -1,7 +1,7 @@
-"""Calibration and triangulation for notebooks and for the commands: a session in, a result that can be saved out.
+"""Calibration and triangulation of sessions, for notebooks and for the commands.
 
-The estimators themselves are ``hub.calibration.pipeline`` and ``hub.calibration.triangulation``; here are only their
-options, the reading of what a path means, and the files of a result.
+The estimators are ``hub.calibration.pipeline`` and ``hub.calibration.triangulation``. This module adds their options,
+loads sessions and calibrations from paths, and saves results.
 """
 
 from __future__ import annotations
@@ -62,19 +62,19 @@ class CalibrationOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationResult:
-    """A solved session. calibration: clocks, poses, trajectories and pair reports. session: what it was made from."""
+    """A calibrated session. calibration: clocks, poses, trajectories and pair reports. session: the input."""
 
     calibration: Calibration
     session: Session
 
     @property
     def cameras(self) -> dict[str, CameraCalibration]:
-        """The solved cameras by name."""
+        """The calibrated cameras by name."""
         return self.calibration.cameras
 
     @property
     def refused(self) -> dict[str, str]:
-        """Why a camera is not among them, by name."""
+        """Reasons of the cameras that could not be calibrated, by name."""
         return self.calibration.refused
 
     def save(self, out: str | Path, command: str = "") -> dict[str, Any]:
@@ -99,7 +99,7 @@ class CalibrationResult:
         return document
 
     def to_dataframe(self) -> pandas.DataFrame:
-        """One row a solved camera: clock, pose and their stds. Needs pandas.
+        """A table with one row per calibrated camera: clock, pose and their stds. Needs pandas.
 
         time_offset, clock_rate: t_reference = clock_rate * t_camera + time_offset [s]. x, y, z: its centre in the
         world, with the std of each [rig units]. rx, ry, rz: Rodrigues vector, camera from world [rad]. rms_px: of its
@@ -123,7 +123,7 @@ class CalibrationResult:
         )
 
     def trajectory_dataframe(self) -> pandas.DataFrame:
-        """One row a sample: time [s, reference clock], x, y, z, std [rig units], label. Needs pandas."""
+        """One row per sample: time [s, reference clock], x, y, z, std [rig units], label. Needs pandas."""
         return _trajectories(self.calibration.trajectories)
 
 
@@ -152,17 +152,17 @@ class TriangulationResult:
         write_atomically(Path(file), "\n".join(["time,x,y,z,std,label", *rows]) + "\n")
 
     def to_dataframe(self) -> pandas.DataFrame:
-        """One row a sample: time [s, reference clock], x, y, z, std [rig units], label. Needs pandas."""
+        """One row per sample: time [s, reference clock], x, y, z, std [rig units], label. Needs pandas."""
         return _trajectories(self.tables)
 
 
 def calibrate(
     session: Session | str | Path, options: CalibrationOptions | None = None, progress: Progress | None = None
 ) -> CalibrationResult:
-    """Estimate when each camera of a session fired, where it stands, and the trajectories of what moved.
+    """Estimate the clocks and poses of a session's cameras, and the trajectories of the observed points.
 
     session: as `load_session` returns it, or a path that it reads. Raises InputError for what cannot be read, and
-    Refused, with reasons by camera, where the data do not determine an answer for at least two cameras.
+    Refused, with reasons by camera, where the data do not determine the result for at least two cameras.
     """
     from hub.calibration.pipeline import calibrate as estimate_calibration
 
@@ -196,7 +196,7 @@ def calibrate(
 def save_refusal(
     out: str | Path, refusal: Refused, session: Session, command: str = "", solver: str = "joint"
 ) -> dict[str, Any]:
-    """Write result.json and report.html of a session that was refused; an earlier answer is removed.
+    """Write result.json and report.html of a refused session, and remove the files of an earlier result.
 
     Returns the content of result.json. Raises InputError.
     """
@@ -220,7 +220,7 @@ def save_refusal(
 
 
 def remove_outputs(out: Path) -> None:
-    """Remove an earlier answer: beside a refusal it would look like the present one. Raises InputError."""
+    """Remove calibration.toml and trajectory.csv of an earlier result. Raises InputError."""
     for name in (CALIBRATION, TRAJECTORY):
         try:
             (out / name).unlink(missing_ok=True)

@@ -68,7 +68,7 @@ def _detector(config: CameraConfig, lens: Intrinsics | None, fps: float) -> Dete
 
         marker = config.marker
         if marker.mode != "colour":
-            from edge.offline.video import bright_or_tag_detector
+            from edge.detectors.marker.factory import bright_or_tag_detector
 
             return bright_or_tag_detector(
                 marker.mode, marker.threshold, marker.dictionary, marker.label, marker.min_size, marker.max_size
@@ -131,7 +131,7 @@ def _export(hub: object, out: Path) -> str:
 
 
 def write_last(hub: object, out: Path) -> None:
-    """The hub's last answer, or its last refusal, as the files that `calibrate` writes."""
+    """Write the hub's last calibration or refusal as the files that `calibrate` writes."""
     # Only here: with it comes the report, which costs a camera agent a fifth of a second of its start.
     from deploy.offline.outputs import report_refusal, report_result
     from hub.api import CalibrationResult

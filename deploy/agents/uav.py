@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from edge.mavlink.link.connection import Link
     from edge.mavlink.roles.autopilot import Autopilot
     from edge.mavlink.roles.camera import CameraComponent, SelectTarget, StopTracking, VideoStream
-    from edge.uav.tracker import Estimate, Image
+    from edge.uav.base import Estimate, Image
     from edge.uav.world.flight_world import FlightWorld
 
 _HOVER_HEIGHT_M = 62.0

@@ -12,7 +12,7 @@ from deploy.config.uav import VideoOutConfig
 
 if TYPE_CHECKING:
     from edge.mavlink.roles.camera import VideoStream
-    from edge.uav.tracker import Estimate, Image
+    from edge.uav.base import Estimate, Image
 
 
 class OperatorVideo:

@@ -151,9 +151,9 @@ def _pictures(log: Path, states: Sequence[pb.TargetState], world: FlightWorld) -
 def _figure(message: pb.FlightImage, state: Any, clouds: Iterable[pb.TargetCloud], why: str) -> str:
     import cv2
 
+    from edge.uav.base import Estimate, TrackState
     from edge.uav.estimator import decode_image
     from edge.uav.operator_view import draw
-    from edge.uav.tracker import Estimate, TrackState
 
     image = decode_image(message)
     if image is None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from deploy.offline.track import TrackedFrame
-from edge.uav.tracker import TrackState
+from edge.uav.base import TrackState
 from protocols.core.errors import InputError
 from protocols.geometry.types import Bools, Floats
 

@@ -100,7 +100,7 @@ def frame_clock(fps: float | None, videos: Path | None) -> points.Times:
             beyond = frames[(frames < 0) | (frames >= len(known))]
             if len(beyond):
                 what = f"frame {beyond[0]}, and the video of {camera} has {len(known)}"
-                raise InputError(what, file=file, remedy="give the very videos that were tracked")
+                raise InputError(what, file=file, remedy="give the same videos that were tracked")
             return known[frames]
         if fps is None:
             what = "its frames have no times"

@@ -192,7 +192,7 @@ def _document(file: Path) -> dict[str, Any]:
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", file=file, remedy="check its rights") from None
+        raise InputError(f"cannot be read: {error.strerror}", file=file, remedy="check its permissions") from None
     except (ValueError, RecursionError):
         raise InputError("is not JSON", file=file, remedy=remedy) from None
     if not isinstance(document, dict) or document.get("status") not in ("solved", "refused"):

@@ -85,7 +85,7 @@ def common_time_grid(spans: dict[str, Span], fps: float) -> Floats:
     if last < first:
         raise Refused(
             f"the videos have no time in common: {late} begins at {begin:.3f} s, {early} ends at {end:.3f} s of the "
-            "reference clock; is the calibration of these very videos?"
+            "reference clock; is the calibration of these same videos?"
         )
     return np.arange(first, last + 1) / fps
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from deploy.offline.track import TelemetryFile
 from deploy.offline.track_log import open_recording
-from edge.uav.tracker import Telemetry
+from edge.uav.base import Telemetry
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics

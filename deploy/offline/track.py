@@ -16,7 +16,7 @@ import numpy as np
 
 from edge.devices.base import Frame
 from edge.devices.playback.video_file import IMAGE_SUFFIXES
-from edge.uav.tracker import Box, Estimate, Image, Telemetry, Tracker, TrackState
+from edge.uav.base import Box, Estimate, Image, Telemetry, Tracker, TrackState
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats

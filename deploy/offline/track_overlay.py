@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from deploy.offline.track import TrackedFrame
-from edge.uav.tracker import Image, TrackState
+from edge.uav.base import Image, TrackState
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 

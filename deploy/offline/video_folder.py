@@ -16,9 +16,10 @@ import cv2
 import tomli_w
 
 from edge.detectors.marker.ball import REVISION, MarkerModel
+from edge.detectors.marker.factory import ball_detector
 from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader, has_pyav
 from edge.offline.detections import VideoDetections, observations_csv, run_detector
-from edge.offline.video import MARKER_FILE, ball_detector, read_marker_model
+from edge.offline.video import MARKER_FILE, read_marker_model
 from protocols.core.errors import InputError
 from protocols.core.files import write_together
 from protocols.core.names import name_from_file

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import tomli_w
 
-from edge.uav.tracker import Telemetry
+from edge.uav.base import Telemetry
 from edge.uav.world import scenarios
 from edge.uav.world.flight_world import FlightWorld
 from protocols.core.errors import InputError

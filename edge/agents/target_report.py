@@ -8,8 +8,8 @@ import numpy as np
 
 from edge.mavlink.roles.camera import TrackingStatus
 from edge.mavlink.roles.vehicle import Vehicle
+from edge.uav.base import Estimate, TrackState
 from edge.uav.navigation import quaternion_from_rotation
-from edge.uav.tracker import Estimate, TrackState
 
 
 def update_tracking_status(

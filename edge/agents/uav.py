@@ -24,10 +24,10 @@ from edge.mavlink.link.receiver import Receiver
 from edge.mavlink.roles.camera import CameraComponent, SelectTarget, StopTracking
 from edge.mavlink.roles.guidance import Guidance, GuidanceTarget
 from edge.mavlink.roles.vehicle import MountSample, Vehicle
+from edge.uav.base import Box, Estimate, Telemetry, TrackState
 from edge.uav.estimator import TargetEstimator, decode_image
 from edge.uav.navigation import quaternion_from_rotation
 from edge.uav.timing.clock_alignment import CameraHostClock, ClockAligner
-from edge.uav.tracker import Box, Estimate, Telemetry, TrackState
 from protocols.bus.base import Bus
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.version import VERSION

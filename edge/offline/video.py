@@ -11,7 +11,8 @@ from typing import Literal, get_args
 import tomli_w
 
 from edge.detectors.base import Detection, Detector
-from edge.detectors.marker.ball import MarkerDetector, MarkerModel, learn_marker_model
+from edge.detectors.marker.ball import MarkerModel, learn_marker_model
+from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
 from edge.devices.base import check_size
 from edge.devices.playback.video_reader import VideoReader
 from edge.offline.detections import VideoDetections, run_detector
@@ -120,32 +121,6 @@ def _with_overlay(
     write_overlay(video, overlay, {frame: [(one.label, one) for _, one in shown] for frame, shown in collected.items()})
     rows = [row.format(label=csv_cell(one.label)) for shown in collected.values() for row, one in shown]
     return replace(found, rows=tuple(rows))
-
-
-def ball_detector(model: MarkerModel, lens: Intrinsics | None, size: tuple[int, int]) -> MarkerDetector:
-    """The ball detector of one camera; a lens given for an image size other than the video's is ignored."""
-    fits = lens is not None and (lens.width, lens.height) == size
-    return MarkerDetector(model, lens if fits else None)
-
-
-def bright_or_tag_detector(
-    mode: Literal["bright", "tag"],
-    threshold: int = 200,
-    dictionary: str = "apriltag_36h11",
-    label: str = "marker",
-    min_size: float | None = None,
-    max_size: float | None = None,
-) -> Detector:
-    """The detector of a point of light or of fiducial tags; see ``MarkerConfig``. Raises InputError."""
-    if mode == "tag":
-        from edge.detectors.marker.tag import TagDetector, TagModel
-
-        tags = TagModel(dictionary, "tag" if label == "marker" else label)
-        return TagDetector(tags if min_size is None else replace(tags, min_size=min_size))
-    from edge.detectors.marker.bright import BrightDetector, BrightModel
-
-    light = BrightModel(threshold, min_size or 0.0, label=label)
-    return BrightDetector(light if max_size is None else replace(light, max_size=max_size))
 
 
 def read_marker_model(file: Path) -> MarkerModel:

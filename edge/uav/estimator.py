@@ -16,9 +16,9 @@ import numpy as np
 from google.protobuf.message import Message
 
 from edge.uav import tracker_factory
+from edge.uav.base import Box, Estimate, Image, Telemetry, Tracker, TrackState
 from edge.uav.georeference import Georeference
 from edge.uav.navigation import Origin, rotation_from_quaternion
-from edge.uav.tracker import Box, Estimate, Image, Telemetry, Tracker, TrackState
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
@@ -37,7 +37,7 @@ _DEFAULT_BOX_PX = 40.0
 class TargetEstimator:
     """The estimator of one agent. size: (width, height) [px]. seed: of the trackers' random numbers.
 
-    The n-th target's tracker uses seed + n. model: one of ``models.NAMES``. lens, body_from_camera: as far as known;
+    The n-th target's tracker uses seed + n. model: of ``tracker_factory.NAMES``. lens, body_from_camera: where known;
     where the camera hangs on a gimbal, body is the gimbal. estimate: the newest; None while no target is tracked.
     refused, undecodable: counts of rejected commands and of images that could not be decoded.
     """
@@ -130,7 +130,7 @@ class TargetEstimator:
         if self._image is None:
             self.refused += 1
             return []
-        tracker = tracker_factory.get(
+        tracker = tracker_factory.make_tracker(
             self._model, self._size, self._lens, self._mounting, self._fps, self._seed + self._targets
         )
         for sample in self._samples:

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from edge.uav.base import Estimate, Telemetry
 from edge.uav.timing.telemetry_track import TelemetryTrack
-from edge.uav.tracker import Estimate, Telemetry
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 

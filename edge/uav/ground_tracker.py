@@ -12,9 +12,10 @@ from functools import partial
 
 import numpy as np
 
+from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
 from edge.uav.ground.image_plane import apply_homography
-from edge.uav.ground.layers import LazyLayers
 from edge.uav.ground.localisation import CameraLocaliser
+from edge.uav.ground.overlay_layers import LazyLayers
 from edge.uav.ground.road_map import RoadMap
 from edge.uav.prediction import particle_filter as pf
 from edge.uav.prediction import particle_set
@@ -30,7 +31,6 @@ from edge.uav.target.redetection import Redetector
 from edge.uav.target.state_estimate import estimate_target
 from edge.uav.target.target import Target
 from edge.uav.target.tracklets import Tracklet, Tracklets
-from edge.uav.tracker import Box, Estimate, Image, Telemetry, TrackState
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Ints
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from edge.uav.tracker import Tracker
+from edge.uav.base import Tracker
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
@@ -10,7 +10,7 @@ from protocols.geometry.types import Floats
 NAMES = ("ground", "paper", "plain")
 
 
-def get(
+def make_tracker(
     name: str,
     size: tuple[int, int],
     lens: Intrinsics | None = None,
@@ -39,4 +39,4 @@ def get(
     raise InputError(f"there is no model {name!r}", remedy=f"use one of {', '.join(NAMES)}")
 
 
-__all__ = ["NAMES", "get"]
+__all__ = ["NAMES", "make_tracker"]

@@ -9,7 +9,7 @@ import numpy as np
 from hub.bundle import covariance as cov
 from hub.bundle.adjustment import predict, residual_norms
 from hub.bundle.datum.control_outliers import reject_outliers
-from hub.bundle.datum.control_points import adjust_to_control_points
+from hub.bundle.datum.control_point_adjustment import adjust_to_control_points
 from hub.bundle.datum.gauge import fix_gauge, identity_gauge, is_overdetermined, transform_state
 from hub.bundle.initialisation import Reconstruction
 from hub.bundle.noise_scale import rescale_noise

@@ -63,11 +63,11 @@ class PairSettings:
     max_log10_gap: float = -2.0
     """log10 of the probability of the gap to the next best lag; either this or ``max_log10_false_alarm`` must hold."""
     unique_min_support: float = 5.0
-    """Uniqueness tests: support of inliers [s] …"""
+    """Inlier support [s] that the uniqueness tests require."""
     unique_min_strength: float = 3.0
-    """… strength …"""
+    """Strength that the uniqueness tests require: cycles of inlier motion times the log of their misfit ratio."""
     unique_min_margin: float = 2.3
-    """… and margin of strength over the next best alignment: half the log Bayes factor, 100 to 1."""
+    """Margin of strength over the next best alignment that they require: half the log of the Bayes factor 100."""
     unique_max_strength_ratio: float = 0.6
     """Unique maximum: strength of the next best alignment over the best one's. (At the noise floor the limit is
     ``max_evidence_ratio``: a periodic motion makes two alignments that are both strong.)"""
@@ -80,41 +80,41 @@ class PairSettings:
     max_evidence_ratio: float = 0.5
     """Evidence of the best competing hypothesis over the best alignment's."""
     competing_residual_ratio: float = 1.6
-    """Residual over the best one's up to which another alignment competes …"""
+    """Ratio of residuals, another alignment over the best one, up to which the other one competes."""
     competing_residual_ratio_at_noise: float = 1.4
-    """… and where the best one is at the noise floor …"""
+    """The same ratio where the best alignment is at the noise floor."""
     competing_log10_margin: float = 3.0
-    """… unless its false-alarm probability is larger by this many powers of ten …"""
+    """A competing alignment is ignored if its false-alarm probability is larger by this many powers of ten."""
     chance_log10_margin: float = 2.0
-    """… or by this many, where every search is expected to yield one like it by chance."""
+    """The same margin for alignments that every search is expected to yield by chance."""
     predicted_lag_window: float = 0.3
     """Half-width [s] of the search about a lag that other cameras imply."""
     max_noise_ratio: float = 1.3
     """Residual over the tracks' own noise up to which an alignment is at the noise floor."""
     max_lag_std: float = 4e-3
-    """Std of the lag by noise alone [s] …"""
+    """Largest std of the lag [s] by noise alone."""
     max_slow_lag_std: float = 10e-3
-    """… and at most this [s] where the point moves by less than a pixel in that time."""
+    """Largest std of the lag [s] by noise alone, where the point moves by less than a pixel in that time."""
     standalone: bool = True
     """Whether the pair is the final result. If not, it only initialises a bundle adjustment of more cameras, which
     tests it, and the sensitivity tests below are left out."""
     max_total_lag_std: float = 10e-3
-    """Std of the lag with lens and readout uncertainty included [s]; the bundle adjustment must then agree …"""
+    """Largest std of the lag [s] with lens and readout uncertainty; the bundle adjustment must agree with it."""
     max_total_lag_std_planar: float = 7e-3
-    """… for a unique maximum where a plane explains the motion nearly as well …"""
+    """The same limit for a unique maximum where a plane explains the motion nearly as well."""
     max_total_lag_std_short: float = 7e-3
-    """… and for a unique maximum with less support than …"""
+    """The same limit for a unique maximum with less support than ``unique_long_support``."""
     unique_long_support: float = 10.0
-    """… this [s]."""
+    """Inlier support [s] from which a unique maximum counts as long."""
     max_leave_out_change: float = 30e-3
     """Largest change of the lag [s] when a fifth of the samples is left out."""
     max_rotation_ambiguity: float = 0.5
     """Angle [rad] between equally likely rotations, beyond which a standalone pair has no pose."""
     max_rotation_std: float = 0.1
-    """Std of the relative rotation [rad] …"""
+    """Largest std of the relative rotation [rad]."""
     unique_max_rotation_std: float = 0.04
-    """… where an alignment is accepted as a unique maximum …"""
+    """The same limit for an alignment that is accepted as a unique maximum."""
     max_rotation_std_certain_lag: float = 0.25
-    """… and where the lag is certain: epipolar lines can be right to a pixel with the pose undetermined."""
+    """The same limit where the lag is certain: epipolar lines can fit while the pose is undetermined."""
     certain_lag_log10_false_alarm: float = -3.0
     """log10 of the false-alarm probability of one wrong lag, from which the lag is certain."""

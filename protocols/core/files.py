@@ -31,7 +31,7 @@ def write_together(files: Mapping[Path, str]) -> None:
             now = file
             file.parent.mkdir(parents=True, exist_ok=True)
             if file.is_dir():
-                raise IsADirectoryError(errno.EISDIR, "a folder of this name is in the way")
+                raise IsADirectoryError(errno.EISDIR, "this is a folder, but a file is needed")
             handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name[:40]}.")
             prepared.append((Path(name), file))
             with os.fdopen(handle, "w", encoding="utf-8", newline="") as out:

@@ -46,7 +46,7 @@ def load(file: Path) -> tuple[dict[str, Any], str]:
     try:
         text = file.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {error}", file=file, remedy="check the file and its rights") from None
+        raise InputError(f"cannot be read: {error}", file=file, remedy="check the file and its permissions") from None
 
     class Loader(yaml.SafeLoader):
         """Safe, with OpenCV's tag, and with names as they are written: a camera may be called 007 or true."""

@@ -147,7 +147,7 @@ def read_toml(file: Path, what: str = "file") -> tuple[dict[str, Any], str]:
     except FileNotFoundError:
         raise InputError(f"this {what} does not exist", file=file, remedy="check the path") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {error}", file=file, remedy="check the file and its rights") from None
+        raise InputError(f"cannot be read: {error}", file=file, remedy="check the file and its permissions") from None
     try:
         return tomllib.loads(text), text
     except (RecursionError, OverflowError):

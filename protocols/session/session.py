@@ -24,9 +24,9 @@ _COLUMNS = ("camera", "time", "u", "v")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Session:
-    """What a calibration starts from.
+    """The input of a calibration.
 
-    rig: the cameras with everything given of them. observations: tracks by camera and label. warnings: what was
+    rig: the cameras and everything that is known of them. observations: tracks by camera and label. warnings: what was
     noticed while reading. name: of the folder or log, for progress and reports.
     """
 
@@ -82,7 +82,7 @@ class Session:
         return cls(rig, found, found.warnings, name)
 
     def to_dataframe(self) -> pandas.DataFrame:
-        """One row an observation: camera, label, frame, time [s, camera clock], u, v [px], size [px]. Needs pandas."""
+        """One row per observation: camera, label, frame, time [s, camera clock], u, v [px], size [px]. Needs pandas."""
         tracks = list(self.observations.tracks.values())
         return dataframe(
             {

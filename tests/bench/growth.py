@@ -150,7 +150,7 @@ def particles(quick: bool) -> list[Curve]:
     for count in (100, 800, 6400) if quick else (100, 400, 1600, 6400, 25600):
 
         def run() -> None:
-            tracker = tracker_factory.get("plain", world.size, fps=world.fps, seed=1)
+            tracker = tracker_factory.make_tracker("plain", world.size, fps=world.fps, seed=1)
             tracker.begin(images[0], world.time(0), world.truth(0).box)
             for i in range(1, len(images)):
                 tracker.handle_frame(images[i], world.time(i))

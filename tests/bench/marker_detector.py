@@ -6,7 +6,7 @@ Errors are against the projection of the ball's centre at mid-exposure. ``nees``
 reported covariance, 1 if the covariance is right. Distractors (balls and boxes of other hues, wood) are in every frame;
 the ball is missing in as many further frames. ``--frames``: per camera of a scene's three cameras; of lights and tags
 as many are rendered per case as all scenes together have, in two dozen rooms that are mirrored and change colours.
-Videos are consecutive frames through an encoder, "ultrafast" as ``tests/support/films.py`` writes them, and a decoder.
+Videos are consecutive frames through an encoder, "ultrafast" as ``tests/support/videos.py`` writes them, and a decoder.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from edge.scenes import renderer_for
 from edge.scenes.marker.renderer import MarkerRenderer
 from edge.scenes.marker.scene import MarkerScene
 from protocols.geometry.types import Floats
-from tests.support.films import write_video_frames
 from tests.support.rendered_markers import Image, add_distractors, add_spot, add_tag, dim_room, exposed, tag_image
+from tests.support.videos import write_video_frames
 
 _ROOMS = 24  # drawn for lights and tags, each used mirrored and with its colours exchanged
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edge.uav.tracker import Box, Estimate, Image, Tracker, TrackState
+from edge.uav.base import Box, Estimate, Image, Tracker, TrackState
 from protocols.geometry.types import Floats
 from tests.bench import uav_rivals
 from tests.bench.real_rigs import DEFAULT_DATA
@@ -167,7 +167,7 @@ def make(model: str) -> Tracker:
         return uav_rivals.OpenCvTracker(model)
     from edge.uav import tracker_factory
 
-    return tracker_factory.get(model, SIZE, fps=FPS)
+    return tracker_factory.make_tracker(model, SIZE, fps=FPS)
 
 
 def main() -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 import cv2
 
-from edge.uav.tracker import Box, Estimate, Image, Telemetry, TrackState
+from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
 
 NAMES = ("csrt", "kcf")
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from edge.uav.tracker import Estimate, TrackState
+from edge.uav.base import Estimate, TrackState
 from edge.uav.world.flight_world import GroundTruth
 from protocols.geometry.types import Bools, Floats
 

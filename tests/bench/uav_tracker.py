@@ -21,7 +21,7 @@ from pathlib import Path
 
 import cv2
 
-from edge.uav.tracker import Estimate, Telemetry, Tracker
+from edge.uav.base import Estimate, Telemetry, Tracker
 from edge.uav.world import scenarios
 from edge.uav.world.flight_world import FlightWorld
 from tests.bench import uav_rivals
@@ -90,7 +90,9 @@ def make(model: str, world: FlightWorld, telemetry: bool, options: Options) -> T
 
     lens = world.lens if telemetry or options.blind_lens else None
     body = world.body_from_camera if telemetry else None
-    return tracker_factory.get(model, world.size, lens=lens, body_from_camera=body, fps=world.fps, seed=world.seed)
+    return tracker_factory.make_tracker(
+        model, world.size, lens=lens, body_from_camera=body, fps=world.fps, seed=world.seed
+    )
 
 
 def fly(

@@ -42,7 +42,7 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import fit_similarity
 from protocols.geometry.types import Floats
 from protocols.session.calibration import read_calibration
-from tests.support.films import write_video_frames
+from tests.support.videos import write_video_frames
 
 FISHEYES = (1, 4)
 _TRUTH = "truth.json"

@@ -15,7 +15,7 @@ from deploy.demo.flight_report import write_report
 from deploy.logs.replay_uav import replay_through_uav
 from edge.agents.uav import TOPICS
 from edge.mavlink.roles.autopilot import LinkFaults
-from edge.uav.tracker import TrackState
+from edge.uav.base import TrackState
 from edge.uav.world.flight_world import FlightWorld
 from edge.uav.world.patrol import patrol_world
 from protocols.core.errors import InputError

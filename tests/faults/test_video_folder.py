@@ -16,7 +16,7 @@ import tomli_w
 
 from deploy.cli import run
 from hub.calibration.pipeline import calibrate
-from tests.support.films import record_scene_videos
+from tests.support.videos import record_scene_videos
 from tests.unit.protocols.test_sphere_projection import ball_session
 
 

@@ -16,10 +16,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from edge.uav.base import Estimate, Image, Tracker, TrackState
 from edge.uav.baselines import regions
 from edge.uav.baselines.paper_tracker import PaperTracker
 from edge.uav.baselines.plain_tracker import PlainTracker
-from edge.uav.tracker import Estimate, Image, Tracker, TrackState
 from edge.uav.world import scenarios
 from edge.uav.world.flight_world import FlightWorld
 from protocols.geometry.camera import Intrinsics

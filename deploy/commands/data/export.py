@@ -73,7 +73,7 @@ def export(
         if to in exports.IN_FOLDERS:
             check_folder(out)
         elif out.is_dir():
-            raise InputError("a folder of this name is in the way", file=out, remedy="give --out the name of a file")
+            raise InputError("this is a folder, but a file is needed", file=out, remedy="give --out the name of a file")
         if to == "trc":
             texts = exports.trajectory_files(source, out, units)
         else:

@@ -74,9 +74,9 @@ def import_(
     if not sources:
         raise InputError("nothing to import", remedy="give files, or a folder")
     if out.is_dir():
-        raise InputError("a folder of this name is in the way", file=out, remedy="give --out the name of a file")
+        raise InputError("this is a folder, but a file is needed", file=out, remedy="give --out the name of a file")
     if fps is not None and not 0.1 <= fps <= 10_000:
-        raise InputError(f"--fps {fps:g} is out of range", remedy="give frames a second")
+        raise InputError(f"--fps {fps:g} is out of range", remedy="give the frame rate in Hz")
     if not 0.0 <= likelihood <= 1.0:
         raise InputError(f"--likelihood {likelihood:g} is out of range", remedy="give 0 to 1")
     if fps is not None and videos is not None:

@@ -100,7 +100,7 @@ def _load(
 
         if is_video_folder(session):
             if marker is not None and detector != "marker":
-                raise InputError(f"--marker means nothing with --detector {detector}", remedy="leave one of them out")
+                raise InputError(f"--marker cannot be used with --detector {detector}", remedy="leave one of them out")
             with progress_bar(f"looking for the {detector}", quiet=quiet) as progress:
                 gathered = session_from_videos(session, out / SESSION, progress, marker, detector)
             for line in () if quiet else gathered.summaries:

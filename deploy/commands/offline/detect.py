@@ -104,12 +104,12 @@ def detect(
     """
     shown = {"--teach": teach or None, "--target": target, "--marker": marker, "--colour": colour, "--rig": rig}
     if what != "marker" and (useless := [option for option, value in shown.items() if value is not None]):
-        raise InputError(f"{useless[0]} means nothing for `detect {what}`", remedy="leave it out")
+        raise InputError(f"{useless[0]} cannot be used with `detect {what}`", remedy="leave it out")
     _check_mode(what, mode, shown, threshold, dictionary)
     if fps is not None and not 0.1 <= fps <= 10_000:
-        raise InputError(f"--fps {fps:g} is out of range", remedy="give frames a second")
+        raise InputError(f"--fps {fps:g} is out of range", remedy="give the frame rate in Hz")
     if out.is_dir():
-        raise InputError("a folder of this name is in the way", file=out, remedy="give --out the name of a CSV file")
+        raise InputError("this is a folder, but a file is needed", file=out, remedy="give --out the name of a CSV file")
     if overlay is not None and (overlay.is_dir() or not overlay.parent.is_dir()):
         raise InputError("cannot be written", file=overlay, remedy="give --overlay a file in a folder that exists")
     if teach != (target is not None):
@@ -184,9 +184,9 @@ def _check_mode(
 ) -> None:
     """Check that the options fit together. Raises InputError."""
     if mode != "colour" and what != "marker":
-        raise InputError(f"--mode means nothing for `detect {what}`", remedy="leave it out")
+        raise InputError(f"--mode cannot be used with `detect {what}`", remedy="leave it out")
     if mode != "colour" and (useless := [option for option, value in shown.items() if value is not None]):
-        raise InputError(f"{useless[0]} means nothing for a marker of --mode {mode}", remedy="leave it out")
+        raise InputError(f"{useless[0]} cannot be used with a marker of --mode {mode}", remedy="leave it out")
     for option, value, owner in (("--threshold", threshold, "bright"), ("--dictionary", dictionary, "tag")):
         if value is not None and mode != owner:
             raise InputError(f"{option} belongs to --mode {owner}", remedy=f"add --mode {owner}, or leave it out")

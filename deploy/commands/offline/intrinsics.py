@@ -75,7 +75,7 @@ def intrinsics(
         Accepted for consistency; this command uses no random numbers.
     """
     if out.is_dir():
-        raise InputError("a folder of this name is in the way", file=out, remedy="give --out the name of a rig.toml")
+        raise InputError("this is a folder, but a file is needed", file=out, remedy="give --out the name of a rig.toml")
     numbers = re.fullmatch(r"(\d{1,3})x(\d{1,3})", squares)
     if numbers is None or min(int(numbers[1]), int(numbers[2])) < 4:
         raise InputError(f"--squares {squares} is no board", remedy="give squares across x down, at least 4x4: 8x5")

@@ -142,7 +142,7 @@ def simulate(
 def _refuse(options: Mapping[str, object], scene: str) -> None:
     for option, value in options.items():
         if value is not None:
-            raise InputError(f"{option} means nothing for scene {scene}", remedy="leave it out")
+            raise InputError(f"{option} cannot be used with scene {scene}", remedy="leave it out")
 
 
 def _fly(

@@ -52,9 +52,9 @@ def sync(
 
     check_folder(out)
     if fps is not None and not 0.1 <= fps <= 1000:
-        raise InputError(f"--fps {fps:g} is out of range", remedy="give frames a second")
+        raise InputError(f"--fps {fps:g} is out of range", remedy="give the frame rate in Hz")
     if fps is not None and videos == "trim":
-        raise InputError("--fps means nothing with --videos trim", remedy="leave one of the two out")
+        raise InputError("--fps cannot be used with --videos trim", remedy="leave one of the two out")
     if out.exists() and folder.exists() and out.resolve() == folder.resolve():
         raise InputError("--out is the folder of the videos", file=out, remedy="choose another --out")
     from deploy.offline import sync as syncing

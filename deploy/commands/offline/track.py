@@ -74,7 +74,7 @@ def track(
     from deploy.offline.track_log import LoggedFlightImages, open_recording
     from deploy.offline.track_overlay import Overlay
     from edge.uav import tracker_factory
-    from edge.uav.tracker import Telemetry
+    from edge.uav.base import Telemetry
 
     box = tracking.parse_target(target)
     camera = tracking.choose_camera(rig, video) if rig is not None else None
@@ -127,7 +127,7 @@ def track(
     elif recorded is not None and telemetry is not None:
         end = count / recording.info.fps if count else float("inf")
         tracking.check_clock(recorded, telemetry, start / recording.info.fps, end)
-    tracker = tracker_factory.get(model, size, lens, mounting, recording.info.fps, seed)
+    tracker = tracker_factory.make_tracker(model, size, lens, mounting, recording.info.fps, seed)
     rows: list[tracking.TrackedFrame] = []
     with ExitStack() as stack:
         progress = stack.enter_context(progress_bar(f"tracking in {video.name}", quiet=json))
@@ -171,7 +171,7 @@ def _check(video: Path, start: int, fps: float | None, seed: int) -> None:
     if seed < 0:
         raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
     if fps is not None and not 0.1 <= fps <= 10_000:
-        raise InputError(f"--fps {fps:g} is out of range", remedy="give frames a second")
+        raise InputError(f"--fps {fps:g} is out of range", remedy="give the frame rate in Hz")
 
 
 def _print_summary(

@@ -45,7 +45,7 @@ def triangulate(
         Accepted for consistency; this command uses no random numbers.
     """
     if out.is_dir():
-        raise InputError("a folder of this name is in the way", file=out, remedy="give --out the name of a CSV file")
+        raise InputError("this is a folder, but a file is needed", file=out, remedy="give --out the name of a CSV file")
     from hub.api import triangulate as solve
 
     with progress_bar(f"triangulating {session.name}", quiet=json) as progress:

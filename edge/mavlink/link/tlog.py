@@ -16,8 +16,8 @@ import numpy as np
 from edge.mavlink.dialect import mavlink
 from edge.mavlink.link.connection import is_autopilot
 from edge.mavlink.roles.telemetry import Attitude, GlobalPosition, LocalPosition, parse_telemetry
+from edge.uav.base import Telemetry
 from edge.uav.navigation import Origin
-from edge.uav.tracker import Telemetry
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from edge.uav.base import Box
 from edge.uav.prediction import particle_filter as pf
-from edge.uav.tracker import Box
 from protocols.geometry.types import Bools, Floats
 
 Grey = npt.NDArray[np.uint8]

@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from edge.uav.base import Box, Image
 from edge.uav.baselines import histograms
 from edge.uav.baselines.background import BackgroundMotion
 from edge.uav.baselines.regions import ExistenceMap
@@ -17,7 +18,6 @@ from edge.uav.baselines.road import (
     road_heading,
     road_log_likelihood,
 )
-from edge.uav.tracker import Box, Image
 from protocols.geometry.types import Floats
 
 _TURN_NOISE = 0.06  # rad a frame

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.tracker import Box, Image
+from edge.uav.base import Box, Image
 from protocols.geometry.types import Bools, Floats
 
 Bins = npt.NDArray[np.uint8]

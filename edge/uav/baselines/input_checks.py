@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.tracker import Box, Image
+from edge.uav.base import Box, Image
 from protocols.core.errors import InputError
 
 _MIN_SIDE = 4.0  # px: below this a box holds too few pixels for a histogram

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from edge.uav.base import Box, Estimate, Hypothesis, Image, Telemetry, TrackState
 from edge.uav.baselines import histograms, regions
 from edge.uav.baselines.background import BackgroundFilter, BackgroundMotion
 from edge.uav.baselines.car_models import BackgroundAwareModel, FrameObservation, RoadSteeredModel
@@ -22,7 +23,6 @@ from edge.uav.baselines.road import RoadCourse, RoadMidline, extrapolated_course
 from edge.uav.baselines.road_filter import RoadFilter, line_support
 from edge.uav.baselines.white_lines import EdgeDistance, find_sections
 from edge.uav.prediction import particle_filter as pf
-from edge.uav.tracker import Box, Estimate, Hypothesis, Image, Telemetry, TrackState
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
 from edge.uav.baselines import histograms
 from edge.uav.baselines.input_checks import check_image, check_target, has_frame_format, visible_share
 from edge.uav.prediction import particle_filter as pf
-from edge.uav.tracker import Box, Estimate, Image, Telemetry, TrackState
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 

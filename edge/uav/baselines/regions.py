@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from edge.uav.base import Box, Image
 from edge.uav.baselines.road import RoadCourse
-from edge.uav.tracker import Box, Image
 from protocols.geometry.types import Bools, Floats
 
 Labels = npt.NDArray[np.uint8]

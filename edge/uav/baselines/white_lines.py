@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.tracker import Box
+from edge.uav.base import Box
 from protocols.geometry.types import Bools, Floats
 
 Grey = npt.NDArray[np.uint8]

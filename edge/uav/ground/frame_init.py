@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edge.uav.base import Box
 from edge.uav.ground.image_plane import ImagePlane, apply_homography, inverse
 from edge.uav.ground.plane_pose import PlaneHomography, PlanePose
 from edge.uav.timing.telemetry_track import TelemetryTrack
-from edge.uav.tracker import Box
 from protocols.geometry.types import Floats
 
 CAR_LENGTH = 4.5

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from edge.uav.base import Box
 from edge.uav.ground.ego_motion import EgoMotion
 from edge.uav.ground.frame_init import GroundFrame, frame_from_image, frame_from_telemetry
 from edge.uav.ground.image_plane import ImagePlane, apply_homography, inverse
 from edge.uav.ground.photometric import PhotometricGain
 from edge.uav.ground.plane_pose import PlanePose
 from edge.uav.timing.telemetry_track import TelemetryTrack
-from edge.uav.tracker import Box
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats

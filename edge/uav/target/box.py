@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge.uav.tracker import Box, Image
+from edge.uav.base import Box, Image
 from protocols.core.errors import InputError
 
 _MIN_BOX_PX = 4.0  # side

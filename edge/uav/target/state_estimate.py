@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from edge.uav.base import Estimate, Hypothesis, TrackState
 from edge.uav.ground.localisation import CameraLocaliser
 from edge.uav.prediction import particle_filter as pf
 from edge.uav.prediction.particle_set import ParticleSet
 from edge.uav.target import footprint
 from edge.uav.target.target import Target
-from edge.uav.tracker import Estimate, Hypothesis, TrackState
 
 _LOST_STD = 8.0  # in target lengths
 _LOST_AFTER_S = 15.0

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from edge.uav.base import Box
 from edge.uav.ground.localisation import CameraLocaliser
 from edge.uav.ground.photometric import TargetGain
 from edge.uav.target import footprint
 from edge.uav.target.appearance import AppearanceModel, Candidate, GroundPatch, rectify_patch
 from edge.uav.target.motion_history import MotionFit
-from edge.uav.tracker import Box
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 

@@ -10,9 +10,9 @@ from collections import deque
 
 import numpy as np
 
+from edge.uav.base import Image, Telemetry
 from edge.uav.timing.telemetry_offset import OffsetEstimate, find_offset
 from edge.uav.timing.visual_rotation import VisualRotationEstimator
-from edge.uav.tracker import Image, Telemetry
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.uav.tracker import Telemetry
+from edge.uav.base import Telemetry
 from protocols.geometry.types import Bools, Floats
 
 _STEP_S = 1.0 / 60.0

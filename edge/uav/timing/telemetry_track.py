@@ -10,7 +10,7 @@ from collections import deque
 
 import numpy as np
 
-from edge.uav.tracker import Telemetry
+from edge.uav.base import Telemetry
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from edge.uav.base import Image, Telemetry
 from edge.uav.ground.ego_motion import EgoMotion
 from edge.uav.ground.image_plane import ImagePlane
 from edge.uav.ground.plane_pose import PlanePose
 from edge.uav.timing.telemetry_offset import RelativeRotations
-from edge.uav.tracker import Image, Telemetry
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.tracker import Box, Telemetry
+from edge.uav.base import Box, Telemetry
 from edge.uav.world import cars
 from edge.uav.world.flight import LEAD_S, Flight
 from edge.uav.world.noise import smoothed_noise

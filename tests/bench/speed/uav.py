@@ -10,7 +10,7 @@ from pathlib import Path
 
 import cv2
 
-from edge.uav.tracker import Tracker
+from edge.uav.base import Tracker
 from edge.uav.world import scenarios
 from tests.bench import uav_rivals
 from tests.bench.speed.rows import Limit, Row, Section

@@ -15,7 +15,7 @@ from edge import scenes
 from edge.detectors.marker.interactive import InteractiveMarkerDetector, learn_marker_at
 from edge.scenes import renderer_for
 from protocols.core.errors import InputError
-from tests.support.films import record_scene_videos
+from tests.support.videos import record_scene_videos
 
 pytest.importorskip("viser")
 

@@ -352,7 +352,7 @@ def test_mvus_files_hold_x_y_frame_one_a_camera(tmp_path: Path) -> None:
 
 
 def test_frames_get_the_videos_own_times(tmp_path: Path) -> None:
-    from tests.support.films import numbered_image, write_video
+    from tests.support.videos import numbered_image, write_video
 
     (tmp_path / "videos").mkdir()
     times = np.array([0.0, 0.04, 0.13, 0.15])

@@ -21,9 +21,9 @@ from hub.two_view.relative_pose import FundamentalMatrix, relative_pose_between
 from protocols.core.errors import InputError
 from protocols.session.folder import read_folder, write_observations
 from protocols.session.rig import RigCamera, read_rig
-from tests.support.films import numbered_image, write_video
 from tests.support.rigs import Path as Curve
 from tests.support.rigs import Session, random_lens, random_path, random_poses, simulate
+from tests.support.videos import numbered_image, write_video
 
 
 def without_lenses(session: Session, *names: str) -> Session:

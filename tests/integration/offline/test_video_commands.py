@@ -22,7 +22,7 @@ from deploy.cli import run
 from edge.devices.playback.video_reader import VideoReader
 from edge.scenes.marker.scene import MarkerScene
 from protocols.geometry.types import Floats
-from tests.support.films import Image, numbered_image, read_number, record_scene_videos, write_video
+from tests.support.videos import Image, numbered_image, read_number, record_scene_videos, write_video
 
 Capture = pytest.CaptureFixture[str]
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
-from edge.uav.tracker import Box, Estimate, Hypothesis, Image, Telemetry, TrackState
+from edge.uav.base import Box, Estimate, Hypothesis, Image, Telemetry, TrackState
 from edge.uav.world import scenarios
 from edge.uav.world.flight_world import FlightWorld, GroundTruth
 from protocols.core.errors import EXIT_DONE

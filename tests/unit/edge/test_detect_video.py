@@ -16,8 +16,8 @@ from edge.detectors.marker.ball import MarkerModel
 from edge.offline.video import VideoDetections, detect_video, marker_toml
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
-from tests.support.films import Image, write_video
 from tests.support.rendered_markers import add_spot, add_tag, dim_room, exposed, tag_image
+from tests.support.videos import Image, write_video
 
 FRAMES = 12
 

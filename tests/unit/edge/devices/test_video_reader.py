@@ -12,7 +12,7 @@ import pytest
 from edge.devices.playback import video_reader
 from edge.devices.playback.video_reader import VideoReader
 from protocols.core.errors import InputError
-from tests.support.films import numbered_image, read_number, write_video
+from tests.support.videos import numbered_image, read_number, write_video
 
 TIMES = np.cumsum(np.r_[0.0, np.random.default_rng(5).uniform(0.01, 0.08, 39)])
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edge.uav.base import Estimate, Telemetry, TrackState
 from edge.uav.georeference import Georeference
-from edge.uav.tracker import Estimate, Telemetry, TrackState
 from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA, rotation
 from protocols.geometry.camera import Intrinsics
 

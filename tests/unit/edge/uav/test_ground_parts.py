@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from edge.uav.base import Box, Telemetry
 from edge.uav.ground.frame_init import frame_from_telemetry
 from edge.uav.ground.image_plane import ImagePlane
 from edge.uav.ground.photometric import PhotometricGain, TargetGain
@@ -25,7 +26,6 @@ from edge.uav.target.motion_history import MotionFit, MotionHistory
 from edge.uav.target.redetection import path_plausibility
 from edge.uav.target.tracklets import Tracklet, Tracklets
 from edge.uav.timing.telemetry_track import TelemetryTrack
-from edge.uav.tracker import Box, Telemetry
 from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from edge.uav.tracker import Box, Estimate, Telemetry, TrackState
-from edge.uav.tracker_factory import get
+from edge.uav.base import Box, Estimate, Telemetry, TrackState
+from edge.uav.tracker_factory import make_tracker
 from edge.uav.world import scenarios
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
@@ -72,7 +72,7 @@ def video_of(background: Image, frames: int, speed: float, window_speed: float, 
 
 
 def track(video: Video, model: str = "ground", seed: int = 0, without: range = range(0)) -> list[Estimate]:
-    tracker = get(model, SIZE, fps=FPS, seed=seed)
+    tracker = make_tracker(model, SIZE, fps=FPS, seed=seed)
     out = [tracker.begin(video.frame(0), 0.0, video.box())]
     for i in range(1, len(video.car)):
         out.append(tracker.handle_frame(None if i in without else video.frame(i), i / FPS))
@@ -152,7 +152,7 @@ def test_the_same_seed_gives_the_same_estimates(background: Image) -> None:
 
 def test_the_target_is_finally_lost_and_then_has_no_position(background: Image) -> None:
     video = video_of(background, 40, 4.0, 0.0)
-    tracker = get("ground", SIZE, fps=FPS)
+    tracker = make_tracker("ground", SIZE, fps=FPS)
     tracker.begin(video.frame(0), 0.0, video.box())
     for i in range(1, 40):
         tracker.handle_frame(video.frame(i), i / FPS)
@@ -169,7 +169,7 @@ def test_the_target_is_finally_lost_and_then_has_no_position(background: Image) 
 )
 def test_an_invalid_box_is_rejected_in_one_line(background: Image, box: Box) -> None:
     with pytest.raises(InputError) as raised:
-        get("ground", SIZE).begin(background[:240, :320], 0.0, box)
+        make_tracker("ground", SIZE).begin(background[:240, :320], 0.0, box)
     assert "\n" not in str(raised.value)
 
 
@@ -178,7 +178,7 @@ def test_telemetry_makes_the_estimate_metric(background: Image) -> None:
     lens = Intrinsics(320, 240, np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]]))
     camera_up_is_north = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     video = video_of(background, 60, 4.0, 3.0)
-    tracker = get("ground", SIZE, lens, camera_up_is_north, FPS)
+    tracker = make_tracker("ground", SIZE, lens, camera_up_is_north, FPS)
     for i in range(60):
         tracker.handle_telemetry(Telemetry(i / FPS, np.eye(3), np.array([0.0, 9.0 * i / FPS, -30.0])))
         last = (
@@ -194,7 +194,7 @@ def test_telemetry_makes_the_estimate_metric(background: Image) -> None:
 def test_later_telemetry_makes_the_estimate_metric_without_losing_the_target(background: Image) -> None:
     lens = Intrinsics(320, 240, np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]]))
     video = video_of(background, 60, 4.0, 3.0)
-    tracker = get("ground", SIZE, lens, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), FPS)
+    tracker = make_tracker("ground", SIZE, lens, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), FPS)
     found = [tracker.begin(video.frame(0), 0.0, video.box())]
     for i in range(1, 60):
         if i > 30:
@@ -207,7 +207,7 @@ def test_later_telemetry_makes_the_estimate_metric_without_losing_the_target(bac
 
 def test_an_unknown_model_is_rejected_with_the_list_of_models() -> None:
     with pytest.raises(InputError, match="ground, paper, plain"):
-        get("best", SIZE)
+        make_tracker("best", SIZE)
 
 
 def test_a_car_on_an_unpredicted_path_is_redetected_over_the_full_frame(background: Image) -> None:
@@ -226,7 +226,9 @@ def test_a_car_on_an_unpredicted_path_is_redetected_over_the_full_frame(backgrou
 def test_a_car_that_returns_with_another_heading_is_reacquired(seed: int) -> None:
     """It took a bend out of view and the particles' heading is off: its shape matches only when rotated."""
     world = scenarios.get("exit-bend", seed, frames=45)
-    tracker = get("ground", world.size, lens=world.lens, body_from_camera=world.body_from_camera, fps=world.fps)
+    tracker = make_tracker(
+        "ground", world.size, lens=world.lens, body_from_camera=world.body_from_camera, fps=world.fps
+    )
     samples = world.telemetry(30.0)
     states = []
     for i in range(175):

@@ -7,11 +7,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from edge.uav.base import Telemetry
 from edge.uav.ground.ego_motion import EgoMotion
 from edge.uav.ground.image_plane import ImagePlane, apply_homography, inverse
 from edge.uav.ground.plane_pose import PlaneHomography, PlanePose
 from edge.uav.timing.telemetry_track import TelemetryTrack
-from edge.uav.tracker import Telemetry
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats

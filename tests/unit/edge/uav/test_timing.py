@@ -7,10 +7,10 @@ import itertools
 import numpy as np
 import pytest
 
+from edge.uav.base import Telemetry
 from edge.uav.navigation import Origin
 from edge.uav.timing.telemetry_offset import OffsetEstimate, RelativeRotations, find_offset
 from edge.uav.timing.vehicle_clock import VehicleClock
-from edge.uav.tracker import Telemetry
 from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA, Flight, grid_times, rotation
 from edge.uav.world.noise import smoothed_noise
 from protocols.geometry import so3
