@@ -23,7 +23,7 @@ from edge.mavlink.roles.autopilot import Autopilot
 
 
 def examine_link(url: str, patience_s: float = 0.5) -> CheckResult:
-    return selection._vehicle(UavConfig(id="drone", mavlink=MavlinkConfig(url=url)), patience_s)
+    return selection._check_autopilot(UavConfig(id="drone", mavlink=MavlinkConfig(url=url)), patience_s)
 
 
 def free_port() -> int:

@@ -9,8 +9,8 @@ import pytest
 
 GROWTH = """
 import os, sys
-from deploy.agents.malloc_tuning import steady_heap
-if sys.argv[1] == "steady" and not steady_heap(give_back=True):
+from deploy.agents.malloc_tuning import limit_heap_growth
+if sys.argv[1] == "steady" and not limit_heap_growth(release_large_blocks=True):
     print("cannot"); sys.exit()
 import numpy as np
 def mb():
@@ -38,8 +38,8 @@ def test_memory_freed_by_a_solver_returns_to_the_system() -> None:
 
 FAULTS = """
 import resource, sys
-from deploy.agents.malloc_tuning import keep_heap
-if sys.argv[1] == "kept" and not keep_heap():
+from deploy.agents.malloc_tuning import retain_freed_memory
+if sys.argv[1] == "kept" and not retain_freed_memory():
     print("cannot"); sys.exit()
 import numpy as np
 def work():

@@ -1,4 +1,4 @@
-"""A newcomer's walk: the commands of the READMEs, run as they are written, and every option they name."""
+"""The commands of the documentation: those of a tutorial run as written, and every option on a page exists."""
 
 from __future__ import annotations
 
@@ -16,13 +16,17 @@ from deploy.cli import COMMANDS, build_app
 from protocols.session.calibration import read_calibration
 
 ROOT = Path(__file__).parents[3]
-READMES = ("README.md", "deploy/README.md", "hub/README.md", "edge/README.md", "protocols/README.md", "hub/FAQ.md")
+PAGES = sorted(
+    page.relative_to(ROOT).as_posix()
+    for pattern in ("*.md", "*/README.md", "*/*/README.md", "docs/**/*.md")
+    for page in ROOT.glob(pattern)
+)
 NAMES = {name for name, _, _ in COMMANDS}
 _SPAN = re.compile(r"`(syncline [^`]+)`")
 
 
 def command_lines(text: str) -> list[str]:
-    """Every `syncline …` of a README: prompts in blocks and spans in sentences, without comments."""
+    """Every `syncline …` of a page: prompts in blocks and spans in sentences, without comments."""
     found = []
     for line in text.splitlines():
         prompt = re.match(r"\$ (syncline .*)", line.strip())
@@ -39,19 +43,19 @@ def help_of(name: str) -> str:
     return result.stdout
 
 
-def in_readmes() -> list[tuple[str, str]]:
-    return [(file, line) for file in READMES for line in command_lines((ROOT / file).read_text(encoding="utf-8"))]
+def in_pages() -> list[tuple[str, str]]:
+    return [(file, line) for file in PAGES for line in command_lines((ROOT / file).read_text(encoding="utf-8"))]
 
 
-def test_the_readmes_name_commands() -> None:
-    assert len(in_readmes()) > 20
+def test_the_documentation_names_commands() -> None:
+    assert len(in_pages()) > 20
 
 
-def test_every_command_and_option_in_the_readmes_exists() -> None:
+def test_every_command_and_option_in_the_documentation_exists() -> None:
     wrong = []
-    for file, line in in_readmes():
+    for file, line in in_pages():
         words = [word for word in line.split()[1:] if word not in ("…", "...")]
-        if not words or words[0].startswith(("-", "<")) or words[0] in ("X", "COMMAND"):
+        if not words or words[0].startswith(("-", "<")) or words[0].isupper():
             continue
         name = words[0].rstrip(".,;:")
         if name not in NAMES:
@@ -93,20 +97,20 @@ def run_as_written(line: str, folder: Path) -> str:
 
 
 def line_with(text: str, *words: str) -> str:
-    """The README's command that holds all of these words."""
+    """The page's command that holds all of these words."""
     (line,) = sorted({line for line in command_lines(text) if all(word in line for word in words)}, key=len)[:1]
     return line
 
 
-def test_from_the_readme_to_a_session_a_calibration_a_report_and_other_tools(tmp_path: Path) -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+def test_from_the_tutorial_to_a_session_a_calibration_a_report_and_other_tools(tmp_path: Path) -> None:
+    text = (ROOT / "docs" / "tutorials" / "first-calibration.md").read_text(encoding="utf-8")
     run_as_written(line_with(text, "simulate marker", "my-session"), tmp_path)
     assert (tmp_path / "my-session" / "rig.toml").exists()
     printed = run_as_written(line_with(text, "calibrate my-session"), tmp_path)
-    assert "3 cameras" in printed
+    assert "4 cameras" in printed
     _, cameras = read_calibration(tmp_path / "out" / "calibration.toml")
-    assert len(cameras) == 3
-    assert "Good: all 3 cameras calibrated" in run_as_written("syncline report out", tmp_path)
+    assert len(cameras) == 4
+    assert "Good: all 4 cameras calibrated" in run_as_written("syncline report out", tmp_path)
     example = " ".join(help_of("export").split())
     line = re.search(r"Example: (syncline export out/trajectory\.csv \S+ \S+ \S+ \S+)", example)
     assert line is not None
@@ -114,7 +118,7 @@ def test_from_the_readme_to_a_session_a_calibration_a_report_and_other_tools(tmp
     written = tmp_path / shlex.split(line[1])[-1]
     assert len(written.read_text(encoding="utf-8").splitlines()) > 100
     run_as_written("syncline export out/calibration.toml --to opencv --out for-opencv", tmp_path)
-    assert len(list((tmp_path / "for-opencv").iterdir())) == 3
+    assert len(list((tmp_path / "for-opencv").iterdir())) == 4
 
 
 def test_the_overview_lists_every_command() -> None:
