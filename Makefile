@@ -56,7 +56,7 @@ faults: $(STAMP)
 browser: $(STAMP)
 	$(BIN)/python -m pytest tests/browser
 
-# A million and more damaged inputs for every decoder of what others send; seed by the time, told in the output.
+# A million and more damaged inputs for every decoder of what others send; seed by the time, printed in the output.
 fuzz: $(STAMP)
 	$(BIN)/python -m tests.faults.fuzz
 	$(BIN)/python -m pytest tests/property --hypothesis-profile=fuzz

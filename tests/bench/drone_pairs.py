@@ -1,12 +1,12 @@
 """Two cameras far from a drone with a short common stretch, and inaccurate intrinsics and readout times.
 
-    python -m tests.bench.drone_pairs [--seconds 20] [--sessions 60] [--start 7000] [--strangers]
+    python -m tests.bench.drone_pairs [--seconds 20] [--sessions 60] [--start 7000] [--unrelated]
 
 Each camera films 30 to 90 s more than the stretch, before or after it. A solution is wrong if its lag is over 20 ms off
 at the middle of the stretch. Label errors are correlated over half a second, focal lengths are off by up to 2 %,
 principal points by 8 px, k1 by 0.012; readout times are up to 25 ms in either direction. Stretches do not count if a
 camera sees motion in less than a third of them.
---strangers: a of each stretch with b of the next one, which saw another flight; none may be accepted.
+--unrelated: a of each stretch with b of the next one, which saw another flight; none may be accepted.
 """
 
 from __future__ import annotations
@@ -144,10 +144,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0, help="length of the common stretch")
     parser.add_argument("--sessions", type=int, default=60)
     parser.add_argument("--start", type=int, default=7000, help="first seed")
-    parser.add_argument("--strangers", action="store_true", help="pairs that saw different flights instead")
+    parser.add_argument("--unrelated", action="store_true", help="pairs that saw different flights instead")
     options = parser.parse_args()
     seeds = range(options.start, options.start + options.sessions)
-    if options.strangers:
+    if options.unrelated:
         made = [part for seed in seeds if (part := stretch(seed, options.seconds)) is not None]
         print(f"{len(made) - 1} pairs that saw different flights: {count_accepted_unrelated(made)} accepted")
         return

@@ -34,7 +34,7 @@ BENCHES = {
     "marker_detector": Bench("marker detector on rendered frames", ("--quick",)),
     "pair_timing": Bench(
         "two cameras over random rigs",
-        ("--trials", "10", "--strangers", "1", "--regimes", "clean,dropped,10 %,30/25,everything,overlap"),
+        ("--trials", "10", "--unrelated", "1", "--regimes", "clean,dropped,10 %,30/25,everything,overlap"),
         ("--jobs", "2"),
     ),
     "real_rigs": Bench("drone flights and webcams", data=True),

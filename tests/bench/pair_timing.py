@@ -74,9 +74,9 @@ ROWS: dict[str, Row] = {
     "second thing 40 %": Row(Regime(second_object=0.4), None, 0.80),
     "10 fps, 3 Hz": Row(Regime(fps=(10.0, 10.0), slowest=0.5, fastest=3.0), None, 0.80),
     "120 s, ±5000 ppm": Row(Regime(span=120, ppm=5000)),
-    "25 fps told as 30": Row(Regime(fps=(25.0, 30.0), assumed_fps=(30.0, 30.0))),
-    "59.94 fps told as 25": Row(Regime(fps=(30.0, 59.94), assumed_fps=(30.0, 25.0))),
-    "29.97 fps told as 30": Row(Regime(fps=(30.0, 29.97), assumed_fps=(30.0, 30.0))),
+    "25 fps given as 30": Row(Regime(fps=(25.0, 30.0), assumed_fps=(30.0, 30.0))),
+    "59.94 fps given as 25": Row(Regime(fps=(30.0, 59.94), assumed_fps=(30.0, 25.0))),
+    "29.97 fps given as 30": Row(Regime(fps=(30.0, 29.97), assumed_fps=(30.0, 30.0))),
     "rolling shutter 20 ms": Row(Regime(readout=0.02)),
 }
 
@@ -143,7 +143,7 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=100)
     parser.add_argument("--start", type=int, default=10_000, help="first seed")
     parser.add_argument("--regimes", default="", help="parts of their names, separated by commas")
-    parser.add_argument("--strangers", type=int, default=5, help="pairs that saw different motions, per regime")
+    parser.add_argument("--unrelated", type=int, default=5, help="pairs that saw different motions, per regime")
     parser.add_argument("--uncalibrated", action="store_true", help="without intrinsics: F in place of E")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--json", type=Path, help="every trial, for figures of your own")
@@ -160,7 +160,7 @@ def main() -> None:
         for name in names:
             trials = options.trials
             jobs = [(options.start + k, True) for k in range(trials)]
-            jobs += [(options.start + k, False) for k in range(options.strangers)]
+            jobs += [(options.start + k, False) for k in range(options.unrelated)]
             done = list(pool.map(partial(_one, name, not options.uncalibrated), jobs, chunksize=4))
             results[name] = [asdict(one) for one in done]
             _print(name, done[:trials], done[trials:])

@@ -157,7 +157,7 @@ def simulate(
     late: float = 3.0,
     fastest: float = 0.7,
     fisheye: Sequence[int] = (),
-    strangers: Sequence[int] = (),
+    unrelated: Sequence[int] = (),
     windows: Sequence[tuple[float, float]] | None = None,
     labels: Mapping[str, Sequence[int]] | None = None,
     path: Path | None = None,
@@ -165,7 +165,7 @@ def simulate(
     """One random session, a pure function of its arguments.
 
     noise: [px]. drops, outliers: shares of the rows. ppm: largest rate error of a clock. late: each camera
-    starts within that many seconds. strangers: cameras that watch something else. windows: true times in
+    starts within that many seconds. unrelated: cameras that watch something else. windows: true times in
     which each camera sees. labels: which cameras see which label. path: instead of a random one.
     """
     rng = np.random.default_rng(seed)
@@ -189,7 +189,7 @@ def simulate(
         for label, viewers in seen_by.items():
             if i not in viewers:
                 continue
-            points = (strange if i in strangers else paths[label]).at(true)
+            points = (strange if i in unrelated else paths[label]).at(true)
             pixels = lens.project(poses[i].camera_from_world(points)) + rng.normal(0, noise, (len(true), 2))
             wrong = rng.random(len(true)) < outliers
             pixels[wrong] = rng.uniform((0, 0), SIZE, (int(wrong.sum()), 2))

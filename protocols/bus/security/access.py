@@ -87,7 +87,7 @@ def access_rules(
             "key_exprs": all_keys,
         },
         {
-            "id": "be-told-all",
+            "id": "receive-all",
             "permission": "allow",
             "flows": ["egress"],
             "messages": _RECEIVE_OUT,
@@ -112,9 +112,9 @@ def access_rules(
         allowed = [f"own-{name}", "be-asked"]
         if role == "router":
             # The canary receives its own messages; other routers relay what their own rules admitted.
-            allowed += ["ask-all", "be-told-all", "relay"]
+            allowed += ["ask-all", "receive-all", "relay"]
         elif role in _SUBSCRIBE_ALL:
-            allowed += ["ask-all", "be-told-all"]
+            allowed += ["ask-all", "receive-all"]
         subjects.append({"id": name, "cert_common_names": [name]})
         policies.append({"subjects": [name], "rules": allowed})
     if any("relay" in policy["rules"] for policy in policies):

@@ -97,13 +97,13 @@ def test_consistent_clocks_are_not_reported(hub: LiveHub, session: Session) -> N
     assert contradictions(LiveHub(SETTINGS), *right) == [], "nothing is known yet"
 
 
-def regular_session(seed: int, period: float = 2.5, cameras: int = 2, strangers: tuple[int, ...] = ()) -> Session:
+def regular_session(seed: int, period: float = 2.5, cameras: int = 2, unrelated: tuple[int, ...] = ()) -> Session:
     """Cameras that see an exactly periodic motion: lags a period apart fit equally well."""
     rng = np.random.default_rng(seed)
     harmonic = np.arange(1.0, 4.0)[:, None] * np.ones((1, 3))
     amplitude = rng.uniform(0.4, 1.0, (3, 3)) / harmonic
     path = Path(harmonic / period, rng.uniform(0.0, 2.0 * np.pi, (3, 3)), 1.4 * amplitude / amplitude.sum(axis=0))
-    return simulate(seed, cameras, 20, path=path, ppm=20.0, strangers=list(strangers))
+    return simulate(seed, cameras, 20, path=path, ppm=20.0, unrelated=list(unrelated))
 
 
 def hub_after(session: Session, *priors: pb.AgentStatus) -> LiveHub:
@@ -134,7 +134,7 @@ def test_of_lags_that_are_ambiguous_by_periodic_motion_the_prior_selects_one_wit
 
 
 def test_a_prior_selects_also_beside_a_camera_that_does_not_see_the_motion() -> None:
-    session = regular_session(900, cameras=3, strangers=(2,))
+    session = regular_session(900, cameras=3, unrelated=(2,))
     selected = hub_after(session, clock_status(session, "cam0"), clock_status(session, "cam1")).calibration
     assert selected is not None
     assert list(selected.cameras) == ["cam0", "cam1"]

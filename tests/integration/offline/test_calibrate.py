@@ -214,7 +214,7 @@ def test_large_time_origins_cost_no_accuracy() -> None:
 
 @pytest.mark.parametrize("seed", [17, 43])
 def test_a_camera_that_sees_another_object_is_refused_by_name(seed: int) -> None:
-    solved = run(simulate(seed, 4, 25, strangers=(2,)))
+    solved = run(simulate(seed, 4, 25, unrelated=(2,)))
     assert list(solved.found.refused) == ["cam2"], f"rms {[c.rms_px for c in solved.found.cameras.values()]}"
     assert len(solved.found.refused["cam2"]) > 20
     assert set(solved.found.cameras) == {"cam0", "cam1", "cam3"}
@@ -222,7 +222,7 @@ def test_a_camera_that_sees_another_object_is_refused_by_name(seed: int) -> None
 
 
 def test_a_first_camera_that_sees_another_object_is_not_the_reference() -> None:
-    solved = run(simulate(17, 4, 25, strangers=(0,)))
+    solved = run(simulate(17, 4, 25, unrelated=(0,)))
     assert list(solved.found.refused) == ["cam0"]
     assert solved.found.reference == "cam1"
     assert max(map(abs, solved.clock_errors().values())) < 1e-3
@@ -231,7 +231,7 @@ def test_a_first_camera_that_sees_another_object_is_not_the_reference() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_two_cameras_that_see_different_objects_are_refused(seed: int) -> None:
     with pytest.raises(Refused) as caught:
-        run(simulate(800 + seed, 2, 25, strangers=(1,)))
+        run(simulate(800 + seed, 2, 25, unrelated=(1,)))
     assert set(caught.value.cameras) == {"cam0", "cam1"}
     assert caught.value.exit_status == EXIT_REFUSED
 

@@ -53,7 +53,7 @@ def test_the_result_does_not_depend_on_the_order_of_rows() -> None:
 
 
 def test_a_camera_that_observes_another_target_is_refused() -> None:
-    session = simulate(6, 4, 10.0, strangers=[2])
+    session = simulate(6, 4, 10.0, unrelated=[2])
     found = calibrate(session.rig, session.observations(), solver="distributed")
     assert list(found.refused) == ["cam2"]
     assert _error(session, found)[1] < np.deg2rad(0.5)
@@ -97,6 +97,6 @@ def test_the_nodes_and_the_papers_method_use_sizes() -> None:
 
 
 def test_two_cameras_without_common_targets_are_refused() -> None:
-    session = simulate(7, 2, 6.0, strangers=[1])
+    session = simulate(7, 2, 6.0, unrelated=[1])
     with pytest.raises(Refused):
         calibrate(session.rig, session.observations(), solver="distributed")

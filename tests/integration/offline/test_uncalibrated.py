@@ -146,7 +146,7 @@ def test_two_cameras_that_cannot_be_placed_are_refused_with_their_timing(
 
 
 def test_an_uncalibrated_camera_that_saw_another_object_is_not_timed(tmp_path: Path) -> None:
-    session = without_lenses(simulate(2, 3, 20, strangers=(1,)), "cam1")
+    session = without_lenses(simulate(2, 3, 20, unrelated=(1,)), "cam1")
     status, result = solve(session, tmp_path)
     assert status == 0
     assert "only its timing" not in result["metadata"]["refused"]["cam1"]
@@ -167,7 +167,7 @@ def test_a_refusal_of_the_rigs_control_points_reports_the_pairs(tmp_path: Path) 
 
 
 def test_unrelated_cameras_are_refused_with_the_status_of_each_pair(tmp_path: Path) -> None:
-    status, result = solve(simulate(800, 2, 20, strangers=(1,)), tmp_path)
+    status, result = solve(simulate(800, 2, 20, unrelated=(1,)), tmp_path)
     assert status == 3
     (pair,) = result["pairs"]
     assert pair["cameras"] == ["cam0", "cam1"]

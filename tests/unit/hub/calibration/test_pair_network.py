@@ -59,7 +59,7 @@ def test_a_search_near_the_right_lag_finds_it_and_near_a_wrong_one_does_not() ->
 
 
 def test_a_pair_that_saw_the_same_object_has_a_higher_ranking_score() -> None:
-    prepared = prepared_of(simulate(6, 3, 30.0, strangers=[2]))
+    prepared = prepared_of(simulate(6, 3, 30.0, unrelated=[2]))
     tracks = {name: smooth_only(prepared.camera(name).tracks) for name in prepared.names}
     assert ranking_score(tracks["cam0"], tracks["cam1"]) > 1.5 * ranking_score(tracks["cam0"], tracks["cam2"])
 
@@ -73,7 +73,7 @@ def test_pairs_of_many_cameras_are_returned_in_the_rigs_order() -> None:
 
 def test_a_search_over_all_lags_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The thorough search continues from the refusal of the first one, with the same result as without it."""
-    prepared = prepared_of(simulate(9, 2, 12.0, strangers=[1]))
+    prepared = prepared_of(simulate(9, 2, 12.0, unrelated=[1]))
     rates: list[float] = []
     search_at_rate, solve = _PairSearch.search_at_rate, hub.calibration.pair_network._solve
 

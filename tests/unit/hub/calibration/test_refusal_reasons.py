@@ -137,7 +137,7 @@ def too_short_track(_: pytest.MonkeyPatch) -> str:
 
 
 def unrelated_camera(_: pytest.MonkeyPatch) -> str:
-    return refusal_texts(rigs.simulate(1, 3, SECONDS, late=0.5, strangers=[2]))
+    return refusal_texts(rigs.simulate(1, 3, SECONDS, late=0.5, unrelated=[2]))
 
 
 def disconnected_groups(_: pytest.MonkeyPatch) -> str:

@@ -125,7 +125,7 @@ def test_a_still_marker_is_refused() -> None:
 
 @pytest.mark.parametrize("seed", range(30, 42))
 def test_unrelated_tracks_are_refused(seed: int) -> None:
-    found = solve(simulate(seed, 2, 30, strangers=(1,)))
+    found = solve(simulate(seed, 2, 30, unrelated=(1,)))
     assert not found.solved, f"accepted with {found.fit}"
 
 
@@ -187,7 +187,7 @@ def test_a_solution_is_tried_at_the_other_lags_where_its_geometry_fits() -> None
 
 
 def test_a_refusal_has_a_reason() -> None:
-    found = solve(simulate(31, 2, 30, strangers=(1,)))
+    found = solve(simulate(31, 2, 30, unrelated=(1,)))
     assert found.status != "ok"
     assert len(found.status) > 15
 
