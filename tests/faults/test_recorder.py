@@ -66,7 +66,7 @@ def test_a_disk_that_fills_up_ends_the_recording_with_a_whole_log(tmp_path: Path
     share = 100.0 * shutil.disk_usage(small_disk).free / shutil.disk_usage(small_disk).total
     text = errors.read_text(encoding="utf-8")
     assert status == 2
-    assert "min_free_percent is 5; the log is whole" in text
+    assert "min_free_percent is 5; the log is complete" in text
     assert kept > 20
     assert sequences == list(range(put))
     measured(
