@@ -72,17 +72,17 @@ def _peak_mb(work: Callable[[], object]) -> float:
 
 def adjustment(quick: bool) -> list[Curve]:
     """The joint adjustment: rows at six cameras, and cameras at the same length."""
-    from tests.bench.speed.joint import make_trial, ours
+    from tests.bench.speed.joint import make, ours
 
     rows = Curve("adjustment", "observations", "s of CPU")
     memory = Curve("adjustment, memory", "observations", "MB")
     for seconds in (15, 30, 60, 120) if quick else (30, 60, 120, 240, 480):
-        task = make_trial(7, seconds, 6)
+        task = make(7, seconds, 6)
         rows.add(task.rows, _cpu(lambda task=task: ours(task)))  # type: ignore[misc]
         memory.add(task.rows, _peak_mb(lambda task=task: ours(task)))  # type: ignore[misc]
     cameras = Curve("adjustment of 20 s", "cameras", "s of CPU")
     for count in (4, 8, 16) if quick else (4, 8, 16, 32, 64):
-        task = make_trial(8, 20.0, count)
+        task = make(8, 20.0, count)
         cameras.add(count, _cpu(lambda task=task: ours(task)))  # type: ignore[misc]
     return [rows, memory, cameras]
 

@@ -117,7 +117,7 @@ def rendered(scene: PeopleScene, seconds: float, seed: int, kept: float = 1.0) -
             due = moment + INTERVAL_S
             ahead = (tracker.time_ns or 0) + round(0.1 * NANOSECONDS)
             figures = prediction_message(
-                tracker.at(ahead), ahead, tracker.cameras, tracker.boots, tracker.world, number
+                tracker.predicted_at(ahead), ahead, tracker.cameras, tracker.boot_ids, tracker.parameters, number
             )
             publisher.put(figures)
         camera, rng, renderer, detector, predictions = cameras[index]
@@ -168,7 +168,7 @@ def nearest_frames(seed: int, seconds: float = 25.0, fps: float = 10.0, noise_px
     for moment, name, number, pixel in frames:
         while asked and asked[0] + 0.5 / fps < moment:
             wanted = asked.pop(0)
-            known = tracker.at(round(wanted * NANOSECONDS))
+            known = tracker.predicted_at(round(wanted * NANOSECONDS))
             known = known.select(known.confirmed)
             if wanted > 3.0:
                 by_filter.append(float(np.linalg.norm(known.mean[0, :3] - path(wanted))))

@@ -76,7 +76,7 @@ class Options:
     blind_lens: whether a tracker without telemetry is given the intrinsics.
     """
 
-    tracker_factory: tuple[str, ...]
+    models: tuple[str, ...]
     rate_hz: float = 30.0
     any_offset: bool = False
     blind_lens: bool = False
@@ -191,14 +191,14 @@ def total(scores: dict[tuple[Case, str], Score], groups: tuple[str, ...], model:
     return out
 
 
-def table(scores: dict[tuple[Case, str], Score], tracker_factory: Sequence[str]) -> str:
+def table(scores: dict[tuple[Case, str], Score], models: Sequence[str]) -> str:
     """The table of requirements, and below it one line per case and model."""
     flown = {case.group for case, _ in scores}
-    lines = [f"{'':44s}{'must':>9s}{'reach':>10s}" + "".join(f"{model:>18s}" for model in tracker_factory)]
+    lines = [f"{'':44s}{'must':>9s}{'reach':>10s}" + "".join(f"{model:>18s}" for model in models)]
     for title, groups, must, reach, figure in ROWS:
         if not ("*" in groups or flown.intersection(groups)):
             continue
-        cells = "".join(f"{figure(total(scores, groups, model)):>18s}" for model in tracker_factory)
+        cells = "".join(f"{figure(total(scores, groups, model)):>18s}" for model in models)
         lines.append(f"{title:44s}{must:>9s}{reach:>10s}{cells}")
     lines += [
         "",

@@ -75,7 +75,7 @@ def _refined(
     middle = float(at.mean())
 
     def residual(step: Floats) -> Floats:
-        pose: RelativePose = start.moved(step[:5])
+        pose: RelativePose = start.retract(step[:5])
         shown = np.clip(at + lag + step[5] + 1e-3 * step[6] * (at - middle), 0.0, time_b[-1])
         return sampson(pose.essential, mine, other(shown), 0.5 / FOCAL, 0.5 / FOCAL)
 
