@@ -245,6 +245,8 @@ def triangulate(
     """
     from hub.calibration.triangulation import triangulate as estimate_trajectories
 
+    if isinstance(session, Session) and observations is not None:
+        raise InputError("a session in memory has its own observations", remedy="leave observations out")
     if isinstance(calibration, CalibrationResult):
         rig, known = calibration.session.rig, calibration.cameras
     else:

@@ -54,15 +54,13 @@ class Session:
             raise InputError(f"column {', '.join(missing)} is missing", remedy=f"give {', '.join(_COLUMNS)}")
         cameras = [str(value) for value in table["camera"]]
         count = len(cameras)
-        given = {
-            name: np.asarray(table[name], dtype=np.float64) for name in ("time", "u", "v", "size") if name in table
-        }
+        given = {name: _numbers(table[name], name) for name in ("time", "u", "v", "size", "frame") if name in table}
         uneven = [name for name, values in given.items() if values.shape != (count,)]
         if uneven:
             raise InputError(
                 f"column {uneven[0]} is not as long as camera ({count} rows)", remedy="give one value a row"
             )
-        bad = [name for name in ("time", "u", "v") if not np.isfinite(given[name]).all()]
+        bad = [name for name in ("time", "u", "v", "frame") if name in given and not np.isfinite(given[name]).all()]
         if bad:
             raise InputError(f"{bad[0]} is not finite everywhere", remedy="remove the rows: a point not seen has none")
         unknown = sorted(set(cameras) - set(rig.cameras))
@@ -71,9 +69,7 @@ class Session:
                 f"camera {unknown[0]!r} is not in the rig ({', '.join(rig.cameras)})", remedy="add it to the rig"
             )
         labels = [str(value) for value in table["label"]] if "label" in table else [DEFAULT_LABEL] * count
-        frame = (
-            np.asarray(table["frame"], dtype=np.int64) if "frame" in table else _frames(cameras, labels, given["time"])
-        )
+        frame = given["frame"].astype(np.int64) if "frame" in given else _frames(cameras, labels, given["time"])
         size = given.get("size", np.full(count, np.nan))
         found = gather_tracks(
             cameras, labels, frame, given["time"], np.column_stack([given["u"], given["v"]]), size, order=rig.cameras
@@ -99,6 +95,14 @@ class Session:
     def save_observations(self, file: str | Path) -> None:
         """Write observations.csv. Raises InputError."""
         write_observations(Path(file), self.observations)
+
+
+def _numbers(values: Any, name: str) -> Any:
+    """A column as float64. Raises InputError."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"column {name} holds something that is not a number", remedy="give numbers") from None
 
 
 def _plain(value: Any) -> Any:

@@ -1,0 +1,75 @@
+"""Sessions made in memory: columns become tracks, and a bad column gives one clear error."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hub.api import calibrate, triangulate
+from protocols.core.errors import InputError, Refused
+from protocols.session.session import Session
+
+RIG = {name: {"size": np.array([640, 480]), "fps": 30.0} for name in ("GoPro 2", "CVLab1")}
+
+
+def columns(**changes: Any) -> dict[str, Any]:
+    table: dict[str, Any] = {
+        "camera": ["CVLab1", "GoPro 2", "CVLab1", "CVLab1"],
+        "time": [0.2, 0.1, 0.1, 0.3],
+        "u": [12.0, 5.0, 11.0, 13.0],
+        "v": [1.0, 2.0, 3.0, 4.0],
+    }
+    return {key: value for key, value in (table | changes).items() if value is not None}
+
+
+def test_rows_in_any_order_become_tracks_in_order_of_time_with_consecutive_frames() -> None:
+    session = Session.from_table(RIG, columns())
+    assert list(session.rig.cameras) == ["GoPro 2", "CVLab1"]
+    track = session.observations.by_label("CVLab1")["marker"]
+    np.testing.assert_array_equal(track.time, [0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(track.frame, [0, 1, 2])
+    np.testing.assert_array_equal(track.pixels[:, 0], [11.0, 12.0, 13.0])
+
+
+def test_the_dataframe_of_a_session_makes_the_same_session() -> None:
+    pytest.importorskip("pandas")
+    session = Session.from_table(RIG, columns(size=[1.0, np.nan, 2.0, 3.0], label=["a", "b", "a", "a"]))
+    again = Session.from_table(session.rig, session.to_dataframe())
+    assert again.observations.tracks.keys() == session.observations.tracks.keys()
+    for key, track in session.observations.tracks.items():
+        np.testing.assert_array_equal(again.observations.tracks[key].pixels, track.pixels)
+        np.testing.assert_array_equal(again.observations.tracks[key].size, track.size)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"u": None}, "column u is missing"),
+        ({"v": [1.0, 2.0]}, "column v is not as long"),
+        ({"time": [0.1, np.nan, 0.2, 0.3]}, "time is not finite"),
+        ({"u": ["left", 1, 2, 3]}, "column u holds something that is not a number"),
+        ({"frame": [1, 2, 3, np.inf]}, "frame is not finite"),
+        ({"camera": ["cam9", "CVLab1", "CVLab1", "CVLab1"]}, "camera 'cam9' is not in the rig"),
+        ({"time": [0.1, 0.1, 0.1, 0.3]}, "two rows of camera CVLab1 at time"),
+    ],
+)
+def test_a_bad_column_is_named(changes: dict[str, Any], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        Session.from_table(RIG, columns(**changes))
+
+
+def test_a_bad_name_or_size_in_the_rig_is_named() -> None:
+    with pytest.raises(InputError, match="not usable"):
+        Session.from_table({"../evil": {"size": [640, 480]}}, columns())
+    with pytest.raises(InputError, match="size is missing"):
+        Session.from_table({"CVLab1": {"fps": 30.0}}, columns())
+
+
+def test_too_little_is_refused_and_a_session_has_its_own_observations() -> None:
+    session = Session.from_table(RIG, columns())
+    with pytest.raises(Refused):
+        calibrate(session)
+    with pytest.raises(InputError, match="its own observations"):
+        triangulate(session, "no.toml", observations="other.csv")
