@@ -182,10 +182,12 @@ class ViewPage:
             self._play = gui.add_button("Pause" if player.playing else "Play")
             self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "5", "10"), initial_value="1")
 
+        self._time_shown = 0.0
+
         @self._time.on_update
         def _(event: Any) -> None:
             if event.client is not None:  # moved by the user, not by the replay
-                player.seek_to = float(self._time.value)
+                self._time_shown = player.seek_to = float(self._time.value)
 
         @self._play.on_click
         def _(event: Any) -> None:
@@ -203,8 +205,9 @@ class ViewPage:
         if self._play.label != label:
             self._play.label = label
         value = min(round(player.position, 1), self._time.max)
-        if player.seek_to is None and abs(self._time.value - value) >= 0.1:
-            self._time.value = value
+        # A value that the replay did not set is the user's, though the callback may still be on its way.
+        if player.seek_to is None and self._time.value == self._time_shown and abs(self._time_shown - value) >= 0.1:
+            self._time.value = self._time_shown = value
 
 
 class _UavPanel:

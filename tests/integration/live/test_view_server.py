@@ -14,12 +14,14 @@ import pytest
 pytest.importorskip("viser")
 
 from deploy.cli import run
+from hub.view.player import LogRecording, Player
 from hub.view.server import ViewServer, run_view
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.errors import InputError
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import CALIBRATION, CAMERA_INFO, COMMAND, OBSERVATION, STATUS, TRACK
 from tests.support.samples import MATRIX, camera_info, eventually, observation, status, track
+from tests.unit.hub.view.test_state import log_of
 
 TOKEN = "a-long-secret-token"
 
@@ -213,3 +215,14 @@ def test_bad_arguments_are_reported_in_one_line(
     error = capsys.readouterr().err
     assert expected in error
     assert error.count("\n") == 1
+
+
+def test_a_position_that_the_user_chose_is_not_overwritten_before_it_is_read(tmp_path: Path) -> None:
+    player = Player(LogRecording(log_of(tmp_path / "a.mcap")))
+    view = ViewServer(port=0, player=player)
+    try:
+        view.page._time.value = 20.0  # as viser does on the browser's message; the callback comes later
+        view.page._show_time(player)
+        assert view.page._time.value == 20.0
+    finally:
+        view.close()
