@@ -39,7 +39,6 @@ _ROOTS = {
     "fleet": "FleetFile",
 }
 _CONFIG_MODULE = re.compile(r"config|fleet|rig")
-_CATALOGUES = ("protocols.topics", "protocols.catalogue")
 
 
 def on_page_markdown(markdown: str, page: Any = None, config: Any = None, files: Any = None) -> str:
@@ -187,14 +186,13 @@ def _value(value: Any) -> str:
 
 def _topics() -> str:
     """The table of topics."""
-    module = next((one for one in map(_imported, _CATALOGUES) if one is not None), None)
-    if module is None:
-        raise LookupError(f"none of {', '.join(_CATALOGUES)} is there")
+    from protocols.topics import TOPICS
+
     lines = [
         "| topic | key below `syncline/SITE/` | message | delivery | rate [Hz] | recorded | queue | stale after [s] |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
-    for topic in module.TOPICS:
+    for topic in TOPICS:
         rate = f"{topic.rate_hz:g}" if topic.rate_hz else "on change"
         stale = f"{topic.stale_after_s:g}" if topic.stale_after_s else "never"
         bulk = ", bulk lane" if topic.bulky else ""
@@ -203,13 +201,6 @@ def _topics() -> str:
             f"{topic.delivery.value}{bulk} | {rate} | {'yes' if topic.recorded else 'no'} | {topic.queue} | {stale} |"
         )
     return "\n".join(lines)
-
-
-def _imported(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError:
-        return None
 
 
 def _messages() -> str:

@@ -205,8 +205,12 @@ class ViewPage:
         if self._play.label != label:
             self._play.label = label
         value = min(round(player.position, 1), self._time.max)
-        # A value that the replay did not set is the user's, though the callback may still be on its way.
-        if player.seek_to is None and self._time.value == self._time_shown and abs(self._time_shown - value) >= 0.1:
+        if player.seek_to is not None:
+            return
+        if self._time.value != self._time_shown:
+            # The replay did not set it, so the user did; the callback is late, or two of them overtook each other.
+            self._time_shown = player.seek_to = float(self._time.value)
+        elif abs(self._time_shown - value) >= 0.1:
             self._time.value = self._time_shown = value
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import csv
 import itertools
-import os
 import resource
 import shutil
 import subprocess
@@ -30,8 +29,6 @@ from protocols.session.calibration import (
     CameraCalibration,
     FixedCalibration,
     read_calibration,
-    write_calibration,
-    write_trajectory,
 )
 from protocols.session.observations import Observations, read_observations
 from protocols.session.rig import read_rig
@@ -76,14 +73,11 @@ class CommandFailed(Exception):
 
 
 def run_calibrate(session: Path, observations: str) -> Run:
-    """Run the real command line (in this process where it isn't there yet) and read what it wrote."""
+    """Run the real command line and read what it wrote."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
         before, began = _cpu(), time.perf_counter()
-        if (REPOSITORY / "deploy" / "commands" / "calibrate.py").is_file():
-            _run_command(session, observations, out)
-        else:
-            _run_here(session, observations, out)
+        _run_command(session, observations, out)
         cpu, wall = _cpu() - before, time.perf_counter() - began
         _, cameras = read_calibration(out / "calibration.toml")
         times, paths = _read_paths(out / "trajectory.csv")
@@ -101,20 +95,12 @@ def _run_command(session: Path, observations: str, out: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", "from deploy.cli import main; main()", *arguments],
         cwd=REPOSITORY,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
         check=False,
     )
     if done.returncode != 0:
         raise CommandFailed(f"status {done.returncode}: {done.stderr.strip()[-500:]}")
-
-
-def _run_here(session: Path, observations: str, out: Path) -> None:
-    rig = read_rig(session / "rig.toml")
-    result = calibrate(rig, read_observations(session / observations, rig.cameras))
-    write_calibration(out / "calibration.toml", result, rig)
-    write_trajectory(out / "trajectory.csv", result)
 
 
 def _read_paths(file: Path) -> tuple[dict[str, Floats], dict[str, Floats]]:

@@ -221,8 +221,15 @@ def test_a_position_that_the_user_chose_is_not_overwritten_before_it_is_read(tmp
     player = Player(LogRecording(log_of(tmp_path / "a.mcap")))
     view = ViewServer(port=0, player=player)
     try:
+        player.advance(3.0)
+        view.page._show_time(player)
+        assert view.page._time.value == 3.0, "the slider follows the playback"
         view.page._time.value = 20.0  # as viser does on the browser's message; the callback comes later
         view.page._show_time(player)
-        assert view.page._time.value == 20.0
+        assert view.page._time.value == player.seek_to == 20.0
+        player.advance(0.0)
+        player.advance(2.0)
+        view.page._show_time(player)
+        assert view.page._time.value == 22.0, "and follows it again after the seek"
     finally:
         view.close()
