@@ -59,6 +59,8 @@ CAMERA_INFO = Topic("camera_info", "camera/{id}/info", "CameraInfo", 0.5, True, 
 RIG_INFO = Topic("rig_info", "hub/{id}/rig", "RigInfo", 0.1, True, Delivery.LATEST, 16, 60.0)
 CALIBRATION = Topic("calibration", "hub/{id}/calibration", "Calibration", 0.5, True, Delivery.LATEST, 64, 0.0)
 TRACK = Topic("track", "hub/{id}/track", "Track", 30.0, True, Delivery.RELIABLE, 4096, 0.0)
+TRACK_SMOOTHED = Topic("track_smoothed", "hub/{id}/track_smoothed", "Track", 30.0, True, Delivery.RELIABLE, 4096, 0.0)
+SOLVER_EVENT = Topic("solver_event", "hub/{id}/solver", "SolverEvent", 1.0, True, Delivery.RELIABLE, 256, 0.0)
 STATUS = Topic("status", "agent/{id}/status", "AgentStatus", 1.0, True, Delivery.LATEST, 1024, 5.0)
 NODE_STATE = Topic("node_state", "node/{id}/state", "NodeState", 10.0, True, Delivery.LATEST, 4096, 2.0)
 COMMAND = Topic("command", "view/{id}/command", "Command", 0.1, False, Delivery.RELIABLE, 64, 0.0)
@@ -78,6 +80,8 @@ TOPICS: tuple[Topic, ...] = (
     RIG_INFO,
     CALIBRATION,
     TRACK,
+    TRACK_SMOOTHED,
+    SOLVER_EVENT,
     STATUS,
     NODE_STATE,
     COMMAND,

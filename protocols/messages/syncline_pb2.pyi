@@ -128,7 +128,7 @@ class RigInfo(_message.Message):
     def __init__(self, schema_version: _Optional[int] = ..., units: _Optional[str] = ..., clock: _Optional[str] = ..., distances: _Optional[_Iterable[_Union[RigInfo.Distance, _Mapping]]] = ..., up: _Optional[_Iterable[float]] = ..., up_camera: _Optional[str] = ..., reference_camera: _Optional[str] = ...) -> None: ...
 
 class CameraCalibration(_message.Message):
-    __slots__ = ("camera", "rotation", "translation", "time_offset", "clock_rate", "time_offset_std", "position_std", "rms_px", "matrix", "distortions", "fisheye", "boot_id")
+    __slots__ = ("camera", "rotation", "translation", "time_offset", "clock_rate", "time_offset_std", "position_std", "rms_px", "matrix", "distortions", "fisheye", "boot_id", "lag_time_s", "clock_rate_std")
     CAMERA_FIELD_NUMBER: _ClassVar[int]
     ROTATION_FIELD_NUMBER: _ClassVar[int]
     TRANSLATION_FIELD_NUMBER: _ClassVar[int]
@@ -141,6 +141,8 @@ class CameraCalibration(_message.Message):
     DISTORTIONS_FIELD_NUMBER: _ClassVar[int]
     FISHEYE_FIELD_NUMBER: _ClassVar[int]
     BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    LAG_TIME_S_FIELD_NUMBER: _ClassVar[int]
+    CLOCK_RATE_STD_FIELD_NUMBER: _ClassVar[int]
     camera: str
     rotation: _containers.RepeatedScalarFieldContainer[float]
     translation: _containers.RepeatedScalarFieldContainer[float]
@@ -153,7 +155,25 @@ class CameraCalibration(_message.Message):
     distortions: _containers.RepeatedScalarFieldContainer[float]
     fisheye: bool
     boot_id: str
-    def __init__(self, camera: _Optional[str] = ..., rotation: _Optional[_Iterable[float]] = ..., translation: _Optional[_Iterable[float]] = ..., time_offset: _Optional[float] = ..., clock_rate: _Optional[float] = ..., time_offset_std: _Optional[float] = ..., position_std: _Optional[_Iterable[float]] = ..., rms_px: _Optional[float] = ..., matrix: _Optional[_Iterable[float]] = ..., distortions: _Optional[_Iterable[float]] = ..., fisheye: _Optional[bool] = ..., boot_id: _Optional[str] = ...) -> None: ...
+    lag_time_s: float
+    clock_rate_std: float
+    def __init__(self, camera: _Optional[str] = ..., rotation: _Optional[_Iterable[float]] = ..., translation: _Optional[_Iterable[float]] = ..., time_offset: _Optional[float] = ..., clock_rate: _Optional[float] = ..., time_offset_std: _Optional[float] = ..., position_std: _Optional[_Iterable[float]] = ..., rms_px: _Optional[float] = ..., matrix: _Optional[_Iterable[float]] = ..., distortions: _Optional[_Iterable[float]] = ..., fisheye: _Optional[bool] = ..., boot_id: _Optional[str] = ..., lag_time_s: _Optional[float] = ..., clock_rate_std: _Optional[float] = ...) -> None: ...
+
+class CameraProgress(_message.Message):
+    __slots__ = ("camera", "state", "shared_motion_s", "coverage", "margin", "reason")
+    CAMERA_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    SHARED_MOTION_S_FIELD_NUMBER: _ClassVar[int]
+    COVERAGE_FIELD_NUMBER: _ClassVar[int]
+    MARGIN_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    camera: str
+    state: str
+    shared_motion_s: float
+    coverage: float
+    margin: float
+    reason: str
+    def __init__(self, camera: _Optional[str] = ..., state: _Optional[str] = ..., shared_motion_s: _Optional[float] = ..., coverage: _Optional[float] = ..., margin: _Optional[float] = ..., reason: _Optional[str] = ...) -> None: ...
 
 class Refusal(_message.Message):
     __slots__ = ("camera", "reason")
@@ -164,7 +184,7 @@ class Refusal(_message.Message):
     def __init__(self, camera: _Optional[str] = ..., reason: _Optional[str] = ...) -> None: ...
 
 class Calibration(_message.Message):
-    __slots__ = ("schema_version", "revision", "status", "reason", "reference_camera", "scale", "units", "solver", "cameras", "refused")
+    __slots__ = ("schema_version", "revision", "status", "reason", "reference_camera", "scale", "units", "solver", "cameras", "refused", "progress", "state")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     REVISION_FIELD_NUMBER: _ClassVar[int]
     STATUS_FIELD_NUMBER: _ClassVar[int]
@@ -175,6 +195,8 @@ class Calibration(_message.Message):
     SOLVER_FIELD_NUMBER: _ClassVar[int]
     CAMERAS_FIELD_NUMBER: _ClassVar[int]
     REFUSED_FIELD_NUMBER: _ClassVar[int]
+    PROGRESS_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     revision: int
     status: str
@@ -185,7 +207,49 @@ class Calibration(_message.Message):
     solver: str
     cameras: _containers.RepeatedCompositeFieldContainer[CameraCalibration]
     refused: _containers.RepeatedCompositeFieldContainer[Refusal]
-    def __init__(self, schema_version: _Optional[int] = ..., revision: _Optional[int] = ..., status: _Optional[str] = ..., reason: _Optional[str] = ..., reference_camera: _Optional[str] = ..., scale: _Optional[str] = ..., units: _Optional[str] = ..., solver: _Optional[str] = ..., cameras: _Optional[_Iterable[_Union[CameraCalibration, _Mapping]]] = ..., refused: _Optional[_Iterable[_Union[Refusal, _Mapping]]] = ...) -> None: ...
+    progress: _containers.RepeatedCompositeFieldContainer[CameraProgress]
+    state: str
+    def __init__(self, schema_version: _Optional[int] = ..., revision: _Optional[int] = ..., status: _Optional[str] = ..., reason: _Optional[str] = ..., reference_camera: _Optional[str] = ..., scale: _Optional[str] = ..., units: _Optional[str] = ..., solver: _Optional[str] = ..., cameras: _Optional[_Iterable[_Union[CameraCalibration, _Mapping]]] = ..., refused: _Optional[_Iterable[_Union[Refusal, _Mapping]]] = ..., progress: _Optional[_Iterable[_Union[CameraProgress, _Mapping]]] = ..., state: _Optional[str] = ...) -> None: ...
+
+class SolverEvent(_message.Message):
+    __slots__ = ("schema_version", "job", "kind", "rows", "clock_priors", "reason", "cpu_s")
+    class Rows(_message.Message):
+        __slots__ = ("camera", "boot_id", "first_sequence", "last_sequence", "count")
+        CAMERA_FIELD_NUMBER: _ClassVar[int]
+        BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+        FIRST_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+        LAST_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+        COUNT_FIELD_NUMBER: _ClassVar[int]
+        camera: str
+        boot_id: str
+        first_sequence: int
+        last_sequence: int
+        count: int
+        def __init__(self, camera: _Optional[str] = ..., boot_id: _Optional[str] = ..., first_sequence: _Optional[int] = ..., last_sequence: _Optional[int] = ..., count: _Optional[int] = ...) -> None: ...
+    class ClockPrior(_message.Message):
+        __slots__ = ("camera", "unix_minus_camera", "error_bound")
+        CAMERA_FIELD_NUMBER: _ClassVar[int]
+        UNIX_MINUS_CAMERA_FIELD_NUMBER: _ClassVar[int]
+        ERROR_BOUND_FIELD_NUMBER: _ClassVar[int]
+        camera: str
+        unix_minus_camera: float
+        error_bound: float
+        def __init__(self, camera: _Optional[str] = ..., unix_minus_camera: _Optional[float] = ..., error_bound: _Optional[float] = ...) -> None: ...
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    JOB_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ROWS_FIELD_NUMBER: _ClassVar[int]
+    CLOCK_PRIORS_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    CPU_S_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    job: int
+    kind: str
+    rows: _containers.RepeatedCompositeFieldContainer[SolverEvent.Rows]
+    clock_priors: _containers.RepeatedCompositeFieldContainer[SolverEvent.ClockPrior]
+    reason: str
+    cpu_s: float
+    def __init__(self, schema_version: _Optional[int] = ..., job: _Optional[int] = ..., kind: _Optional[str] = ..., rows: _Optional[_Iterable[_Union[SolverEvent.Rows, _Mapping]]] = ..., clock_priors: _Optional[_Iterable[_Union[SolverEvent.ClockPrior, _Mapping]]] = ..., reason: _Optional[str] = ..., cpu_s: _Optional[float] = ...) -> None: ...
 
 class Track(_message.Message):
     __slots__ = ("schema_version", "sequence", "label", "state", "reference_time_ns", "position", "velocity", "position_covariance", "kind", "heading", "height", "height_std", "colour", "cameras", "unseen_s", "velocity_covariance")
