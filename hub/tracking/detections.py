@@ -17,7 +17,7 @@ from protocols.session.calibration import CameraCalibration
 
 _DEFAULT_STD_PX = 1.5
 """Of a detection without a covariance."""
-_MIN_STD_PX = 0.2
+MIN_STD_PX = 0.2
 _BORDER = 0.02
 """Border as a fraction of the image's sides in which no detection is expected: targets are truncated there."""
 
@@ -26,8 +26,9 @@ _BORDER = 0.02
 class TrackingCamera:
     """One calibrated camera. boot_id: the boot whose clock the time map refers to; "" = any.
 
-    time_std: of the time map's offset [s]. noise_px: std of the calibration's residuals. low, high: (2,) corners of the
-    image without its border, in normalised coordinates.
+    time_std: of the time map's offset [s]. noise_px: root mean square of the calibration's residuals. readout: seconds
+    from the image's first row to its last. low, high: (2,) corners of the image without its border, in normalised
+    coordinates.
     """
 
     name: str
@@ -37,6 +38,7 @@ class TrackingCamera:
     time_std: float = 0.0
     noise_px: float = 0.0
     boot_id: str = ""
+    readout: float = 0.0
     low: Floats = field(init=False)
     high: Floats = field(init=False)
 
@@ -59,6 +61,7 @@ class TrackingCamera:
             camera.time_offset_std,
             min(camera.rms_px, 5.0),
             boot_id,
+            camera.readout,
         )
 
     def reference_ns(self, device_time_ns: int) -> int:
@@ -159,7 +162,7 @@ def _covariance(detection: pb.Detection) -> Floats:
     if len(detection.covariance) != 3:
         return np.asarray(_DEFAULT_STD_PX**2 * np.eye(2))
     uu, uv, vv = detection.covariance
-    return np.array([[uu, uv], [uv, vv]]) + _MIN_STD_PX**2 * np.eye(2)
+    return np.array([[uu, uv], [uv, vv]]) + MIN_STD_PX**2 * np.eye(2)
 
 
 def _pixel_or_nan(pixel_pairs: Sequence[float]) -> tuple[float, float]:

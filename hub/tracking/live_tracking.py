@@ -15,6 +15,7 @@ from hub.tracking.detections import TrackingCamera, tracked_kind
 from hub.tracking.filter.kalman import LOG_SIZE
 from hub.tracking.filter.target_models import PERSON
 from hub.tracking.filter.target_states import MultiTargetState
+from hub.tracking.marker_tracks import MarkerTracks
 from hub.tracking.messages import prediction_message, track_messages
 from hub.tracking.tracker import Tracker
 from protocols.core.clocks import NANOSECONDS
@@ -44,7 +45,10 @@ class TrackingSettings:
 
 
 class LiveTracking:
-    """The tracker with online estimates of the vertical and of the scale of the world."""
+    """Tracks of people, vehicles and markers, with online estimates of the vertical and of the scale of the world.
+
+    Markers with a label are tracked by it (`MarkerTracks`), all else by association (`Tracker`).
+    """
 
     def __init__(self, settings: TrackingSettings | None = None) -> None:
         self.settings = settings or TrackingSettings()
@@ -61,11 +65,13 @@ class LiveTracking:
         self._used_frames = 0
         self._clock: tuple[str, str] | None = None
         self.has_detections = False
+        self.markers = MarkerTracks(self.settings.lag_s, self.tracker.parameters.coast_s, self.settings.interval_s)
+        self._smoothed = 0
 
     @property
     def counters(self) -> Counter[str]:
-        """Frames by how they were handled."""
-        return self.tracker.counters
+        """Frames, and rows of labelled markers, by how they were handled."""
+        return self.tracker.counters + self.markers.counters
 
     def calibrate(
         self,
@@ -84,7 +90,9 @@ class LiveTracking:
         """
         clock = (reference, boot_ids.get(reference, ""))
         if clock != self._clock and self._clock is not None:
-            self.tracker.reset()  # all times refer to another clock now
+            # All times refer to another clock now.
+            self.tracker.reset()
+            self.markers.reset()
         self._clock = clock
         new = {
             name: TrackingCamera.from_calibration(camera, boot_ids.get(name, "")) for name, camera in cameras.items()
@@ -101,12 +109,14 @@ class LiveTracking:
         self._scale = LengthScale(units_per_m, metric)
         self._given_up = up
         self.tracker.calibrate(new, change)
+        self.markers.calibrate(new, change)
         self._set_parameters(up if up is not None else self._estimated_up())
 
     def handle(self, message: Message) -> None:
         """Process one observation; other messages are ignored."""
         if not isinstance(message, pb.Observation):
             return
+        self.markers.handle(message)
         if not self.has_detections:
             self.has_detections = any(tracked_kind(detection) for detection in message.detections)
             if not self.has_detections:
@@ -126,7 +136,21 @@ class LiveTracking:
                     self._set_parameters(up)
 
     def tick(self, now: float) -> list[Message]:
-        """Track and prediction messages, at most every ``interval_s``; now: any monotonic clock [s]."""
+        """Track and prediction messages; now: any monotonic clock [s].
+
+        Of labelled markers as soon as there are new rows, of all else at most every ``interval_s``.
+        """
+        return [*self._tick_targets(now), *self._numbered(self.markers.tick(now))]
+
+    def smoothed(self) -> list[pb.Track]:
+        """The tracks of labelled markers, smoothed over ``lag_s`` behind the newest row, since the last call."""
+        out = self.markers.smoothed()
+        for message in out:
+            message.sequence, self._smoothed = self._smoothed, self._smoothed + 1
+        return out
+
+    def _tick_targets(self, now: float) -> list[Message]:
+        """Track and prediction messages of people, vehicles and unlabelled markers."""
         if now < self._next or not self.tracker.cameras or not self.has_detections:
             return []
         self._next = now + self.settings.interval_s
@@ -148,6 +172,12 @@ class LiveTracking:
         )
         self._predictions += 1
         return out
+
+    def _numbered(self, tracks: list[pb.Track]) -> list[pb.Track]:
+        """The messages with their sequence numbers."""
+        for message in tracks:
+            message.sequence, self._sequence = self._sequence, self._sequence + 1
+        return tracks
 
     def gauges(self) -> dict[str, float]:
         """Gauges for the hub's status."""

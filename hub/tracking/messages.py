@@ -7,15 +7,17 @@ import numpy as np
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY
 from hub.tracking.filter.measurement import POINT, predict_measurement
-from hub.tracking.filter.target_models import TARGET_MODELS
+from hub.tracking.filter.target_models import MARKER, TARGET_MODELS
 from hub.tracking.filter.target_states import LostTrack, Targets
 from hub.tracking.frame_update import TrackerParameters, track_label
+from hub.tracking.marker_filter import MarkerState
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 
 SCHEMA_VERSION = 1
 _COASTING_AFTER_S = 0.35
+MARKER_COASTING_AFTER_S = 0.2
 _RECENT_NS = 500_000_000
 _MIN_HEADING_SPEED_M_S = 0.25
 """Targets slower than this have no heading."""
@@ -69,6 +71,31 @@ def track_messages(
             )
         )
     return out
+
+
+def marker_message(
+    label: str, state: MarkerState, time_ns: int, moments: tuple[Floats, Floats] | None = None
+) -> pb.Track:
+    """The message, without its sequence number, of a labelled marker at a reference time not before the state's.
+
+    moments: mean (9,) and covariance (9, 9) at that time, if not those of the state.
+    """
+    mean, covariance = moments or state.predicted(time_ns)
+    unseen = (time_ns - state.time_ns) / NANOSECONDS
+    told = "confirmed" if state.confirmed else "tentative"
+    return pb.Track(
+        schema_version=SCHEMA_VERSION,
+        label=label,
+        state="coasting" if unseen > MARKER_COASTING_AFTER_S or state.is_uncertain(covariance) else told,
+        reference_time_ns=time_ns,
+        position=mean[POSITION].tolist(),
+        velocity=mean[VELOCITY].tolist(),
+        position_covariance=covariance[POSITION, POSITION].ravel().tolist(),
+        velocity_covariance=covariance[VELOCITY, VELOCITY].ravel().tolist(),
+        kind=MARKER.kind,
+        cameras=state.cameras(time_ns),
+        unseen_s=unseen,
+    )
 
 
 def prediction_message(
