@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import tomli_w
 
+from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.core.errors import InputError
 from protocols.formats import colmap, points, toml_rigs, yaml_rigs
 from protocols.formats.cameras import ForeignRig, rig_tables
 from protocols.geometry.types import Floats, Ints
+from protocols.session.calibration import CameraCalibration, read_calibration
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, parse_camera_table, read_toml
@@ -31,6 +33,26 @@ class ImportSource:
 
     kind: str
     files: list[Path]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arrivals:
+    """When frames arrive at the recorder: ``delay`` + |N(0, ``jitter``)| [s] after their exposure, a camera's in order.
+
+    clocks: calibrations whose time maps give the exposures, by camera.
+    """
+
+    clocks: dict[str, CameraCalibration]
+    delay: float = 0.0
+    jitter: float = 0.0
+    seed: int = 0
+
+    def of(self, camera: str, times: Floats) -> Floats:
+        """Reference times (n,) [s] at which frames (n,) of increasing camera times [s] arrive."""
+        clock = self.clocks[camera].time_map
+        rng = np.random.default_rng([self.seed, *camera.encode()])
+        late = self.delay + np.abs(rng.normal(0.0, self.jitter, len(times)))
+        return np.asarray(np.maximum.accumulate(clock.clock_rate * times + clock.time_offset + late))
 
 
 def detect_source(sources: list[Path], wanted: str | None) -> ImportSource:
@@ -117,8 +139,11 @@ def read_points(source: ImportSource, times: points.Times, likelihood: float, ca
     return points.read(source.kind, source.files, times, likelihood, camera)
 
 
-def session_to_log(rig: Rig, observations: Observations, out: Path) -> int:
-    """Write a session as a log, atomically; returns the number of messages. Raises InputError."""
+def session_to_log(rig: Rig, observations: Observations, out: Path, arrivals: Arrivals | None = None) -> int:
+    """Write a session as a log, atomically; returns the number of messages. Raises InputError.
+
+    arrivals: the log times; by default every camera's first frame is at the log's beginning.
+    """
     from protocols.log.write.writer import LogWriter
     from protocols.topics import CAMERA_INFO, OBSERVATION, RIG_INFO
 
@@ -133,13 +158,23 @@ def session_to_log(rig: Rig, observations: Observations, out: Path) -> int:
                 writer.write(CAMERA_INFO, name, "import", _camera_info(rig, name), 0)
             writer.write(RIG_INFO, "import", "import", _rig_info(rig), 0)
             count = len(rig.cameras) + 1
-            for at, name, message in _observation_messages(rig, observations):
+            for at, name, message in _observation_messages(rig, observations, arrivals):
                 writer.write(OBSERVATION, name, "import", message, at)
                 count += 1
         part.replace(out)
     finally:
         part.unlink(missing_ok=True)
     return count
+
+
+def read_arrivals(calibration: Path, rig: Rig, delay: float, jitter: float, seed: int) -> Arrivals:
+    """Arrivals at the times that a calibration.toml gives; it must have all cameras. Raises InputError."""
+    _, clocks = read_calibration(calibration)
+    missing = [name for name in rig.cameras if name not in clocks]
+    if missing:
+        what = f"no clock of {', '.join(missing)}: the arrival of its frames is not known"
+        raise InputError(what, file=calibration, remedy="take a calibration of all cameras, or remove it from rig.toml")
+    return Arrivals(clocks, delay, jitter, seed)
 
 
 def rig_tables_of_log(rig: Rig) -> dict[str, Any]:
@@ -232,26 +267,42 @@ def _rig_info(rig: Rig) -> Any:
     return info
 
 
-def _observation_messages(rig: Rig, observations: Observations) -> list[tuple[int, str, Any]]:
-    """One message per frame of each camera, sorted by the time since that camera's first frame."""
+def _observation_messages(
+    rig: Rig, observations: Observations, arrivals: Arrivals | None
+) -> list[tuple[int, str, Any]]:
+    """Log time [ns], camera and message of each frame, in order of log time.
+
+    Log time 0 is the first exposure of all cameras, or of each camera where ``arrivals`` are not given.
+    """
     from protocols.messages import syncline_pb2 as pb
 
     out: list[tuple[int, str, Any]] = []
+    exposures: list[float] = []
     for name in rig.cameras:
         frames: dict[tuple[int, int], list[tuple[str, float, float, float]]] = {}
         for track in observations.of_camera(name):
             for frame, time, (u, v), size in zip(track.frame, track.time, track.pixels, track.size, strict=True):
-                seen = frames.setdefault((round(float(time) * 1e9), int(frame)), [])
+                seen = frames.setdefault((round(float(time) * NANOSECONDS), int(frame)), [])
                 seen.append((track.label, float(u), float(v), float(size) if np.isfinite(size) else 0.0))
-        first = min((key[0] for key in frames), default=0)
-        for sequence, ((time_ns, frame), seen) in enumerate(sorted(frames.items())):
+        if not frames:
+            continue
+        ordered = sorted(frames.items())
+        stamps = [key[0] for key, _ in ordered]
+        if arrivals is None:
+            log_times = [stamp - stamps[0] for stamp in stamps]
+        else:
+            times = np.array(stamps) / NANOSECONDS
+            exposures.append(float(arrivals.clocks[name].time_map.reference_from_camera(CameraTime(times[0]))))
+            log_times = [round(at * NANOSECONDS) for at in arrivals.of(name, times).tolist()]
+        for sequence, (log_time, ((time_ns, frame), seen)) in enumerate(zip(log_times, ordered, strict=True)):
             message = pb.Observation(
                 schema_version=1, camera=name, boot_id="import", sequence=sequence, frame=frame, device_time_ns=time_ns
             )
             for label, u, v, size in seen:
                 message.detections.add(u=u, v=v, size=size, score=1.0, label=label)
-            out.append((time_ns - first, name, message))
-    return sorted(out, key=lambda item: item[:2])
+            out.append((log_time, name, message))
+    first = round(min(exposures) * NANOSECONDS) if exposures else 0
+    return sorted(((at - first, name, message) for at, name, message in out), key=lambda item: item[:2])
 
 
 __all__ = [
@@ -259,10 +310,12 @@ __all__ = [
     "FORMATS",
     "OBSERVATIONS_FILE",
     "POINTS",
+    "Arrivals",
     "ImportSource",
     "calibration_text",
     "detect_source",
     "frame_clock",
+    "read_arrivals",
     "read_foreign_calibration",
     "read_points",
     "rig_tables_of_log",

@@ -32,6 +32,9 @@ def import_(
     videos: Path | None = None,
     likelihood: float = 0.6,
     camera: str | None = None,
+    calibration: Path | None = None,
+    arrival_delay_ms: float = 0.0,
+    arrival_jitter_ms: float = 0.0,
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
@@ -46,6 +49,8 @@ def import_(
     Example: syncline import cam0DLC_resnet50.csv cam1DLC_resnet50.csv --videos my-videos --out observations.csv
 
     Example: syncline import my-session --out my-session.mcap
+
+    Example: syncline import my-session --calibration out/calibration.toml --arrival-delay-ms 50 --out live.mcap
 
     Parameters
     ----------
@@ -66,10 +71,18 @@ def import_(
         DeepLabCut points with a smaller likelihood are discarded.
     camera
         The camera's name, for tracks in one file; default: the file's name.
+    calibration
+        For a session: the calibration.toml that gives its clocks. The log then holds the frames of all cameras in the
+        order in which they were exposed, and `replay` plays them as they happened. Default: all cameras start together.
+    arrival_delay_ms
+        With --calibration: from a frame's exposure to its arrival in the log.
+    arrival_jitter_ms
+        With --calibration: standard deviation of a normal distribution, whose magnitude is added to each delay. A
+        camera's frames keep their order.
     json
         Print a summary as JSON.
     seed
-        Accepted for consistency; this command uses no random numbers.
+        Seed of the jitter.
     """
     if not sources:
         raise InputError("nothing to import", remedy="give files, or a folder")
@@ -81,16 +94,26 @@ def import_(
         raise InputError(f"--likelihood {likelihood:g} is out of range", remedy="give 0 to 1")
     if fps is not None and videos is not None:
         raise InputError("--fps and --videos each give the frames' times", remedy="keep one")
+    if calibration is None and (arrival_delay_ms or arrival_jitter_ms):
+        raise InputError("arrival times need the cameras' clocks", remedy="give --calibration CALIB.toml")
+    if not (0.0 <= arrival_delay_ms <= 1e6 and 0.0 <= arrival_jitter_ms <= 1e6):
+        raise InputError("the arrival's delay or jitter is out of range", remedy="give milliseconds, 0 or more")
     from deploy.offline import imports
     from protocols.core.files import write_atomically
     from protocols.session.folder import read_folder, write_observations
 
     source = imports.detect_source(list(sources), format)
     _check_suffix(source.kind, out)
+    if calibration is not None and source.kind != "session":
+        raise InputError("--calibration goes with a session folder", remedy="leave it out")
     warnings: tuple[str, ...] = ()
     if source.kind == "session":
         rig, seen = read_folder(source.files[0])
-        count = imports.session_to_log(rig, seen, out)
+        arrivals = None
+        if calibration is not None:
+            delay, jitter = 1e-3 * arrival_delay_ms, 1e-3 * arrival_jitter_ms
+            arrivals = imports.read_arrivals(calibration, rig, delay, jitter, seed)
+        count = imports.session_to_log(rig, seen, out, arrivals)
         warnings = seen.warnings
         if rig.scale_bars:
             warnings += ("a log does not store the scale bar: add it to the rig.toml of its export",)

@@ -18,6 +18,7 @@ import yaml
 from deploy.cli import run
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
+from protocols.log.read.reader import LogReader
 from protocols.session.calibration import read_calibration
 from protocols.session.folder import read_folder
 
@@ -389,6 +390,48 @@ def test_a_session_becomes_a_log_and_a_session_again(tmp_path: Path) -> None:
         np.testing.assert_allclose(seen_again.tracks[key].time, track.time, rtol=0, atol=1e-9 + 1e-15 * track.time[0])
     assert run(["import", str(tmp_path / "s"), "--out", str(log)]) == 2  # a log is not replaced
     assert run(["export", str(log), "--out", str(again)]) == 2
+
+
+def test_a_log_by_a_calibration_has_the_frames_as_they_happened(tmp_path: Path, capsys: Capture) -> None:
+    """left's clock is the reference; right's shows 100 s more and wide's runs twice as fast."""
+    rows = {"left": [1.0, 2.0, 3.0], "right": [102.5, 103.5], "wide": [1.0, 9.0]}
+    tables = {
+        "metadata": {"reference": "left"},
+        "left": camera("left", [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0, 1.0),
+        "right": camera("right", [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], -100.0, 1.0),
+        "wide": camera("wide", [0.0, 0.0, 0.0], [2.0, 0.0, 0.0], 0.0, 0.5),
+    }
+    session = tmp_path / "s"
+    session.mkdir()
+    (session / "rig.toml").write_text(tomli_w.dumps(tables))
+    lines = [f"{name},{k},{time},5,5" for name, times in rows.items() for k, time in enumerate(times)]
+    (session / "observations.csv").write_text("\n".join(["camera,frame,time,u,v", *lines]) + "\n")
+    (tmp_path / "c.toml").write_text(tomli_w.dumps(tables))
+
+    def arrivals(out: str, *options: str) -> list[tuple[str, float]]:
+        command = ["import", str(session), "--calibration", str(tmp_path / "c.toml"), "--out", str(tmp_path / out)]
+        assert run([*command, *options]) == 0
+        messages = LogReader(tmp_path / out).messages(["observation"])
+        return [(message.agent, message.log_time_ns * 1e-9) for message in messages]
+
+    expected = [("wide", 0.0), ("left", 0.5), ("left", 1.5), ("right", 2.0), ("left", 2.5), ("right", 3.0)]
+    assert arrivals("a.mcap") == [(name, pytest.approx(at)) for name, at in [*expected, ("wide", 4.0)]]
+    delayed = arrivals("b.mcap", "--arrival-delay-ms", "50", "--arrival-jitter-ms", "20", "--seed", "3")
+    late = np.array([at for _, at in sorted(delayed)]) - [at for _, at in sorted([*expected, ("wide", 4.0)])]
+    assert (late >= 0.05 - 1e-9).all() and 0.05 < late.mean() < 0.12  # noqa: PT018
+    again = arrivals("c.mcap", "--arrival-delay-ms", "50", "--arrival-jitter-ms", "20", "--seed", "3")
+    assert again == delayed
+    assert arrivals("d.mcap", "--arrival-jitter-ms", "20", "--seed", "4") != arrivals("e.mcap")
+
+    capsys.readouterr()
+    del tables["wide"]
+    (tmp_path / "c.toml").write_text(tomli_w.dumps(tables))
+    command = ["import", str(session), "--out", str(tmp_path / "f.mcap")]
+    assert run([*command, "--calibration", str(tmp_path / "c.toml")]) == 2
+    assert "c.toml: no clock of wide" in capsys.readouterr().err
+    assert run([*command, "--arrival-delay-ms", "50"]) == 2
+    assert "give --calibration" in capsys.readouterr().err
+    assert not (tmp_path / "f.mcap").exists()
 
 
 BAD = [
