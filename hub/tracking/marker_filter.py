@@ -1,20 +1,21 @@
-"""Asynchronous extended Kalman filter of one labelled marker over single-camera rows. Pure functions.
+"""Asynchronous iterated extended Kalman filter of one labelled marker over single-camera rows. Pure functions.
 
-A bank of filters differs in the density of the jerk, because neither the motion nor the scale of the world is known.
-The bank is weighted by the likelihood of the innovations with forgetting (Raftery, Kárný, Ettler 2010), and moves to
-larger or smaller densities when its outermost filter is the likeliest. Each camera's noise is estimated from the
-residuals (Mehra 1972; Mohamed and Schwarz 1999).
+Each row is linearised again at its result (Bell and Cathey 1993). A bank of filters differs in the density of the
+jerk, because neither the motion nor the scale of the world is known. The bank is weighted by the likelihood of the
+innovations with forgetting (Raftery, Kárný, Ettler 2010), and moves to larger or smaller densities when its outermost
+filter is the likeliest. Each camera's noise is estimated from the residuals (Mehra 1972; Mohamed and Schwarz 1999).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from math import exp, log, sqrt
 
 import numpy as np
 
 from hub.tracking.association.triangulation import ROWS_PER_CAMERA, initial_motion
-from hub.tracking.filter.jerk_model import POSITION, STATE_DIM, jerk_model, rts_smooth
+from hub.tracking.filter.jerk_model import POSITION, STATE_DIM, VELOCITY, jerk_model, rts_smooth
 from hub.tracking.filter.marker_rows import MarkerRow
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.pose import Similarity
@@ -22,12 +23,15 @@ from protocols.geometry.types import Floats
 
 _PSD_STEP = 10.0
 """Between the densities of neighbouring filters: the bandwidth goes with the sixth root, so 1.5 times."""
-_BANK = np.array([1.0 / _PSD_STEP, 1.0, _PSD_STEP])
+_BANK = (1.0 / _PSD_STEP, 1.0, _PSD_STEP)
 _MOVE_WEIGHT = 0.7
 _MEMORY_S = 1.0
 """Time constant of the forgetting of past innovations."""
 _GATE = 18.4
 """The 99.99 % quantile of chi-square with two degrees of freedom."""
+_ITERATIONS, _LINEAR = 4, 0.003
+"""Linearisations of a row, at most; the last one is near enough if it moves the state by less, as a fraction of the
+depth. They matter when a second camera sees a marker whose depth had been lost."""
 _NOISE_GAIN, _NOISE_START = 0.02, 10.0
 """Smallest gain of a camera's noise factor, and the rows that its prior counts for."""
 RECENT_NS = 500_000_000
@@ -39,22 +43,26 @@ _COASTING_STD = 3.0
 """Times the usual std: then one std is as large as errors ever are while two cameras see the marker."""
 
 
+Bank = tuple[float, float, float]
+"""One number for each filter of the bank, by increasing density."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerState:
-    """The bank of m filters of one marker after a row; m = 0: no track.
+    """The bank of three filters of one marker after a row; without filters (m = 0) there is no track.
 
-    mean: (m, 9), covariance: (m, 9, 9), log_weight: (m,), psd: (m,) density of the jerk [unit²/s⁵], at time_ns on the
-    reference clock, the time of the last accepted row. hits: accepted rows. accepted, rejected: by camera, the time of
-    the last row that was accepted or rejected. noise: by camera, factor of its noise and number of rows behind it.
-    usual_std: std of the position while at least two cameras see the marker. pending: the newest rejected rows.
-    serial: counts the tracks.
+    mean: (m, 9), covariance: (m, 9, 9) at time_ns on the reference clock, the time of the last accepted row.
+    log_weight: logarithms of the weights. psd: density of the jerk [unit²/s⁵]. hits: accepted rows. accepted,
+    rejected: by camera, the time of the last row that was accepted or rejected. noise: by camera, factor of its noise
+    and number of rows behind it. usual_std: std of the position while at least two cameras see the marker. pending:
+    the newest rejected rows. serial: counts the tracks.
     """
 
     time_ns: int = 0
     mean: Floats = field(default_factory=lambda: np.zeros((0, STATE_DIM)))
     covariance: Floats = field(default_factory=lambda: np.zeros((0, STATE_DIM, STATE_DIM)))
-    log_weight: Floats = field(default_factory=lambda: np.zeros(0))
-    psd: Floats = field(default_factory=lambda: np.zeros(0))
+    log_weight: Bank = (0.0, 0.0, 0.0)
+    psd: Bank = (0.0, 0.0, 0.0)
     hits: int = 0
     accepted: dict[str, int] = field(default_factory=dict)
     rejected: dict[str, int] = field(default_factory=dict)
@@ -70,9 +78,14 @@ class MarkerState:
 
     @property
     def weight(self) -> Floats:
-        """(m,) posterior weights of the bank."""
-        weight = np.exp(self.log_weight - self.log_weight.max())
+        """(3,) posterior weights of the bank."""
+        weight = np.exp(self.log_weight)
         return np.asarray(weight / weight.sum())
+
+    @property
+    def best(self) -> int:
+        """The likeliest filter of the bank."""
+        return self.log_weight.index(max(self.log_weight))
 
     def cameras(self, time_ns: int) -> int:
         """How many cameras saw the marker recently."""
@@ -80,13 +93,16 @@ class MarkerState:
 
     def predicted(self, time_ns: int) -> tuple[Floats, Floats]:
         """Mean (9,) and covariance (9, 9) of the bank's mixture, predicted to a time not before the state's."""
-        step, noise = jerk_model((time_ns - self.time_ns) / NANOSECONDS)
-        means = self.mean @ step.T
-        covariances = step @ self.covariance @ step.T + self.psd[:, None, None] * noise
+        means, covariances = self.mean, self.covariance
+        if time_ns != self.time_ns:
+            step, noise = jerk_model((time_ns - self.time_ns) / NANOSECONDS)
+            means, covariances = means @ step.T, step @ covariances @ step.T
+            covariances += np.array(self.psd)[:, None, None] * noise
         weight = self.weight
         mean = weight @ means
         off = means - mean
-        return mean, np.einsum("m,mij->ij", weight, covariances + off[:, :, None] * off[:, None, :])
+        within = (weight @ covariances.reshape(len(weight), -1)).reshape(STATE_DIM, STATE_DIM)
+        return mean, within + (off.T * weight) @ off
 
     def is_uncertain(self, covariance: Floats) -> bool:
         """Whether a position's covariance (9, 9) is far above the usual one: only one camera sees it, or none."""
@@ -101,15 +117,20 @@ class MarkerState:
             self,
             mean=mean,
             covariance=turn @ self.covariance @ turn.T,
-            psd=self.psd * change.scale**2,
+            psd=scaled(self.psd, change.scale**2),
             usual_std=self.usual_std * change.scale,
             pending=(),
         )
 
 
+def scaled(bank: Bank, factor: float) -> Bank:
+    """The bank's numbers times a factor."""
+    return bank[0] * factor, bank[1] * factor, bank[2] * factor
+
+
 def position_std(covariance: Floats) -> float:
     """Root mean square std of a position's three coordinates, from the state's covariance (9, 9)."""
-    return float(np.sqrt(max(covariance[0, 0] + covariance[1, 1] + covariance[2, 2], 0.0) / 3.0))
+    return sqrt(max(float(covariance[0, 0] + covariance[1, 1] + covariance[2, 2]), 0.0) / 3.0)
 
 
 def process_row(state: MarkerState, row: MarkerRow, coast_ns: int) -> MarkerState:
@@ -127,68 +148,89 @@ def process_row(state: MarkerState, row: MarkerRow, coast_ns: int) -> MarkerStat
 
 
 def _update(state: MarkerState, row: MarkerRow) -> MarkerState | None:
-    """The state after an accepted row; None if it is outside the gate."""
+    """The state after an accepted row; None if it is outside the gate.
+
+    What is small is computed in scalars: for a handful of numbers, each array operation costs more than they do.
+    """
     camera, name = row.camera, row.camera.name
     elapsed = (row.reference_ns - state.time_ns) / NANOSECONDS
     step, drift = jerk_model(elapsed)
     mean = state.mean @ step.T
-    covariance = step @ state.covariance @ step.T + state.psd[:, None, None] * drift
-    rotation = camera.pose.rotation
-    local = (mean[:, POSITION] - camera.pose.position) @ rotation.T
-    depth = local[:, 2:]
-    if not depth.min() > 0.0:
-        return None
-    seen = local[:, :2] / depth
-    jacobian = (rotation[:2] - seen[:, :, None] * rotation[2]) / depth[:, :, None]
+    covariance = step @ state.covariance @ step.T
+    covariance += np.array(state.psd)[:, None, None] * drift
+    rotation, centre = camera.pose.rotation, camera.pose.position
+    moved = (rotation @ (camera.time_std * mean[:, VELOCITY, None])).tolist()
     factor, rows = state.noise.get(name, (1.0, 0))
-    # The error of the time map moves the point along its image velocity.
-    moved = (jacobian @ mean[:, 3:6, None]) * camera.time_std
-    noise = factor * row.noise + moved * moved.transpose(0, 2, 1)
-    cross = covariance[:, :, POSITION] @ jacobian.transpose(0, 2, 1)
-    spread = jacobian @ cross[:, POSITION] + noise
-    determinant = spread[:, 0, 0] * spread[:, 1, 1] - spread[:, 0, 1] * spread[:, 1, 0]
-    inverse = np.empty_like(spread)
-    inverse[:, 0, 0], inverse[:, 1, 1] = spread[:, 1, 1], spread[:, 0, 0]
-    inverse[:, 0, 1], inverse[:, 1, 0] = -spread[:, 0, 1], -spread[:, 1, 0]
-    inverse /= determinant[:, None, None]
-    innovation = (row.point - seen)[:, :, None]
-    solved = inverse @ innovation
-    distance = (innovation * solved).sum(axis=(1, 2))
+    prior = ((mean[:, POSITION] - centre) @ rotation.T).tolist()
+    local = prior
+    for _ in range(_ITERATIONS):
+        if not min(z for _, _, z in local) > 0.0:
+            return None
+        slopes = [((1.0 / z, 0.0, -x / z**2), (0.0, 1.0 / z, -y / z**2)) for x, y, z in local]
+        jacobian = np.array(slopes) @ rotation
+        cross = covariance[:, :, POSITION] @ jacobian.transpose(0, 2, 1)
+        spreads = (jacobian @ cross[:, POSITION]).tolist()
+        solved, inverses, fits, excesses = [], [], [], []
+        for (x, y, z), (px, py, pz), ((a, _, b), (_, c, d)), ((uu, uv), (_, vv)), ((mx,), (my,), (mz,)) in zip(
+            local, prior, slopes, spreads, moved, strict=True
+        ):
+            # The innovation of the linearised measurement at the prior mean.
+            u = row.point[0] - x / z - a * (px - x) - b * (pz - z)
+            v = row.point[1] - y / z - c * (py - y) - d * (pz - z)
+            # The error of the time map moves the point along its image velocity.
+            mu, mv = a * mx + b * mz, c * my + d * mz
+            nuu, nuv, nvv = (factor * one for one in row.noise)
+            nuu, nuv, nvv = nuu + mu * mu, nuv + mu * mv, nvv + mv * mv
+            suu, suv, svv = uu + nuu, uv + nuv, vv + nvv
+            determinant = suu * svv - suv * suv
+            iuu, iuv, ivv = svv / determinant, -suv / determinant, suu / determinant
+            su, sv = iuu * u + iuv * v, iuv * u + ivv * v
+            distance = u * su + v * sv
+            inverses.append(((iuu, iuv), (iuv, ivv)))
+            solved.append(((su,), (sv,)))
+            fits.append(-0.5 * (distance + log(determinant)))
+            # E[residual residualᵀ] = R - H P⁺ Hᵀ, here relative to R.
+            residual = nuu * su * su + 2.0 * nuv * su * sv + nvv * sv * sv
+            excesses.append(0.5 * (residual - nuu * iuu - 2.0 * nuv * iuv - nvv * ivv))
+        step_to = (cross @ np.array(solved))[:, :, 0]
+        before, local = local, ((mean[:, POSITION] + step_to[:, POSITION] - centre) @ rotation.T).tolist()
+        far = max(abs(new[k] - old[k]) / old[2] for new, old in zip(local, before, strict=True) for k in range(3))
+        if far < _LINEAR:
+            break
     # The gate of the filter with the largest density: a manoeuvre must not look like an outlier.
-    if not distance[-1] < _GATE:
+    if not distance < _GATE:
         return None
-    mean = mean + (cross @ solved)[:, :, 0]
-    covariance = covariance - cross @ inverse @ cross.transpose(0, 2, 1)
+    mean += step_to
+    covariance -= cross @ np.array(inverses) @ cross.transpose(0, 2, 1)
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-    log_weight = np.exp(-elapsed / _MEMORY_S) * state.log_weight - 0.5 * (distance + np.log(determinant))
-    log_weight -= log_weight.max()
-    best = int(log_weight.argmax())
-    # E[residual residualᵀ] = R - H P⁺ Hᵀ, of the likeliest filter and relative to R.
-    weighted = noise[best] @ inverse[best]
-    excess = 0.5 * (float((solved[best].T @ noise[best] @ solved[best])[0, 0]) - weighted[0, 0] - weighted[1, 1])
+    kept = exp(-elapsed / _MEMORY_S)
+    log_weight = [kept * old + fit for old, fit in zip(state.log_weight, fits, strict=True)]
+    most = max(log_weight)
+    best = log_weight.index(most)
     gain = max(1.0 / (rows + _NOISE_START), _NOISE_GAIN)
     accepted = {**state.accepted, name: row.reference_ns}
     usual = state.usual_std
     if sum(seen_ns > row.reference_ns - RECENT_NS for seen_ns in accepted.values()) >= 2:
         usual += _USUAL_GAIN * (position_std(covariance[best]) - usual)
     psd = state.psd
-    if np.exp(log_weight[[0, -1]]).max() > _MOVE_WEIGHT * np.exp(log_weight).sum():
+    if best != 1 and _MOVE_WEIGHT * sum(exp(one - most) for one in log_weight) < 1.0:
         # The bank moves by one density: the outermost filter is doubled, and the opposite one is dropped.
-        up = best > 0
-        keep = [1, 2, 2] if up else [0, 0, 1]
-        mean, covariance, log_weight = mean[keep], covariance[keep], log_weight[keep]
-        psd = psd * (_PSD_STEP if up else 1.0 / _PSD_STEP)
-    return replace(
-        state,
+        keep, times = ([1, 2, 2], _PSD_STEP) if best else ([0, 0, 1], 1.0 / _PSD_STEP)
+        mean, covariance, log_weight = mean[keep], covariance[keep], [log_weight[k] for k in keep]
+        psd = scaled(psd, times)
+    return MarkerState(
         time_ns=row.reference_ns,
         mean=mean,
         covariance=covariance,
-        log_weight=log_weight,
+        log_weight=(log_weight[0] - most, log_weight[1] - most, log_weight[2] - most),
         psd=psd,
         hits=state.hits + 1,
         accepted=accepted,
-        noise={**state.noise, name: (max(factor * (1.0 + gain * excess), 1.0), rows + 1)},
+        rejected=state.rejected,
+        noise={**state.noise, name: (max(factor * (1.0 + gain * excesses[best]), 1.0), rows + 1)},
         usual_std=usual,
+        pending=state.pending,
+        serial=state.serial,
     )
 
 
@@ -230,8 +272,7 @@ def _begin(
         time_ns=row.reference_ns,
         mean=np.tile(mean, (len(_BANK), 1)),
         covariance=np.tile(covariance, (len(_BANK), 1, 1)),
-        log_weight=np.zeros(len(_BANK)),
-        psd=psd * _BANK,
+        psd=scaled(_BANK, psd),
         hits=2 * ROWS_PER_CAMERA,
         accepted=dict.fromkeys((other, row.camera.name), row.reference_ns),
         noise={**state.noise, **noise},
@@ -240,18 +281,17 @@ def _begin(
     )
 
 
-def smooth_states(states: list[MarkerState]) -> tuple[Floats, Floats]:
-    """Smoothed means (n, 9) and covariances (n, 9, 9) of n states of one track, in order of time.
+def smooth_states(states: Sequence[MarkerState], wanted: int) -> tuple[Floats, Floats]:
+    """The first ``wanted`` smoothed means (n, 9) and covariances (n, 9, 9) of the states of one track, in order.
 
     Each with the filter whose density is nearest to the likeliest one now.
     """
     psd = np.array([state.psd for state in states])
-    likely = psd[-1, int(states[-1].log_weight.argmax())]
-    member = np.abs(np.log(psd / likely)).argmin(axis=1)
+    member = np.abs(np.log(psd / states[-1].psd[states[-1].best])).argmin(axis=1)
     mean = np.array([state.mean[m] for state, m in zip(states, member, strict=True)])
     covariance = np.array([state.covariance[m] for state, m in zip(states, member, strict=True)])
     time = np.array([state.time_ns - states[-1].time_ns for state in states]) / NANOSECONDS
-    return rts_smooth(time, mean, covariance, psd[np.arange(len(states)), member])
+    return rts_smooth(time, mean, covariance, psd[np.arange(len(states)), member], wanted)
 
 
 def misfit(pairs: Sequence[tuple[MarkerRow, MarkerState]], change: Similarity | None) -> float:
@@ -259,10 +299,10 @@ def misfit(pairs: Sequence[tuple[MarkerRow, MarkerState]], change: Similarity | 
 
     In variances of the rows. change: from the states' world frame to the calibration's, None = the same frame.
     """
-    mean = np.array([state.mean[int(state.log_weight.argmax()), POSITION] for _, state in pairs])
+    mean = np.array([state.mean[state.best, POSITION] for _, state in pairs])
     off = []
     for (row, _), place in zip(pairs, mean if change is None else change.points(mean), strict=True):
         x, y, depth = row.camera.pose.rotation @ (place - row.camera.pose.position)
-        away = row.point - np.array([x, y]) / depth if depth > 0.0 else np.full(2, np.inf)
-        off.append(float(away @ away) / float(np.trace(row.noise)))
+        away = np.hypot(row.point[0] - x / depth, row.point[1] - y / depth) if depth > 0.0 else np.inf
+        off.append(float(away**2 / (row.noise[0] + row.noise[2])))
     return float(np.median(off))

@@ -179,8 +179,10 @@ class _LabelTrack:
 
     def insert(self, row: MarkerRow) -> str:
         """Insert a row; how it was handled."""
-        own = sum(old.camera.name == row.camera.name for old in self._rows.rows)
-        return "floods" if own >= _MAX_ROWS_PER_S * self._keep_ns // NANOSECONDS else self._rows.insert(row)
+        most, rows = _MAX_ROWS_PER_S * self._keep_ns // NANOSECONDS, self._rows.rows
+        if len(rows) >= most and sum(old.camera.name == row.camera.name for old in rows) >= most:
+            return "flood"
+        return self._rows.insert(row)
 
     def advance(self, newest_ns: int) -> int:
         """Process the pending rows; newest_ns: reference time that frames have reached. The number of rows."""
@@ -216,12 +218,14 @@ class _LabelTrack:
     def smoothed(self, newest_ns: int) -> list[pb.Track]:
         """The smoothed messages at least the lag before ``newest_ns``, in batches; forgets the rows behind them."""
         until = max(newest_ns, self._rows.newest_ns or newest_ns) - self._lag_ns
-        due = {id(state) for state in self._accepted(self._smoothed_ns, until)}
-        out = []
-        if until > self._smoothed_ns + _BATCH_NS and due:
-            for _, states in groupby(self._accepted(self._smoothed_ns, None), lambda state: state.serial):
+        out: list[pb.Track] = []
+        if until > self._smoothed_ns + _BATCH_NS:
+            due = {id(state) for state in self._accepted(self._smoothed_ns, until)}
+            chain = self._accepted(self._smoothed_ns, None) if due else []
+            for _, states in groupby(chain, lambda state: state.serial):
                 track = list(states)
-                for state, mean, covariance in zip(track, *smooth_states(track), strict=True):
+                wanted = max((number + 1 for number, state in enumerate(track) if id(state) in due), default=0)
+                for state, mean, covariance in zip(track, *smooth_states(track, wanted), strict=False):
                     if id(state) in due:
                         self._smoothed_ns = state.time_ns
                         out.append(marker_message(self._label, state, state.time_ns, (mean, covariance)))

@@ -70,8 +70,6 @@ def initial_motion(rows: Sequence[MarkerRow]) -> tuple[Floats, Floats, float] | 
 def _noise(row: MarkerRow, rows: Sequence[MarkerRow]) -> Floats:
     """Covariance (2, 2) of a row's point, with the uncertainty of its time from the image speed."""
     own = [other for other in rows if other.camera.name == row.camera.name]
-    elapsed = (own[-1].reference_ns - own[0].reference_ns) / NANOSECONDS
-    if not elapsed > 0.0:
-        return row.noise
-    moved = (own[-1].point - own[0].point) * (row.camera.time_std / elapsed)
-    return np.asarray(row.noise + np.outer(moved, moved))
+    elapsed = max(own[-1].reference_ns - own[0].reference_ns, 1) / NANOSECONDS
+    moved = (np.array(own[-1].point) - np.array(own[0].point)) * (row.camera.time_std / elapsed)
+    return np.array([row.noise[:2], row.noise[1:]]) + np.outer(moved, moved)

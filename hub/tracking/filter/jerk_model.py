@@ -42,26 +42,40 @@ def jerk_model(elapsed: float) -> tuple[Floats, Floats]:
 
     Bar-Shalom, Li, Kirubarajan (2001), section 6.2.3 (white-noise jerk): two steps equal one step of their sum.
     """
-    both = (elapsed**_POWERS @ _BASIS).reshape(2 * STATE_DIM, STATE_DIM)
+    square = elapsed * elapsed
+    powers = (1.0, elapsed, square, square * elapsed, square * square, square * square * elapsed)
+    both = (powers @ _BASIS).reshape(2 * STATE_DIM, STATE_DIM)
     return both[:STATE_DIM], both[STATE_DIM:]
 
 
-def rts_smooth(time: Floats, mean: Floats, covariance: Floats, psd: Floats) -> tuple[Floats, Floats]:
-    """Smoothed means (n, 9) and covariances (n, 9, 9) from filtered ones (Rauch, Tung, Striebel 1965).
+def rts_smooth(time: Floats, mean: Floats, covariance: Floats, psd: Floats, wanted: int) -> tuple[Floats, Floats]:
+    """The first ``wanted`` smoothed means (n, 9) and covariances (n, 9, 9) from filtered ones.
 
-    time: (n,) [s], in order. psd: (n,) spectral density [unit²/s⁵] of the jerk before each state; the first is unused.
+    Rauch, Tung, Striebel (1965); the later rows are combined in pairs (Särkkä and García-Fernández 2021). time: (n,)
+    [s], in order. psd: (n,) spectral density [unit²/s⁵] of the jerk before each state; the first is unused.
     """
     both = ((np.diff(time)[:, None] ** _POWERS) @ _BASIS).reshape(-1, 2 * STATE_DIM, STATE_DIM)
     step, noise = both[:, :STATE_DIM], psd[1:, None, None] * both[:, STATE_DIM:]
-    ahead = step @ mean[:-1, :, None]
     cross = step @ covariance[:-1]
     predicted = cross @ step.transpose(0, 2, 1) + noise
     # Scaled to a unit diagonal: accelerations and positions differ by the square of a frame interval.
     scale = 1.0 / np.sqrt(np.einsum("nii->ni", predicted))
     gain = np.linalg.solve(predicted * scale[:, :, None] * scale[:, None, :], cross * scale[:, :, None])
     gain = (gain * scale[:, :, None]).transpose(0, 2, 1)
-    means, covariances = mean.copy(), covariance.copy()
-    for k in range(len(time) - 2, -1, -1):
-        means[k] += gain[k] @ (means[k + 1] - ahead[k, :, 0])
-        covariances[k] += gain[k] @ (covariances[k + 1] - predicted[k]) @ gain[k].T
-    return means, covariances
+    # Smoothed state = gain · next smoothed state + shift, with a covariance of its own.
+    shift = mean[:-1, :, None] - gain @ (step @ mean[:-1, :, None])
+    own = covariance[:-1] - gain @ predicted @ gain.transpose(0, 2, 1)
+    tail: tuple[Floats, ...] = gain[wanted:], shift[wanted:], own[wanted:]
+    while len(tail[0]) > 1:
+        even = len(tail[0]) // 2 * 2
+        (g, s, c), (later, s_later, c_later) = (tuple(part[k:even:2] for part in tail) for k in (0, 1))
+        pairs = g @ later, g @ s_later + s, g @ c_later @ g.transpose(0, 2, 1) + c
+        tail = tuple(np.concatenate([pair, part[even:]]) for pair, part in zip(pairs, tail, strict=True))
+    one, spread = mean[-1, :, None], covariance[-1]
+    parts = [*zip(gain[:wanted], shift[:wanted], own[:wanted], strict=True), *zip(*tail, strict=True)]
+    means, covariances = [one], [spread]
+    for g, s, c in reversed(parts):
+        one, spread = g @ one + s, g @ spread @ g.T + c
+        means.append(one)
+        covariances.append(spread)
+    return np.array(means)[::-1][:wanted, :, 0], np.array(covariances)[::-1][:wanted]

@@ -5,11 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import hypot, isfinite, pi, tan
 
-import numpy as np
-
 from hub.tracking.detections import MIN_STD_PX, TrackingCamera
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 
 _NEWTON_STEPS, _TOLERANCE = 20, 1e-11
@@ -19,8 +16,8 @@ _NEWTON_STEPS, _TOLERANCE = 20, 1e-11
 class MarkerRow:
     """One detection of a labelled marker.
 
-    reference_ns: capture time of its image row on the reference clock. point: (2,) normalised. noise: (2, 2) covariance
-    of the point. detection, device_ns: as the camera told them.
+    reference_ns: capture time of its image row on the reference clock. point: x, y, normalised. noise: its
+    covariance xx, xy, yy. detection, device_ns: as the camera told them.
     """
 
     camera: TrackingCamera
@@ -29,8 +26,8 @@ class MarkerRow:
     sequence: int
     device_ns: int
     detection: pb.Detection
-    point: Floats
-    noise: Floats
+    point: tuple[float, float]
+    noise: tuple[float, float, float]
 
     @property
     def key(self) -> tuple[int, str, str, int]:
@@ -61,11 +58,16 @@ def marker_row(
         uu, uv, vv = 0.0, 0.0, 0.0
     # noise_px is the root mean square of both coordinates together.
     more = max(max(0.5 * camera.noise_px**2, MIN_STD_PX**2) - 0.5 * (uu + vv), 0.0)
-    inverse = np.array([[d, -b], [-c, a]]) / determinant
-    noise = inverse @ np.array([[uu + more, uv], [uv, vv + more]]) @ inverse.T
+    a, b, c, d = d / determinant, -b / determinant, -c / determinant, a / determinant
+    uu, vv = uu + more, vv + more
+    noise = (
+        a * a * uu + 2.0 * a * b * uv + b * b * vv,
+        a * c * uu + (a * d + b * c) * uv + b * d * vv,
+        c * c * uu + 2.0 * c * d * uv + d * d * vv,
+    )
     row_ns = round(camera.readout * 1e9 * (min(max(detection.v / max(lens.height - 1, 1), 0.0), 1.0) - 0.5))
     reference_ns = camera.reference_ns(device_ns + row_ns)
-    return MarkerRow(camera, reference_ns, boot_id, sequence, device_ns, detection, np.array([x, y]), noise)
+    return MarkerRow(camera, reference_ns, boot_id, sequence, device_ns, detection, (x, y), noise)
 
 
 def undistort(lens: Intrinsics, u: float, v: float) -> tuple[float, float, tuple[tuple[float, float], ...]] | None:
