@@ -142,7 +142,8 @@ def read_points(source: ImportSource, times: points.Times, likelihood: float, ca
 def session_to_log(rig: Rig, observations: Observations, out: Path, arrivals: Arrivals | None = None) -> int:
     """Write a session as a log, atomically; returns the number of messages. Raises InputError.
 
-    arrivals: the log times; by default every camera's first frame is at the log's beginning.
+    arrivals: the log times; by default every camera's first frame is at the log's beginning. A camera's information
+    comes with its first frame.
     """
     from protocols.log.write.writer import LogWriter
     from protocols.topics import CAMERA_INFO, OBSERVATION, RIG_INFO
@@ -151,20 +152,19 @@ def session_to_log(rig: Rig, observations: Observations, out: Path, arrivals: Ar
         raise InputError("this file exists already", file=out, remedy="choose another --out: logs are not replaced")
     part = out.with_name(f".{out.stem}.part.mcap")
     part.unlink(missing_ok=True)
-    count = 0
+    frames = _observation_messages(rig, observations, arrivals)
+    begins = {name: at for at, name, _ in reversed(frames)}
+    messages = [(begins.get(name, 0), CAMERA_INFO, name, _camera_info(rig, name)) for name in rig.cameras]
+    messages.append((0, RIG_INFO, "import", _rig_info(rig)))
+    messages += [(at, OBSERVATION, name, message) for at, name, message in frames]
     try:
         with LogWriter(part, views=True) as writer:
-            for name in rig.cameras:
-                writer.write(CAMERA_INFO, name, "import", _camera_info(rig, name), 0)
-            writer.write(RIG_INFO, "import", "import", _rig_info(rig), 0)
-            count = len(rig.cameras) + 1
-            for at, name, message in _observation_messages(rig, observations, arrivals):
-                writer.write(OBSERVATION, name, "import", message, at)
-                count += 1
+            for at, topic, name, message in sorted(messages, key=lambda entry: entry[0]):
+                writer.write(topic, name, "import", message, at)
         part.replace(out)
     finally:
         part.unlink(missing_ok=True)
-    return count
+    return len(messages)
 
 
 def read_arrivals(calibration: Path, rig: Rig, delay: float, jitter: float, seed: int) -> Arrivals:

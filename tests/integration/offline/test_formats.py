@@ -416,6 +416,8 @@ def test_a_log_by_a_calibration_has_the_frames_as_they_happened(tmp_path: Path, 
 
     expected = [("wide", 0.0), ("left", 0.5), ("left", 1.5), ("right", 2.0), ("left", 2.5), ("right", 3.0)]
     assert arrivals("a.mcap") == [(name, pytest.approx(at)) for name, at in [*expected, ("wide", 4.0)]]
+    introduced = {m.agent: m.log_time_ns * 1e-9 for m in LogReader(tmp_path / "a.mcap").messages(["camera_info"])}
+    assert introduced == pytest.approx({"left": 0.5, "right": 2.0, "wide": 0.0})
     delayed = arrivals("b.mcap", "--arrival-delay-ms", "50", "--arrival-jitter-ms", "20", "--seed", "3")
     late = np.array([at for _, at in sorted(delayed)]) - [at for _, at in sorted([*expected, ("wide", 4.0)])]
     assert (late >= 0.05 - 1e-9).all() and 0.05 < late.mean() < 0.12  # noqa: PT018
