@@ -36,6 +36,7 @@ SECTIONS = {
     "uav": "UAV tracker",
     "detectors": "marker and person detectors",
     "bus": "edge to hub",
+    "live": "the live hub on streams at their own pace",
     "hubs": "a hub with up to 1,000 cameras",
     "recorder": "recorder",
     "processes": "memory and starts of real processes",
@@ -71,7 +72,7 @@ def run(name: str, quick: bool, data: Path, file: Path) -> Section | str:
 def main() -> int:
     """Run the sections, print the table, keep it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="small work: within 3 minutes on an idle machine")
+    parser.add_argument("--quick", action="store_true", help="small work: within 5 minutes on an idle machine")
     parser.add_argument("--data", type=Path, default=DEFAULT_DATA, help="folder of the recordings")
     parser.add_argument("--only", default=",".join(SECTIONS), help="sections, by comma")
     parser.add_argument("--keep", action="store_true", help="compare later runs with this one")

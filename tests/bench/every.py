@@ -38,6 +38,7 @@ BENCHES = {
         ("--jobs", "2"),
     ),
     "real_rigs": Bench("drone flights and webcams", data=True),
+    "live": Bench("live hub, streams at their own pace", ("--only", "simulated", "--seconds", "60"), data=True),
     "simulated_rigs": Bench(
         "five cameras, twenty cameras, pairs cut short",
         ("--sessions", "4", "--seconds", "120", "--only", "five,twenty"),
