@@ -162,10 +162,21 @@ def _update(state: MarkerState, row: MarkerRow) -> MarkerState | None:
     moved = (rotation @ (camera.time_std * mean[:, VELOCITY, None])).tolist()
     factor, rows = state.noise.get(name, (1.0, 0))
     prior = ((mean[:, POSITION] - centre) @ rotation.T).tolist()
-    local = prior
-    for _ in range(_ITERATIONS):
-        if not min(z for _, _, z in local) > 0.0:
+    behind = [number for number, (_, _, z) in enumerate(prior) if not z > 0.0]
+    if behind:
+        if state.best in behind:
             return None
+        # An unlikely filter whose depth is lost, as with one camera alone, begins again from the likeliest.
+        for number in behind:
+            mean[number], covariance[number], prior[number] = (
+                mean[state.best],
+                covariance[state.best],
+                prior[state.best],
+            )
+    accepted = {**state.accepted, name: row.reference_ns}
+    cameras = sum(seen_ns > row.reference_ns - RECENT_NS for seen_ns in accepted.values())
+    local = prior
+    for _ in range(_ITERATIONS if cameras > 1 else 1):
         slopes = [((1.0 / z, 0.0, -x / z**2), (0.0, 1.0 / z, -y / z**2)) for x, y, z in local]
         jacobian = np.array(slopes) @ rotation
         cross = covariance[:, :, POSITION] @ jacobian.transpose(0, 2, 1)
@@ -195,12 +206,14 @@ def _update(state: MarkerState, row: MarkerRow) -> MarkerState | None:
         step_to = (cross @ np.array(solved))[:, :, 0]
         before, local = local, ((mean[:, POSITION] + step_to[:, POSITION] - centre) @ rotation.T).tolist()
         far = max(abs(new[k] - old[k]) / old[2] for new, old in zip(local, before, strict=True) for k in range(3))
-        if far < _LINEAR:
+        if far < _LINEAR or not min(z for _, _, z in local) > 0.0:
             break
     # The gate of the filter with the largest density: a manoeuvre must not look like an outlier.
     if not distance < _GATE:
         return None
-    mean += step_to
+    before_row, mean = mean, mean + step_to
+    if cameras == 1:
+        covariance = _with_scale_at(covariance, before_row, mean, centre)
     covariance -= cross @ np.array(inverses) @ cross.transpose(0, 2, 1)
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
     kept = exp(-elapsed / _MEMORY_S)
@@ -208,9 +221,8 @@ def _update(state: MarkerState, row: MarkerRow) -> MarkerState | None:
     most = max(log_weight)
     best = log_weight.index(most)
     gain = max(1.0 / (rows + _NOISE_START), _NOISE_GAIN)
-    accepted = {**state.accepted, name: row.reference_ns}
-    usual = state.usual_std
-    if sum(seen_ns > row.reference_ns - RECENT_NS for seen_ns in accepted.values()) >= 2:
+    usual, last_ns = state.usual_std, state.accepted.get(name)
+    if cameras > 1 and (last_ns is None or state.time_ns > last_ns):  # another camera saw it since this one did
         usual += _USUAL_GAIN * (position_std(covariance[best]) - usual)
     psd = state.psd
     if best != 1 and _MOVE_WEIGHT * sum(exp(one - most) for one in log_weight) < 1.0:
@@ -232,6 +244,20 @@ def _update(state: MarkerState, row: MarkerRow) -> MarkerState | None:
         pending=state.pending,
         serial=state.serial,
     )
+
+
+def _with_scale_at(covariance: Floats, before: Floats, after: Floats, centre: Floats) -> Floats:
+    """Covariances (3, 9, 9) whose uncertain scale about one camera's centre is that of the states ``after`` a row.
+
+    One camera alone cannot tell the scale of the motion about its centre. Where the linearisation moves, the filter
+    would learn it nevertheless (Huang, Mourikis, Roumeliotis 2010): so the largest part of the covariance that can be
+    that scale's, s² n nᵀ with n = (position - centre, velocity, acceleration), is turned to the new n. A row of the
+    camera leaves that part as it is. before, after: (3, 9).
+    """
+    offset = np.concatenate([centre, np.zeros(STATE_DIM - 3)])
+    old, new = before - offset, after - offset
+    scale = 1.0 / (old[:, None] @ np.linalg.solve(covariance, old[:, :, None]))
+    return np.asarray(covariance + scale * (new[:, :, None] * new[:, None] - old[:, :, None] * old[:, None]))
 
 
 def _reject(state: MarkerState, row: MarkerRow) -> MarkerState:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Mapping
 from functools import partial
-from itertools import groupby
+from itertools import groupby, pairwise
 
 from hub.tracking.detections import TrackingCamera, tracked_kind
 from hub.tracking.filter.marker_rows import MarkerRow, marker_row
@@ -18,7 +18,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.observations import DEFAULT_LABEL
 
 _MAX_AHEAD_NS = 5 * NANOSECONDS
-"""A row further ahead than this is used only when a second camera has come as far."""
+"""Cameras whose times differ by more do not agree; a row further ahead of the others is not used."""
 _SAMPLE_NS = NANOSECONDS // 30
 """Between two smoothed samples, and between those that a delayed hub publishes afterwards."""
 _BATCH_NS = NANOSECONDS // 10
@@ -49,7 +49,8 @@ class MarkerTracks:
         self._newest_ns: dict[str, int] = {}
         self._labels: dict[str, _LabelTrack] = {}
         self._smoothed: deque[pb.Track] = deque(maxlen=_MAX_SMOOTHED)
-        self._heard, self._fresh = -float("inf"), False
+        self._heard: dict[str, float] = {}
+        self._fresh: set[str] = set()
 
     def calibrate(self, cameras: Mapping[str, TrackingCamera], change: Similarity | None) -> None:
         """Use a new calibration; the kept rows are processed again with it.
@@ -95,8 +96,11 @@ class MarkerTracks:
 
     def tick(self, now: float) -> list[pb.Track]:
         """Messages, without sequence numbers, of all labels with news; now: any monotonic clock [s]."""
-        if self._fresh:
-            self._heard, self._fresh = now, False
+        self._heard |= dict.fromkeys(self._fresh, now)
+        self._fresh.clear()
+        alive = {name: time for name, time in self._newest_ns.items() if now - self._heard[name] <= self._coast_s}
+        # A camera that fell silent must not hold the others' time.
+        self._newest_ns = alive or self._newest_ns
         newest = self._consensus_ns()
         if newest is None:
             return []
@@ -104,7 +108,7 @@ class MarkerTracks:
         for label, track in list(self._labels.items()):
             self.counters["marker.steps"] += track.advance(newest)
             self._smoothed.extend(track.smoothed(newest))
-            out += track.messages(newest, now - self._heard > self._coast_s)
+            out += track.messages(newest, not alive)
             if track.is_over(newest):
                 del self._labels[label]
         return out
@@ -126,14 +130,15 @@ class MarkerTracks:
     def _is_plausible(self, name: str, reference_ns: int) -> bool:
         """Whether a frame's time is plausible: one camera's wrong clock must not make all others late."""
         self._newest_ns[name] = reference_ns
+        self._fresh.add(name)
         newest = self._consensus_ns()
-        self._fresh = True
         return newest is not None and reference_ns <= newest + _MAX_AHEAD_NS
 
     def _consensus_ns(self) -> int | None:
-        """The reference time that two cameras have reached; of a single camera its own."""
-        times = sorted(self._newest_ns.values())
-        return times[max(len(times) - 2, 0)] if times else None
+        """The newest reference time on which two cameras agree; without such a pair the oldest."""
+        times = sorted(self._newest_ns.values(), reverse=True)
+        agreed = (earlier for later, earlier in pairwise(times) if later - earlier <= _MAX_AHEAD_NS)
+        return next(agreed, times[-1] if times else None)
 
     def _introduced(self, label: str, camera: str) -> _LabelTrack | None:
         """A track for a new label, unless its camera floods the tracker with labels."""

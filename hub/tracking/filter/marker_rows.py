@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import hypot, isfinite, pi, tan
+from math import hypot, pi, tan
 
 from hub.tracking.detections import MIN_STD_PX, TrackingCamera
 from protocols.geometry.camera import Intrinsics
@@ -42,7 +42,7 @@ class MarkerRow:
 def marker_row(
     camera: TrackingCamera, device_ns: int, boot_id: str, sequence: int, detection: pb.Detection
 ) -> MarkerRow | None:
-    """The row of a detection; None if it is not finite or the lens has no inverse there.
+    """The row of a detection; None if it or its covariance is no use, or the lens has no inverse there.
 
     Its covariance is the detection's own, but not below the residuals of the calibration.
     """
@@ -54,8 +54,8 @@ def marker_row(
     (a, b), (c, d) = jacobian
     determinant = a * d - b * c
     uu, uv, vv = detection.covariance if len(detection.covariance) == 3 else (0.0, 0.0, 0.0)
-    if not (isfinite(uu + uv + vv) and uu >= 0.0 and uu * vv >= uv * uv):
-        uu, uv, vv = 0.0, 0.0, 0.0
+    if not (0.0 <= uu < lens.width**2 and 0.0 <= vv < lens.height**2 and uv * uv <= uu * vv):
+        return None
     # noise_px is the root mean square of both coordinates together.
     more = max(max(0.5 * camera.noise_px**2, MIN_STD_PX**2) - 0.5 * (uu + vv), 0.0)
     a, b, c, d = d / determinant, -b / determinant, -c / determinant, a / determinant
