@@ -13,7 +13,6 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
-from deploy.agents.malloc_tuning import release_free_pages
 from deploy.config.agents import CameraConfig, HubConfig, OakConfig, PiCameraConfig, SimulatedConfig, UsbConfig
 from edge.detectors.base import Detector
 from edge.devices.base import Device
@@ -102,20 +101,34 @@ def _fps(config: CameraConfig) -> float:
 
 
 def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable[[], None] = lambda: None) -> int:
-    """Run the hub until it is stopped; its answers are also files where `out` is given. beat: called every round."""
+    """Run the hub until it is stopped; every answer is kept on disk. beat: called every round."""
+    from deploy.agents.answer_store import AnswerStore, default_folder
     from hub.distributed.network.host import NodeHost
     from hub.live.agent import run_hub
     from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
+    from hub.live.worker import WorkerSolver
     from protocols.session.calibration import read_calibration
 
     rig = None if config.rig is None else read_rig(config.rig)
     nodes = NodeHost(config.id, config.nodes, leave_after_s=config.leave_after_s) if config.pose_nodes else None
     known = None if config.known is None else KnownCalibration(*read_calibration(config.known))
     settings = LiveSettings(config.window_s, config.interval_s, solve=config.solve, track=config.track)
-    hub = LiveHub(settings, rig, None if known is not None else nodes, known)
+    hub = LiveHub(settings, rig, None if known is not None else nodes, known, WorkerSolver())
     export = None if config.out is None else partial(_export, out=config.out)
-    # A solve leaves holes behind it, which would add up.
-    run_hub(hub, bus, config.id, stop, rig=rig, beat=beat, export=export, on_result=lambda _: release_free_pages())
+    store = AnswerStore(config.state or default_folder(config.out, config.site, config.id))
+    last = store.load() if config.solve else None
+    if last is not None:
+        hub.reload(*last)
+
+    def keep(hub: LiveHub) -> None:
+        if config.solve and known is None and hub.calibration is not None and hub.session is not None:
+            store.keep(hub.calibration, hub.session[0], hub.boot_ids)
+        hub.notice = f"answers cannot be kept: {store.problem}" if store.problem else ""
+
+    try:
+        run_hub(hub, bus, config.id, stop, rig=rig, beat=beat, export=export, on_result=keep)
+    finally:
+        store.close()
     if config.out is not None:
         write_last(hub, config.out)
     return EXIT_DONE
@@ -142,10 +155,10 @@ def write_last(hub: object, out: Path) -> None:
     if hub.session is None:
         return
     session = Session(*hub.session)
-    if hub.refusal is not None:
-        report_refusal(hub.refusal, session, out, "syncline hub")
-    elif hub.calibration is not None:
+    if hub.calibration is not None:
         report_result(CalibrationResult(hub.calibration, session), out, "syncline hub")
+    elif hub.refusal is not None:
+        report_refusal(hub.refusal, session, out, "syncline hub")
 
 
 def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:

@@ -20,6 +20,7 @@ from edge.lens.solve import intrinsics_from_field_of_view
 from hub.calibration.coverage import MIN_COVERAGE
 from hub.live.agent import run_hub
 from hub.live.live_hub import LiveHub, LiveSettings
+from hub.live.worker import WorkerSolver
 from hub.view.image_planes import ImagePlanes
 from hub.view.server import ViewServer, run_view
 from hub.view.state import ViewState
@@ -111,7 +112,7 @@ class QuickCalibration:
         }
         self._detectors = {name: InteractiveMarkerDetector(self._lens(name), settings.marker) for name in self._devices}
         rig = settings.rig
-        self.hub = LiveHub(LiveSettings(WINDOW_S, 2.0), rig)
+        self.hub = LiveHub(LiveSettings(WINDOW_S, 2.0), rig, solver=WorkerSolver())
         self._errors: list[BaseException] = []
         self._reset_requested = threading.Event()
         self._consecutive_good = 0

@@ -295,7 +295,9 @@ class CameraConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields
 class HubConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The hub. rig: a rig.toml with what is known of the rig; out: folder in which calibrations are written.
 
-    window_s: length of the sliding window of observations that is solved; interval_s: time between solves. solve:
+    state: folder in which every answer is kept, so that a hub that was killed goes on from the last one; default:
+    in ``out``, else in the user's state folder. window_s: total duration of the observations that are kept; interval_s:
+    least time between two solves. solve:
     false = this hub does not estimate timing itself. nodes: cameras whose pose nodes always run on this hub; the others
     are distributed among all hubs. pose_nodes: false = none run here. leave_after_s: time after which a camera that has
     disappeared is removed. known: a calibration.toml whose poses, intrinsics and clocks are kept fixed; nothing is
@@ -305,7 +307,8 @@ class HubConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     id: str = "hub"
     rig: Path | None = None
     out: Path | None = None
-    window_s: Seconds = 60.0
+    state: Path | None = None
+    window_s: Seconds = 180.0
     interval_s: Seconds = 2.0
     solve: bool = True
     pose_nodes: bool = True

@@ -6,14 +6,25 @@ import os
 from pathlib import Path
 
 from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
+from hub.live.scheduled_hub import ScheduledHub
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
 from protocols.session.calibration import read_calibration
-from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, PREDICTION, RIG_INFO, TRACK
+from protocols.topics import (
+    CALIBRATION,
+    CAMERA_INFO,
+    OBSERVATION,
+    PREDICTION,
+    RIG_INFO,
+    SOLVER_EVENT,
+    TRACK,
+    TRACK_SMOOTHED,
+)
 
-_TOPICS = {topic.message: topic for topic in (CALIBRATION, TRACK, PREDICTION)}
+_TOPICS = {topic.message: topic for topic in (CALIBRATION, TRACK, PREDICTION, SOLVER_EVENT)}
+_INPUTS = [OBSERVATION, CAMERA_INFO, RIG_INFO]
 
 
 def replay_through_hub(
@@ -25,15 +36,17 @@ def replay_through_hub(
 ) -> int:
     """Write the messages that a hub publishes for the input of a log to a new log; returns their number.
 
-    calibration: a calibration.toml to track with instead of calibrating. The hub runs on log time, so it solves after
-    the same messages on every machine and the output is identical. ``out`` is written atomically. Raises InputError.
+    calibration: a calibration.toml to track with instead of calibrating. Where the log holds what a hub's solver was
+    given and when its answers took effect, these answers are repeated bit for bit; otherwise the hub solves on log
+    time, after the same messages on every machine. ``out`` is written atomically. Raises InputError.
     """
     reader = LogReader(log)
     if out.exists():
         raise InputError("exists already", file=out, remedy="choose another --out, or move it away")
     temporary = out.with_name(f".{out.name}.{os.getpid()}")
     known = None if calibration is None else KnownCalibration(*read_calibration(calibration))
-    hub = LiveHub(settings, known=known)
+    recorded = next(reader.messages([SOLVER_EVENT]), None) if known is None and settings is None else None
+    hub = ScheduledHub() if recorded is not None else LiveHub(settings, known=known)
     count, first_ns, now_ns, site = 0, None, 0, ""
     try:
         with LogWriter(temporary, {"replay": {"through": "hub"}}) as writer:
@@ -42,9 +55,14 @@ def replay_through_hub(
                 published = hub.tick((now_ns - (first_ns or 0)) / NANOSECONDS, final=final)
                 for message in published:
                     writer.write(_TOPICS[message.DESCRIPTOR.name], agent, site, message, now_ns)
-                return len(published)
+                smoothed = [] if hub.tracking is None else hub.tracking.smoothed()
+                for track in smoothed:
+                    writer.write(TRACK_SMOOTHED, agent, site, track, now_ns)
+                return len(published) + len(smoothed)
 
-            for logged in reader.messages([OBSERVATION, CAMERA_INFO, RIG_INFO]):
+            for logged in reader.messages(_INPUTS if recorded is None else [*_INPUTS, SOLVER_EVENT]):
+                if logged.topic is SOLVER_EVENT and recorded is not None and logged.agent != recorded.agent:
+                    continue  # of another hub
                 first_ns = logged.log_time_ns if first_ns is None else first_ns
                 now_ns, site = max(now_ns, logged.log_time_ns), logged.site
                 hub.handle(logged.message)

@@ -36,7 +36,7 @@ from hub.trajectory.discrete import PointBasis
 from protocols.geometry.camera import Intrinsics
 from protocols.session.calibration import AdjustmentStep
 
-_MIN_INFLATION = 4.0
+MIN_INFLATION = 4.0
 """Variance inflation by autocorrelation (rows per effective row) from which the noise is modelled as correlated."""
 _MAX_ROTATION_STD = 0.0175
 """Std [rad] of a camera's orientation above which correlated errors and trajectory cannot be distinguished."""
@@ -60,7 +60,9 @@ def lens_tolerance(lens: Intrinsics) -> LensPrior:
     )
 
 
-def refit_with_correlated_noise(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
+def refit_with_correlated_noise(
+    problem: Problem, state: AdjustmentState, min_inflation: float = MIN_INFLATION
+) -> tuple[Problem, AdjustmentState]:
     """Problem and state after the re-fit where residuals are autocorrelated; otherwise both unchanged.
 
     problem, state: adjusted. Both are also unchanged where poses are given, where clocks are shared, where frame times
@@ -71,7 +73,7 @@ def refit_with_correlated_noise(problem: Problem, state: AdjustmentState) -> tup
     if excluded or any(isinstance(path.basis, PointBasis) for path in state.trajectories):
         return problem, state
     cameras = range(len(state.cameras))
-    if max(correlation_inflation(problem, state, camera) for camera in cameras) < _MIN_INFLATION:
+    if max(correlation_inflation(problem, state, camera) for camera in cameras) < min_inflation:
         return problem, state
     noise_model = estimate_correlated_noise(problem, state)
     if not is_tractable(problem, noise_model):

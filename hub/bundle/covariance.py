@@ -38,12 +38,17 @@ class Covariance:
 
 
 def covariance(
-    problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, control_information: Floats | None = None
+    problem: Problem,
+    state: AdjustmentState,
+    prior: SmoothnessPrior,
+    control_information: Floats | None = None,
+    datum_points: list[tuple[int, Floats]] | None = None,
 ) -> Covariance:
     """Covariance at the solution.
 
     control_information: (18 n, 18 n) information of control points: surveyed positions, attitudes and distances. Gauge
-    directions that they leave free are fixed by convention: the first camera's pose and the first baseline.
+    directions that they leave free are fixed by convention: the first camera's pose and the first baseline, or, with
+    datum_points (label index, internal times), by inner constraints over these points of the trajectories.
     """
     system, _ = build_system(problem, state, prior, robust=False)
     parts = eliminate(system)
@@ -57,7 +62,10 @@ def covariance(
             else control_information
         )
         information = information + prior_information[np.ix_(columns, columns)]
-        constraints = gauge_constraints([camera.pose for camera in state.cameras], prior_information)[:, columns]
+        if datum_points:
+            constraints = inner_constraints(parts.a_inv_b, state, datum_points)
+        else:
+            constraints = gauge_constraints([camera.pose for camera in state.cameras], prior_information)[:, columns]
     if constraints is not None and len(constraints):
         _, _, vt = np.linalg.svd(constraints)
         tangent = vt[len(constraints) :].T
@@ -131,6 +139,38 @@ def time_map_std(cov: Covariance, state: AdjustmentState, camera: int, reference
     row[reference * CAMERA_PARAMETERS + OFFSET] -= 1.0
     row[reference * CAMERA_PARAMETERS + RATE] -= at - base.centre
     return float(np.sqrt(max(float(row @ cov.cameras @ row), 0.0)) / base.rate)
+
+
+def inner_constraints(a_inv_b: Floats, state: AdjustmentState, datum_points: list[tuple[int, Floats]]) -> Floats:
+    """(7, p) constraints over the free columns: the similarity fitted to the datum points does not move.
+
+    The trajectory follows the cameras by -A^-1 B; the points' own noise averages out over many of them.
+    """
+    generators, jacobian = [], []
+    for label, time in datum_points:
+        path = state.trajectories[label]
+        base = 3 * sum(before.basis.size for before in state.trajectories[:label])
+        index, weights, _ = path.basis.weights(time)
+        rows = base + 3 * (index[:, None] + np.arange(weights.shape[1]))
+        control = a_inv_b[rows[:, :, None] + np.arange(3)]
+        jacobian.append(-np.einsum("na,naip->nip", weights, control).reshape(-1, a_inv_b.shape[1]))
+        points = path.at(time)
+        block = np.zeros((len(points), 3, 7))
+        block[:, :, :3] = np.eye(3)
+        block[:, :, 3:6] = -np.array([so3.hat(point) for point in points])
+        block[:, :, 6] = points
+        generators.append(block.reshape(-1, 7))
+    columns = np.concatenate(generators)
+    found = np.linalg.lstsq(columns / np.linalg.norm(columns, axis=0), np.concatenate(jacobian), rcond=None)[0]
+    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
+
+
+def clock_rate_std(cov: Covariance, state: AdjustmentState, camera: int, reference: int) -> float:
+    """Std of the camera's clock rate relative to the reference camera's."""
+    row = np.zeros(len(cov.cameras))
+    row[camera * CAMERA_PARAMETERS + RATE] += 1.0
+    row[reference * CAMERA_PARAMETERS + RATE] -= 1.0
+    return float(np.sqrt(max(float(row @ cov.cameras @ row), 0.0)) / state.cameras[reference].rate)
 
 
 def relative_clock_stds(cov: Covariance, problem: Problem, state: AdjustmentState) -> Floats:

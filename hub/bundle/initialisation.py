@@ -80,11 +80,28 @@ def reconstruct_incrementally(
     rows: raw observations by camera, label indices into ``labels``. free_parameters: of the adjustment
     after each step; None = no adjustment (solver "paper").
     """
-    placed: dict[str, CameraState] = {}
-    refused: dict[str, str] = {}
     seed = max(graph.inlier_pairs, key=_seed_score)
-    placed |= _seed_cameras(cameras, graph, seed)
-    anchors = (seed.a, seed.b)
+    placed = _seed_cameras(cameras, graph, seed)
+    return place_cameras(cameras, graph, rows, labels, placed, free_parameters, (seed.a, seed.b), progress)
+
+
+def place_cameras(
+    cameras: dict[str, CameraInput],
+    graph: ClockGraph,
+    rows: dict[str, list[TrackObservations]],
+    labels: list[str],
+    placed: dict[str, CameraState],
+    free_parameters: FreeParameters | None,
+    anchors: tuple[str, str] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[Reconstruction, dict[str, str]]:
+    """Place the cameras of a graph next to those that are placed already, which are adjusted first; as above.
+
+    anchors: two placed cameras that fix the gauge; None = the first two.
+    """
+    refused: dict[str, str] = {}
+    first, second = [name for name in cameras if name in placed][:2]
+    anchors = anchors or (first, second)
     reconstruction = triangulate_and_adjust(cameras, placed, rows, labels, anchors, free_parameters)
     adjusted = len(placed)
     unplaced = [name for name in graph.clocks if name not in placed]

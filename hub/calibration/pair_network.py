@@ -40,6 +40,7 @@ _RATIO_TOLERANCE = 0.01
 _SMALL_NETWORK = 8  # cameras up to which all failed guided searches are repeated over all lags
 _MIN_REDUNDANT = 3  # cameras from which on pairs are checked against each other
 _LONG_OVERLAP = 8.0  # s of common motion
+_ENOUGH_PAIRS = 2  # of a new camera with placed ones: the second checks the first
 _MAX_PRIOR_WINDOW = 0.5  # s on either side: a less precise prior selects nothing
 
 
@@ -50,12 +51,14 @@ def solve_pairs(
     thorough: bool = False,
     known: FixedCalibration | None = None,
     clock_priors: Mapping[str, ExternalClockPrior] | None = None,
+    arrivals: Mapping[str, ExternalClockPrior] | None = None,
 ) -> tuple[PreparedSession, list[PairSolution]]:
     """All pairs of cameras, uncalibrated ones included, and the session with the time scales that were found.
 
     thorough: whether to try rates that a wrong nominal frame rate causes, for unconnected cameras. known: given poses;
     pairs of two such cameras then estimate lag and rate only. clock_priors: external clock priors by camera; they
-    select a lag only where the images leave it ambiguous, which a warning reports.
+    select a lag only where the images leave it ambiguous, which a warning reports. arrivals: the same by times of
+    arrival; pairs that have no solution near them are not searched further.
     """
     names = prepared.names
     todo = list(itertools.combinations(names, 2))
@@ -66,6 +69,13 @@ def solve_pairs(
     is_ranked = len(todo) > 1 and not prepared.shared_clock
     for done, (a, b) in enumerate(_ranked(prepared, todo, report, cache) if is_ranked else todo):
         report(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
+        expected = expected_lag(prepared, a, b, arrivals) if arrivals and not prepared.shared_clock else None
+        if expected is not None:
+            near = PairSettings(predicted_lag_window=expected[1])
+            solution = _solve(prepared, (a, b), known, predicted_lag=expected[0], settings=near, cache=cache)
+            if not solution.solved:
+                pairs[a, b] = solution
+                continue
         predicted_lag = None if prepared.shared_clock else synchronised.lag(prepared, a, b)
         solution = _solve(prepared, (a, b), known, predicted_lag=predicted_lag, cache=cache)
         # If the predicted lag is right, a pair with a long overlap must agree with it; else it is solved over all lags.
@@ -90,6 +100,34 @@ def solve_pairs(
     return prepared, list(pairs.values())
 
 
+def solve_new_pairs(
+    prepared: PreparedSession,
+    new: list[str],
+    placed: list[str],
+    clock_priors: Mapping[str, ExternalClockPrior] | None = None,
+) -> tuple[PreparedSession, list[PairSolution]]:
+    """Pairs of the new cameras with placed ones, most promising first, until two of a new camera are solved.
+
+    The session is returned with warnings about lags that clock priors selected.
+    """
+    cache, out = TrackCache(), []
+    for name in new:
+        pairs = [
+            (one, name) if prepared.names.index(one) < prepared.names.index(name) else (name, one) for one in placed
+        ]
+        solved = 0
+        for pair in _ranked(prepared, pairs, lambda text, share: None, cache):
+            solution = _solve(prepared, pair, None, cache=cache)
+            if clock_priors and not solution.solved:
+                solution, warning = _disambiguated_by_priors(prepared, solution, None, clock_priors)
+                prepared = replace(prepared, warnings=prepared.warnings + warning)
+            out.append(solution)
+            solved += solution.solved
+            if solved >= _ENOUGH_PAIRS:
+                break
+    return prepared, out
+
+
 def _isolated_pairs(pairs: Mapping[tuple[str, str], PairSolution]) -> list[tuple[str, str]]:
     """Solved pairs whose cameras are in no other solved pair: nothing else checks their lag."""
     counts = Counter(name for both, solution in pairs.items() if solution.solved for name in both)
@@ -108,19 +146,10 @@ def _disambiguated_by_priors(
     alignment at all, or if there is none near the prior lag, or one whose inlier support is less than half or whose
     residuals are clearly larger than the best alignment's: then the prior is wrong.
     """
-    if solution.fit is None or solution.a not in clock_priors or solution.b not in clock_priors:
+    expected = expected_lag(prepared, solution.a, solution.b, clock_priors)
+    if solution.fit is None or expected is None:
         return solution, ()
-    one, other = clock_priors[solution.a], clock_priors[solution.b]
-    lag_window = one.error_bound + other.error_bound + MAX_CAMERA_DELAY_S
-    if not lag_window <= _MAX_PRIOR_WINDOW:
-        return solution, ()
-    # t_unix = t_a + m_a = t_b + m_b, with times from each camera's time origin
-    lag = (
-        other.unix_minus_camera
-        - one.unix_minus_camera
-        + prepared.time_origins[solution.b]
-        - prepared.time_origins[solution.a]
-    )
+    lag, lag_window = expected
     settings = PairSettings(predicted_lag_window=lag_window)
     guided = _solve(prepared, (solution.a, solution.b), known, predicted_lag=lag, settings=settings)
     best, fit = solution.fit, guided.fit
@@ -135,6 +164,21 @@ def _disambiguated_by_priors(
         f"the one near the external clock priors was selected (within {1e3 * lag_window:.3g} ms)"
     )
     return guided, (warning,)
+
+
+def expected_lag(
+    prepared: PreparedSession, a: str, b: str, clock_priors: Mapping[str, ExternalClockPrior]
+) -> tuple[float, float] | None:
+    """``t_a - t_b`` [s] by the priors, times from each camera's origin, and its error bound; None if not known well."""
+    if a not in clock_priors or b not in clock_priors:
+        return None
+    one, other = clock_priors[a], clock_priors[b]
+    lag_window = one.error_bound + other.error_bound + MAX_CAMERA_DELAY_S
+    if not lag_window <= _MAX_PRIOR_WINDOW:
+        return None
+    # t_unix = t_a + m_a = t_b + m_b, with times from each camera's time origin
+    difference = other.unix_minus_camera - one.unix_minus_camera
+    return difference + prepared.time_origins[b] - prepared.time_origins[a], lag_window
 
 
 def _has_long_overlap(solution: PairSolution) -> bool:

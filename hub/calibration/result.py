@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from hub.bundle.noise_scale import rescale_noise
 from hub.bundle.preprocessing import PreparedSession
 from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, READOUT, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
+from hub.calibration.held_gauge import similarity_to_published
 from hub.calibration.pair_network import pair_lag
 from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
 from hub.calibration.solution import Solution
@@ -33,18 +35,28 @@ SEEN_WITHIN = 0.2
 """A camera counts as observing at a time if it has an observation within this interval [s]."""
 
 
-def assemble_calibration(rig: Rig, solution: Solution) -> Calibration:
-    """The calibration in the rig's world frame and units, on the reference camera's clock."""
+def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | None = None) -> Calibration:
+    """The calibration in the rig's world frame and units, on the reference camera's clock.
+
+    published: an earlier calibration of the same cameras, whose world and scale are kept where the rig fixes none.
+    """
     reconstruction = solution.reconstruction
     # The rig's order decides which camera is the reference and the first baseline.
     order = [reconstruction.names.index(name) for name in rig.cameras if name in reconstruction.names]
     names = [reconstruction.names[i] for i in order]
     problem, state = _reordered(reconstruction.problem, reconstruction.state, order)
+    reference = _reference_index(rig, names)
     control_outliers: tuple[str, ...] = ()
+    datum_points: list[tuple[int, Floats]] = []
     if solution.known is None:
         rig, control_outliers = reject_outliers(rig, names, [camera.pose for camera in state.cameras])
         gauge = fix_gauge(rig, names, [camera.pose for camera in state.cameras])
         gauge = scaled_by_bars(gauge, measure_scale_bars(rig, reconstruction.labels, problem, state))
+        if published is not None and gauge.scale == "arbitrary":
+            held, datum_points = similarity_to_published(
+                published, names, reconstruction.labels, state, _internal_time(solution, names, state, reference)
+            )
+            gauge = replace(gauge, similarity=held)
         state = transform_state(state, gauge.similarity)
         if gauge.scale == "metric" and problem.free_parameters.pose and is_overdetermined(rig, names):
             prior = estimate_smoothness(problem, state)
@@ -53,10 +65,9 @@ def assemble_calibration(rig: Rig, solution: Solution) -> Calibration:
     else:
         gauge = identity_gauge(len(names), solution.known.scale)
     prior = estimate_smoothness(problem, state)
-    covariance = cov.covariance(problem, rescale_noise(problem, state, prior), prior, gauge.information)
+    covariance = cov.covariance(problem, rescale_noise(problem, state, prior), prior, gauge.information, datum_points)
     lens_stds = focal_stds(problem, state, covariance)
     readout_stds = np.sqrt(np.maximum(np.diag(covariance.cameras)[READOUT::CAMERA_PARAMETERS], 0.0))
-    reference = _reference_index(rig, names)
     time_origins = [solution.prepared.time_origins[name] for name in names]
     time_scales = [solution.prepared.time_scale(name) for name in names]
     base = state.cameras[reference]
@@ -82,6 +93,10 @@ def assemble_calibration(rig: Rig, solution: Solution) -> Calibration:
             focal_std=float(lens_stds[i]),
             readout=_readout(rig, name, state.cameras[i].readout / time_scales[i]),
             readout_std=float(readout_stds[i]) / time_scales[i],
+            lag_time=state.cameras[i].centre / time_scales[i] + time_origins[i],
+            clock_rate_std=cov.clock_rate_std(covariance, state, i, reference)
+            if problem.free_parameters.clock
+            else 0.0,
         )
         for i, name in enumerate(names)
     }
@@ -138,6 +153,14 @@ def trajectory_tables(
         _trajectory_table(problem, state, covariance, label, name, reference, time_origin, time_scale, rate_hz)
         for label, name in enumerate(reconstruction.labels)
     )
+
+
+def _internal_time(
+    solution: Solution, names: list[str], state: AdjustmentState, reference: int
+) -> Callable[[Floats], Floats]:
+    """Internal times (n,) from times on the reference camera's clock (n,)."""
+    prepared, name, base = solution.prepared, names[reference], state.cameras[reference]
+    return lambda time: base.reference_time((time - prepared.time_origins[name]) * prepared.time_scale(name))
 
 
 def _reference_index(rig: Rig, names: list[str]) -> int:

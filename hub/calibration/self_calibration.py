@@ -58,7 +58,7 @@ def initial_self_calibration(
     priors = {name: focal_prior(rig, name) for name in names}
     focals = initial_focal_lengths(priors, {name: prepared.camera(name).intrinsics for name in connected}, solved)
     lenses = {name: _with_focal(prepared.uncalibrated[name].intrinsics, focals[name]) for name in names}
-    updated = {name: _with_lens(prepared, name, lenses[name], priors[name]) for name in names}
+    updated = {name: with_lens(prepared, name, lenses[name], priors[name]) for name in names}
     return with_cameras(prepared, updated), [_with_relative_pose(pair, prepared, updated) for pair in pairs]
 
 
@@ -132,7 +132,7 @@ def with_updated_lenses(
 ) -> tuple[PreparedSession, list[PairSolution], bool]:
     """The session with the uncalibrated lenses as an adjustment estimated them, and whether that changed any."""
     changed = {
-        name: _with_lens(prepared, name, lens, prepared.cameras[name].lens_prior)
+        name: with_lens(prepared, name, lens, prepared.cameras[name].lens_prior)
         for name, lens in lenses.items()
         if prepared.cameras[name].lens_prior is not None and _lens_changed(prepared, name, lens)
     }
@@ -161,7 +161,7 @@ def _with_focal(lens: Intrinsics, focal: float) -> Intrinsics:
     return replace(lens, matrix=matrix)
 
 
-def _with_lens(prepared: PreparedSession, name: str, lens: Intrinsics, prior: LensPrior | None) -> CameraInput:
+def with_lens(prepared: PreparedSession, name: str, lens: Intrinsics, prior: LensPrior | None) -> CameraInput:
     """A camera with another lens: its tracks are smoothed again from the raw rows."""
     camera = prepared.camera(name)
     tracks = dict(camera.tracks)

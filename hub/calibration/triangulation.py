@@ -75,7 +75,9 @@ def triangulate(
         if len(reconstruction.names) == 2:
             residuals = ", ".join(f"{name} {sigma:.1f} px" for name, sigma in _sigmas(reconstruction).items())
             what = f"the rows contradict the calibration (typical residual: {residuals})"
-            raise Refused(f"{what}: a camera was moved, or its clock was set; calibrate this session", unused)
+            refusal = Refused(f"{what}: a camera was moved, or its clock was set; calibrate this session", unused)
+            refusal.permanent = True
+            raise refusal
         # Of three and more, the camera that fits worst is removed, and the trajectories are estimated without it.
         unused[worst] = (
             f"only {100 * share:.0f} % of its {count} rows fit the trajectories of the other cameras: was it moved?"

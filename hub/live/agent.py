@@ -19,10 +19,26 @@ from protocols.bus.commands import CommandSubscription
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import Rig
-from protocols.topics import CALIBRATION, CAMERA_INFO, NODE_STATE, OBSERVATION, PREDICTION, RIG_INFO, STATUS, TRACK
+from protocols.topics import (
+    CALIBRATION,
+    CAMERA_INFO,
+    NODE_STATE,
+    OBSERVATION,
+    PREDICTION,
+    RIG_INFO,
+    SOLVER_EVENT,
+    STATUS,
+    TRACK,
+    TRACK_SMOOTHED,
+)
 
 ROLE = "hub"
 _TICK_S = 0.05
+_ROUND_S = 0.008
+"""Least time between two rounds: observations that arrive closer together are processed together."""
+_FINISH_S = 20.0
+"""Longest wait for the last answer when the hub is stopped."""
+_PROGRESS_S = 2.0
 _STATUS_S = 1.0
 _RIG_S = 5.0
 _MAX_TEXT = 2000  # characters of a status message
@@ -40,11 +56,11 @@ def run_hub(
     beat: Callable[[], None] = lambda: None,
     export: Callable[[LiveHub], str] | None = None,
 ) -> None:
-    """Process messages, solve and publish until ``stop`` is set; then solve once more with all data.
+    """Process messages, have them solved, and publish until ``stop`` is set; then once more with all data.
 
-    on_result: called after every solve that gave a calibration or a refusal (to write files). beat: watchdog heartbeat,
-    called after every loop and during a solve as it progresses, so that a watchdog detects a hanging loop. export:
-    writes the calibration on request of a view; returns a status text.
+    on_result: called after every answer that was taken, a calibration or a refusal (to write files). beat: watchdog
+    heartbeat, called after every round, so that a watchdog detects a hanging loop. export: writes the calibration on
+    request of a view; returns a status text.
     """
     boot = boot_id or uuid.uuid4().hex
     nodes = hub.nodes
@@ -53,14 +69,17 @@ def run_hub(
     publishers = {
         "Calibration": bus.publisher(CALIBRATION, agent),
         "Track": bus.publisher(TRACK, agent, rate_hz=200.0),
+        "SolverEvent": bus.publisher(SOLVER_EVENT, agent),
         "Prediction": bus.publisher(PREDICTION, agent),
         "RigInfo": bus.publisher(RIG_INFO, agent),
         "AgentStatus": bus.publisher(STATUS, agent),
     }
+    smoothed = bus.publisher(TRACK_SMOOTHED, agent)
     orders = CommandSubscription(bus, agent, boot, ("recalibrate", "export"))
-    hub.on_progress = beat
-    sequence, next_status, next_rig = 0, 0.0, 0.0
+    observations = subscriptions[1]
+    sequence, next_status, next_rig, next_progress = 0, 0.0, 0.0, 0.0
     last_action = ""
+    finish_by: float | None = None
 
     def publish(messages: list[Message]) -> None:
         for message in messages:
@@ -80,7 +99,9 @@ def run_hub(
     try:
         with bus.announce(ROLE, agent, boot), nullcontext() if nodes is None else bus.announce(NODES, agent, boot):
             while True:
-                last = stop.is_set()
+                if stop.is_set() and finish_by is None:
+                    finish_by = time.monotonic() + _FINISH_S
+                finishing = finish_by is not None
                 if nodes is not None and watch is not None:
                     for event in watch.drain():
                         nodes.on_liveliness(event.role, event.agent, event.boot_id, alive=event.alive)
@@ -98,20 +119,30 @@ def run_hub(
                 if nodes is not None:
                     publish_nodes(nodes, time.monotonic())
                 now = time.monotonic()
-                before = hub.counters["solved"] + hub.counters["refused"]
-                publish(hub.tick(now, final=last))
-                has_result = hub.counters["solved"] + hub.counters["refused"] > before
+                before = hub.results
+                publish(hub.tick(now, final=finishing and not hub.finished))
+                if hub.tracking is not None:
+                    for track in hub.tracking.smoothed():
+                        smoothed.put(track)
+                has_result = hub.results > before
+                last = finish_by is not None and (now >= finish_by or (hub.finished and not hub.solver.busy))
                 if has_result and not memory_frozen:
                     memory_frozen = True
-                    freeze_garbage_collector()  # the solver's modules have been loaded
+                    freeze_garbage_collector()
                 if on_result is not None and has_result:
                     on_result(hub)
+                if now >= next_progress and hub.calibration is None and hub.settings.solve:
+                    next_progress = now + _PROGRESS_S
+                    publish(hub.waiting(now))
                 if rig is not None and now >= next_rig:
                     next_rig = now + _RIG_S
                     publish([rig_message(rig)])
                 if now >= next_status or last:
                     next_status = now + _STATUS_S
-                    status = status_message(hub, agent, boot, sequence, [s.counters for s in subscriptions])
+                    status = status_message(hub, agent, boot, sequence, [s.counters for s in subscriptions], now)
+                    if not bus.connected():
+                        status.state = "degraded"
+                        status.message = f"no router can be reached; {status.message}"
                     needs_advice = hub.calibration is None or hub.refusal is not None or hub.calibration.refused
                     advice = [one.text for one in hub.guidance.advice()] if needs_advice else []
                     status.message = "; ".join(text for text in (status.message, *advice, last_action) if text)[
@@ -122,9 +153,11 @@ def run_hub(
                 beat()
                 if last:
                     break
-                stop.wait(_TICK_S)
+                time.sleep(_ROUND_S)
+                observations.wait(_TICK_S)
     finally:
-        for publisher in (*publishers.values(), *node_publishers.values()):
+        hub.solver.close()
+        for publisher in (*publishers.values(), smoothed, *node_publishers.values()):
             publisher.close()
         if watch is not None:
             watch.close()
@@ -158,18 +191,18 @@ def rig_message(rig: Rig) -> pb.RigInfo:
 
 
 def status_message(
-    hub: LiveHub, agent: str, boot: str, sequence: int, counters: Sequence[Mapping[str, int]]
+    hub: LiveHub, agent: str, boot: str, sequence: int, counters: Sequence[Mapping[str, int]], now: float = 0.0
 ) -> pb.AgentStatus:
-    """The hub's status: counters, gauges, and one line of text."""
-    calibrated = hub.calibration is not None
+    """The hub's status at ``now``: counters, gauges, and one line of text."""
+    state, text = hub.state(now)
     message = pb.AgentStatus(
         schema_version=1,
         agent=agent,
         role=ROLE,
         boot_id=boot,
         sequence=sequence,
-        state="running" if calibrated else "starting",
-        message=f"{len(hub.calibration.cameras)} cameras calibrated" if hub.calibration else hub.missing() or "solving",
+        state="running" if state == "calibrated" else "degraded" if state == "degraded" else "starting",
+        message=text,
         version=VERSION,
     )
     for name, count in hub.counters.items():

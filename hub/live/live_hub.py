@@ -1,29 +1,32 @@
-"""Live calibration: collects observations in a sliding window and solves again every few seconds.
+"""Live calibration: collects observations and has them solved elsewhere, every second or two.
 
-No sockets, threads, files or wall clock: ``handle`` takes messages, ``tick(now)`` returns messages. The same object
-runs in the agent, in replay and in tests.
+No sockets, threads, files or wall clock: ``handle`` takes messages, ``tick(now)`` returns messages; jobs go to a
+`Solver`, in a worker process for an agent, inline for replays and tests. ``tick`` never waits for it.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from google.protobuf.message import Message
 
 from hub.calibration.coverage import CoverageMonitor
-from hub.calibration.pipeline import calibrate
+from hub.clocks.arrival_prior import ArrivalPriors
 from hub.clocks.external_prior import ExternalClockPriors
 from hub.clocks.rate_change import RateChanges
 from hub.clocks.segments import SEGMENT_MIN_ROWS, ClockSegments
 from hub.distributed.network.host import NodeHost
-from hub.distributed.solver import node_calibration, with_node_poses
-from hub.live.messages import calibration_message, refusal_message, track_messages
+from hub.distributed.solver import node_calibration
+from hub.live.messages import calibration_message, refusal_message, solver_event
+from hub.live.solver import InlineSolver, Solver, SolverAnswer, SolverJob
 from hub.tracking.calibration.people import PeopleTracklets
 from hub.tracking.detections import tracked_kind
 from hub.tracking.live_tracking import LiveTracking
+from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
@@ -32,20 +35,35 @@ from protocols.session.calibration import Calibration, CameraCalibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
+HubState = Literal["collecting", "searching", "calibrated", "degraded", "refused"]
+
 _MIN_PEOPLE_S = 40.0
 """Total duration of people's tracklets [s] that two cameras need before people-based calibration is tried."""
+_SEARCH_LOAD, _UPDATE_LOAD = 0.6, 0.3
+"""CPU seconds of the solver per second before the first answer, and after it: a longer job is followed by a longer
+pause."""
+_SEARCH_EVERY_S = 4.0
+"""Between two searches for cameras that are not tied."""
+_FULL_EVERY_S, _FULL_GROWTH = 30.0, 1.5
+"""Between two searches over all lags, and the growth of rows from which lenses are decided again."""
+_SILENT_S = 3.0
+"""A calibrated camera without a frame for longer than this degrades the hub."""
+_VERIFY_ROWS, _VERIFY_S = 60, 1.5
+"""Detections and seconds that a reloaded calibration is verified with."""
+_MAX_STD_GROWTH = 1.5
+"""An answer whose stds are larger than the present one's by this factor is not taken: its rows say less."""
 
 
 @dataclass(frozen=True, slots=True)
 class LiveSettings:
-    """window_s: length of the sliding window. interval_s: time between two solves.
+    """window_s: total duration of the observations that are kept. interval_s: least time between two solves.
 
     least_rows: detections that two cameras need before solving is tried. solve: whether timing is estimated here; if
     not, only pose nodes run, on a shared clock or on another hub's timing. track: whether people, vehicles and
-    unlabelled markers are tracked as soon as there is a calibration.
+    markers are tracked as soon as there is a calibration.
     """
 
-    window_s: float = 60.0
+    window_s: float = 180.0
     interval_s: float = 2.0
     least_rows: int = 90
     solve: bool = True
@@ -64,9 +82,8 @@ class LiveHub:
     """Collects observations and calibrates the cameras repeatedly.
 
     rig: from the hub's own rig.toml: control points, distances, up; intrinsics come from the cameras unless it has
-    them. nodes: this hub's pose nodes; then the published poses are the network's as soon as it has converged, and the
-    nodes use the solver's timing. known: a given calibration: then nothing is solved. on_progress: called during a
-    solve, which takes minutes on a small machine.
+    them. nodes: this hub's pose nodes; where this hub does not solve, the published calibration is theirs. known: a
+    given calibration: then nothing is solved. solver: of the jobs. agent: name of this hub in its messages.
     """
 
     def __init__(
@@ -75,37 +92,54 @@ class LiveHub:
         rig: Rig | None = None,
         nodes: NodeHost | None = None,
         known: KnownCalibration | None = None,
+        solver: Solver | None = None,
     ) -> None:
         self.settings = settings or LiveSettings()
         self._rig = rig
         self.nodes = nodes
         if nodes is not None and rig is not None and rig.shared_clock:
             nodes.use_shared_clock()
-        self._builder = SessionBuilder(self.settings.window_s)
-        self._next = 0.0
+        self.solver = solver or InlineSolver()
         self._revision = 0
-        self._sequence = 0
-        self._published: dict[str, float] = {}
-        self._received = 0
-        self._solved_at = -1
-        self.calibration: Calibration | None = None
-        self.session: tuple[Rig, Observations] | None = None
-        self.refusal: Refused | None = None
+        self._jobs = 0
+        self._now = 0.0
+        self._infos: dict[str, pb.CameraInfo] = {}
+        self._last_frame: dict[str, float] = {}
         self.counters: Counter[str] = Counter()
         self.clocks = ClockSegments()
         self._rate_changes = RateChanges()
         self.clock_priors = ExternalClockPriors()
-        self._solved_boot_ids: dict[str, str] = {}
+        self._arrivals = ArrivalPriors()
+        self._boots: dict[str, str] = {}
         self._clock_stepped = False
         self.guidance = CoverageMonitor()
-        self.tracking = LiveTracking() if self.settings.track else None
-        self._people = PeopleTracklets(self.settings.window_s)
-        self._infos: dict[str, pb.CameraInfo] = {}
-        self._people_used = False
         self._known = known
-        self.on_progress: Callable[[], None] = lambda: None
-        if known is not None:
-            self._use_known(known)
+        self.notice = ""
+        """What the agent around has to say of its own health."""
+        self.finished = False
+        """Whether the last job was handed over, or there is none."""
+        self._begin()
+
+    def _begin(self) -> None:
+        """No observations and no result."""
+        self._builder = SessionBuilder(self.settings.window_s)
+        self._people = PeopleTracklets(self.settings.window_s)
+        self.tracking = LiveTracking() if self.settings.track else None
+        self._next = self._next_search = self._next_full = 0.0
+        self._received, self._solved_at, self._full_rows = 0, -1, 0
+        self._submitted: SolverJob | None = None
+        self._submitted_at = 0.0
+        self._submitted_boots: dict[str, str] = {}
+        self._superseded = 0
+        self.calibration: Calibration | None = None
+        self.session: tuple[Rig, Observations] | None = None
+        self.refusal: Refused | None = None
+        self.solver_failure = ""
+        self._solved_boot_ids: dict[str, str] = {}
+        self._unverified: Calibration | None = None
+        self._unverified_boots: dict[str, str] = {}
+        if self._known is not None:
+            self._use_known(self._known)
 
     def handle(self, message: Message, arrival: float | None = None) -> None:
         """Process one message from the bus or a log. arrival: its arrival time [s, any fixed clock]; None = unknown."""
@@ -120,6 +154,9 @@ class LiveHub:
                 self._builder.require_rows(event.segment, SEGMENT_MIN_ROWS)
                 self._rate_changes.handle(event)
                 self._clock_stepped = True
+            if arrival is not None:
+                self._arrivals.handle(message.camera, message.boot_id, message.device_time_ns / NANOSECONDS, arrival)
+            self._last_frame[message.camera] = self._now
         self.guidance.handle(message)
         if self.tracking is not None:
             self.tracking.handle(message)
@@ -128,7 +165,7 @@ class LiveHub:
         if isinstance(message, pb.Observation) and any(d.kind and tracked_kind(d) for d in message.detections):
             self._people.handle(message)
             message = without_tracked(message)
-        self._builder.handle(message)
+        self._builder.handle(message, self._now)
         if isinstance(message, pb.Observation):
             self._extend_old_segment(message)
         if self.nodes is not None:
@@ -139,15 +176,18 @@ class LiveHub:
 
     def reset(self) -> None:
         """Forget observations and results, as after the rig was rebuilt; clock state and message numbering are kept."""
-        self._builder = SessionBuilder(self.settings.window_s)
+        self._superseded = self._jobs
         self.guidance.reset()
-        self._next, self._solved_at = 0.0, -1
-        self.calibration, self.session, self.refusal = None, None, None
-        self._people, self._people_used = PeopleTracklets(self.settings.window_s), False
-        if self.tracking is not None:
-            self.tracking = LiveTracking()
-        if self._known is not None:
-            self._use_known(self._known)
+        self._begin()
+
+    def reload(self, calibration: Calibration, boot_ids: dict[str, str]) -> None:
+        """Go on with an earlier answer, unverified until the first consistent second.
+
+        boot_ids: by camera, the boot whose clock its time map refers to; cameras that were restarted since are left
+        out. A hub that was killed tracks again at once.
+        """
+        if self._known is None and self.calibration is None:
+            self._unverified, self._unverified_boots = calibration, dict(boot_ids)
 
     def clock_contradictions(self) -> list[str]:
         """Cameras whose external clock prior (NTP/PTP) the calibration contradicts, one line each."""
@@ -158,13 +198,14 @@ class LiveHub:
     def missing(self) -> str:
         """What is missing before solving is tried; "" if nothing."""
         cameras = self._builder.cameras
+        if self._unverified is not None:
+            rows = [self._builder.rows(name) for name in self._unverified.cameras]
+            return "" if sum(count >= _VERIFY_ROWS for count in rows) >= 2 else "verifying the reloaded calibration"
         if len(cameras) < 2:
             return f"{len(cameras)} of at least 2 cameras heard of"
         rows_by_camera = {name: self._builder.rows(name) for name in cameras}
         ready = [name for name, rows in rows_by_camera.items() if rows >= self.settings.least_rows]
         if len(ready) < 2 and self._people.cameras:
-            if self._people_used:
-                return ""
             durations = {name: self._people.seconds(name) for name in self._people.cameras}
             if sum(seconds >= _MIN_PEOPLE_S for seconds in durations.values()) < 2:
                 counts = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in durations.items())
@@ -176,64 +217,266 @@ class LiveHub:
         return ""
 
     def tick(self, now: float, final: bool = False) -> list[Message]:
-        """The messages to publish at time ``now`` [s, any monotonic clock]; solves when due.
+        """The messages to publish at time ``now`` [s, any monotonic clock]; hands a job over when due.
 
-        final: solve now, with all observations.
+        final: hand a last job over, with all observations; tick again until ``solver`` is not busy.
         """
-        tracked = [] if self.tracking is None else self.tracking.tick(now)
-        return tracked + self._calibrate(now, final)
+        self._now = max(self._now, now)
+        out: list[Message] = []
+        if final and not self.solver.busy:
+            self.finished = True
+        out += self._calibrate(now, final)
+        out += self._poll(now)
+        return out + ([] if self.tracking is None else self.tracking.tick(now))
+
+    def _poll(self, now: float) -> list[Message]:
+        answer = self.solver.poll(now)
+        return [] if answer is None else self._take(answer, now)
+
+    @property
+    def results(self) -> int:
+        """Answers so far that gave a calibration or a refusal."""
+        return self.counters["solved"] + self.counters["refused"]
+
+    def waiting(self, now: float) -> list[Message]:
+        """While there is no calibration: what the hub does, and how far each camera is."""
+        if self.calibration is not None:
+            return []
+        self._revision += 1
+        state, reason = self.state(now)
+        return [self._waiting(reason, state)]
+
+    @property
+    def boot_ids(self) -> dict[str, str]:
+        """By calibrated camera, the boot whose clock the calibration refers to."""
+        return dict(self._solved_boot_ids)
+
+    @property
+    def unverified(self) -> bool:
+        """Whether the present calibration was reloaded and not verified yet."""
+        return self._unverified is not None and self.calibration is not None
+
+    def state(self, now: float) -> tuple[HubState, str]:
+        """What the hub does at ``now``, and one line for a person."""
+        if self.calibration is not None:
+            reasons = self.degradations(now)
+            count = f"{len(self.calibration.cameras)} cameras calibrated"
+            return ("degraded", "; ".join([*reasons, count])) if reasons else ("calibrated", count)
+        missing = self.missing()
+        if missing:
+            return "collecting", missing
+        if self.refusal is not None and self.refusal.permanent:
+            return "refused", self.refusal.reason
+        return "searching", "searching" if self.refusal is None else f"searching: {self.refusal.reason}"
+
+    def degradations(self, now: float) -> list[str]:
+        """What impairs a calibrated hub at ``now``, one line each."""
+        out = []
+        if self.unverified:
+            out.append("the calibration was reloaded and is not verified yet")
+        if self.calibration is not None:
+            silent = [
+                f"{name} ({now - last:.0f} s)"
+                for name in self.calibration.cameras
+                if now - (last := self._last_frame.get(name, 0.0)) > _SILENT_S
+            ]
+            out += [f"no frames from {', '.join(silent)}"] if silent else []
+        return out + [text for text in (self.solver_failure, self.notice) if text]
+
+    def progress(self) -> list[pb.CameraProgress]:
+        """How far each camera is."""
+        refused = {} if self.refusal is None else self.refusal.cameras
+        tied = {} if self.calibration is None else self.calibration.cameras
+        waiting = {} if self.calibration is None else self.calibration.refused
+        out = []
+        for name in self._builder.cameras:
+            reason = waiting.get(name, refused.get(name, ""))
+            state = "searching" if self._builder.rows(name) >= self.settings.least_rows else "collecting"
+            if name in tied:
+                silent = self._now - self._last_frame.get(name, self._now) > _SILENT_S
+                state, reason = ("degraded", "no frames") if silent else ("calibrated", "")
+            out.append(
+                pb.CameraProgress(
+                    camera=name,
+                    state=state,
+                    shared_motion_s=self._builder.shared_motion_s(name),
+                    coverage=self.guidance.coverage(name),
+                    reason=reason[:300],
+                )
+            )
+        return out
 
     def _calibrate(self, now: float, final: bool) -> list[Message]:
         if self._clock_stepped and self.calibration is not None:
             # After a clock step, the transformed calibration is published at once, before the new segment is solved.
             self._clock_stepped = False
-            return self._publish_known()
-        if not final and now < self._next:
+            return self._publish_present()
+        if self._unverified is not None and self.calibration is None:
+            return self._publish_unverified()
+        if self.solver.busy or (not final and now < self._next):
             return []
         self._next = now + self.settings.interval_s
         if self._known is not None:
-            return self._publish_known()
+            return self._publish_present(changed=False)
         if not self.settings.solve:
-            return self._solve()
+            return self._use_nodes()
         if self._solved_at == self._received and not final:
             return []
-        self._solved_at = self._received
         missing = self.missing()
         if missing:
             self._revision += 1
-            return [refusal_message(missing, {}, self._revision, "collecting")]
-        return self._solve()
+            return [self._waiting(missing, "collecting")]
+        return self._submit(now)
 
-    def _solve(self) -> list[Message]:
-        if self._people_used and not self._has_marker():
-            return []  # people-based calibration is solved once: it is costly, and the identities do not improve
+    def _submit(self, now: float) -> list[Message]:
+        """Hand the present observations to the solver."""
+        try:
+            rig, observations = self._build_session()
+        except Refused as refusal:
+            self.refusal = refusal
+            return []
+        except InputError as error:
+            # Invalid input is a camera's fault that must not stop the hub.
+            self.counters["bad_sessions"] += 1
+            self.refusal = Refused(str(error))
+            return []
+        boots = {name: self._source().boot(name) for name in rig.cameras}
+        last = self._start_from(boots)
+        self._solved_at = self._received
+        rows = len(observations)
+        untied = last is None or any(name not in last.cameras for name in observations.cameras)
+        search = untied and now >= self._next_search
+        full = (search and now >= self._next_full) or (last is not None and rows > _FULL_GROWTH * self._full_rows)
+        if search:
+            self._next_search = now + _SEARCH_EVERY_S
+        if full:
+            self._next_full, self._full_rows = now + _FULL_EVERY_S, rows
+        arrivals = {name: p for name, p in self._arrivals.priors().items() if p.boot_id == boots.get(name)}
+        verify = self._unverified is not None
+        job = SolverJob(
+            self._jobs + 1,
+            rig,
+            observations,
+            self._unverified if verify else last,
+            search or last is None,
+            full or (last is None and not arrivals),
+            verify,
+            self.clock_priors.for_boots(boots),
+            arrivals,
+        )
+        ranges = self._builder.ranges() if self._has_marker() else []
+        return self._hand_over(job, boots, ranges, now)
+
+    def _hand_over(
+        self, job: SolverJob, boots: dict[str, str], ranges: list[tuple[str, str, int, int, int]], now: float
+    ) -> list[Message]:
+        self._jobs = job.number
+        self.session = job.rig, job.observations
+        self._submitted, self._submitted_at, self._submitted_boots = job, now, boots
+        self.solver.submit(job, now)
+        return [solver_event(job, "submitted", ranges)]
+
+    def _start_from(self, boots: Mapping[str, str]) -> Calibration | None:
+        """The present answer with the cameras whose clock is still the one that the observations are on."""
+        if self.calibration is None:
+            return None
+        present, now_boots = self._in_present_segments(self.calibration)
+        kept = {name: camera for name, camera in present.cameras.items() if now_boots[name] == boots.get(name)}
+        return replace(present, cameras=kept) if len(kept) > 1 else None
+
+    def _take(self, answer: SolverAnswer, now: float) -> list[Message]:
+        """Use an answer: the calibration that it gives, or why there is none."""
+        job, boots = self._submitted, self._submitted_boots
+        self._submitted = None
+        load = _SEARCH_LOAD if self.calibration is None else _UPDATE_LOAD
+        self._next = max(self._next, self._submitted_at + answer.cpu_s / load)
+        if job is None or answer.number <= self._superseded:
+            return []
+        self.solver_failure = answer.reason if answer.failed else ""
+        if answer.failed:
+            self.counters["solver_failures"] += 1
+            return [solver_event(job, "failed", [], answer)]
+        event = solver_event(job, "applied", [], answer)
+        if answer.calibration is None:
+            self.counters["refused"] += 1
+            if job.verify and answer.permanent:
+                self._unverified, self.calibration = None, None  # what was reloaded does not hold any more
+            if self.calibration is not None:
+                return [event]  # an answer that holds is not given up because new rows say little
+            self.refusal = Refused(answer.reason, dict(answer.refused))
+            self.refusal.permanent = answer.permanent
+            self._revision += 1
+            return [event, self._waiting(answer.reason, "refused" if answer.permanent else "searching")]
+        self.refusal = None
+        found = answer.calibration
+        for name, since in answer.moved.items():
+            self.counters["moved"] += 1
+            self._builder.forget_before(name, since)
+        if not job.verify and self.calibration is not None and not self._says_more(found, answer.moved):
+            self.counters["not_better"] += 1
+            return [event]
+        self.counters["verified" if job.verify else "solved"] += 1
+        self._unverified = None
+        self.calibration = found
+        self._solved_boot_ids = {name: boots[name] for name in found.cameras if name in boots}
+        return [event, *self._publish_present()]
+
+    def _says_more(self, found: Calibration, moved: Mapping[str, float]) -> bool:
+        """Whether a new answer has stds like the present one's or smaller, or is about other cameras or poses."""
+        assert self.calibration is not None
+        before = self.calibration.cameras
+        if moved or set(found.cameras) != set(before):
+            return True
+        growth = []
+        for name, camera in found.cameras.items():
+            for new, old in (
+                (camera.time_offset_std, before[name].time_offset_std),
+                *zip(camera.position_std, before[name].position_std, strict=True),
+            ):
+                if old > 0.0:
+                    growth.append(new / old)
+        return not growth or float(np.median(growth)) < _MAX_STD_GROWTH
+
+    def _waiting(self, reason: str, status: str) -> pb.Calibration:
+        refused = {} if self.refusal is None else self.refusal.cameras
+        message = refusal_message(reason, refused if status == "refused" else {}, self._revision, status)
+        message.progress.extend(self.progress())
+        message.state = status
+        return message
+
+    def _use_nodes(self) -> list[Message]:
+        """The pose nodes' calibration, where this hub does not solve."""
         self._revision += 1
         try:
             rig, observations = self._build_session()
-            self.session = (rig, observations)
-            self.calibration = self._estimate(rig, observations)
-            self._solved_boot_ids = self._boot_ids(self.calibration)
-            self.refusal = None
+            self.session = rig, observations
+            self.calibration = node_calibration(rig, self.nodes)
         except Refused as refusal:
             self.counters["refused"] += 1
             self.refusal = refusal
             return [refusal_message(refusal.reason, refusal.cameras, self._revision, "refused")]
-        except InputError as error:
-            # Invalid input such as two frames with one time stamp: a camera's fault that must not stop the hub.
-            self.counters["bad_sessions"] += 1
-            self.refusal = Refused(str(error))
-            return [refusal_message(str(error), {}, self._revision, "refused")]
         self.counters["solved"] += 1
-        present, boot_ids = self._in_present_segments(self.calibration)
-        self._track_with(present, rig, boot_ids)
-        out: list[Message] = [calibration_message(present, self._revision, boot_ids)]
-        for table in self.calibration.trajectories:
-            tracks = track_messages(table, self._published.get(table.label, -float("inf")), self._sequence)
-            self._sequence += len(tracks)
-            if len(table.time):
-                self._published[table.label] = float(table.time[-1])
-            out.extend(tracks)
-        return out
+        self.refusal = None
+        self._solved_boot_ids = {name: self._source().boot(name) for name in self.calibration.cameras}
+        return self._publish_present()
+
+    def _publish_unverified(self) -> list[Message]:
+        """Publish a reloaded answer as soon as two of its cameras are heard of on the clocks that it knows."""
+        assert self._unverified is not None
+        boots = {name: self._builder.boot(name) for name in self._builder.cameras}
+        kept = {
+            name: camera
+            for name, camera in self._unverified.cameras.items()
+            if boots.get(name, "") and boots[name] == self._unverified_boots.get(name)
+        }
+        others = [name for name in self._unverified.cameras if boots.get(name) and name not in kept]
+        if len(kept) < 2:
+            if len(others) > 1:
+                self._unverified = None  # these cameras have been restarted: nothing is left of it
+            return []
+        self.calibration = replace(self._unverified, cameras=kept)
+        self._solved_boot_ids = {name: boots[name] for name in kept}
+        return self._publish_present()
 
     def _has_marker(self) -> bool:
         """Whether to calibrate from markers: there are enough marker detections, or no people."""
@@ -262,7 +505,7 @@ class LiveHub:
         copy = pb.Observation()
         copy.CopyFrom(message)
         copy.boot_id, copy.device_time_ns = old
-        self._builder.handle(copy)
+        self._builder.handle(copy, self._now)
 
     def _with_rate_changes_corrected(self, observations: Observations) -> Observations:
         """The observations with corrected time stamps between a rate change of a clock and its detection."""
@@ -280,9 +523,8 @@ class LiveHub:
         }
         return replace(observations, tracks=tracks)
 
-    def _boot_ids(self, calibration: Calibration) -> dict[str, str]:
-        source = self._builder if self._has_marker() else self._people
-        return {name: source.boot(name) for name in calibration.cameras}
+    def _source(self) -> SessionBuilder | PeopleTracklets:
+        return self._builder if self._has_marker() else self._people
 
     def _use_known(self, known: KnownCalibration) -> None:
         """Use the given calibration as this hub's result."""
@@ -295,12 +537,13 @@ class LiveHub:
             "known",
             VERSION,
         )
+        self._rig = rig
         self._track_with(self.calibration, rig, {})
 
-    def _track_with(self, calibration: Calibration, rig: Rig, boot_ids: dict[str, str]) -> None:
+    def _track_with(self, calibration: Calibration, rig: Rig | None, boot_ids: dict[str, str]) -> None:
         """Pass a new calibration to tracking. With ``up`` in the rig, the world's z axis is up."""
         if self.tracking is not None:
-            up = None if rig.up is None else np.array([0.0, 0.0, 1.0])
+            up = None if rig is None or rig.up is None else np.array([0.0, 0.0, 1.0])
             self.tracking.calibrate(
                 calibration.cameras,
                 boot_ids,
@@ -310,27 +553,24 @@ class LiveHub:
                 up=up,
             )
 
-    def _publish_known(self) -> list[Message]:
+    def _publish_present(self, changed: bool = True) -> list[Message]:
+        """The present calibration, in the clocks' present segments, for the bus and, where it changed, for tracking."""
         assert self.calibration is not None
         self._revision += 1
         present, boot_ids = self._in_present_segments(self.calibration)
-        return [calibration_message(present, self._revision, boot_ids)]
+        if changed:
+            self._track_with(present, self._rig, boot_ids)
+        message = calibration_message(present, self._revision, boot_ids)
+        message.progress.extend(self.progress())
+        message.state = self.state(self._now)[0]
+        if self.nodes is not None and self.settings.solve:
+            self.nodes.handle(message)
+        return [message]
 
     def _in_present_segments(self, calibration: Calibration) -> tuple[Calibration, dict[str, str]]:
         """The calibration in the clocks' present segments, and the boot ids of those."""
-        return self.clocks.to_present(calibration, {name: self._builder.boot(name) for name in calibration.cameras})
-
-    def _estimate(self, rig: Rig, observations: Observations) -> Calibration:
-        if not self.settings.solve:
-            return node_calibration(rig, self.nodes)
-        source = self._builder if self._has_marker() else self._people
-        clock_priors = self.clock_priors.for_boots({name: source.boot(name) for name in rig.cameras})
-        found = calibrate(rig, observations, lambda text, share: self.on_progress(), clock_priors=clock_priors)
-        if self.nodes is None:
-            return found
-        boot_ids = self._boot_ids(found)
-        self.nodes.handle(calibration_message(found, self._revision, boot_ids))
-        return with_node_poses(found, rig, self.nodes)
+        boots = {name: self._solved_boot_ids.get(name) or self._source().boot(name) for name in calibration.cameras}
+        return self.clocks.to_present(calibration, boots)
 
 
 def without_tracked(message: pb.Observation) -> pb.Observation:

@@ -1,9 +1,12 @@
-"""Calibration and trajectories as messages for the bus and the log."""
+"""Calibrations, trajectories and solver events as messages for the bus and the log."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from hub.live.solver import SolverAnswer, SolverJob
 from protocols.core.clocks import NANOSECONDS
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, TrajectoryTable
@@ -38,6 +41,8 @@ def calibration_message(calibration: Calibration, revision: int, boot_ids: dict[
                 distortions=lens.distortions.tolist(),
                 fisheye=lens.fisheye,
                 boot_id=boot_ids.get(name, ""),
+                lag_time_s=camera.lag_time,
+                clock_rate_std=camera.clock_rate_std,
             )
         )
     message.refused.extend(pb.Refusal(camera=name, reason=reason) for name, reason in calibration.refused.items())
@@ -48,6 +53,29 @@ def refusal_message(reason: str, cameras: dict[str, str], revision: int, status:
     """The message of no calibration. status: "refused" or "collecting"; reason: what is missing."""
     message = pb.Calibration(schema_version=SCHEMA_VERSION, revision=revision, status=status, reason=reason)
     message.refused.extend(pb.Refusal(camera=name, reason=why) for name, why in cameras.items())
+    return message
+
+
+def solver_event(
+    job: SolverJob, kind: str, ranges: Sequence[tuple[str, str, int, int, int]], answer: SolverAnswer | None = None
+) -> pb.SolverEvent:
+    """What a job was given, or that its answer took effect, for the log. ranges: of sequence numbers, by camera."""
+    message = pb.SolverEvent(schema_version=SCHEMA_VERSION, job=job.number, kind=kind)
+    message.rows.extend(
+        pb.SolverEvent.Rows(camera=camera, boot_id=boot, first_sequence=first, last_sequence=last, count=count)
+        for camera, boot, first, last, count in ranges
+    )
+    if kind == "submitted":
+        message.search, message.full, message.verify = job.search, job.full, job.verify
+        for field, priors in ((message.clock_priors, job.clock_priors), (message.arrivals, job.arrivals)):
+            field.extend(
+                pb.SolverEvent.ClockPrior(
+                    camera=name, unix_minus_camera=prior.unix_minus_camera, error_bound=prior.error_bound
+                )
+                for name, prior in priors.items()
+            )
+    if answer is not None:
+        message.reason, message.cpu_s = answer.reason, answer.cpu_s
     return message
 
 

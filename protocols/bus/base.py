@@ -131,6 +131,9 @@ class Bus(Protocol):
     def watch_agents(self) -> AgentWatch:
         """Watch all agents of the site appear and disappear."""
 
+    def connected(self) -> bool:
+        """Whether this process can reach others: a client that lost its router cannot."""
+
     def close(self) -> None:
         """Close everything that was declared on this bus. May be called twice."""
 

@@ -52,6 +52,8 @@ class Refused(SynclineError):
 
     exit_status = EXIT_REFUSED
     cpu_seconds: float = 0.0
+    permanent: bool = False
+    """Whether more observations of the same kind cannot help."""
 
     def __init__(
         self,

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+import math
+from array import array
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,27 +16,63 @@ from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks
+from protocols.session.observations import DEFAULT_LABEL, Observations, gather_columns
 from protocols.session.rig import Rig, RigCamera
 
 _DUPLICATE_WINDOW = 16_384
 """Sequence numbers of one run that a live hub remembers to detect duplicates: nine minutes at 30 Hz; 2 KiB a camera."""
+CHUNK_S = 2.0
+"""Length of the intervals that are kept or dropped as a whole [s]."""
+_MAX_AGE = 10
+"""A chunk older than so many windows is dropped first: clocks do not stay linear for ever."""
+_MAX_STEP_PX = 50.0
+"""A longer step from frame to frame is a false detection rather than motion."""
+_MOVING = 20.0
+"""Motion in a chunk [px] from which a camera saw its target move."""
+_MAX_CHUNK_ROWS = 8_000
+"""Detections of one camera in a chunk: twelve points at 330 frames a second. A camera that floods costs only itself."""
 MIN_ROWS_AFTER_RESTART = 90
 """Detections from which on the new clock of a restarted camera is used."""
+
+
+@dataclass(slots=True, eq=False)
+class _Columns:
+    """Detections in order of arrival, column by column: a snapshot of 20,000 rows is taken in milliseconds.
+
+    chunk: number of the interval of arrival; label: index into the builder's labels.
+    """
+
+    time_ns: array[int] = field(default_factory=lambda: array("q"))
+    frame: array[int] = field(default_factory=lambda: array("Q"))
+    sequence: array[int] = field(default_factory=lambda: array("Q"))
+    chunk: array[int] = field(default_factory=lambda: array("q"))
+    label: array[int] = field(default_factory=lambda: array("q"))
+    values: array[float] = field(default_factory=lambda: array("d"))  # u, v, size
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    def take(self, keep: Ints) -> None:
+        """Keep only the rows of these indices."""
+        values = np.frombuffer(self.values).reshape(-1, 3)[keep]
+        for name in ("time_ns", "frame", "sequence", "chunk", "label"):
+            column = getattr(self, name)
+            setattr(self, name, array(column.typecode, np.array(column)[keep].tobytes()))
+        self.values = array("d", values.tobytes())
 
 
 @dataclass(slots=True, eq=False)
 class _BootBuffer:
     """The observations of one boot of one camera's agent, which has one clock.
 
-    rows: (device time ns, frame, u, v, size, label).
+    last: by label, u and v. room: a chunk, and how many rows of it are still taken.
     """
 
-    rows: deque[tuple[int, int, float, float, float, str]] = field(default_factory=deque)
-    last_ns: int = -(2**63)
-    """Clocks may count from any origin, so times may be negative."""
+    rows: _Columns = field(default_factory=_Columns)
+    last: dict[int, tuple[float, float]] = field(default_factory=dict)
+    room: tuple[int, int] = (-1, 0)
     frames: int = 0
     seen: set[int] = field(default_factory=set)
     highest: int = -1
@@ -72,25 +111,42 @@ class SessionBuilder:
     """Collects CameraInfo, RigInfo and Observation messages, in any order and with duplicates.
 
     A restarted camera has a new clock: each boot is stored separately, and the one with the most detections is used.
-    window_s: keep only the detections of each boot's last so many seconds; None = all.
+    window_s: total duration of what is kept; None = all. Of a longer recording the intervals with the most motion that
+    two cameras saw are kept, and always the newest: a target at rest tells nothing, and what moved before still does.
     """
 
     def __init__(self, window_s: float | None = None) -> None:
-        self._window_ns = None if window_s is None else round(window_s * NANOSECONDS)
+        self._chunks = None if window_s is None else max(3, round(window_s / CHUNK_S))
+        self._motion: dict[int, dict[str, float]] = {}
+        self._chunk = 0
         self._cameras: dict[str, pb.CameraInfo] = {}
         self._rig: pb.RigInfo | None = None
         self._boots: dict[str, dict[str, _BootBuffer]] = {}
         self._settled: dict[str, int] = {}
+        self._labels: dict[str, int] = {}
+        self._since: dict[tuple[str, str], int] = {}
+        self._selection: dict[str, list[tuple[str, int, int]]] | None = None
         self.counters: Counter[str] = Counter()
 
-    def handle(self, message: Message) -> None:
-        """Take one message; other kinds are ignored."""
+    def handle(self, message: Message, moment: float = 0.0) -> None:
+        """Take one message; other kinds are ignored. moment: of its arrival [s], any fixed clock."""
         if isinstance(message, pb.Observation):
-            self._observe(message)
+            self._observe(message, moment)
         elif isinstance(message, pb.CameraInfo):
             self._cameras[message.camera] = message
         elif isinstance(message, pb.RigInfo):
             self._rig = message
+
+    def shared_motion_s(self, camera: str) -> float:
+        """Duration of the kept intervals [s] in which the camera and another one saw motion."""
+        return CHUNK_S * sum(
+            camera in moved and moved[camera] > _MOVING and sum(one > _MOVING for one in moved.values()) > 1
+            for moved in self._motion.values()
+        )
+
+    def forget_before(self, camera: str, time: float) -> None:
+        """Do not use a camera's detections before a time on its clock [s]: it was moved then."""
+        self._since[camera, self.boot(camera)] = round(time * NANOSECONDS)
 
     def rows(self, camera: str) -> int:
         """Detections held of a camera, over all its boots."""
@@ -111,7 +167,7 @@ class SessionBuilder:
         With a moving window, the newest boot with enough detections: otherwise an older one would be used too long.
         """
         boots = self._boots.get(camera, {})
-        if self._window_ns is not None:
+        if self._chunks is not None:
             for boot in reversed(boots):
                 if len(boots[boot].rows) >= self._settled.get(boot, MIN_ROWS_AFTER_RESTART):
                     return boot
@@ -138,38 +194,102 @@ class SessionBuilder:
         """The session so far. Raises Refused where there is no camera or no detection."""
         if not self._cameras:
             raise Refused("no camera has introduced itself yet" if not self._boots else "no camera published its info")
-        names: list[str] = []
-        labels: list[str] = []
-        values: list[tuple[int, int, float, float, float]] = []
-        for camera in sorted(self._cameras):
-            boots = self._boots.get(camera)
-            if not boots:
-                continue
-            for row in boots[self.boot(camera)].rows:
-                names.append(camera)
-                labels.append(row[5])
-                values.append(row[:5])
-        if not values:
-            raise Refused("no camera has seen anything yet")
-        time = np.array([value[0] for value in values], dtype=np.float64) / NANOSECONDS
-        rest = np.array([value[1:] for value in values], dtype=np.float64)
-        size = np.where(rest[:, 3] > 0, rest[:, 3], np.nan)
         order = sorted(self._cameras)
-        observations = gather_tracks(
-            names, labels, rest[:, 0].astype(np.int64), time, np.ascontiguousarray(rest[:, 1:3]), size, order=order
+        parts = [self._used(camera) for camera in order]
+        names = [camera for camera, (rows, used) in zip(order, parts, strict=True) if len(used)]
+        if not names:
+            raise Refused("no camera has seen anything yet")
+        taken = [(rows, used) for rows, used in parts if len(used)]
+        values = np.concatenate([np.array(rows.values).reshape(-1, 3)[used] for rows, used in taken])
+
+        def column(name: str) -> Ints:
+            return np.concatenate([np.array(getattr(rows, name))[used] for rows, used in taken]).astype(np.int64)
+
+        labels = sorted(self._labels)
+        rank = np.array([labels.index(label) for label in self._labels], dtype=np.int64)
+        observations = gather_columns(
+            names,
+            labels,
+            np.repeat(np.arange(len(names)), [len(used) for _, used in taken]),
+            rank[column("label")],
+            column("frame"),
+            column("time_ns") / NANOSECONDS,
+            np.ascontiguousarray(values[:, :2]),
+            np.where(values[:, 2] > 0, values[:, 2], np.nan),
         )
         return self._build_rig(order), observations
 
-    def _observe(self, message: pb.Observation) -> None:
+    def ranges(self) -> list[tuple[str, str, int, int, int]]:
+        """Which detections `build` uses: camera, boot id, first and last sequence number of a run, detections in it.
+
+        A run ends where an interval was dropped.
+        """
+        out = []
+        for camera in sorted(self._cameras):
+            rows, used = self._used(camera)
+            if not len(used):
+                continue
+            chunk, sequence = np.array(rows.chunk)[used], np.array(rows.sequence, dtype=np.int64)[used]
+            ends = np.flatnonzero([(one + 1 not in self._motion) for one in np.unique(chunk)])
+            last = np.unique(chunk)[ends]
+            run = np.searchsorted(last, chunk)
+            for index in np.unique(run):
+                inside = sequence[run == index]
+                out.append((camera, self.boot(camera), int(inside.min()), int(inside.max()), len(inside)))
+        return out
+
+    def select(self, ranges: Iterable[tuple[str, str, int, int]]) -> None:
+        """Let `build` use exactly these detections: camera, boot id, first and last sequence number of a run."""
+        self._selection = {}
+        for camera, boot, first, last in ranges:
+            self._selection.setdefault(camera, []).append((boot, first, last))
+
+    def _used(self, camera: str) -> tuple[_Columns, Ints]:
+        """A camera's rows, and the indices of those that are used: one a time and label."""
+        boots = self._boots.get(camera)
+        if not boots:
+            return _Columns(), np.zeros(0, dtype=np.int64)
+        if self._selection is not None:
+            runs = [run for run in self._selection.get(camera, []) if run[0] in boots]
+            if not runs:
+                return _Columns(), np.zeros(0, dtype=np.int64)
+            rows = boots[runs[0][0]].rows
+            sequence = np.array(rows.sequence, dtype=np.int64)
+            inside = np.zeros(len(sequence), dtype=np.bool_)
+            for _, begin, end in runs:
+                inside |= (sequence >= begin) & (sequence <= end)
+            return rows, self._one_a_time(rows, np.flatnonzero(inside))
+        rows = boots[self.boot(camera)].rows
+        used = np.flatnonzero(np.array(rows.time_ns) >= self._since.get((camera, self.boot(camera)), -(2**63)))
+        if self._chunks is None:
+            return rows, used
+        return rows, self._one_a_time(rows, used)
+
+    @staticmethod
+    def _one_a_time(rows: _Columns, used: Ints) -> Ints:
+        """Of two rows of one time and label the first: a camera's fault that must not cost the others their answer."""
+        time, label = np.array(rows.time_ns)[used], np.array(rows.label)[used]
+        order = np.lexsort((used, time, label))
+        repeated = (np.diff(time[order]) == 0) & (np.diff(label[order]) == 0)
+        return np.sort(used[order[np.concatenate([[True], ~repeated])]]) if len(used) else used
+
+    def _observe(self, message: pb.Observation, moment: float) -> None:
         boots = self._boots.setdefault(message.camera, {})
         boot = boots.get(message.boot_id)
         if boot is None:
             boot = boots[message.boot_id] = _BootBuffer()
-        known = boot.is_duplicate if self._window_ns is None else boot.is_recent_duplicate
+        known = boot.is_duplicate if self._chunks is None else boot.is_recent_duplicate
         if known(message.sequence):
             self.counters["duplicates"] += 1
             return
         boot.frames += 1
+        chunk = self._advance(moment)
+        if self._chunks is not None:
+            room = boot.room[1] if boot.room[0] == chunk else _MAX_CHUNK_ROWS
+            boot.room = chunk, room - len(message.detections)
+            if boot.room[1] < 0:
+                self.counters["flooded"] += 1
+                return
         labels: set[str] = set()
         # One row per label and frame: of several detections the one of the highest score is used.
         for detection in sorted(message.detections, key=lambda found: -found.score):
@@ -178,11 +298,41 @@ class SessionBuilder:
                 self.counters["second_detections"] += 1
                 continue
             labels.add(label)
-            boot.rows.append((message.device_time_ns, message.frame, detection.u, detection.v, detection.size, label))
-        boot.last_ns = max(boot.last_ns, message.device_time_ns)
-        if self._window_ns is not None:
-            while boot.rows and boot.rows[0][0] < boot.last_ns - self._window_ns:
-                boot.rows.popleft()
+            index = self._labels.setdefault(label, len(self._labels))
+            rows = boot.rows
+            rows.time_ns.append(message.device_time_ns)
+            rows.frame.append(message.frame)
+            rows.sequence.append(message.sequence)
+            rows.chunk.append(chunk)
+            rows.label.append(index)
+            rows.values.extend((detection.u, detection.v, detection.size))
+            if chunk in self._motion:
+                u, v = boot.last.get(index, (detection.u, detection.v))
+                boot.last[index] = detection.u, detection.v
+                moved = self._motion[chunk]
+                step = min(math.hypot(detection.u - u, detection.v - v), _MAX_STEP_PX)
+                moved[message.camera] = moved.get(message.camera, 0.0) + step
+
+    def _advance(self, moment: float) -> int:
+        """The chunk of a moment; a new one may replace the one with the least motion."""
+        if self._chunks is None:
+            return 0
+        chunk = max(math.floor(moment / CHUNK_S), self._chunk)
+        if chunk > self._chunk or not self._motion:
+            self._chunk = chunk
+            self._motion[chunk] = {}
+            if len(self._motion) > self._chunks:
+                newest = sorted(self._motion)
+                oldest = [number for number in newest if number < chunk - _MAX_AGE * self._chunks]
+                candidates = oldest or newest[: -self._chunks // 3]
+                dropped = min(candidates, key=lambda number: (_shared(self._motion[number]), number))
+                del self._motion[dropped]
+                for boots in self._boots.values():
+                    for boot in boots.values():
+                        kept = np.flatnonzero(np.array(boot.rows.chunk, dtype=np.int64) != dropped)
+                        if len(kept) < len(boot.rows):
+                            boot.rows.take(kept)
+        return chunk
 
     def _build_rig(self, order: list[str]) -> Rig:
         info = self._rig
@@ -206,6 +356,11 @@ class SessionBuilder:
             up,
             metadata,
         )
+
+
+def _shared(motion: dict[str, float]) -> float:
+    """Motion [px] that more than one camera saw."""
+    return sum(motion.values()) - max(motion.values(), default=0.0)
 
 
 def rig_camera_from_info(info: pb.CameraInfo) -> RigCamera:

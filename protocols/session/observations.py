@@ -157,6 +157,23 @@ def gather_tracks(
     label_ids = {name: index for index, name in enumerate(sorted(set(labels)))}
     c = np.array([camera_ids[name] for name in cameras], dtype=np.int64)
     k = np.array([label_ids[name] for name in labels], dtype=np.int64)
+    return gather_columns(list(camera_ids), list(label_ids), c, k, frame, time, pixels, size, file=file, lines=lines)
+
+
+def gather_columns(
+    camera_names: list[str],
+    label_names: list[str],
+    c: Ints,
+    k: Ints,
+    frame: Ints,
+    time: Floats,
+    pixels: Floats,
+    size: Floats,
+    *,
+    file: Path | None = None,
+    lines: list[int] | None = None,
+) -> Observations:
+    """The same for rows (n,) with indices of their camera ``c`` and label ``k``; label_names: sorted."""
     sorting = np.lexsort((frame, time, k, c))
     c, k, frame, time, pixels, size = (
         c[sorting],
@@ -169,7 +186,6 @@ def gather_tracks(
     line = None if lines is None else np.array(lines)[sorting]
     starts = np.flatnonzero(np.r_[True, (np.diff(c) != 0) | (np.diff(k) != 0)])
     ends = np.r_[starts[1:], len(c)]
-    camera_names, label_names = list(camera_ids), list(label_ids)
     tracks: dict[tuple[str, str], Track] = {}
     warnings: list[str] = []
     for start, end in zip(starts, ends, strict=True):

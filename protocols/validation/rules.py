@@ -248,11 +248,15 @@ def _camera_calibration(camera: pb.CameraCalibration) -> None:
     _number(camera.time_offset_std, "time_offset_std", 0.0)
     _vector(camera.position_std, "position_std", (0, 3), low=0.0)
     _number(camera.rms_px, "rms_px", 0.0)
+    _number(camera.lag_time_s, "lag_time_s")
+    _number(camera.clock_rate_std, "clock_rate_std", 0.0)
     _intrinsics(camera)
     _id(camera.boot_id, "boot id", optional=True)
 
 
-_STATUS = frozenset({"solved", "refused", "collecting"})
+_STATUS = frozenset({"solved", "refused", "collecting", "searching"})
+_HUB_STATES = frozenset({"", "collecting", "searching", "calibrated", "degraded", "refused"})
+MAX_RUNS = 65_536
 _SCALES = frozenset({"metric", "arbitrary"})
 
 
@@ -274,6 +278,34 @@ def _calibration(message: pb.Calibration) -> None:
         _name(refusal.camera, "camera")
         _text(refusal.reason, "reason")
     _distinct([c.camera for c in message.cameras] + [r.camera for r in message.refused], "camera")
+    _one_of(message.state, "state", _HUB_STATES)
+    _count(message.progress, "progress", MAX_CAMERAS)
+    for progress in message.progress:
+        _name(progress.camera, "camera")
+        _one_of(progress.state, "state", _HUB_STATES)
+        _number(progress.shared_motion_s, "shared_motion_s", 0.0)
+        _number(progress.coverage, "coverage", 0.0, 1.0)
+        _number(progress.margin, "margin", 0.0)
+        _text(progress.reason, "reason")
+    _distinct([progress.camera for progress in message.progress], "camera")
+
+
+def _solver_event(message: pb.SolverEvent) -> None:
+    _one_of(message.kind, "kind", frozenset({"submitted", "applied", "failed"}))
+    _text(message.reason, "reason")
+    _number(message.cpu_s, "cpu_s", 0.0)
+    _count(message.rows, "runs of rows", MAX_RUNS)
+    for rows in message.rows:
+        _name(rows.camera, "camera")
+        _id(rows.boot_id, "boot id")
+        if rows.last_sequence < rows.first_sequence:
+            raise Rejected(RejectionReason.OUT_OF_RANGE, "a run of rows ends before it begins")
+    for priors in (message.clock_priors, message.arrivals):
+        _count(priors, "clock priors", MAX_CAMERAS)
+        for prior in priors:
+            _name(prior.camera, "camera")
+            _number(prior.unix_minus_camera, "unix_minus_camera")
+            _number(prior.error_bound, "error_bound", 0.0)
 
 
 _TRACK_STATES = frozenset({"tentative", "confirmed", "coasting", "lost"})
@@ -524,6 +556,7 @@ _RULES: dict[str, Callable[[Any], None]] = {
     "RigInfo": _rig_info,
     "Calibration": _calibration,
     "Track": _track,
+    "SolverEvent": _solver_event,
     "AgentStatus": _agent_status,
     "NodeState": _node_state,
     "Command": _command,

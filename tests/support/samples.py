@@ -19,12 +19,14 @@ from protocols.topics import (
     PREDICTION,
     RIG_INFO,
     ROAD_MAP,
+    SOLVER_EVENT,
     STATUS,
     TARGET,
     TARGET_CLOUD,
     TARGET_COMMAND,
     TELEMETRY,
     TRACK,
+    TRACK_SMOOTHED,
     UAV_INFO,
     Topic,
 )
@@ -122,6 +124,8 @@ def calibration(revision: int = 1) -> pb.Calibration:
         solver="joint",
         cameras=[solved],
         refused=[pb.Refusal(camera="cam1", reason="nothing moved in its view")],
+        progress=[pb.CameraProgress(camera="cam1", state="searching", shared_motion_s=4.0, coverage=0.2, margin=1.5)],
+        state="calibrated",
     )
 
 
@@ -356,12 +360,23 @@ def uav_info(agent: str = "cam0") -> pb.UavInfo:
     )
 
 
+def solver_event() -> pb.SolverEvent:
+    """A job of a hub's solver."""
+    message = pb.SolverEvent(schema_version=1, job=3, kind="submitted", search=True, full=True, cpu_s=0.5)
+    message.rows.add(camera="cam0", boot_id="b0", first_sequence=5, last_sequence=90, count=80)
+    message.clock_priors.add(camera="cam0", unix_minus_camera=1.5, error_bound=0.01)
+    message.arrivals.add(camera="cam0", unix_minus_camera=1.6, error_bound=0.15)
+    return message
+
+
 SAMPLES: dict[Topic, Callable[[], Message]] = {
     OBSERVATION: observation,
     CAMERA_INFO: camera_info,
     RIG_INFO: rig_info,
     CALIBRATION: calibration,
     TRACK: track,
+    TRACK_SMOOTHED: track,
+    SOLVER_EVENT: solver_event,
     STATUS: status,
     NODE_STATE: node_state,
     COMMAND: command,

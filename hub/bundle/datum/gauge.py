@@ -56,7 +56,9 @@ def fix_gauge(rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
     if len(final) and float(np.sqrt(np.mean(final**2))) > CONTRADICTION_SIGMA:
         worst, share = _worst_control_point(names, poses, control, best)
         if share > _MAX_CONTRADICTION:
-            raise Refused(f"the rig's control points contradict each other or the observations: worst is {worst}")
+            refusal = Refused(f"the rig's control points contradict each other or the observations: worst is {worst}")
+            refusal.permanent = True
+            raise refusal
         found.append(f"the rig's control points disagree by more than their stds: worst is {worst}")
     terms = control_point_terms(rig, names, [best.pose(pose) for pose in poses])
     return Gauge(best, "metric", terms.information, tuple(found))

@@ -205,6 +205,10 @@ class SenderCheckedBus:
         """Watch all agents of the site appear and disappear."""
         return self._bus.watch_agents()
 
+    def connected(self) -> bool:
+        """Whether this process can reach others."""
+        return self._bus.connected()
+
     def close(self) -> None:
         """Close the bus."""
         if self._watch is not None:

@@ -202,6 +202,10 @@ class MemoryBus:
         self._declared.append(subscription)
         return subscription
 
+    def connected(self) -> bool:
+        """Whether it is open."""
+        return not self._closed
+
     @contextmanager
     def announce(self, role: str, agent: str, boot_id: str) -> Iterator[None]:
         """Hold a liveliness token while the context is open, or until the bus is closed."""

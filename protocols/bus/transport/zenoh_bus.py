@@ -265,8 +265,16 @@ class ZenohWatch:
 class ZenohBus:
     """See ``protocols.bus.base.Bus``. Made by ``open_bus``."""
 
-    def __init__(self, session: zenoh.Session, site: str, clock_ns: Callable[[], int], outage_s: float) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        site: str,
+        clock_ns: Callable[[], int],
+        outage_s: float,
+        needs_router: bool = False,
+    ) -> None:
         self._session = session
+        self._needs_router = needs_router
         self._site = check_identifier(site, "site")
         self._clock_ns = clock_ns
         self._outage_s = outage_s
@@ -310,6 +318,12 @@ class ZenohBus:
         self._declared.append(watch)
         return watch
 
+    def connected(self) -> bool:
+        """Whether this process can reach others: a client that lost its router cannot."""
+        with zenoh_call("routers"):
+            info = self._session.info
+            return not self._needs_router or bool(info.routers_zid())
+
     def close(self) -> None:
         """Undeclare everything and close the session."""
         while self._declared:
@@ -342,4 +356,5 @@ def open_bus(
     """
     check_identifier(site, "site")
     config = config or BusConfig()
-    return ZenohBus(open_session(config, stop=stop, timeout_s=timeout_s), site, clock_ns, config.outage_s)
+    session = open_session(config, stop=stop, timeout_s=timeout_s)
+    return ZenohBus(session, site, clock_ns, config.outage_s, needs_router=config.mode == "client")

@@ -1,0 +1,81 @@
+"""Every answer of a hub on disk at once, with its history; the last one is reloaded after a crash."""
+
+from __future__ import annotations
+
+import os
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+from protocols.core.errors import InputError
+from protocols.core.version import VERSION
+from protocols.session.calibration import Calibration, calibration_text, read_calibration
+from protocols.session.rig import Rig
+
+LAST = "last.toml"
+HISTORY = "history"
+_MAX_AGE_S = 900.0
+"""An answer older than this is not reloaded: the cameras' clocks have drifted, and who knows where they stand now."""
+_MAX_HISTORY = 200
+
+
+def default_folder(out: Path | None, site: str, agent: str) -> Path:
+    """Where a hub's answers are kept: beside what it writes, else in the user's state folder."""
+    if out is not None:
+        return out / "state"
+    home = os.environ.get("XDG_STATE_HOME") or str(Path("~/.local/state").expanduser())
+    return Path(home) / "syncline" / site / agent
+
+
+class AnswerStore:
+    """Writes answers in a thread of its own, atomically; the hub's loop never waits for a disk.
+
+    problem: why the last answer could not be kept; "" if it was.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.problem = ""
+        self._writer = ThreadPoolExecutor(1, "answers")
+        self._pending: Future[None] | None = None
+
+    def keep(self, calibration: Calibration, rig: Rig, boot_ids: dict[str, str]) -> None:
+        """Write an answer. boot_ids: by camera, the boot whose clock its time map refers to."""
+        if self._pending is not None and not self._pending.done():
+            self._pending.cancel()  # a slow disk: only the newest counts
+        self._pending = self._writer.submit(self._write, calibration, rig, dict(boot_ids))
+
+    def load(self) -> tuple[Calibration, dict[str, str]] | None:
+        """The last answer and its boot ids, if it is recent and readable."""
+        file = self.folder / LAST
+        try:
+            if not file.is_file() or abs(time.time() - file.stat().st_mtime) > _MAX_AGE_S:
+                return None
+            rig, cameras = read_calibration(file)
+        except (InputError, OSError):
+            return None
+        boots = rig.metadata.get("boot_ids")
+        if not isinstance(boots, dict) or len(cameras) < 2:
+            return None
+        metadata = {key: str(rig.metadata.get(key, "")) for key in ("reference", "scale")}
+        calibration = Calibration(cameras, metadata["reference"], metadata["scale"], rig.units, "joint", VERSION)
+        return calibration, {name: str(boot) for name, boot in boots.items()}
+
+    def close(self) -> None:
+        """Wait for the last answer to be written."""
+        self._writer.shutdown(wait=True)
+
+    def _write(self, calibration: Calibration, rig: Rig, boot_ids: dict[str, str]) -> None:
+        from protocols.core.files import write_together
+
+        text = calibration_text(calibration, replace(rig, metadata={**rig.metadata, "boot_ids": boot_ids}))
+        history = self.folder / HISTORY
+        try:
+            write_together({self.folder / LAST: text, history / f"{time.time_ns() // 1_000_000}.toml": text})
+            for old in sorted(history.glob("*.toml"))[:-_MAX_HISTORY]:
+                old.unlink(missing_ok=True)
+        except (InputError, OSError) as error:
+            self.problem = str(error)
+        else:
+            self.problem = ""

@@ -1,0 +1,352 @@
+"""Incremental calibration: new rows refine the last answer; only cameras that are not tied to it yet are searched.
+
+A warm start of the estimator that `calibrate` uses: poses, clocks and lenses of the last answer are the initial values
+of one bundle adjustment over all rows that are kept (asynchronous calibration paper, section A.6, without its search
+over lags and without incremental reconstruction). The same rows give the same answer as from scratch, because the
+adjustment converges to the same minimum; what it costs is linear in the rows.
+
+A camera is tied while its rows fit the trajectory that the others give. One whose newest rows do not, while its older
+ones did, was moved: its older rows are dropped, and it is located again by resection, at the clock that it had.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hub.bundle.adjustment import residual_norms
+from hub.bundle.initialisation import (
+    Reconstruction,
+    inlier_share,
+    place_cameras,
+    triangulate_and_adjust,
+)
+from hub.bundle.preprocessing import PreparedSession, prepare
+from hub.bundle.problem import CameraState, FreeParameters
+from hub.calibration.pair_network import expected_lag, solve_new_pairs
+from hub.calibration.pipeline import calibrate, final_adjustment, fits_trajectory, least_certain_camera
+from hub.calibration.resection_scan import scan_resection
+from hub.calibration.result import assemble_calibration
+from hub.calibration.self_calibration import focal_prior, with_cameras, with_lens
+from hub.calibration.solution import Solution
+from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
+from hub.clocks.external_prior import ExternalClockPrior
+from hub.sync.hypothesis import PairSolution, evidence
+from protocols.core.clocks import CameraTime, TimeMap
+from protocols.core.errors import Refused
+from protocols.geometry.types import Bools
+from protocols.session.calibration import Calibration
+from protocols.session.observations import Observations
+from protocols.session.rig import Rig
+
+_RECENT_S = 3.0
+"""Span of the newest rows that are tested for a moved camera [s]."""
+_MIN_RECENT_ROWS = 30
+_MOVED_SHARE, _STEADY_SHARE = 0.4, 0.8
+"""A camera was moved where fewer of its newest rows than the first fit, while more of its older ones than the second
+do: of a camera that stands still 90 % and more fit."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Update:
+    """An answer, and cameras that were moved: by name, camera time [s] from which on the new pose holds."""
+
+    calibration: Calibration
+    moved: dict[str, float]
+
+
+def update_calibration(
+    rig: Rig,
+    observations: Observations,
+    last: Calibration | None,
+    *,
+    search: bool = True,
+    full: bool = True,
+    clock_priors: Mapping[str, ExternalClockPrior] | None = None,
+    arrivals: Mapping[str, ExternalClockPrior] | None = None,
+) -> Update:
+    """The calibration from all given rows, starting from the last one.
+
+    last: the answer before, of which cameras with another clock or pose have been removed; None = from scratch.
+    search: whether cameras that are not tied are searched. full: whether it is searched over all lags, and whether
+    lenses and readouts are tried again. clock_priors: by camera; bounds for lags that the images leave ambiguous.
+    arrivals: the same by times of arrival at the hub. Raises Refused where fewer than two cameras can be placed.
+    """
+    if last is None or sum(name in last.cameras for name in observations.cameras) < 2:
+        found = calibrate(
+            rig, observations, clock_priors=clock_priors, arrivals=None if full else arrivals, online=True
+        )
+        return Update(found if last is None else _in_published_clock(found, last), {})
+    if last.reference in rig.cameras:
+        rig = replace(rig, metadata={**rig.metadata, "reference": last.reference})
+    prepared = _with_estimated_lenses(rig, prepare(rig, observations), last)
+    refused = dict(prepared.refused)
+    tied = [name for name in prepared.cameras if name in last.cameras]
+    reconstruction = _warm_start(prepared, _initial_states(prepared, last, tied, measured_lenses=full))
+    moved = _moved_cameras(reconstruction, prepared)
+    if moved:
+        observations = _without_older_rows(observations, moved)
+        prepared = _with_estimated_lenses(rig, prepare(rig, observations), last)
+    placed = {
+        name: state
+        for name, state in zip(reconstruction.names, reconstruction.state.cameras, strict=True)
+        if name not in moved
+    }
+    if len(placed) < 2:
+        raise Refused("fewer than two cameras stand where they stood", dict.fromkeys(moved, "was moved"))
+    pairs: list[PairSolution] = []
+    reasons: dict[str, str] = {}
+    new = [name for name in prepared.cameras if name not in placed and name not in moved]
+    clocks = {name: _clock_of(state) for name, state in placed.items()}
+    clocks |= {name: _clock_of(_state_of(reconstruction, name)) for name in moved if name in prepared.cameras}
+    if new and search:
+        reconstruction = _warm_start(prepared, placed) if moved else reconstruction
+        for name in new:
+            reasons[name] = "no common clock bounds its lag yet"
+            expected = _expected_clock(prepared, name, reconstruction, {**(arrivals or {}), **(clock_priors or {})})
+            if expected is not None:
+                clock, reasons[name] = scan_resection(prepared.cameras[name], reconstruction, *expected)
+                clocks |= {} if clock is None else {name: clock}
+        unknown = [name for name in new if name not in clocks]
+        if full and unknown:
+            prepared, pairs = solve_new_pairs(prepared, unknown, list(placed), clock_priors)
+            clocks |= _clocks_from_pairs(pairs, placed, prepared)
+            reasons |= {name: _failed_with(name, pairs) for name in unknown if name not in clocks}
+    reasons = {name: reasons.get(name, "waits for the next search of its lag") for name in new if name not in clocks}
+    if len(clocks) > len(placed) or moved:
+        reconstruction, unplaced = place_cameras(
+            prepared.cameras,
+            ClockGraph(clocks, tuple(pair for pair in pairs if pair.solved), ()),
+            prepared.rows,
+            prepared.labels,
+            placed,
+            _free_parameters(prepared),
+        )
+        reasons |= unplaced
+    refuted = set(moved)
+    while True:
+        reconstruction = final_adjustment(reconstruction, lambda text, share: None, warm=not full, online=True)
+        worst, reason = _inconsistent(reconstruction)
+        if reason:
+            refuted.add(worst)
+        else:
+            worst, reason = least_certain_camera(reconstruction)
+        if not reason:
+            break
+        reasons[worst] = reason
+        remaining = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
+        del remaining[worst]
+        if len(remaining) < 2:
+            raise Refused(f"no two cameras can be placed ({worst}: {reason})", refused | reasons)
+        reconstruction = _warm_start(prepared, remaining)
+    joint = tuple(pair for pair in pairs if pair.solved) + _tied_pairs(reconstruction.names, pairs)
+    solution = Solution(
+        reconstruction,
+        joint,
+        {name: (refused | reasons)[name] for name in prepared.camera_order if name in refused | reasons},
+        prepared,
+        "joint",
+    )
+    found = _in_published_clock(assemble_calibration(rig, solution, last), last)
+    # Cameras of which the present rows say too little stay as they were: world and clock are the same.
+    kept = {name: camera for name, camera in last.cameras.items() if name not in found.cameras and name not in refuted}
+    refused = {name: reason for name, reason in found.refused.items() if name not in kept}
+    return Update(replace(found, cameras=found.cameras | kept, refused=refused), moved)
+
+
+def _free_parameters(prepared: PreparedSession) -> FreeParameters:
+    return FreeParameters(clock=not prepared.shared_clock)
+
+
+def _initial_states(
+    prepared: PreparedSession, last: Calibration, names: list[str], measured_lenses: bool
+) -> dict[str, CameraState]:
+    """The last answer as states on an internal time: the published reference time since the first row.
+
+    measured_lenses: whether to start from the measured lenses, so that whether to estimate them is
+    decided as from scratch: with a refined lens that absorbed it once, an error would confirm itself.
+    """
+    maps = {name: last.cameras[name].time_map for name in names}
+    start = min(float(maps[n].reference_from_camera(CameraTime(prepared.time_origins[n]))) for n in names)
+    out = {}
+    for name in names:
+        centre = _centre(prepared, name)
+        camera_time = CameraTime(centre / prepared.time_scale(name) + prepared.time_origins[name])
+        offset = float(maps[name].reference_from_camera(camera_time)) - start
+        camera = last.cameras[name]
+        given = prepared.cameras[name]
+        lens = given.intrinsics if measured_lenses and given.lens_prior is None else camera.intrinsics
+        out[name] = CameraState(lens, camera.pose, maps[name].clock_rate, offset, centre)
+    return out
+
+
+def _centre(prepared: PreparedSession, name: str) -> float:
+    """Middle of a camera's span [s] since its origin."""
+    times = [part.time for part in prepared.rows[name]]
+    return 0.5 * (min(float(time.min()) for time in times) + max(float(time.max()) for time in times))
+
+
+def _with_estimated_lenses(rig: Rig, prepared: PreparedSession, last: Calibration) -> PreparedSession:
+    """The session with the lenses that the last answer estimated for cameras without measured intrinsics."""
+    names = [n for n in prepared.uncalibrated if n in last.cameras and last.cameras[n].focal_std > 0.0]
+    if not names:
+        return prepared
+    lenses = {n: with_lens(prepared, n, last.cameras[n].intrinsics, focal_prior(rig, n)) for n in names}
+    return with_cameras(prepared, lenses)
+
+
+def _warm_start(prepared: PreparedSession, states: dict[str, CameraState]) -> Reconstruction:
+    cameras = {name: camera for name, camera in prepared.cameras.items() if name in states}
+    names = list(cameras)
+    return triangulate_and_adjust(
+        cameras, states, prepared.rows, prepared.labels, (names[0], names[1]), _free_parameters(prepared)
+    )
+
+
+def _state_of(reconstruction: Reconstruction, name: str) -> CameraState:
+    return reconstruction.state.cameras[reconstruction.names.index(name)]
+
+
+def _clock_of(state: CameraState) -> TimeMapEstimate:
+    return TimeMapEstimate(state.rate, state.offset, state.centre)
+
+
+def _moved_cameras(reconstruction: Reconstruction, prepared: PreparedSession) -> dict[str, float]:
+    """Cameras whose newest rows contradict their older ones: by name, camera time [s] of the first that does.
+
+    Needs two other cameras: with one other, either may have moved.
+    """
+    if len(reconstruction.names) < 3:
+        return {}
+    out = {}
+    for number, name in enumerate(reconstruction.names):
+        times, fits = [], []
+        for rows in reconstruction.problem.rows:
+            if rows.camera == number:
+                norms = residual_norms(
+                    rows, reconstruction.state.cameras[number], reconstruction.state.trajectories[rows.label]
+                )
+                good = np.isfinite(norms)
+                times.append(rows.time[good])
+                fits.append(norms[good] < max(3.0, 5.0 * float(np.median(reconstruction.state.sigma))))
+        time, fit = np.concatenate(times), np.concatenate(fits)
+        order = np.argsort(time)
+        time, fit = time[order], fit[order]
+        recent = time > time[-1] - _RECENT_S if len(time) else np.zeros(0, dtype=np.bool_)
+        if recent.sum() < _MIN_RECENT_ROWS or (~recent).sum() < _MIN_RECENT_ROWS:
+            continue
+        if fit[recent].mean() < _MOVED_SHARE and fit[~recent].mean() > _STEADY_SHARE:
+            since = time[_change(fit)]
+            out[name] = float(since / prepared.time_scale(name) + prepared.time_origins[name])
+    return out
+
+
+def _change(fit: Bools) -> int:
+    """Index of the change from rows that fit to rows that do not: maximum likelihood of one change point."""
+    value = np.cumsum(np.where(fit, 1.0, -1.0))
+    return min(int(np.argmax(value)) + 1, len(fit) - 1)
+
+
+def _without_older_rows(observations: Observations, since: Mapping[str, float]) -> Observations:
+    tracks = {}
+    for key, track in observations.tracks.items():
+        keep = track.time >= since.get(key[0], -np.inf)
+        if keep.any():
+            tracks[key] = replace(
+                track,
+                frame=track.frame[keep],
+                time=track.time[keep],
+                pixels=track.pixels[keep],
+                size=track.size[keep],
+            )
+    return replace(observations, tracks=tracks)
+
+
+def _clocks_from_pairs(
+    pairs: list[PairSolution], placed: Mapping[str, CameraState], prepared: PreparedSession
+) -> dict[str, TimeMapEstimate]:
+    """Time maps of new cameras from their best pair with a placed one."""
+    out: dict[str, TimeMapEstimate] = {}
+    best: dict[str, float] = {}
+    for pair in pairs:
+        fit = pair.fit
+        if not pair.solved or fit is None:
+            continue
+        known, new = (pair.a, pair.b) if pair.a in placed else (pair.b, pair.a)
+        if evidence(fit) <= best.get(new, 0.0):
+            continue
+        best[new] = evidence(fit)
+        # t_a = rate t_b + offset
+        rate, offset = (fit.rate, fit.offset) if new == pair.b else (1.0 / fit.rate, -fit.offset / fit.rate)
+        state, centre = placed[known], _centre(prepared, new)
+        out[new] = TimeMapEstimate(
+            state.rate * rate, float(state.reference_time(np.array([rate * centre + offset]))[0]), centre
+        )
+    return out
+
+
+def _expected_clock(
+    prepared: PreparedSession,
+    name: str,
+    reconstruction: Reconstruction,
+    common: Mapping[str, ExternalClockPrior],
+) -> tuple[TimeMapEstimate, float] | None:
+    """A new camera's time map by a clock that it has in common with a placed one, and its error bound [s]."""
+    found = []
+    for other, state in zip(reconstruction.names, reconstruction.state.cameras, strict=True):
+        expected = expected_lag(prepared, other, name, common)
+        if expected is not None:
+            lag, window = expected
+            centre = _centre(prepared, name)
+            offset = float(state.reference_time(np.array([centre + lag]))[0])
+            found.append((window, offset, TimeMapEstimate(state.rate, offset, centre)))
+    if not found:
+        return None
+    window, _, estimate = min(found, key=lambda one: one[:2])
+    return estimate, window
+
+
+def _failed_with(name: str, pairs: list[PairSolution]) -> str:
+    tried = "; ".join(f"with {p.b if p.a == name else p.a}: {p.status}" for p in pairs if name in (p.a, p.b))
+    return tried or "no other camera to compare with"
+
+
+def _inconsistent(reconstruction: Reconstruction) -> tuple[str, str]:
+    """The camera that fits the others' trajectory worst, and why it does not fit; "" where all do."""
+    names = [name for name in reconstruction.names if not fits_trajectory(reconstruction, name)]
+    if not names:
+        return "", ""
+    worst = min(names, key=lambda name: inlier_share(reconstruction, name)[0])
+    share, count = inlier_share(reconstruction, worst)
+    return worst, f"only {100 * share:.0f} % of its {count} observations fit the trajectory seen by the other cameras"
+
+
+def _tied_pairs(names: list[str], pairs: list[PairSolution]) -> tuple[PairSolution, ...]:
+    """Pairs that needed no search: both cameras are in the joint solution."""
+    searched = {(pair.a, pair.b) for pair in pairs if pair.solved}
+    return tuple(
+        PairSolution(a, b, "ok") for i, a in enumerate(names) for b in names[i + 1 :] if (a, b) not in searched
+    )
+
+
+def _in_published_clock(found: Calibration, last: Calibration) -> Calibration:
+    """The answer on the published reference clock, where its reference camera is not in the answer any more."""
+    if found.reference == last.reference or found.reference not in last.cameras:
+        return found
+    base = last.cameras[found.reference].time_map
+    cameras = {
+        name: replace(
+            camera,
+            time_map=TimeMap(
+                clock_rate=base.clock_rate * camera.time_map.clock_rate,
+                time_offset=base.clock_rate * camera.time_map.time_offset + base.time_offset,
+            ),
+        )
+        for name, camera in found.cameras.items()
+    }
+    trajectories = tuple(
+        replace(table, time=base.clock_rate * table.time + base.time_offset) for table in found.trajectories
+    )
+    return replace(found, cameras=cameras, trajectories=trajectories, reference=last.reference)

@@ -1,0 +1,45 @@
+"""Clock priors from times of arrival: a camera's frame cannot arrive before it was taken, and seldom much later.
+
+The smallest of (arrival - camera time) over some seconds is the offset of the hub's clock from the camera's plus the
+smallest delay of the link. It bounds lags to a few tenths of a second, no better: delays of cameras differ. Where the
+smallest delays of successive seconds differ much (a backlog, a recording played as fast as it goes), there is no prior.
+"""
+
+from __future__ import annotations
+
+from hub.clocks.external_prior import ExternalClockPrior
+
+_INTERVAL_S = 2.0
+_INTERVALS = 15
+_MIN_INTERVALS = 3
+_MAX_SPREAD_S = 0.1
+"""Largest difference of the intervals' smallest delays."""
+ERROR_BOUND_S = 0.15
+"""Of one camera's offset: its smallest delay is 0 to 0.3 s."""
+
+
+class ArrivalPriors:
+    """The smallest delays of each camera's clock over the last half minute."""
+
+    def __init__(self) -> None:
+        self._least: dict[tuple[str, str], dict[int, float]] = {}
+
+    def handle(self, camera: str, boot_id: str, camera_time: float, arrival: float) -> None:
+        """Add one frame: its time on the camera's clock and its arrival on the hub's [s]."""
+        for key in [key for key in self._least if key[0] == camera and key[1] != boot_id]:
+            del self._least[key]
+        least = self._least.setdefault((camera, boot_id), {})
+        interval = int(arrival // _INTERVAL_S)
+        delay = arrival - camera_time
+        least[interval] = min(least.get(interval, delay), delay)
+        if len(least) > _INTERVALS:
+            del least[min(least)]
+
+    def priors(self) -> dict[str, ExternalClockPrior]:
+        """By camera, the hub's clock in place of Unix time."""
+        out = {}
+        for (camera, boot_id), least in self._least.items():
+            complete = [least[interval] for interval in sorted(least)[:-1]]
+            if len(complete) >= _MIN_INTERVALS and max(complete) - min(complete) <= _MAX_SPREAD_S:
+                out[camera] = ExternalClockPrior(boot_id, min(complete), ERROR_BOUND_S)
+        return out

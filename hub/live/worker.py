@@ -1,0 +1,110 @@
+"""The solver in a process of its own: the loop that serves the bus never waits for it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+
+from hub.live.solver import SolverAnswer, SolverJob, run_job
+
+_BUDGET_S = 60.0
+_MEMORY_BYTES = 3 << 30
+_NICENESS = 5
+_PARENT_CHECK_S = 1.0
+_THREAD_LIMITS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class WorkerSolver:
+    """Solves jobs in one worker process, which is ended and replaced when it exceeds its budget or dies.
+
+    budget_s: wall time [s] that a job may take, from its start to its answer. memory_bytes: limit of the worker's data.
+    """
+
+    def __init__(self, budget_s: float = _BUDGET_S, memory_bytes: int = _MEMORY_BYTES) -> None:
+        self._budget_s, self._memory_bytes = budget_s, memory_bytes
+        self._pool: ProcessPoolExecutor | None = None
+        self._pid: Future[int] | None = None
+        self._job: tuple[int, float, Future[SolverAnswer]] | None = None
+        self.restarts = 0
+
+    @property
+    def busy(self) -> bool:
+        """Whether a job is under way."""
+        return self._job is not None
+
+    def submit(self, job: SolverJob, now: float) -> None:
+        """Hand a job over; a worker is started where none runs."""
+        self._job = job.number, now, self._started().submit(run_job, job)
+
+    def poll(self, now: float) -> SolverAnswer | None:
+        """The answer, once; a failure where the worker died or was ended for exceeding its budget."""
+        if self._job is None:
+            return None
+        number, since, future = self._job
+        if future.done():
+            self._job = None
+            try:
+                return future.result()
+            except BrokenProcessPool:
+                self._end()
+                return SolverAnswer(number, reason="the solver's process ended", failed=True)
+            except Exception as error:  # noqa: BLE001 - whatever a job raised there is a failed job here
+                return SolverAnswer(number, reason=f"the solver failed: {type(error).__name__}: {error}", failed=True)
+        if now - since <= self._budget_s:
+            return None
+        self._job = None
+        self._end()
+        return SolverAnswer(number, reason=f"no answer within {self._budget_s:g} s", failed=True, cpu_s=now - since)
+
+    def close(self) -> None:
+        """End the worker; a job under way is given up."""
+        self._job = None
+        self._end()
+
+    def _started(self) -> ProcessPoolExecutor:
+        if self._pool is None:
+            for name in _THREAD_LIMITS:  # before the worker loads numpy; more threads double the CPU and gain nothing
+                os.environ.setdefault(name, "1")
+            self._pool = ProcessPoolExecutor(
+                1,
+                mp_context=multiprocessing.get_context("spawn"),
+                initializer=_prepare_worker,
+                initargs=(self._memory_bytes, os.getpid()),
+            )
+            self._pid = self._pool.submit(os.getpid)
+        return self._pool
+
+    def _end(self) -> None:
+        """Kill the worker; the next job starts another one."""
+        pool, pid, self._pool, self._pid = self._pool, self._pid, None, None
+        if pool is None:
+            return
+        self.restarts += 1
+        with suppress(Exception):
+            if pid is not None and pid.done():
+                os.kill(pid.result(), signal.SIGKILL)
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _prepare_worker(memory_bytes: int, parent: int) -> None:
+    """Bound the worker's memory, let the bus go first, and end with the parent, also where that was killed."""
+    with suppress(ImportError, OSError, ValueError):  # not on every system
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_DATA, (memory_bytes, memory_bytes))
+    with suppress(OSError, AttributeError):
+        os.nice(_NICENESS)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the hub, which ends its worker
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_PARENT_CHECK_S)
+        os._exit(0)
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
