@@ -73,12 +73,18 @@ class LagBuffer(Generic[Row, State]):
 
     def forget(self) -> None:
         """Drop the processed rows that are older than ``keep_ns``."""
-        if not self._keys:
-            return
-        old = min(bisect_right(self._keys, (self._keys[-1][0] - self._keep_ns, "", "", 0)), len(self.states))
-        if old:
-            self.base, self._base_key = self.states[old - 1], self._keys[old - 1]
-            del self._keys[:old], self.rows[:old], self.states[:old]
+        if self._keys:
+            self._drop(bisect_right(self._keys, (self._keys[-1][0] - self._keep_ns, "", "", 0)))
+
+    def commit(self) -> None:
+        """Make the present state the base: the processed rows will not be processed again."""
+        self._drop(len(self.states))
+
+    def _drop(self, count: int) -> None:
+        count = min(count, len(self.states))
+        if count:
+            self.base, self._base_key = self.states[count - 1], self._keys[count - 1]
+            del self._keys[:count], self.rows[:count], self.states[:count]
 
     def restart(self, base: State, rows: Iterable[Row]) -> None:
         """Process other rows from another base at the same time; those before it are dropped."""

@@ -1,8 +1,7 @@
-"""Multi-target tracker with out-of-sequence frames: a late frame is inserted and the later ones are reprocessed."""
+"""Multi-target tracker with out-of-sequence frames."""
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
 from collections import Counter
 from dataclasses import replace
 
@@ -11,6 +10,7 @@ import numpy as np
 from hub.tracking.detections import FrameDetections, TrackingCamera, frame_detections
 from hub.tracking.filter.target_states import MultiTargetState, Targets
 from hub.tracking.frame_update import TrackerParameters, predict_targets, process_frame
+from hub.tracking.lag_buffer import LagBuffer
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.pose import Similarity
 from protocols.messages import syncline_pb2 as pb
@@ -31,13 +31,13 @@ class Tracker:
         self.parameters = parameters or TrackerParameters()
         self.cameras: dict[str, TrackingCamera] = {}
         self.counters: Counter[str] = Counter()
-        self._lag_ns = round(lag_s * NANOSECONDS)
-        self._base = MultiTargetState.empty()
-        self._base_key: tuple[int, str, str, int] | None = None
-        self._keys: list[tuple[int, str, str, int]] = []
-        self._frames: list[FrameDetections] = []
-        self._states: list[MultiTargetState] = []
-        self._processed = 0
+        lag_ns = round(lag_s * NANOSECONDS)
+        self._frames: LagBuffer[FrameDetections, MultiTargetState] = LagBuffer(
+            MultiTargetState.empty(),
+            lambda state, frame: process_frame(state, frame, self.cameras, self.parameters),
+            lag_ns,
+            lag_ns,
+        )
         self._boot_ids: dict[str, str] = {}
         self._ahead_ns: dict[str, int] = {}
         self.newest_frame: FrameDetections | None = None
@@ -45,27 +45,26 @@ class Tracker:
     def set_parameters(self, parameters: TrackerParameters) -> None:
         """Use other parameters from now on; processed frames are not reprocessed."""
         self.advance()
-        self._commit()
+        self._frames.commit()
         self.parameters = parameters
 
     def calibrate(self, cameras: dict[str, TrackingCamera], change: Similarity | None = None) -> None:
         """Use a new calibration. change: similarity from the old to the new world frame, None = the same frame."""
         self.advance()
-        self._commit()
+        self._frames.commit()
         if change is not None:
-            self._base = transform_state(self._base, change)
+            self._frames.base = transform_state(self._frames.base, change)
         self.cameras = dict(cameras)
 
     def reset(self) -> None:
         """Forget all targets, tracks and frames."""
-        self._base, self._base_key = MultiTargetState.empty(), None
-        self._keys, self._frames, self._states, self._processed = [], [], [], 0
+        self._frames.clear(MultiTargetState.empty())
         self._ahead_ns.clear()
 
     @property
     def state(self) -> MultiTargetState:
         """The state after all processed frames."""
-        return self._states[self._processed - 1] if self._processed else self._base
+        return self._frames.state
 
     @property
     def boot_ids(self) -> dict[str, str]:
@@ -97,45 +96,24 @@ class Tracker:
 
     def insert(self, frame: FrameDetections) -> bool:
         """Insert a frame in order; False if it is late, a duplicate, or has an implausible time."""
-        key = frame.key
-        newest = self._keys[-1][0] if self._keys else None if self._base_key is None else self._base_key[0]
+        newest = self._frames.newest_ns
         if newest is not None and not self._is_plausible(frame, newest):
             self.counters["track.ahead"] += 1
             return False
-        if self._base_key is not None and key <= self._base_key:
-            self.counters["track.late"] += 1
-            return False
-        position = bisect_left(self._keys, key)
-        if position < len(self._keys) and self._keys[position] == key:
-            self.counters["track.duplicates"] += 1
-            return False
-        if newest is not None and key[0] < newest - self._lag_ns:
-            self.counters["track.late"] += 1
+        how = self._frames.insert(frame)
+        if how in ("late", "duplicates"):
+            self.counters[f"track.{how}"] += 1
             return False
         self.counters["track.frames"] += 1
-        if position < len(self._keys):
+        if how == "reordered":
             self.counters["track.reordered"] += 1
-        self._keys.insert(position, key)
-        self._frames.insert(position, frame)
         self.newest_frame = frame
-        if self._processed > position:
-            del self._states[position:]
-            self._processed = position
         return True
 
     def advance(self) -> MultiTargetState:
         """Process all pending frames in order; forget those older than the lag."""
-        while self._processed < len(self._frames):
-            before = self._states[self._processed - 1] if self._processed else self._base
-            self._states.append(process_frame(before, self._frames[self._processed], self.cameras, self.parameters))
-            self._processed += 1
-            self.counters["track.steps"] += 1
-        if self._keys:
-            old = bisect_right(self._keys, (self._keys[-1][0] - self._lag_ns, "", "", 0))
-            if old:
-                self._base, self._base_key = self._states[old - 1], self._keys[old - 1]
-                del self._keys[:old], self._frames[:old], self._states[:old]
-                self._processed -= old
+        self.counters["track.steps"] += self._frames.advance()
+        self._frames.forget()
         return self.state
 
     def states_since(self, after_ns: int, every_ns: int) -> list[MultiTargetState]:
@@ -144,7 +122,7 @@ class Tracker:
         A hub that was delayed publishes them afterwards.
         """
         out: list[MultiTargetState] = []
-        for state in self._states[: max(self._processed - 1, 0)]:
+        for state in self._frames.states[:-1]:
             time_ns = state.time_ns or 0
             if time_ns >= after_ns + every_ns and (self.time_ns or 0) - time_ns >= every_ns:
                 out.append(state)
@@ -156,12 +134,6 @@ class Tracker:
         if self.time_ns is None:
             return self.targets
         return predict_targets(self.targets, (reference_ns - self.time_ns) / NANOSECONDS, self.parameters)
-
-    def _commit(self) -> None:
-        """Make the present state the base: earlier frames will not be reprocessed."""
-        self._base = self.state
-        self._base_key = self._keys[-1] if self._keys else self._base_key
-        self._keys, self._frames, self._states, self._processed = [], [], [], 0
 
     def _is_plausible(self, frame: FrameDetections, newest: int) -> bool:
         """Whether a frame's time is plausible: one camera's wrong clock must not make all others late."""
