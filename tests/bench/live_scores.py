@@ -279,7 +279,9 @@ class LiveScores:
         for key, track in reference.seen.tracks.items():
             if key[0] in known:
                 moment = reference.common(key[0], track.time)
-                tracks[key] = _rows_of(track, (moment >= begin) & (moment <= end))
+                during = (moment >= begin) & (moment <= end)
+                if during.any():
+                    tracks[key] = _rows_of(track, during)
         rig = Rig({name: reference.rig.cameras[name] for name in known}, reference.rig.units)
         try:
             tables = triangulate(rig, known, Observations(tracks)).tables
