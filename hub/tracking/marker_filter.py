@@ -38,6 +38,8 @@ RECENT_NS = 500_000_000
 """A camera that saw the marker no longer ago counts as seeing it."""
 _CONFIRM_HITS = 10
 """Accepted rows, with the six of the first state."""
+_TRY_EVERY_NS = 40_000_000
+"""Between two attempts to begin a track, each as costly as several rows."""
 _USUAL_GAIN = 0.05
 _COASTING_STD = 3.0
 """Times the usual std: then one std is as large as errors ever are while two cameras see the marker."""
@@ -55,7 +57,7 @@ class MarkerState:
     log_weight: logarithms of the weights. psd: density of the jerk [unit²/s⁵]. hits: accepted rows. accepted,
     rejected: by camera, the time of the last row that was accepted or rejected. noise: by camera, factor of its noise
     and number of rows behind it. usual_std: std of the position while at least two cameras see the marker. pending:
-    the newest rejected rows. serial: counts the tracks.
+    the newest rejected rows. tried_ns: when they were last tried as the beginning of a track. serial: counts tracks.
     """
 
     time_ns: int = 0
@@ -69,6 +71,7 @@ class MarkerState:
     noise: dict[str, tuple[float, int]] = field(default_factory=dict)
     usual_std: float = 0.0
     pending: tuple[MarkerRow, ...] = ()
+    tried_ns: int | None = None
     serial: int = 0
 
     @property
@@ -143,7 +146,13 @@ def process_row(state: MarkerState, row: MarkerRow, coast_ns: int) -> MarkerStat
         if updated is not None:
             return updated
     elif len(state.mean):
-        state = MarkerState(rejected=state.rejected, noise=state.noise, pending=state.pending, serial=state.serial)
+        state = MarkerState(
+            rejected=state.rejected,
+            noise=state.noise,
+            pending=state.pending,
+            tried_ns=state.tried_ns,
+            serial=state.serial,
+        )
     return _reject(state, row)
 
 
@@ -274,6 +283,9 @@ def _reject(state: MarkerState, row: MarkerRow) -> MarkerState:
     agreeing = sum(time > now - RECENT_NS for camera, time in state.accepted.items() if camera not in against)
     if len(own) < ROWS_PER_CAMERA or len(against) < 2 or (len(state.mean) and len(against) <= agreeing):
         return state
+    if state.tried_ns is not None and now < state.tried_ns + _TRY_EVERY_NS:
+        return state
+    state = replace(state, tried_ns=now)
     for other in sorted({old.camera.name for old in others}):
         theirs = [old for old in others if old.camera.name == other]
         if len(theirs) == ROWS_PER_CAMERA and other in against:
