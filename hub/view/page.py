@@ -1,4 +1,4 @@
-"""The view's panels: site status, cameras, buttons, display options, drones, and the timeline of a replay."""
+"""The view's panels: site status, cameras, pictures, lags, buttons, options, drones, and a replay's timeline."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from hub.view.export import calibration_file
-from hub.view.panels import camera_details, camera_table, overview
+from hub.view.lag_chart import lag_charts
+from hub.view.panels import camera_details, camera_table, overview, picture_tiles, recording_html
 from hub.view.scene_renderer import DisplayOptions, decode_jpeg
 from hub.view.state import CameraView, ViewState
 from hub.view.uav_overlay import draw_uav, pad_to_aspect, uav_panel_html
@@ -70,13 +69,17 @@ class ViewPage:
         self._filled = False
         self._table = gui.add_html("")
         self._note: Any = None
+        self._recording: Any = None
+        self._buttons: dict[str, Any] = {}
         if player is None:
             self._add_actions(allowed, actions)
-        with gui.add_folder("Camera"):
+        with gui.add_folder("Pictures"):
+            self._tiles = gui.add_html("")
+        with gui.add_folder("Lags"):
+            self._lags = gui.add_html("")
+        with gui.add_folder("Camera", expand_by_default=False):
             self._choice: Any = gui.add_dropdown("camera", ("–",))
-            self._picture = gui.add_image(np.full((90, 160, 3), 235, dtype=np.uint8), format="jpeg", visible=False)
             self._details = gui.add_html("")
-        self._shown: tuple[str, int] = ("", -1)
         self._add_options()
 
     def update(self, state: ViewState, now: float) -> None:
@@ -93,7 +96,10 @@ class ViewPage:
         camera = state.cameras.get(self._choice.value)
         if camera is not None:
             self._set(self._details, camera_details(state, camera, now))
-            self._show_picture(camera)
+        self._set(self._tiles, picture_tiles(state, now, wanted=self.options.pictures))
+        self._set(self._lags, lag_charts(state, now))
+        if self._recording is not None:
+            self._show_recording(state, now)
         if self._player is not None:
             self._show_time(self._player)
 
@@ -123,24 +129,23 @@ class ViewPage:
             self._texts[id(handle)] = text
             handle.content = text
 
-    def _show_picture(self, camera: CameraView) -> None:
-        key = (camera.name, camera.pictures)
-        if camera.picture is None or key == self._shown:
-            self._picture.visible = camera.picture is not None
-            return
-        image = decode_jpeg(camera.picture.jpeg)
-        if image is None:
-            return
-        self._shown = key
-        self._picture.image = draw_detections(image, camera)
-        self._picture.visible = True
+    def _show_recording(self, state: ViewState, now: float) -> None:
+        """Say what the recorders do, and offer only what would change it."""
+        self._set(self._recording, recording_html(state, now))
+        recording = [agent.recording for agent in state.of_role("record")]
+        for action, visible in (("start_recording", not all(recording)), ("stop_recording", any(recording))):
+            if action in self._buttons:
+                self._buttons[action].visible = visible
 
     def _add_actions(self, allowed: bool, actions: tuple[str, ...]) -> None:
         gui = self._server.gui
         with gui.add_folder("Actions"):
+            if "start_recording" in actions:
+                self._recording = gui.add_html("")
             for action in actions:
                 button = gui.add_button(ACTIONS[action], hint=_HINTS[action], disabled=not allowed)
                 button.on_click(partial(self._clicked, action))
+                self._buttons[action] = button
             text = "" if allowed else "Read-only: start the view without --look-only to enable the buttons."
             self._note = gui.add_markdown(text)
 

@@ -11,6 +11,7 @@ import numpy as np
 from google.protobuf.message import Message
 
 from hub.live.messages import calibration_message, track_messages
+from hub.view.lag_history import LAG_WINDOW_S
 from hub.view.state import ViewState
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
@@ -80,17 +81,18 @@ class LogRecording:
         self._times = [time for time, _ in self._latched]
 
     def latched_messages(self, before: float) -> Iterable[Timed]:
-        """The last message of each camera, hub and agent before that time."""
+        """The last message of each camera, hub and agent before that time; solutions of the lag chart's window."""
         last: dict[tuple[str, str], Timed] = {}
-        solved: Timed | None = None
+        solved: list[Timed] = []
         for timed in self._latched[: bisect.bisect_left(self._times, before)]:
             message = timed[1]
             if isinstance(message, pb.Calibration) and message.status == "solved":
-                solved = timed
+                solved.append(timed)
             name = getattr(message, "camera", "") or getattr(message, "agent", "")
             last[message.DESCRIPTOR.name, name] = timed
-        # A refusal after a solution does not remove the poses.
-        return sorted([*([solved] if solved else []), *last.values()], key=lambda timed: timed[0])
+        # A refusal after a solution does not remove the poses, and the lag chart shows differences to the first one.
+        recent = [timed for timed in solved[1:-1] if timed[0] > before - LAG_WINDOW_S]
+        return sorted([*solved[:1], *recent, *solved[-1:], *last.values()], key=lambda timed: timed[0])
 
     def messages(self, start: float) -> Iterator[Timed]:
         """All messages from ``start`` [s] on."""
@@ -153,7 +155,7 @@ class Player:
         self.seek_to: float | None = None
         self.playing = True
         self.speed = 1.0
-        self.state = ViewState(recording.is_static)
+        self.state = ViewState(recording.is_static, is_live=False)
         self._next: Timed | None = None
         self._rest: Iterator[Timed] = iter(())
         self.seek(0.0)
@@ -161,7 +163,7 @@ class Player:
     def seek(self, position: float) -> None:
         """Seek: a new state, as it was at ``position`` [s]."""
         self.position = min(max(position, 0.0), self.duration)
-        self.state = ViewState(self._recording.is_static)
+        self.state = ViewState(self._recording.is_static, is_live=False)
         start = max(0.0, self.position - CONTEXT_S)
         for moment, message in self._recording.latched_messages(start if start > 0.0 else 1e-9):
             self.state.handle(message, moment)

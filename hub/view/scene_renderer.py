@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
-from hub.view.panels import SIGNS
-from hub.view.state import CameraState, CameraView, ViewState
+from hub.view.panels import SIGNS, jpeg_fits, track_text
+from hub.view.state import CameraState, CameraView, PathView, ViewState
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
-from protocols.log.write.thumbnails import jpeg_size
 
 if TYPE_CHECKING:
     import viser
 
+Points32 = npt.NDArray[np.float32]
+
 COLOURS: dict[CameraState, tuple[int, int, int]] = {
-    "solved": (30, 110, 190),
+    "calibrated": (30, 110, 190),
+    "degraded": (150, 90, 160),
+    "searching": (120, 120, 120),
     "refused": (200, 60, 30),
     "collecting": (120, 120, 120),
     "silent": (200, 140, 0),
@@ -26,8 +31,12 @@ COLOURS: dict[CameraState, tuple[int, int, int]] = {
 }
 _PATHS = ((214, 96, 20), (30, 130, 90), (120, 70, 170), (20, 120, 160), (170, 40, 90))
 _IMAGES_PER_S = 24.0  # over all cameras: decoding and encoding one image costs 2 ms
-_MAX_PIXELS = 16_000_000  # of an image; a few bytes of JPEG may claim 4 thousand million
 _PATH_S = 20.0  # length of the trajectory that is drawn [s]
+_FADE_S = 1.0  # how often a trajectory fades: between, only what is new is sent [s]
+_MAX_GAP_S = 0.5  # a longer gap is not bridged
+_DASH_S = 0.1  # of the dashes while a track coasts
+_HEAD_OPACITY = {"confirmed": None, "tentative": 0.5, "coasting": 0.6, "stale": 0.25}
+_HINT_WIDTH = 34  # letters
 _ELEVATION = math.radians(35.0)  # of the initial viewpoint
 _TAN_HALF_FOV = 0.9 * math.tan(math.radians(75.0) / 2)  # of viser's default camera, less a margin for labels
 
@@ -55,8 +64,12 @@ class SceneRenderer:
         self._ellipsoids: dict[str, Any] = {}
         self._paths: dict[str, Any] = {}
         self._numbers: dict[str, int] = {}
+        self._faded: dict[str, float] = {}
+        self._placed: dict[str, Pose] = {}
+        self._lenses: dict[str, Intrinsics | None] = {}
         self._drawn: dict[str, Any] = {}
         self._rays: Any = None
+        self._hint: Any = None
         self._size = 1.0
         self._picture_budget, self._budget_at = 1.0, 0.0
         self._framed: tuple[Floats, float] | None = None
@@ -73,30 +86,62 @@ class SceneRenderer:
             self._rays = None
         self._drawn.clear()
         self._numbers.clear()
+        self._faded.clear()
 
     def update(self, state: ViewState, now: float) -> None:
         """Draw what has changed."""
         with self._server.atomic():
-            poses = {name: camera.pose for name, camera in state.cameras.items()}
-            placed = {name: pose for name, pose in poses.items() if pose is not None}
+            placed = self._poses(state)
             self._remove_cameras(set(placed))
             if placed:
                 self._fit_scene(placed, state)
                 for name, pose in placed.items():
                     self._draw_camera(state.cameras[name], pose, now)
+            self._draw_hint(state, bool(placed))
             self._draw_rays(state, placed, now)
-            self._draw_paths(state)
+            self._draw_tracks(state, now)
         if placed and self.options.pictures:
             self._draw_pictures(state, placed, now)
+
+    def update_tracks(self, state: ViewState, now: float) -> None:
+        """Draw what moves at camera rate, the rays and the tracks: cheap enough for every cycle."""
+        with self._server.atomic():
+            self._draw_rays(state, self._poses(state), now)
+            self._draw_tracks(state, now)
+
+    def _poses(self, state: ViewState) -> dict[str, Pose]:
+        """The known poses of the cameras; with the lenses, computed anew for a new calibration only."""
+        key = (id(state), state.revision, sum(camera.info is not None for camera in state.cameras.values()))
+        if self._drawn.get("poses") != key:
+            self._drawn["poses"] = key
+            poses = ((name, camera.pose) for name, camera in state.cameras.items())
+            self._placed = {name: pose for name, pose in poses if pose is not None}
+            self._lenses = {name: _lens(state.cameras[name]) for name in self._placed}
+        return self._placed
+
+    def _draw_hint(self, state: ViewState, is_placed: bool) -> None:
+        """What to do, in the middle of an empty scene."""
+        steps = [] if is_placed else state.next_steps()
+        # Instead of it, images of cameras or of a drone may be shown.
+        images = any(self._scene.get_handle_by_name(f"/pictures/{name}") is not None for name in state.cameras)
+        text = "" if images or not steps else "\n".join(textwrap.wrap(steps[0], _HINT_WIDTH))
+        if self._drawn.get("hint", "") == text:
+            return
+        self._drawn["hint"] = text
+        if self._hint is None:
+            self._hint = self._scene.add_label(
+                "/hint", text, position=(0, 0, 1.2), anchor="center-center", font_screen_scale=1.4
+            )
+        self._hint.text, self._hint.visible = text, bool(text)
 
     def _fit_scene(self, placed: dict[str, Pose], state: ViewState) -> None:
         """Set symbol size, ground grid and initial viewpoint from the positions of cameras and points."""
         centres = np.array([pose.position for pose in placed.values()])
-        points = [path.array()[:, 1:4] for path in state.paths.values() if path.points]
-        key = (tuple(np.round(centres.ravel(), 2)), bool(points))
+        key = (tuple(np.round(centres.ravel(), 2)), any(path.points for path in state.paths.values()))
         if self._drawn.get("measure") == key:
             return
         self._drawn["measure"] = key
+        points = [path.array()[:, 1:4] for path in state.paths.values() if path.points]
         everything = np.concatenate([centres, *points])
         low, high = np.percentile(everything, [2, 98], axis=0)
         extent = max(float(np.linalg.norm(high - low)), 1e-6)
@@ -150,7 +195,7 @@ class SceneRenderer:
             self.frusta_moved += 1
         std_ms = 1e3 * found.time_offset_std
         sharp = f"± {std_ms:.2g} ms" if std_ms > 0.0 else "reference clock"
-        text = f"{SIGNS[status]} {name}  {sharp if status == 'solved' else status}"
+        text = f"{SIGNS[status]} {name}  {sharp if status == 'calibrated' else status}"
         if self._drawn.get(f"text {name}") != text:
             self._drawn[f"text {name}"] = text
             self._labels[name].text = text
@@ -176,11 +221,11 @@ class SceneRenderer:
 
     def _draw_rays(self, state: ViewState, placed: dict[str, Pose], now: float) -> None:
         """A line from each camera towards its present detections, as long as the distance of the last point."""
-        starts, ends, colours = [], [], []
+        starts, ends = [], []
         last = [path.points[-1][1:4] for path in state.paths.values() if path.points]
         for name, pose in placed.items() if self.options.rays else ():
             camera = state.cameras[name]
-            lens = _lens(camera)
+            lens = self._lenses.get(name)
             if lens is None or camera.last_seen is None or now - camera.last_seen > 0.3 or not camera.detections:
                 continue
             pixels = np.array([[u, v] for u, v, _ in camera.detections[:16]])
@@ -190,7 +235,6 @@ class SceneRenderer:
             seen = seen / np.linalg.norm(seen, axis=1, keepdims=True) * far
             starts += [pose.position] * len(rays)
             ends += list(pose.world_from_camera(seen))
-            colours += [[COLOURS[camera.state(now)]] * 2] * len(rays)
         intersection = _nearest_point(np.array(starts), np.array(ends), 0.05 * self._size)
         points = np.array(
             [[start, end if intersection is None else intersection] for start, end in zip(starts, ends, strict=True)],
@@ -204,47 +248,72 @@ class SceneRenderer:
             if self._rays is not None:
                 self._rays.visible = False
             return
-        shades = np.array(colours, dtype=np.uint8)
-        if self._rays is None or len(self._rays.points) != len(points):
-            self._rays = self._scene.add_line_segments("/rays", points, shades, thickness=1.5, thickness_units="screen")
-        self._rays.points, self._rays.colors, self._rays.visible = points, shades, True
+        if self._rays is None:
+            colour = COLOURS["calibrated"]
+            self._rays = self._scene.add_line_segments("/rays", points, colour, thickness=1.5, thickness_units="screen")
+        self._rays.points, self._rays.visible = points, True
 
-    def _draw_paths(self, state: ViewState) -> None:
+    def _draw_tracks(self, state: ViewState, now: float) -> None:
         for label in [label for label in self._numbers if label not in state.paths]:
             key = f"/paths/{self._numbers.pop(label)}"
-            for name in (key, f"{key}/head"):
+            for name in (key, f"{key}/recent", f"{key}/head", f"{key}/label"):
                 if name in self._paths:
                     self._paths.pop(name).remove()
+            self._draw_uncertainty(f"/uncertainty{key}", np.zeros(3), np.zeros(0), (0, 0, 0))
+            self._drawn.pop(f"path {label}", None)
+            self._faded.pop(key, None)
+        options = (self.options.paths, self.options.uncertainty_scale, self.options.uncertainty, self._size)
         for label, path in state.paths.items():
             if label not in self._numbers:
                 free = set(range(len(self._numbers) + 1)) - set(self._numbers.values())
                 self._numbers[label] = min(free)
-            index = self._numbers[label]
-            drawn = (path.count, self.options.paths, self.options.uncertainty_scale, self.options.uncertainty)
-            if self._drawn.get(f"path {label}") == drawn or not path.points:
-                continue
-            self._drawn[f"path {label}"] = drawn
-            table = path.array()
-            table = table[table[:, 0] > table[-1, 0] - _PATH_S]
-            paint = _PATHS[index % len(_PATHS)]
-            colour = np.array(paint)
-            key = f"/paths/{index}"
-            gaps = np.diff(table[:, 0]) < 0.5
-            points = np.stack([table[:-1, 1:4], table[1:, 1:4]], axis=1)[gaps].astype(np.float32)
-            if self.options.paths and len(points):
-                age = (table[-1, 0] - table[1:, 0])[gaps] / _PATH_S
-                fade = np.clip(0.75 * age, 0.0, 0.75)[:, None]
-                shades = np.repeat(((1 - fade) * colour + fade * 235)[:, None], 2, axis=1).astype(np.uint8)
-                self._paths[key] = self._scene.add_line_segments(
-                    key, points, shades, thickness=3.0, thickness_units="screen"
-                )
-            elif key in self._paths:
-                self._paths.pop(key).remove()
-            head = table[-1]
-            self._paths[f"{key}/head"] = self._scene.add_icosphere(
-                f"{key}-head", 0.012 * self._size, paint, subdivisions=2, position=head[1:4]
+            drawn = (path.count, path.state(now), int(now - path.at), len(state.paths), *options)
+            if self._drawn.get(f"path {label}") != drawn:
+                self._drawn[f"path {label}"] = drawn
+                key, paint = f"/paths/{self._numbers[label]}", _PATHS[self._numbers[label] % len(_PATHS)]
+                self._draw_trail(key, path, paint)
+                self._draw_head(key, path, paint, now, named=len(state.paths) > 1)
+
+    def _draw_trail(self, key: str, path: PathView, paint: tuple[int, int, int]) -> None:
+        """The trajectory: what is older than ``_FADE_S`` is sent that often, what is newer each time."""
+        newest = path.points[-1][0]
+        faded = self._faded.get(key)
+        if faded is None or not 0.0 <= newest - faded < _FADE_S:
+            # From the newest point that is certainly kept.
+            self._faded[key] = faded = path.points[-min(2, len(path.points))][0]
+            segments, times = trail_segments(path.array(newest - _PATH_S))
+            fade = 0.75 * np.clip((newest - times) / _PATH_S, 0.0, 1.0)[:, None]
+            shades = np.repeat(((1 - fade) * paint + fade * 235)[:, None], 2, axis=1).astype(np.uint8)
+            self._draw_lines(key, segments, shades)
+        self._draw_lines(f"{key}/recent", trail_segments(path.array(faded))[0], np.array(paint, dtype=np.uint8))
+
+    def _draw_lines(self, name: str, segments: Points32, colours: npt.NDArray[np.uint8]) -> None:
+        lines = self._paths.get(name)
+        visible = self.options.paths and len(segments) > 0
+        if not visible:
+            if lines is not None:
+                lines.visible = False
+        elif lines is None:
+            self._paths[name] = self._scene.add_line_segments(
+                name.replace("/recent", "-recent"), segments, colours, thickness=3.0, thickness_units="screen"
             )
-            self._draw_uncertainty(f"/uncertainty/path-{index}", head[1:4], np.full(3, head[4]), paint)
+        else:
+            lines.points, lines.colors, lines.visible = segments, colours, True
+
+    def _draw_head(self, key: str, path: PathView, paint: tuple[int, int, int], now: float, *, named: bool) -> None:
+        """A ball at the newest point, hollow while the track coasts, and what it is in words if it is not confirmed."""
+        status, (_, *place, std, _) = path.state(now), path.points[-1]
+        head, label = self._paths.get(f"{key}/head"), self._paths.get(f"{key}/label")
+        if head is None or label is None:
+            head = self._scene.add_icosphere(f"{key}-head", 1.0, paint, subdivisions=1)
+            label = self._scene.add_label(f"{key}-label", "", anchor="bottom-left")
+            self._paths[f"{key}/head"], self._paths[f"{key}/label"] = head, label
+        head.position, head.scale = np.array(place), 0.012 * self._size
+        head.wireframe, head.opacity = status == "coasting", _HEAD_OPACITY.get(status)
+        text = "" if status == "confirmed" and not named else track_text(path, now)
+        label.position, label.text, label.visible = np.array(place), text, bool(text)
+        stds = np.full(0 if status == "stale" else 3, std)
+        self._draw_uncertainty(f"/uncertainty{key}", np.array(place), stds, paint)
 
     def _draw_pictures(self, state: ViewState, placed: dict[str, Pose], now: float) -> None:
         """Show the newest images in the frusta, those that have waited longest first."""
@@ -276,6 +345,17 @@ class SceneRenderer:
                 ellipsoid.remove()
             for key in [key for key in self._drawn if key.endswith((f" {name}", f"/{name}"))]:
                 del self._drawn[key]
+
+
+def trail_segments(table: Floats) -> tuple[Points32, Floats]:
+    """The lines (m, 2, 3) of a trajectory and their times (m,) [s]: no line over a gap, dashes where it coasts.
+
+    table: as `PathView.array`.
+    """
+    times, coasting = table[1:, 0], table[1:, 5] > 0.0
+    kept = (np.diff(table[:, 0]) < _MAX_GAP_S) & ~(coasting & ((times / _DASH_S).astype(np.int64) % 2 == 1))
+    segments = np.stack([table[:-1, 1:4], table[1:, 1:4]], axis=1)[kept]
+    return segments.astype(np.float32), times[kept]
 
 
 def fit_viewpoint(points: Floats, up: Floats, radius: float) -> tuple[Floats, Floats]:
@@ -324,8 +404,7 @@ def decode_jpeg(jpeg: bytes) -> Any:
     """A JPEG decoded to (H, W, 3) RGB; None if it is invalid or too large."""
     import cv2
 
-    size = jpeg_size(jpeg)
-    if size is None or size[0] * size[1] > _MAX_PIXELS:
+    if not jpeg_fits(jpeg):
         return None
     image = cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), cv2.IMREAD_COLOR) if jpeg else None
     return None if image is None else np.ascontiguousarray(image[..., ::-1])

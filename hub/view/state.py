@@ -5,6 +5,7 @@ No sockets, no clock and no browser code: the same state is shown live and in re
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Literal
@@ -13,6 +14,7 @@ import numpy as np
 from google.protobuf.message import Message
 
 from hub.calibration.coverage import CoverageMonitor
+from hub.view.lag_history import LagHistory
 from hub.view.uav_state import UavView
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry import so3
@@ -22,19 +24,32 @@ from protocols.messages import syncline_pb2 as pb
 
 SILENT_S = 2.0
 """A camera without a frame for longer than this is silent."""
+STALE_S = 5.0
+"""An agent without a status, or a track without a message, for longer than this is not to be trusted."""
 _RATE_S = 3.0  # window of the frame rate [s]
-_PATH_POINTS = 1200
+_PATH_POINTS = 700
+_PATH_INTERVAL_S = 1 / 30  # between two kept points of a trajectory: tracks come at up to 120 Hz
+_NEW_CLOCK_S = 5.0  # a track that goes back by more is on another clock
 _MAX_PATHS = 48  # tracked people get new labels: the track not updated for longest is dropped
+_MAX_PROBLEMS = 3  # in the headline
 
-CameraState = Literal["solved", "refused", "collecting", "silent", "gone"]
+CameraState = Literal["calibrated", "degraded", "searching", "collecting", "refused", "silent", "gone"]
+"""The hub's word for a camera, or that no frames come."""
+_WORDS: dict[str, CameraState] = {
+    "calibrated": "calibrated",
+    "degraded": "degraded",
+    "searching": "searching",
+    "refused": "refused",
+}
 
 
 @dataclass(slots=True, eq=False)
 class CameraView:
     """One camera. Times are the view's own [s]; calibration is None until a hub has published one.
 
-    lost: missing frames by sequence number. detections: of the last frame: u, v, size [px]; by_frame: of the last
-    frames. is_static: the camera is from a calibration file, so no frames are expected.
+    verdict, reason: the hub's word for it, and why. refused: the reason if it is refused. lost: missing frames by
+    sequence number. detections: of the last frame: u, v, size [px]; by_frame: of the last frames. is_static: the camera
+    is from a calibration file, so no frames are expected.
     """
 
     name: str
@@ -47,14 +62,19 @@ class CameraView:
     last_frame: float | None = None
     last_seen: float | None = None
     detections: list[tuple[float, float, float]] = field(default_factory=list)
-    by_frame: deque[tuple[int, list[tuple[float, float, float]]]] = field(default_factory=lambda: deque(maxlen=128))
+    by_frame: deque[tuple[int, list[tuple[float, float, float]]]] = field(default_factory=lambda: deque(maxlen=512))
     arrivals: deque[float] = field(default_factory=lambda: deque(maxlen=256))
     calibration: pb.CameraCalibration | None = None
+    progress: pb.CameraProgress | None = None
+    lags: LagHistory = field(default_factory=LagHistory)
+    verdict: CameraState = "collecting"
+    reason: str = ""
     refused: str = ""
     refusals: int = 0
     alive: bool = True
     picture: pb.Picture | None = None
     pictures: int = 0
+    last_picture: float | None = None
     sequence: int = -1
     is_static: bool = False
 
@@ -84,38 +104,71 @@ class CameraView:
             return "gone"
         if not self.is_static and (self.last_frame is None or now - self.last_frame > SILENT_S):
             return "silent"
-        if self.refused:
-            return "refused"
-        return "solved" if self.calibration is not None else "collecting"
+        return self.verdict
+
+
+PathPoint = tuple[float, float, float, float, float, float]
+"""Reference time [s], x, y, z, std of one axis, 1 if coasting."""
 
 
 @dataclass(slots=True, eq=False)
 class PathView:
-    """The trajectory of one point: reference time [s], x, y, z, std of one axis; newest last."""
+    """The trajectory of one point, newest last. last: its last message; at: when it came [s]; count: of messages."""
 
     label: str
-    points: deque[tuple[float, float, float, float, float]] = field(default_factory=lambda: deque(maxlen=_PATH_POINTS))
-    state: str = ""
+    last: pb.Track
+    points: deque[PathPoint] = field(default_factory=lambda: deque(maxlen=_PATH_POINTS))
+    at: float = 0.0
     count: int = 0
 
-    def array(self) -> Floats:
-        """(n, 5) in order of time."""
-        return np.array(sorted(self.points), dtype=np.float64).reshape(-1, 5)
+    def add(self, message: pb.Track, now: float) -> None:
+        """Add a message; of points closer together than 1/30 s only the newest is kept."""
+        variance = message.position_covariance[::4]
+        std = float(np.sqrt(np.mean(variance))) if variance else 0.0
+        x, y, z = message.position
+        time = message.reference_time_ns / NANOSECONDS
+        points = self.points
+        if points and time < points[-1][0] - _NEW_CLOCK_S:
+            points.clear()
+        if len(points) > 1 and 0.0 <= points[-1][0] - points[-2][0] < _PATH_INTERVAL_S:
+            points.pop()
+        points.append((time, x, y, z, std, float(message.state == "coasting")))
+        self.last, self.at, self.count = message, now, self.count + 1
+
+    def state(self, now: float) -> str:
+        """The hub's word for the track, "stale" if none has come for long."""
+        return "stale" if now - self.at > STALE_S else self.last.state
+
+    def array(self, after: float = -np.inf) -> Floats:
+        """(n, 6) in order of time: the columns of `PathPoint`. after: a reference time [s]; only points not before."""
+        found = list(itertools.takewhile(lambda point: point[0] >= after, reversed(self.points)))
+        return np.array(sorted(found), dtype=np.float64).reshape(-1, 6)
 
 
 @dataclass(slots=True, eq=False)
 class AgentView:
-    """One hub or recorder: its last status and its arrival time [s]."""
+    """One agent: its last status and its arrival time [s].
+
+    since: when a recorder began, or ceased, to record [s]; at the latest, unless the change was seen.
+    """
 
     status: pb.AgentStatus
     at: float
+    since: float = 0.0
+    change_seen: bool = False
+    alive: bool = True
+
+    @property
+    def recording(self) -> bool:
+        """Whether a recorder writes a log now."""
+        return self.alive and self.status.state != "stopping" and bool(self.status.gauges.get("recording", 1.0))
 
 
 class ViewState:
     """All data that a view shows. ``handle`` takes messages with the view's time [s, any monotonic clock]."""
 
-    def __init__(self, is_static: bool = False) -> None:
-        self._is_static = is_static
+    def __init__(self, is_static: bool = False, *, is_live: bool = True) -> None:
+        self._is_static, self._is_live = is_static, is_live
         self.cameras: dict[str, CameraView] = {}
         self.paths: dict[str, PathView] = {}
         self.agents: dict[str, AgentView] = {}
@@ -130,13 +183,13 @@ class ViewState:
         if isinstance(message, pb.Observation):
             self._observe(message, now)
         elif isinstance(message, pb.Track):
-            self._add_track(message)
+            self._add_track(message, now)
         elif isinstance(message, pb.Picture):
             if message.camera in self.uavs:
                 self.uavs[message.camera].show_thumbnail(message, now)
                 return
             camera = self._camera(message.camera)
-            camera.picture, camera.pictures = message, camera.pictures + 1
+            camera.picture, camera.pictures, camera.last_picture = message, camera.pictures + 1, now
         elif isinstance(message, (pb.TargetState, pb.TargetCloud, pb.RoadMap, pb.UavInfo, pb.FlightImage)):
             self._uav(message.agent).handle(message, now)
         elif isinstance(message, pb.AgentStatus) and message.role == "uav":
@@ -145,9 +198,9 @@ class ViewState:
             self._camera(message.camera).info = message
             self.guidance.handle(message)
         elif isinstance(message, pb.Calibration):
-            self._calibrate(message)
-        elif isinstance(message, pb.AgentStatus) and message.role != "camera":
-            self.agents[message.agent] = AgentView(message, now)
+            self._calibrate(message, now)
+        elif isinstance(message, pb.AgentStatus):
+            self._hear(message, now)
 
     def presence(self, role: str, agent: str, alive: bool, boot: str) -> None:
         """An agent appeared or disappeared; of a restarted camera only the newest boot id counts."""
@@ -155,32 +208,73 @@ class ViewState:
             camera = self._camera(agent)
             if alive or camera.boot in ("", boot):
                 camera.alive = alive
+                if not alive:
+                    self.agents.pop(agent, None)
         elif role == "uav":
             if alive:
                 self._uav(agent)
             elif agent in self.uavs and self.uavs[agent].boot in ("", boot):
                 del self.uavs[agent]
         elif not alive and agent in self.agents and self.agents[agent].status.boot_id == boot:
-            del self.agents[agent]
+            self.agents[agent].alive = False
 
     def of_role(self, role: str) -> list[AgentView]:
-        """The agents of a role, by name."""
-        return [self.agents[name] for name in sorted(self.agents) if self.agents[name].status.role == role]
+        """The running agents of a role, by name."""
+        agents = (self.agents[name] for name in sorted(self.agents))
+        return [agent for agent in agents if agent.alive and agent.status.role == role]
+
+    @property
+    def hub_state(self) -> str:
+        """The hub's own word for the site: its state, or the status of an older hub; "" if none was heard."""
+        return "" if self.calibration is None else _word(self.calibration)
 
     def headline(self) -> str:
-        """One line of status for the whole site."""
-        found = self.calibration
+        """One line of status for the whole site; its first word is the hub's state."""
+        found, word = self.calibration, self.hub_state
         if not self.cameras and self.uavs:
             return f"{len(self.uavs)} drone{'s' if len(self.uavs) > 1 else ''}"
         if not self.cameras:
             return "waiting for cameras"
         if found is None:
-            return f"{len(self.cameras)} cameras, no calibration received yet"
-        if found.status == "solved":
-            stds = [camera.time_offset_std for camera in found.cameras]
-            refused = f", {len(found.refused)} refused" if found.refused else ""
-            return f"{len(found.cameras)} cameras calibrated, offsets ± {1e3 * max(stds, default=0.0):.2f} ms{refused}"
-        return f"{found.status}: {found.reason}"
+            return f"waiting for a hub: {_counted(len(self.cameras))}, no calibration received yet"
+        if word not in ("calibrated", "degraded"):
+            return f"{word}: {found.reason}"
+        shown = self.solved or found
+        stds = [camera.time_offset_std for camera in shown.cameras]
+        refused = sum(camera.verdict == "refused" for camera in self.cameras.values())
+        parts = [
+            f"{word}: {_counted(len(shown.cameras))}",
+            f"lags ± {1e3 * max(stds, default=0.0):.2g} ms",
+            f"{refused} refused" if refused else "",
+            found.reason if word == "degraded" else "",
+        ]
+        return ", ".join(part for part in parts if part)
+
+    def problems(self, now: float) -> list[str]:
+        """What is wrong with the agents of the site, by name; empty while all are well."""
+        out = [] if self._is_static else [text for camera in self.cameras.values() if (text := _absence(camera, now))]
+        for name, agent in sorted(self.agents.items()):
+            role, status = agent.status.role, agent.status
+            if not agent.alive:
+                if not self.of_role(role):
+                    out.append(f"{name} has ended" + (f": {status.message}" if status.state == "stopping" else ""))
+            elif status.state == "degraded" or (status.state == "stopping" and role == "record"):
+                out.append(f"{name}: {status.message or status.state}")
+            elif role != "camera" and now - agent.at > STALE_S:
+                out.append(f"{name} has sent no status for {now - agent.at:.0f} s")
+        more = len(out) - _MAX_PROBLEMS
+        return [*out[:_MAX_PROBLEMS], f"{more} more"] if more > 0 else out
+
+    def next_steps(self) -> list[str]:
+        """What to do next, the most urgent first; empty if nothing is missing."""
+        if self._is_static or (self.uavs and not self.cameras):
+            return []
+        steps = []
+        if self._is_live and not self.cameras:
+            steps.append("no camera yet: start one on each camera's machine: syncline camera camera.toml")
+        if self._is_live and self.calibration is None and not self.of_role("hub"):
+            steps.append("no hub yet: start one: syncline hub hub.toml")
+        return [*steps, *(advice.text for advice in self.guidance.advice())]
 
     def _camera(self, name: str) -> CameraView:
         if name not in self.cameras:
@@ -218,28 +312,73 @@ class ViewState:
             camera.last_seen = now
         self.guidance.handle(message)
 
-    def _add_track(self, message: pb.Track) -> None:
-        path = self.paths.pop(message.label, None) or PathView(message.label)
-        self.paths[message.label] = path  # most recently updated last
+    def _hear(self, message: pb.AgentStatus, now: float) -> None:
+        """Process the status of a camera, hub or recorder."""
+        before, agent = self.agents.get(message.agent), AgentView(message, now, since=now)
+        if before is not None:
+            agent.change_seen = before.recording != agent.recording
+            if not agent.change_seen:
+                agent.since, agent.change_seen = before.since, before.change_seen
+        self.agents[message.agent] = agent
+
+    def _add_track(self, message: pb.Track, now: float) -> None:
+        path = self.paths.pop(message.label, None)
+        if message.state == "lost":
+            return
+        self.paths[message.label] = path = path or PathView(message.label, message)  # most recently updated last
         while len(self.paths) > _MAX_PATHS:
             del self.paths[next(iter(self.paths))]
-        variance = message.position_covariance[::4]
-        std = float(np.sqrt(np.mean(variance))) if variance else 0.0
-        x, y, z = message.position
-        path.points.append((message.reference_time_ns / NANOSECONDS, x, y, z, std))
-        path.state, path.count = message.state, path.count + 1
+        path.add(message, now)
 
-    def _calibrate(self, message: pb.Calibration) -> None:
+    def _calibrate(self, message: pb.Calibration, now: float) -> None:
+        is_new = self.solved is None or message.revision != self.solved.revision
         self.calibration = message
         self.revision += 1
         refused = {entry.camera: entry.reason for entry in message.refused}
+        progress = {entry.camera: entry for entry in message.progress}
         if message.status == "solved":
             self.solved = message
             solved = {entry.camera: entry for entry in message.cameras}
-            for name in solved:
-                self._camera(name)
+            reference = solved.get(message.reference_camera)
+            for name, found in solved.items():
+                camera = self._camera(name)
+                if is_new:
+                    clocks = (found.boot_id, message.reference_camera, "" if reference is None else reference.boot_id)
+                    camera.lags.add(found, clocks, now)
             for name, camera in self.cameras.items():
                 camera.calibration = solved.get(name)
+        word = _word(message)
+        for name in progress:
+            self._camera(name)
         for name, camera in self.cameras.items():
-            camera.refusals += name in refused and not camera.refused
-            camera.refused = refused.get(name, "")
+            camera.progress, was = progress.get(name), camera.verdict
+            camera.reason = refused.get(name, "")
+            if camera.progress is not None:
+                camera.verdict = _WORDS.get(camera.progress.state, "collecting")
+                camera.reason = camera.progress.reason or camera.reason
+            elif name in refused and word not in ("collecting", "searching"):
+                camera.verdict = "refused"
+            else:
+                waiting: CameraState = "searching" if word == "searching" else "collecting"
+                camera.verdict = waiting if camera.calibration is None else "calibrated"
+            camera.refused = camera.reason if camera.verdict == "refused" else ""
+            camera.refusals += camera.verdict == "refused" != was
+
+
+def _word(message: pb.Calibration) -> str:
+    return message.state or {"solved": "calibrated"}.get(message.status, message.status)
+
+
+def _counted(cameras: int) -> str:
+    return f"{cameras} camera{'' if cameras == 1 else 's'}"
+
+
+def _absence(camera: CameraView, now: float) -> str:
+    """What a camera that sends no frames is said to be; "" for the others."""
+    status = camera.state(now)
+    if status == "gone":
+        return f"{camera.name} is gone"
+    if status != "silent":
+        return ""
+    since = "" if camera.last_frame is None else f" for {now - camera.last_frame:.0f} s"
+    return f"{camera.name} has sent no frames{since}"

@@ -57,8 +57,10 @@ class Tab:
         self.page.on("request", lambda request: self.requests.append(request.url))
 
     def _heard(self, message: Any) -> None:
-        if message.type == "error" and not any(text in message.text for text in _HARMLESS):
-            self.errors.append(message.text)
+        # An image that is replaced before the browser has loaded it is not found: a newer one is shown.
+        replaced = str(message.location.get("url", "")).startswith("blob:") and "ERR_FILE_NOT_FOUND" in message.text
+        if message.type == "error" and not replaced and not any(text in message.text for text in _HARMLESS):
+            self.errors.append(f"{message.text} {message.location.get('url', '')}".strip())
 
     def shot(self, name: str, **options: Any) -> bytes:
         """A screenshot, kept as browser-out/NAME.png."""

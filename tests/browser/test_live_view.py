@@ -59,11 +59,11 @@ def test_the_view_of_a_running_demo(demo: Demo, tab: Tab) -> None:
         page.goto(demo.address)
         for name in NAMES:
             page.wait_for_selector(f"[data-camera={name}]")
-        page.wait_for_selector("[data-state=solved]")
-        page.wait_for_function("document.querySelectorAll('[data-state=solved]').length === 3")
+        page.wait_for_selector("[data-state=calibrated]")
+        page.wait_for_function("document.querySelectorAll('[data-state=calibrated]').length === 3")
         page.wait_for_timeout(1500)
         tab.shot("live")
-        assert "3 cameras calibrated" in page.inner_text("[data-syncline=headline]")
+        assert "calibrated: 3 cameras" in page.inner_text("[data-syncline=headline]")
 
         # The panel shows of cam1 what the hub has published.
         shown: set[str] = set()

@@ -33,7 +33,7 @@ def test_two_simulated_webcams_from_the_page_to_a_calibration(tab: Tab, tmp_path
         page.wait_for_function("Array.from(document.images).some(image => image.naturalWidth >= 300)")
         page.wait_for_timeout(1000)
         tab.shot("quick")
-        page.wait_for_function("document.querySelectorAll('[data-state=solved]').length === 2")
+        page.wait_for_function("document.querySelectorAll('[data-state=calibrated]').length === 2")
         with contextlib.suppress(Error):  # it may have ended already
             page.get_by_role("button", name="Finish").click(timeout=10_000)
         rest, _ = process.communicate(timeout=120)

@@ -54,7 +54,7 @@ def test_a_frustum_moves_when_its_camera_has_moved(tab: Tab) -> None:
             hub = agents.publisher(CALIBRATION, "hub")
             hub.put(solved((0, 0, 0), (2, 0, 0)))
             tab.page.goto(view.address)
-            tab.page.wait_for_function("document.querySelectorAll('[data-state=solved]').length === 2")
+            tab.page.wait_for_function("document.querySelectorAll('[data-state=calibrated]').length === 2")
             count, place = blue(tab, "frusta-before")
             assert count > 100, "the frusta are in view"
             hub.put(solved((0, 0, 0), (2, 0.6, 0), revision=2))
@@ -165,7 +165,7 @@ def test_a_log_can_be_moved_along_its_timeline(tab: Tab, tmp_path: Path) -> None
         time = page.get_by_role("textbox").first
         time.fill("30")
         time.press("Enter")
-        page.wait_for_selector("[data-state=solved]")
+        page.wait_for_selector("[data-state=calibrated]")
         tab.shot("replay")
         time.fill("1")
         time.press("Enter")

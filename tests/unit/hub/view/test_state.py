@@ -50,14 +50,14 @@ def test_frame_rate_and_lost_frames_follow_from_the_frames() -> None:
     assert (camera.restarts, camera.lost) == (1, 9), "another boot id may start at any sequence number"
 
 
-def test_a_camera_is_solved_refused_silent_or_gone() -> None:
+def test_a_camera_is_calibrated_refused_silent_or_gone() -> None:
     state = ViewState()
     now = filming(state)
     camera = state.cameras["cam0"]
     assert camera.state(now) == "collecting"
     solved = calibration()
     state.handle(solved, now)
-    assert camera.state(now) == "solved"
+    assert camera.state(now) == "calibrated"
     assert camera.state(now + SILENT_S + 0.1) == "silent"
     refused = pb.Calibration(schema_version=1, status="refused", reason="moved", revision=9)
     refused.refused.append(pb.Refusal(camera="cam0", reason="it was moved"))
@@ -174,7 +174,7 @@ def test_a_replay_can_seek_forward_and_back(tmp_path: Path) -> None:
     player.seek_to = 30.0
     assert player.advance(0.1), "a seek makes a new state"
     camera = player.state.cameras["cam0"]
-    assert camera.state(player.position) == "solved", "the calibration was published 25 s before"
+    assert camera.state(player.position) == "calibrated", "the calibration was published 25 s before"
     assert camera.fps(player.position) == pytest.approx(10.0, rel=0.05)
     path = player.state.paths["marker"].array()
     assert path[-1, 0] == pytest.approx(30.0, abs=0.11)
@@ -220,7 +220,7 @@ def test_cameras_of_a_calibration_file_are_not_silent(tmp_path: Path) -> None:
     player = Player(CalibrationRecording(tmp_path))
     player.advance(1.0)
     assert player.duration == 1.0
-    assert {camera.state(player.position) for camera in player.state.cameras.values()} == {"solved"}
+    assert {camera.state(player.position) for camera in player.state.cameras.values()} == {"calibrated"}
     assert player.state.paths["marker"].array()[:, 1].tolist() == [1.0, 2.0]
     (tmp_path / "trajectory.csv").write_text("time,x,y,z,std\n5,1,nan,3,0.1\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"trajectory.csv:2: a number is not finite"):
