@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-from contextlib import suppress
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of glibc's mallopt
 _MAX_ARENAS = 2
@@ -48,9 +47,3 @@ def retain_freed_memory() -> bool:
     return bool(set_option(_MMAP_THRESHOLD, _MAX_MMAP_THRESHOLD_BYTES)) and bool(
         set_option(_TRIM_THRESHOLD, _NEVER_TRIM_BYTES)
     )
-
-
-def release_free_pages() -> None:
-    """Return free pages to the system, also those between blocks that are in use; takes about a millisecond."""
-    with suppress(AttributeError, OSError):
-        ctypes.CDLL(None).malloc_trim(0)

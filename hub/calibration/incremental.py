@@ -86,6 +86,7 @@ def update_calibration(
     tied = [name for name in prepared.cameras if name in last.cameras]
     reconstruction = _warm_start(prepared, _initial_states(prepared, last, tied, measured_lenses=full))
     moved = _moved_cameras(reconstruction, prepared)
+    origins = prepared.time_origins
     if moved:
         observations = _without_older_rows(observations, moved)
         prepared = _with_estimated_lenses(rig, prepare(rig, observations), last)
@@ -100,7 +101,11 @@ def update_calibration(
     reasons: dict[str, str] = {}
     new = [name for name in prepared.cameras if name not in placed and name not in moved]
     clocks = {name: _clock_of(state) for name, state in placed.items()}
-    clocks |= {name: _clock_of(_state_of(reconstruction, name)) for name in moved if name in prepared.cameras}
+    for name in moved:
+        if name in prepared.cameras:  # its times count from another row now
+            later = prepared.time_scale(name) * (prepared.time_origins[name] - origins[name])
+            clock = _clock_of(_state_of(reconstruction, name))
+            clocks[name] = replace(clock, centre=clock.centre - later)
     if new and search:
         reconstruction = _warm_start(prepared, placed) if moved else reconstruction
         for name in new:

@@ -452,12 +452,14 @@ def final_adjustment(
     tolerances make early stds honest, does not wait for long residuals to show it.
     """
     report("adjusting", 0.75)
-    problem, state, _ = adjust(
-        reconstruction.problem,
-        reconstruction.state,
-        rounds=2 if warm else 4,
-        progress=lambda text: report(text, 0.75),
-    )
+    problem, state = reconstruction.problem, reconstruction.state
+    if warm and online and state.jitter is None:
+        # Near the solution the re-fit alone converges; where it does not apply, the adjustment does.
+        problem, state = estimate_frame_times(problem, state)
+        refitted = refit_with_correlated_noise(problem, state, min_inflation=1.0)
+        if refitted[1] is not state:
+            return _with_state(reconstruction, *refitted)
+    problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
     problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
     if not warm:
         report("adjusting the lenses", 0.85)

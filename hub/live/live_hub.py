@@ -46,6 +46,9 @@ _SEARCH_EVERY_S = 4.0
 """Between two searches for cameras that are not tied."""
 _FULL_EVERY_S, _FULL_GROWTH = 30.0, 1.5
 """Between two searches over all lags, and the growth of rows from which lenses are decided again."""
+_FIRST_FULL_S = 60.0
+"""Until the first search over all lags where times of arrival bound them: it takes several seconds, and at a right
+arrival it finds nothing more."""
 _SILENT_S = 3.0
 """A calibrated camera without a frame for longer than this degrades the hub."""
 _VERIFY_ROWS, _VERIFY_S = 60, 1.5
@@ -344,14 +347,16 @@ class LiveHub:
         last = self._start_from(boots)
         self._solved_at = self._received
         rows = len(observations)
+        arrivals = {name: p for name, p in self._arrivals.priors().items() if p.boot_id == boots.get(name)}
         untied = last is None or any(name not in last.cameras for name in observations.cameras)
         search = untied and now >= self._next_search
+        if last is None and arrivals and not self._next_full:
+            self._next_full = now + _FIRST_FULL_S
         full = (search and now >= self._next_full) or (last is not None and rows > _FULL_GROWTH * self._full_rows)
         if search:
             self._next_search = now + _SEARCH_EVERY_S
         if full:
             self._next_full, self._full_rows = now + _FULL_EVERY_S, rows
-        arrivals = {name: p for name, p in self._arrivals.priors().items() if p.boot_id == boots.get(name)}
         verify = self._unverified is not None
         job = SolverJob(
             self._jobs + 1,

@@ -1,0 +1,186 @@
+"""Incremental calibration: as good as from scratch, in a gauge that holds, and what it says of cameras that change."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hub.calibration.incremental import update_calibration
+from hub.calibration.pipeline import calibrate
+from hub.clocks.arrival_prior import ERROR_BOUND_S, ArrivalPriors
+from hub.clocks.external_prior import ExternalClockPrior
+from protocols.core.clocks import CameraTime
+from protocols.core.errors import Refused
+from protocols.geometry import so3
+from protocols.geometry.pose import Pose, fit_similarity
+from protocols.session.calibration import Calibration
+from protocols.session.observations import Observations
+from tests.support.rigs import Session, simulate
+
+
+def until(session: Session, true_s: float, **since: float) -> Observations:
+    """The rows until a true time; of the named cameras only those since another."""
+    true = np.array([session.true_time(c, t) for c, t in zip(session.camera, session.time, strict=True)])
+    begin = np.array([since.get(camera, -np.inf) for camera in session.camera])
+    return session.observations(np.flatnonzero((true <= true_s) & (true >= begin)))
+
+
+def priors(session: Session, **wrong: float) -> dict[str, ExternalClockPrior]:
+    """Arrival priors, right within 0.1 s except for the named cameras' errors."""
+    rng = np.random.default_rng(5)
+    return {
+        name: ExternalClockPrior(
+            "", -session.shown(name, 0.0) + rng.uniform(0.0, 0.1) + wrong.get(name, 0.0), ERROR_BOUND_S
+        )
+        for name in session.rig.cameras
+    }
+
+
+def moved_stds(before: Calibration, after: Calibration) -> float:
+    """Largest move of a camera's centre between two answers, in stds."""
+    out = []
+    for name, camera in after.cameras.items():
+        if name in before.cameras:
+            std = np.linalg.norm(np.hypot(camera.position_std, before.cameras[name].position_std))
+            out.append(np.linalg.norm(camera.pose.position - before.cameras[name].pose.position) / max(std, 1e-12))
+    return float(max(out))
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_growing_rows_refine_the_answer_in_a_gauge_that_holds(seed: int) -> None:
+    session = simulate(seed, 4, 50)
+    last: Calibration | None = None
+    for seconds in (20.0, 26.0, 32.0, 38.0, 44.0, 50.0):
+        found = update_calibration(
+            session.rig, until(session, seconds), last, full=last is None, search=last is None
+        ).calibration
+        for name, camera in found.cameras.items():
+            at = CameraTime(camera.lag_time)
+            error = float(camera.time_map.reference_from_camera(at)) - session.shown(
+                found.reference, session.true_time(name, camera.lag_time)
+            )
+            assert abs(error) <= 4.0 * camera.time_offset_std + 1e-6
+        if last is not None:
+            assert moved_stds(last, found) < 3.0
+            assert found.reference == last.reference
+        last = found
+    assert last is not None
+    scratch = calibrate(session.rig, until(session, 50.0))
+    for name, camera in last.cameras.items():
+        at = CameraTime(camera.lag_time)
+        difference = float(camera.time_map.reference_from_camera(at)) - float(
+            scratch.cameras[name].time_map.reference_from_camera(at)
+        )
+        assert abs(difference) <= camera.time_offset_std + 1e-6
+
+
+def test_a_late_camera_joins_by_resection_within_its_arrival_bound() -> None:
+    session = simulate(11, 4, 40)
+    first = update_calibration(session.rig, without(until(session, 25.0), "cam3"), None).calibration
+    assert set(first.cameras) == {"cam0", "cam1", "cam2"}
+    joined = update_calibration(
+        session.rig, until(session, 40.0, cam3=28.0), first, full=False, arrivals=priors(session)
+    ).calibration
+    assert "cam3" in joined.cameras
+    camera = joined.cameras["cam3"]
+    truth = session.shown(joined.reference, session.true_time("cam3", camera.lag_time))
+    assert abs(float(camera.time_map.reference_from_camera(CameraTime(camera.lag_time))) - truth) < 2e-3
+
+
+@pytest.mark.parametrize("error", [-3.0, 0.7, 5.0])
+def test_a_wrong_arrival_gives_no_wrong_lag(error: float) -> None:
+    session = simulate(11, 4, 40)
+    first = update_calibration(session.rig, without(until(session, 25.0), "cam3"), None).calibration
+    rows = until(session, 40.0, cam3=28.0)
+    wrong = priors(session, cam3=error)
+    found = update_calibration(session.rig, rows, first, full=False, arrivals=wrong).calibration
+    assert "cam3" not in found.cameras
+    assert "arrival" in found.refused["cam3"]
+    full = update_calibration(session.rig, rows, found, full=True, arrivals=wrong).calibration
+    camera = full.cameras["cam3"]
+    truth = session.shown(full.reference, session.true_time("cam3", camera.lag_time))
+    assert abs(float(camera.time_map.reference_from_camera(CameraTime(camera.lag_time))) - truth) < 2e-3
+
+
+@pytest.mark.parametrize(("shift_m", "turn_rad"), [(0.0, 0.035), (0.05, 0.0), (0.05, 0.035)])
+def test_a_moved_camera_is_found_again_where_it_stands(shift_m: float, turn_rad: float) -> None:
+    """It must neither drag the others nor lose its clock."""
+    session = simulate(21, 4, 40, windows=[(0, 40)] * 4)
+    pose = session.poses["cam2"]
+    moved = Pose(
+        so3.exp(np.array([0.0, turn_rad, 0.0])) @ pose.rotation, pose.position + shift_m * np.array([0.6, 0.0, 0.8])
+    )
+    lens = session.rig.cameras["cam2"].intrinsics
+    assert lens is not None
+    true = np.array([session.true_time(c, t) for c, t in zip(session.camera, session.time, strict=True)])
+    rows = np.array([c == "cam2" for c in session.camera]) & (true > 30.0)
+    path = session.paths["marker"].at(true[rows])
+    pixels = session.pixels.copy()
+    old, new = lens.project(pose.camera_from_world(path)), lens.project(moved.camera_from_world(path))
+    pixels[rows] += new - old
+    bumped = replace(session, pixels=pixels)
+    last = update_calibration(session.rig, until(bumped, 29.0), None).calibration
+    update = update_calibration(session.rig, until(bumped, 34.0), last, full=False)
+    assert list(update.moved) == ["cam2"]
+    assert abs(session.true_time("cam2", update.moved["cam2"]) - 30.0) < 0.3
+    found = update.calibration
+    assert moved_stds(last, replace(found, cameras={n: c for n, c in found.cameras.items() if n != "cam2"})) < 3.0
+    names = list(session.poses)
+    truth = [moved if name == "cam2" else session.poses[name] for name in names]
+    world = fit_similarity(
+        np.array([found.cameras[name].pose.position for name in names]), np.array([one.position for one in truth])
+    )
+    for name, one in zip(names, truth, strict=True):
+        placed = world.pose(found.cameras[name].pose)
+        assert so3.angle_between(placed.rotation, one.rotation) < 0.005
+    before, after = last.cameras["cam2"].time_map, found.cameras["cam2"].time_map
+    at = CameraTime(update.moved["cam2"])
+    assert abs(float(before.reference_from_camera(at)) - float(after.reference_from_camera(at))) < 3e-3
+
+
+def test_cameras_that_see_nothing_any_more_stay_as_they_were() -> None:
+    session = simulate(3, 4, 40)
+    last = update_calibration(session.rig, until(session, 30.0), None).calibration
+    found = update_calibration(session.rig, without(until(session, 40.0), "cam3"), last, full=False).calibration
+    assert found.cameras["cam3"] == last.cameras["cam3"]
+    assert moved_stds(last, found) < 3.0
+
+
+def test_the_published_clock_goes_on_without_its_camera() -> None:
+    session = simulate(3, 4, 40)
+    last = update_calibration(session.rig, until(session, 30.0), None).calibration
+    rest = replace(last, cameras={name: camera for name, camera in last.cameras.items() if name != last.reference})
+    rows = without(until(session, 40.0), last.reference)
+    found = update_calibration(session.rig, rows, rest, full=False).calibration
+    assert found.reference == last.reference
+    for name, camera in rest.cameras.items():
+        at = CameraTime(camera.lag_time)
+        change = float(found.cameras[name].time_map.reference_from_camera(at)) - float(
+            camera.time_map.reference_from_camera(at)
+        )
+        assert abs(change) < 4.0 * max(camera.time_offset_std, 1e-4)
+
+
+def test_too_few_rows_for_an_answer_are_refused() -> None:
+    session = simulate(3, 3, 20)
+    with pytest.raises(Refused):
+        update_calibration(session.rig, until(session, 3.2), None)
+
+
+def without(observations: Observations, camera: str) -> Observations:
+    return replace(observations, tracks={k: t for k, t in observations.tracks.items() if k[0] != camera})
+
+
+def test_arrival_priors_need_steady_delays() -> None:
+    steady, backlog = ArrivalPriors(), ArrivalPriors()
+    for frame in range(600):
+        time = frame / 30.0
+        steady.handle("a", "b0", time, 1000.0 + time + 0.05 + 0.02 * (frame % 5))
+        backlog.handle("a", "b0", time, 1000.0 + 0.1 * time)
+    prior = steady.priors()["a"]
+    assert abs(prior.unix_minus_camera - 1000.05) < 1e-9
+    assert backlog.priors() == {}
+    steady.handle("a", "b1", 5.0, 1030.0)
+    assert steady.priors() == {}, "another boot is another clock"
