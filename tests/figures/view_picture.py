@@ -33,10 +33,10 @@ def main() -> int:
         try:
             assert process.stdout is not None
             address = process.stdout.readline().split()[-1]
-            page = browser.new_page(viewport={"width": 1400, "height": 780})
+            page = browser.new_page(viewport={"width": 1400, "height": 1000})
             page.set_default_timeout(180_000)
             page.goto(address)
-            page.wait_for_function("document.querySelectorAll('[data-state=solved]').length === 4")
+            page.wait_for_function("document.querySelectorAll('[data-state=calibrated]').length === 4")
             page.wait_for_timeout(15_000)  # part of the path, and images in every frustum
             notice = page.locator(".mantine-Notification-closeButton")
             if notice.count():
