@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from protocols.core.errors import InputError
+from protocols.core.files import write_together
 from protocols.core.version import VERSION
 from protocols.session.calibration import Calibration, calibration_text, read_calibration
 from protocols.session.rig import Rig
@@ -40,14 +41,16 @@ class AnswerStore:
         self._writer = ThreadPoolExecutor(1, "answers")
         self._pending: Future[None] | None = None
 
-    def keep(self, calibration: Calibration, rig: Rig, boot_ids: dict[str, str]) -> None:
-        """Write an answer. boot_ids: by camera, the boot whose clock its time map refers to."""
+    def keep(self, calibration: Calibration, rig: Rig, boot_ids: dict[str, str], delays: dict[str, float]) -> None:
+        """Write an answer. boot_ids, delays: by camera, see `LiveHub.reload`."""
         if self._pending is not None and not self._pending.done():
             self._pending.cancel()  # a slow disk: only the newest counts
-        self._pending = self._writer.submit(self._write, calibration, rig, dict(boot_ids))
+        self._pending = self._writer.submit(
+            self._write, calibration, rig, {"boot_ids": dict(boot_ids), "delays": dict(delays)}
+        )
 
-    def load(self) -> tuple[Calibration, dict[str, str]] | None:
-        """The last answer and its boot ids, if it is recent and readable."""
+    def load(self) -> tuple[Calibration, dict[str, str], dict[str, float]] | None:
+        """The last answer with its boot ids and delays, if it is recent and readable."""
         file = self.folder / LAST
         try:
             if not file.is_file() or abs(time.time() - file.stat().st_mtime) > _MAX_AGE_S:
@@ -55,21 +58,20 @@ class AnswerStore:
             rig, cameras = read_calibration(file)
         except (InputError, OSError):
             return None
-        boots = rig.metadata.get("boot_ids")
-        if not isinstance(boots, dict) or len(cameras) < 2:
+        boots, delays = rig.metadata.get("boot_ids"), rig.metadata.get("delays")
+        if not isinstance(boots, dict) or not isinstance(delays, dict) or len(cameras) < 2:
             return None
         metadata = {key: str(rig.metadata.get(key, "")) for key in ("reference", "scale")}
         calibration = Calibration(cameras, metadata["reference"], metadata["scale"], rig.units, "joint", VERSION)
-        return calibration, {name: str(boot) for name, boot in boots.items()}
+        seconds = {name: float(delay) for name, delay in delays.items() if isinstance(delay, int | float)}
+        return calibration, {name: str(boot) for name, boot in boots.items()}, seconds
 
     def close(self) -> None:
         """Wait for the last answer to be written."""
         self._writer.shutdown(wait=True)
 
-    def _write(self, calibration: Calibration, rig: Rig, boot_ids: dict[str, str]) -> None:
-        from protocols.core.files import write_together
-
-        text = calibration_text(calibration, replace(rig, metadata={**rig.metadata, "boot_ids": boot_ids}))
+    def _write(self, calibration: Calibration, rig: Rig, clocks: dict[str, object]) -> None:
+        text = calibration_text(calibration, replace(rig, metadata={**rig.metadata, **clocks}))
         history = self.folder / HISTORY
         try:
             write_together({self.folder / LAST: text, history / f"{time.time_ns() // 1_000_000}.toml": text})

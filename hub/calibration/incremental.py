@@ -112,8 +112,8 @@ def update_calibration(
             reasons[name] = "no common clock bounds its lag yet"
             expected = _expected_clock(prepared, name, reconstruction, {**(arrivals or {}), **(clock_priors or {})})
             if expected is not None:
-                clock, reasons[name] = scan_resection(prepared.cameras[name], reconstruction, *expected)
-                clocks |= {} if clock is None else {name: clock}
+                found_clock, reasons[name] = scan_resection(prepared.cameras[name], reconstruction, *expected)
+                clocks |= {} if found_clock is None else {name: found_clock}
         unknown = [name for name in new if name not in clocks]
         if full and unknown:
             prepared, pairs = solve_new_pairs(prepared, unknown, list(placed), clock_priors)
@@ -337,10 +337,12 @@ def _tied_pairs(names: list[str], pairs: list[PairSolution]) -> tuple[PairSoluti
 
 
 def _in_published_clock(found: Calibration, last: Calibration) -> Calibration:
-    """The answer on the published reference clock, where its reference camera is not in the answer any more."""
-    if found.reference == last.reference or found.reference not in last.cameras:
+    """The answer on the published reference clock: its camera may be gone, or its clock may have been set since."""
+    if found.reference not in last.cameras:
         return found
     base = last.cameras[found.reference].time_map
+    if base == TimeMap(clock_rate=1.0, time_offset=0.0):
+        return found
     cameras = {
         name: replace(
             camera,

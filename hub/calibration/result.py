@@ -54,7 +54,11 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         gauge = scaled_by_bars(gauge, measure_scale_bars(rig, reconstruction.labels, problem, state))
         if published is not None and gauge.scale == "arbitrary":
             held, datum_points = similarity_to_published(
-                published, names, reconstruction.labels, state, _internal_time(solution, names, state, reference)
+                published,
+                names,
+                reconstruction.labels,
+                state,
+                _internal_time(solution, names, state, reference, published),
             )
             gauge = replace(gauge, similarity=held)
         state = transform_state(state, gauge.similarity)
@@ -156,11 +160,18 @@ def trajectory_tables(
 
 
 def _internal_time(
-    solution: Solution, names: list[str], state: AdjustmentState, reference: int
+    solution: Solution, names: list[str], state: AdjustmentState, reference: int, published: Calibration
 ) -> Callable[[Floats], Floats]:
-    """Internal times (n,) from times on the reference camera's clock (n,)."""
+    """Internal times (n,) from published reference times (n,), by the published map of camera ``reference``."""
     prepared, name, base = solution.prepared, names[reference], state.cameras[reference]
-    return lambda time: base.reference_time((time - prepared.time_origins[name]) * prepared.time_scale(name))
+    known = published.cameras.get(name)
+    clock = TimeMap(clock_rate=1.0, time_offset=0.0) if known is None else known.time_map
+
+    def internal(time: Floats) -> Floats:
+        camera_time = (time - clock.time_offset) / clock.clock_rate
+        return base.reference_time((camera_time - prepared.time_origins[name]) * prepared.time_scale(name))
+
+    return internal
 
 
 def _reference_index(rig: Rig, names: list[str]) -> int:

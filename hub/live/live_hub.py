@@ -51,8 +51,11 @@ _FIRST_FULL_S = 60.0
 arrival it finds nothing more."""
 _SILENT_S = 3.0
 """A calibrated camera without a frame for longer than this degrades the hub."""
-_VERIFY_ROWS, _VERIFY_S = 60, 1.5
-"""Detections and seconds that a reloaded calibration is verified with."""
+_VERIFY_ROWS, _VERIFY_S = 60, 15.0
+"""Detections of two cameras that a reloaded calibration is verified with, and seconds after which it is dropped."""
+_VERIFY_EVERY_S = 0.5
+_SAME_CLOCK_S = 1.0
+"""Largest change of a camera's delay against the hub's clock for a reloaded time map to be of the same clock."""
 _MAX_STD_GROWTH = 1.5
 """An answer whose stds are larger than the present one's by this factor is not taken: its rows say less."""
 
@@ -113,6 +116,8 @@ class LiveHub:
         self._rate_changes = RateChanges()
         self.clock_priors = ExternalClockPriors()
         self._arrivals = ArrivalPriors()
+        self.delays: dict[str, float] = {}
+        """By camera, arrival of its newest frame on the hub's clock less its time on the camera's [s]."""
         self._boots: dict[str, str] = {}
         self._clock_stepped = False
         self.guidance = CoverageMonitor()
@@ -141,6 +146,8 @@ class LiveHub:
         self._solved_boot_ids: dict[str, str] = {}
         self._unverified: Calibration | None = None
         self._unverified_boots: dict[str, str] = {}
+        self._unverified_delays: dict[str, float] = {}
+        self._unverified_since: float | None = None
         if self._known is not None:
             self._use_known(self._known)
 
@@ -158,7 +165,9 @@ class LiveHub:
                 self._rate_changes.handle(event)
                 self._clock_stepped = True
             if arrival is not None:
-                self._arrivals.handle(message.camera, message.boot_id, message.device_time_ns / NANOSECONDS, arrival)
+                camera_time = message.device_time_ns / NANOSECONDS
+                self._arrivals.handle(message.camera, message.boot_id, camera_time, arrival)
+                self.delays[message.camera] = arrival - camera_time
             self._last_frame[message.camera] = self._now
         self.guidance.handle(message)
         if self.tracking is not None:
@@ -183,14 +192,15 @@ class LiveHub:
         self.guidance.reset()
         self._begin()
 
-    def reload(self, calibration: Calibration, boot_ids: dict[str, str]) -> None:
+    def reload(self, calibration: Calibration, boot_ids: dict[str, str], delays: dict[str, float]) -> None:
         """Go on with an earlier answer, unverified until the first consistent second.
 
-        boot_ids: by camera, the boot whose clock its time map refers to; cameras that were restarted since are left
-        out. A hub that was killed tracks again at once.
+        boot_ids, delays: of its cameras then; cameras that were restarted since, or whose clock was set, are left out.
+        A hub that was killed tracks again at once.
         """
         if self._known is None and self.calibration is None:
             self._unverified, self._unverified_boots = calibration, dict(boot_ids)
+            self._unverified_delays, self._unverified_since = dict(delays), None
 
     def clock_contradictions(self) -> list[str]:
         """Cameras whose external clock prior (NTP/PTP) the calibration contradicts, one line each."""
@@ -201,7 +211,8 @@ class LiveHub:
     def missing(self) -> str:
         """What is missing before solving is tried; "" if nothing."""
         cameras = self._builder.cameras
-        if self._unverified is not None:
+        if self.unverified:
+            assert self._unverified is not None
             rows = [self._builder.rows(name) for name in self._unverified.cameras]
             return "" if sum(count >= _VERIFY_ROWS for count in rows) >= 2 else "verifying the reloaded calibration"
         if len(cameras) < 2:
@@ -315,10 +326,12 @@ class LiveHub:
             self._clock_stepped = False
             return self._publish_present()
         if self._unverified is not None and self.calibration is None:
-            return self._publish_unverified()
+            reloaded = self._publish_unverified()
+            if reloaded:
+                return reloaded
         if self.solver.busy or (not final and now < self._next):
             return []
-        self._next = now + self.settings.interval_s
+        self._next = now + (_VERIFY_EVERY_S if self.unverified else self.settings.interval_s)
         if self._known is not None:
             return self._publish_present(changed=False)
         if not self.settings.solve:
@@ -357,7 +370,9 @@ class LiveHub:
             self._next_search = now + _SEARCH_EVERY_S
         if full:
             self._next_full, self._full_rows = now + _FULL_EVERY_S, rows
-        verify = self._unverified is not None
+        verify = self.unverified
+        if not verify:
+            self._unverified = None  # there are enough rows for an answer of their own
         job = SolverJob(
             self._jobs + 1,
             rig,
@@ -404,7 +419,8 @@ class LiveHub:
         event = solver_event(job, "applied", [], answer)
         if answer.calibration is None:
             self.counters["refused"] += 1
-            if job.verify and answer.permanent:
+            since = self._unverified_since
+            if job.verify and (answer.permanent or since is None or now - since > _VERIFY_S):
                 self._unverified, self.calibration = None, None  # what was reloaded does not hold any more
             if self.calibration is not None:
                 return [event]  # an answer that holds is not given up because new rows say little
@@ -472,13 +488,16 @@ class LiveHub:
         kept = {
             name: camera
             for name, camera in self._unverified.cameras.items()
-            if boots.get(name, "") and boots[name] == self._unverified_boots.get(name)
+            if boots.get(name, "")
+            and boots[name] == self._unverified_boots.get(name)
+            and abs(self.delays.get(name, np.inf) - self._unverified_delays.get(name, -np.inf)) < _SAME_CLOCK_S
         }
         others = [name for name in self._unverified.cameras if boots.get(name) and name not in kept]
         if len(kept) < 2:
             if len(others) > 1:
                 self._unverified = None  # these cameras have been restarted: nothing is left of it
             return []
+        self._unverified_since = self._now
         self.calibration = replace(self._unverified, cameras=kept)
         self._solved_boot_ids = {name: boots[name] for name in kept}
         return self._publish_present()
@@ -556,6 +575,7 @@ class LiveHub:
                 scale=calibration.scale,
                 units=calibration.units,
                 up=up,
+                held=self.settings.solve,
             )
 
     def _publish_present(self, changed: bool = True) -> list[Message]:

@@ -82,13 +82,15 @@ class LiveTracking:
         scale: str,
         units: str,
         up: Floats | None,
+        held: bool = False,
     ) -> None:
         """Use a new calibration.
 
         boot_ids: by camera, the boot id of the clock it refers to, "" = any. reference: the camera whose clock is the
-        reference. up: (3,) unit vector in its world frame; None = unknown.
+        reference. up: (3,) unit vector in its world frame; None = unknown. held: world frame, scale and reference clock
+        are those of the calibration before.
         """
-        clock = (reference, boot_ids.get(reference, ""))
+        clock = (reference, "" if held else boot_ids.get(reference, ""))
         if clock != self._clock and self._clock is not None:
             # All times refer to another clock now.
             self.tracker.reset()
@@ -98,7 +100,7 @@ class LiveTracking:
             name: TrackingCamera.from_calibration(camera, boot_ids.get(name, "")) for name, camera in cameras.items()
         }
         change = None
-        if self.tracker.cameras:
+        if self.tracker.cameras and not held:
             change = _gauge_change(self.tracker.cameras, new)
         metric = scale == "metric"
         units_per_m = _METRES.get(units, 1.0) if metric else _guessed_units_per_m(new)

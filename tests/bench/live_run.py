@@ -76,7 +76,7 @@ def run_live(log: Path, folder: Path, seconds: float) -> Heard:
     endpoint = free_endpoint()
     bus_table = {"mode": "client", "connect": [endpoint]}
     config, stamps = folder / "hub.toml", folder / "stamps.npy"
-    config.write_text(tomli_w.dumps({"id": _HUB, "site": _SITE, "bus": bus_table}), encoding="utf-8")
+    config.write_text(tomli_w.dumps({"id": _HUB, "site": _SITE, "state": "state", "bus": bus_table}), encoding="utf-8")
     with Router(endpoint), open_bus(_SITE, BusConfig(mode="client", connect=(endpoint,)), timeout_s=10.0) as bus:
         listener = _Listener(bus)
         with _process(["deploy", "hub", str(config)], folder / "hub.txt") as hub:

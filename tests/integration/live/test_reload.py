@@ -1,0 +1,120 @@
+"""A hub that was killed goes on from its last answer: unverified until the rows agree, and never where they do not."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deploy.agents.answer_store import HISTORY, LAST, AnswerStore
+from hub.live.live_hub import LiveHub, LiveSettings
+from protocols.core.clocks import NANOSECONDS
+from protocols.geometry.pose import Pose
+from protocols.messages import syncline_pb2 as pb
+from tests.integration.live.test_live_hub import messages
+from tests.support.rigs import Session, simulate
+
+SETTINGS = LiveSettings(interval_s=2.0)
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    return simulate(71, 3, 24)
+
+
+def play(hub: LiveHub, session: Session, begin: float, end: float, clock: float = 1e9) -> list[pb.Calibration]:
+    """Play a part of the session at its true times; ``clock``: of the hub when the session began."""
+    stream = []
+    for message in messages(session):
+        if isinstance(message, pb.Observation):
+            true = session.true_time(message.camera, message.device_time_ns / NANOSECONDS)
+            stream.append((true, message))
+        else:
+            hub.handle(message, clock + begin)
+    out = []
+    for true, message in sorted(stream, key=lambda item: item[0]):
+        if begin <= true < end:
+            hub.handle(message, clock + true + 0.05)
+            out += [one for one in hub.tick(true) if isinstance(one, pb.Calibration)]
+    return out
+
+
+@pytest.fixture(scope="module")
+def kept(session: Session, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("state")
+    hub, store = LiveHub(SETTINGS), AnswerStore(folder)
+    play(hub, session, 0.0, 18.0)
+    assert hub.calibration is not None
+    assert hub.session is not None
+    store.keep(hub.calibration, hub.session[0], hub.boot_ids, hub.delays)
+    store.close()
+    return folder
+
+
+def restarted(folder: Path) -> LiveHub:
+    hub, last = LiveHub(SETTINGS), AnswerStore(folder).load()
+    assert last is not None
+    hub.reload(*last)
+    return hub
+
+
+def test_a_killed_hub_tracks_again_within_seconds(session: Session, kept: Path) -> None:
+    assert (kept / LAST).is_file()
+    assert len(list((kept / HISTORY).glob("*.toml"))) == 1
+    hub = restarted(kept)
+    first = next(one for one in play(hub, session, 18.0, 18.5) if one.status == "solved")
+    assert first.state == "degraded"
+    assert hub.unverified
+    assert "not verified" in hub.state(18.5)[1]
+    play(hub, session, 18.5, 22.0)
+    assert not hub.unverified
+    assert hub.counters["verified"] == 1
+    assert hub.state(22.0)[0] == "calibrated"
+    assert hub.calibration is not None
+    for name, camera in hub.calibration.cameras.items():
+        assert abs(session.clock_error(name, hub.calibration.reference, camera.time_map)) < 1e-3
+
+
+def test_a_camera_that_was_moved_meanwhile_is_not_believed(session: Session, kept: Path) -> None:
+    hub = restarted(kept)
+    reloaded = hub._unverified
+    assert reloaded is not None
+    pose = reloaded.cameras["cam1"].pose
+    wrong = dataclasses.replace(reloaded.cameras["cam1"], pose=Pose(pose.rotation, pose.position + np.array([0, 1, 0])))
+    hub._unverified = dataclasses.replace(reloaded, cameras={**reloaded.cameras, "cam1": wrong})
+    play(hub, session, 18.0, 22.0)
+    assert hub.calibration is None or "cam1" not in hub.calibration.cameras
+
+
+@pytest.mark.parametrize("change", ["boots", "clocks", "other cameras"])
+def test_what_was_restarted_or_set_since_is_left_out(session: Session, kept: Path, change: str) -> None:
+    hub = restarted(kept)
+    if change == "boots":
+        hub._unverified_boots = dict.fromkeys(hub._unverified_boots, "another")
+    elif change == "other cameras":
+        assert hub._unverified is not None
+        hub._unverified = dataclasses.replace(
+            hub._unverified, cameras={f"x{name}": camera for name, camera in hub._unverified.cameras.items()}
+        )
+    published = play(hub, session, 4.0, 20.0, 1e9 + (100.0 if change == "clocks" else 0.0))
+    assert not hub.unverified
+    assert hub.counters["verified"] == 0
+    assert hub.calibration is not None, "an answer of its own"
+    assert published[0].status != "solved"
+
+
+def test_a_disk_that_cannot_be_written_is_told(session: Session, kept: Path, tmp_path: Path) -> None:
+    last = AnswerStore(kept).load()
+    assert last is not None
+    blocked = tmp_path / "file"
+    blocked.write_text("", encoding="utf-8")
+    store = AnswerStore(blocked)
+    store.keep(last[0], session.rig, last[1], last[2])
+    store.close()
+    assert "file" in store.problem
+    assert AnswerStore(tmp_path / "none").load() is None
+    (kept / "broken").mkdir(exist_ok=True)
+    (kept / "broken" / LAST).write_text("[cam0\n", encoding="utf-8")
+    assert AnswerStore(kept / "broken").load() is None
