@@ -110,7 +110,9 @@ def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable
     from protocols.session.calibration import read_calibration
 
     rig = None if config.rig is None else read_rig(config.rig)
-    nodes = NodeHost(config.id, config.nodes, leave_after_s=config.leave_after_s) if config.pose_nodes else None
+    # A hub that solves publishes its own poses: nodes beside it cost more than all else, and only serve other hubs.
+    runs_nodes = config.pose_nodes if config.pose_nodes is not None else bool(config.nodes) or not config.solve
+    nodes = NodeHost(config.id, config.nodes, leave_after_s=config.leave_after_s) if runs_nodes else None
     known = None if config.known is None else KnownCalibration(*read_calibration(config.known))
     settings = LiveSettings(config.window_s, config.interval_s, solve=config.solve, track=config.track)
     hub = LiveHub(settings, rig, None if known is not None else nodes, known, WorkerSolver())

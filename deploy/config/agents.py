@@ -299,7 +299,8 @@ class HubConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     in ``out``, else in the user's state folder. window_s: total duration of the observations that are kept; interval_s:
     least time between two solves. solve:
     false = this hub does not estimate timing itself. nodes: cameras whose pose nodes always run on this hub; the others
-    are distributed among all hubs. pose_nodes: false = none run here. leave_after_s: time after which a camera that has
+    are distributed among all hubs. pose_nodes: whether pose nodes run here; default:
+    where this hub does not solve, or ``nodes`` names some. leave_after_s: time after which a camera that has
     disappeared is removed. known: a calibration.toml whose poses, intrinsics and clocks are kept fixed; nothing is
     solved then. track: whether people, vehicles and unlabelled markers are tracked.
     """
@@ -311,7 +312,7 @@ class HubConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     window_s: Seconds = 180.0
     interval_s: Seconds = 2.0
     solve: bool = True
-    pose_nodes: bool = True
+    pose_nodes: bool | None = None
     nodes: tuple[str, ...] = ()
     leave_after_s: Seconds = 30.0
     known: Path | None = None
