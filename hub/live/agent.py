@@ -34,7 +34,7 @@ from protocols.topics import (
 
 ROLE = "hub"
 _TICK_S = 0.05
-_ROUND_S = 0.008
+_ROUND_S = 0.012
 """Least time between two rounds: observations that arrive closer together are processed together."""
 _FINISH_S = 20.0
 """Longest wait for the last answer when the hub is stopped."""
@@ -153,8 +153,11 @@ def run_hub(
                 beat()
                 if last:
                     break
-                time.sleep(_ROUND_S)
-                observations.wait(_TICK_S)
+                if hub.calibration is None:
+                    stop.wait(_TICK_S)  # nothing is published at the cameras' pace yet
+                else:
+                    time.sleep(_ROUND_S)
+                    observations.wait(_TICK_S)
     finally:
         hub.solver.close()
         for publisher in (*publishers.values(), smoothed, *node_publishers.values()):
