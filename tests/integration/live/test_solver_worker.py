@@ -1,4 +1,4 @@
-"""The solver in a process of its own: answers as inline, ended when it hangs, replaced when it dies, never waited for."""
+"""The solver in a process of its own: answers as inline, ended when it hangs, replaced when it dies."""
 
 from __future__ import annotations
 

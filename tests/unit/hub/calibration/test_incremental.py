@@ -43,8 +43,9 @@ def moved_stds(before: Calibration, after: Calibration) -> float:
     out = []
     for name, camera in after.cameras.items():
         if name in before.cameras:
-            std = np.linalg.norm(np.hypot(camera.position_std, before.cameras[name].position_std))
-            out.append(np.linalg.norm(camera.pose.position - before.cameras[name].pose.position) / max(std, 1e-12))
+            std = float(np.linalg.norm(np.hypot(camera.position_std, before.cameras[name].position_std)))
+            move = float(np.linalg.norm(camera.pose.position - before.cameras[name].pose.position))
+            out.append(move / max(std, 1e-12))
     return float(max(out))
 
 
