@@ -39,7 +39,7 @@ HubState = Literal["collecting", "searching", "calibrated", "degraded", "refused
 
 _MIN_PEOPLE_S = 40.0
 """Total duration of people's tracklets [s] that two cameras need before people-based calibration is tried."""
-_SEARCH_LOAD, _UPDATE_LOAD = 0.6, 0.22
+_SEARCH_LOAD, _UPDATE_LOAD = 0.6, 0.2
 """CPU seconds of the solver per second before the first answer, and after it: a longer job is followed by a longer
 pause."""
 _SEARCH_EVERY_S = 4.0
