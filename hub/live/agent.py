@@ -36,6 +36,8 @@ ROLE = "hub"
 _TICK_S = 0.05
 _ROUND_S = 0.012
 """Least time between two rounds: observations that arrive closer together are processed together."""
+_BACKLOG_S = 2.0
+"""After its start a hub gets what cameras had published before, all at once."""
 _FINISH_S = 20.0
 """Longest wait for the last answer when the hub is stopped."""
 _PROGRESS_S = 2.0
@@ -79,6 +81,7 @@ def run_hub(
     observations = subscriptions[1]
     sequence, next_status, next_rig, next_progress = 0, 0.0, 0.0, 0.0
     last_action = ""
+    began = time.monotonic()
     finish_by: float | None = None
 
     def publish(messages: list[Message]) -> None:
@@ -102,13 +105,14 @@ def run_hub(
                 if stop.is_set() and finish_by is None:
                     finish_by = time.monotonic() + _FINISH_S
                 finishing = finish_by is not None
+                backlog = time.monotonic() < began + _BACKLOG_S
                 if nodes is not None and watch is not None:
                     for event in watch.drain():
                         nodes.on_liveliness(event.role, event.agent, event.boot_id, alive=event.alive)
                 for subscription in subscriptions:
                     for received in subscription.drain():
                         if received.agent != agent or not isinstance(received.message, pb.Calibration):
-                            hub.handle(received.message, received.arrival_ns * 1e-9)
+                            hub.handle(received.message, received.arrival_ns * 1e-9, backlog=backlog)
                 for action in orders.take():
                     hub.counters[f"asked.{action}"] += 1
                     if action == "recalibrate":

@@ -151,14 +151,18 @@ class LiveHub:
         if self._known is not None:
             self._use_known(self._known)
 
-    def handle(self, message: Message, arrival: float | None = None) -> None:
-        """Process one message from the bus or a log. arrival: its arrival time [s, any fixed clock]; None = unknown."""
+    def handle(self, message: Message, arrival: float | None = None, *, backlog: bool = False) -> None:
+        """Process one message from the bus or a log.
+
+        arrival: its arrival time [s, any fixed clock]; None = unknown. backlog: it may have waited for this hub, so its
+        arrival says little about its camera's clock.
+        """
         if isinstance(message, pb.AgentStatus):
             self.clock_priors.handle(message)
             return
         if isinstance(message, pb.Observation):
             self.clock_priors.handle(message)
-            message, event = self.clocks.assign(message, arrival)
+            message, event = self.clocks.assign(message, None if backlog else arrival)
             if event is not None:
                 self.counters[f"clock_{event.kind}s"] += 1
                 self._builder.require_rows(event.segment, SEGMENT_MIN_ROWS)
@@ -166,7 +170,8 @@ class LiveHub:
                 self._clock_stepped = True
             if arrival is not None:
                 camera_time = message.device_time_ns / NANOSECONDS
-                self._arrivals.handle(message.camera, message.boot_id, camera_time, arrival)
+                if not backlog:
+                    self._arrivals.handle(message.camera, message.boot_id, camera_time, arrival)
                 self.delays[message.camera] = arrival - camera_time
             self._last_frame[message.camera] = self._now
         self.guidance.handle(message)
@@ -492,11 +497,8 @@ class LiveHub:
             and boots[name] == self._unverified_boots.get(name)
             and abs(self.delays.get(name, np.inf) - self._unverified_delays.get(name, -np.inf)) < _SAME_CLOCK_S
         }
-        others = [name for name in self._unverified.cameras if boots.get(name) and name not in kept]
         if len(kept) < 2:
-            if len(others) > 1:
-                self._unverified = None  # these cameras have been restarted: nothing is left of it
-            return []
+            return []  # not heard of yet, a backlog, or clocks that it does not know
         self._unverified_since = self._now
         self.calibration = replace(self._unverified, cameras=kept)
         self._solved_boot_ids = {name: boots[name] for name in kept}

@@ -29,13 +29,13 @@ class ScheduledHub(LiveHub):
         self._whole = SessionBuilder()
         self._events: list[pb.SolverEvent] = []
 
-    def handle(self, message: Message, arrival: float | None = None) -> None:
+    def handle(self, message: Message, arrival: float | None = None, *, backlog: bool = False) -> None:
         """Process one message of the log, solver events included."""
         if isinstance(message, pb.SolverEvent):
             self._events.append(message)
             return
         self._whole.handle(without_tracked(message) if isinstance(message, pb.Observation) else message)
-        super().handle(message, arrival)
+        super().handle(message, arrival, backlog=backlog)
 
     def _calibrate(self, now: float, final: bool) -> list[Message]:
         out: list[Message] = []
