@@ -49,6 +49,8 @@ _FULL_EVERY_S, _FULL_GROWTH = 30.0, 1.5
 _FIRST_FULL_S = 60.0
 """Until the first search over all lags where times of arrival bound them: it takes several seconds, and at a right
 arrival it finds nothing more."""
+_BEHIND_S = 10.0
+"""A job that takes longer than this degrades a calibrated hub: warm ones take about a second."""
 _SILENT_S = 3.0
 """A calibrated camera without a frame for longer than this degrades the hub."""
 _VERIFY_ROWS, _VERIFY_S = 60, 15.0
@@ -300,6 +302,8 @@ class LiveHub:
                 if now - (last := self._last_frame.get(name, 0.0)) > _SILENT_S
             ]
             out += [f"no frames from {', '.join(silent)}"] if silent else []
+        if self.solver.busy and now - self._submitted_at > _BEHIND_S:
+            out.append(f"the solver is behind: {now - self._submitted_at:.0f} s for one job")
         return out + [text for text in (self.solver_failure, self.notice) if text]
 
     def progress(self) -> list[pb.CameraProgress]:

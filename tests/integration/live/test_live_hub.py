@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from google.protobuf.message import Message
 
+from hub.live.agent import status_message
 from hub.live.live_hub import LiveHub, LiveSettings
+from hub.live.solver import InlineSolver, SolverJob
 from protocols.core.clocks import NANOSECONDS
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder
@@ -174,3 +176,33 @@ def test_a_flood_and_equal_times_cost_only_their_camera() -> None:
     assert len(observations.of_camera("b")[0]) == 60
     assert len(observations.of_camera("a")[0]) <= 4000
     assert builder.counters["flooded"] == 32_000
+
+
+class StuckSolver(InlineSolver):
+    """Answers the first job and no other."""
+
+    def submit(self, job: SolverJob, now: float) -> None:
+        if job.number == 1:
+            super().submit(job, now)
+
+    @property
+    def busy(self) -> bool:
+        return True
+
+
+def test_ill_health_of_a_calibrated_hub_is_told(session: Session) -> None:
+    """Cameras that fall silent, and a solver that does not answer: degraded, in the status that /readyz reports."""
+    hub = LiveHub(SETTINGS)
+    feed(hub, messages(session))
+    now = max(hub._last_frame.values())
+    assert hub.state(now)[0] == "calibrated"
+    state, text = hub.state(now + 5.0)
+    assert state == "degraded"
+    assert "no frames from cam0 (5 s), cam1 (5 s), cam2 (5 s)" in text
+    hub._now = now
+    status = status_message(hub, "hub", "b0", 0, [], now + 5.0)
+    assert status.state == "degraded"
+    hub.solver = StuckSolver()
+    hub._submitted_at = now - 11.0
+    assert "the solver is behind: 11 s for one job" in hub.state(now)[1]
+    assert {one.camera: one.state for one in hub.progress()} == dict.fromkeys(session.rig.cameras, "calibrated")
