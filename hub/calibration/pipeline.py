@@ -488,7 +488,7 @@ def final_adjustment(
 def _refit_online(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
     """The re-fit with correlated noise, on a part of many rows: its cost grows with the cube of the rows a second.
 
-    Eight cameras at 30 frames a second took 17 s for 60 s; errors that last for tenths of a second are sampled often
+    Eight cameras at 30 frames a second took 17 s for 60 s; errors correlated over tenths of a second are sampled often
     enough by a third of the rows.
     """
     begins, ends = zip(*((rows.time.min(), rows.time.max()) for rows in problem.rows if len(rows.time)), strict=True)

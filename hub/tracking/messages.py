@@ -82,11 +82,11 @@ def marker_message(
     """
     mean, covariance = moments or state.predicted(time_ns)
     unseen = (time_ns - state.time_ns) / NANOSECONDS
-    told = "confirmed" if state.confirmed else "tentative"
+    detected = "confirmed" if state.confirmed else "tentative"
     return pb.Track(
         schema_version=SCHEMA_VERSION,
         label=label,
-        state="coasting" if unseen > MARKER_COASTING_AFTER_S or state.is_uncertain(covariance) else told,
+        state="coasting" if unseen > MARKER_COASTING_AFTER_S or state.is_uncertain(covariance) else detected,
         reference_time_ns=time_ns,
         position=mean[POSITION].tolist(),
         velocity=mean[VELOCITY].tolist(),

@@ -240,7 +240,7 @@ class LiveScores:
         for name, messages in live.items():
             arrival, time, position = self._published(messages)
             settled = np.flatnonzero(arrival >= first + SETTLED_S)
-            # In order of time, and of what tells the same moment again the first.
+            # In order of time, and of several positions at one moment the first.
             kept = settled[np.argsort(time[settled], kind="stable")]
             kept = kept[np.r_[True, np.diff(time[kept]) > _SAME_TIME_S]] if len(kept) else kept
             found |= self._errors(name, time[kept], position[kept])

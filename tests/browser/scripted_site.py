@@ -1,4 +1,4 @@
-"""A site that says what a test tells it to: three cameras around a moving marker, a hub and a recorder, on a bus."""
+"""A site with scripted messages: three cameras around a moving marker, a hub and a recorder, on a bus."""
 
 from __future__ import annotations
 

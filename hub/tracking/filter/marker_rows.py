@@ -17,7 +17,7 @@ class MarkerRow:
     """One detection of a labelled marker.
 
     reference_ns: capture time of its image row on the reference clock. point: x, y, normalised. noise: its
-    covariance xx, xy, yy. detection, device_ns: as the camera told them.
+    covariance xx, xy, yy. detection, device_ns: as the camera published them.
     """
 
     camera: TrackingCamera

@@ -68,7 +68,7 @@ def calibration(reference: Reference, names: list[str], revision: int) -> pb.Cal
 
 
 def heard_of(reference: Reference, lag_error_s: float = 0.0, latency_s: float = 0.03) -> Heard:
-    """A hub that answers after 10 s and tells every row's place ``latency_s`` after its arrival."""
+    """A hub that answers after 10 s and publishes every row's place ``latency_s`` after its arrival."""
     rows = sorted(
         (float(moment) + 0.05, name, float(time))
         for name in reference.rig.cameras

@@ -37,7 +37,7 @@ class Stream:
         return np.asarray(self.session.paths[track.label].at(np.array([true]))[0])
 
     def error(self, track: pb.Track) -> Floats:
-        """(3,) told minus true position."""
+        """(3,) published minus true position."""
         return np.array(track.position) - self.truth(track)
 
 
