@@ -112,7 +112,7 @@ class SessionBuilder:
 
     A restarted camera has a new clock: each boot is stored separately, and the one with the most detections is used.
     window_s: total duration of what is kept; None = all. Of a longer recording the intervals with the most motion that
-    two cameras saw are kept, and always the newest: a target at rest adds no information, and what moved before still does.
+    two cameras saw are kept, and always the newest: a target at rest adds no information.
     """
 
     def __init__(self, window_s: float | None = None) -> None:
