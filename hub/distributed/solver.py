@@ -185,19 +185,6 @@ def _time_std(name: str, graph: ClockGraph) -> float:
     return min([s for s in stds if np.isfinite(s)], default=0.0)
 
 
-def with_node_poses(found: Calibration, rig: Rig, nodes: NodeHost) -> Calibration:
-    """A live calibration with the network's poses in the rig's world, once all its cameras have converged poses."""
-    poses = nodes.poses()
-    names = [name for name in found.cameras if name in poses]
-    if len(names) < len(found.cameras):
-        return found
-    rig, rejected = reject_outliers(rig, names, [poses[name] for name in names])
-    world = fix_gauge(rig, names, [poses[name] for name in names]).similarity
-    cameras = {name: replace(camera, pose=world.pose(poses[name])) for name, camera in found.cameras.items()}
-    warnings = found.warnings + tuple(text for text in rejected if text not in found.warnings)
-    return replace(found, cameras=cameras, solver="distributed", warnings=warnings)
-
-
 def node_calibration(rig: Rig, nodes: NodeHost | None) -> Calibration:
     """The network's poses as a calibration, where clocks are not estimated.
 

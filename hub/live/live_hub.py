@@ -109,7 +109,7 @@ class LiveHub:
             nodes.use_shared_clock()
         self.solver = solver or InlineSolver()
         self._revision = 0
-        self._jobs = 0
+        self._jobs = self._superseded = 0
         self._now = 0.0
         self._infos: dict[str, pb.CameraInfo] = {}
         self._last_frame: dict[str, float] = {}
@@ -140,7 +140,7 @@ class LiveHub:
         self._submitted: SolverJob | None = None
         self._submitted_at = 0.0
         self._submitted_boots: dict[str, str] = {}
-        self._superseded = 0
+        self._answer_rows = 0.0
         self.calibration: Calibration | None = None
         self.session: tuple[Rig, Observations] | None = None
         self.refusal: Refused | None = None
@@ -296,10 +296,11 @@ class LiveHub:
         if self.unverified:
             out.append("the calibration was reloaded and is not verified yet")
         if self.calibration is not None:
+            last = {name: self._last_frame.get(name) for name in self.calibration.cameras}
             silent = [
-                f"{name} ({now - last:.0f} s)"
-                for name in self.calibration.cameras
-                if now - (last := self._last_frame.get(name, 0.0)) > _SILENT_S
+                f"{name} (never)" if frame is None else f"{name} ({now - frame:.0f} s)"
+                for name, frame in last.items()
+                if frame is None or now - frame > _SILENT_S
             ]
             out += [f"no frames from {', '.join(silent)}"] if silent else []
         if self.solver.busy and now - self._submitted_at > _BEHIND_S:
@@ -400,7 +401,8 @@ class LiveHub:
         self, job: SolverJob, boots: dict[str, str], ranges: list[tuple[str, str, int, int, int]], now: float
     ) -> list[Message]:
         self._jobs = job.number
-        self.session = job.rig, job.observations
+        if self.calibration is None:
+            self.session = job.rig, job.observations
         self._submitted, self._submitted_at, self._submitted_boots = job, now, boots
         self.solver.submit(job, now)
         return [solver_event(job, "submitted", ranges)]
@@ -442,11 +444,16 @@ class LiveHub:
         for name, since in answer.moved.items():
             self.counters["moved"] += 1
             self._builder.forget_before(name, since)
-        if not job.verify and self.calibration is not None and not self._says_more(found, answer.moved):
+        rows = len(job.observations)
+        # As many rows may have larger stds, once the noise is known better: only fewer must not replace more.
+        fewer = rows < self._answer_rows and not job.verify and self.calibration is not None
+        if fewer and not self._says_more(found, answer.moved):
             self.counters["not_better"] += 1
             return [event]
         self.counters["verified" if job.verify else "solved"] += 1
         self._unverified = None
+        self._answer_rows = np.inf if job.verify else rows  # of a reloaded answer the rows are not known
+        self.session = job.rig, job.observations
         self.calibration = found
         self._solved_boot_ids = {name: boots[name] for name in found.cameras if name in boots}
         return [event, *self._publish_present()]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from google.protobuf.message import Message
@@ -206,3 +208,21 @@ def test_ill_health_of_a_calibrated_hub_is_told(session: Session) -> None:
     hub._submitted_at = now - 11.0
     assert "the solver is behind: 11 s for one job" in hub.state(now)[1]
     assert {one.camera: one.state for one in hub.progress()} == dict.fromkeys(session.rig.cameras, "calibrated")
+
+
+def test_more_rows_replace_an_answer_whatever_their_stds_and_the_session_is_the_answers(session: Session) -> None:
+    """An early answer may have stds that are too small: it must not keep out those that follow."""
+    hub = LiveHub(SETTINGS)
+    stream = messages(session)
+    feed(hub, stream[: len(stream) // 2])
+    assert hub.calibration is not None
+    assert hub.session is not None
+    early, rows = hub.calibration, len(hub.session[1])
+    tiny = {name: replace(camera, position_std=1e-9 * camera.position_std) for name, camera in early.cameras.items()}
+    hub.calibration = replace(early, cameras=tiny)
+    for message in stream[len(stream) // 2 :]:
+        hub.handle(message)
+    hub.tick(2e6, final=True)
+    assert hub.counters["not_better"] == 0
+    assert hub.calibration.cameras["cam1"].position_std.max() > 1e-7 * early.cameras["cam1"].position_std.max()
+    assert len(hub.session[1]) > 1.5 * rows
