@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -58,7 +58,8 @@ class Detector(Protocol):
     """Detects objects in the images of one camera, which are passed one after the other.
 
     Detectors of light spots and tags keep no state. The ball detector remembers the background behind the ball;
-    detectors of people and vehicles learn a background model and track from image to image.
+    detectors of people and vehicles learn a background model and track from image to image. Other packages may register
+    theirs: see ``edge.detectors.plugins``.
     """
 
     def detect(
@@ -68,4 +69,21 @@ class Detector(Protocol):
 
         time_s: time of the image [s] on the camera's clock; None = one frame period after the last one. predictions: of
         targets in this image; only detectors of people and vehicles use them.
+        """
+
+
+@runtime_checkable
+class BatchDetector(Detector, Protocol):
+    """A detector that is faster on several images of its camera at once, as networks are on some hardware.
+
+    batch: number of images that it takes best at once, >= 1.
+    """
+
+    @property
+    def batch(self) -> int: ...
+
+    def detect_batch(self, images: Sequence[npt.NDArray[np.uint8]], times_s: Sequence[float]) -> list[list[Detection]]:
+        """The detections in each image (H, W, 3) uint8 BGR, as by ``detect`` on one after the other.
+
+        times_s: increasing times of the images [s] on the camera's clock.
         """
