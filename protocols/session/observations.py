@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from protocols.core.errors import InputError
-from protocols.geometry.types import Floats, Ints
+from protocols.geometry.types import Bools, Floats, Ints
 
 REQUIRED = ("camera", "frame", "time", "u", "v")
 DEFAULT_LABEL = "marker"
@@ -69,10 +69,69 @@ class Observations:
         return sum(len(track) for track in self.tracks.values())
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ObservationRows:
+    """The columns of an observations.csv in the file's order, n rows.
+
+    camera, label: n names. frame: (n,). time: (n,) [s]. pixels: (n, 2). size: (n,) [px], NaN where not measured. line:
+    (n,) line numbers. cells: n rows of text. column: index of each column by its name.
+    """
+
+    file: Path
+    camera: list[str]
+    label: list[str]
+    frame: Ints
+    time: Floats
+    pixels: Floats
+    size: Floats
+    line: list[int]
+    cells: list[list[str]]
+    column: dict[str, int]
+
+    def numbers(self, name: str, limit: float = _MAX_ABS_PIXEL) -> Floats:
+        """An optional column (n,); NaN where the cell is empty. Raises InputError beyond ±limit."""
+        if name not in self.column:
+            return np.full(len(self.cells), np.nan)
+        values = _column(self.cells, self.line, self.column[name], name, self.file, empty=np.nan)
+        empty = np.array([not cells[self.column[name]].strip() for cells in self.cells])
+        self.refuse(np.isnan(values) & ~empty, lambda row: f"{name} is nan", "leave a cell that was not seen empty")
+        self.refuse(np.abs(values) > limit, lambda row: f"{name} {values[row]:g} is beyond ±{limit:g}")
+        return values
+
+    def refuse(
+        self, bad: Bools | np.bool_, what: Callable[[int], str], remedy: str = "correct or remove the row"
+    ) -> None:
+        """Raise InputError with the line of the first row (n,) that is ``bad``."""
+        which = np.flatnonzero(bad)
+        if len(which):
+            row = int(which[0])
+            raise InputError(what(row), file=self.file, line=self.line[row], remedy=remedy)
+
+
 def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
     """Read observations.csv: camera,frame,time,u,v[,size][,label] in any row order.
 
     cameras: the names that the rig knows. Raises InputError: file, line, what, remedy.
+    """
+    known = list(cameras)
+    rows = read_rows(file, known)
+    return gather_tracks(
+        rows.camera,
+        rows.label,
+        rows.frame,
+        rows.time,
+        rows.pixels,
+        rows.size,
+        order=known,
+        file=file,
+        lines=rows.line,
+    )
+
+
+def read_rows(file: Path, cameras: Iterable[str], optional: Sequence[str] = ()) -> ObservationRows:
+    """Read the rows of observations.csv as they stand, also several of one camera, label and time.
+
+    optional: names of further columns, which every row must then have. Raises InputError: file, line, what, remedy.
     """
     try:
         text = file.read_text(encoding="utf-8-sig")
@@ -86,7 +145,8 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
     except csv.Error as error:
         raise InputError(f"not CSV: {error}", file=file, line=1, remedy="save it as CSV") from None
     columns = {name: index for index, name in reversed(list(enumerate(header)))}
-    twice = [name for name in (*REQUIRED, "size", "label") if header.count(name) > 1]
+    used = (*REQUIRED, "size", "label", *optional)
+    twice = [name for name in used if header.count(name) > 1]
     if twice:
         raise InputError(f"column {twice[0]} is named twice", file=file, line=1, remedy="keep one")
     missing = [name for name in REQUIRED if name not in columns]
@@ -104,7 +164,7 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
         raise InputError(f"not CSV: {error}", file=file, line=reader.line_num, remedy="correct this row") from None
     if not rows:
         raise InputError("no rows", file=file, line=1, remedy="record some observations first")
-    _check_width(rows, lines, max(columns[name] for name in columns if name in (*REQUIRED, "size", "label")), file)
+    _check_width(rows, lines, max(columns[name] for name in columns if name in used), file)
     numbers = {name: _column(rows, lines, columns[name], name, file) for name in ("time", "u", "v")}
     far = np.flatnonzero(np.abs(numbers["time"]) > _MAX_ABS_TIME_S)
     if len(far):
@@ -125,18 +185,18 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
         size = np.where(size > 0, size, np.nan)
     names = [row[columns["camera"]].strip() for row in rows]
     labels = [row[columns["label"]].strip() or DEFAULT_LABEL for row in rows] if "label" in columns else None
-    known = list(cameras)
-    _check_cameras(names, lines, known, file)
-    return gather_tracks(
+    _check_cameras(names, lines, list(cameras), file)
+    return ObservationRows(
+        file,
         names,
         labels or [DEFAULT_LABEL] * len(rows),
         frame,
         numbers["time"],
         np.column_stack([numbers["u"], numbers["v"]]),
         size,
-        order=known,
-        file=file,
-        lines=lines,
+        lines,
+        rows,
+        columns,
     )
 
 
