@@ -9,20 +9,46 @@ import numpy as np
 from edge.mavlink.roles.camera import TrackingStatus
 from edge.mavlink.roles.vehicle import Vehicle
 from edge.uav.base import Estimate, TrackState
+from edge.uav.georeference import ground_point
 from edge.uav.navigation import quaternion_from_rotation
+from protocols.core.clocks import NANOSECONDS
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Floats
+
+_CAMERA_FROM_FRD = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+"""From a camera's axes forward, right, down, which MAVLink uses, to right, down, forward."""
+_LEAST_DOWN = 0.1  # of the optical axis: 6 degrees below the horizon the tilt's error alone is half the height
+_STALE_NS = NANOSECONDS  # age of an attitude that no longer is the camera's
 
 
 def update_tracking_status(
-    status: TrackingStatus, estimate: Estimate | None, vehicle: Vehicle, size: tuple[int, int]
+    status: TrackingStatus,
+    estimate: Estimate | None,
+    vehicle: Vehicle,
+    size: tuple[int, int],
+    lens: Intrinsics | None,
+    mounting: Floats | None,
+    now_ns: int,
 ) -> None:
-    """Fill ``status`` from the target estimate and the vehicle's pose. size: (width, height) of the image [px]."""
+    """Fill ``status`` from the target estimate and the vehicle's pose.
+
+    size: (width, height) of the image [px]. mounting: body_from_camera (3, 3). now_ns: the host's clock.
+    """
     width, height = size
     origin, position = vehicle.origin, vehicle.position
-    status.camera = None
+    status.camera = status.image_centre = status.quaternion = None
     if origin is not None and position is not None:
         status.camera = origin.to_geodetic(float(position[0]), float(position[1]), float(position[2]))
-    if vehicle.attitude is not None:
-        status.quaternion = quaternion_from_rotation(vehicle.attitude.ned_from_body)
+    mount = vehicle.mount
+    if mount is not None and mounting is not None and now_ns - mount.host_ns < _STALE_NS:
+        ned_from_camera = mount.ned_from_mount @ mounting
+        status.quaternion = quaternion_from_rotation(ned_from_camera @ _CAMERA_FROM_FRD)
+        if origin is not None and mount.position is not None:
+            middle = np.array([[0.5 * (width - 1), 0.5 * (height - 1)]])
+            ray = np.array([0.0, 0.0, 1.0]) if lens is None else np.append(lens.unproject(middle)[0], 1.0)
+            met = ground_point(ned_from_camera @ ray, mount.position, _LEAST_DOWN)
+            if met is not None:
+                status.image_centre = origin.to_geodetic(float(met[0][0]), float(met[0][1]), 0.0)
     status.centre = status.half_size = status.geo = status.velocity = None
     status.h_acc = status.distance = status.course = math.nan
     status.state = "idle" if estimate is None else estimate.state.value

@@ -130,7 +130,7 @@ class UavAgent:
         self._last_visible_s = -math.inf
         self._last_frame_s = -math.inf
         self._last_frame: int | None = None
-        self._reboots = self._steps = 0
+        self._resets = (0, 0, 0)
         self.counters: Counter[str] = Counter()
         self.latencies: deque[float] = deque(maxlen=900)
         """Latencies from a frame's arrival until its status was sent on the link [s]."""
@@ -195,7 +195,7 @@ class UavAgent:
     def status(self, sequence: int, ended: str = "", unpublished: int = 0) -> pb.AgentStatus:
         """The agent's status. ended: the reason if it is stopping. unpublished: messages dropped by the queue."""
         now_s = self._now_ns() / NANOSECONDS
-        link, clock = self._link, self._vehicle.clock
+        link, vehicle = self._link, self._vehicle
         message = ended
         state = "stopping" if ended else "running"
         frame_silent_s = now_s - self._last_frame_s
@@ -211,24 +211,27 @@ class UavAgent:
         elif not ended and link_silent_s > _LINK_STALE_S:
             state, message = "degraded", f"the vehicle is silent for {link_silent_s:.0f} s {link.problem}".rstrip()
         elif not ended:
-            message = self._guidance.hold_reason or "commands are sent"
+            problem = vehicle.problem(self._now_ns())
+            state = "degraded" if problem.startswith("no attitude") else state
+            message = problem or self._guidance.hold_reason or "commands are sent"
         counters: Counter[str] = Counter(self.counters)
         for prefix, part in (
             ("link", link.counters),
             ("camera", self.camera.counters),
             ("sent", self._guidance.counters),
+            ("telemetry.refused", vehicle.counters),
         ):
             counters.update({f"{prefix}.{name}": count for name, count in part.items()})
         counters.update(
             {
-                "vehicle.reboots": clock.reboots,
-                "vehicle.clock_steps": clock.steps,
+                "vehicle.reboots": vehicle.clock_resets[0],
+                "vehicle.clock_steps": vehicle.clock_resets[1],
                 "target.refused": self.estimator.refused,
                 "undecodable": self.estimator.undecodable,
                 "unpublished": unpublished,
             }
         )
-        gauges = {"time_std_s": min(clock.std_s, 1e6)}
+        gauges = {"time_std_s": min(vehicle.clock.std_s, 1e6)}
         if self.aligner is not None and self.aligner.estimate is not None:
             gauges["time_offset_s"] = self.aligner.estimate.offset
             gauges["time_offset_std_s"] = self.aligner.estimate.std
@@ -364,9 +367,9 @@ class UavAgent:
 
     def _check_clock_resets(self) -> None:
         """Reset the time alignment when the vehicle's or the camera's clock was reset or stepped."""
-        clock = self._vehicle.clock
-        if (clock.reboots, clock.steps + self.camera_clock.steps) != (self._reboots, self._steps):
-            self._reboots, self._steps = clock.reboots, clock.steps + self.camera_clock.steps
+        resets = (*self._vehicle.clock_resets, self.camera_clock.steps)
+        if resets != self._resets:
+            self._resets = resets
             self._telemetry_ns = 0
             if self.aligner is not None:
                 self.aligner.reset()
@@ -414,7 +417,16 @@ class UavAgent:
         vehicle = self._vehicle
         boot_ns = self._now_ns() + vehicle.clock.offset_ns if vehicle.clock.known else 0
         self.camera.status.boot_ms = (boot_ns // 1_000_000) & 0xFFFFFFFF
-        update_tracking_status(self.camera.status, self.estimator.estimate, vehicle, self._settings.size)
+        settings = self._settings
+        update_tracking_status(
+            self.camera.status,
+            self.estimator.estimate,
+            vehicle,
+            settings.size,
+            settings.lens,
+            settings.body_from_camera,
+            self._now_ns(),
+        )
 
     def _message_header(self) -> dict[str, Any]:
         """The common fields of all input messages; ``order`` numbers the inputs for replay."""

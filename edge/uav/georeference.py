@@ -23,6 +23,21 @@ _MIN_HEIGHT_M = 2.0
 _CAR_CENTRE_HEIGHT_M = 0.7
 
 
+def ground_point(ray: Floats, centre: Floats, least_down: float, above: float = 0.0) -> tuple[Floats, float] | None:
+    """Where a ray meets the ground: (2,) north, east [m] and its std by the attitude's [m]; None if not observable.
+
+    ray: (3,) direction NED of any length. centre: (3,) NED [m] where it starts. least_down: least cosine between the
+    ray and straight down. above: height of the plane above the ground [m].
+    """
+    ray = ray / np.linalg.norm(ray)
+    height = -float(centre[2])
+    if not (ray[2] > least_down and height > _MIN_HEIGHT_M):
+        return None
+    height -= above
+    ground: Floats = centre[:2] + height / ray[2] * ray[:2]
+    return ground, _ROLL_PITCH_STD_RAD * height / float(ray[2]) ** 2
+
+
 class Georeference:
     """Corrects target positions to the vehicle's frame; fed with telemetry on the camera's clock.
 
@@ -51,15 +66,10 @@ class Georeference:
         if camera_from_ned is None or centre is None or not (math.isfinite(x) and math.isfinite(y)):
             return None
         bound = 2.0 * max(self._lens.width, self._lens.height)
-        if max(abs(x), abs(y)) > bound or -centre[2] < _MIN_HEIGHT_M:
+        if max(abs(x), abs(y)) > bound:
             return None
         ray = camera_from_ned.T @ np.append(self._lens.unproject(np.array([[x, y]]))[0], 1.0)
-        ray = ray / np.linalg.norm(ray)
-        if not ray[2] > _MIN_COSINE:
-            return None
-        height = -float(centre[2]) - _CAR_CENTRE_HEIGHT_M
-        ground: Floats = centre[:2] + height / ray[2] * ray[:2]
-        return ground, _ROLL_PITCH_STD_RAD * height / float(ray[2]) ** 2
+        return ground_point(ray, centre, _MIN_COSINE, _CAR_CENTRE_HEIGHT_M)
 
     def corrected(self, estimate: Estimate, time: float) -> Estimate:
         """The estimate with its position in the vehicle's frame; unchanged where its ground frame is not metric."""

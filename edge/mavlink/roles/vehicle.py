@@ -1,7 +1,13 @@
-"""The vehicle's telemetry: requests message rates and time sync, converts messages to samples on the host's clock."""
+"""The vehicle's telemetry: requests message rates and time sync, converts messages to samples on the host's clock.
+
+Attitude, position and time are the autopilot component's alone; the gimbal's attitude may also come from the gimbal
+device, whose clock is its own. What another component says of the vehicle is refused, counted and reported.
+"""
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -14,12 +20,11 @@ from edge.mavlink.roles.telemetry import (
     GimbalAttitude,
     GlobalPosition,
     LocalPosition,
-    SystemTime,
     ned_from_gimbal,
     parse_telemetry,
 )
 from edge.uav.navigation import Origin
-from edge.uav.timing.vehicle_clock import VehicleClock
+from edge.uav.timing.vehicle_clock import MAX_DELAY_NS, VehicleClock
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats
 
@@ -27,11 +32,17 @@ _TIMESYNC_PERIOD_S = 0.5  # between TIMESYNC requests
 _RATE_REQUEST_PERIOD_S = 5.0  # of rates, which an autopilot forgets when it reboots
 _MAX_POSITION_AGE_S = 1.0  # for how long a position is extrapolated at its velocity
 _MAX_HEADING_AGE_S = 0.5
+_MAX_LOCAL_AGE_S = 2.0  # without a local position, after which the global one is used
+_SOURCE_SILENT_S = 2.0  # after which another gimbal source may take over
+_REFUSAL_SHOWN_S = 10.0
+_MISSING_AFTER_S = 3.0
+_GIMBALS = frozenset({AUTOPILOT, GIMBAL, *range(mavlink.MAV_COMP_ID_GIMBAL2, mavlink.MAV_COMP_ID_GIMBAL6 + 1)})
+_NEVER = -math.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MountSample:
-    """A telemetry sample. host_ns, vehicle_ns: time of measurement on the host's and the vehicle's clock.
+    """A telemetry sample. host_ns, vehicle_ns: time of measurement on the host's and the autopilot's clock.
 
     std_s: of host_ns. ned_from_mount: (3, 3) of the camera's mount (airframe or gimbal). position: (3,) NED [m] from
     the vehicle's ``origin``, None where unknown. velocity: (3,) NED [m/s].
@@ -46,22 +57,28 @@ class MountSample:
 
 
 class Vehicle:
-    """One vehicle on one link. gimbal: the camera hangs on it. rate_hz: requested rate of attitude and position."""
+    """One vehicle on one link. gimbal: the camera hangs on it. rate_hz: requested rate of attitude and position.
+
+    clock: the autopilot's. counters: refused telemetry by reason. mount: the newest sample.
+    """
 
     def __init__(self, link: Link, *, gimbal: bool, rate_hz: float = 30.0) -> None:
         self._link, self._gimbal, self._rate_hz = link, gimbal, rate_hz
         self.clock = VehicleClock()
+        self._gimbal_clock = VehicleClock()
+        self._gimbal_source: tuple[int, int] | None = None
+        self._gimbal_s = _NEVER
         self.origin: Origin | None = None
-        self.attitude: Attitude | None = None
+        self.mount: MountSample | None = None
         self.armed = False
-        self.unix_offset_s: float | None = None
-        """Unix time minus the vehicle's clock [s], where the vehicle knows it."""
+        self.counters: Counter[str] = Counter()
+        self._refusal = (_NEVER, "")
+        self._attitude: tuple[float, Attitude] | None = None
         self._last_position: tuple[float, Floats, Floats] | None = None
-        self._local_s = -1e9
-        self._quaternion_s = -1e9
-        self._next_trip_s = self._next_ask_s = -1e9
-        self._asked = 0
-        self.stamped_at_reboot = 0
+        self._local_s = self._quaternion_s = self._sample_s = _NEVER
+        self._next_trip_s = self._next_ask_s = _NEVER
+        self._first_s: float | None = None
+        self._resets = (0, 0)
 
     @property
     def velocity(self) -> Floats | None:
@@ -73,114 +90,175 @@ class Vehicle:
         """Position of the vehicle, (3,) NED [m] from ``origin``."""
         return None if self._last_position is None else self._last_position[1]
 
+    @property
+    def clock_resets(self) -> tuple[int, int]:
+        """How often a clock of the telemetry was restarted, and how often it stepped."""
+        clocks = (self.clock, self._gimbal_clock)
+        return sum(clock.reboots for clock in clocks), sum(clock.steps for clock in clocks)
+
+    def problem(self, now_ns: int) -> str:
+        """What is missing or was refused lately, as one line; "" if nothing."""
+        now = now_ns / NANOSECONDS
+        since, text = self._refusal
+        refused = f"{text} ({self.counters.total()} refused)" if now - since < _REFUSAL_SHOWN_S else ""
+        if self._first_s is not None and now - max(self._sample_s, self._first_s) > _MISSING_AFTER_S:
+            source = "gimbal (GIMBAL_DEVICE_ATTITUDE_STATUS)" if self._gimbal else "autopilot (ATTITUDE_QUATERNION)"
+            return f"no attitude of the {source}" + (f": {refused}" if refused else "")
+        return refused
+
     def tick(self, now_ns: int) -> None:
         """Send the TIMESYNC and rate requests that are due."""
         now = now_ns / NANOSECONDS
         if self._link.vehicle is None or not self._link.open:
             return
+        if self._first_s is None:
+            self._first_s = now
         if now >= self._next_trip_s:
             self._next_trip_s = now + _TIMESYNC_PERIOD_S
             self._link.send(mavlink.MAVLink_timesync_message(0, now_ns))
         if now >= self._next_ask_s:
             self._next_ask_s = now + _RATE_REQUEST_PERIOD_S
-            for kind, rate in self._message_rates():
+            for kind, rate, component in self._message_rates():
                 number = getattr(mavlink, f"MAVLINK_MSG_ID_{kind}")
-                component = GIMBAL if kind.startswith("GIMBAL_DEVICE") else AUTOPILOT
                 self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, component, number, round(1e6 / rate))
 
     def handle(self, received: ReceivedMessage) -> list[MountSample]:
         """Handle a message of the vehicle; returns the samples that it completes."""
-        message = received.message
-        if received.kind == "TIMESYNC":
-            if message.tc1 > 0 and received.component == AUTOPILOT:
-                if not self.clock.handle_round_trip(message.ts1, message.tc1, received.received_ns):
-                    self._handle_clock_reset()
-            elif message.tc1 == 0 and received.component == AUTOPILOT:
+        message, kind, component = received.message, received.kind, received.component
+        from_gimbal = kind == "GIMBAL_DEVICE_ATTITUDE_STATUS"
+        if component != AUTOPILOT and not (from_gimbal and component in _GIMBALS):
+            if kind != "HEARTBEAT" and hasattr(message, "time_boot_ms"):
+                self._refuse("component", f"{kind} of component {component} refused: not the autopilot", received)
+            return []
+        if kind == "TIMESYNC":
+            if message.tc1 > 0:
+                self._take_clock(self.clock.handle_round_trip(message.ts1, message.tc1, received.received_ns))
+            elif message.tc1 == 0:
                 self._link.send(mavlink.MAVLink_timesync_message(received.received_ns, message.ts1))
             return []
-        if received.kind == "HEARTBEAT":
-            if received.component == AUTOPILOT:
-                self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        if kind == "HEARTBEAT":
+            self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
             return []
         telemetry = parse_telemetry(message)
         if telemetry is None:
             return []
+        if from_gimbal and not self._from_current_gimbal(received):
+            return []
+        clock = self.clock if component == AUTOPILOT else self._gimbal_clock
         boot_ns = round(telemetry.boot_s * NANOSECONDS)
-        if received.component == AUTOPILOT and not self.clock.handle_message(boot_ns, received.received_ns):
-            self._handle_clock_reset()
-        if isinstance(telemetry, Attitude):
-            return self._take_attitude(telemetry, received.kind == "ATTITUDE_QUATERNION")
-        if isinstance(telemetry, GimbalAttitude):
-            return self._take_gimbal(telemetry)
-        if isinstance(telemetry, LocalPosition):
-            if self._local_s < 0.0:
-                self.origin = None  # so far it was the vehicle's first global position, not the local frame's origin
-            self._local_s = telemetry.boot_s
-            self._last_position = (telemetry.boot_s, telemetry.position, telemetry.velocity)
-        elif isinstance(telemetry, GlobalPosition):
-            self._take_global(telemetry)
-        elif isinstance(telemetry, SystemTime) and telemetry.unix_s > 0:
-            self.unix_offset_s = telemetry.unix_s - telemetry.boot_s
-        return []
+        if not self._take_clock(clock.handle_message(boot_ns, received.received_ns)):
+            self._refuse("time", f"{kind} of component {component} refused: {clock.reason}", received)
+            return []
+        host_ns = clock.host_time(boot_ns)
+        if not -MAX_DELAY_NS <= host_ns - received.received_ns <= MAX_DELAY_NS:
+            self._refuse("time", f"{kind} of component {component} refused: {clock.reason}", received)
+            return []
+        # Nothing is measured after it has arrived: that would be an error of the clock's estimate.
+        host_ns = min(host_ns, received.received_ns)
+        return self._take(telemetry, host_ns, clock, quaternion=kind == "ATTITUDE_QUATERNION")
 
     def command(self, command: int, component: int, *parameters: float) -> None:
         """Send a COMMAND_LONG to a component of the vehicle."""
         self._command(command, component, *parameters)
 
-    def _message_rates(self) -> Iterable[tuple[str, float]]:
-        yield "ATTITUDE_QUATERNION", self._rate_hz
-        yield "LOCAL_POSITION_NED", min(self._rate_hz, 20.0)
-        yield "GLOBAL_POSITION_INT", 5.0
-        yield "SYSTEM_TIME", 1.0
+    def _message_rates(self) -> Iterable[tuple[str, float, int]]:
+        yield "ATTITUDE_QUATERNION", self._rate_hz, AUTOPILOT
+        yield "LOCAL_POSITION_NED", min(self._rate_hz, 20.0), AUTOPILOT
+        yield "GLOBAL_POSITION_INT", 5.0, AUTOPILOT
+        yield "SYSTEM_TIME", 1.0, AUTOPILOT
         if self._gimbal:
-            yield "GIMBAL_DEVICE_ATTITUDE_STATUS", self._rate_hz
+            components = (GIMBAL, AUTOPILOT) if self._gimbal_source is None else (self._gimbal_source[0],)
+            for component in components:
+                yield "GIMBAL_DEVICE_ATTITUDE_STATUS", self._rate_hz, component
 
     def _command(self, command: int, component: int, *parameters: float) -> None:
         filled = [*parameters, *([0.0] * (7 - len(parameters)))]
         self._link.send(mavlink.MAVLink_command_long_message(self._link.vehicle, component, command, 0, *filled))
 
-    def _take_attitude(self, telemetry: Attitude, quaternion: bool) -> list[MountSample]:
+    def _refuse(self, counter: str, text: str, received: ReceivedMessage) -> None:
+        self.counters[counter] += 1
+        self._refusal = (received.received_ns / NANOSECONDS, text)
+
+    def _from_current_gimbal(self, received: ReceivedMessage) -> bool:
+        """Whether a gimbal's message comes from the gimbal that was first and has not fallen silent."""
+        source = (received.component, int(getattr(received.message, "gimbal_device_id", 0)))
+        now = received.received_ns / NANOSECONDS
+        if source != self._gimbal_source:
+            if now - self._gimbal_s < _SOURCE_SILENT_S:
+                self._refuse("gimbal", f"gimbal {source} refused: {self._gimbal_source} is followed", received)
+                return False
+            if self._gimbal_source is not None and source[0] != self._gimbal_source[0]:
+                self._gimbal_clock = VehicleClock()
+            self._gimbal_source = source
+        self._gimbal_s = now
+        return True
+
+    def _take_clock(self, accepted: bool) -> bool:
+        """Discard what was stamped by an old clock if one was reset."""
+        resets = self.clock_resets
+        if resets != self._resets:
+            self._resets = resets
+            self._attitude = self._last_position = None
+            self._local_s = self._quaternion_s = self._sample_s = _NEVER
+            self._next_ask_s = self._next_trip_s = _NEVER
+        return accepted
+
+    def _take(self, telemetry: object, host_ns: int, clock: VehicleClock, *, quaternion: bool) -> list[MountSample]:
+        """Handle telemetry measured at ``host_ns``."""
+        time = host_ns / NANOSECONDS
+        if isinstance(telemetry, Attitude):
+            return self._take_attitude(telemetry, host_ns, quaternion)
+        if isinstance(telemetry, GimbalAttitude):
+            body = self._attitude
+            fresh = body is not None and abs(time - body[0]) < _MAX_HEADING_AGE_S
+            rotation = ned_from_gimbal(telemetry, body[1].ned_from_body if fresh and body is not None else None)
+            return self._sample(host_ns, clock, rotation) if self._gimbal and rotation is not None else []
+        if isinstance(telemetry, LocalPosition):
+            if self._local_s == _NEVER:
+                self.origin = None  # so far it was the vehicle's first global position, not the local frame's origin
+            self._local_s = time
+            self._last_position = (time, telemetry.position, telemetry.velocity)
+        elif isinstance(telemetry, GlobalPosition):
+            self._take_global(telemetry, time)
+        return []
+
+    def _take_attitude(self, telemetry: Attitude, host_ns: int, quaternion: bool) -> list[MountSample]:
+        time = host_ns / NANOSECONDS
         if quaternion:
-            self._quaternion_s = telemetry.boot_s
-        elif telemetry.boot_s - self._quaternion_s < 1.0:
+            self._quaternion_s = time
+        elif time - self._quaternion_s < 1.0:
             return []  # the same attitude at lower resolution
-        if self.attitude is not None and telemetry.boot_s <= self.attitude.boot_s:
+        if self._attitude is not None and telemetry.boot_s <= self._attitude[1].boot_s:
             return []
-        self.attitude = telemetry
-        return [] if self._gimbal else [self._sample(telemetry.boot_s, telemetry.ned_from_body)]
+        self._attitude = (time, telemetry)
+        return [] if self._gimbal else self._sample(host_ns, self.clock, telemetry.ned_from_body)
 
-    def _take_gimbal(self, telemetry: GimbalAttitude) -> list[MountSample]:
-        body = self.attitude
-        fresh = body is not None and abs(telemetry.boot_s - body.boot_s) < _MAX_HEADING_AGE_S
-        rotation = ned_from_gimbal(telemetry, body.ned_from_body if fresh and body is not None else None)
-        return [self._sample(telemetry.boot_s, rotation)] if self._gimbal and rotation is not None else []
-
-    def _take_global(self, telemetry: GlobalPosition) -> None:
+    def _take_global(self, telemetry: GlobalPosition, time: float) -> None:
         home = telemetry.altitude - telemetry.relative_altitude
-        if self._last_position is not None and telemetry.boot_s - self._local_s < 2.0:
+        if self._last_position is not None and time - self._local_s < _MAX_LOCAL_AGE_S:
             if self.origin is None:
                 # The origin is where this global position has the vehicle's local position.
-                boot, position, velocity = self._last_position
-                moved = position + (telemetry.boot_s - boot) * velocity
-                at = Origin(telemetry.latitude, telemetry.longitude, telemetry.altitude).to_geodetic(*(-moved))
-                self.origin = Origin(*at)
+                at, position, velocity = self._last_position
+                moved = position + (time - at) * velocity
+                place = Origin(telemetry.latitude, telemetry.longitude, telemetry.altitude).to_geodetic(*(-moved))
+                self.origin = Origin(*place)
             return
         if self.origin is None:
             self.origin = Origin(telemetry.latitude, telemetry.longitude, home)
         position = self.origin.to_ned(telemetry.latitude, telemetry.longitude, telemetry.altitude)
-        self._last_position = (telemetry.boot_s, position, telemetry.velocity)
+        self._last_position = (time, position, telemetry.velocity)
 
-    def _sample(self, boot_s: float, rotation: Floats) -> MountSample:
-        boot_ns = round(boot_s * NANOSECONDS)
+    def _sample(self, host_ns: int, clock: VehicleClock, rotation: Floats) -> list[MountSample]:
+        """The sample of an attitude; none if it is not later than the one before."""
+        time = host_ns / NANOSECONDS
+        if time <= self._sample_s:
+            self.counters["order"] += 1
+            return []
+        self._sample_s = time
         position = velocity = None
-        if self._last_position is not None and abs(boot_s - self._last_position[0]) < _MAX_POSITION_AGE_S:
+        if self._last_position is not None and abs(time - self._last_position[0]) < _MAX_POSITION_AGE_S:
             velocity = self._last_position[2]
-            position = np.asarray(self._last_position[1] + (boot_s - self._last_position[0]) * velocity)
-        return MountSample(self.clock.host_time(boot_ns), boot_ns, self.clock.std_s, rotation, position, velocity)
-
-    def _handle_clock_reset(self) -> None:
-        """The vehicle's clock was reset: discard all that was stamped by the old one."""
-        self.attitude = None
-        self._last_position = None
-        self._local_s = self._quaternion_s = -1e9
-        self._next_ask_s = self._next_trip_s = -1e9
+            position = np.asarray(self._last_position[1] + (time - self._last_position[0]) * velocity)
+        vehicle_ns = host_ns + (self.clock.offset_ns if self.clock.known else clock.offset_ns)
+        self.mount = MountSample(host_ns, vehicle_ns, clock.std_s, rotation, position, velocity)
+        return [self.mount]

@@ -101,9 +101,9 @@ class ClockAligner:
 
     def _solve(self, time: float, tracking: bool) -> None:
         rotations = self._visual.relative_rotations()
-        recent = rotations.starts > time - _WINDOW_S
+        recent = (rotations.starts > time - _WINDOW_S) & (rotations.ends < time + _WINDOW_S)
         rotations = type(rotations)(rotations.starts[recent], rotations.ends[recent], rotations.vectors[recent])
-        samples = [sample for sample in self._samples if sample.time > time - _WINDOW_S - 2.0]
+        samples = [sample for sample in self._samples if abs(sample.time - time) < _WINDOW_S + 2.0]
         result = find_offset(rotations, samples, self._mounting, (-_SEARCH_HALF_WIDTH_S, _SEARCH_HALF_WIDTH_S))
         if isinstance(result, str):
             self.reason = result

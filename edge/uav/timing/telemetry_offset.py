@@ -26,6 +26,7 @@ _PEAK_HALF_WIDTH_S = 0.35  # offsets closer to the maximum belong to the same pe
 _MIN_OVERLAP_S = 2.0  # of images and telemetry
 _FINE_STEP_S = 0.002
 _GAP_FACTOR = 2.5  # times the median spacing: a longer one is a gap
+_MAX_SPAN_S = 6 * 3600.0  # of images or telemetry: the grids of six hours take 50 MB, and no battery lasts longer
 _MAX_STD_S = 0.02  # of an accepted offset: at 30 degrees a second it is half a degree
 
 
@@ -58,9 +59,14 @@ def find_offset(
     visual: rotation seen by the camera. telemetry: by increasing time. body_from_camera: (3, 3). search: lowest and
     highest offset [s]; None: all offsets at which the two overlap by 2 s.
     """
-    from_telemetry = _telemetry_angles(telemetry, body_from_camera)
     if len(visual.vectors) < 10:
         return "no camera rotation could be measured in the images"
+    if len(telemetry) < 5:
+        return "the telemetry has too few attitudes"
+    spans = (float(visual.ends[-1] - visual.starts[0]), telemetry[-1].time - telemetry[0].time)
+    if not max(spans) < _MAX_SPAN_S:  # before any array is sized by it
+        return f"time stamps span {max(spans):.0f} s, more than {_MAX_SPAN_S:.0f} s: a clock jumped"
+    from_telemetry = _telemetry_angles(telemetry, body_from_camera)
     if from_telemetry is None:
         return "the telemetry has too few attitudes"
     start = float(visual.starts[0])

@@ -1,7 +1,8 @@
-"""Offset of the vehicle's clock to the host's, from round trips or else from the least delayed messages.
+"""Offset of one telemetry source's clock to the host's, from round trips or else from the least delayed messages.
 
-vehicle time = host time + offset. A round trip bounds the offset to half its duration. A one-way message bounds it from
-one side only, and the least delayed of many still has an unknown constant delay.
+source time = host time + offset. A round trip bounds the offset to half its duration. A one-way message bounds it from
+one side only, and the least delayed of many still has an unknown constant delay. A single message never moves the
+clock: what contradicts the estimate is refused, and only several in a row that agree with each other replace it.
 """
 
 from __future__ import annotations
@@ -11,13 +12,18 @@ from dataclasses import dataclass
 
 from protocols.core.clocks import NANOSECONDS
 
+MAX_DELAY_NS = 5 * NANOSECONDS
+"""Longest delay from measurement to arrival: an older attitude or position is of no use."""
 _WINDOW_NS = 20 * NANOSECONDS
 _BUFFER = 512
 _MAX_DRIFT = 1e-4  # relative rate of two oscillators
 _STEP_NS = 100_000_000
-_REBOOT_NS = NANOSECONDS  # a clock that goes back by more has been restarted
+_REORDER_NS = NANOSECONDS  # a clock that goes back by more has been restarted, or the message is not from that clock
 _MAX_ROUND_TRIP_NS = NANOSECONDS
 _ONE_WAY_STD_NS = 20_000_000
+_CONFIRMATIONS = 3  # agreeing messages in a row that replace the estimate …
+_CONFIRM_NS = 500_000_000  # … over at least this time, in which an autopilot at its default 4 Hz contradicts them
+_AGREE_NS = 500_000_000  # jitter of the delays of messages that agree
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,16 +33,39 @@ class _OffsetBound:
     half_width: int
 
 
+@dataclass(slots=True)
+class _Candidate:
+    """Consecutive measurements that contradict the estimate and agree with each other."""
+
+    since_ns: int
+    vehicle_ns: int
+    offset: int
+    count: int = 1
+
+    def confirms(self, vehicle_ns: int, host_ns: int) -> bool:
+        """Add one more; whether they replace the estimate. A repeated message does not count."""
+        if vehicle_ns > self.vehicle_ns:
+            self.count += 1
+        self.vehicle_ns, self.offset = vehicle_ns, vehicle_ns - host_ns
+        return self.count >= _CONFIRMATIONS and host_ns - self.since_ns >= _CONFIRM_NS
+
+
 class VehicleClock:
-    """One vehicle's clock. Times are integer ns. reboots, steps: how often it was restarted, or stepped."""
+    """The clock of one source. Times are integer ns. reboots, steps: how often it was restarted, or stepped.
+
+    rejected: round trips that were not used. reason: why the last message or round trip was refused; "" = it was not.
+    """
 
     def __init__(self) -> None:
         self._round_trips: deque[_OffsetBound] = deque(maxlen=_BUFFER)
         self._one_way: deque[_OffsetBound] = deque(maxlen=_BUFFER)
         self._newest_ns = -1
+        self._candidate: _Candidate | None = None
+        self._trip_candidate: _Candidate | None = None
         self.reboots = 0
         self.steps = 0
         self.rejected = 0
+        self.reason = ""
 
     @property
     def known(self) -> bool:
@@ -44,41 +73,54 @@ class VehicleClock:
         return bool(self._round_trips or self._one_way)
 
     def handle_message(self, vehicle_ns: int, host_ns: int) -> bool:
-        """Add a message stamped ``vehicle_ns`` that arrived at ``host_ns``. False if the clock restarted or stepped."""
-        continuous = True
-        if vehicle_ns < self._newest_ns - _REBOOT_NS:
+        """Add a message stamped ``vehicle_ns`` that arrived at ``host_ns``. False if it is refused; see ``reason``."""
+        offset = vehicle_ns - host_ns
+        reason, restarted = self._contradiction(vehicle_ns, host_ns)
+        if reason:
+            candidate = self._candidate
+            if candidate is None or abs(offset - candidate.offset) > _AGREE_NS:
+                candidate = self._candidate = _Candidate(host_ns, vehicle_ns, offset)
+            if not candidate.confirms(vehicle_ns, host_ns):
+                self.reason = reason
+                return False
             self._reset()
-            self.reboots += 1
-            continuous = False
-        elif self._one_way and abs((vehicle_ns - host_ns) - self._one_way[-1].offset) > NANOSECONDS + _STEP_NS:
-            # A message delayed by a second is no step: later ones return to the old offset.
-            least_delayed = self._best(self._one_way, host_ns)
-            if least_delayed is not None and (vehicle_ns - host_ns) - least_delayed.offset > _STEP_NS:
-                self._reset()
-                self.steps += 1
-                continuous = False
+            self.reboots += restarted
+            self.steps += not restarted
+        self.reason = ""
+        self._candidate = None
         self._newest_ns = max(self._newest_ns, vehicle_ns)
-        self._one_way.append(_OffsetBound(host_ns, vehicle_ns - host_ns, _ONE_WAY_STD_NS))
-        return continuous
+        self._one_way.append(_OffsetBound(host_ns, offset, _ONE_WAY_STD_NS))
+        return True
 
     def handle_round_trip(self, sent_ns: int, vehicle_ns: int, received_ns: int) -> bool:
-        """Add a round trip: sent, stamped by the vehicle, and received. False if the clock stepped."""
+        """Add a round trip: sent, stamped by the source, and received. False if it is refused."""
         if not 0 <= received_ns - sent_ns <= _MAX_ROUND_TRIP_NS:
             self.rejected += 1
-            return True
+            return False
         bound = _OffsetBound(received_ns, vehicle_ns - (sent_ns + received_ns) // 2, (received_ns - sent_ns) // 2 + 1)
+        if self._one_way and received_ns - self._one_way[-1].host_ns < _WINDOW_NS:
+            # The message was stamped before it arrived, and not long before.
+            early = self._one_way[-1].offset - bound.offset
+            if not -MAX_DELAY_NS <= early <= bound.half_width + _STEP_NS:
+                self.rejected += 1
+                self.reason = "TIMESYNC is answered by another clock than the one that stamps the messages"
+                return False
         known = self._best(self._round_trips, received_ns)
-        stepped = (
-            known is not None and abs(bound.offset - known.offset) > bound.half_width + known.half_width + _STEP_NS
-        )
-        if stepped:
+        if known is not None and abs(bound.offset - known.offset) > bound.half_width + known.half_width + _STEP_NS:
+            candidate = self._trip_candidate
+            if candidate is None or abs(bound.offset - candidate.offset) > _STEP_NS + bound.half_width:
+                candidate = self._trip_candidate = _Candidate(vehicle_ns - bound.offset, vehicle_ns, bound.offset)
+            if not candidate.confirms(vehicle_ns, vehicle_ns - bound.offset):
+                self.rejected += 1
+                return False
             self._reset()
             self.steps += 1
+        self._trip_candidate = None
         self._round_trips.append(bound)
-        return not stepped
+        return True
 
     def host_time(self, vehicle_ns: int) -> int:
-        """Host time of a time on the vehicle's clock. Raises RuntimeError without an estimate."""
+        """Host time of a time on the source's clock. Raises RuntimeError without an estimate."""
         best = self._estimate()
         if best is None:
             raise RuntimeError("no estimate of this clock yet")
@@ -92,9 +134,26 @@ class VehicleClock:
 
     @property
     def offset_ns(self) -> int:
-        """vehicle − host; 0 without an estimate."""
+        """source − host; 0 without an estimate."""
         best = self._estimate()
         return 0 if best is None else best.offset
+
+    def _contradiction(self, vehicle_ns: int, host_ns: int) -> tuple[str, bool]:
+        """How a message contradicts the clock ("" = it does not), and whether that would be a restart."""
+        best = self._best(self._round_trips, host_ns) if self._round_trips else self._best(self._one_way, host_ns)
+        if best is None:
+            return "", False
+        ahead = vehicle_ns - host_ns - best.offset
+        drift = round(_MAX_DRIFT * max(host_ns - best.host_ns, 0))
+        # Without round trips the estimate itself contains a delay, which later messages may not have.
+        allowed = (best.half_width if self._round_trips else _REORDER_NS) + _STEP_NS + drift
+        if ahead > allowed:
+            return f"stamped {ahead / NANOSECONDS:.1f} s in the future", False
+        if vehicle_ns < self._newest_ns - _REORDER_NS:
+            return f"its clock went back by {(self._newest_ns - vehicle_ns) / NANOSECONDS:.1f} s", True
+        if -ahead > MAX_DELAY_NS + drift:
+            return f"stamped {-ahead / NANOSECONDS:.1f} s in the past", False
+        return "", False
 
     def _estimate(self) -> _OffsetBound | None:
         if self._round_trips:
@@ -114,3 +173,4 @@ class VehicleClock:
         self._round_trips.clear()
         self._one_way.clear()
         self._newest_ns = -1
+        self._candidate = self._trip_candidate = None

@@ -46,19 +46,46 @@ def test_a_vehicle_restart_is_detected_as_a_new_clock() -> None:
     clock = VehicleClock()
     clock.handle_round_trip(0, 500 * SECOND, 2_000_000)
     assert clock.handle_message(501 * SECOND, SECOND)
-    assert not clock.handle_message(2 * SECOND, 10 * SECOND)
-    clock.handle_round_trip(10 * SECOND, 2 * SECOND, 10 * SECOND + 2_000_000)
-    assert clock.reboots == 1
-    assert clock.host_time(3 * SECOND) == pytest.approx(11 * SECOND, abs=2e6)
+    after = [clock.handle_message((2 + k) * SECOND, (10 + k) * SECOND) for k in range(4)]
+    assert after == [False, False, True, True]  # one message alone may be another sender's
+    clock.handle_round_trip(14 * SECOND, 6 * SECOND, 14 * SECOND + 2_000_000)
+    assert (clock.reboots, clock.steps) == (1, 0)
+    assert clock.host_time(7 * SECOND) == pytest.approx(15 * SECOND, abs=2e6)
 
 
 def test_a_clock_step_is_detected_and_the_new_offset_is_used() -> None:
     clock = VehicleClock()
     for k in range(10):
         assert clock.handle_round_trip(k * SECOND, k * SECOND + 5 * SECOND, k * SECOND + 1_000_000)
-    assert not clock.handle_round_trip(10 * SECOND, 18 * SECOND, 10 * SECOND + 1_000_000)
+    after = [clock.handle_round_trip(k * SECOND, k * SECOND + 8 * SECOND, k * SECOND + 1_000_000) for k in (10, 11, 12)]
+    assert after == [False, False, True]
     assert clock.steps == 1
     assert clock.offset_ns == pytest.approx(8 * SECOND, abs=1e6)
+
+
+@pytest.mark.parametrize("error_s", [86_400, 40, -40, -3])
+def test_stamps_of_another_clock_between_the_vehicles_own_never_move_its_clock(error_s: int) -> None:
+    clock = VehicleClock()
+    good, wrong = [], []
+    for k in range(100):
+        now = k * SECOND // 10
+        good.append(clock.handle_message(now + 500 * SECOND, now + 5_000_000))
+        # Three at once, agreeing with each other, between two of the vehicle's.
+        wrong += [
+            clock.handle_message(now + j + (500 + error_s) * SECOND, now + 6_000_000) for j in (0, 1_000_000, 2_000_000)
+        ]
+    assert all(good)
+    assert not any(wrong[3:])
+    assert (clock.reboots, clock.steps) == (0, 0)
+    assert clock.offset_ns == 500 * SECOND - 5_000_000
+
+
+def test_an_answer_of_another_clock_to_timesync_is_not_used() -> None:
+    clock = VehicleClock()
+    clock.handle_message(500 * SECOND, 5_000_000)
+    assert not clock.handle_round_trip(SECOND, 1_700_000_000 * SECOND, SECOND + 2_000_000)
+    assert clock.offset_ns == 500 * SECOND - 5_000_000
+    assert "another clock" in clock.reason
 
 
 def test_round_trips_of_negative_or_excessive_duration_are_rejected() -> None:
@@ -114,6 +141,14 @@ def test_a_short_video_is_located_within_a_long_flight() -> None:
     assert isinstance(result, OffsetEstimate), result
     assert result.offset == pytest.approx(550.0, abs=3.0 * result.std)
     assert result.std < 0.02
+
+
+def test_time_stamps_that_span_more_than_a_flight_size_no_array() -> None:
+    rotations, telemetry = simulated_rotations_and_telemetry(flight(1, 10.0), 0.0, 10.0)
+    ahead = [*telemetry, Telemetry(telemetry[-1].time + 1e12, telemetry[-1].ned_from_body)]
+    reason = find_offset(rotations, ahead, BODY_FROM_DOWN_CAMERA, (-0.7, 0.7))
+    assert isinstance(reason, str)
+    assert "a clock jumped" in reason
 
 
 def test_telemetry_of_another_flight_is_rejected() -> None:

@@ -1,0 +1,158 @@
+"""The vehicle's telemetry: whose messages count, and how each source's clock is mapped to the host's."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge.mavlink.dialect import AUTOPILOT, GIMBAL, mavlink
+from edge.mavlink.link.connection import ReceivedMessage
+from edge.mavlink.roles.vehicle import MountSample, Vehicle
+
+BOOT_S, DELAY_S = 123.0, 0.01
+COMPANION = 191
+EARTH = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
+HEADING = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
+
+
+class NoLink:
+    """A link that keeps what is sent."""
+
+    vehicle, open = 1, True
+
+    def __init__(self) -> None:
+        self.sent: list[Any] = []
+
+    def send(self, message: Any) -> bool:
+        self.sent.append(message)
+        return True
+
+
+class VehicleUnderTest:
+    """A vehicle whose clock is BOOT_S ahead of the host's, and whose messages arrive after DELAY_S."""
+
+    def __init__(self, *, gimbal: bool = False) -> None:
+        self.link = NoLink()
+        self.vehicle = Vehicle(self.link, gimbal=gimbal)  # type: ignore[arg-type]
+        self.vehicle.tick(0)
+
+    def take(self, message: Any, time_s: float, component: int = AUTOPILOT) -> list[MountSample]:
+        """Hand over a message measured at a host time."""
+        arrival = round(1e9 * (time_s + DELAY_S))
+        return self.vehicle.handle(ReceivedMessage(message, message.get_type(), 1, component, arrival))
+
+    def attitude(
+        self, time_s: float, component: int = AUTOPILOT, ahead_s: float = 0.0, yaw: float = 0.0
+    ) -> list[MountSample]:
+        """An attitude; ahead_s: error of its stamp."""
+        q = (math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw))
+        message = mavlink.MAVLink_attitude_quaternion_message(boot_ms(time_s + ahead_s), *q, 0.0, 0.0, 0.0)
+        return self.take(message, time_s, component)
+
+    def gimbal(self, time_s: float, ahead_s: float, component: int = GIMBAL, flags: int = EARTH) -> list[MountSample]:
+        """A gimbal's attitude, pitched down by 60 degrees."""
+        q = [math.cos(math.radians(30.0)), 0.0, -math.sin(math.radians(30.0)), 0.0]
+        message = mavlink.MAVLink_gimbal_device_attitude_status_message(
+            0, 0, boot_ms(time_s + ahead_s), flags, q, 0, 0, 0, 0
+        )
+        return self.take(message, time_s, component)
+
+    def position(self, time_s: float, component: int = AUTOPILOT) -> None:
+        """A position that moves north at 10 m/s."""
+        self.take(
+            mavlink.MAVLink_local_position_ned_message(boot_ms(time_s), 10 * time_s, 0, -50, 10, 0, 0),
+            time_s,
+            component,
+        )
+
+
+def boot_ms(time_s: float) -> int:
+    return round(1e3 * (time_s + BOOT_S))
+
+
+@pytest.mark.parametrize("ahead_s", [86_400.0, 40.0, 0.0])
+def test_attitude_position_and_time_of_another_component_are_refused_and_reported(ahead_s: float) -> None:
+    under_test = VehicleUnderTest()
+    for k in range(20):
+        under_test.position(0.1 * k)
+        assert len(under_test.attitude(0.1 * k)) == 1
+        assert under_test.attitude(0.1 * k + 0.05, COMPANION, ahead_s, yaw=2.0) == []
+        under_test.take(mavlink.MAVLink_system_time_message(0, boot_ms(0.1 * k + ahead_s)), 0.1 * k, COMPANION)
+        under_test.take(mavlink.MAVLink_local_position_ned_message(boot_ms(0.1 * k), 9e9, 0, 0, 0, 0, 0), 0.1 * k, 191)
+    (sample,) = under_test.attitude(2.0)
+    np.testing.assert_allclose(sample.ned_from_mount, np.eye(3), atol=1e-9)
+    assert sample.position is not None
+    assert sample.position == pytest.approx([20.0, 0.0, -50.0], abs=0.2)
+    assert abs(sample.host_ns - 2e9) < 2e7
+    assert under_test.vehicle.counters["component"] == 60
+    problem = under_test.vehicle.problem(2_000_000_000)
+    assert problem == "LOCAL_POSITION_NED of component 191 refused: not the autopilot (60 refused)"
+    assert under_test.vehicle.problem(30_000_000_000).startswith("no attitude of the autopilot")
+
+
+@pytest.mark.parametrize("ahead_s", [86_400.0, 40.0, -40.0])
+def test_a_wrong_stamp_of_the_autopilot_itself_is_refused_with_its_reason(ahead_s: float) -> None:
+    under_test = VehicleUnderTest()
+    for k in range(20):
+        assert len(under_test.attitude(0.1 * k)) == 1
+    assert under_test.attitude(1.95, ahead_s=ahead_s) == []
+    assert len(under_test.attitude(2.0)) == 1
+    assert under_test.vehicle.counters["time"] == 1
+    text = "in the future" if ahead_s > 0 else "went back"
+    assert text in under_test.vehicle.problem(2_000_000_000)
+
+
+@pytest.mark.parametrize(("ahead_s", "flags"), [(45.0, EARTH), (45.0, HEADING), (-100.0, HEADING), (0.0, EARTH)])
+def test_a_gimbal_with_its_own_clock_is_mapped_by_itself(ahead_s: float, flags: int) -> None:
+    under_test = VehicleUnderTest(gimbal=True)
+    for k in range(20):
+        assert under_test.attitude(0.1 * k, yaw=0.5) == []
+        under_test.position(0.1 * k)
+        samples = under_test.gimbal(0.1 * k + 0.01, ahead_s, flags=flags)
+        assert len(samples) == 1
+    sample = samples[0]
+    assert abs(sample.host_ns - 1.91e9) < 5e7
+    assert sample.position is not None
+    assert sample.position[0] == pytest.approx(19.1, abs=0.5)
+    assert abs(sample.vehicle_ns - round(1e9 * (1.91 + BOOT_S))) < 5e7  # by the autopilot's clock
+    forward = sample.ned_from_mount[:, 0]
+    yaw = 0.5 if flags == HEADING else 0.0
+    expected = [0.5 * math.cos(yaw), 0.5 * math.sin(yaw), math.sqrt(0.75)]
+    assert forward == pytest.approx(expected, abs=1e-6)
+    assert under_test.vehicle.problem(2_000_000_000) == ""
+
+
+def test_a_second_gimbal_is_not_mixed_with_the_first_and_takes_over_when_that_is_silent() -> None:
+    under_test = VehicleUnderTest(gimbal=True)
+    for k in range(10):
+        assert len(under_test.gimbal(0.1 * k, 45.0)) == 1
+        assert under_test.gimbal(0.1 * k + 0.05, 0.0, AUTOPILOT) == []
+    assert under_test.vehicle.counters["gimbal"] == 10
+    assert under_test.gimbal(3.5, 0.0, COMPANION) == []
+    assert len(under_test.gimbal(3.6, 0.0, AUTOPILOT)) == 1
+
+
+def test_a_gimbal_that_never_reports_is_named() -> None:
+    under_test = VehicleUnderTest(gimbal=True)
+    for k in range(40):
+        under_test.attitude(0.1 * k)
+    assert under_test.vehicle.problem(4_000_000_000) == "no attitude of the gimbal (GIMBAL_DEVICE_ATTITUDE_STATUS)"
+
+
+def test_samples_are_later_than_each_other_and_never_later_than_their_arrival() -> None:
+    under_test = VehicleUnderTest()
+    rng = np.random.default_rng(1)
+    last, count = -1, 0
+    for k in range(300):
+        time_s = 0.05 * k
+        message = mavlink.MAVLink_attitude_quaternion_message(boot_ms(time_s), 1, 0, 0, 0, 0, 0, 0)
+        arrival = round(1e9 * (time_s + rng.uniform(0.0, 0.3)))
+        handed_over = ReceivedMessage(message, message.get_type(), 1, AUTOPILOT, arrival)
+        for sample in under_test.vehicle.handle(handed_over):
+            count += 1
+            assert last < sample.host_ns <= arrival
+            last = sample.host_ns
+    assert count > 250
