@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from edge.devices.simulated.aircraft import SimulatedAircraft
     from edge.mavlink.link.connection import Link
     from edge.mavlink.roles.autopilot import Autopilot
-    from edge.mavlink.roles.camera import CameraComponent, SelectTarget, StopTracking, VideoStream
+    from edge.mavlink.roles.camera import CameraComponent, SelectTarget, StopTracking
+    from edge.mavlink.roles.camera_messages import VideoStream
     from edge.uav.base import Estimate, Image
     from edge.uav.world.flight_world import FlightWorld
 

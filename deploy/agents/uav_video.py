@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from deploy.config.uav import VideoOutConfig
 
 if TYPE_CHECKING:
-    from edge.mavlink.roles.camera import VideoStream
+    from edge.mavlink.roles.camera_messages import VideoStream
     from edge.uav.base import Estimate, Image
 
 
@@ -56,7 +56,7 @@ def serve_video(
 
     size: (width, height) [px]. Raises InputError if it cannot be served.
     """
-    from edge.mavlink.roles.camera import VideoStream
+    from edge.mavlink.roles.camera_messages import VideoStream
 
     host, _, text = out.listen.rpartition(":")
     host, port = host.strip("[]"), int(text)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from edge.mavlink.roles.camera import TrackingStatus
+from edge.mavlink.roles.camera_messages import TrackingStatus
 from edge.mavlink.roles.vehicle import Vehicle
 from edge.uav.base import Estimate, TrackState
 from edge.uav.georeference import ground_point

@@ -29,6 +29,7 @@ from edge.mavlink.link.signing import Signing
 from edge.mavlink.link.transport import Address, Pipe
 from edge.mavlink.roles import camera, telemetry
 from edge.mavlink.roles.autopilot import Autopilot, LinkFaults
+from edge.mavlink.roles.camera_messages import VideoStream
 from edge.uav.world.flight_world import FlightWorld, GroundTruth
 
 STEP_S = 0.01
@@ -170,7 +171,7 @@ class Flight:
         )
         agent = make_agent(
             config, self.device, self.link, looking, now_ns=self.now_ns, boot_id="boot",
-            stream=camera.VideoStream("mjpeg", "http://127.0.0.1:8560/stream.mjpg"),
+            stream=VideoStream("mjpeg", "http://127.0.0.1:8560/stream.mjpg"),
         )  # fmt: skip
         assert isinstance(agent, UavAgent)
         self.agent = agent

@@ -1,8 +1,4 @@
-"""A MAVLink camera component: camera information, target tracking status, and tracking commands.
-
-MAVLink's units and conventions are confined to this module: image coordinates 0 … 1, 1e-7 degrees, NaN for "not
-available".
-"""
+"""A MAVLink camera component: answers the commands of ground stations, and sends its status."""
 
 from __future__ import annotations
 
@@ -14,14 +10,14 @@ from typing import Any
 
 from edge.mavlink.dialect import CAMERA, mavlink
 from edge.mavlink.link.connection import Link, ReceivedMessage
+from edge.mavlink.roles.camera_messages import STREAM_ID, CameraMessages, TrackingStatus, VideoStream
+from edge.mavlink.roles.message_rates import MessageRates
+from edge.mavlink.roles.status_texts import StatusText, StatusTexts
 from protocols.geometry.camera import Intrinsics
 
-MESSAGE_TYPES = ("COMMAND_LONG", "COMMAND_INT", "PARAM_REQUEST_LIST")
-NAN = float("nan")
+MESSAGE_TYPES = ("HEARTBEAT", "COMMAND_LONG", "COMMAND_INT", "PARAM_REQUEST_LIST")
 _HEARTBEAT_S = 1.0
 _REPEAT_WINDOW_S = 2  # s within which identical commands are retransmissions of the station
-_UNKNOWN_INT = 0x7FFFFFFF
-_MODEL = b"Syncline UAV tracker"
 _DEFAULT_HZ = {"CAMERA_TRACKING_IMAGE_STATUS": 10.0, "CAMERA_TRACKING_GEO_STATUS": 5.0, "CAMERA_FOV_STATUS": 1.0}
 
 
@@ -51,45 +47,6 @@ class StopTracking:
     by: int
 
 
-@dataclass(frozen=True, slots=True)
-class VideoStream:
-    """The operator's video stream. kind: "rtsp" or "mjpeg"; uri: its address."""
-
-    kind: str
-    uri: str
-
-
-@dataclass(slots=True)
-class TrackingStatus:
-    """What the component reports of the target and the camera; the agent keeps it up to date.
-
-    state: "idle", "visible", "coasting", "lost". centre, half_size: of the target's box as fractions of the image, None
-    where unknown or outside. geo: latitude, longitude [degrees], altitude [m]. h_acc, distance [m]; velocity: north,
-    east [m/s]; course [rad]. camera: latitude, longitude, altitude of the camera; image_centre: of the ground point at
-    the image centre. quaternion: of the camera's axes forward, right, down in NED.
-    """
-
-    state: str = "idle"
-    mode_point: bool = False
-    centre: tuple[float, float] | None = None
-    half_size: tuple[float, float] | None = None
-    geo: tuple[float, float, float] | None = None
-    h_acc: float = NAN
-    velocity: tuple[float, float] | None = None
-    distance: float = NAN
-    course: float = NAN
-    camera: tuple[float, float, float] | None = None
-    image_centre: tuple[float, float, float] | None = None
-    quaternion: list[float] | None = None
-    boot_ms: int = 0
-
-
-@dataclass(slots=True)
-class _MessageSchedule:
-    interval_s: float
-    due_s: float = -math.inf
-
-
 class CameraComponent:
     """The camera component on one link. size: (width, height) [px]; lens: None where not calibrated.
 
@@ -109,28 +66,28 @@ class CameraComponent:
         stations: frozenset[int] = frozenset(),
         version: tuple[int, int, int] = (0, 1, 0),
     ) -> None:
-        self._link, self._size, self._fps, self._lens, self._stream = link, size, fps, lens, stream
-        self._on_command, self._stations, self._version = on_command, stations, version
-        self.status = TrackingStatus()
+        self._link, self._on_command, self._stations = link, on_command, stations
+        self._messages = CameraMessages(size, fps, lens, stream, version)
+        streams = ("VIDEO_STREAM_INFORMATION", "VIDEO_STREAM_STATUS") if stream is not None else ()
+        self._available = frozenset(("CAMERA_INFORMATION", "CAMERA_SETTINGS", *_DEFAULT_HZ, *streams))
+        self._has_stream = stream is not None
         self.counters: Counter[str] = Counter()
         self._beat_s = -math.inf
-        self._rates = {kind: _MessageSchedule(1.0 / rate) for kind, rate in _DEFAULT_HZ.items()}
+        self._rates = MessageRates(_DEFAULT_HZ)
+        self._texts = StatusTexts()
         self._last: dict[tuple[int, int], _AcknowledgedCommand] = {}
 
     @property
-    def fov(self) -> tuple[float, float]:
-        """Horizontal and vertical [degrees]; NaN without a lens."""
-        if self._lens is None:
-            return NAN, NAN
-        matrix = self._lens.matrix
-        return (
-            math.degrees(2.0 * math.atan(0.5 * self._size[0] / matrix[0, 0])),
-            math.degrees(2.0 * math.atan(0.5 * self._size[1] / matrix[1, 1])),
-        )
+    def status(self) -> TrackingStatus:
+        """What is reported of the target and the camera."""
+        return self._messages.status
 
     def handle(self, received: ReceivedMessage, now_s: float) -> None:
         """Handle a message if it addresses the camera."""
         message = received.message
+        station = (received.system, received.component)
+        if received.kind == "HEARTBEAT" and message.type == mavlink.MAV_TYPE_GCS:
+            self._rates.hear(station, now_s)
         if received.kind not in ("COMMAND_LONG", "COMMAND_INT"):
             return
         if message.target_system not in (0, self._link.vehicle) or message.target_component not in (0, CAMERA):
@@ -141,9 +98,9 @@ class CameraComponent:
             if for_us:
                 self._acknowledge(message, received, mavlink.MAV_RESULT_DENIED)
             return
+        self._rates.hear(station, now_s)
         parameters = _parameters(message)
-        key = (received.system, received.component)
-        last = self._last.get(key)
+        last = self._last.get(station)
         if (
             last is not None
             and last.same(message, parameters)
@@ -162,7 +119,7 @@ class CameraComponent:
             result = mavlink.MAV_RESULT_UNSUPPORTED
         if len(self._last) > 32:
             self._last.clear()
-        self._last[key] = _AcknowledgedCommand(message.command, parameters, result, now_s)
+        self._last[station] = _AcknowledgedCommand(message.command, parameters, result, now_s)
         self._acknowledge(message, received, result)
         self._send_response(message.command, parameters, result)
 
@@ -178,13 +135,13 @@ class CameraComponent:
             )
         if self._link.vehicle is None:
             return
-        for kind, rate in self._rates.items():
+        for kind in _DEFAULT_HZ:
             per_frame = kind != "CAMERA_FOV_STATUS"
             if per_frame and (not frame or self.status.state == "idle"):
                 continue
-            if rate.interval_s > 0.0 and now_s >= rate.due_s:
-                rate.due_s = max(rate.due_s + rate.interval_s, now_s + 0.5 * rate.interval_s)
+            if self._rates.is_due(kind, now_s):
                 self._send_message(kind)
+        self._send_text(self._texts.update(self.status.state, now_s))
 
     def send_status_now(self) -> None:
         """Send the tracking status at once, after a change of state."""
@@ -195,14 +152,21 @@ class CameraComponent:
         """Execute one command; its MAV_RESULT, None where it is not for a camera."""
         accepted, denied = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED
         if command in _REQUESTS or command == mavlink.MAV_CMD_REQUEST_MESSAGE:
-            return accepted if self._requested(command, p) in self._available_messages() else None
-        if command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-            rate = self._rates.get(_message_name(p[0]))
-            if rate is None or not math.isfinite(p[1]):
+            kind = self._requested(command, p)
+            if kind not in self._available:
                 return None
-            default = 1.0 / _DEFAULT_HZ[_message_name(p[0])]
-            rate.interval_s = default if p[1] == 0 else 0.0 if p[1] < 0 else max(1e-6 * p[1], 1.0 / 60.0)
-            rate.due_s = -math.inf
+            stream = p[0] if command in _REQUESTS else p[1]
+            return accepted if not kind.startswith("VIDEO_STREAM") or stream in (0, STREAM_ID) else denied
+        if command in (mavlink.MAV_CMD_VIDEO_START_STREAMING, mavlink.MAV_CMD_VIDEO_STOP_STREAMING):
+            # The stream is always there, and costs nothing while nobody opens it: one station cannot end another's.
+            return None if not self._has_stream else accepted if p[0] in (0, STREAM_ID) else denied
+        if command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+            kind = _message_name(p[0])
+            if kind not in _DEFAULT_HZ:
+                return None
+            if not math.isfinite(p[1]):
+                return denied
+            self._rates.set_interval((received.system, received.component), kind, p[1])
             return accepted
         if command == mavlink.MAV_CMD_CAMERA_TRACK_POINT:
             selection = SelectTarget(p[0], p[1], p[0], p[1], received.system)
@@ -223,8 +187,12 @@ class CameraComponent:
             self.counters["refused.box"] += 1
             return denied
         self.counters["selections"] += 1
+        if not self._on_command(selection):
+            return mavlink.MAV_RESULT_FAILED
         self.status.mode_point = selection.is_point
-        return accepted if self._on_command(selection) else mavlink.MAV_RESULT_FAILED
+        self._rates.restore((received.system, received.component))  # who selects wants to see
+        self._send_text(self._texts.select(received.system))
+        return accepted
 
     def _send_response(self, command: int, p: tuple[float, ...], result: int) -> None:
         """Send the data that a command requested, after its ACK."""
@@ -232,129 +200,19 @@ class CameraComponent:
             return
         if command in _REQUESTS or command == mavlink.MAV_CMD_REQUEST_MESSAGE:
             self._send_message(self._requested(command, p))
-        elif command != mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+        elif command in _TRACKING:
             self.send_status_now()
 
     def _requested(self, command: int, p: tuple[float, ...]) -> str:
         return _REQUESTS.get(command) or _message_name(p[0])
 
-    def _available_messages(self) -> frozenset[str]:
-        streams = ("VIDEO_STREAM_INFORMATION", "VIDEO_STREAM_STATUS") if self._stream is not None else ()
-        return frozenset(("CAMERA_INFORMATION", "CAMERA_SETTINGS", *self._rates, *streams))
-
     def _send_message(self, kind: str) -> None:
-        if self._link.send(getattr(self, f"_{kind.lower()}")()):
+        if self._link.send(self._messages.build(kind)):
             self.counters["statuses"] += kind in _DEFAULT_HZ
 
-    def _camera_information(self) -> Any:
-        flags = mavlink.CAMERA_CAP_FLAGS_HAS_TRACKING_POINT | mavlink.CAMERA_CAP_FLAGS_HAS_TRACKING_RECTANGLE
-        flags |= mavlink.CAMERA_CAP_FLAGS_HAS_TRACKING_GEO_STATUS
-        if self._stream is not None:
-            flags |= mavlink.CAMERA_CAP_FLAGS_HAS_VIDEO_STREAM
-        major, minor, patch = self._version
-        return mavlink.MAVLink_camera_information_message(
-            self.status.boot_ms,
-            list(b"Syncline".ljust(32, b"\0")),
-            list(_MODEL.ljust(32, b"\0")),
-            major | minor << 8 | patch << 16,
-            NAN,
-            NAN,
-            NAN,
-            self._size[0],
-            self._size[1],
-            0,
-            flags,
-            0,
-            b"",
-        )
-
-    def _camera_settings(self) -> Any:
-        return mavlink.MAVLink_camera_settings_message(self.status.boot_ms, mavlink.CAMERA_MODE_VIDEO)
-
-    def _video_stream_information(self) -> Any:
-        assert self._stream is not None
-        rtsp = self._stream.kind == "rtsp"
-        hfov = self.fov[0]
-        # MAVLink has no type for MJPEG over HTTP: the uri identifies it, and the encoding is reported as unknown.
-        return mavlink.MAVLink_video_stream_information_message(
-            1,
-            1,
-            mavlink.VIDEO_STREAM_TYPE_RTSP if rtsp else mavlink.VIDEO_STREAM_TYPE_TCP_MPEG,
-            mavlink.VIDEO_STREAM_STATUS_FLAGS_RUNNING,
-            self._fps,
-            self._size[0],
-            self._size[1],
-            0,
-            0,
-            round(hfov) if math.isfinite(hfov) else 0,
-            self._stream.kind.encode(),
-            self._stream.uri.encode()[:159],
-            mavlink.VIDEO_STREAM_ENCODING_H264 if rtsp else mavlink.VIDEO_STREAM_ENCODING_UNKNOWN,
-        )
-
-    def _video_stream_status(self) -> Any:
-        hfov = self.fov[0]
-        return mavlink.MAVLink_video_stream_status_message(
-            1,
-            mavlink.VIDEO_STREAM_STATUS_FLAGS_RUNNING,
-            self._fps,
-            self._size[0],
-            self._size[1],
-            0,
-            0,
-            round(hfov) if math.isfinite(hfov) else 0,
-        )
-
-    def _camera_tracking_image_status(self) -> Any:
-        status = self.status
-        mode = mavlink.CAMERA_TRACKING_MODE_RECTANGLE
-        if status.state == "idle":
-            mode = mavlink.CAMERA_TRACKING_MODE_NONE
-        elif status.mode_point:
-            mode = mavlink.CAMERA_TRACKING_MODE_POINT
-        x, y, box = NAN, NAN, (NAN,) * 4
-        # Outside the image there is no box; the geo status reports the predicted position.
-        if status.centre is not None and status.half_size is not None and all(0.0 <= c <= 1.0 for c in status.centre):
-            (x, y), (w, h) = status.centre, status.half_size
-            box = (max(x - w, 0.0), max(y - h, 0.0), min(x + w, 1.0), min(y + h, 1.0))
-        return mavlink.MAVLink_camera_tracking_image_status_message(
-            _STATUS_FLAGS[status.state], mode, mavlink.CAMERA_TRACKING_TARGET_DATA_IN_STATUS, x, y, NAN, *box
-        )
-
-    def _camera_tracking_geo_status(self) -> Any:
-        status = self.status
-        latitude, longitude, altitude = _scaled_position(status.geo)
-        north, east = status.velocity or (NAN, NAN)
-        return mavlink.MAVLink_camera_tracking_geo_status_message(
-            _STATUS_FLAGS[status.state],
-            latitude,
-            longitude,
-            altitude,
-            status.h_acc,
-            NAN,
-            north,
-            east,
-            0.0 if status.velocity else NAN,
-            NAN,
-            status.distance,
-            status.course,
-            NAN,
-        )
-
-    def _camera_fov_status(self) -> Any:
-        status, (hfov, vfov) = self.status, self.fov
-        camera, image = _scaled_position(status.camera), _scaled_position(status.image_centre)
-        heights = [round(1e3 * place[2]) if place[0] != _UNKNOWN_INT else _UNKNOWN_INT for place in (camera, image)]
-        return mavlink.MAVLink_camera_fov_status_message(
-            status.boot_ms,
-            *camera[:2],
-            heights[0],
-            *image[:2],
-            heights[1],
-            status.quaternion or [NAN] * 4,
-            hfov,
-            vfov,
-        )
+    def _send_text(self, text: StatusText | None) -> None:
+        if text is not None:
+            self._link.send(mavlink.MAVLink_statustext_message(text[1], text[0].encode()[:50]))
 
     def _acknowledge(self, message: Any, received: ReceivedMessage, result: int) -> None:
         self._link.send(
@@ -378,12 +236,6 @@ def is_retransmission(message: Any) -> bool:
     return int(getattr(message, "confirmation", 0)) > 0
 
 
-_STATUS_FLAGS = {
-    "idle": mavlink.CAMERA_TRACKING_STATUS_FLAGS_IDLE,
-    "visible": mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE,
-    "coasting": mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE | mavlink.CAMERA_TRACKING_STATUS_FLAGS_COASTING,
-    "lost": mavlink.CAMERA_TRACKING_STATUS_FLAGS_ERROR,
-}
 _REQUESTS = {
     mavlink.MAV_CMD_REQUEST_CAMERA_INFORMATION: "CAMERA_INFORMATION",
     mavlink.MAV_CMD_REQUEST_CAMERA_SETTINGS: "CAMERA_SETTINGS",
@@ -391,6 +243,13 @@ _REQUESTS = {
     mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_STATUS: "VIDEO_STREAM_STATUS",
 }
 """Commands from before MAV_CMD_REQUEST_MESSAGE, which stations still send."""
+_TRACKING = frozenset(
+    {
+        mavlink.MAV_CMD_CAMERA_TRACK_POINT,
+        mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE,
+        mavlink.MAV_CMD_CAMERA_STOP_TRACKING,
+    }
+)
 
 
 def _parameters(message: Any) -> tuple[float, ...]:
@@ -403,10 +262,3 @@ def _message_name(number: float) -> str:
     """The name of a message id that came as a float; "" for an unknown one."""
     kind = mavlink.mavlink_map.get(int(number)) if math.isfinite(number) and number == int(number) else None
     return "" if kind is None else str(kind.msgname)
-
-
-def _scaled_position(geo: tuple[float, float, float] | None) -> tuple[int, int, float]:
-    """Latitude, longitude in 1e-7 degrees and altitude [m]; INT32_MAX and NaN where unknown."""
-    if geo is None:
-        return _UNKNOWN_INT, _UNKNOWN_INT, NAN
-    return round(1e7 * geo[0]), round(1e7 * geo[1]), geo[2]

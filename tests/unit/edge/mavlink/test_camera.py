@@ -12,7 +12,10 @@ import pytest
 from edge.mavlink.dialect import mavlink
 from edge.mavlink.link.connection import Link
 from edge.mavlink.link.transport import Pipe
-from edge.mavlink.roles.camera import CameraComponent, SelectTarget, StopTracking, VideoStream
+from edge.mavlink.roles import status_texts
+from edge.mavlink.roles.camera import CameraComponent, SelectTarget, StopTracking
+from edge.mavlink.roles.camera_messages import VideoStream
+from edge.mavlink.roles.message_rates import MessageRates
 from protocols.geometry.camera import Intrinsics
 
 ACTIVE, ERROR, COASTING = 1, 2, 8
@@ -42,22 +45,41 @@ class CameraUnderTest:
         vehicle = mavlink.MAVLink(None, 1, 1)
         self.pipe.send(bytes(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(vehicle)), None)
         self.link.poll()
-        self._station = mavlink.MAVLink(None, 255, 190)
 
-    def command(self, command: int, *parameters: float, confirmation: int = 0, component: int = 100) -> list[Any]:
-        """Send a command to the camera; returns all its responses."""
+    def command(
+        self, command: int, *parameters: float, confirmation: int = 0, component: int = 100, by: int = 255
+    ) -> list[Any]:
+        """Send a command to the camera; returns all its responses. by: system id of the station."""
         filled = [*parameters, *([0.0] * (7 - len(parameters)))]
         message = mavlink.MAVLink_command_long_message(1, component, command, confirmation, *filled)
-        self.pipe.send(bytes(message.pack(self._station)), None)
+        return self.send(message, by)
+
+    def send(self, message: Any, by: int = 255) -> list[Any]:
+        """Send a message of a station to the camera; returns all its responses."""
+        self.pipe.send(bytes(message.pack(mavlink.MAVLink(None, by, 190))), None)
         for received in self.link.poll():
             self.camera.handle(received, self.now)
         return self.received()
 
-    def result(self, command: int, *parameters: float, **options: Any) -> int:
+    def result(self, command: int, *parameters: float, by: int = 255, **options: Any) -> int:
         """The result in the ACK of a command."""
-        (ack,) = [m for m in self.command(command, *parameters, **options) if m.get_type() == "COMMAND_ACK"]
-        assert (ack.target_system, ack.target_component) == (255, 190)
+        (ack,) = [m for m in self.command(command, *parameters, by=by, **options) if m.get_type() == "COMMAND_ACK"]
+        assert (ack.target_system, ack.target_component) == (by, 190)
         return int(ack.result)
+
+    def fly(self, seconds: float, *beating: int) -> dict[str, int]:
+        """Frames at 30 fps while stations send heartbeats; how many messages of each type were sent."""
+        counts: dict[str, int] = {}
+        for k in range(round(30 * seconds)):
+            self.now += 1 / 30
+            if k % 30 == 0:
+                for station in beating:
+                    heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
+                    self.send(heartbeat, station)
+            self.camera.tick(self.now, frame=True)
+            for message in self.received():
+                counts[message.get_type()] = counts.get(message.get_type(), 0) + 1
+        return counts
 
     def received(self) -> list[Any]:
         """All messages since the last call, parsed by pymavlink."""
@@ -80,6 +102,7 @@ class CameraUnderTest:
 def test_the_tracking_state_is_encoded_in_the_status_flags(state: str, flags: int) -> None:
     under_test = CameraUnderTest()
     under_test.camera.status.state = state
+    under_test.camera.status.centre = under_test.camera.status.half_size = (0.5, 0.5)
     assert under_test.status_message("CAMERA_TRACKING_IMAGE_STATUS").tracking_status == flags
     assert under_test.status_message("CAMERA_TRACKING_GEO_STATUS").tracking_status == flags
 
@@ -93,6 +116,8 @@ def test_a_box_is_clipped_to_the_image_and_a_target_outside_has_none() -> None:
     assert corners == pytest.approx((0.85, 0.3, 1.0, 0.7), abs=1e-6)
     status.state, status.centre = "coasting", (1.05, 0.5)
     away = under_test.status_message("CAMERA_TRACKING_IMAGE_STATUS")
+    status.state = "visible"  # QGroundControl would draw a box of NaN
+    assert under_test.status_message("CAMERA_TRACKING_IMAGE_STATUS").tracking_status == ACTIVE | COASTING
     assert all(math.isnan(value) for value in (away.point_x, away.rec_top_x, away.rec_bottom_y))
 
 
@@ -116,7 +141,7 @@ def test_tracking_status_is_sent_with_frames_and_only_while_there_is_a_target() 
     assert {m.get_type() for m in under_test.received()} == {"HEARTBEAT", "CAMERA_FOV_STATUS"}
     under_test.camera.status.state = "visible"
     under_test.camera.tick(0.1, frame=False)
-    assert under_test.received() == []
+    assert [m.get_type() for m in under_test.received()] == ["STATUSTEXT"]
     under_test.camera.tick(0.2, frame=True)
     assert {m.get_type() for m in under_test.received()} == {
         "CAMERA_TRACKING_IMAGE_STATUS",
@@ -206,3 +231,121 @@ def test_the_video_stream_is_described_only_where_there_is_one(kind: str, uri: s
     encoding = mavlink.VIDEO_STREAM_ENCODING_H264 if kind == "rtsp" else mavlink.VIDEO_STREAM_ENCODING_UNKNOWN
     assert info.encoding == encoding
     assert CameraUnderTest().result(request, stream_id) == mavlink.MAV_RESULT_UNSUPPORTED
+
+
+IMAGE = mavlink.MAVLINK_MSG_ID_CAMERA_TRACKING_IMAGE_STATUS
+QGC, OTHER = 255, 253
+
+
+def tracked(under_test: CameraUnderTest, by: int) -> None:
+    under_test.result(mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, 0.1, 0.1, 0.2, 0.2, by=by)
+    status = under_test.camera.status
+    status.state, status.centre, status.half_size = "visible", (0.15, 0.15), (0.05, 0.05)
+
+
+def test_a_station_that_slows_or_stops_the_status_changes_nothing_for_the_others() -> None:
+    under_test = CameraUnderTest()
+    under_test.fly(0.1, QGC, OTHER)
+    tracked(under_test, QGC)
+    # As QGroundControl does after a selection, and after it has stopped tracking.
+    for interval_us in (500_000, -1):
+        assert under_test.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, IMAGE, interval_us, by=QGC) == 0
+        assert under_test.fly(3.0, QGC, OTHER)["CAMERA_TRACKING_IMAGE_STATUS"] == pytest.approx(30, abs=2)
+
+
+def test_a_station_alone_gets_what_it_asks_for() -> None:
+    under_test = CameraUnderTest()
+    tracked(under_test, QGC)
+    under_test.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, IMAGE, 500_000, by=QGC)
+    assert under_test.fly(3.0, QGC)["CAMERA_TRACKING_IMAGE_STATUS"] == pytest.approx(6, abs=1)
+    under_test.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, IMAGE, -1, by=QGC)
+    assert "CAMERA_TRACKING_IMAGE_STATUS" not in under_test.fly(3.0, QGC)
+    under_test.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, IMAGE, 0, by=QGC)
+    assert under_test.fly(3.0, QGC)["CAMERA_TRACKING_IMAGE_STATUS"] == pytest.approx(30, abs=2)
+    assert under_test.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, IMAGE, math.nan, by=QGC) == mavlink.MAV_RESULT_DENIED
+    unknown = under_test.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, 1000, by=QGC)
+    assert unknown == mavlink.MAV_RESULT_UNSUPPORTED
+
+
+def test_a_selection_and_a_departure_restore_the_default_rate() -> None:
+    under_test = CameraUnderTest()
+    tracked(under_test, QGC)
+    under_test.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, IMAGE, -1, by=QGC)
+    assert "CAMERA_TRACKING_IMAGE_STATUS" not in under_test.fly(1.0, QGC)
+    tracked(under_test, QGC)
+    assert under_test.fly(3.0, QGC)["CAMERA_TRACKING_IMAGE_STATUS"] == pytest.approx(30, abs=2)
+    under_test.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, IMAGE, 3_600_000_000, by=QGC)
+    under_test.fly(0.1)
+    under_test.now += 10.0  # the station is gone
+    assert under_test.fly(3.0)["CAMERA_TRACKING_IMAGE_STATUS"] == pytest.approx(30, abs=2)
+
+
+def test_any_number_of_stations_is_remembered_only_up_to_a_limit() -> None:
+    rates = MessageRates({"CAMERA_FOV_STATUS": 1.0})
+    for system in range(200):
+        rates.hear((system, 190), 0.01 * system)
+        rates.set_interval((system, 190), "CAMERA_FOV_STATUS", 100_000 * (system + 1))
+    assert len(rates._stations) == 32
+    assert rates.interval("CAMERA_FOV_STATUS", 2.0) == pytest.approx(16.9)
+
+
+def test_video_stream_commands_are_acknowledged_and_unknown_streams_refused() -> None:
+    accepted, denied, unsupported = (
+        mavlink.MAV_RESULT_ACCEPTED,
+        mavlink.MAV_RESULT_DENIED,
+        mavlink.MAV_RESULT_UNSUPPORTED,
+    )
+    under_test = CameraUnderTest(stream=VideoStream("rtsp", "rtsp://10.0.0.7:8554/overlay"))
+    information, status = mavlink.MAVLINK_MSG_ID_VIDEO_STREAM_INFORMATION, mavlink.MAVLINK_MSG_ID_VIDEO_STREAM_STATUS
+    for stream, result in ((0, accepted), (1, accepted), (7, denied), (math.nan, denied)):
+        for command in (mavlink.MAV_CMD_VIDEO_START_STREAMING, mavlink.MAV_CMD_VIDEO_STOP_STREAMING):
+            assert under_test.result(command, stream) == result
+        for legacy in (
+            mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_INFORMATION,
+            mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_STATUS,
+        ):
+            assert under_test.result(legacy, stream) == result
+        for message in (information, status):
+            answers = under_test.command(mavlink.MAV_CMD_REQUEST_MESSAGE, message, stream)
+            assert answers[0].result == result
+            assert [m.stream_id for m in answers[1:]] == ([1] if result == accepted else [])
+    assert CameraUnderTest().result(mavlink.MAV_CMD_VIDEO_START_STREAMING, 1) == unsupported
+
+
+def test_unknown_zoom_and_focus_are_nan() -> None:
+    _, settings = CameraUnderTest().command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_CAMERA_SETTINGS)
+    assert math.isnan(settings.zoomLevel)
+    assert math.isnan(settings.focusLevel)
+
+
+def test_status_texts_say_what_happens_to_the_target() -> None:
+    under_test = CameraUnderTest()
+    texts: list[str] = []
+
+    def fly(state: str, seconds: float) -> None:
+        under_test.camera.status.state = state
+        for _ in range(round(10 * seconds)):
+            under_test.now += 0.1
+            under_test.camera.tick(under_test.now, frame=True)
+            texts.extend(m.text for m in under_test.received() if m.get_type() == "STATUSTEXT")
+
+    tracked(under_test, QGC)
+    for state, seconds in (("visible", 5), ("coasting", 0.3), ("visible", 1), ("coasting", 3), ("visible", 3)):
+        fly(state, seconds)
+    assert texts == [
+        "Syncline: tracking started",
+        "Syncline: target not seen, position predicted",
+        "Syncline: target found again",
+    ]
+    texts.clear()
+    for _ in range(20):  # a target that comes and goes floods no message list
+        fly("coasting", 0.6)
+        fly("visible", 0.6)
+    assert 2 <= len(texts) <= 12
+    texts.clear()
+    answers = under_test.command(mavlink.MAV_CMD_CAMERA_TRACK_POINT, 0.5, 0.5, by=OTHER)
+    assert "Syncline: station 253 took over from 255" in [m.text for m in answers if m.get_type() == "STATUSTEXT"]
+    fly("lost", 1)
+    fly("idle", 1)
+    assert texts == ["Syncline: target lost, select it again", "Syncline: tracking stopped"]
+    assert all(len(text) <= 50 for text, _ in status_texts._TEXTS.values())
