@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
 import os
@@ -18,7 +19,7 @@ import tomli_w
 from edge.detectors.marker.ball import REVISION, MarkerModel
 from edge.detectors.marker.factory import ball_detector
 from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader, has_pyav
-from edge.offline.detections import VideoDetections, observations_csv, run_detector
+from edge.offline.detections import HEADER, VideoDetections, observations_csv, run_detector
 from edge.offline.video import MARKER_FILE, read_marker_model
 from protocols.core.errors import InputError
 from protocols.core.files import write_together
@@ -277,17 +278,16 @@ def _detect_all(
 
 
 def _detect_people_or_vehicles(film: VideoReader, camera: str, kind: str, progress: Progress) -> VideoDetections:
-    """Detect people or vehicles in a video, without the extra columns that a session does not have."""
-    from edge.offline.moving import EXTRA_COLUMNS, detect_moving, moving_detector
+    """Detect people or vehicles in a video."""
+    from edge.offline.moving import detect_moving, moving_detector
 
-    found = detect_moving(film, camera, moving_detector(kind, "mog2", film.info.fps), progress)
-    extra = EXTRA_COLUMNS.count(",") + 1
-    return replace(found, rows=tuple(row.rsplit(",", extra)[0] for row in found.rows), extra_columns="")
+    return detect_moving(film, camera, moving_detector(kind, "mog2", film.info.fps), progress)
 
 
 def _label_count_if_many(found: VideoDetections) -> int:
-    """Number of different labels in a video if more than one, else 0; the label is the last cell but one."""
-    labels = {row.rsplit(",", 2)[1] for row in found.rows}
+    """Number of different labels in a video if more than one, else 0."""
+    column = HEADER.split(",").index("label")
+    labels = {cells[column] for cells in csv.reader(found.rows)}
     return len(labels) if len(labels) > 1 else 0
 
 

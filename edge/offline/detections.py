@@ -5,25 +5,30 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edge.detectors.base import Detection, Detector
-from edge.devices.playback.video_reader import VideoReader
+from edge.detectors.base import BatchDetector, Detection, Detector
+from edge.devices.playback.video_reader import VideoFrame, VideoReader
 from protocols.core.errors import InputError
 from protocols.core.files import write_together
 from protocols.core.tables import dataframe
 from protocols.session.calibration import csv_cell
+from protocols.session.detections import COLUMNS
 
 if TYPE_CHECKING:
     import pandas
 
-HEADER = "camera,frame,time,u,v,size,label,score"
+HEADER = ",".join(("camera", "frame", "time", "u", "v", "size", "label", *COLUMNS))
 _PROGRESS_EVERY = 10  # frames
+
+Collected = dict[int, tuple[float, list[Detection]]]
+"""Of frames, by number: the time [s] and the detections."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +38,6 @@ class VideoDetections:
     rows: lines of observations.csv without its header. frames: number of frames read. frames_with_detection: number
     of those with at least one row. corrupt: frames that could not be decoded. repaired: frames without a usable time
     stamp. size: (width, height) [px]. fps: mean frame rate [Hz]. span: times [s] of the first and last frame.
-    extra_columns: names of the columns after ``score``, separated by commas.
     """
 
     rows: tuple[str, ...]
@@ -44,7 +48,6 @@ class VideoDetections:
     size: tuple[int, int]
     fps: float
     span: tuple[float, float]
-    extra_columns: str = ""
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -58,7 +61,7 @@ class VideoDetections:
 
     def to_csv(self) -> str:
         """The text of observations.csv."""
-        return observations_csv(self.rows, self.extra_columns)
+        return observations_csv(self.rows)
 
     def save(self, path: str | Path) -> None:
         """Write observations.csv to ``path`` atomically, as `syncline detect` does. Raises InputError."""
@@ -67,14 +70,15 @@ class VideoDetections:
     def to_dataframe(self) -> pandas.DataFrame:
         """The columns of observations.csv, one row per detection. Needs pandas.
 
-        camera and label are text, frame is an integer, all others are floats (time in seconds, u, v and size in
+        camera, label and kind are text, frame is an integer, all others are floats (time in seconds, lengths in
         pixels); NaN = not measured. Raises InputError where pandas is not installed.
         """
         # Not by pandas.read_csv: a camera or a label may be called "NA".
         names, *rows = csv.reader(io.StringIO(self.to_csv()))
-        kinds: dict[str, type] = {"camera": object, "label": object, "frame": np.int64}
+        kinds: dict[str, type] = {"camera": object, "label": object, "kind": object, "frame": np.int64}
         cells = np.array(rows, dtype=object).reshape(-1, len(names))
-        cells[cells == ""] = "nan"
+        texts = np.array([kinds.get(name) is object for name in names])
+        cells[(cells == "") & ~texts] = "nan"
         return dataframe({name: cells[:, k].astype(kinds.get(name, np.float64)) for k, name in enumerate(names)})
 
 
@@ -84,39 +88,32 @@ def run_detector(
     detector: Detector,
     on_frame: Callable[[int], None] = lambda frame: None,
     stop: Callable[[], bool] = lambda: False,
-    collected: dict[int, list[tuple[str, Detection]]] | None = None,
+    collected: Collected | None = None,
 ) -> VideoDetections:
     """Run a detector over all frames of a video, at most one row per label and frame. Raises InputError.
 
     on_frame: called every ten frames with the number of frames done. stop: polled at each frame, ends the run early.
-    seen: where given, is filled with each frame's rows and detections in place of the result's ``rows``; its rows are
-    format strings with ``{label}`` in place of the label.
+    collected: where given, is filled in place of the result's ``rows``; see ``detection_rows``.
     """
+    found: Collected = {} if collected is None else collected
     rows: list[str] = []
-    name = csv_cell(camera)
     frames = frames_with = 0
     first = last = math.nan
-    for frame in video:
-        if stop():
-            break
+    for frame, seen in detected_frames(video, detector, stop):
         first = frame.time if frames == 0 else first
         last = frame.time
         frames += 1
-        labels: set[str] = set()
-        for one in detector.detect(frame.image(), frame.time):
+        by_label: dict[str, Detection] = {}
+        for one in seen:
             # Detections come best first: the first one of each label is kept.
-            if one.label in labels or not (math.isfinite(one.u) and math.isfinite(one.v)):
-                continue
-            labels.add(one.label)
-            size = f"{one.size:.17g}" if one.size > 0 else ""
-            place = f"{frame.frame},{frame.time:.17g},{one.u:.17g},{one.v:.17g}"
-            if collected is not None:
-                template = name.replace("{", "{{").replace("}", "}}")
-                row = f"{template},{place},{size},{{label}},{one.score:.6g}"
-                collected.setdefault(frame.frame, []).append((row, one))
+            if math.isfinite(one.u) and math.isfinite(one.v):
+                by_label.setdefault(one.label, one)
+        if by_label:
+            frames_with += 1
+            if collected is None:
+                rows += detection_rows(camera, {frame.frame: (frame.time, list(by_label.values()))})
             else:
-                rows.append(f"{name},{place},{size},{csv_cell(one.label)},{one.score:.6g}")
-        frames_with += bool(labels)
+                found[frame.frame] = frame.time, list(by_label.values())
         if frames % _PROGRESS_EVERY == 0:
             on_frame(frames)
     if not frames:
@@ -128,6 +125,46 @@ def run_detector(
     )
 
 
-def observations_csv(rows: tuple[str, ...] | list[str], extra: str = "") -> str:
-    """The text of observations.csv. extra: names of the columns after ``score``, separated by commas."""
-    return "\n".join([HEADER + (f",{extra}" if extra else ""), *rows]) + "\n"
+def detected_frames(
+    video: VideoReader, detector: Detector, stop: Callable[[], bool] = lambda: False
+) -> Iterator[tuple[VideoFrame, Sequence[Detection]]]:
+    """Each frame with its detections, best first, in batches where the detector takes them. stop: ends it early."""
+    frames = iter(video)
+    if not isinstance(detector, BatchDetector):
+        for frame in frames:
+            if stop():
+                return
+            yield frame, detector.detect(frame.image(), frame.time)
+        return
+    while (batch := list(islice(frames, detector.batch))) and not stop():
+        seen = detector.detect_batch([frame.image() for frame in batch], [frame.time for frame in batch])
+        yield from zip(batch, seen, strict=True)
+
+
+def detection_rows(camera: str, collected: Collected, names: Mapping[str, str] | None = None) -> list[str]:
+    """The lines of observations.csv, without its header. names: other names of labels; those not in it are left out."""
+    cell = csv_cell(camera)
+    return [
+        ",".join((cell, str(number), f"{time:.17g}", _cells(one, one.label if names is None else names[one.label])))
+        for number, (time, seen) in collected.items()
+        for one in seen
+        if names is None or one.label in names
+    ]
+
+
+def _cells(one: Detection, label: str) -> str:
+    """The cells from ``u`` on."""
+    parts: list[float | None] = []
+    for part, length in ((one.covariance, 3), (one.head, 2), (one.foot, 2), (one.box, 4)):
+        parts += [None] * length if part is None or not all(map(math.isfinite, part)) else list(part)
+    size = one.size if one.size > 0 else None
+    return ",".join((_numbers((one.u, one.v, size)), csv_cell(label), f"{one.score:.6g}", one.kind, _numbers(parts)))
+
+
+def _numbers(values: Iterable[float | None]) -> str:
+    return ",".join("" if value is None else f"{value:.17g}" for value in values)
+
+
+def observations_csv(rows: tuple[str, ...] | list[str]) -> str:
+    """The text of observations.csv."""
+    return "\n".join([HEADER, *rows]) + "\n"

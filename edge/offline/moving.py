@@ -8,18 +8,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from edge.detectors.base import Detection
 from edge.detectors.moving.foreground import SubtractorName
 from edge.detectors.moving.vehicle import VehicleDetector
 from edge.detectors.people.person import PersonDetector
 from edge.devices.playback.video_reader import VideoReader
-from edge.offline.detections import VideoDetections, run_detector
+from edge.offline.detections import Collected, VideoDetections, detection_rows, run_detector
 
 if TYPE_CHECKING:
-    from edge.detectors.base import Detection
     from edge.devices.base import Image
 
 MovingDetector = PersonDetector | VehicleDetector
-EXTRA_COLUMNS = "head_u,head_v,foot_u,foot_v,box_x,box_y,box_w,box_h"
 _LEARN_S, _LEARN_IMAGES = 60.0, 48
 _HEIGHT_FRAMES = 400
 _MIN_FRAMES = 5
@@ -46,31 +45,42 @@ def detect_moving(
     detections drawn into it. Raises InputError.
     """
     total = max(video.info.frames, 1)
-    _learn(video, detector, progress)
-    rows: dict[int, list[tuple[str, Detection]]] = {}
+    learn_background(video, detector, progress)
+    shown: Collected = {}
 
     def on_frame(frame: int) -> None:
         progress(f"frame {frame} of {total}", frame / total)
 
-    found = run_detector(video, camera, detector, on_frame, collected=rows)
-    names = _confirmed_labels(rows, detector)
+    found = run_detector(video, camera, detector, on_frame, collected=shown)
+    return named_detections(video, camera, found, shown, confirmed_labels(shown, detector), overlay)
+
+
+def named_detections(
+    video: VideoReader,
+    camera: str,
+    found: VideoDetections,
+    collected: Collected,
+    names: dict[str, str],
+    overlay: Path | None = None,
+) -> VideoDetections:
+    """The result with the rows of the labels in ``names``, and their new names. overlay: see ``detect_moving``."""
+    kept = {
+        frame: (time, [replace(one, label=names[one.label]) for one in seen if one.label in names])
+        for frame, (time, seen) in collected.items()
+    }
     if overlay is not None:
         from edge.offline.overlay import write_overlay
 
-        confirmed = {
-            frame: [(names[one.label], one) for _, one in shown if one.label in names] for frame, shown in rows.items()
-        }
-        write_overlay(video, overlay, confirmed)
-    lines = []
-    frames_with_detection = 0
-    for shown in rows.values():
-        kept = [(row, one) for row, one in shown if one.label in names]
-        frames_with_detection += bool(kept)
-        lines += [f"{row.format(label=names[one.label])},{_extra_cells(one)}" for row, one in kept]
-    return replace(found, rows=tuple(lines), frames_with_detection=frames_with_detection, extra_columns=EXTRA_COLUMNS)
+        write_overlay(video, overlay, {frame: [(one.label, one) for one in seen] for frame, (_, seen) in kept.items()})
+    frames_with_detection = sum(bool(seen) for _, seen in kept.values())
+    return replace(found, rows=tuple(detection_rows(camera, kept)), frames_with_detection=frames_with_detection)
 
 
-def _learn(video: VideoReader, detector: MovingDetector, progress: Callable[[str, float], None]) -> None:
+def learn_background(
+    video: VideoReader,
+    detector: MovingDetector,
+    progress: Callable[[str, float], None] = lambda text, fraction: None,
+) -> None:
     """Learn the background from images spread over the first minute, then people's heights from its first frames."""
     fps = video.info.fps
     span = min(video.info.frames or 10**9, round(_LEARN_S * fps))
@@ -92,13 +102,13 @@ def _learn(video: VideoReader, detector: MovingDetector, progress: Callable[[str
     detector.rewind()
 
 
-def _confirmed_labels(rows: dict[int, list[tuple[str, Detection]]], detector: MovingDetector) -> dict[str, str]:
+def confirmed_labels(collected: Collected, detector: MovingDetector) -> dict[str, str]:
     """Output labels of the confirmed tracks, numbered in order of appearance."""
     names: dict[str, str] = {}
     at_once = 0
-    stationary = _stationary_labels(rows) if isinstance(detector, VehicleDetector) else set()
-    for shown in rows.values():
-        confirmed = [one for _, one in shown if detector.is_confirmed(one.label) and one.label not in stationary]
+    stationary = _stationary_labels(collected) if isinstance(detector, VehicleDetector) else set()
+    for _, shown in collected.values():
+        confirmed = [one for one in shown if detector.is_confirmed(one.label) and one.label not in stationary]
         at_once = max(at_once, len(confirmed))
         for one in sorted(confirmed, key=lambda each: int(each.label[1:])):
             names.setdefault(one.label, f"{one.label[0]}{len(names)}")
@@ -107,11 +117,11 @@ def _confirmed_labels(rows: dict[int, list[tuple[str, Detection]]], detector: Mo
     return names
 
 
-def _stationary_labels(rows: dict[int, list[tuple[str, Detection]]]) -> set[str]:
+def _stationary_labels(collected: Collected) -> set[str]:
     """Labels of tracks of few frames or of a displacement below their own length: paint, shadows, swaying trees."""
     seen: dict[str, list[Detection]] = {}
-    for shown in rows.values():
-        for _, one in shown:
+    for _, shown in collected.values():
+        for one in shown:
             seen.setdefault(one.label, []).append(one)
     stationary = set()
     for label, ones in seen.items():
@@ -121,10 +131,3 @@ def _stationary_labels(rows: dict[int, list[tuple[str, Detection]]]) -> set[str]
         if len(ones) < _MIN_FRAMES or displacement < length:
             stationary.add(label)
     return stationary
-
-
-def _extra_cells(one: Detection) -> str:
-    cells: list[float | None] = []
-    for part, length in ((one.head, 2), (one.foot, 2), (one.box, 4)):
-        cells += [None] * length if part is None else list(part)
-    return ",".join("" if cell is None else f"{cell:.17g}" for cell in cells)

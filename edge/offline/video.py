@@ -10,16 +10,15 @@ from typing import Literal, get_args
 
 import tomli_w
 
-from edge.detectors.base import Detection, Detector
+from edge.detectors.base import Detector
 from edge.detectors.marker.ball import MarkerModel, learn_marker_model
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
 from edge.devices.base import check_size
 from edge.devices.playback.video_reader import VideoReader
-from edge.offline.detections import VideoDetections, run_detector
+from edge.offline.detections import Collected, VideoDetections, detection_rows, run_detector
 from protocols.core.errors import InputError
 from protocols.core.names import check_name, name_from_file
 from protocols.geometry.camera import Intrinsics
-from protocols.session.calibration import csv_cell
 from protocols.session.rig import read_toml
 
 VideoDetector = Literal["marker", "bright", "tag", "person", "vehicle"]
@@ -107,20 +106,19 @@ def detect_video(
         finder: Detector = ball_detector(model, intrinsics, reader.info.size)
     else:
         finder = bright_or_tag_detector(detector, threshold, dictionary)
-    drawn: dict[int, list[tuple[str, Detection]]] = {}
+    drawn: Collected = {}
     found = run_detector(reader, name, finder, on_frame, collected=None if overlay is None else drawn)
-    return found if overlay is None else _with_overlay(reader, found, drawn, overlay)
+    return found if overlay is None else _with_overlay(reader, name, found, drawn, overlay)
 
 
 def _with_overlay(
-    video: VideoReader, found: VideoDetections, collected: dict[int, list[tuple[str, Detection]]], overlay: Path
+    video: VideoReader, camera: str, found: VideoDetections, collected: Collected, overlay: Path
 ) -> VideoDetections:
     """Write a copy of the video with the detections drawn into it; ``found`` with its rows. Raises InputError."""
     from edge.offline.overlay import write_overlay
 
-    write_overlay(video, overlay, {frame: [(one.label, one) for _, one in shown] for frame, shown in collected.items()})
-    rows = [row.format(label=csv_cell(one.label)) for shown in collected.values() for row, one in shown]
-    return replace(found, rows=tuple(rows))
+    write_overlay(video, overlay, {frame: [(one.label, one) for one in seen] for frame, (_, seen) in collected.items()})
+    return replace(found, rows=tuple(detection_rows(camera, collected)))
 
 
 def read_marker_model(file: Path) -> MarkerModel:

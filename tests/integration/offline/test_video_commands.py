@@ -20,6 +20,7 @@ import tomli_w
 
 from deploy.cli import run
 from edge.devices.playback.video_reader import VideoReader
+from edge.offline.detections import HEADER
 from edge.scenes.marker.scene import MarkerScene
 from protocols.geometry.types import Floats
 from tests.support.videos import Image, numbered_image, read_number, record_scene_videos, write_video
@@ -169,7 +170,9 @@ def test_detections_of_a_video_carry_its_frame_times_and_lie_on_the_ball(
     out = tmp_path / "observations.csv"
     assert run(["detect", "marker", str(recorded.folder / "cam1.mp4"), "--camera", "left", "--out", str(out)]) == 0
     table = rows(out)
-    assert list(table[0]) == ["camera", "frame", "time", "u", "v", "size", "label", "score"]
+    assert list(table[0]) == HEADER.split(",")
+    assert (table[0]["kind"], table[0]["head_u"]) == ("marker", "")
+    assert all(float(row["cov_uu"]) > 0.0 for row in table)
     assert {row["camera"] for row in table} == {"left"}
     times = recorded.times["cam1"]
     frames = [int(row["frame"]) for row in table]

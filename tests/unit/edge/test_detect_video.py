@@ -13,6 +13,7 @@ import pytest
 import edge
 from deploy.cli import run
 from edge.detectors.marker.ball import MarkerModel
+from edge.offline.detections import HEADER
 from edge.offline.video import VideoDetections, detect_video, marker_toml
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
@@ -69,17 +70,20 @@ def test_the_saved_file_is_that_of_the_command(video: Path, tmp_path: Path, dete
 def test_people_have_the_columns_of_the_command_also_where_there_are_none(video: Path) -> None:
     nobody = detect_video(video, "person")
     assert nobody.to_csv() == (
-        "camera,frame,time,u,v,size,label,score,head_u,head_v,foot_u,foot_v,box_x,box_y,box_w,box_h\n"
+        "camera,frame,time,u,v,size,label,score,kind,cov_uu,cov_uv,cov_vv,"
+        "head_u,head_v,foot_u,foot_v,box_x,box_y,box_w,box_h\n"
     )
 
 
 def test_a_dataframe_has_the_columns_and_numbers_of_the_csv(found: VideoDetections) -> None:
     pandas = pytest.importorskip("pandas")
     table = found.to_dataframe()
-    assert list(table.columns) == ["camera", "frame", "time", "u", "v", "size", "label", "score"]
+    assert list(table.columns) == HEADER.split(",")
     assert table["frame"].tolist() == list(range(FRAMES))
     assert table["u"].tolist() == [float(row.split(",")[3]) for row in found.rows]
-    unmeasured = VideoDetections(("NA,3,0.1,1,2,,nan,1",), 1, 1, 0, 0, (4, 3), 30.0, (0.0, 0.0)).to_dataframe()
+    unmeasured = VideoDetections(
+        ("NA,3,0.1,1,2,,nan,1" + ",," * 6,), 1, 1, 0, 0, (4, 3), 30.0, (0.0, 0.0)
+    ).to_dataframe()
     assert unmeasured["camera"].tolist() == ["NA"]
     assert unmeasured["label"].tolist() == ["nan"]
     assert pandas.isna(unmeasured["size"][0])
