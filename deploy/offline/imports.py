@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tomli_w
@@ -15,10 +16,16 @@ from protocols.core.errors import InputError
 from protocols.formats import colmap, points, toml_rigs, yaml_rigs
 from protocols.formats.cameras import ForeignRig, rig_tables
 from protocols.geometry.types import Floats, Ints
+from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration, read_calibration
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, parse_camera_table, read_toml
+
+if TYPE_CHECKING:
+    from google.protobuf.message import Message
+
+    from protocols.topics import Topic
 
 CALIBRATIONS = ("aniposelib", "caliscope", "pose2sim", "freemocap", "opencv", "kalibr", "colmap")
 POINTS = ("caliscope-points", "deeplabcut", "mvus")
@@ -145,6 +152,28 @@ def session_to_log(rig: Rig, observations: Observations, out: Path, arrivals: Ar
     arrivals: the log times; by default every camera's first frame is at the log's beginning. A camera's information
     comes with its first frame.
     """
+    infos = [camera_info(rig, name) for name in rig.cameras]
+    return _write_log(out, infos, rig, _with_log_times(_observation_messages(rig, observations), arrivals))
+
+
+def write_observation_log(
+    out: Path,
+    infos: Sequence[pb.CameraInfo],
+    rig: Rig,
+    observations: Iterable[pb.Observation],
+    clocks: dict[str, CameraCalibration],
+    arrivals: Arrivals | None = None,
+) -> int:
+    """Write observations as a log in the order of their exposures on the reference clock; as `session_to_log`.
+
+    clocks: calibrations of all cameras whose frames are written; those of others are left out. arrivals: of the frames,
+    in place of the exposures.
+    """
+    known = [message for message in observations if message.camera in clocks]
+    return _write_log(out, infos, rig, _with_log_times(known, arrivals or Arrivals(clocks)))
+
+
+def _write_log(out: Path, infos: Sequence[pb.CameraInfo], rig: Rig, frames: list[tuple[int, pb.Observation]]) -> int:
     from protocols.log.write.writer import LogWriter
     from protocols.topics import CAMERA_INFO, OBSERVATION, RIG_INFO
 
@@ -152,11 +181,13 @@ def session_to_log(rig: Rig, observations: Observations, out: Path, arrivals: Ar
         raise InputError("this file exists already", file=out, remedy="choose another --out: logs are not replaced")
     part = out.with_name(f".{out.stem}.part.mcap")
     part.unlink(missing_ok=True)
-    frames = _observation_messages(rig, observations, arrivals)
-    begins = {name: at for at, name, _ in reversed(frames)}
-    messages = [(begins.get(name, 0), CAMERA_INFO, name, _camera_info(rig, name)) for name in rig.cameras]
-    messages.append((0, RIG_INFO, "import", _rig_info(rig)))
-    messages += [(at, OBSERVATION, name, message) for at, name, message in frames]
+    begins = {message.camera: at for at, message in reversed(frames)}
+    boots = {message.camera: message.boot_id for _, message in frames}
+    messages: list[tuple[int, Topic, str, Message]] = [(0, RIG_INFO, "import", _rig_info(rig))]
+    for info in infos:
+        info.boot_id = boots.get(info.camera, info.boot_id)
+        messages.append((begins.get(info.camera, 0), CAMERA_INFO, info.camera, info))
+    messages += [(at, OBSERVATION, message.camera, message) for at, message in frames]
     try:
         with LogWriter(part, views=True) as writer:
             for at, topic, name, message in sorted(messages, key=lambda entry: entry[0]):
@@ -233,9 +264,9 @@ def _stamps_of(camera: str, videos: Path) -> Floats:
     return np.array([shot.time for shot in VideoReader(found[0])])
 
 
-def _camera_info(rig: Rig, name: str) -> Any:
+def camera_info(rig: Rig, name: str) -> pb.CameraInfo:
+    """The information message of a rig's camera."""
     from protocols.geometry import so3
-    from protocols.messages import syncline_pb2 as pb
 
     camera = rig.cameras[name]
     info = pb.CameraInfo(schema_version=1, camera=name, boot_id="import", driver="import", clock="device")
@@ -253,9 +284,7 @@ def _camera_info(rig: Rig, name: str) -> Any:
     return info
 
 
-def _rig_info(rig: Rig) -> Any:
-    from protocols.messages import syncline_pb2 as pb
-
+def _rig_info(rig: Rig) -> pb.RigInfo:
     info = pb.RigInfo(schema_version=1, units=rig.units, clock=rig.clock)
     info.reference_camera = str(rig.metadata.get("reference", ""))
     for a, b, length in rig.distances:
@@ -267,42 +296,44 @@ def _rig_info(rig: Rig) -> Any:
     return info
 
 
-def _observation_messages(
-    rig: Rig, observations: Observations, arrivals: Arrivals | None
-) -> list[tuple[int, str, Any]]:
-    """Log time [ns], camera and message of each frame, in order of log time.
-
-    Log time 0 is the first exposure of all cameras, or of each camera where ``arrivals`` are not given.
-    """
-    from protocols.messages import syncline_pb2 as pb
-
-    out: list[tuple[int, str, Any]] = []
-    exposures: list[float] = []
+def _observation_messages(rig: Rig, observations: Observations) -> list[pb.Observation]:
+    """The frames with rows, by camera and time."""
+    out = []
     for name in rig.cameras:
         frames: dict[tuple[int, int], list[tuple[str, float, float, float]]] = {}
         for track in observations.of_camera(name):
             for frame, time, (u, v), size in zip(track.frame, track.time, track.pixels, track.size, strict=True):
                 seen = frames.setdefault((round(float(time) * NANOSECONDS), int(frame)), [])
                 seen.append((track.label, float(u), float(v), float(size) if np.isfinite(size) else 0.0))
-        if not frames:
-            continue
-        ordered = sorted(frames.items())
-        stamps = [key[0] for key, _ in ordered]
+        for sequence, ((time_ns, frame), seen) in enumerate(sorted(frames.items())):
+            message = pb.Observation(
+                schema_version=1, camera=name, boot_id="import", sequence=sequence, frame=frame, device_time_ns=time_ns
+            )
+            for label, u, v, size in seen:
+                message.detections.add(u=u, v=v, size=size, score=1.0, label=label)
+            out.append(message)
+    return out
+
+
+def _with_log_times(messages: list[pb.Observation], arrivals: Arrivals | None) -> list[tuple[int, pb.Observation]]:
+    """Messages, which are in order of time for each camera, with log times [ns], in order of these.
+
+    Log time 0 is the first exposure of all cameras, or of each camera where ``arrivals`` are not given.
+    """
+    out: list[tuple[int, pb.Observation]] = []
+    exposures: list[float] = []
+    for name in dict.fromkeys(message.camera for message in messages):
+        mine = [message for message in messages if message.camera == name]
+        stamps = [message.device_time_ns for message in mine]
         if arrivals is None:
             log_times = [stamp - stamps[0] for stamp in stamps]
         else:
             times = np.array(stamps) / NANOSECONDS
             exposures.append(float(arrivals.clocks[name].time_map.reference_from_camera(CameraTime(times[0]))))
             log_times = [round(at * NANOSECONDS) for at in arrivals.of(name, times).tolist()]
-        for sequence, (log_time, ((time_ns, frame), seen)) in enumerate(zip(log_times, ordered, strict=True)):
-            message = pb.Observation(
-                schema_version=1, camera=name, boot_id="import", sequence=sequence, frame=frame, device_time_ns=time_ns
-            )
-            for label, u, v, size in seen:
-                message.detections.add(u=u, v=v, size=size, score=1.0, label=label)
-            out.append((log_time, name, message))
+        out += zip(log_times, mine, strict=True)
     first = round(min(exposures) * NANOSECONDS) if exposures else 0
-    return sorted(((at - first, name, message) for at, name, message in out), key=lambda item: item[:2])
+    return sorted(((at - first, message) for at, message in out), key=lambda item: (item[0], item[1].camera))
 
 
 __all__ = [
@@ -313,6 +344,7 @@ __all__ = [
     "Arrivals",
     "ImportSource",
     "calibration_text",
+    "camera_info",
     "detect_source",
     "frame_clock",
     "read_arrivals",
@@ -320,4 +352,5 @@ __all__ = [
     "read_points",
     "rig_tables_of_log",
     "session_to_log",
+    "write_observation_log",
 ]

@@ -176,7 +176,7 @@ class CameraAgent:
             frame=frame.frame,
             device_time_ns=frame.device_time_ns,
             exposure_ns=frame.exposure_ns,
-            detections=[_detection_message(detection) for detection in found],
+            detections=[detection_message(detection) for detection in found],
         )
         self._sequence += 1
         return message
@@ -299,7 +299,8 @@ def _is_finite(detection: Detection) -> bool:
     return math.isfinite(detection.u) and math.isfinite(detection.v) and math.isfinite(detection.size)
 
 
-def _detection_message(detection: Detection) -> pb.Detection:
+def detection_message(detection: Detection) -> pb.Detection:
+    """The detection as it stands in an observation message."""
     message = pb.Detection(
         u=detection.u,
         v=detection.v,

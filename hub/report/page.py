@@ -78,45 +78,45 @@ def _calibration_page(
     several = f" over {len(calibration.trajectories)} points" if len(calibration.trajectories) > 1 else ""
     parts = [
         _assessment_section(assessment, _key_figures(calibration, rig, observations, used)),
-        _section("Cameras", "", tables.cameras(calibration, used)),
-        _section(
+        section("Cameras", "", tables.cameras(calibration, used)),
+        section(
             "Refused cameras",
             "These have no table in calibration.toml; the other cameras are not affected.",
             tables.refused(calibration.refused, counts) if calibration.refused else "",
         ),
-        _section(
+        section(
             "Clock offsets",
             "Uncertainty of each camera’s time offset: the dot is the estimate, the bar its 95 % interval.",
             "" if rig.shared_clock else time_figures.offset_intervals(calibration, used),
         ),
-        _section(
+        section(
             "Convergence",
             "",
             _convergence(calibration, rig, history),
         ),
-        _section(
+        section(
             "Pairs",
             "Every pair of cameras is solved separately, then checked for consistency with the others around loops.",
             _pairs(calibration),
         ),
-        _section(
+        section(
             "Scene",
             f"Camera poses and the trajectory of the point{several}. Drag to rotate, scroll to zoom; "
             "the trajectory starts at the circle and ends at the diamond.",
             f'<div class="frame screen"><div id="{rig_figure.DIV}"></div></div>{rig_figure.plan_and_side(drawn)}',
         ),
-        _section(
+        section(
             "Residuals in the image",
             "Arrows in random directions are noise; neighbouring arrows that agree indicate inaccurate intrinsics.",
             image_maps.residual_maps(calibration),
         ),
-        _section(
+        section(
             "Residuals over time",
             "The line is the median in pixels, the band the 10 to 90 % range. A step indicates a moved camera, "
             "a slope a clock whose rate changes.",
             time_figures.residuals_over_time(calibration),
         ),
-        _section(
+        section(
             "Visibility of the point",
             "Only times at which two or more cameras see the point contribute to the calibration.",
             time_figures.time_line(calibration, observations),
@@ -129,8 +129,8 @@ def _calibration_page(
         "Reference clock": calibration.reference,
         "Lengths": calibration.units if calibration.scale == "metric" else "arbitrary: the first baseline is 1",
     }
-    parts.append(_section("Provenance", "", tables.provenance(facts, rig, command)))
-    return _document("Calibration report", assessment, parts, rig_figure.rig_figure_script(drawn))
+    parts.append(section("Provenance", "", tables.provenance(facts, rig, command)))
+    return html_page("Calibration report", assessment.headline, parts, rig_figure.rig_figure_script(drawn))
 
 
 def _refusal_page(refused: Refused, rig: Rig, observations: Observations, command: str) -> str:
@@ -142,29 +142,29 @@ def _refusal_page(refused: Refused, rig: Rig, observations: Observations, comman
     seen = {name: part for name, part in rows.items() if len(part)}
     parts = [
         _assessment_section(assessment, ""),
-        _section(
+        section(
             "Cameras",
             "The rows of each camera, why it could not be connected to another, and what to do.",
             tables.refused(reasons, {name: len(part) for name, part in rows.items()}),
         ),
-        _section(
+        section(
             "Pairs",
             "Results of camera pairs: these lags are valid, only poses and trajectories are missing.",
             tables.pairs(refused) if any(pair.status == "ok" for pair in refused.pairs) else "",
         ),
-        _section(
+        section(
             "When each camera saw the point",
             "The clocks are unknown, so each row starts at the camera’s own first observation.",
             time_figures.own_time_lines(rows),
         ),
-        _section(
+        section(
             "Where each camera saw the point",
             "Motion across most of every image, at different depths, constrains the calibration best.",
             image_maps.seen_maps(seen, sizes) if seen else "",
         ),
-        _section("Provenance", "", tables.provenance({"Syncline": VERSION}, rig, command)),
+        section("Provenance", "", tables.provenance({"Syncline": VERSION}, rig, command)),
     ]
-    return _document("Calibration refused", assessment, parts, "")
+    return html_page("Calibration refused", assessment.headline, parts)
 
 
 def _key_figures(calibration: Calibration, rig: Rig, observations: Observations, used: dict[str, RowUsage]) -> str:
@@ -258,7 +258,7 @@ def _glossary() -> str:
     return f'<section class="screen">{inner}</section>'
 
 
-def _section(title: str, lead: str, content: str) -> str:
+def section(title: str, lead: str, content: str) -> str:
     """A section, or "" without content."""
     if not content:
         return ""
@@ -271,7 +271,8 @@ def _capital(text: str) -> str:
     return text if ":" in text.split(" ")[0] else text[:1].upper() + text[1:]
 
 
-def _document(title: str, assessment: QualityAssessment, parts: list[str], script: str) -> str:
+def html_page(title: str, headline: str, parts: list[str], script: str = "") -> str:
+    """A page that loads nothing. parts: its sections; script: JavaScript that uses plotly, "" = none."""
     scripts = ""
     if script:
         from plotly.offline import get_plotlyjs  # imported here: it costs 50 ms and 5 MB
@@ -282,7 +283,7 @@ def _document(title: str, assessment: QualityAssessment, parts: list[str], scrip
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{esc(assessment.headline)} · Syncline</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        f"<title>{esc(headline)} · Syncline</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
         f'<header class="top"><b>Syncline</b><span>{esc(title)}</span></header>\n'
         f"<main>\n{body}\n</main>\n{scripts}</body>\n</html>\n"
     )
