@@ -200,6 +200,7 @@ class UavAgent:
         state = "stopping" if ended else "running"
         frame_silent_s = now_s - self._last_frame_s
         link_silent_s = (self._now_ns() - link.last_received_ns) / NANOSECONDS
+        reason = link.problem or link.report(self._now_ns())
         if not ended and frame_silent_s > _FRAME_TIMEOUT_S:
             state, message = (
                 "degraded",
@@ -209,9 +210,9 @@ class UavAgent:
             state = "degraded"
             message = f"no heartbeat received: {link.problem}" if link.problem else "no heartbeat received yet"
         elif not ended and link_silent_s > _LINK_STALE_S:
-            state, message = "degraded", f"the vehicle is silent for {link_silent_s:.0f} s {link.problem}".rstrip()
+            state, message = "degraded", f"the vehicle is silent for {link_silent_s:.0f} s {reason}".rstrip()
         elif not ended:
-            problem = vehicle.problem(self._now_ns())
+            problem = vehicle.problem(self._now_ns()) or reason
             state = "degraded" if problem.startswith("no attitude") else state
             message = problem or self._guidance.hold_reason or "commands are sent"
         counters: Counter[str] = Counter(self.counters)

@@ -57,9 +57,8 @@ class Air:
     def receive(self) -> list[tuple[bytes, Address]]:
         return [(data, ("pipe", k)) for k, pipe in enumerate(self.pipes) for data, _ in pipe.receive()]
 
-    def send(self, data: bytes, address: Address | None) -> None:
-        if address is not None:
-            self.pipes[address[1]].send(data, None)
+    def send(self, data: bytes, address: Address | None) -> bool:
+        return address is None or self.pipes[address[1]].send(data, None)
 
     def close(self) -> None:
         pass

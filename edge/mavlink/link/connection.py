@@ -10,16 +10,20 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from edge.mavlink.dialect import mavlink
+from edge.mavlink.dialect import AUTOPILOT, mavlink
 from edge.mavlink.link.framing import Framer
+from edge.mavlink.link.identity import Evidence
+from edge.mavlink.link.outbox import Outbox
 from edge.mavlink.link.signing import Signing
-from edge.mavlink.link.transport import Address, Transport, Url, open_transport
+from edge.mavlink.link.transport import Address, Transport, Url, capacity, open_transport
 from protocols.core.clocks import NANOSECONDS
 
 _DEFAULT_SYSTEM = 1
 _MAX_SENDERS = 8  # senders whose bytes are parsed while no vehicle is locked
-_SILENT_NS = 10 * NANOSECONDS  # silence after which the vehicle may use another address
-_MIN_RETRY_S, _MAX_RETRY_S = 0.2, 10.0
+_SILENT_NS = 1_500_000_000  # of an autopilot, which sends a heartbeat each second and here 30 attitudes
+_UNKNOWN_SILENT_NS = 10 * NANOSECONDS  # … of one of which nothing but heartbeats is known
+_MIN_RETRY_S, _MAX_RETRY_S = 0.2, 1.0
+_CONFLICT_SHOWN_NS = 10 * NANOSECONDS
 _NAN_ALLOWED = frozenset({"COMMAND_LONG", "COMMAND_INT", "GIMBAL_MANAGER_SET_PITCHYAW", "CAMERA_TRACKING_IMAGE_STATUS",
                           "CAMERA_TRACKING_GEO_STATUS", "CAMERA_FOV_STATUS", "VIDEO_STREAM_INFORMATION",
                           "CAMERA_INFORMATION"})  # fmt: skip
@@ -47,7 +51,9 @@ class Link:
     used only for signing.
 
     Messages of the locked vehicle and, over its address, of any other system (ground stations behind it) are accepted;
-    the reader checks ``ReceivedMessage.system``. counters: by event, in dotted names ("refused.replayed").
+    the reader checks ``ReceivedMessage.system``. Another address or system id is followed only after the vehicle has
+    fallen silent, and if it is signed or continues the vehicle (``identity``). counters: by event, in dotted names
+    ("refused.replayed"). last_received_ns: of the autopilot itself. problem: why nothing is received.
     """
 
     def __init__(
@@ -79,10 +85,15 @@ class Link:
         self._retry_s = _MIN_RETRY_S
         self._next_try_ns = 0
         self._address: Address | None = None
-        self._address_ns = 0
+        self._reply_address: Address | None = None
+        self._fixed = vehicle is not None
+        self._identity = Evidence()
+        self._candidates: dict[tuple[Address, int], Evidence] = {}
+        self._conflict = (-_CONFLICT_SHOWN_NS, "")
         self.vehicle = vehicle
         self.last_received_ns = 0
         self.counters: Counter[str] = Counter()
+        self._outbox = Outbox(capacity(url), self.counters)
         self.problem = ""
 
     @property
@@ -105,10 +116,11 @@ class Link:
 
     def poll(self) -> list[ReceivedMessage]:
         """The messages accepted since the last call; (re)opens the transport if that is due."""
+        if self._transport is None:
+            self._try_open()
         with self._lock:
-            if self._transport is None and not self._try_open():
+            if self._transport is None:
                 return []
-            assert self._transport is not None
             try:
                 pieces = self._transport.receive()
             except OSError as error:
@@ -118,26 +130,20 @@ class Link:
             out: list[ReceivedMessage] = []
             for data, address in pieces:
                 out += self._process(data, address, now)
-            return out
+            self._flush(now)
+            unsaved = None if self._signing is None else self._signing.unsaved()
+        if unsaved is not None and self._signing is not None:
+            self._signing.write(unsaved)  # without the lock: a slow disk must not hold up the sender
+        return out
 
     def send(self, message: Any) -> bool:
-        """Send a message; False where the link is down. A loss on the way is not detected."""
+        """Send a message, or let it wait for room; False where the link is down. A loss on the way is not detected."""
+        if self._transport is None:
+            return False  # without the lock, which is held while a link is opened
         with self._lock:
-            if self._transport is None:
-                return False
-            if self._signing is not None:
-                self._codec.signing.timestamp = self._signing.next_time(self._unix_s())
-            if self._as_vehicle and self.vehicle is not None:
-                self._codec.srcSystem = self.vehicle
-            data = message.pack(self._codec)
-            self._codec.seq = (self._codec.seq + 1) % 256
-            try:
-                self._transport.send(bytes(data), self._address)
-            except OSError as error:
-                self._handle_failure(error)
-                return False
-            self.counters["sent"] += 1
-            return True
+            self._outbox.put(message)
+            self._flush(self._now_ns())
+            return self._transport is not None
 
     def close(self) -> None:
         """Close for good, and save the signing timestamps."""
@@ -149,11 +155,36 @@ class Link:
             if self._signing is not None:
                 self._signing.save()
 
+    def report(self, now_ns: int) -> str:
+        """Who else claims to be the vehicle, or why the signing times are not stored; "" if there is nothing."""
+        since, text = self._conflict
+        if now_ns - since < _CONFLICT_SHOWN_NS:
+            return text
+        return "" if self._signing is None else self._signing.problem
+
+    def _flush(self, now: int) -> None:
+        """Send what the link has room for."""
+        while self._transport is not None and (message := self._outbox.next(now)) is not None:
+            if self._signing is not None:
+                self._codec.signing.timestamp = self._signing.next_time(self._unix_s())
+            if self._as_vehicle and self.vehicle is not None:
+                self._codec.srcSystem = self.vehicle
+            data = bytes(message.pack(self._codec))
+            try:
+                if not self._transport.send(data, self._address or self._reply_address):
+                    return
+            except OSError as error:
+                self._handle_failure(error)
+                return
+            self._codec.seq = (self._codec.seq + 1) % 256
+            self._outbox.sent(len(data))
+            self.counters["sent"] += 1
+
     def _process(self, data: bytes, address: Address, now: int) -> list[ReceivedMessage]:
         self.counters["bytes"] += len(data)
-        silent = now - self._address_ns > _SILENT_NS
-        if self._address is not None and address != self._address and not silent:
+        if self._address is not None and address != self._address and now - self.last_received_ns <= _SILENT_NS:
             self.counters["refused.address"] += 1
+            self._conflict = (now, f"{address[0]}:{address[1]} sends as well, and is not followed")
             return []
         framer = self._framers.get(address)
         if framer is None:
@@ -176,7 +207,7 @@ class Link:
         if self._signing is not None:
             reason = self._signing.rejection_reason(frame, system, component, self._unix_s())
             if reason is not None:
-                self.counters[f"refused.{reason}"] += 1
+                self._reject(reason, address, component)
                 return None
         if kind not in self._allowed:
             self.counters["not_needed"] += 1
@@ -184,35 +215,89 @@ class Link:
         if kind not in _NAN_ALLOWED and not _all_finite(message):
             self.counters["refused.not_finite"] += 1
             return None
-        is_vehicle = kind == "HEARTBEAT" and is_autopilot(message, component)
-        if is_vehicle and self.vehicle is None:
-            self.vehicle = system
-        if is_vehicle and system == self.vehicle and (self._address is None or address != self._address):
-            self._address = address
-            self.counters["locked"] += 1
+        beats = kind == "HEARTBEAT" and is_autopilot(message, component)
+        if component == AUTOPILOT and (self._address != address or self.vehicle != system):
+            self._consider(message, address, system, beats=beats, now=now)
         if self._address is None or address != self._address:
             self.counters["refused.unlocked"] += 1
             return None
-        if is_vehicle and system != self.vehicle:
+        if beats and system != self.vehicle:
             self.counters["refused.other_vehicle"] += 1
             return None
-        if system == self.vehicle:
-            self._address_ns = self.last_received_ns = now
+        if system == self.vehicle and component == AUTOPILOT:
+            self.last_received_ns = now
+            self._identity.add(message, now)
         self.counters["received"] += 1
         return ReceivedMessage(message, kind, system, component, now)
 
-    def _try_open(self) -> bool:
-        now = self._now_ns()
-        if self._url is None or now < self._next_try_ns:
-            return False
+    def _reject(self, reason: str, address: Address, component: int) -> None:
+        """Count a message that the signing rejects, and say why the vehicle cannot be heard."""
+        self.counters[f"refused.{reason}"] += 1
+        if self._address is not None or component != AUTOPILOT or self._signing is None:
+            return
+        if reason in ("late", "future"):
+            behind = self._signing.behind_s
+            self.problem = f"the autopilot signs with the key, but its clock is {abs(behind):.0f} s " + (
+                "behind" if behind > 0.0 else "ahead of this machine's"
+            )
+            # It takes over the time of what it receives: it needs an answer, though nothing it says is accepted yet.
+            self._reply_address = address
+        elif reason in ("unsigned", "wrong_key"):
+            self.problem = "the autopilot " + ("does not sign" if reason == "unsigned" else "signs with another key")
+
+    def _consider(self, message: Any, address: Address, system: int, *, beats: bool, now: int) -> None:
+        """Follow an autopilot at another address or with another system id, if it is the vehicle."""
+        if self.vehicle is None or (self._address is None and system == self.vehicle):
+            if beats:
+                self._lock_to(address, system, Evidence())
+            return
+        key = (address, system)
+        candidate = self._candidates.setdefault(key, Evidence())
+        candidate.add(message, now)
+        if len(self._candidates) > _MAX_SENDERS:
+            del self._candidates[min(self._candidates, key=lambda one: self._candidates[one].heard_ns)]
+        silent_ns = now - self.last_received_ns
+        if silent_ns <= _SILENT_NS:
+            return  # another vehicle behind the same router
+        if self._fixed and system != self.vehicle:
+            objection = "vehicle is set in the configuration"
+        elif self._signing is not None:
+            objection = "" if beats or system == self.vehicle else "no heartbeat yet"
+        elif self._identity.offset_ns is None and system == self.vehicle:
+            objection = "" if beats and silent_ns > _UNKNOWN_SILENT_NS else "nothing identifies it"
+        else:
+            objection = self._identity.objection(candidate, now, same_system=system == self.vehicle)
+        if objection:
+            where = f" at {address[0]}:{address[1]}" if address[0] else ""
+            self._conflict = (now, f"system {system}{where} is not followed: {objection}")
+            self.counters["refused.identity"] += 1
+            return
+        self._lock_to(address, system, candidate)
+        self.last_received_ns = now
+        self.counters["handed_over"] += 1
+
+    def _lock_to(self, address: Address, system: int, identity: Evidence) -> None:
+        self._address, self.vehicle, self._identity = address, system, identity
+        self._candidates.clear()
+        self._conflict, self.problem = (-_CONFLICT_SHOWN_NS, ""), ""
+        self.counters["locked"] += 1
+
+    def _try_open(self) -> None:
+        if self._url is None or self._now_ns() < self._next_try_ns:
+            return
         try:
-            self._transport = open_transport(self._url)
+            transport = open_transport(self._url)
         except OSError as error:
-            self._handle_failure(error)
-            return False
-        self.counters["opened"] += 1
-        self._retry_s, self.problem = _MIN_RETRY_S, ""
-        return True
+            with self._lock:
+                self._handle_failure(error)
+            return
+        with self._lock:
+            if self._url is None:  # closed meanwhile
+                transport.close()
+                return
+            self._transport = transport
+            self.counters["opened"] += 1
+            self._retry_s, self.problem = _MIN_RETRY_S, ""
 
     def _handle_failure(self, error: OSError | ValueError) -> None:
         """Close the transport and schedule the next attempt with exponential back-off."""
@@ -220,6 +305,7 @@ class Link:
             self._transport.close()
             self._transport = None
         self._framers.clear()
+        self._outbox.clear()
         self.problem = str(getattr(error, "strerror", None) or error)
         self.counters["broken"] += 1
         self._next_try_ns = self._now_ns() + round(self._retry_s * NANOSECONDS)
@@ -228,7 +314,7 @@ class Link:
 
 def is_autopilot(message: Any, component: int) -> bool:
     """Whether a heartbeat comes from an autopilot rather than a station, a camera or a gimbal."""
-    return component == 1 and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
+    return component == AUTOPILOT and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
 
 
 def _all_finite(message: Any) -> bool:

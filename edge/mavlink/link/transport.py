@@ -6,10 +6,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import select
 import socket
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -59,11 +61,16 @@ class Transport(Protocol):
     def receive(self) -> list[tuple[bytes, Address]]:
         """The bytes received so far, by sender; never waits."""
 
-    def send(self, data: bytes, address: Address | None) -> None:
-        """Send to an address received from before; None: to the only peer."""
+    def send(self, data: bytes, address: Address | None) -> bool:
+        """Send to an address received from before; None: to the only peer. False if there is no room at present."""
 
     def close(self) -> None:
         """Release it; may be called twice."""
+
+
+def capacity(url: Url | None) -> float | None:
+    """What the link carries [bytes/s], of which a serial port takes ten bits for each; None: unlimited."""
+    return url.number / 10.0 if url is not None and url.kind == "serial" else None
 
 
 def open_transport(url: Url) -> Transport:
@@ -111,7 +118,7 @@ class Udp:
             out.append((data, (str(sender[0]), int(sender[1])) if self._bound else ONLY))
         return out
 
-    def send(self, data: bytes, address: Address | None) -> None:
+    def send(self, data: bytes, address: Address | None) -> bool:
         try:
             if not self._bound:
                 self._socket.send(data)
@@ -119,9 +126,30 @@ class Udp:
                 self._socket.sendto(data, address)
         except (BlockingIOError, ConnectionRefusedError):
             pass  # equivalent to a lost datagram
+        return True
 
     def close(self) -> None:
         self._socket.close()
+
+
+class _Rest:
+    """Sends on a byte stream that may take only a part: the rest goes before the next message, so that none is torn."""
+
+    def __init__(self, write: Callable[[bytes], int]) -> None:
+        self._write = write
+        self._waiting = b""
+
+    def send(self, data: bytes) -> bool:
+        """Send a message; False if an earlier one is not through yet."""
+        try:
+            if self._waiting:
+                self._waiting = self._waiting[self._write(self._waiting) :]
+                if self._waiting:
+                    return False
+            self._waiting = data[self._write(data) :]
+        except BlockingIOError:
+            return False
+        return True
 
 
 class Tcp:
@@ -131,6 +159,7 @@ class Tcp:
         self._socket = socket.create_connection((url.place, url.number), timeout=2.0)
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._rest = _Rest(self._socket.send)
 
     def wait(self, timeout_s: float) -> bool:
         return bool(select.select([self._socket], [], [], max(timeout_s, 0.0))[0])
@@ -144,13 +173,8 @@ class Tcp:
             raise ConnectionResetError("the other side has closed the connection")
         return [(data, ONLY)]
 
-    def send(self, data: bytes, address: Address | None) -> None:
-        try:
-            sent = self._socket.send(data)
-        except BlockingIOError:
-            return  # the buffer is full: the whole message is dropped
-        if sent != len(data):
-            raise ConnectionResetError("the link is too slow for what is sent")
+    def send(self, data: bytes, address: Address | None) -> bool:
+        return self._rest.send(data)
 
     def close(self) -> None:
         self._socket.close()
@@ -168,6 +192,8 @@ class Serial:
             ) from None
         # SerialException is an OSError.
         self._port: Any = serial.Serial(url.place, url.number, timeout=0, write_timeout=0, exclusive=True)
+        # Not by pyserial, whose write without timeout waits in a busy loop while the port's buffer is full.
+        self._rest = _Rest(lambda data: os.write(self._port.fileno(), data))
 
     def wait(self, timeout_s: float) -> bool:
         return bool(select.select([self._port.fileno()], [], [], max(timeout_s, 0.0))[0])
@@ -176,8 +202,8 @@ class Serial:
         data = bytes(self._port.read(4096))
         return [(data, ONLY)] if data else []
 
-    def send(self, data: bytes, address: Address | None) -> None:
-        self._port.write(data)
+    def send(self, data: bytes, address: Address | None) -> bool:
+        return self._rest.send(data)
 
     def close(self) -> None:
         self._port.close()
@@ -205,9 +231,10 @@ class Pipe:
         self._inbox.clear()
         return out
 
-    def send(self, data: bytes, address: Address | None) -> None:
+    def send(self, data: bytes, address: Address | None) -> bool:
         if self.other is not None:
             self.other._inbox.append(data)
+        return True
 
     def close(self) -> None:
         self._inbox.clear()

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from edge.mavlink.dialect import mavlink
+from edge.mavlink.link import signing as signing_module
 from edge.mavlink.link.connection import Link, ReceivedMessage
 from edge.mavlink.link.framing import Framer
 from edge.mavlink.link.signing import EPOCH_UNIX_S, TICKS, Signing, read_key, ticks
@@ -100,39 +101,6 @@ def test_messages_are_accepted_only_after_an_autopilots_heartbeat_and_from_that_
     assert (link.vehicle, link.counters["refused.other_vehicle"]) == (1, 1)
 
 
-def test_another_address_is_rejected_while_the_locked_one_is_active() -> None:
-    now = [0]
-
-    class Two:
-        """Two senders at one bound socket."""
-
-        def __init__(self) -> None:
-            self.come: list[tuple[bytes, tuple[str, int]]] = []
-
-        def wait(self, timeout_s: float) -> bool:
-            return True
-
-        def receive(self) -> list[tuple[bytes, tuple[str, int]]]:
-            out, self.come = self.come, []
-            return out
-
-        def send(self, data: bytes, address: object) -> None:
-            pass
-
-        def close(self) -> None:
-            pass
-
-    transport = Two()
-    link = Link(None, system=1, component=100, allowed=KINDS, transport=transport, now_ns=lambda: now[0])
-    sender = Sender(Pipe())
-    transport.come = [(sender.pack(heartbeat()), ("10.0.0.1", 5)), (sender.pack(attitude()), ("10.0.0.9", 5))]
-    assert kinds(link.poll()) == ["HEARTBEAT"]
-    assert link.counters["refused.address"] == 1
-    now[0] = 20_000_000_000  # the vehicle has moved to another address, after a silence
-    transport.come = [(sender.pack(heartbeat()), ("10.0.0.9", 5))]
-    assert kinds(link.poll()) == ["HEARTBEAT"]
-
-
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_message_with_a_non_finite_number_is_rejected_and_counted(value: float) -> None:
     link, pipe = make_link()
@@ -176,7 +144,7 @@ def test_a_new_sender_more_than_a_minute_late_is_rejected() -> None:
     late.codec.signing.timestamp = ticks(UNIX_S) - 61 * TICKS
     late.send(heartbeat())
     assert link.poll() == []
-    assert link.counters["refused.replayed"] == 1
+    assert link.counters["refused.late"] == 1
 
 
 def test_after_a_restart_replays_are_rejected_and_no_timestamp_is_reused(tmp_path: Path) -> None:
@@ -231,7 +199,7 @@ def test_a_broken_link_is_reopened_with_increasing_pauses() -> None:
     gaps = [b - a for a, b in itertools.pairwise(tried)]
     assert gaps == sorted(gaps)
     assert gaps[0] < 300_000_000
-    assert 9_000_000_000 < gaps[-1] <= 10_010_000_000
+    assert 900_000_000 < gaps[-1] <= 1_010_000_000  # a router that restarts is found within a second
     assert not link.send(heartbeat())
 
 
@@ -282,3 +250,53 @@ def test_signing_timestamps_count_from_2015() -> None:
     assert ticks(EPOCH_UNIX_S) == 0
     assert ticks(EPOCH_UNIX_S + 1.0) == TICKS
     assert ticks(0.0) == 0  # a clock that was never set
+
+
+def test_a_full_disk_costs_the_flight_nothing_and_the_times_are_stored_when_there_is_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, now = tmp_path / "times.json", [UNIX_S]
+    full = [True]
+
+    def write(file: Path, text: str) -> None:
+        if full[0]:
+            raise InputError("No space left on device", file=file)
+        file.write_text(text)
+
+    monkeypatch.setattr(signing_module, "write_atomically", write)
+    ours, pipe = Pipe.pair()
+    link = Link(
+        None,
+        system=1,
+        component=100,
+        allowed=KINDS,
+        transport=ours,
+        signing=Signing(KEY, state),
+        unix_s=lambda: now[0],
+    )
+    sender = Sender(pipe, key=KEY)
+    for _ in range(3):
+        now[0] += 6.0
+        sender.codec.signing.timestamp = ticks(now[0])
+        sender.send(heartbeat())
+        assert kinds(link.poll()) == ["HEARTBEAT"]
+        assert link.send(heartbeat(autopilot=8))
+    assert link.report(0) == "signing times are not on disk: No space left on device"
+    full[0] = False
+    now[0] += 6.0
+    link.send(heartbeat(autopilot=8))
+    link.poll()
+    assert link.report(0) == ""
+    assert json.loads(state.read_text())["sent"] >= ticks(now[0])
+    full[0] = True
+    link.close()  # at the end of a flight as well
+
+
+def test_while_the_clock_is_not_set_the_time_of_the_last_run_goes_on(tmp_path: Path) -> None:
+    state, passed = tmp_path / "times.json", [0.0]
+    first = Signing(KEY, state)
+    first.next_time(UNIX_S)
+    first.save()
+    again = Signing(KEY, state, monotonic_s=lambda: passed[0])
+    passed[0] = 100.0
+    assert ticks(UNIX_S + 100.0) <= again.next_time(0.0) <= ticks(UNIX_S + 106.0)
