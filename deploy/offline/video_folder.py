@@ -11,13 +11,15 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, get_args
 
 import cv2
 import tomli_w
 
+from edge.detectors.base import Kind
 from edge.detectors.marker.ball import REVISION, MarkerModel
 from edge.detectors.marker.factory import ball_detector
+from edge.detectors.plugins import detector_revision, load_detector
 from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader, has_pyav
 from edge.offline.detections import HEADER, VideoDetections, observations_csv, run_detector
 from edge.offline.video import MARKER_FILE, read_marker_model
@@ -32,7 +34,6 @@ from protocols.session.rig import Rig, read_rig, read_toml
 from protocols.session.session import Session
 
 Progress = Callable[[str, float], None]
-DetectorName = Literal["marker", "person", "vehicle"]
 
 SESSION = "session"
 _DETECTIONS, _STATE = "detections", "videos.json"
@@ -93,15 +94,20 @@ def session_from_videos(
     session: str | Path,
     progress: Progress = lambda text, share: None,
     marker: Path | None = None,
-    detector: DetectorName = "marker",
+    detector: str = "marker",
 ) -> VideoSession:
     """Run a detector on every video and merge the detections into a session folder.
 
     session: folder that is created or updated: rig.toml, observations.csv and the detections of each video, which are
     reused if the video has not changed. marker: a marker.toml; default: the one in the folder, or the demo's orange
-    ball. detector: person and vehicle require videos with one target at a time, because targets are not associated
-    between videos. Raises InputError if fewer than two videos can be read.
+    ball. detector: marker, person, vehicle, a network's .toml file, or another package's detector; all but marker
+    require videos with one target at a time, because targets are not associated between videos. Raises InputError if
+    fewer than two videos can be read.
     """
+    what = detector
+    if detector not in ("marker", *get_args(Kind)):
+        load_detector(detector)  # one that is not usable fails once, not for every video
+        what = "target"
     folder, session = Path(folder), Path(session)
     videos, warnings = list_videos(folder)
     if len(videos) < 2:
@@ -124,15 +130,15 @@ def session_from_videos(
         several = _label_count_if_many(one)
         if several:
             warnings.append(
-                f"{video.path.name}: {several} {detector}s in it, and who is who in two videos is not known; left out"
+                f"{video.path.name}: {several} {what}s in it, and who is who in two videos is not known; left out"
             )
             one = replace(one, rows=())
         rows += one.rows
         again = " (kept from before)" if kept else ""
-        lines.append(f"{video.path.name}: {detector} in {one.frames_with_detection} of {one.frames} frames{again}")
+        lines.append(f"{video.path.name}: {what} in {one.frames_with_detection} of {one.frames} frames{again}")
         warnings += [f"{video.path.name}: {warning}" for warning in one.warnings]
         if not one.rows and not several:
-            warnings.append(f"{video.path.name}: no {detector} in any of its frames")
+            warnings.append(f"{video.path.name}: no {what} in any of its frames")
         table = _camera_table(video, one, tables.get(video.camera, {}), warnings)
         lens = _measured_lens(given, video.camera)
         # A ball's centre does not project to the centre of its outline: without measured intrinsics, the solver
@@ -210,7 +216,7 @@ def _detect_all(
     model: MarkerModel,
     given: Rig | None,
     progress: Progress,
-    kind: DetectorName,
+    kind: str,
 ) -> tuple[dict[str, tuple[VideoDetections, bool]], list[str]]:
     """Detections of each video with whether they come from the cache, and reasons why some could not be read."""
     state = _read_state(session)
@@ -278,7 +284,11 @@ def _detect_all(
 
 
 def _detect_people_or_vehicles(film: VideoReader, camera: str, kind: str, progress: Progress) -> VideoDetections:
-    """Detect people or vehicles in a video."""
+    """Detect people or vehicles in a video, by the shipped detectors or by another one."""
+    if kind not in get_args(Kind):
+        from edge.offline.video import detect_objects
+
+        return detect_objects(film, camera, load_detector(kind, fps=film.info.fps), progress)
     from edge.offline.moving import detect_moving, moving_detector
 
     return detect_moving(film, camera, moving_detector(kind, "mog2", film.info.fps), progress)
@@ -294,7 +304,8 @@ def _label_count_if_many(found: VideoDetections) -> int:
 def _cache_key(video: VideoFile, model: MarkerModel | None, lens: Any, kind: str) -> str:
     """Cache key: a hash of everything that affects a video's detections."""
     table = None if model is None else {"revision": REVISION, **model.to_table()}
-    about = [VERSION, has_pyav(), video.path.name, video.size, video.mtime_ns, table, lens, kind]
+    revision = kind if kind in ("marker", *get_args(Kind)) else detector_revision(kind)
+    about = [VERSION, has_pyav(), video.path.name, video.size, video.mtime_ns, table, lens, revision]
     return hashlib.sha256(json.dumps(about).encode()).hexdigest()
 
 

@@ -9,6 +9,8 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+Kind = Literal["person", "vehicle"]
+
 
 @dataclass(frozen=True, slots=True)
 class Detection:
@@ -52,6 +54,21 @@ class Prediction:
     target: str
     size: float = 0.0
     colour: tuple[int, int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorOptions:
+    """What a detector is made for: the images of one camera, passed one after the other.
+
+    kind: report only objects of this kind; None = all that it knows. fps: frame rate [Hz], where images come without
+    times. prefix: put before the labels of tracks (p0, t0, …), so that those of two cameras differ. seed: of random
+    numbers, where it draws any.
+    """
+
+    kind: Kind | None = None
+    fps: float = 25.0
+    prefix: str = ""
+    seed: int = 0
 
 
 class Detector(Protocol):

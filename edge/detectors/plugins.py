@@ -10,31 +10,16 @@ where ``make_detector(options: DetectorOptions) -> Detector`` (a class with such
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
-from edge.detectors.base import Detector
+from edge.detectors.base import Detector, DetectorOptions, Kind
 from protocols.core.errors import InputError
 
 GROUP = "syncline.detectors"
-Kind = Literal["person", "vehicle"]
-
-
-@dataclass(frozen=True, slots=True)
-class DetectorOptions:
-    """What a detector is made for: the images of one camera, passed one after the other.
-
-    kind: report only objects of this kind; None = all that it knows. fps: frame rate [Hz], where images come without
-    times. prefix: put before the labels of tracks (p0, t0, …), so that those of two cameras differ. seed: of random
-    numbers, where it draws any.
-    """
-
-    kind: Kind | None = None
-    fps: float = 25.0
-    prefix: str = ""
-    seed: int = 0
 
 
 def is_plugin(name: str) -> bool:
@@ -47,6 +32,19 @@ def is_network_file(name: str | Path) -> bool:
     return Path(name).suffix.lower() == ".toml"
 
 
+def detector_revision(name_or_path: str | Path) -> str:
+    """A text that changes when a detector may detect something else: a hash of its files, or its package's version.
+
+    Raises InputError where a file of a network cannot be read.
+    """
+    if is_network_file(name_or_path):
+        from edge.detectors.network.description import network_digest
+
+        return network_digest(Path(name_or_path))
+    dists = {point.dist for point in entry_points(group=GROUP) if point.name == name_or_path}
+    return " ".join([str(name_or_path), *sorted(f"{one.name} {one.version}" for one in dists if one is not None)])
+
+
 def load_detector(
     name_or_path: str | Path, *, kind: Kind | None = None, fps: float = 25.0, prefix: str = "", seed: int = 0
 ) -> Detector:
@@ -56,7 +54,7 @@ def load_detector(
     ----------
     name_or_path
         A path that ends in .toml: an ONNX network (see ``edge.detectors.network.description``). Otherwise ``person`` or
-        ``vehicle`` (the shipped detectors of motion), or the name of an entry point of the group ``syncline.detectors``.
+        ``vehicle`` (shipped: what moves before the background), or an entry point of the group ``syncline.detectors``.
     kind, fps, prefix, seed
         See ``DetectorOptions``.
 
@@ -73,7 +71,7 @@ def load_detector(
     InputError
         There is no such detector, or its file or model is not usable: one line with file, reason and remedy.
     """
-    options = DetectorOptions(kind, fps, prefix, seed)
+    options = DetectorOptions(kind, fps if fps > 0.0 and math.isfinite(fps) else 25.0, prefix, seed)
     if is_network_file(name_or_path):
         from edge.detectors.network.detector import NetworkDetector
 
@@ -112,7 +110,7 @@ def _from_entry_point(name: str, options: DetectorOptions) -> Detector:
 
 def _load(point: EntryPoint, options: DetectorOptions) -> Detector:
     try:
-        factory = point.load()
+        factory: Callable[[DetectorOptions], Detector] = point.load()
     except (ImportError, AttributeError) as error:
         what = f"the detector {point.name!r} ({point.value}) cannot be loaded: {error}"
         raise InputError(what, remedy="install its package again, with all that it needs") from None
@@ -120,5 +118,4 @@ def _load(point: EntryPoint, options: DetectorOptions) -> Detector:
     if not callable(getattr(detector, "detect", None)):
         what = f"the detector {point.name!r} ({point.value}) has no method detect(image, time_s, predictions)"
         raise InputError(what, remedy="see edge.detectors.base.Detector")
-    made: Detector = detector
-    return made
+    return detector

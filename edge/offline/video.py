@@ -1,4 +1,4 @@
-"""Detection in a whole video, and marker model files."""
+"""Detection in a whole video by any detector, and marker model files."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import Literal, get_args
 
 import tomli_w
 
-from edge.detectors.base import Detector
+from edge.detectors.base import Detector, Kind
 from edge.detectors.marker.ball import MarkerModel, learn_marker_model
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
+from edge.detectors.plugins import is_plugin, load_detector
 from edge.devices.base import check_size
 from edge.devices.playback.video_reader import VideoReader
 from edge.offline.detections import Collected, VideoDetections, detection_rows, run_detector
@@ -28,8 +29,9 @@ MARKER_FILE = "marker.toml"
 
 def detect_video(
     video: str | Path,
-    detector: VideoDetector = "marker",
+    detector: VideoDetector | str | Path = "marker",
     *,
+    kind: Kind | None = None,
     camera: str | None = None,
     marker: MarkerModel | str | Path | None = None,
     intrinsics: Intrinsics | None = None,
@@ -48,7 +50,10 @@ def detect_video(
         A video file, or a folder of images in the order of their names.
     detector
         marker: one brightly coloured ball. bright: a point of light. tag: AprilTag or ArUco tags. person: people
-        before a fixed camera. vehicle: moving vehicles; the camera may move.
+        before a fixed camera. vehicle: moving vehicles; the camera may move. Or a network's .toml file, or another
+        package's detector by name: see ``edge.detectors.plugins.load_detector``.
+    kind
+        Of such a network or package: keep only people or only vehicles; default: all.
     camera
         Name of the camera in the rows; default: the video's name.
     marker
@@ -81,8 +86,13 @@ def detect_video(
         Where the video or the marker file cannot be read, or intrinsics are for another image size.
     """
     path, move = Path(video), progress or (lambda text, fraction: None)
-    if detector not in (names := get_args(VideoDetector)):
-        raise InputError(f"there is no detector {detector!r}", remedy=f"use one of {', '.join(names)}")
+    detector = str(detector)
+    shipped = detector in (names := get_args(VideoDetector))
+    if not shipped and not is_plugin(detector):
+        remedy = f"use one of {', '.join(names)}, or a network's .toml file"
+        raise InputError(f"there is no detector {detector!r}", remedy=remedy)
+    if kind is not None and shipped:
+        raise InputError(f"kind has no effect on the detector {detector}", remedy="leave it out")
     if detector != "marker" and (marker is not None or intrinsics is not None):
         given = "intrinsics" if marker is None else "marker"
         raise InputError(f"{given} has no effect on the detector {detector}", remedy="leave it out")
@@ -96,19 +106,51 @@ def detect_video(
         return moving.detect_moving(
             reader, name, moving.moving_detector(detector, background, reader.info.fps), move, overlay
         )
-    total = reader.info.frames
-
-    def on_frame(frame: int) -> None:
-        move(f"frame {frame}" + (f" of {total}" if total else ""), frame / total if total else 0.0)
-
+    if not shipped:
+        return detect_objects(reader, name, load_detector(detector, kind=kind, fps=reader.info.fps), move, overlay)
+    on_frame = _frame_progress(reader, move)
     if detector == "marker":
         model = read_marker_model(Path(marker)) if isinstance(marker, str | Path) else marker or MarkerModel.default()
         finder: Detector = ball_detector(model, intrinsics, reader.info.size)
     else:
-        finder = bright_or_tag_detector(detector, threshold, dictionary)
+        finder = bright_or_tag_detector("tag" if detector == "tag" else "bright", threshold, dictionary)
     drawn: Collected = {}
     found = run_detector(reader, name, finder, on_frame, collected=None if overlay is None else drawn)
     return found if overlay is None else _with_overlay(reader, name, found, drawn, overlay)
+
+
+def detect_objects(
+    video: VideoReader,
+    camera: str,
+    detector: Detector,
+    progress: Callable[[str, float], None] = lambda text, fraction: None,
+    overlay: Path | None = None,
+) -> VideoDetections:
+    """Run another package's detector, or a network, over a video.
+
+    Where there is never more than one person, or one vehicle, at a time, all of them are one label, ``person`` or
+    ``vehicle``, although its track was lost in between. progress, overlay: as of ``detect_video``. Raises InputError.
+    """
+    from edge.offline.moving import named_detections
+
+    seen: Collected = {}
+    found = run_detector(video, camera, detector, _frame_progress(video, progress), collected=seen)
+    several = {one.kind for _, shown in seen.values() for one in shown if sum(one.kind == k.kind for k in shown) > 1}
+    names = {
+        one.label: one.label if one.kind in several or one.kind not in get_args(Kind) else one.kind
+        for _, shown in seen.values()
+        for one in shown
+    }
+    return named_detections(video, camera, found, seen, names, overlay)
+
+
+def _frame_progress(video: VideoReader, progress: Callable[[str, float], None]) -> Callable[[int], None]:
+    total = video.info.frames
+
+    def on_frame(frame: int) -> None:
+        progress(f"frame {frame}" + (f" of {total}" if total else ""), min(frame / total, 1.0) if total else 0.0)
+
+    return on_frame
 
 
 def _with_overlay(

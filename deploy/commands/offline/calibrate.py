@@ -26,7 +26,7 @@ def calibrate(
     solver: Literal["joint", "distributed", "paper"] = "joint",
     from_known: Path | None = None,
     marker: Path | None = None,
-    detector: Literal["marker", "person", "vehicle"] = "marker",
+    detector: str = "marker",
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
@@ -60,7 +60,8 @@ def calibrate(
         For videos: appearance of the marker, as written by `syncline detect --teach`. Default: marker.toml in the
         folder of videos, otherwise the orange ball of the demo.
     detector
-        For videos: what moves in them. person, vehicle: only one at a time in view, with fixed cameras.
+        For videos: what moves in them. person, vehicle: only one at a time in view, with fixed cameras. Or the .toml
+        file of an ONNX network, or a detector that another package registers: only one target at a time in view.
     json
         Print the result as JSON on standard output.
     seed
@@ -91,7 +92,7 @@ def _load(
     observations: Path | None,
     out: Path,
     marker: Path | None,
-    detector: Literal["marker", "person", "vehicle"],
+    detector: str,
     quiet: bool,
 ) -> Session:
     """Read a session, or make one from a folder of videos. Raises InputError."""

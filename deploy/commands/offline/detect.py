@@ -40,18 +40,21 @@ def detect(
     fps: float | None = None,
     overlay: Path | None = None,
     background: Literal["mog2", "knn"] = "mog2",
+    detector: str | None = None,
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
     """Detect a marker, people or vehicles in every frame of a video, and write the times and pixels.
 
-    Writes camera,frame,time,u,v,size,label,score to --out: time is the file's presentation time (variable frame rates
-    are kept), u, v and size are in pixels. Exit status 3 if nothing is detected in any frame.
+    Writes camera,frame,time,u,v,size,label,score,kind,cov_uu,cov_uv,cov_vv,head_u,head_v,foot_u,foot_v and
+    box_x,box_y,box_w,box_h (x, y of the top left) to --out: time is the file's presentation time (variable frame rates
+    are kept), all others are in pixels; an empty cell is not measured. Exit status 3 if nothing is detected in any
+    frame.
 
-    People and vehicles are detected as motion before the background. person: u, v is the representative point, size the
-    distance from head to foot; label p0, p1, ... is one per track in this video (person where there is never more than
-    one). vehicle: u, v is the box's centre; label t0, t1, ... is one per track; the camera may be moving. Both have
-    further columns: head_u,head_v,foot_u,foot_v,box_x,box_y,box_w,box_h (x, y of the top left).
+    People and vehicles are detected as motion before the background, or by --detector. person: u, v is the
+    representative point, size the distance from head to foot; label p0, p1, ... is one per track in this video (person
+    where there is never more than one). vehicle: u, v is the box's centre; label t0, t1, ... is one per track; the
+    camera may be moving.
 
     Example: syncline detect marker cam0.mp4 --out observations.csv
 
@@ -60,6 +63,8 @@ def detect(
     Example: syncline detect marker cam0.mp4 --mode tag --out observations.csv
 
     Example: syncline detect person street.mp4 --out observations.csv --overlay seen.mp4
+
+    Example: syncline detect person street.mp4 --detector yolo.toml --out observations.csv
 
     Parameters
     ----------
@@ -97,6 +102,9 @@ def detect(
         A video to write: a copy with the detections drawn into it.
     background
         OpenCV's background model for people and vehicles: mog2 or knn.
+    detector
+        For people and vehicles: the .toml file of an ONNX network, or the name of a detector that another package
+        registers, in place of the shipped one.
     json
         Print a summary as JSON.
     seed
@@ -106,6 +114,9 @@ def detect(
     if what != "marker" and (useless := [option for option, value in shown.items() if value is not None]):
         raise InputError(f"{useless[0]} cannot be used with `detect {what}`", remedy="leave it out")
     _check_mode(what, mode, shown, threshold, dictionary)
+    if detector is not None and (what == "marker" or background != "mog2"):
+        other = "`detect marker`" if what == "marker" else "--background"
+        raise InputError(f"--detector cannot be used with {other}", remedy="leave one of them out")
     if fps is not None and not 0.1 <= fps <= 10_000:
         raise InputError(f"--fps {fps:g} is out of range", remedy="give the frame rate in Hz")
     if out.is_dir():
@@ -135,7 +146,8 @@ def detect(
     with progress_bar(f"looking through {video.name}", quiet=json) as progress:
         found = detect_video(
             video,
-            mode if mode != "colour" else what,
+            detector or (mode if mode != "colour" else what),
+            kind=None if detector is None or what == "marker" else what,
             camera=name,
             marker=model,
             intrinsics=None if rig is None else choose_camera(rig, Path(f"{name}.mp4")).intrinsics,
@@ -147,9 +159,10 @@ def detect(
             progress=progress,
         )
     if not found.rows:
-        raise Refused(
-            f"{video}: no {what} in any of {found.frames} frames; {_REMEDIES[mode if mode in _REMEDIES else what]}"
+        remedy = (
+            "a lower `score` in its file may find more" if detector else _REMEDIES[mode if mode in _REMEDIES else what]
         )
+        raise Refused(f"{video}: no {what} in any of {found.frames} frames; {remedy}")
     write_together({**files, out: found.to_csv()})
     warnings = [f"{video}: {warning}" for warning in found.warnings]
     if json:

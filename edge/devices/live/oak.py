@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from edge.detectors.network.boxes import BoxLabeller
 from edge.devices.base import DeviceInfo, Frame, check_size
-from edge.devices.live.oak_network import BoxLabeller, boxes_in_image
+from edge.devices.live.oak_network import boxes_in_image
 from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
@@ -79,7 +80,7 @@ class OakCamera(ReconnectingCamera):
     ) -> None:
         name = settings.device or "OAK camera"
         make = connect or open_stream
-        labeller = BoxLabeller(settings.prefix)
+        labeller = BoxLabeller(f"{settings.prefix}-")
 
         def connected() -> Connection:
             try:
@@ -105,7 +106,7 @@ class OakConnection:
 
     def __init__(self, stream: OakStream, labels: tuple[str, ...] = (), labeller: BoxLabeller | None = None) -> None:
         self._stream, self._labels = stream, labels
-        self._labeller = labeller or BoxLabeller("oak")
+        self._labeller = labeller or BoxLabeller("oak-")
         self._result: Any = None
         self._pending_frame: Any = None
 

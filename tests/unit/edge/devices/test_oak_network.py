@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from edge.agents.camera import run_camera_agent
+from edge.detectors.network.boxes import BoxLabeller, NetworkBox
 from edge.devices.base import Frame
 from edge.devices.live.oak import OakCamera, OakSettings, OakStream, open_archive, open_stream
-from edge.devices.live.oak_network import BoxLabeller, NetworkBox, boxes_in_image
+from edge.devices.live.oak_network import boxes_in_image
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.errors import InputError
 from protocols.topics import OBSERVATION
@@ -96,7 +97,7 @@ def test_invalid_boxes_are_dropped_and_results_without_a_transformation_are_refu
 
 
 def test_people_keep_their_track_labels_and_a_marker_its_class() -> None:
-    labeller = BoxLabeller("cam4")
+    labeller = BoxLabeller("cam4-")
     seen = []
     for step in range(8):
         people = [
