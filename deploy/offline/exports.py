@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from protocols.core.errors import InputError
+from protocols.core.files import file_in
 from protocols.formats import colmap, toml_rigs, trc, yaml_rigs
 from protocols.formats.cameras import ExportedFiles, convert_units
 from protocols.session.calibration import read_calibration
@@ -31,7 +32,7 @@ def calibration_files(source: Path, to: str, out: Path) -> tuple[dict[Path, str]
     else:
         written = colmap.write(cameras)
     folder = out if to in IN_FOLDERS else out.parent
-    return {folder / name: text for name, text in written.files.items()}, written.warnings
+    return {file_in(folder, name): text for name, text in written.files.items()}, written.warnings
 
 
 def trajectory_files(source: Path, out: Path, units: str) -> dict[Path, str]:

@@ -93,18 +93,19 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
     labels = observations.labels
     start = min((float(track.time[0]) for track in observations.tracks.values()), default=0.0)
     warnings: list[str] = []
-    for name, rig_camera in rig.cameras.items():
+
+    def take(name: str, rig_camera: RigCamera) -> None:
         tracks, clock_step = without_clock_steps(observations.of_camera(name))
         if clock_step:
             warnings.append(f"{name}: {clock_step}")
         if not tracks:
             refused[name] = "no observations"
-            continue
+            return
         is_uncalibrated = rig_camera.intrinsics is None or rig_camera.focal_std > 0.0
         if is_uncalibrated:
             refused[name] = NO_INTRINSICS
             if rig.shared_clock:
-                continue
+                return
         lens = rig_camera.intrinsics or nominal_intrinsics(rig_camera)
         time_origin = start if rig.shared_clock else min(float(track.time[0]) for track in tracks)
         smooth: dict[str, ImageTrack] = {}
@@ -140,12 +141,19 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
         if not smooth:
             few = f"too few connected observations ({sum(len(track) for track in tracks)} rows)"
             refused[name] = f"{NO_INTRINSICS}; and {few}" if is_uncalibrated else few
-            continue
+            return
         time_origins[name] = time_origin
         rows[name] = mine
         (uncalibrated if is_uncalibrated else cameras)[name] = CameraInput(
             name, lens, smooth, readout_given=rig_camera.readout is not None
         )
+
+    for name, rig_camera in rig.cameras.items():
+        try:
+            take(name, rig_camera)
+        except (ValueError, ArithmeticError, IndexError, np.linalg.LinAlgError) as error:
+            # Whatever is wrong with one camera's numbers is a reason to refuse that camera, not the session.
+            refused[name] = f"its rows or its lens cannot be used ({type(error).__name__}: {error})"[:300]
     return PreparedSession(
         cameras,
         rows,

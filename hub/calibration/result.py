@@ -33,6 +33,11 @@ from protocols.session.rig import Rig
 
 SEEN_WITHIN = 0.2
 """A camera counts as observing at a time if it has an observation within this interval [s]."""
+_SHORT_GAPS, _MAX_NOMINAL = 0.05, 4.0
+"""Quantile of a camera's gaps between rows that stands for consecutive frames, and how much faster than those its
+nominal rate may be: a target seen in every fourth frame at best."""
+_MAX_SAMPLES = 4_000_000
+"""Of one path: 4.6 hours at 240 Hz."""
 
 
 def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | None = None) -> Calibration:
@@ -296,13 +301,19 @@ def _residual_rows(
 
 
 def _sampling_rate(rig: Rig, problem: Problem, names: list[str], time_scales: list[float], reference: float) -> float:
-    """Frame rate of the fastest camera on a clock of time scale ``reference``: nominal, or from its rows."""
+    """Frame rate of the fastest camera on a clock of time scale ``reference``: nominal, or from its rows.
+
+    Where no gap between a camera's rows comes near its nominal rate, that one is wrong, and its rows say the rate.
+    """
     rates = [
         rig.cameras[name].fps * reference / time_scale for name, time_scale in zip(names, time_scales, strict=True)
     ]
     for rows in problem.rows:
-        if rates[rows.camera] <= 0 and len(rows.time) > 2:
-            rates[rows.camera] = reference / float(np.median(np.diff(rows.time)))
+        if len(rows.time) > 2:
+            gaps = np.diff(rows.time)
+            shortest = reference / max(float(np.quantile(gaps, _SHORT_GAPS)), 1e-9)
+            if not 0.0 < rates[rows.camera] < _MAX_NOMINAL * shortest:
+                rates[rows.camera] = reference / float(np.median(gaps))
     return max([rate for rate in rates if np.isfinite(rate)], default=30.0) or 30.0
 
 
@@ -343,6 +354,7 @@ def _trajectory_table(
     else:
         # A grid on the reference camera's clock, so that two runs on one log sample the same instants.
         first, last = base.camera_time(np.array([path.basis.begin, path.basis.end])) / time_scale
+        rate_hz = min(rate_hz, _MAX_SAMPLES / max(last - first, 1.0 / rate_hz))
         ticks = (
             np.arange(np.ceil((first + time_origin) * rate_hz), np.floor((last + time_origin) * rate_hz) + 1) / rate_hz
         )

@@ -50,6 +50,16 @@ def write_together(files: Mapping[Path, str]) -> None:
             temporary.unlink(missing_ok=True)
 
 
+def file_in(folder: Path, name: str) -> Path:
+    """The file ``name`` directly in ``folder``; raises InputError for a name that leads anywhere else.
+
+    Names of cameras cannot (``protocols.core.names``); this is the writers' own check.
+    """
+    if name in ("", ".", "..") or any(separator in name for separator in "/\\\0"):
+        raise InputError(f"{name[:80]!a} is no file name", file=folder, remedy="rename the camera")
+    return folder / name
+
+
 def check_folder(folder: Path) -> None:
     """Raise InputError if ``folder`` cannot be created or used as an output folder; creates nothing."""
     try:

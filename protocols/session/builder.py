@@ -261,8 +261,6 @@ class SessionBuilder:
             return rows, self._one_a_time(rows, np.flatnonzero(inside))
         rows = boots[self.boot(camera)].rows
         used = np.flatnonzero(np.array(rows.time_ns) >= self._since.get((camera, self.boot(camera)), -(2**63)))
-        if self._chunks is None:
-            return rows, used
         return rows, self._one_a_time(rows, used)
 
     @staticmethod

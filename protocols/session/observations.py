@@ -11,13 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from protocols.core.errors import InputError
+from protocols.core.ranges import MAX_COUNT, MAX_PIXEL, MAX_TIME_S
 from protocols.geometry.types import Bools, Floats, Ints
 
 REQUIRED = ("camera", "frame", "time", "u", "v")
 DEFAULT_LABEL = "marker"
-_MAX_ABS_TIME_S = 1e11  # s: 3,000 years; beyond it a float does not resolve microseconds
-_MAX_ABS_PIXEL = 1e6
-_MAX_FRAME = 2.0**53  # beyond it a float no longer represents every whole number
 _MAX_REPEATED_SHARE = 0.1  # share of repeated frame numbers above which the column is not a frame numbering
 
 
@@ -88,7 +86,7 @@ class ObservationRows:
     cells: list[list[str]]
     column: dict[str, int]
 
-    def numbers(self, name: str, limit: float = _MAX_ABS_PIXEL) -> Floats:
+    def numbers(self, name: str, limit: float = MAX_PIXEL) -> Floats:
         """An optional column (n,); NaN where the cell is empty. Raises InputError beyond ±limit."""
         if name not in self.column:
             return np.full(len(self.cells), np.nan)
@@ -166,12 +164,12 @@ def read_rows(file: Path, cameras: Iterable[str], optional: Sequence[str] = ()) 
         raise InputError("no rows", file=file, line=1, remedy="record some observations first")
     _check_width(rows, lines, max(columns[name] for name in columns if name in used), file)
     numbers = {name: _column(rows, lines, columns[name], name, file) for name in ("time", "u", "v")}
-    far = np.flatnonzero(np.abs(numbers["time"]) > _MAX_ABS_TIME_S)
+    far = np.flatnonzero(np.abs(numbers["time"]) > MAX_TIME_S)
     if len(far):
         what = f"time {numbers['time'][far[0]]:g} is no time in seconds"
         raise InputError(what, file=file, line=lines[far[0]], remedy="give seconds; Unix time is about 1.8e9")
     for name in ("u", "v"):
-        far = np.flatnonzero(np.abs(numbers[name]) > _MAX_ABS_PIXEL)
+        far = np.flatnonzero(np.abs(numbers[name]) > MAX_PIXEL)
         if len(far):
             what = f"{name} {numbers[name][far[0]]:g} is no pixel"
             raise InputError(what, file=file, line=lines[far[0]], remedy="correct or remove the row")
@@ -328,7 +326,7 @@ def _column(
 
 def _frames(rows: list[list[str]], lines: list[int], index: int, file: Path) -> Ints:
     values = _column(rows, lines, index, "frame", file)
-    bad = np.flatnonzero((values != np.round(values)) | (np.abs(values) > _MAX_FRAME))
+    bad = np.flatnonzero((values != np.round(values)) | (np.abs(values) > MAX_COUNT))
     if len(bad):
         raise InputError(
             f"frame {rows[bad[0]][index].strip()} is not a whole number",

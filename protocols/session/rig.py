@@ -12,6 +12,16 @@ import numpy as np
 
 from protocols.core.errors import InputError
 from protocols.core.names import check_name
+from protocols.core.ranges import (
+    MAX_DISTORTION,
+    MAX_FOCAL,
+    MAX_FPS,
+    MAX_IMAGE_SIDE,
+    MAX_LENGTH,
+    MAX_TURN,
+    MIN_FOCAL,
+    MIN_STD,
+)
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
@@ -22,7 +32,6 @@ MEASURED_FOCAL_STD = 0.02
 """A focal length of at most this relative std counts as measured."""
 MAX_READOUT_S = 0.06
 """Upper bound [s] of a rolling shutter's readout, from an image's first row to its last."""
-_LARGEST = 1e12  # no length, angle or pixel of a rig comes near it
 _POSITION_TOLERANCE = 1e-3  # relative: position and translation may differ by rounding, not by more
 
 
@@ -112,8 +121,8 @@ class _Table:
     def fail(self, key: str | None, what: str, remedy: str) -> InputError:
         return InputError(f"[{self.where}] {what}", file=self.file, line=self.line(key), remedy=remedy)
 
-    def numbers(self, key: str, count: int | tuple[int, ...], what: str) -> Floats | None:
-        """A list of finite numbers, or None where the key is absent."""
+    def numbers(self, key: str, count: int | tuple[int, ...], what: str, most: float = MAX_LENGTH) -> Floats | None:
+        """A list of numbers within ±most, or None where the key is absent."""
         if key not in self.values:
             return None
         remedy = f"give {key} = {what}"
@@ -124,8 +133,8 @@ class _Table:
         shape = (count,) if isinstance(count, int) else count
         if array.shape != shape:
             raise self.fail(key, f"{key} has shape {list(array.shape)}, not {list(shape)}", remedy)
-        if not np.isfinite(array).all() or np.abs(array).max(initial=0.0) > _LARGEST:
-            raise self.fail(key, f"{key} is not finite, or far too large", remedy)
+        if not np.isfinite(array).all() or np.abs(array).max(initial=0.0) > most:
+            raise self.fail(key, f"{key} is not finite, or beyond ±{most:g}", remedy)
         return array
 
     def std(self, key: str, what: str) -> Floats | None:
@@ -137,7 +146,7 @@ class _Table:
         array = table.numbers(key, 3, what)
         if array is not None and not (array >= 0).all():
             raise self.fail(key, f"{key} is negative", f"give {key} = {what}; 0 means exactly known")
-        return array
+        return None if array is None else np.where(array < MIN_STD, 0.0, array)
 
 
 def read_toml(file: Path, what: str = "file") -> tuple[dict[str, Any], str]:
@@ -212,7 +221,7 @@ def _read_scale_bars(meta: _Table) -> tuple[tuple[str, str, float], ...]:
         shape = isinstance(row, list) and len(row) == 3 and all(isinstance(name, str) for name in row[:2])
         if not (shape and isinstance(row[2], int | float) and not isinstance(row[2], bool)):
             raise meta.fail("wand", f"wand {row!r} is not [label, label, length]", remedy)
-        if not 0 < row[2] <= _LARGEST or row[0] == row[1]:
+        if not MIN_STD <= row[2] <= MAX_LENGTH or row[0] == row[1]:
             raise meta.fail("wand", f"wand {row!r} is not a length between two labels", remedy)
         scale_bars.append((row[0], row[1], float(row[2])))
     return tuple(scale_bars)
@@ -229,7 +238,7 @@ def _read_distances(meta: _Table, cameras: dict[str, RigCamera]) -> tuple[tuple[
         for name in row[:2]:
             if name not in cameras:
                 raise meta.fail("distances", f"distance to an unknown camera {name!r}", "use a camera of this file")
-        if not 0 < row[2] <= _LARGEST or row[0] == row[1]:
+        if not MIN_STD <= row[2] <= MAX_LENGTH or row[0] == row[1]:
             raise meta.fail("distances", f"distance {row!r} is not a length between two cameras", remedy)
         distances.append((row[0], row[1], float(row[2])))
     return tuple(distances)
@@ -262,11 +271,11 @@ def _read_camera(table: _Table) -> RigCamera:
     theirs = re.fullmatch(r"cam_\d+", table.where) is not None
     if name != table.where and not theirs:
         raise table.fail("name", f"name = {name!r} differs from the table's key", "make them the same")
-    size = table.numbers("size", 2, "[width, height]")
+    size = table.numbers("size", 2, "[width, height]", MAX_IMAGE_SIDE)
     if size is None or not (size > 0).all() or not (size == size.round()).all():
         raise table.fail("size", "size is missing or not two whole numbers", "give size = [width, height] in pixels")
     fps = table.values.get("fps", 0.0)
-    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 <= fps <= _LARGEST:
+    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 <= fps <= MAX_FPS:
         raise table.fail("fps", f"fps = {fps!r} is not a frame rate", "give fps = 30.0")
     width, height = int(size[0]), int(size[1])
     position, rotation = _read_pose(table)
@@ -333,7 +342,7 @@ def _read_body(table: _Table) -> Floats | None:
 
 
 def _read_intrinsics(table: _Table, width: int, height: int) -> Intrinsics | None:
-    matrix = table.numbers("matrix", (3, 3), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    matrix = table.numbers("matrix", (3, 3), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", MAX_FOCAL)
     fisheye = table.values.get("fisheye", False)
     if not isinstance(fisheye, bool):
         raise table.fail("fisheye", f"fisheye = {fisheye!r}", "give true or false")
@@ -343,11 +352,16 @@ def _read_intrinsics(table: _Table, width: int, height: int) -> Intrinsics | Non
             padded = {**table.values, "distortions": [*table.values["distortions"], 0.0]}
             table = _Table(padded, table.where, table.file, table.text)
     distortions = table.numbers(
-        "distortions", 4 if fisheye else 5, "[k1, k2, k3, k4]" if fisheye else "[k1, k2, p1, p2, k3]"
+        "distortions", 4 if fisheye else 5, "[k1, k2, k3, k4]" if fisheye else "[k1, k2, p1, p2, k3]", MAX_DISTORTION
     )
     if matrix is None:
         return None
-    if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.allclose(matrix[2], [0, 0, 1]) and matrix[1, 0] == 0):
+    if not (
+        matrix[0, 0] >= MIN_FOCAL
+        and matrix[1, 1] >= MIN_FOCAL
+        and np.allclose(matrix[2], [0, 0, 1])
+        and matrix[1, 0] == 0
+    ):
         raise table.fail("matrix", "matrix is not a camera matrix", "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     zeros = np.zeros(4 if fisheye else 5)
     return Intrinsics(width, height, matrix, zeros if distortions is None else distortions, fisheye)
@@ -356,7 +370,7 @@ def _read_intrinsics(table: _Table, width: int, height: int) -> Intrinsics | Non
 def _read_pose(table: _Table) -> tuple[Floats | None, Floats | None]:
     """Position (3,) and rotation (3, 3); a translation is turned into a position."""
     position = table.numbers("position", 3, "[x, y, z]")
-    rodrigues = table.numbers("rotation", 3, "a Rodrigues vector, camera from world")
+    rodrigues = table.numbers("rotation", 3, "a Rodrigues vector, camera from world", MAX_TURN)
     translation = table.numbers("translation", 3, "camera from world")
     rotation = None if rodrigues is None else so3.exp(rodrigues)
     if translation is None:

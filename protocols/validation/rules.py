@@ -1,7 +1,7 @@
 """Validation rules of each message type: ranges, counts, lengths, names.
 
 One function per message. Each raises Rejected at the first violation, so that no estimator ever receives a number
-that is not finite or an array of the wrong length.
+that is not plausible (``protocols.core.ranges``) or an array of the wrong length.
 """
 
 from __future__ import annotations
@@ -13,6 +13,23 @@ from typing import Any
 
 from protocols.core.errors import InputError
 from protocols.core.names import check_identifier, is_name
+from protocols.core.ranges import (
+    MAX_CLOCK_RATE,
+    MAX_COUNT,
+    MAX_DISTORTION,
+    MAX_EXPOSURE_NS,
+    MAX_FOCAL,
+    MAX_FPS,
+    MAX_IMAGE_SIDE,
+    MAX_LENGTH,
+    MAX_PIXEL,
+    MAX_TIME_NS,
+    MAX_TIME_S,
+    MAX_TURN,
+    MIN_CLOCK_RATE,
+    MIN_FOCAL,
+    MIN_STD,
+)
 from protocols.messages import syncline_pb2 as pb
 
 SCHEMA_VERSION = 1
@@ -20,10 +37,6 @@ SCHEMA_VERSION = 1
 MAX_DETECTIONS = 4096
 MAX_CAMERAS = 1024
 MAX_NUMBERS = 256
-MAX_PIXEL = 1e6
-"""A detection may lie outside the image (a predicted one does), but not a million pixels away."""
-MAX_IMAGE_SIDE = 65_535
-MAX_FPS = 100_000.0
 MAX_LABEL = 64
 MAX_TEXT = 4096
 
@@ -76,13 +89,7 @@ def _number(value: float, name: str, low: float = -inf, high: float = inf) -> No
     if not isfinite(value):
         raise Rejected(RejectionReason.NOT_FINITE, f"{name} is {value}")
     if not low <= value <= high:
-        raise Rejected(RejectionReason.OUT_OF_RANGE, f"{name} is {value}")
-
-
-def _positive(value: float, name: str, high: float = inf) -> None:
-    _number(value, name, 0.0, high)
-    if value == 0.0:
-        raise Rejected(RejectionReason.OUT_OF_RANGE, f"{name} is 0")
+        raise Rejected(RejectionReason.OUT_OF_RANGE, f"{name} is {value:g}, allowed: {low:g} to {high:g}")
 
 
 def _vector(values: Sequence[float], name: str, lengths: tuple[int, ...], low: float = -inf, high: float = inf) -> None:
@@ -136,8 +143,30 @@ def _distinct(names: Iterable[str], what: str) -> None:
         seen.add(name)
 
 
+def _times(message: Any, *names: str) -> None:
+    """Times [ns]: differences of two must not overflow."""
+    for name in names:
+        time = getattr(message, name)
+        if not -MAX_TIME_NS <= time <= MAX_TIME_NS:
+            raise Rejected(RejectionReason.OUT_OF_RANGE, f"{name} is {time}")
+
+
+def _counts(message: Any, *names: str) -> None:
+    """Numbers of frames and messages."""
+    for name in names:
+        if getattr(message, name) > MAX_COUNT:
+            raise Rejected(RejectionReason.OUT_OF_RANGE, f"{name} is {getattr(message, name)}")
+
+
+def _stds(values: Sequence[float], name: str, lengths: tuple[int, ...], most: float) -> None:
+    """Standard deviations of what an estimator weights by them: 0 (exact), or not so small that 1/std² overflows."""
+    _vector(values, name, lengths, 0.0, most)
+    if any(0.0 < value < MIN_STD for value in values):
+        raise Rejected(RejectionReason.OUT_OF_RANGE, f"{name} is below {MIN_STD:g}, but not 0")
+
+
 def _covariance_2d(covariance: Sequence[float], name: str) -> None:
-    _vector(covariance, name, (0, 3))
+    _vector(covariance, name, (0, 3), -(MAX_PIXEL**2), MAX_PIXEL**2)
     if covariance:
         uu, uv, vv = covariance
         # The tolerance lets a rank-one covariance pass after rounding.
@@ -146,10 +175,14 @@ def _covariance_2d(covariance: Sequence[float], name: str) -> None:
 
 
 def _intrinsics(message: Any) -> None:
-    _vector(message.matrix, "matrix", (0, 9))
-    if message.matrix and not (message.matrix[0] > 0.0 and message.matrix[4] > 0.0):
-        raise Rejected(RejectionReason.OUT_OF_RANGE, "a focal length is not positive")
-    _vector(message.distortions, "distortions", (0, 4) if message.fisheye else (0, 4, 5))
+    matrix = message.matrix
+    _vector(matrix, "matrix", (0, 9), -MAX_FOCAL, MAX_FOCAL)
+    if matrix and not (matrix[0] >= MIN_FOCAL and matrix[4] >= MIN_FOCAL):
+        raise Rejected(RejectionReason.OUT_OF_RANGE, f"a focal length is below {MIN_FOCAL:g} px")
+    if matrix and (matrix[3], *matrix[6:]) != (0.0, 0.0, 0.0, 1.0):
+        raise Rejected(RejectionReason.OUT_OF_RANGE, "matrix is no camera matrix")
+    lengths = (0, 4) if message.fisheye else (0, 4, 5)
+    _vector(message.distortions, "distortions", lengths, -MAX_DISTORTION, MAX_DISTORTION)
 
 
 _KINDS = frozenset({"marker", "person", "vehicle"})
@@ -196,8 +229,10 @@ def _detection(detection: pb.Detection) -> None:
 def _observation(message: pb.Observation) -> None:
     _name(message.camera, "camera")
     _id(message.boot_id, "boot id")
-    if message.exposure_ns < 0:
-        raise Rejected(RejectionReason.OUT_OF_RANGE, "exposure is negative")
+    _times(message, "device_time_ns")
+    _counts(message, "sequence", "frame")
+    if not 0 <= message.exposure_ns <= MAX_EXPOSURE_NS:
+        raise Rejected(RejectionReason.OUT_OF_RANGE, f"exposure is {message.exposure_ns} ns")
     _count(message.detections, "detections", MAX_DETECTIONS)
     for detection in message.detections:
         _detection(detection)
@@ -212,10 +247,10 @@ def _camera_info(message: pb.CameraInfo) -> None:
     _intrinsics(message)
     _text(message.driver, "driver", MAX_LABEL)
     _text(message.clock, "clock", MAX_LABEL)
-    _vector(message.position, "position", (0, 3))
-    _vector(message.rotation, "rotation", (0, 3))
-    _vector(message.position_std, "position_std", (0, 3), low=0.0)
-    _vector(message.rotation_std, "rotation_std", (0, 3), low=0.0)
+    _bounded(message.position, "position", (0, 3), MAX_LENGTH)
+    _bounded(message.rotation, "rotation", (0, 3), MAX_TURN)
+    _stds(message.position_std, "position_std", (0, 3), MAX_LENGTH)
+    _stds(message.rotation_std, "rotation_std", (0, 3), MAX_TURN)
     _number(message.readout_s, "readout_s", 0.0, 10.0)
 
 
@@ -231,9 +266,9 @@ def _rig_info(message: pb.RigInfo) -> None:
         _name(distance.camera_a, "camera")
         _name(distance.camera_b, "camera")
         _distinct((distance.camera_a, distance.camera_b), "distance names")
-        _positive(distance.distance, "distance")
-    _vector(message.up, "up", (0, 3))
-    if message.up and not any(message.up):
+        _number(distance.distance, "distance", MIN_STD, MAX_LENGTH)
+    _bounded(message.up, "up", (0, 3), MAX_LENGTH)
+    if message.up and max(map(abs, message.up)) < MIN_STD:
         raise Rejected(RejectionReason.OUT_OF_RANGE, "up has no direction")
     _name(message.up_camera, "up camera", optional=True)
     _name(message.reference_camera, "reference camera", optional=True)
@@ -241,15 +276,15 @@ def _rig_info(message: pb.RigInfo) -> None:
 
 def _camera_calibration(camera: pb.CameraCalibration) -> None:
     _name(camera.camera, "camera")
-    _vector(camera.rotation, "rotation", (3,))
-    _vector(camera.translation, "translation", (3,))
-    _number(camera.time_offset, "time_offset")
-    _positive(camera.clock_rate, "clock_rate")
-    _number(camera.time_offset_std, "time_offset_std", 0.0)
-    _vector(camera.position_std, "position_std", (0, 3), low=0.0)
-    _number(camera.rms_px, "rms_px", 0.0)
-    _number(camera.lag_time_s, "lag_time_s")
-    _number(camera.clock_rate_std, "clock_rate_std", 0.0)
+    _bounded(camera.rotation, "rotation", (3,), MAX_TURN)
+    _bounded(camera.translation, "translation", (3,), MAX_LENGTH)
+    _number(camera.time_offset, "time_offset", -MAX_TIME_S, MAX_TIME_S)
+    _number(camera.clock_rate, "clock_rate", MIN_CLOCK_RATE, MAX_CLOCK_RATE)
+    _number(camera.time_offset_std, "time_offset_std", 0.0, MAX_TIME_S)
+    _vector(camera.position_std, "position_std", (0, 3), 0.0, MAX_LENGTH)
+    _number(camera.rms_px, "rms_px", 0.0, MAX_PIXEL)
+    _number(camera.lag_time_s, "lag_time_s", -MAX_TIME_S, MAX_TIME_S)
+    _number(camera.clock_rate_std, "clock_rate_std", 0.0, MAX_CLOCK_RATE)
     _intrinsics(camera)
     _id(camera.boot_id, "boot id", optional=True)
 
@@ -304,8 +339,8 @@ def _solver_event(message: pb.SolverEvent) -> None:
         _count(priors, "clock priors", MAX_CAMERAS)
         for prior in priors:
             _name(prior.camera, "camera")
-            _number(prior.unix_minus_camera, "unix_minus_camera")
-            _number(prior.error_bound, "error_bound", 0.0)
+            _number(prior.unix_minus_camera, "unix_minus_camera", -MAX_TIME_S, MAX_TIME_S)
+            _number(prior.error_bound, "error_bound", 0.0, MAX_TIME_S)
 
 
 _TRACK_STATES = frozenset({"tentative", "confirmed", "coasting", "lost"})
@@ -314,19 +349,20 @@ _TRACK_STATES = frozenset({"tentative", "confirmed", "coasting", "lost"})
 def _track(message: pb.Track) -> None:
     _text(message.label, "label", MAX_LABEL)
     _one_of(message.state, "state", _TRACK_STATES)
-    _vector(message.position, "position", (3,))
-    _vector(message.velocity, "velocity", (0, 3))
+    _times(message, "reference_time_ns")
+    _bounded(message.position, "position", (3,), MAX_LENGTH)
+    _bounded(message.velocity, "velocity", (0, 3), MAX_LENGTH)
     for covariance, name in ((message.position_covariance, "position"), (message.velocity_covariance, "velocity")):
-        _vector(covariance, f"{name}_covariance", (0, 9))
+        _bounded(covariance, f"{name}_covariance", (0, 9), MAX_LENGTH**2)
         if covariance and min(covariance[::4]) < 0.0:
             raise Rejected(RejectionReason.OUT_OF_RANGE, f"a variance of the {name} is negative")
     if message.kind:
         _one_of(message.kind, "kind", _KINDS)
     if message.HasField("heading"):
         _number(message.heading, "heading", -7.0, 7.0)
-    _number(message.height, "height", 0.0)
-    _number(message.height_std, "height_std", 0.0)
-    _number(message.unseen_s, "unseen_s", 0.0)
+    _number(message.height, "height", 0.0, MAX_LENGTH)
+    _number(message.height_std, "height_std", 0.0, MAX_LENGTH)
+    _number(message.unseen_s, "unseen_s", 0.0, MAX_TIME_S)
     _count(range(message.cameras), "cameras", MAX_CAMERAS)
     if message.HasField("colour"):
         _colour(message.colour)
@@ -356,8 +392,10 @@ def _predicted_target(target: pb.PredictedTarget) -> None:
 
 
 def _prediction(message: pb.Prediction) -> None:
+    _times(message, "reference_time_ns")
     _count(message.cameras, "cameras", MAX_CAMERAS)
     for camera in message.cameras:
+        _times(camera, "device_time_ns")
         _name(camera.camera, "camera")
         _id(camera.boot_id, "boot id", optional=True)
         _count(camera.targets, "targets", MAX_DETECTIONS)
@@ -384,30 +422,34 @@ def _agent_status(message: pb.AgentStatus) -> None:
             _number(value, "a counter or gauge")
 
 
+MAX_INFORMATION = 1e30
+"""1/unit². Observations of a pose, 1e9 of them, with a std of 1e-9 each stay below it, and its products are finite."""
+
+
 def _node_edge(edge: pb.NodeEdge) -> None:
     _name(edge.neighbour, "neighbour")
-    for values, name, length in (
-        (edge.rotation, "rotation", 3),
-        (edge.centre, "centre", 3),
-        (edge.hessian, "hessian", 21),
-        (edge.gradient, "gradient", 6),
+    for values, name, length, most in (
+        (edge.rotation, "rotation", 3, MAX_TURN),
+        (edge.centre, "centre", 3, MAX_LENGTH),
+        (edge.hessian, "hessian", 21, MAX_INFORMATION),
+        (edge.gradient, "gradient", 6, MAX_INFORMATION),
     ):
-        _vector(values, name, (length,))
-    _number(edge.count, "count", 0.0)
-    _number(edge.chi2, "chi2", 0.0)
+        _bounded(values, name, (length,), most)
+    _number(edge.count, "count", 0.0, MAX_COUNT)
+    _number(edge.chi2, "chi2", 0.0, MAX_INFORMATION)
 
 
 def _node_anchor(anchor: pb.NodeAnchor) -> None:
     _name(anchor.camera, "anchor")
-    for values, name, lengths in (
-        (anchor.rotation, "rotation", (3,)),
-        (anchor.position, "position", (3,)),
-        (anchor.world_rotation, "world_rotation", (0, 3)),
-        (anchor.world_position, "world_position", (0, 3)),
+    for values, name, lengths, most in (
+        (anchor.rotation, "rotation", (3,), MAX_TURN),
+        (anchor.position, "position", (3,), MAX_LENGTH),
+        (anchor.world_rotation, "world_rotation", (0, 3), MAX_TURN),
+        (anchor.world_position, "world_position", (0, 3), MAX_LENGTH),
     ):
-        _vector(values, name, lengths)
-    _number(anchor.rotation_std, "rotation_std", 0.0)
-    _number(anchor.position_std, "position_std", 0.0)
+        _bounded(values, name, lengths, most)
+    _stds([anchor.rotation_std], "rotation_std", (1,), MAX_TURN)
+    _stds([anchor.position_std], "position_std", (1,), MAX_LENGTH)
 
 
 def _node_state(message: pb.NodeState) -> None:
@@ -415,8 +457,8 @@ def _node_state(message: pb.NodeState) -> None:
     _name(message.host, "host")
     _name(message.frame, "frame")
     _name(message.partner, "partner", optional=True)
-    _vector(message.rotation, "rotation", (0, 3))
-    _vector(message.position, "position", (len(message.rotation),))
+    _bounded(message.rotation, "rotation", (0, 3), MAX_TURN)
+    _bounded(message.position, "position", (len(message.rotation),), MAX_LENGTH)
     _count(message.edges, "edges", MAX_CAMERAS)
     for edge in message.edges:
         _node_edge(edge)
@@ -442,6 +484,7 @@ def _command(message: pb.Command) -> None:
 def _picture(message: pb.Picture) -> None:
     _name(message.camera, "camera")
     _id(message.boot_id, "boot id")
+    _times(message, "device_time_ns")
     _number(message.width, "width", 1, MAX_IMAGE_SIDE)
     _number(message.height, "height", 1, MAX_IMAGE_SIDE)
     _count(message.jpeg, "bytes of picture", MAX_PICTURE)
@@ -486,6 +529,7 @@ def _geodetic(geo: Sequence[float], name: str) -> None:
 
 def _flight_image(message: pb.FlightImage) -> None:
     _uav_header(message)
+    _times(message, "device_time_ns")
     _number(message.width, "width", 1, MAX_IMAGE_SIDE)
     _number(message.height, "height", 1, MAX_IMAGE_SIDE)
     _count(message.jpeg, "bytes of picture", MAX_IMAGE)
@@ -493,7 +537,8 @@ def _flight_image(message: pb.FlightImage) -> None:
 
 def _vehicle_telemetry(message: pb.VehicleTelemetry) -> None:
     _uav_header(message)
-    _number(message.time_std_s, "time_std_s", 0.0)
+    _times(message, "device_time_ns", "vehicle_time_ns")
+    _number(message.time_std_s, "time_std_s", 0.0, MAX_TIME_S)
     _vector(message.ned_from_body, "ned_from_body", (4,))
     if abs(sum(part * part for part in message.ned_from_body) - 1.0) > 1e-6:
         raise Rejected(RejectionReason.OUT_OF_RANGE, "ned_from_body is no rotation")
@@ -512,6 +557,7 @@ def _target_command(message: pb.TargetCommand) -> None:
 
 def _target_state(message: pb.TargetState) -> None:
     _uav_header(message)
+    _times(message, "device_time_ns")
     _one_of(message.state, "state", _TARGET_STATES)
     _bounded(message.centre, "centre", (0,) if message.state == "lost" else (2,), MAX_FAR_PIXEL)
     _bounded(message.size, "size", (0, 2), MAX_FAR_PIXEL)

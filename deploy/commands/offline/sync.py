@@ -48,7 +48,7 @@ def sync(
     seed
         Accepted for consistency; this command uses no random numbers.
     """
-    from protocols.core.files import check_folder, write_together
+    from protocols.core.files import check_folder, file_in, write_together
 
     check_folder(out)
     if fps is not None and not 0.1 <= fps <= 1000:
@@ -85,7 +85,7 @@ def sync(
             def report(frame: int, name: str = name, before: int = before) -> None:
                 progress(f"{name} frame {frame}", min((before + frame) / total, 1.0))
 
-            target = out / f"{name}.mp4"
+            target = file_in(out, f"{name}.mp4")
             if videos == "trim":
                 span = syncing.Span(max(s.first for s in spans.values()), min(s.last for s in spans.values()))
                 done[name] = syncing.trim(film, maps[name], span, target, report)
@@ -94,7 +94,7 @@ def sync(
                 done[name] = syncing.retime(film, maps[name], grid, target_or_none, rate, report)
             before += film.info.frames
             warnings += [f"{film.path.name}: {text}" for text in _reader_warnings(film)]
-    files = {out / f"{name}.csv": syncing.times_text(video) for name, video in done.items()}
+    files = {file_in(out, f"{name}.csv"): syncing.times_text(video) for name, video in done.items()}
     if videos != "trim":
         files[out / "synchronised.csv"] = syncing.grid_text(grid, done, csv_cell)
     write_together(files)

@@ -12,6 +12,7 @@ from hub.live.agent import status_message
 from hub.live.live_hub import LiveHub, LiveSettings
 from hub.live.solver import InlineSolver, SolverJob
 from protocols.core.clocks import NANOSECONDS
+from protocols.core.ranges import MAX_DISTORTION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder
 from tests.support.rigs import Session, simulate
@@ -178,6 +179,46 @@ def test_a_flood_and_equal_times_cost_only_their_camera() -> None:
     assert len(observations.of_camera("b")[0]) == 60
     assert len(observations.of_camera("a")[0]) <= 4000
     assert builder.counters["flooded"] == 32_000
+
+
+def hostile(session: Session, rate_hz: float = 0.0, distortion: float = 0.0) -> list[Message]:
+    """The session with a nominal rate and a lens of cam2 that are not true."""
+    stream = messages(session)
+    for message in stream:
+        if isinstance(message, pb.CameraInfo) and message.camera == "cam2":
+            message.fps = rate_hz or message.fps
+            message.distortions[0] = distortion or message.distortions[0]
+    return stream
+
+
+def test_a_nominal_rate_that_no_row_agrees_with_does_not_sample_the_path(session: Session) -> None:
+    """The path was sampled at any rate that a camera's info gave: 100,000 Hz took minutes to publish."""
+    hub = LiveHub(SETTINGS)
+    feed(hub, hostile(session, rate_hz=100_000.0), batch=10**9)
+    assert hub.calibration is not None
+    assert len(hub.calibration.trajectories[0].time) < 20.0 * 121.0
+
+
+def test_a_lens_that_cannot_be_costs_only_its_camera(session: Session) -> None:
+    """The largest distortion that messages may have; of 1e308 the polynomial had no roots, which ended the hub."""
+    hub = LiveHub(SETTINGS)
+    feed(hub, hostile(session, distortion=MAX_DISTORTION), batch=10**9)
+    assert hub.calibration is not None
+    assert set(hub.calibration.cameras) == {"cam0", "cam1"}
+
+
+def test_a_repeated_time_stamp_does_not_refuse_the_session_of_a_log(session: Session) -> None:
+    """Two frames of one time in a log refused all cameras."""
+    builder = SessionBuilder()
+    stream = messages(session)
+    for message in stream:
+        builder.handle(message)
+    twice = pb.Observation()
+    twice.CopyFrom(stream[-1])
+    twice.sequence += 1_000_000
+    builder.handle(twice)
+    _, observations = builder.build()
+    assert sum(len(track) for track in observations.tracks.values()) == len(stream) - 3
 
 
 class StuckSolver(InlineSolver):

@@ -12,6 +12,8 @@ import pytest
 import tomli_w
 
 from deploy.cli import run
+from protocols.core.errors import InputError
+from protocols.core.files import file_in
 from protocols.geometry import so3
 
 
@@ -87,3 +89,26 @@ def test_a_file_of_another_kind_is_reported(tmp_path: Path, capsys: pytest.Captu
     assert run(["export", str(tmp_path / "a.csv"), "--to", "trc", "--out", str(tmp_path / "b.trc")]) == 2
     assert "a.csv:1: column y, z is missing" in capsys.readouterr().err
     assert not (tmp_path / "b.trc").exists()
+
+
+@pytest.mark.parametrize("to", ["opencv", "colmap", "kalibr", "aniposelib"])
+@pytest.mark.parametrize("name", ["../../evil", "/tmp/evil", "..", "a\\b", "evil\x1b[2J"])
+def test_a_camera_s_name_does_not_lead_out_of_the_folder(
+    tmp_path: Path, calibration: tuple[Path, dict[str, Any]], name: str, to: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Names from aniposelib's files reached the file system: `../../evil` was written beside --out."""
+    file, tables = calibration
+    inner = tmp_path / "a" / "b"
+    inner.mkdir(parents=True)
+    file.write_text(tomli_w.dumps({"cam_0": {**tables["cam0"], "name": name}}))
+    before = set(tmp_path.rglob("*"))
+    assert run(["export", str(file), "--to", to, "--out", str(inner / "out")]) == 2
+    assert set(tmp_path.rglob("*")) == before
+    assert "\x1b" not in capsys.readouterr().err
+
+
+def test_a_writer_checks_that_it_stays_in_its_folder(tmp_path: Path) -> None:
+    assert file_in(tmp_path, "GoPro 2.yml") == tmp_path / "GoPro 2.yml"
+    for name in ("../x.yml", "/x.yml", "a/b.yml", "a\\b.yml", "..", "", "a\0b"):
+        with pytest.raises(InputError):
+            file_in(tmp_path, name)

@@ -75,6 +75,20 @@ def test_distortions_may_be_absent(tmp_path: Path) -> None:
     np.testing.assert_array_equal(lens.distortions, np.zeros(5))
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ("[0.1, 0, 0, 0, 0]", "[1e10, 0, 0, 0, 0]", 6),
+        ("[900.0,", "[1e9,", 5),
+        ("[900.0,", "[0.5,", 5),
+        ("fps = 30", "fps = 1e6", 4),
+        ("[1280, 720]", "[1280, 1e6]", 3),
+    ],
+)
+def test_what_no_camera_is_like_is_reported(tmp_path: Path, old: str, new: str, line: int) -> None:
+    assert_reported(tmp_path, CAM0.replace(old, new), line)
+
+
 def test_translation_and_rotation_give_the_position(tmp_path: Path) -> None:
     text = f"{CAM0}rotation = [0.1, 0.2, 0.3]\ntranslation = [1.0, 2.0, 3.0]\n"
     camera = read(tmp_path, text).cameras["cam0"]
