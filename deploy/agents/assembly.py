@@ -12,9 +12,10 @@ from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import get_args
 
 from deploy.config.agents import CameraConfig, HubConfig, OakConfig, PiCameraConfig, SimulatedConfig, UsbConfig
-from edge.detectors.base import Detector
+from edge.detectors.base import Detector, Kind
 from edge.devices.base import Device
 from protocols.bus.base import Bus
 from protocols.core.errors import EXIT_DONE, InputError
@@ -80,6 +81,10 @@ def _detector(config: CameraConfig, lens: Intrinsics | None, fps: float) -> Dete
             max_size=marker.max_size or math.inf,
         )
     moving = config.moving
+    if config.detector not in get_args(Kind):
+        from edge.detectors.plugins import load_detector
+
+        return load_detector(config.detector, fps=fps, prefix=f"{config.id[:48]}-")
     if config.detector == "person":
         from edge.detectors.people.person import PersonDetector
 

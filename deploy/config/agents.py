@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from deploy.config.file import Source, effective_toml, load
+from deploy.config.file import DetectorName, Source, effective_toml, load
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import InputError
 from protocols.core.names import check_identifier, check_name
@@ -262,6 +262,8 @@ class MovingConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_field
 class CameraConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One camera agent. rig: a rig.toml with this camera's intrinsics and known pose.
 
+    detector: marker, person, vehicle, the .toml file of an ONNX network, or a detector that another package registers.
+
     pictures_hz: rate of thumbnails on the bus while a view or a recorder subscribes to them; 0 = never.
     picture_width: width of the thumbnails [px].
     """
@@ -271,7 +273,7 @@ class CameraConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields
     pictures_hz: Annotated[float, Meta(ge=0.0, le=30.0)] = 2.0
     picture_width: Annotated[int, Meta(ge=64, le=640)] = 320
     driver: Literal["simulated", "video", "usb", "picamera2", "rtsp", "oak", "log"] = "simulated"
-    detector: Literal["marker", "person", "vehicle"] = "marker"
+    detector: DetectorName = DetectorName("marker")
     simulated: SimulatedConfig | None = None
     video: VideoConfig | None = None
     usb: UsbConfig | None = None

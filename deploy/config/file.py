@@ -22,6 +22,12 @@ class Source(str):
     __slots__ = ()
 
 
+class DetectorName(str):
+    """A detector: a name, or the .toml file of a network."""
+
+    __slots__ = ()
+
+
 _PLACE = re.compile(r" - at `\$\.?(?P<path>[^`]*)`\Z")
 _UNKNOWN = re.compile(r"Object contains unknown field `(?P<key>[^`]*)`\Z")
 _MISSING = re.compile(r"Object missing required field `(?P<key>[^`]*)`\Z")
@@ -75,6 +81,9 @@ def _from_text(wanted: type, value: object, folder: Path) -> object:
     if wanted is Source:
         elsewhere = "://" in value or value.isdigit()
         return Source(value if elsewhere else folder / Path(value).expanduser())
+    if wanted is DetectorName:
+        path = folder / Path(value).expanduser()
+        return DetectorName(path if path.suffix.lower() == ".toml" else value)
     raise TypeError(f"no reader for {wanted}")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,6 +10,7 @@ import msgspec
 from msgspec import Meta
 
 from protocols.core.errors import InputError
+from protocols.session.rig import read_toml
 
 Layout = Literal["yolov5", "yolov8", "end2end", "detr", "separate"]
 BoxFormat = Literal["cxcywh", "xyxy", "xywh"]
@@ -91,21 +91,13 @@ class NetworkDescription(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
 
 def read_description(file: Path) -> NetworkDescription:
     """Read the TOML file of a network. Raises InputError."""
-    remedy = "see docs/guide/detectors.md for an example"
+    if file.is_file() and file.stat().st_size > _MAX_BYTES:
+        raise InputError(f"larger than {_MAX_BYTES >> 10} KiB", file=file, remedy="give a network's .toml file")
+    values, _ = read_toml(file, "network's file")
     try:
-        with file.open("rb") as stream:
-            text = stream.read(_MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", file=file, remedy="give a network's .toml file") from None
-    if len(text) > _MAX_BYTES:
-        raise InputError(f"larger than {_MAX_BYTES >> 10} KiB", file=file, remedy=remedy)
-    try:
-        return msgspec.convert(tomllib.loads(text.decode("utf-8")), NetworkDescription)
-    except UnicodeDecodeError:
-        raise InputError("not UTF-8 text", file=file, remedy=remedy) from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not TOML: {error}", file=file, remedy="correct it") from None
+        return msgspec.convert(values, NetworkDescription)
     except msgspec.ValidationError as error:
+        remedy = "see docs/guide/detectors.md for an example"
         raise InputError(f"not a network's description: {error}", file=file, remedy=remedy) from None
 
 

@@ -133,3 +133,21 @@ def test_a_package_missing_from_a_boards_bundle_is_reported(
     monkeypatch.setattr("deploy.agents.assembly.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"needs SciPy.*--extra scipy"):
         detector_of(load(file, CameraConfig), None, 30.0)
+
+
+def test_a_network_of_a_camera_is_beside_its_configuration(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime", reason="the extra `onnx` is not installed")
+    from edge.detectors.network.detector import NetworkDetector
+    from tests.support.networks import constant_model, write_network
+
+    write_network(tmp_path, constant_model({"o": [[[9.0, 9.0, 30.0, 40.0, 0.9, 0.0]]]}), 'layout = "end2end"')
+    file = tmp_path / "cam.toml"
+    file.write_text('id = "cam7"\ndetector = "model.toml"\n')
+    config = load(file, CameraConfig)
+    assert str(tmp_path / "model.toml") in effective_toml(config)
+    detector = detector_of(config, None, 30.0)
+    assert isinstance(detector, NetworkDetector)
+    assert detector.detect(np.zeros((48, 64, 3), np.uint8))[0].label == "cam7-p0"
+    file.write_text('id = "cam7"\ndetector = "none.toml"\n')
+    with pytest.raises(InputError, match=r"none\.toml"):
+        detector_of(load(file, CameraConfig), None, 30.0)
