@@ -19,6 +19,8 @@ Array = npt.NDArray[Any]
 MAX_OUTPUT = 50_000_000
 """Numbers in all outputs of one run: four times what YOLOv5 gives for 32 images of 640x640 in 9 classes (1.1e7)."""
 _INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+_MAX_MEMORY = 4 << 30
+"""[bytes] of all models of a process in onnxruntime: four times the largest model file that is accepted."""
 
 
 class Runtime(Protocol):
@@ -54,6 +56,11 @@ class OnnxRuntime:
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
         options.log_severity_level = 4  # what is wrong is reported by us, in one line
+        memory = onnxruntime.OrtMemoryInfo(
+            "Cpu", onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
+        )
+        onnxruntime.create_and_register_allocator(memory, onnxruntime.OrtArenaCfg({"max_mem": _MAX_MEMORY}))
+        options.add_session_config_entry("session.use_env_allocators", "1")
         # Waiting threads would otherwise spin, and take the core of the next agent.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         self._file = file
@@ -129,6 +136,10 @@ def _checked(outputs: dict[str, Array], file: Path) -> dict[str, Array]:
 
 
 def _unusable(file: Path, error: Exception) -> InputError:
-    """The first sentence of a runtime's error."""
-    text = " ".join(str(error).split()).replace(str(file), file.name)[:240]
+    """A runtime's error as one line."""
+    text = " ".join(str(error).split()).replace(str(file), file.name)
+    if "AllocateRaw" in text or "Insufficient memory" in text:
+        text = f"it needs more than {_MAX_MEMORY >> 30} GiB, or than there are"
+    elif len(text) > 240:
+        text = f"{text[:120]} … {text[-120:]}"
     return InputError(f"the model cannot be run: {text}", file=file, remedy="export it again, and check `input`")

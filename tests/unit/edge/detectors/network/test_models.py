@@ -11,7 +11,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from deploy.cli import run
-from edge.detectors.network import model_file
+from edge.detectors.network import model_file, runtime
 from edge.detectors.network.decode import Boxes
 from edge.detectors.network.description import NetworkDescription
 from edge.detectors.network.detector import boxes_in_image, prepare
@@ -76,9 +76,20 @@ def unknown_operator() -> onnx.ModelProto:
     return model
 
 
+def of_huge_outputs(numbers: int) -> onnx.ModelProto:
+    """A model whose outputs are its mean, many times: a few bytes that say how much memory to take."""
+    shape = numpy_helper.from_array(np.array([1, 5, numbers // 5]), "shape")
+    images = helper.make_tensor_value_info("images", TensorProto.FLOAT, ["n", 3, 48, 64])
+    mean = helper.make_node("ReduceMean", ["images"], ["mean"], axes=[0, 1, 2, 3], keepdims=0)
+    expand = helper.make_node("Expand", ["mean", "shape"], ["o"])
+    return model_of([mean, expand], [images], [helper.make_tensor_value_info("o", TensorProto.FLOAT, None)], [shape])
+
+
 @pytest.mark.parametrize(
     ("model", "message"),
     [
+        (of_huge_outputs(10**10), "needs more than 4 GiB"),
+        (of_huge_outputs(10**14), "needs more than 4 GiB"),
         (b"", "not an ONNX file"),
         (b"hello world" * 99, "not an ONNX file"),
         (GOOD.SerializeToString()[:-100], "not an ONNX file"),
@@ -112,6 +123,12 @@ def test_a_hostile_or_wrong_model_is_one_line(tmp_path: Path, model: onnx.ModelP
 def test_opencv_refuses_them_too(tmp_path: Path, model: onnx.ModelProto | bytes) -> None:
     with pytest.raises(InputError, match=r"model\.onnx"):
         load_detector(write_network(tmp_path, model, 'backend = "opencv"'))
+
+
+def test_outputs_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime, "MAX_OUTPUT", 999)
+    with pytest.raises(InputError, match="outputs have more than 999 numbers"):
+        load_detector(write_network(tmp_path, of_huge_outputs(1000)))
 
 
 def test_external_data_beside_the_model_is_read_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
