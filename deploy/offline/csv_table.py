@@ -1,0 +1,112 @@
+"""CSV files of numbers with named columns; every mistake is reported with file, line and remedy."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from protocols.core.errors import InputError
+from protocols.geometry.types import Bools, Floats, Ints
+
+_LARGEST_WHOLE = 2.0**53
+"""Up to here a float represents every whole number."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CsvTable:
+    """The n rows of a CSV file. columns: n stripped cells by name. line: n line numbers in the file."""
+
+    file: Path
+    columns: dict[str, list[str]]
+    line: list[int]
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    def numbers(self, name: str, limit: float) -> Floats:
+        """A column (n,) of numbers within ±limit. Raises InputError."""
+        cells = self.columns[name]
+        try:
+            values = np.array(cells, dtype=np.float64)
+        except ValueError:
+            values = np.array([_number(cell) for cell in cells])
+        self.refuse(
+            ~(np.abs(values) <= limit), lambda row: f"{name} {cells[row][:40]!r} is not a number up to {limit:g}"
+        )
+        return values
+
+    def whole(self, name: str) -> Ints:
+        """A column (n,) of whole numbers. Raises InputError."""
+        values = self.numbers(name, _LARGEST_WHOLE)
+        self.refuse(values != np.round(values), lambda row: f"{name} {values[row]:g} is not a whole number")
+        return values.astype(np.int64)
+
+    def refuse(self, bad: Bools, what: Callable[[int], str], remedy: str = "correct or remove the row") -> None:
+        """Raise InputError with the line of the first row (n,) that is ``bad``."""
+        if bad.any():
+            row = int(np.flatnonzero(bad)[0])
+            raise InputError(what(row), file=self.file, line=self.line[row], remedy=remedy)
+
+
+def read_csv_header(file: Path, what: str) -> list[str]:
+    """The names in the first line of a CSV file. Raises InputError. what: the file's purpose, for messages."""
+    return _read(file, what, 1)[0][0]
+
+
+def read_csv_table(file: Path, what: str, required: Sequence[str], optional: Sequence[str] = ()) -> CsvTable:
+    """Read the named columns; others are ignored. Raises InputError: file, line, what, remedy."""
+    rows, lines = _read(file, what)
+    header = rows[0]
+    twice = [name for name in (*required, *optional) if header.count(name) > 1]
+    if twice:
+        raise InputError(f"column {twice[0]} is named twice", file=file, line=1, remedy="keep one")
+    missing = [name for name in required if name not in header]
+    if missing:
+        remedy = f"the first line must name {','.join(required)}"
+        raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)
+    place = {name: header.index(name) for name in (*required, *optional) if name in header}
+    for row, line in zip(rows[1:], lines[1:], strict=True):
+        if len(row) <= max(place.values()):
+            what = f"{len(row)} columns where the first line has {len(header)}"
+            raise InputError(what, file=file, line=line, remedy="complete the row")
+    if len(rows) == 1:
+        raise InputError("no rows below its first line", file=file, line=1, remedy=f"give the rows of the {what}")
+    return CsvTable(file, {name: [row[at] for row in rows[1:]] for name, at in place.items()}, lines[1:])
+
+
+def _read(file: Path, what: str, most: int | None = None) -> tuple[list[list[str]], list[int]]:
+    """The rows that are not empty, with stripped cells, and their line numbers; at least one row."""
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    try:
+        with file.open(encoding="utf-8-sig", newline="") as text:
+            reader = csv.reader(text, strict=True)
+            for row in reader:
+                cells = [cell.strip() for cell in row]
+                if any(cells):
+                    rows.append(cells)
+                    lines.append(reader.line_num)
+                if len(rows) == most:
+                    break
+    except FileNotFoundError:
+        raise InputError(f"this {what} file does not exist", file=file, remedy="check the path") from None
+    except csv.Error as error:
+        raise InputError(f"not CSV: {error}", file=file, line=reader.line_num, remedy="correct this row") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"cannot be read: {error}", file=file, line=len(rows) + 1, remedy="save it as UTF-8 CSV"
+        ) from None
+    if not rows:
+        raise InputError("this file is empty", file=file, line=1, remedy=f"give the rows of the {what}")
+    return rows, lines
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return np.nan
