@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import random
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -85,6 +85,7 @@ class Autopilot:
     """An autopilot on one transport. boot_s: its clock at simulation time 0 [s].
 
     origin: of the local NED frame. seed: of the faults. signing: signs all messages and accepts only signed ones.
+    firmware: MAV_AUTOPILOT of its heartbeat. forwards: whether a link forwards, as MAV_n_FORWARD of PX4 sets it.
     """
 
     def __init__(
@@ -97,12 +98,15 @@ class Autopilot:
         origin: Origin | None = None,
         faults: LinkFaults | None = None,
         signing: Signing | None = None,
+        firmware: int = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+        forwards: Callable[[Address], bool] = lambda address: True,
         seed: int = 0,
     ) -> None:
         self._airframe, self._transport = airframe, transport
         self.system = system
         self.origin = origin or DEFAULT_ORIGIN
         self.faults = faults or LinkFaults()
+        self._firmware, self._forwards = firmware, forwards
         self._random = random.Random(seed)
         self._boot_s = boot_s
         self._now = 0.0
@@ -176,14 +180,16 @@ class Autopilot:
             self._handle(message)
 
     def _route(self, message: Any, frame: bytes, source: Address) -> None:
-        """Forward a message that addresses other systems."""
+        """Forward a message that addresses other systems, between links that forward, to links where they were seen."""
+        if not self._forwards(source):
+            return
         system = getattr(message, "target_system", 0)
         component = getattr(message, "target_component", 0)
         if system == self.system and component == AUTOPILOT:
             return
         for address, sender in self._senders.items():
             known = system == 0 or any(s == system and component in (0, c) for s, c in sender.systems)
-            if address != source and known:
+            if address != source and known and self._forwards(address):
                 self._transmit(frame, address)
 
     def _handle(self, message: Any) -> None:
@@ -252,7 +258,7 @@ class Autopilot:
             yield (
                 mavlink.MAVLink_heartbeat_message(
                     mavlink.MAV_TYPE_QUADROTOR,
-                    mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+                    self._firmware,
                     mavlink.MAV_MODE_FLAG_SAFETY_ARMED | mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED,
                     4,
                     mavlink.MAV_STATE_ACTIVE,

@@ -199,7 +199,11 @@ class CameraComponent:
         if result != mavlink.MAV_RESULT_ACCEPTED:
             return
         if command in _REQUESTS or command == mavlink.MAV_CMD_REQUEST_MESSAGE:
-            self._send_message(self._requested(command, p))
+            kind = self._requested(command, p)
+            self._send_message(kind)
+            if kind == "VIDEO_STREAM_STATUS":
+                # MAVSDK asks for this one first, and for the stream's address only 20 s later.
+                self._send_message("VIDEO_STREAM_INFORMATION")
         elif command in _TRACKING:
             self.send_status_now()
 

@@ -308,7 +308,7 @@ def test_video_stream_commands_are_acknowledged_and_unknown_streams_refused() ->
         for message in (information, status):
             answers = under_test.command(mavlink.MAV_CMD_REQUEST_MESSAGE, message, stream)
             assert answers[0].result == result
-            assert [m.stream_id for m in answers[1:]] == ([1] if result == accepted else [])
+            assert {m.stream_id for m in answers[1:]} == ({1} if result == accepted else set())
     assert CameraUnderTest().result(mavlink.MAV_CMD_VIDEO_START_STREAMING, 1) == unsupported
 
 

@@ -1,0 +1,172 @@
+"""QGroundControl's dialogue with the camera, through autopilots that route like ArduPilot and like PX4.
+
+The steps have the names of QGroundControl's source (QGCCameraManager, VehicleCameraControl); the stations are
+pymavlink's codec. Time is simulated.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge.devices.simulated.aircraft import SimulatedAircraft
+from edge.mavlink.dialect import mavlink as M
+from edge.mavlink.link.transport import Pipe
+from edge.mavlink.roles.autopilot import Autopilot
+from tests.support.uav_flights import Air
+from tests.support.vehicle_link import URI, CameraOnLink
+
+IMAGE = M.MAVLINK_MSG_ID_CAMERA_TRACKING_IMAGE_STATUS
+ACCEPTED, DENIED, UNSUPPORTED = M.MAV_RESULT_ACCEPTED, M.MAV_RESULT_DENIED, M.MAV_RESULT_UNSUPPORTED
+BOX = (0.4, 0.4, 0.6, 0.5)
+
+
+class Station:
+    """A ground station on a pipe. received: all of the camera's messages."""
+
+    def __init__(self, site: Site, pipe: Pipe, system: int) -> None:
+        self._site, self._pipe, self._codec = site, pipe, M.MAVLink(None, system, 190)
+        self._reader = M.MAVLink(None)
+        self.received: list[Any] = []
+        self.tracking_rect: tuple[float, ...] | None = None
+        self.messages: list[str] = []
+
+    def beat(self) -> None:
+        self._send(M.MAVLink_heartbeat_message(M.MAV_TYPE_GCS, M.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3))
+
+    def poll(self) -> None:
+        for data, _ in self._pipe.receive():
+            for message in self._reader.parse_buffer(data) or []:
+                if message.get_srcComponent() == 100:
+                    self.received.append(message)
+                    if message.get_type() == "CAMERA_TRACKING_IMAGE_STATUS":
+                        self.handle_tracking_image_status(message)
+                    elif message.get_type() == "STATUSTEXT":
+                        self.messages.append(message.text)
+
+    def handle_tracking_image_status(self, message: Any) -> None:
+        """handleTrackingImageStatus, and trackingImageStatus as the QML asks for it before it draws."""
+        drawn = message.tracking_status == M.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE
+        corners = (message.rec_top_x, message.rec_top_y, message.rec_bottom_x, message.rec_bottom_y)
+        self.tracking_rect = corners if drawn else None
+
+    def send_mav_command(self, command: int, *parameters: float) -> int | None:
+        """sendMavCommand: the result in the ACK, within half a second."""
+        self.received.clear()
+        filled = [*parameters, *([0.0] * (7 - len(parameters)))]
+        self._send(M.MAVLink_command_long_message(1, 100, command, 0, *filled))
+        self._site.run(0.5)
+        acks = [m for m in self.received if m.get_type() == "COMMAND_ACK" and m.command == command]
+        return int(acks[0].result) if acks else None
+
+    def start_tracking(self) -> None:
+        """startTracking(QRectF), then _requestTrackingStatus."""
+        assert self.send_mav_command(M.MAV_CMD_CAMERA_TRACK_RECTANGLE, *BOX) == ACCEPTED
+        assert self.send_mav_command(M.MAV_CMD_SET_MESSAGE_INTERVAL, IMAGE, 500_000) == ACCEPTED
+
+    def stop_tracking(self) -> None:
+        """stopTracking, which also stops the status messages."""
+        assert self.send_mav_command(M.MAV_CMD_CAMERA_STOP_TRACKING) == ACCEPTED
+        assert self.send_mav_command(M.MAV_CMD_SET_MESSAGE_INTERVAL, IMAGE, -1) == ACCEPTED
+
+    def statuses(self, seconds: float) -> int:
+        """How many tracking statuses arrive in a time."""
+        self.received.clear()
+        self._site.run(seconds)
+        return sum(message.get_type() == "CAMERA_TRACKING_IMAGE_STATUS" for message in self.received)
+
+    def answer(self, kind: str) -> Any:
+        """The newest message of a type."""
+        return next((message for message in reversed(self.received) if message.get_type() == kind), None)
+
+    def _send(self, message: Any) -> None:
+        self._pipe.send(bytes(message.pack(self._codec)), None)
+
+
+class Site:
+    """An autopilot, the camera on one of its links, and a station on each of two others."""
+
+    def __init__(self, *, firmware: int = M.MAV_AUTOPILOT_ARDUPILOTMEGA, camera_forwards: bool = True) -> None:
+        self.time = 0.0
+        air = Air()
+        pipe = air.join()
+        self.autopilot = Autopilot(
+            SimulatedAircraft(start=np.array([0.0, 0.0, -60.0])),
+            air,
+            firmware=firmware,
+            forwards=lambda address: camera_forwards or address != ("pipe", 0),
+        )
+        self.camera = CameraOnLink(transport=pipe, now_ns=lambda: round(1e9 * (100.0 + self.time)))
+        self.qgc, self.other = Station(self, air.join(), 255), Station(self, air.join(), 253)
+        self.run(2.5)
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(25 * seconds)):
+            if round(25 * self.time) % 25 == 0:
+                self.qgc.beat()
+                self.other.beat()
+            self.time += 0.04
+            self.autopilot.step(self.time)
+            self.camera.step()
+            self.qgc.poll()
+            self.other.poll()
+
+
+@pytest.mark.parametrize("firmware", [M.MAV_AUTOPILOT_ARDUPILOTMEGA, M.MAV_AUTOPILOT_PX4])
+def test_qgroundcontrol_finds_the_camera_shows_its_video_and_tracks(firmware: int) -> None:
+    site = Site(firmware=firmware)
+    qgc = site.qgc
+    assert any(m.get_type() == "HEARTBEAT" and m.type == M.MAV_TYPE_CAMERA for m in qgc.received)
+    # _requestCameraInfo, _requestCameraSettings, _requestStorageInfo
+    assert qgc.send_mav_command(M.MAV_CMD_REQUEST_MESSAGE, M.MAVLINK_MSG_ID_CAMERA_INFORMATION) == ACCEPTED
+    information = qgc.answer("CAMERA_INFORMATION")
+    assert information.flags & M.CAMERA_CAP_FLAGS_HAS_TRACKING_RECTANGLE
+    assert qgc.send_mav_command(M.MAV_CMD_REQUEST_MESSAGE, M.MAVLINK_MSG_ID_CAMERA_SETTINGS) == ACCEPTED
+    assert math.isnan(qgc.answer("CAMERA_SETTINGS").zoomLevel)
+    assert qgc.send_mav_command(M.MAV_CMD_REQUEST_MESSAGE, M.MAVLINK_MSG_ID_STORAGE_INFORMATION, 0) == UNSUPPORTED
+    # _checkForVideoStreams: _requestStreamInfo(1), both ways; then resumeStream, stopStream
+    assert qgc.send_mav_command(M.MAV_CMD_REQUEST_MESSAGE, M.MAVLINK_MSG_ID_VIDEO_STREAM_INFORMATION, 1) == ACCEPTED
+    assert qgc.answer("VIDEO_STREAM_INFORMATION").uri == URI
+    assert qgc.send_mav_command(M.MAV_CMD_REQUEST_VIDEO_STREAM_INFORMATION, 1) == ACCEPTED
+    assert qgc.send_mav_command(M.MAV_CMD_VIDEO_STOP_STREAMING, 1) == ACCEPTED
+    assert qgc.send_mav_command(M.MAV_CMD_VIDEO_START_STREAMING, 1) == ACCEPTED
+    assert qgc.send_mav_command(M.MAV_CMD_REQUEST_MESSAGE, M.MAVLINK_MSG_ID_VIDEO_STREAM_STATUS, 1) == ACCEPTED
+    qgc.start_tracking()
+    assert qgc.tracking_rect == pytest.approx(BOX)
+    site.camera.component.status.state = "coasting"
+    site.run(2.5)
+    assert qgc.tracking_rect is None  # the box is hidden; the text says why
+    site.camera.component.status.state = "visible"
+    site.run(3.0)
+    assert qgc.tracking_rect == pytest.approx(BOX)
+    qgc.stop_tracking()
+    assert qgc.tracking_rect is None
+    assert qgc.messages == [
+        "Syncline: tracking started",
+        "Syncline: target not seen, position predicted",
+        "Syncline: target found again",
+        "Syncline: tracking stopped",
+    ]
+
+
+def test_the_next_station_hears_everything_after_qgroundcontrol_has_stopped() -> None:
+    site = Site()
+    site.qgc.start_tracking()
+    site.qgc.stop_tracking()
+    assert site.other.send_mav_command(M.MAV_CMD_CAMERA_TRACK_POINT, 0.5, 0.5, 0.1) == ACCEPTED
+    assert site.other.statuses(2.0) >= 18
+    assert site.qgc.send_mav_command(M.MAV_CMD_SET_MESSAGE_INTERVAL, IMAGE, 500_000) == ACCEPTED
+    assert site.other.statuses(2.0) >= 18
+    assert site.qgc.send_mav_command(M.MAV_CMD_CAMERA_TRACK_RECTANGLE, *BOX) == ACCEPTED
+    assert "Syncline: station 255 took over from 253" in site.other.messages
+
+
+def test_without_forwarding_on_its_port_a_px4_keeps_station_and_camera_apart() -> None:
+    site = Site(firmware=M.MAV_AUTOPILOT_PX4, camera_forwards=False)
+    assert site.camera.link.vehicle == 1  # the camera hears the autopilot
+    assert site.qgc.received == []
+    assert site.qgc.send_mav_command(M.MAV_CMD_CAMERA_TRACK_RECTANGLE, *BOX) is None
+    assert site.camera.commands == []
