@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tomli_w
 
+from deploy.offline.csv_table import read_csv_header
+from deploy.offline.follow.objects import BOXES_FILE, complete_detections, is_boxes_file, object_messages, read_objects
 from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.core.errors import InputError
 from protocols.formats import colmap, points, toml_rigs, yaml_rigs
@@ -20,7 +22,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration, read_calibration
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
 from protocols.session.observations import Observations
-from protocols.session.rig import Rig, parse_camera_table, read_toml
+from protocols.session.rig import Rig, parse_camera_table, read_rig, read_toml
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
@@ -70,7 +72,7 @@ def detect_source(sources: list[Path], wanted: str | None) -> ImportSource:
     files = sources
     if len(sources) == 1 and sources[0].is_dir():
         folder = sources[0]
-        if wanted == "session" or (wanted is None and (folder / RIG_FILE).exists()):
+        if wanted == "session" or (wanted is None and ((folder / RIG_FILE).exists() or (folder / BOXES_FILE).exists())):
             return ImportSource("session", [folder])
         if wanted == "colmap" or (wanted is None and (folder / colmap.IMAGES).exists()):
             return ImportSource("colmap", [folder])
@@ -154,6 +156,43 @@ def session_to_log(rig: Rig, observations: Observations, out: Path, arrivals: Ar
     """
     infos = [camera_info(rig, name) for name in rig.cameras]
     return _write_log(out, infos, rig, _with_log_times(_observation_messages(rig, observations), arrivals))
+
+
+def has_objects(folder: Path) -> bool:
+    """Whether a session folder holds detections of objects, several of one label in a frame, or boxes."""
+    return _objects_file(folder) is not None
+
+
+def objects_to_log(
+    folder: Path, calibration: Path | None, out: Path, arrivals: Arrivals | None
+) -> tuple[Rig, int, int]:
+    """Write a session of detected objects as a log with all that is known of each detection; see `session_to_log`.
+
+    Boxes of no kind become people.
+
+    calibration: gives cameras and lenses in place of the folder's rig.toml. Returns the rig, and the numbers of
+    detections and messages. Raises InputError.
+    """
+    file = _objects_file(folder)
+    assert file is not None
+    if calibration is None and not (folder / RIG_FILE).exists():
+        raise InputError(f"no {RIG_FILE} in this folder", file=folder, remedy="give --calibration CALIB.toml")
+    rig = read_rig(calibration or folder / RIG_FILE)
+    sizes = {name: camera.size for name, camera in rig.cameras.items()}
+    rows = read_objects(file, sizes)
+    messages = object_messages(rows)
+    complete_detections(messages, "person", sizes)
+    infos = [camera_info(rig, name) for name in rig.cameras]
+    return rig, len(rows), _write_log(out, infos, rig, _with_log_times(messages, arrivals))
+
+
+def _objects_file(folder: Path) -> Path | None:
+    file = folder / OBSERVATIONS_FILE
+    if not file.exists():
+        boxes = folder / BOXES_FILE
+        return boxes if boxes.exists() else None
+    objects = is_boxes_file(file) or not {"kind", "box_x", "head_u"}.isdisjoint(read_csv_header(file, "observations"))
+    return file if objects else None
 
 
 def write_observation_log(
@@ -347,6 +386,8 @@ __all__ = [
     "camera_info",
     "detect_source",
     "frame_clock",
+    "has_objects",
+    "objects_to_log",
     "read_arrivals",
     "read_foreign_calibration",
     "read_points",

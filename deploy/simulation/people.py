@@ -19,8 +19,9 @@ from protocols.core.files import write_atomically
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
 from protocols.session.observations import Observations, gather_tracks
 
-TRUTH_BOXES = "truth_boxes.csv"
-_TRUTH_HZ = 50.0
+TRUTH_BOXES, TRUTH_PLACES = "truth_boxes.csv", "truth.csv"
+TRUTH_VIDEO_CALIBRATION = "truth_video_calibration.toml"
+_TRUTH_HZ, _PLACES_HZ = 50.0, 10.0
 
 
 def write_people_session(
@@ -45,12 +46,22 @@ def write_people_session(
     except OSError as error:
         raise InputError(f"cannot be made: {error.strerror}", file=out, remedy="choose another --out") from None
     rig, truth = camera_tables(scene, scene.name)
+    truth["metadata"]["up"] = [0.0, 0.0, 1.0]
     write_rig(out / RIG_FILE, rig)
     write_observations(out / OBSERVATIONS_FILE, people_observations(scene, tracks))
     write_atomically(out / TRUTH_CALIBRATION, tomli_w.dumps(truth))
     _write_truth_trajectory(out / TRUTH_TRAJECTORY, scene, seconds)
     _write_truth_boxes(out / TRUTH_BOXES, scene, tracks)
+    _write_truth_places(out / TRUTH_PLACES, scene, seconds)
     videos = [_write_video(out, scene, name, tracks[name], seed) for name in tracks] if render else []
+    if render:
+        # A video's times begin with 0 at its first frame: the clocks of the files are others than the cameras'.
+        for name, track in tracks.items():
+            rate, epoch = np.polyfit(track.frame - track.frame[0], track.time - track.time[0], 1)
+            fps, clock = scene.camera(name).fps, truth[name]
+            clock["time_offset"] += clock["clock_rate"] * (track.time[0] + float(epoch))
+            clock["clock_rate"] *= float(rate) * fps
+        write_atomically(out / TRUTH_VIDEO_CALIBRATION, tomli_w.dumps(truth))
     return {
         "scene": scene.name,
         "seed": seed,
@@ -91,6 +102,18 @@ def _write_truth_trajectory(file: Path, scene: PeopleScene, seconds: float) -> N
     write_atomically(file, "\n".join(lines) + "\n")
 
 
+def _write_truth_places(file: Path, scene: PeopleScene, seconds: float) -> None:
+    """Write time,person,x,y of the foot points, with times on the first camera's clock."""
+    clock = scene.cameras[0].clock
+    true_time = np.arange(0.0, seconds, 1.0 / _PLACES_HZ)
+    lines = ["time,person,x,y"]
+    for at, places in zip(true_time, scene.feet(true_time), strict=True):
+        time = clock.epoch_ns / NANOSECONDS + clock.rate * at
+        for person, (x, y, _) in zip(scene.people, places, strict=True):
+            lines.append(f"{time:.17g},{person.name},{x:.17g},{y:.17g}")
+    write_atomically(file, "\n".join(lines) + "\n")
+
+
 def _write_truth_boxes(file: Path, scene: PeopleScene, tracks: dict[str, PeopleTrack]) -> None:
     """Write the bounding boxes of all people in every frame that shows somebody, ignoring occlusion."""
     lines = ["camera,frame,time,person,x,y,w,h,head_u,head_v,foot_u,foot_v,head_seen,foot_seen"]
@@ -108,7 +131,7 @@ def _write_truth_boxes(file: Path, scene: PeopleScene, tracks: dict[str, PeopleT
 
 
 def _write_video(out: Path, scene: PeopleScene, name: str, track: PeopleTrack, seed: int) -> str:
-    """Render the camera's frames that are in the session into a video of constant frame rate."""
+    """Render the camera's frames into a video of constant frame rate; a lost frame repeats the one before it."""
     import cv2
 
     camera = scene.camera(name)
@@ -119,10 +142,12 @@ def _write_video(out: Path, scene: PeopleScene, name: str, track: PeopleTrack, s
     writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), camera.fps, size)
     if not writer.isOpened():
         raise InputError("this OpenCV cannot write videos", file=file, remedy="leave out --render")
-    _, first = np.unique(track.frame, return_index=True)
+    frames, first = np.unique(track.frame, return_index=True)
     try:
-        for moment in track.true_time[first]:
-            writer.write(renderer.render(float(moment)))
+        for moment, repeats in zip(track.true_time[first], np.diff(frames, append=frames[-1] + 1), strict=True):
+            image = renderer.render(float(moment))
+            for _ in range(int(repeats)):
+                writer.write(image)
     finally:
         writer.release()
     part.replace(file)

@@ -43,6 +43,8 @@ def import_(
     Calibrations (aniposelib, caliscope, Pose2Sim, FreeMoCap, OpenCV YAML, Kalibr camchain, COLMAP text) become a
     rig.toml, which also serves as a calibration.toml if it has all poses. Tracks (caliscope CSV, DeepLabCut CSV, mvus
     text) become an observations.csv, and a session folder becomes a .mcap log. The format is detected from the content.
+    A folder with detections of people (boxes.csv, or observations.csv as `detect person` writes it) needs no rig.toml
+    where --calibration gives the cameras.
 
     Example: syncline import camchain.yaml --out rig.toml
 
@@ -101,6 +103,7 @@ def import_(
     from deploy.offline import imports
     from protocols.core.files import write_atomically
     from protocols.session.folder import read_folder, write_observations
+    from protocols.session.rig import read_rig
 
     source = imports.detect_source(list(sources), format)
     _check_suffix(source.kind, out)
@@ -108,10 +111,18 @@ def import_(
         raise InputError("--calibration goes with a session folder", remedy="leave it out")
     warnings: tuple[str, ...] = ()
     if source.kind == "session":
+        delay, jitter = 1e-3 * arrival_delay_ms, 1e-3 * arrival_jitter_ms
+    if source.kind == "session" and imports.has_objects(source.files[0]):
+        arrivals = None
+        if calibration is not None:
+            arrivals = imports.read_arrivals(calibration, read_rig(calibration), delay, jitter, seed)
+        rig, detections, count = imports.objects_to_log(source.files[0], calibration, out, arrivals)
+        summary = f"{len(rig.cameras)} cameras, {detections} detections, {count} messages"
+        cameras = list(rig.cameras)
+    elif source.kind == "session":
         rig, seen = read_folder(source.files[0])
         arrivals = None
         if calibration is not None:
-            delay, jitter = 1e-3 * arrival_delay_ms, 1e-3 * arrival_jitter_ms
             arrivals = imports.read_arrivals(calibration, rig, delay, jitter, seed)
         count = imports.session_to_log(rig, seen, out, arrivals)
         warnings = seen.warnings

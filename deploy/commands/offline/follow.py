@@ -1,0 +1,184 @@
+"""`syncline follow`: follows people or vehicles through all cameras, offline."""
+
+from __future__ import annotations
+
+import resource
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from deploy.offline.progress import progress_bar
+from protocols.core.errors import EXIT_DONE, InputError
+from protocols.core.files import check_folder, write_together
+
+
+def follow(
+    session: Path,
+    /,
+    *,
+    calibration: Path,
+    out: Path,
+    kind: Literal["person", "vehicle"] = "person",
+    observations: Path | None = None,
+    detector: str | None = None,
+    fps: float | None = None,
+    truth: Path | None = None,
+    area: str | None = None,
+    crops: Path | None = None,
+    json: Annotated[bool, Parameter(negative="")] = False,
+    seed: int = 0,
+) -> int:
+    """Follow people or vehicles through all cameras of a calibrated rig, offline.
+
+    Writes tracks.csv (time,id,kind,state,x,y,z,height,std), report.html and result.json to --out. Times are on the
+    calibration's reference clock, places in its world and units; x, y, z is the foot point. An id is one person for as
+    long as the data allow. Exit status 3 if there is nobody to follow.
+
+    Videos are named after their cameras. People or vehicles are first detected in each, in several processes; the
+    detections are kept in --out as detections.mcap, which can be followed or replayed again.
+
+    Example: syncline follow my-session --calibration out/calibration.toml --out followed
+
+    Example: syncline follow my-videos --calibration out/calibration.toml --out followed --crops followed/crops
+
+    Example: syncline follow boxes.csv --calibration calibration.toml --out followed --truth truth.csv --area -3,9,-9,27
+
+    Parameters
+    ----------
+    session
+        A folder with observations.csv or boxes.csv (camera,frame,time,x,y,width,height), such a file, a .mcap log that
+        Syncline recorded, or a folder of videos.
+    calibration
+        The calibration.toml that `syncline calibrate` wrote: lenses, poses and clocks.
+    out
+        Folder for the results.
+    kind
+        What to follow. Detections of other kinds are left out.
+    observations
+        Another file of detections to use instead of the session's own.
+    detector
+        For videos: person, vehicle, a detector that another package registers, or a network's .toml file. Default: what
+        moves before the background. With it, the videos of a folder are used even if observations lie beside them.
+    fps
+        Rows a second [Hz]. Default: a row at each frame of the reference camera, or at each time of a shared clock.
+    truth
+        True positions, frame,person,x,y or time,person,x,y (any of them with z): adds MODA, MOTA, IDF1 and HOTA to the
+        results. Matches are within 0.5 m on the ground. Needs TrackEval: pip install --no-deps trackeval
+    area
+        With --truth: x0,x1,y0,y1, the part of the ground that was annotated; nothing outside counts.
+    crops
+        A folder for pictures of the heads, faces and torsos of the followed people, one folder a track. Needs videos,
+        or a log with pictures.
+    json
+        Print result.json on standard output.
+    seed
+        Seed of detectors that use random numbers; it stands in result.json.
+    """
+    check_folder(out)
+    if fps is not None and not 0.01 <= fps <= 1000.0:
+        raise InputError(f"--fps {fps:g} is out of range", remedy="give the rows a second, 0.01 to 1000")
+    if area is not None and truth is None:
+        raise InputError("--area goes with --truth", remedy="leave it out, or give --truth truth.csv")
+    if crops is not None:
+        check_folder(crops)
+        if kind != "person":
+            raise InputError("--crops shows heads and torsos of people", remedy="leave it out for vehicles")
+    from hub.tracking.offline import follow as follow_observations
+
+    from deploy.evaluation.tracking_scores import parse_area, read_ground_truth, score_tracks
+    from deploy.offline.follow.crops import check_pictures, write_crops
+    from deploy.offline.follow.report import follow_report
+    from deploy.offline.follow.results import REPORT, RESULT, TRACKS, result_document, result_text, tracks_text
+    from deploy.offline.follow.source import read_follow_input, read_known_calibration
+    from protocols.core.clocks import NANOSECONDS
+    from protocols.session.rig import METRES_PER_UNIT
+
+    known = read_known_calibration(calibration)
+    limits = None if area is None else parse_area(area)
+    if truth is not None:
+        if known.calibration.scale != "metric":
+            what = "the calibration has no metric scale, and matches are within 0.5 m"
+            raise InputError(what, file=calibration, remedy="give the rig a distance, or leave out --truth")
+        read_ground_truth(truth, None)  # reported before minutes of detection
+    with progress_bar(f"reading {session.name}", quiet=json) as progress:
+        source = read_follow_input(
+            session,
+            known,
+            kind,
+            out,
+            observations=observations,
+            detector=detector,
+            fps=fps,
+            seed=seed,
+            progress=progress,
+        )
+    if crops is not None:
+        check_pictures(source, session)
+    with progress_bar(f"following through {session.name}", quiet=json) as progress:
+        result = follow_observations(
+            source.observations,
+            known.calibration,
+            source.times_ns,
+            up=known.up,
+            progress=lambda share: progress("", share),
+        )
+    times = [time_ns / NANOSECONDS for time_ns in source.times_ns]
+    scores = None
+    warnings = [*source.warnings, *result.warnings]
+    if truth is not None:
+        units_per_m = 1.0 / METRES_PER_UNIT[known.calibration.units]
+        given = read_ground_truth(truth, source.frame_times(known))
+        scores = score_tracks(given, result.tracks, times, units_per_m, limits)
+    command = shlex.join(["syncline", *sys.argv[1:]])
+    written = [out / name for name in (TRACKS, RESULT, REPORT)]
+    if crops is not None:
+        with progress_bar("cutting out heads and torsos", quiet=json) as progress:
+            count = write_crops(crops, source, result.tracks, known, progress)
+        warnings += [] if count else ["no picture shows a followed person large enough for --crops"]
+        written.append(crops)
+    document = result_document(
+        result,
+        known,
+        kind=kind,
+        command=command,
+        times=times,
+        cpu_seconds=_cpu_seconds(),
+        warnings=warnings,
+        scores=scores,
+        seed=seed,
+    )
+    write_together(
+        {
+            out / TRACKS: tracks_text(result.tracks),
+            out / RESULT: result_text(document),
+            out / REPORT: follow_report(result, source, known, document),
+        }
+    )
+    if json:
+        print(result_text(document), end="")
+        return EXIT_DONE
+    seconds = times[-1] - times[0]
+    print(
+        f"{len(result.tracks)} tracks in {seconds:.1f} s, {len(result.cameras)} cameras, {_cpu_seconds():.1f} s of CPU"
+    )
+    for name, camera in result.cameras.items():
+        print(f"{name}: {camera.frames} frames, {camera.detections} detections, {100 * camera.used:.0f} % used")
+    if scores is not None:
+        print(", ".join(f"{name.upper()} {_shown(scores[name])}" for name in ("moda", "mota", "idf1", "hota")))
+    for warning in warnings:
+        print(f"warning: {warning}")
+    print(f"written: {', '.join(map(str, written))}")
+    return EXIT_DONE
+
+
+def _shown(value: float | int | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def _cpu_seconds() -> float:
+    """CPU time [s] of this process and of those that it has ended."""
+    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in usages)

@@ -1,0 +1,1 @@
+"""Following people and vehicles offline: input of any kind, checks, and the files that `syncline follow` writes."""

@@ -1,0 +1,279 @@
+"""Detected people and vehicles without identities, from a session's rows or a log, as observation messages.
+
+A person is followed by head, foot and representative point. A box stands for an upright body: the head is in the middle
+of its top, the foot in the middle of its bottom. Two rows of labels ``NAME-head`` and ``NAME-foot`` in one frame are
+one person; the name is not used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from deploy.offline.csv_table import CsvTable, read_csv_header, read_csv_table
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
+from protocols.geometry.types import Floats, Ints
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.detections import DetectionRows, read_detections
+
+Kind = Literal["person", "vehicle"]
+BOXES_FILE = "boxes.csv"
+_BOX_COLUMNS = ("camera", "frame", "time", "x", "y", "width", "height")
+_MAX_PIXEL = 1e6
+_MAX_TIME_S = 9e9
+"""Beyond it a time [s] does not fit into 64 bits of nanoseconds."""
+_MAX_EMPTY_PER_FRAME = 20
+"""Frames without a row that are added for one with rows. Rarer numbers are labels, not a numbering of the frames."""
+
+
+@dataclass(slots=True, eq=False)
+class LeftOut:
+    """Counts of rows that are not followed, by reason."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """One line a reason."""
+        return tuple(f"{count} rows left out: {reason}" for reason, count in self.counts.items())
+
+
+def is_boxes_file(file: Path) -> bool:
+    """Whether a CSV file has the columns camera,frame,time,x,y,width,height in place of u,v. Raises InputError."""
+    header = read_csv_header(file, "observations")
+    return not {"u", "v"} <= set(header) and set(_BOX_COLUMNS) <= set(header)
+
+
+def read_objects(file: Path, sizes: Mapping[str, tuple[int, int]]) -> DetectionRows:
+    """Read boxes (camera,frame,time,x,y,width,height; x, y the top left) or the rows of an observations.csv.
+
+    sizes: (width, height) of the image [px] of all cameras that the calibration knows. Raises InputError (file, line,
+    what, remedy), also for boxes outside the image, heads below feet, and cameras that are not in ``sizes``.
+    """
+    boxes = is_boxes_file(file)
+    table = read_csv_table(file, "observations", _BOX_COLUMNS if boxes else ("camera", "time"))
+    names = table.columns["camera"]
+    table.refuse(
+        np.array([name not in sizes for name in names]),
+        lambda row: f"camera {names[row][:63]!r} is not in the calibration ({', '.join(sizes)})",
+        "calibrate this camera too, or remove its rows",
+    )
+    table.numbers("time", _MAX_TIME_S)
+    if boxes:
+        return _box_rows(table, sizes)
+    rows = read_detections(file, sizes)
+    _check_pairs(rows, file)
+    return rows
+
+
+def _box_rows(table: CsvTable, sizes: Mapping[str, tuple[int, int]]) -> DetectionRows:
+    box = np.column_stack([table.numbers(name, _MAX_PIXEL) for name in ("x", "y", "width", "height")])
+    flat = np.asarray((box[:, 2:] <= 0.0).any(axis=1))
+    table.refuse(flat, lambda row: f"the box is {box[row, 2]:g} x {box[row, 3]:g} px: its foot is not below its head")
+    limit = np.array([sizes[name] for name in table.columns["camera"]], dtype=np.float64)
+    outside = np.asarray(((box[:, :2] >= limit) | (box[:, :2] + box[:, 2:] <= 0.0)).any(axis=1))
+    table.refuse(
+        outside,
+        lambda row: f"the box lies outside the {limit[row, 0]:g}x{limit[row, 1]:g} picture",
+        "correct or remove the row, or take the calibration of this picture size",
+    )
+    count = len(table)
+    nothing = np.full((count, 4), np.nan)
+    return DetectionRows(
+        camera=table.columns["camera"],
+        label=[""] * count,
+        kind=[""] * count,
+        frame=table.whole("frame"),
+        time=table.numbers("time", _MAX_TIME_S),
+        pixels=box[:, :2] + 0.5 * box[:, 2:],
+        size=nothing[:, 0],
+        score=nothing[:, 0],
+        covariance=nothing[:, :3],
+        head=nothing[:, :2],
+        foot=nothing[:, :2],
+        box=box,
+        line=table.line,
+    )
+
+
+def _check_pairs(rows: DetectionRows, file: Path) -> None:
+    """Refuse a row NAME-head below the row NAME-foot of the same frame: InputError with the later line."""
+    ends: dict[tuple[str, float, str], int] = {}
+    for row, label in enumerate(rows.label):
+        name, _, end = label.rpartition("-")
+        if not name or end not in ("head", "foot"):
+            continue
+        other = ends.setdefault((rows.camera[row], float(rows.time[row]), name), row)
+        if other == row:
+            continue
+        head, foot = (row, other) if end == "head" else (other, row)
+        across, down = rows.pixels[foot] - rows.pixels[head]
+        if down <= 0.0 and abs(across) <= abs(down):
+            what = f"{name}: the head is not above the foot"
+            raise InputError(what, file=file, line=max(rows.line[head], rows.line[foot]), remedy="swap the labels")
+
+
+def object_messages(rows: DetectionRows, *, fill: bool = True) -> list[pb.Observation]:
+    """The rows as observation messages with all that is known of each detection, by camera and time.
+
+    ``sequence`` is the frame number where a camera's frames are numbered, otherwise it counts. fill: also make messages
+    of the frames without a row between two with rows, where frames are numbered: they say that nobody was detected.
+    """
+    out: list[pb.Observation] = []
+    names = np.array(rows.camera)
+    time_ns = np.array([round(time * NANOSECONDS) for time in rows.time.tolist()], dtype=np.int64)
+    for name in dict.fromkeys(rows.camera):
+        mine = np.flatnonzero(names == name)
+        mine = mine[np.lexsort((mine, time_ns[mine]))]
+        stamps, first, counts = np.unique(time_ns[mine], return_index=True, return_counts=True)
+        frames = rows.frame[mine[first]]
+        numbered = bool((np.diff(frames) > 0).all()) and frames[0] >= 0
+        empty_stamps, empty_frames = _empty_frames(stamps, frames) if fill and numbered else (stamps[:0], frames[:0])
+        order = np.argsort(np.concatenate([stamps, empty_stamps]), kind="stable").tolist()
+        every_stamp = np.concatenate([stamps, empty_stamps]).tolist()
+        every_frame = np.concatenate([frames, empty_frames]).tolist()
+        for index, at in enumerate(order):
+            message = pb.Observation(
+                schema_version=1, camera=name, boot_id="session", device_time_ns=every_stamp[at],
+                sequence=every_frame[at] if numbered else index, frame=max(every_frame[at], 0),
+            )  # fmt: skip
+            if at < len(stamps):
+                begin = int(first[at])
+                message.detections.extend(_detection(rows, int(row)) for row in mine[begin : begin + int(counts[at])])
+            out.append(message)
+    return out
+
+
+def _detection(rows: DetectionRows, row: int) -> pb.Detection:
+    def given(values: Floats) -> list[float]:
+        return values[row].tolist() if np.isfinite(values[row]).all() else []
+
+    size, score = float(rows.size[row]), float(rows.score[row])
+    return pb.Detection(
+        u=rows.pixels[row, 0], v=rows.pixels[row, 1], size=size if size > 0.0 else 0.0,
+        score=score if math.isfinite(score) else 1.0, label=rows.label[row], kind=rows.kind[row],
+        covariance=given(rows.covariance), head=given(rows.head), foot=given(rows.foot), box=given(rows.box),
+    )  # fmt: skip
+
+
+def _empty_frames(stamps: Ints, frames: Ints) -> tuple[Ints, Ints]:
+    """Times [ns] and numbers of the frames that are missing between the given ones."""
+    missing = np.diff(frames) - 1
+    if len(frames) < 2 or missing.sum() > _MAX_EMPTY_PER_FRAME * len(frames):
+        return stamps[:0], frames[:0]
+    step = int(np.gcd.reduce(np.diff(frames)))  # every second frame was looked at: the others are not empty
+    numbers = [np.arange(a + step, b, step, dtype=np.int64) for a, b in pairwise(frames.tolist())]
+    wanted = np.concatenate(numbers)
+    whole, part = np.interp(wanted, frames, stamps - stamps[0]), stamps[0]
+    return np.rint(whole).astype(np.int64) + part, wanted
+
+
+def followed_detections(
+    messages: Iterable[pb.Observation], kind: Kind, sizes: Mapping[str, tuple[int, int]]
+) -> tuple[list[pb.Observation], LeftOut]:
+    """The messages with the detections of one kind only, each with all points that a tracker needs.
+
+    sizes: (width, height) of each camera's image [px]. A detection without a kind is of this one if it has a box, a
+    head or a foot. Where all boxes of a camera end at its image's border, a box that reaches it is cut: the end that
+    is not seen is not given.
+    """
+    left = LeftOut()
+    kept = [message for message in messages if message.camera in sizes]
+    clipped = _clipped_cameras(kept, sizes)
+    out = []
+    for message in kept:
+        copy = pb.Observation()
+        copy.CopyFrom(message)
+        del copy.detections[:]
+        for detection in _paired(message.detections, left) if kind == "person" else message.detections:
+            one = _of_kind(detection, kind, sizes[message.camera] if message.camera in clipped else None, left)
+            if one is not None:
+                copy.detections.append(one)
+        out.append(copy)
+    return out, left
+
+
+def _clipped_cameras(messages: Iterable[pb.Observation], sizes: Mapping[str, tuple[int, int]]) -> set[str]:
+    """Cameras whose boxes never reach more than a pixel beyond the image."""
+    beyond = set()
+    for message in messages:
+        width, height = sizes[message.camera]
+        for detection in message.detections:
+            if len(detection.box) == 4:
+                x, y, w, h = detection.box
+                if x < -1.5 or y < -1.5 or x + w > width + 1.0 or y + h > height + 1.0:
+                    beyond.add(message.camera)
+                    break
+    return set(sizes) - beyond
+
+
+def _paired(detections: Sequence[pb.Detection], left: LeftOut) -> list[pb.Detection]:
+    """Detections with those of the labels NAME-head and NAME-foot put together."""
+    out: list[pb.Detection] = []
+    ends: dict[str, dict[str, pb.Detection]] = {}
+    for detection in detections:
+        name, _, end = detection.label.rpartition("-")
+        if name and end in ("head", "foot") and not (detection.kind or detection.box or detection.head):
+            ends.setdefault(name, {})[end] = detection
+        else:
+            out.append(detection)
+    for both in ends.values():
+        if len(both) < 2:
+            left.counts["only the head or only the foot was seen"] += 1
+            continue
+        head, foot = both["head"], both["foot"]
+        out.append(
+            pb.Detection(
+                u=0.5 * (head.u + foot.u), v=0.5 * (head.v + foot.v), score=min(head.score, foot.score), kind="person",
+                size=math.hypot(head.u - foot.u, head.v - foot.v), head=[head.u, head.v], foot=[foot.u, foot.v],
+            )
+        )  # fmt: skip
+    return out
+
+
+def _of_kind(detection: pb.Detection, kind: Kind, clip: tuple[int, int] | None, left: LeftOut) -> pb.Detection | None:
+    """A complete detection of this kind, or None. clip: size of the image where boxes end at its border."""
+    if detection.kind not in ("", kind):
+        left.counts[f"of kind {detection.kind}"] += 1
+        return None
+    if not (detection.kind or detection.box or detection.head or detection.foot):
+        left.counts["neither a box nor head and foot"] += 1
+        return None
+    one = pb.Detection()
+    one.CopyFrom(detection)
+    one.label = ""
+    _complete(one, kind, clip)
+    return one
+
+
+def complete_detections(messages: Iterable[pb.Observation], kind: Kind, sizes: Mapping[str, tuple[int, int]]) -> None:
+    """Give boxes and bodies without a kind this one, and people the ends and the size that their boxes have.
+
+    sizes: as for ``followed_detections``.
+    """
+    every = list(messages)
+    clipped = _clipped_cameras(every, sizes)
+    for message in every:
+        for detection in message.detections:
+            if not detection.kind and (detection.box or detection.head or detection.foot):
+                _complete(detection, kind, sizes[message.camera] if message.camera in clipped else None)
+
+
+def _complete(one: pb.Detection, kind: Kind, clip: tuple[int, int] | None) -> None:
+    one.kind = kind
+    if kind == "person" and len(one.box) == 4 and not (one.head or one.foot):
+        x, y, width, height = one.box
+        if clip is None or y > 0.5:
+            one.head.extend([x + 0.5 * width, y])
+        if clip is None or y + height < clip[1] - 1.5:
+            one.foot.extend([x + 0.5 * width, y + height])
+    if one.size <= 0.0 and one.head and one.foot:
+        one.size = math.dist(one.head, one.foot)

@@ -1,0 +1,230 @@
+"""What `syncline follow` reads: a session folder, a table of boxes, a log or a folder of videos, with a calibration."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from deploy.offline.follow.objects import (
+    BOXES_FILE,
+    Kind,
+    followed_detections,
+    object_messages,
+    read_objects,
+)
+from deploy.offline.follow.units import check_units
+from hub.tracking.detections import TrackingCamera
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError, Refused
+from protocols.core.version import VERSION
+from protocols.geometry.types import Floats
+from protocols.log.read.reader import LogReader
+from protocols.log.read.session import is_log
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.calibration import Calibration, read_calibration
+from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
+from protocols.session.rig import Rig, read_rig
+from protocols.topics import OBSERVATION
+
+Progress = Callable[[str, float], None]
+LOG_OF_VIDEOS = "detections.mcap"
+_MAX_ROWS = 2_000_000
+"""Reference times at which tracks are wanted: 18 h at 30 Hz."""
+_MAX_TIME_NS = 2**62
+_ANY_SIZE = 1_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownCalibration:
+    """A calibration.toml. rig: its tables. up: (3,) in its world; None = not given."""
+
+    file: Path
+    rig: Rig
+    calibration: Calibration
+    up: Floats | None
+
+    @property
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """(width, height) of each calibrated camera's image [px]."""
+        return {name: (c.intrinsics.width, c.intrinsics.height) for name, c in self.calibration.cameras.items()}
+
+    @property
+    def file_sizes(self) -> dict[str, tuple[int, int]]:
+        """The same of all cameras that the calibration knows; a refused one has no table, and any size."""
+        return {**dict.fromkeys(self.calibration.refused, (_ANY_SIZE, _ANY_SIZE)), **self.sizes}
+
+    @property
+    def names(self) -> list[str]:
+        """The cameras that the calibration knows, refused ones included."""
+        return [*self.calibration.cameras, *self.calibration.refused]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FollowInput:
+    """Detections of one kind and the reference times [ns] at which tracks are wanted.
+
+    video: the video of each camera, where there are any. log: the log that was read, where it was one.
+    """
+
+    name: str
+    observations: list[pb.Observation]
+    times_ns: list[int]
+    warnings: tuple[str, ...]
+    videos: dict[str, Path]
+    log: Path | None = None
+
+    def frame_times(self, known: KnownCalibration) -> dict[int, float]:
+        """Reference times [s] of the reference camera's frames, and of frames that only others have, by number."""
+        out: dict[int, float] = {}
+        for name in (known.calibration.reference, *known.sizes):
+            camera = TrackingCamera.from_calibration(known.calibration.cameras[name])
+            for message in self.observations:
+                if message.camera == name and message.sequence not in out:
+                    out[message.sequence] = camera.reference_ns(message.device_time_ns) / NANOSECONDS
+        return out
+
+
+def read_known_calibration(file: Path) -> KnownCalibration:
+    """Read calibration.toml. Raises InputError."""
+    rig, cameras = read_calibration(file)
+    metadata = rig.metadata
+    refused = metadata.get("refused")
+    calibration = Calibration(
+        cameras=cameras,
+        reference=str(metadata.get("reference", next(iter(cameras)))),
+        scale=str(metadata.get("scale", "metric")),
+        units=rig.units,
+        solver=str(metadata.get("solver", "")),
+        version=str(metadata.get("version", VERSION)),
+        refused={str(name): str(why) for name, why in refused.items()} if isinstance(refused, dict) else {},
+    )
+    up = rig.up
+    if isinstance(up, str):
+        up = cameras[up].pose.rotation.T @ rig.up_in_camera(up)
+    return KnownCalibration(file, rig, calibration, None if up is None else np.asarray(up / np.linalg.norm(up)))
+
+
+def read_follow_input(
+    session: Path,
+    known: KnownCalibration,
+    kind: Kind,
+    out: Path,
+    *,
+    observations: Path | None = None,
+    detector: str | None = None,
+    fps: float | None = None,
+    seed: int = 0,
+    progress: Progress = lambda text, share: None,
+) -> FollowInput:
+    """Read the detections of any kind of session; videos are detected in first, into a log in ``out``.
+
+    detector: see ``detect_videos``; where it is given, a folder's videos are used in place of its observations.
+    Raises InputError (file, line, what, remedy), and Refused where there is nothing to follow.
+    """
+    from deploy.offline.follow.video_detection import detect_videos
+    from deploy.offline.video_folder import is_video_folder
+
+    shared, log = known.rig.shared_clock, None
+    videos: dict[str, Path] = {}
+    warnings: tuple[str, ...] = ()
+    more: tuple[str, ...] = ()
+    file = observations or (None if detector is not None else _rows_file(session))
+    if file is None and (is_video_folder(session) or (detector is not None and session.is_dir())):
+        log = out / LOG_OF_VIDEOS
+        videos, warnings = detect_videos(session, known, kind, log, detector=detector, seed=seed, progress=progress)
+        messages, more = _read_log(log)
+    elif detector is not None:
+        raise InputError("--detector goes with a folder of videos", file=session, remedy="leave it out")
+    elif file is None and is_log(session):
+        log = session
+        messages, more = _read_log(session)
+    elif file is None:
+        remedy = f"give a folder with {OBSERVATIONS_FILE} or {BOXES_FILE}, a .mcap log, or a folder of videos"
+        what = "nothing to follow in it" if session.exists() else "this session does not exist"
+        raise InputError(what, file=session, remedy=remedy)
+    else:
+        messages = object_messages(read_objects(file, known.file_sizes))
+        if session.is_dir() and (session / RIG_FILE).exists():
+            shared |= read_rig(session / RIG_FILE).shared_clock
+    found, left_out = followed_detections(messages, kind, known.sizes)
+    warnings = (*warnings, *more, *left_out.warnings)
+    unused = sorted({message.camera for message in messages} - known.sizes.keys())
+    warnings += tuple(f"{name}: not followed in, the calibration refused it" for name in unused if name in known.names)
+    strange = [name for name in unused if name not in known.names]
+    if strange:
+        what = f"camera {strange[0]!r} is not in the calibration ({', '.join(known.names)})"
+        raise InputError(what, file=session, remedy="take the calibration of these cameras")
+    if not any(message.detections for message in found):
+        raise Refused(f"{session}: no {kind} in any frame" + "".join(f"; {warning}" for warning in left_out.warnings))
+    check_units(found, known, kind)
+    times_ns, also = _wanted_times(found, known, shared, fps)
+    return FollowInput(session.stem, found, times_ns, warnings + also, videos, log)
+
+
+def _rows_file(session: Path) -> Path | None:
+    """The CSV file of a session, or None for a log or videos."""
+    if session.suffix.lower() == ".csv" and not session.is_dir():
+        return session
+    return next((session / name for name in (OBSERVATIONS_FILE, BOXES_FILE) if (session / name).exists()), None)
+
+
+def _read_log(file: Path) -> tuple[list[pb.Observation], tuple[str, ...]]:
+    """The observations of a log, of each camera those of the boot with the most detections, and warnings."""
+    reader = LogReader(file)
+    messages: list[pb.Observation] = []
+    counts: dict[str, Counter[str]] = {}
+    for logged in reader.messages([OBSERVATION]):
+        message = logged.message
+        assert isinstance(message, pb.Observation)
+        messages.append(message)
+        counts.setdefault(message.camera, Counter())[message.boot_id] += 1 + len(message.detections)
+    if not messages:
+        raise InputError("no observation in this log", file=file, remedy="record cameras that detect something")
+    boots = {camera: count.most_common(1)[0][0] for camera, count in counts.items()}
+    damage = (f"the log is damaged: {reader.damage}",) if reader.damage else ()
+    restarts = tuple(
+        f"{camera}: it was restarted; only the part with the most detections is on the calibrated clock"
+        for camera, count in counts.items()
+        if len(count) > 1
+    )
+    return [message for message in messages if message.boot_id == boots[message.camera]], damage + restarts
+
+
+def _wanted_times(
+    messages: list[pb.Observation], known: KnownCalibration, shared: bool, fps: float | None
+) -> tuple[list[int], tuple[str, ...]]:
+    """Reference times [ns] of rows: --fps, all times of a shared clock, or the reference camera's frames; warnings."""
+    by_camera: dict[str, set[int]] = {}
+    for name, camera in known.calibration.cameras.items():
+        clock = camera.time_map
+        if abs(clock.time_offset) * NANOSECONDS > _MAX_TIME_NS or not 0.5 < clock.clock_rate < 2.0:
+            what = f"[{name}] time_offset or clock_rate is beyond any clock"
+            raise InputError(what, file=known.file, remedy="give seconds, and a rate near 1")
+        tracked = TrackingCamera.from_calibration(camera)
+        times = {tracked.reference_ns(message.device_time_ns) for message in messages if message.camera == name}
+        if times:
+            by_camera[name] = times
+    every = set().union(*by_camera.values())
+    if max(map(abs, every)) > _MAX_TIME_NS:
+        raise InputError("its times are beyond 146 years", file=known.file, remedy="check time_offset and the session")
+    if fps is not None:
+        count = round((max(every) - min(every)) * fps / NANOSECONDS) + 1
+        if count > _MAX_ROWS:
+            raise InputError(f"--fps {fps:g} asks for {count} times", remedy=f"give no more than {_MAX_ROWS}")
+        return [min(every) + round(index * NANOSECONDS / fps) for index in range(count)], ()
+    if shared and all(
+        known.calibration.cameras[name].time_map.time_offset == 0.0
+        and known.calibration.cameras[name].time_map.clock_rate == 1.0
+        for name in by_camera
+    ):
+        return sorted(every), ()
+    reference = known.calibration.reference
+    if reference in by_camera:
+        return sorted(by_camera[reference]), ()
+    name = max(by_camera, key=lambda one: len(by_camera[one]))
+    warning = f"{reference}, the reference camera, has no frame here: tracks are given at the frames of {name}"
+    return sorted(by_camera[name]), (warning,)
