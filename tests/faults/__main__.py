@@ -19,7 +19,7 @@ from tests.faults.matrix import VARIABLE, table
 
 _HERE = str(Path(__file__).parent)
 _STATIONS = ("mavsdk>=3.10,<4", "MAVProxy>=1.8.70")
-"""Ground stations that are run as processes. Without their requirements, which would replace OpenCV by another build."""
+"""Ground stations run as processes. Without their requirements, which would replace OpenCV by another build."""
 
 
 def _fetch_stations() -> None:

@@ -172,43 +172,6 @@ def access_rights(bus: BusConfig, site: str, role: str, agent: str, seconds: flo
     return ok("access rules", f"{agent} receives no messages of others")
 
 
-def mavlink(
-    link: Any, hello: Any = None, patience_s: float = 3.0, now: Callable[[], float] = time.monotonic
-) -> CheckResult:
-    """Wait for an autopilot's heartbeat.
-
-    link: an ``edge.mavlink.link`` connection that accepts HEARTBEAT. hello: a message that is sent each second, for
-    autopilots that reply only to known senders; None = only receive. patience_s: timeout [s].
-    """
-    began = now()
-    called = 0.0
-    while now() - began < patience_s:
-        heartbeats = [received for received in link.poll() if received.kind == "HEARTBEAT"]
-        if heartbeats:
-            return ok("mavlink", f"heartbeat of system {heartbeats[0].system}")
-        if hello is not None and now() - began >= called and link.send(hello):
-            called += 1.0
-        link.wait(0.1)
-    if "in use" in link.problem:
-        return unavailable("mavlink", str(link.problem), "stop the agent (or whoever holds that port) and ask again")
-    if link.problem:
-        return unavailable(
-            "mavlink", str(link.problem), "check device, baud rate and rights (group dialout), or the address"
-        )
-    refused = sum(count for name, count in link.counters.items() if name not in ("received", "bytes", "opened", "sent"))
-    if refused:
-        return unavailable(
-            "mavlink",
-            f"bytes arrive, but no acceptable heartbeat ({dict(link.counters)})",
-            "check the baud rate, MAVLink 2 (SERIALx_PROTOCOL = 2), and the signing key",
-        )
-    return unavailable(
-        "mavlink",
-        f"no heartbeat within {patience_s:g} s",
-        "check the wiring (TX to RX), port and baud rate, and that the autopilot sends there (SERIALx_PROTOCOL = 2)",
-    )
-
-
 def configuration(file: Path, role: str) -> tuple[CheckResult, Any]:
     """Read the configuration as the agent would."""
     from deploy.config.file import load

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from deploy.site.doctor import agent as agents
-from deploy.site.doctor import machine
-from deploy.site.doctor.check_result import CheckResult, misconfigured, skip, unavailable
+from deploy.site.doctor import autopilot, machine
+from deploy.site.doctor.check_result import CheckResult, skip, unavailable
 from deploy.site.install import units
 from deploy.site.rig_folder import role_of
 from protocols.core.errors import InputError
@@ -38,7 +38,7 @@ def run_checks(file: Path | None, role: str | None = None) -> Iterator[CheckResu
     yield agents.bus_path(config.bus, config.site, kind, config.id)
     yield agents.access_rights(config.bus, config.site, kind, config.id)
     if kind == "uav":
-        yield _check_autopilot(config)
+        yield from autopilot.check(config)
     yield machine.crash(f"syncline-{kind}-{config.id}.service")
 
 
@@ -74,24 +74,3 @@ def _check_camera(config: Any, driver: str) -> Iterator[CheckResult]:
         yield skip("camera", f"not tried: {error.name or error} is missing")
         return
     yield agents.camera(device)
-
-
-def _check_autopilot(config: Any, patience_s: float = 3.0) -> CheckResult:
-    try:
-        from edge.mavlink.dialect import CAMERA, mavlink
-        from edge.mavlink.link.connection import Link
-        from edge.mavlink.link.transport import parse_url
-
-        url = parse_url(config.mavlink.url)
-    except InputError as error:
-        return misconfigured("mavlink", error.what, error.remedy)
-    # Unsigned, because only the presence of a heartbeat is checked. It identifies as the vehicle's camera and never as
-    # a ground station (255): an autopilot whose ground station falls silent assumes a lost link and returns home.
-    link = Link(url, system=None, component=CAMERA, allowed=("HEARTBEAT",))
-    hello = mavlink.MAVLink_heartbeat_message(
-        mavlink.MAV_TYPE_CAMERA, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
-    )
-    try:
-        return agents.mavlink(link, hello if url.kind == "udpout" else None, patience_s)
-    finally:
-        link.close()

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from edge.mavlink.dialect import AUTOPILOT, mavlink
-from edge.mavlink.link.framing import Framer
+from edge.mavlink.link.framing import SIGNED, V2, Framer
 from edge.mavlink.link.identity import Evidence
 from edge.mavlink.link.outbox import Outbox
 from edge.mavlink.link.signing import Signing
@@ -209,6 +209,8 @@ class Link:
             if reason is not None:
                 self._reject(reason, address, component)
                 return None
+        elif frame[0] == V2 and frame[2] & SIGNED:
+            self.counters["signed"] += 1  # which cannot be verified
         if kind not in self._allowed:
             self.counters["not_needed"] += 1
             return None

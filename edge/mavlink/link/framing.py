@@ -11,8 +11,8 @@ from typing import Any
 
 from edge.mavlink.dialect import mavlink
 
-_V1, _V2 = 0xFE, 0xFD
-_SIGNED = 0x01
+V1, V2 = 0xFE, 0xFD
+SIGNED = 0x01
 _SIGNATURE = 13
 _LONGEST = 280 + _SIGNATURE
 
@@ -52,7 +52,7 @@ class Framer:
             elif message.get_msgId() < 0 or isinstance(message, mavlink.MAVLink_unknown):
                 # Its checksum cannot be verified. Accept its length only if another frame starts where it ends.
                 end = at + length
-                if end < len(self._buffer) and self._buffer[end] not in (_V1, _V2):
+                if end < len(self._buffer) and self._buffer[end] not in (V1, V2):
                     self.unreadable += 1
                     at += 1
                 else:
@@ -67,7 +67,7 @@ class Framer:
         del self._buffer[:at]
 
     def _marker(self, at: int) -> int | None:
-        first = [place for mark in (_V1, _V2) if (place := self._buffer.find(mark, at)) >= 0]
+        first = [place for mark in (V1, V2) if (place := self._buffer.find(mark, at)) >= 0]
         return min(first, default=None)
 
     def _length(self, at: int) -> int | None:
@@ -75,12 +75,12 @@ class Framer:
         head = self._buffer[at : at + 3]
         if len(head) < 3:
             return None
-        if head[0] == _V1:
+        if head[0] == V1:
             return 8 + head[1]
-        return 12 + head[1] + (_SIGNATURE if head[2] & _SIGNED else 0)
+        return 12 + head[1] + (_SIGNATURE if head[2] & SIGNED else 0)
 
     def _decode(self, frame: bytes) -> Any:
-        if frame[0] == _V2 and frame[2] & ~_SIGNED:
+        if frame[0] == V2 and frame[2] & ~SIGNED:
             return None
         try:
             return self._codec.decode(bytearray(frame))

@@ -5,25 +5,31 @@ from __future__ import annotations
 import json
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 pytest.importorskip("pymavlink", reason="the extra `uav` is not installed: DOCTOR IS NOT TESTED ON MAVLINK")
 from deploy.config.uav import MavlinkConfig, UavConfig
-from deploy.site.doctor import selection
+from deploy.site.doctor import autopilot
 from deploy.site.doctor.check_result import CheckResult
-from edge.devices.playback.playback_clock import RealTime
-from edge.devices.simulated.aircraft import SimulatedAircraft
+from edge.mavlink.dialect import mavlink as M
+from edge.mavlink.link.signing import Signing
 from edge.mavlink.link.transport import Udp, Url
-from edge.mavlink.roles.autopilot import Autopilot
+from tests.support.vehicle_link import autopilot as simulated_autopilot
 
 
-def examine_link(url: str, patience_s: float = 0.5) -> CheckResult:
-    return selection._check_autopilot(UavConfig(id="drone", mavlink=MavlinkConfig(url=url)), patience_s)
+def examine(url: str, patience_s: float = 0.5, **options: Any) -> list[CheckResult]:
+    config = UavConfig(id="drone", mavlink=MavlinkConfig(url=url, **options))
+    return list(autopilot.check(config, patience_s, listen_s=1.2))
+
+
+def examine_link(url: str) -> CheckResult:
+    (found,) = examine(url)
+    return found
 
 
 def free_port() -> int:
@@ -49,13 +55,24 @@ def looping(step: object) -> Iterator[None]:
         thread.join()
 
 
-def test_an_autopilot_that_waits_for_a_caller_is_found() -> None:
-    transport = Udp(Url("udpin", "127.0.0.1", 0), bound=True)
-    autopilot, clock = Autopilot(SimulatedAircraft(), transport, system=7), RealTime(time.time())
-    with looping(lambda: autopilot.step(clock.now())):
-        found = examine_link(f"udpout:127.0.0.1:{transport.port}", 20.0)
-    transport.close()
-    assert (found.verdict, found.text) == ("ok", "heartbeat of system 7")
+def test_of_an_autopilot_that_does_not_forward_the_parameter_is_named() -> None:
+    with simulated_autopilot(system=7, firmware=M.MAV_AUTOPILOT_PX4) as (simulated, port):
+        simulated.parameters["MAV_1_FORWARD"] = 0.0
+        heartbeat, telemetry, station = examine(f"udpout:127.0.0.1:{port}", 20.0, rate_hz=20.0)
+    assert (heartbeat.verdict, heartbeat.text) == ("ok", "heartbeat of system 7")
+    assert telemetry.verdict == "ok", telemetry.text
+    assert "of 20 requested" in telemetry.text
+    assert (station.verdict, station.text) == ("warn", "none is heard; MAV_1_FORWARD = 0")
+
+
+def test_without_the_key_of_an_autopilot_that_signs_this_is_named(tmp_path: Path) -> None:
+    key = tmp_path / "key"
+    key.write_bytes(bytes(range(32)))
+    with simulated_autopilot(signing=Signing(key.read_bytes())) as (_, port):
+        heartbeat, telemetry, _ = examine(f"udpout:127.0.0.1:{port}", 20.0)
+    assert heartbeat.verdict == "ok"
+    assert "signs its messages" in telemetry.text
+    assert telemetry.remedy == "set key in [mavlink]"
 
 
 def test_a_missing_serial_port_is_a_failure() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
-from deploy.site.doctor import agent, machine, selection
+from deploy.site.doctor import agent, autopilot, machine, selection
 from deploy.site.doctor.check_result import CheckResult, exit_status, misconfigured, ok, unavailable, warn
 from edge.agents.clock_quality import kernel_clock
 from edge.devices.base import DeviceInfo, Frame
@@ -231,11 +231,51 @@ class Vehicle:
         (Vehicle(), "fail", "TX to RX"),
         (Vehicle(problem="/dev/ttyAMA0: Permission denied"), "fail", "group dialout"),
         (Vehicle(problem="Address already in use"), "fail", "stop the agent"),
+        (Vehicle(problem="the autopilot signs with another key"), "fail", "the same key in both"),
         (Vehicle(counters=Counter(garbage=40)), "fail", "baud rate, MAVLink 2"),
     ],
 )
 def test_mavlink(link: Vehicle, verdict: str, remedy: str) -> None:
-    check(agent.mavlink(link, now=lambda: link.time), verdict, remedy)
+    check(autopilot.wait_for_heartbeat(link, now=lambda: link.time), verdict, remedy)
+
+
+ATTITUDES = [0.02 * k for k in range(100)]
+FLYING = {"samples": ATTITUDES, "synchronised": True}
+
+
+@pytest.mark.parametrize(
+    ("heard", "verdict", "remedy"),
+    [
+        (FLYING, "ok", ""),
+        ({"samples": ATTITUDES}, "warn", "both directions"),
+        ({**FLYING, "samples": ATTITUDES[::5]}, "warn", "a faster port"),
+        ({}, "fail", "SERIALx_PROTOCOL = 2"),
+        ({"gimbal": True}, "fail", "MNT1_TYPE"),
+        ({"samples": ATTITUDES, "signs": True}, "fail", "set key"),
+    ],
+)
+def test_vehicle_telemetry(heard: dict[str, Any], verdict: str, remedy: str) -> None:
+    options = {name: heard[name] for name in ("gimbal", "signs") if name in heard}
+    found = autopilot.Heard(**{name: value for name, value in heard.items() if name not in options})
+    check(autopilot.telemetry(found, **{"gimbal": False, "rate_hz": 50.0, **options}), verdict, remedy)
+
+
+@pytest.mark.parametrize(
+    ("firmware", "parameters", "text", "remedy"),
+    [
+        ("PX4", {"MAV_0_FORWARD": 1e-45, "MAV_1_FORWARD": 0.0}, "MAV_1_FORWARD = 0", "set MAV_x_FORWARD = 1"),
+        ("PX4", {"MAV_1_FORWARD": 1e-45}, "none is heard", "two --out do not meet"),
+        ("ArduPilot", {"SERIAL2_OPTIONS": 1024.0}, "SERIAL2_OPTIONS has bit 10", "clear bit 10"),
+        ("ArduPilot", {"SERIAL2_OPTIONS": 8.0}, "none is heard", "two --out do not meet"),
+    ],
+)
+def test_what_keeps_camera_and_ground_station_apart_is_named(
+    firmware: str, parameters: dict[str, float], text: str, remedy: str
+) -> None:
+    found = autopilot.ground_station(autopilot.Heard(firmware=firmware, parameters=parameters))
+    check(found, "warn", remedy)
+    assert text in found.text
+    check(autopilot.ground_station(autopilot.Heard(stations={255})), "ok")
 
 
 def test_no_certificates() -> None:
