@@ -55,8 +55,6 @@ class RejectionReason(Enum):
     BAD_TEXT = "bad_text"
     WRONG_SENDER = "wrong_sender"
     UNKNOWN_KEY = "unknown_key"
-    PLAIN_PUBLISHER = "plain_publisher"
-    """Not from an advanced publisher, so it has no sequence number and losses would not be detected."""
     WRONG_SOURCE = "wrong_source"
     """Its boot id belongs to an agent that publishes over another connection."""
     SECOND_AGENT = "second_agent"

@@ -67,11 +67,10 @@ class SenderValidator:
             if boot in agent.alive:
                 return RejectionReason.SECOND_AGENT, f"boot {boot[:12]} beside {agent.alive[0][:12]}"
             return RejectionReason.WRONG_SOURCE, f"boot {boot[:12]} is not that of the agent that is alive"
-        if not received.source:
-            return None
         known = self._sources.get(boot)
         if known is not None and known[0] != received.source and now - known[1] < SOURCE_TIMEOUT_S:
-            return RejectionReason.WRONG_SOURCE, f"boot {boot[:12]} speaks from {known[0]}, not from {received.source}"
+            here, there = known[0] or "a plain publisher", received.source or "a plain publisher"
+            return RejectionReason.WRONG_SOURCE, f"boot {boot[:12]} speaks from {here}, not from {there}"
         if known is None and len(self._sources) >= _MAX_SOURCES:
             self._sources = {b: s for b, s in self._sources.items() if now - s[1] < SOURCE_TIMEOUT_S}
         if known is not None or len(self._sources) < _MAX_SOURCES:

@@ -14,6 +14,10 @@ which it should not:
 Therefore a publisher whose first message is not number 0 is queried once more for the earlier ones, and a publisher
 whose sequence numbers have a gap is queried for it until the cache has confirmed that it has no more of it. Its
 messages are held back meanwhile. A witness confirms that the query reached the cache: a message that it must have.
+
+What a sender says of its publisher's identity and numbers is not authenticated, only its right to a key is. So nothing
+that is learned on one key has an effect on another, and a number far ahead of all others silences nobody: while a gap
+is open, the messages that continue the numbers before it are delivered, and what opened it was not of their publisher.
 """
 
 from __future__ import annotations
@@ -33,9 +37,10 @@ GAP_TIMEOUT_S = 30.0
 """The same for a gap: the missing messages then count as lost."""
 RETRY_S = 0.3
 """Pause between two queries for one gap."""
-_MAX_SOURCES = 16_384
-_MAX_BYTES = 64 * 1024 * 1024
-"""Bytes held back at once, of all publishers together."""
+_MAX_SOURCES, _MAX_OF_KEY = 16_384, 16
+"""Publishers that are remembered, and of these of one key: an agent that restarts again and again has as many."""
+_MAX_BYTES, _MAX_BYTES_OF_KEY = 64 * 1024 * 1024, 8 * 1024 * 1024
+"""Bytes held back at once, of all publishers together and of one."""
 _SEQUENCE_MODULUS = 2**32
 
 
@@ -58,7 +63,6 @@ class RecoveryQuery(Generic[_Source]):
 class _PendingMessages:
     """Messages of one publisher that are held back until its messages low to first - 1 have arrived."""
 
-    key: str
     low: int
     first: int
     joining: bool
@@ -66,8 +70,10 @@ class _PendingMessages:
     question: int
     due: float | None = None
     """When to query again; None while a query is open."""
-    early: dict[int, tuple[str, bytes]] = field(default_factory=dict)
-    later: deque[tuple[int, str, bytes]] = field(default_factory=deque)
+    continued: bool = False
+    """Whether messages that continue those before the gap arrived meanwhile."""
+    early: dict[int, bytes] = field(default_factory=dict)
+    later: deque[tuple[int, bytes]] = field(default_factory=deque)
     bytes: int = 0
 
 
@@ -89,40 +95,45 @@ class Backfill(Generic[_Source]):
         self._ask = ask
         self._lost = lost
         self._clock = clock
-        self._next: dict[_Source, int] = {}
-        self._held: dict[_Source, _PendingMessages] = {}
+        self._next: dict[tuple[str, _Source], int] = {}
+        self._held: dict[tuple[str, _Source], _PendingMessages] = {}
+        self._of_key: dict[str, list[_Source]] = {}
         self._questions = 0
         self._bytes = 0
         self._lock = threading.Lock()
 
     def take(self, source: _Source, number: int, key: str, payload: bytes) -> None:
         """Process a message from the transport; duplicates by sequence number are discarded."""
+        who = key, source
         with self._lock:
-            expected = self._next.get(source)
+            expected = self._next.get(who)
             if expected == number:  # nearly always the case
-                self._next[source] = (number + 1) % _SEQUENCE_MODULUS
+                self._next[who] = (number + 1) % _SEQUENCE_MODULUS
                 self._push(source, key, payload)
                 return
-            question = self._out_of_sequence(source, expected, number, key, payload)
+            question = self._out_of_sequence(who, expected, number, payload)
         if question is not None:
             self._ask(question)
 
-    def answer(self, source: _Source, number: int, key: str, payload: bytes) -> None:
+    def answer(self, query: RecoveryQuery[_Source], number: int, key: str, payload: bytes) -> None:
         """Process one reply to a query."""
         with self._lock:
-            held = self._held.get(source)
-            if held is not None and held.low <= number < held.first and number not in held.early:
-                held.early[number] = (key, payload)
+            held = self._held.get((query.key, query.source))
+            if held is None or key != query.key:
+                return
+            if held.low <= number < held.first and number not in held.early:
+                held.early[number] = payload
                 self._keep(held, len(payload))
 
-    def finish(self, source: _Source, question: int, served: bool) -> None:
+    def finish(self, query: RecoveryQuery[_Source], served: bool) -> None:
         """Process the end of a query's replies. served: its witness was among them."""
+        who = query.key, query.source
         with self._lock:
-            held = self._held.get(source)
-            if held is None or held.question != question:
+            held = self._held.get(who)
+            if held is None or held.question != query.number:
                 return
             if held.joining or served or len(held.early) == held.first - held.low:
-                follow = self._release(source)
+                follow = self._release(who)
             else:
                 held.due, follow = self._clock() + RETRY_S, None
         if follow is not None:
@@ -135,11 +146,12 @@ class Backfill(Generic[_Source]):
         now = self._clock()
         queries: list[RecoveryQuery[_Source]] = []
         with self._lock:
-            for source, held in list(self._held.items()):
-                if now - held.since > (JOIN_TIMEOUT_S if held.joining else GAP_TIMEOUT_S) or self._bytes > _MAX_BYTES:
-                    follow = self._release(source)
+            for who, held in list(self._held.items()):
+                too_much = held.bytes > _MAX_BYTES_OF_KEY or self._bytes > _MAX_BYTES
+                if too_much or now - held.since > (JOIN_TIMEOUT_S if held.joining else GAP_TIMEOUT_S):
+                    follow = self._release(who)
                 elif held.due is not None and now >= held.due:
-                    follow = self._question(source, held)
+                    follow = self._question(who, held)
                 else:
                     continue
                 if follow is not None:
@@ -148,77 +160,113 @@ class Backfill(Generic[_Source]):
             self._ask(question)
 
     def _out_of_sequence(
-        self, source: _Source, expected: int | None, number: int, key: str, payload: bytes
+        self, who: tuple[str, _Source], expected: int | None, number: int, payload: bytes
     ) -> RecoveryQuery[_Source] | None:
-        held = self._held.get(source)
+        key, source = who
+        held = self._held.get(who)
         if held is not None:
-            held.later.append((number, key, payload))
+            if number == held.low and not held.joining:
+                self._continue(who, held, payload)
+                return self._release(who) if held.low == held.first else None
+            held.later.append((number, payload))
             self._keep(held, len(payload))
             return None
         if expected is None:
-            self._forget_some()
+            self._remember(who)
             if number == 0:
-                self._next[source] = 1
+                self._next[who] = 1
                 self._push(source, key, payload)
                 return None
-            return self._hold(source, 0, number, key, payload, joining=True)
+            return self._hold(who, 0, number, payload, joining=True)
         if (number - expected) % _SEQUENCE_MODULUS >= _SEQUENCE_MODULUS // 2:
             return None
         if number < expected:  # a gap at the wrap-around of the sequence numbers: once in years
             self._lost((number - expected) % _SEQUENCE_MODULUS)
-            self._next[source] = number + 1
+            self._next[who] = number + 1
             self._push(source, key, payload)
             return None
-        return self._hold(source, expected, number, key, payload, joining=False)
+        return self._hold(who, expected, number, payload, joining=False)
 
     def _hold(
-        self, source: _Source, low: int, first: int, key: str, payload: bytes, *, joining: bool
+        self, who: tuple[str, _Source], low: int, first: int, payload: bytes, *, joining: bool
     ) -> RecoveryQuery[_Source]:
-        held = self._held[source] = _PendingMessages(key, low, first, joining, self._clock(), 0)
-        self._next[source] = -1  # no message is in sequence while these are held back
-        held.later.append((first, key, payload))
+        held = self._held[who] = _PendingMessages(low, first, joining, self._clock(), 0)
+        self._next[who] = -1  # no message is in sequence while these are held back
+        held.later.append((first, payload))
         self._keep(held, len(payload))
-        return self._question(source, held)
+        return self._question(who, held)
 
-    def _question(self, source: _Source, held: _PendingMessages) -> RecoveryQuery[_Source]:
+    def _continue(self, who: tuple[str, _Source], held: _PendingMessages, payload: bytes) -> None:
+        """Deliver the message that the gap begins with, and what was fetched of those that follow it."""
+        key, source = who
+        held.continued = True
+        self._push(source, key, payload)
+        held.low += 1
+        while held.low in held.early:
+            self._push(source, key, held.early.pop(held.low))
+            held.low += 1
+
+    def _question(self, who: tuple[str, _Source], held: _PendingMessages) -> RecoveryQuery[_Source]:
         self._questions += 1
         held.question, held.due = self._questions, None
         # The newest one: by the time of the reply the cache may have dropped older ones.
         witness = None if held.joining else held.later[-1][0]
-        return RecoveryQuery(source, held.key, held.low, held.first - 1, witness, held.question)
+        return RecoveryQuery(who[1], who[0], held.low, held.first - 1, witness, held.question)
 
-    def _release(self, source: _Source) -> RecoveryQuery[_Source] | None:
+    def _release(self, who: tuple[str, _Source]) -> RecoveryQuery[_Source] | None:
         """Deliver everything in order up to the next gap, and return the query for that gap."""
-        held = self._held.pop(source)
+        key, source = who
+        held = self._held.pop(who)
         self._bytes -= held.bytes
+        if held.continued and held.low < held.first:
+            # The numbers went on where they had been: what was far ahead of them was another's.
+            self._next[who] = held.low
+            return None
         for _, message in sorted(held.early.items()):
-            self._push(source, *message)
+            self._push(source, key, message)
         missing = held.first - held.low - len(held.early)
         if missing and not held.joining:
             self._lost(missing)
         expected = held.first
         while held.later:
-            number, key, payload = held.later.popleft()
+            number, payload = held.later.popleft()
             behind = (number - expected) % _SEQUENCE_MODULUS >= _SEQUENCE_MODULUS // 2
             if number > expected and not behind:
-                question = self._hold(source, expected, number, key, payload, joining=False)
-                rest = self._held[source]
+                question = self._hold(who, expected, number, payload, joining=False)
+                rest = self._held[who]
                 rest.later.extend(held.later)
-                self._keep(rest, sum(len(one[2]) for one in held.later))
+                self._keep(rest, sum(len(one[1]) for one in held.later))
                 return question
             if not behind:
                 self._push(source, key, payload)
                 expected = (number + 1) % _SEQUENCE_MODULUS
-        self._next[source] = expected
+        self._next[who] = expected
         return None
 
     def _keep(self, held: _PendingMessages, size: int) -> None:
         held.bytes += size
         self._bytes += size
 
-    def _forget_some(self) -> None:
-        """Forget the oldest of very many publishers; their later messages are treated as a late joiner's."""
-        if len(self._next) >= _MAX_SOURCES:
-            for source in list(self._next)[: _MAX_SOURCES // 4]:
-                if source not in self._held:
-                    del self._next[source]
+    def _remember(self, who: tuple[str, _Source]) -> None:
+        """Forget old publishers, of the same key first; their later messages are treated as a late joiner's."""
+        key, source = who
+        if len(self._next) >= _MAX_SOURCES and key not in self._of_key:
+            for one in list(self._next)[: _MAX_SOURCES // 4]:
+                self._forget(one)
+        sources = self._of_key.setdefault(key, [])
+        if len(sources) >= _MAX_OF_KEY:
+            self._forget((key, sources[0]))
+        self._of_key.setdefault(key, []).append(source)
+
+    def _forget(self, who: tuple[str, _Source]) -> None:
+        key, source = who
+        if who in self._held:
+            self._release(who)
+        held = self._held.pop(who, None)  # of a second gap
+        self._bytes -= 0 if held is None else held.bytes
+        self._next.pop(who, None)
+        sources = self._of_key.get(key, [])
+        if source in sources:
+            sources.remove(source)
+        if not sources:
+            self._of_key.pop(key, None)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import heapq
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
+
+from google.protobuf.message import Message
 
 from protocols.bus.base import AgentEvent, Received, Refusal
 from protocols.core.names import name_of_segment
@@ -14,6 +17,10 @@ from protocols.validation.codec import MAX_PAYLOAD, Rejected, RejectionReason, a
 
 MAX_BYTES = 64 * 1024 * 1024
 """Upper bound of one inbox in bytes, so that a reader that has stopped does not exhaust the memory."""
+MAX_BYTES_OF_KEY = MAX_BYTES // 4
+"""The same of one sender, twice as much of images: who floods pays, not the others."""
+_MAX_NUMBERED = 4096
+"""Boots of plain publishers whose last number is remembered."""
 _MAX_REFUSALS = 256
 """Rejections that are kept for reports; all of them are counted."""
 
@@ -28,25 +35,43 @@ class Inbox:
     def __init__(self, topic: Topic, clock_ns: Callable[[], int] = time.time_ns) -> None:
         self._clock_ns = clock_ns
         self._capacity = topic.queue
-        self._queue: deque[tuple[str, bytes, int, str]] = deque()
-        self._bytes = 0
+        self._most_of_key = MAX_BYTES_OF_KEY * (2 if topic.bulky else 1)
+        self._queues: dict[str, deque[tuple[int, bytes, int, str, bool]]] = {}
+        self._sizes: Counter[str] = Counter()
+        self._length = self._bytes = self._order = 0
+        self._newest: dict[tuple[str, str], int] = {}
         self._refusals: list[Refusal] = []
         self._ready = threading.Condition()
         self._counts: Counter[str] = Counter(received=0, dropped=0, lost=0)
 
-    def push(self, key: str, payload: bytes, source: str = "") -> None:
-        """Queue one sample; the oldest is dropped and counted when the queue is full."""
+    def push(self, key: str, payload: bytes, source: str = "", *, numbered: bool = True) -> None:
+        """Queue one sample; where the queue is full, the oldest of who has most in it is dropped and counted.
+
+        numbered: whether the transport counts its publisher's messages; otherwise losses show in their own numbers.
+        """
         if len(payload) > MAX_PAYLOAD:
             self.refuse(Rejected(RejectionReason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD}"), key)
             return
         now = self._clock_ns()
         with self._ready:
-            self._bytes += len(payload)
-            while self._queue and (len(self._queue) >= self._capacity or self._bytes > MAX_BYTES):
-                self._bytes -= len(self._queue.popleft()[1])
-                self._counts["dropped"] += 1
-            self._queue.append((key, payload, now, source))
+            self._order += 1
+            self._queues.setdefault(key, deque()).append((self._order, payload, now, source, numbered))
+            self._add(key, 1, len(payload))
+            while self._sizes[key] > self._most_of_key:
+                self._drop(key)
+            while self._length > self._capacity or self._bytes > MAX_BYTES:
+                by_count = self._length > self._capacity
+                self._drop(max(self._queues, key=lambda one: len(self._queues[one]) if by_count else self._sizes[one]))
             self._ready.notify_all()
+
+    def _add(self, key: str, count: int, size: int) -> None:
+        self._length += count
+        self._bytes += size
+        self._sizes[key] += size
+
+    def _drop(self, key: str) -> None:
+        self._add(key, -1, -len(self._queues[key].popleft()[1]))
+        self._counts["dropped"] += 1
 
     def refuse(self, error: Rejected, key: str, sequence: int | None = None) -> None:
         """Count one rejected message, and keep it for ``refusals``."""
@@ -76,23 +101,40 @@ class Inbox:
     def drain(self) -> list[Received]:
         """Decode and validate everything that is queued."""
         with self._ready:
-            queue, self._queue, self._bytes = self._queue, deque(), 0
+            queues, self._queues = self._queues, {}
+            self._sizes.clear()
+            self._length = self._bytes = 0
         messages: list[Received] = []
-        for key, payload, arrival_ns, source in queue:
+        merged = heapq.merge(*([(item[0], key, item) for item in queue] for key, queue in queues.items()))
+        for _, key, (_, payload, arrival_ns, source, numbered) in merged:
             try:
                 address, message = admit(key, payload)
             except Rejected as error:
                 self.refuse(error, key, error.sequence)
                 continue
+            if not numbered:
+                self._count_gap(key, message)
             messages.append(Received(address.topic, address.agent, message, arrival_ns, source))
         with self._ready:
             self._counts["received"] += len(messages)
         return messages
 
+    def _count_gap(self, key: str, message: Message) -> None:
+        """Count the losses of a plain publisher by the numbers in its messages."""
+        number, boot = getattr(message, "sequence", None), getattr(message, "boot_id", "")
+        if number is None:
+            return
+        newest = self._newest.pop((key, boot), number - 1)
+        if len(self._newest) >= _MAX_NUMBERED:
+            del self._newest[next(iter(self._newest))]
+        self._newest[key, boot] = max(newest, number)
+        if number > newest + 1:
+            self.count_lost(number - newest - 1)
+
     def wait(self, timeout_s: float) -> bool:
         """Wait until something is queued."""
         with self._ready:
-            return self._ready.wait_for(lambda: bool(self._queue), timeout_s)
+            return self._ready.wait_for(lambda: self._length > 0, timeout_s)
 
     @property
     def counters(self) -> Mapping[str, int]:

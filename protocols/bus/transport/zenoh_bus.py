@@ -130,7 +130,7 @@ class ZenohSubscription:
         self._inbox = Inbox(topic, clock_ns)
         self._reliable = topic.delivery is Delivery.RELIABLE
         self._backfill: Backfill[_Source] = Backfill(self._push, self._ask, self._inbox.count_lost)
-        self._newest: dict[_Source, int] = {}
+        self._newest: dict[tuple[str, _Source], int] = {}
         self._keys = _DeclaredKeys(session)
         recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
         with zenoh_call(f"subscribe {key}"):
@@ -148,27 +148,31 @@ class ZenohSubscription:
     def _take(self, sample: zenoh.Sample) -> None:
         if sample.kind != zenoh.SampleKind.PUT:
             return
-        source, key = sample.source_info, str(sample.key_expr)
-        if source is None:
-            self._inbox.refuse(Rejected(RejectionReason.PLAIN_PUBLISHER, "not from an advanced publisher"), key)
+        source, key, payload = sample.source_info, str(sample.key_expr), sample.payload.to_bytes()
+        if parse_key(key) is None:  # nothing is remembered of it
+            self._inbox.refuse(Rejected(RejectionReason.UNKNOWN_KEY, key[:200]), key)
             return
         self._keys.meet(key)
+        if source is None:
+            # A plain publisher, as zenoh-pico's: without recovery, and its gaps are those of its own numbers.
+            self._inbox.push(key, payload, numbered=False)
+            return
         name = (str(source.source_id.zid), source.source_id.eid)
         if self._reliable:
-            self._backfill.take(name, source.source_sn, key, sample.payload.to_bytes())
+            self._backfill.take(name, source.source_sn, key, payload)
         else:
-            self._count_gap(name, source.source_sn)
-            self._push(name, key, sample.payload.to_bytes())
+            self._count_gap((key, name), source.source_sn)
+            self._push(name, key, payload)
 
-    def _count_gap(self, source: _Source, number: int) -> None:
+    def _count_gap(self, publisher: tuple[str, _Source], number: int) -> None:
         """Count the losses of a topic that is not recovered."""
-        newest = self._newest.get(source)
+        newest = self._newest.get(publisher)
         if newest is None and len(self._newest) >= _MAX_KEYS:
             self._newest.clear()
         if newest is None or newest < number:
             if newest is not None and number > newest + 1:
                 self._inbox.count_skipped(number - newest - 1)
-            self._newest[source] = number
+            self._newest[publisher] = number
 
     def _push(self, source: _Source, key: str, payload: bytes) -> None:
         self._inbox.push(key, payload, source[0])
@@ -182,7 +186,7 @@ class ZenohSubscription:
             sample = reply.ok
             if sample is not None and sample.source_info is not None:
                 number = sample.source_info.source_sn
-                self._backfill.answer(source, number, str(sample.key_expr), sample.payload.to_bytes())
+                self._backfill.answer(question, number, str(sample.key_expr), sample.payload.to_bytes())
 
         def witnessed(reply: zenoh.Reply) -> None:
             nonlocal served
@@ -194,7 +198,7 @@ class ZenohSubscription:
                 still_open -= 1
                 ended = still_open == 0
             if ended:
-                self._backfill.finish(source, question.number, served)
+                self._backfill.finish(question, served)
 
         def get(low: int, high: int, take: Callable[[zenoh.Reply], None]) -> None:
             with zenoh_call(f"fetch {question.key}"):
@@ -212,7 +216,7 @@ class ZenohSubscription:
                 # Sent after the other query on the same route: if this one is answered, so was that one.
                 get(question.witness, question.witness, witnessed)
         except BusDead:
-            self._backfill.finish(source, question.number, served=False)
+            self._backfill.finish(question, served=False)
 
     def drain(self) -> list[Received]:
         """Everything since the last call."""

@@ -15,7 +15,8 @@ from protocols.bus.base import AgentEvent, Bus, BusDead, BusStopped, Received
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.backfill import RecoveryQuery
-from protocols.bus.transport.inbox import MAX_BYTES, Inbox
+from protocols.bus.transport.inbox import MAX_BYTES, MAX_BYTES_OF_KEY, Inbox
+from protocols.bus.transport.session import open_session
 from protocols.bus.transport.zenoh_bus import ZenohSubscription, open_bus
 from protocols.core.errors import InputError
 from protocols.messages import syncline_pb2 as pb
@@ -61,7 +62,7 @@ def test_a_gap_that_zenoh_gave_up_is_asked_for_until_the_cache_has_answered(monk
     def broken_at_first(self: ZenohSubscription, question: RecoveryQuery[tuple[str, int]]) -> None:
         asked.append(question)
         if len(asked) == 1:
-            self._backfill.finish(question.source, question.number, served=False)
+            self._backfill.finish(question, served=False)
         else:
             ask(self, question)
 
@@ -158,12 +159,43 @@ def test_a_reader_that_stands_still_holds_so_many_bytes_and_no_more() -> None:
     inbox = Inbox(OBSERVATION)
     for index in range(100):
         inbox.push("syncline/local/camera/cam0/observation", bytes([index]) * 1_000_000)
-    kept = MAX_BYTES // 1_000_000
+    kept = MAX_BYTES_OF_KEY // 1_000_000
     assert inbox.counters["dropped"] == 100 - kept
     inbox.drain()
     for index in range(kept):
         inbox.push("syncline/local/camera/cam0/observation", bytes([index]) * 1_000_000)
     assert inbox.counters["dropped"] == 100 - kept
+    for index in range(400):
+        inbox.push(f"syncline/local/camera/cam{index % 10}/observation", bytes([index % 256]) * 1_000_000)
+    assert inbox._bytes <= MAX_BYTES
+
+
+def test_who_floods_loses_messages_and_the_others_none() -> None:
+    """A full queue dropped the oldest message, whoever had sent it."""
+    inbox = Inbox(OBSERVATION)
+    for index in range(100):
+        inbox.push("syncline/local/camera/cam1/observation", observation("cam1", index).SerializeToString())
+    for _ in range(70_000):
+        inbox.push("syncline/local/camera/cam0/observation", b"garbage")
+    kept = inbox.drain()
+    assert sequences(kept) == list(range(100))
+    assert inbox.counters["dropped"] == 100 + 70_000 - OBSERVATION.queue
+
+
+def test_a_plain_publisher_takes_part_and_its_gaps_are_counted() -> None:
+    """A camera of a third party, as with zenoh-pico: no cache, no numbers of the transport."""
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(OBSERVATION)
+        plain = open_session(config)
+        publisher = plain.declare_publisher(OBSERVATION.key_for("local", "GoPro 2"))
+        assert eventually(lambda: bool(publisher.matching_status.matching))
+        for number in (0, 1, 2, 5, 6):
+            publisher.put(observation("GoPro 2", number).SerializeToString())
+        assert sequences(collect(subscription, 5)) == [0, 1, 2, 5, 6]
+        assert subscription.counters["lost"] == 2
+        plain.close()
 
 
 def test_an_outage_of_the_router_loses_nothing() -> None:

@@ -32,10 +32,10 @@ class Stage:
 
     def answer(self, *numbers: int, served: bool = True) -> None:
         """The answers to the last question, and their end."""
-        source = self.asked[-1].source
+        query = self.asked[-1]
         for number in numbers:
-            self.backfill.answer(source, number, f"key-{source}", f"{source}{number}".encode())
-        self.backfill.finish(source, self.asked[-1].number, served)
+            self.backfill.answer(query, number, query.key, f"{query.source}{number}".encode())
+        self.backfill.finish(query, served)
 
     def after(self, seconds: float) -> None:
         self.now += seconds
@@ -110,9 +110,9 @@ def test_the_end_of_an_older_question_is_no_answer() -> None:
     stage.answer(served=False)
     stage.after(2 * RETRY_S)
     first, second = stage.asked
-    stage.backfill.finish("a", first.number, served=True)
+    stage.backfill.finish(first, served=True)
     assert stage.out == names(0)
-    stage.backfill.finish("a", second.number, served=True)
+    stage.backfill.finish(second, served=True)
     assert stage.out == names(0, 3)
     assert stage.lost == 2
 
@@ -151,3 +151,53 @@ def test_what_comes_twice_is_left_out() -> None:
     stage.answer(4, 4, served=False)
     assert stage.out == names(0, 1, 2, 3, 4, 5, 6)
     assert stage.lost == 0
+
+
+def test_another_s_identity_on_one_s_own_key_silences_nobody() -> None:
+    """One put with another camera's source id silenced that camera, with certificates too."""
+    stage = Stage()
+    stage.take("a", 0, 1, 2)
+    stage.backfill.take("a", 2**31, "key-forger", b"forged")
+    stage.take("a", 3, 4)
+    stage.after(GAP_TIMEOUT_S + 1.0)
+    stage.take("a", 5)
+    assert [text for text in stage.out if text != "forged"] == names(0, 1, 2, 3, 4, 5)
+
+
+def test_a_forged_number_on_one_s_key_delays_and_silences_nobody() -> None:
+    """Where anyone may publish on any key: the numbers that continue are the publisher's."""
+    stage = Stage()
+    stage.take("a", 0, 1, 2)
+    stage.take("a", 1_000_000)
+    stage.take("a", 3, 4)
+    assert stage.out == names(0, 1, 2, 3, 4)
+    stage.answer(served=False)
+    stage.after(GAP_TIMEOUT_S + 1.0)
+    stage.take("a", 5, 6)
+    assert stage.out == names(0, 1, 2, 3, 4, 5, 6)
+    assert stage.lost == 0
+
+
+def test_a_gap_whose_messages_arrive_late_is_closed_by_them() -> None:
+    stage = Stage()
+    stage.take("a", 0, 3, 4, 1, 2, 5)
+    assert stage.out == names(0, 1, 2, 3, 4, 5)
+
+
+def test_replies_on_another_key_are_left_out() -> None:
+    stage = Stage()
+    stage.take("a", 0, 2)
+    stage.backfill.answer(stage.asked[-1], 1, "key-forger", b"forged")
+    assert "forged" not in stage.out
+    stage.answer(1)
+    assert stage.out == names(0, 1, 2)
+
+
+def test_invented_publishers_of_one_key_are_forgotten_first() -> None:
+    stage = Stage()
+    stage.take("a", 0, 1)
+    for number in range(1000):
+        stage.backfill.take(f"x{number}", 0, "key-forger", b"forged")
+    assert len(stage.backfill._next) < 20
+    stage.take("a", 2)
+    assert stage.out[-1] == "a2"

@@ -53,6 +53,14 @@ def test_a_run_speaks_through_one_connection_until_that_is_silent() -> None:
     assert reason(guard, message("boot-1", "b"), 2.0 + SOURCE_TIMEOUT_S) is None
 
 
+def test_a_plain_publisher_does_not_speak_for_another_s_run() -> None:
+    guard = SenderValidator()
+    assert reason(guard, message("boot-1", "a"), 0.0) is None
+    assert reason(guard, message("boot-1", ""), 1.0) is RejectionReason.WRONG_SOURCE
+    assert reason(guard, message("boot-2", ""), 1.0) is None
+    assert reason(guard, message("boot-2", "a"), 2.0) is RejectionReason.WRONG_SOURCE
+
+
 def test_a_flood_of_invented_runs_does_not_fill_the_memory() -> None:
     guard = SenderValidator()
     for number in range(10_000):
