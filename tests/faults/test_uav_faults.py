@@ -1,14 +1,17 @@
-"""A million bytes of noise, and silences, on the UAV agent's link."""
+"""Noise, silences, and other components' clocks on the UAV agent's link."""
 
 from __future__ import annotations
 
 import random
 
 import numpy as np
+import pytest
 
 from edge.mavlink.dialect import mavlink
+from edge.uav.navigation import rotation_from_quaternion
 from edge.uav.world.patrol import patrol_world
 from protocols.messages import syncline_pb2 as pb
+from tests.faults.matrix import measured
 from tests.support.uav_flights import Flight
 
 SIZE = (320, 240)
@@ -83,3 +86,49 @@ def test_an_attitude_of_nan_is_refused_and_the_flight_goes_on() -> None:
     last = flight.messages(pb.TargetState)[-1]
     truth = flight.world.truth(last.frame)
     assert np.hypot(last.centre[0] - truth.x, last.centre[1] - truth.y) < 10.0
+
+
+@pytest.mark.parametrize("ahead_s", [86_400.0, 40.0])
+def test_a_companions_attitude_with_a_clock_of_its_own_does_not_touch_the_target(ahead_s: float) -> None:
+    flight = Flight(patrol_world(3, 10.0, SIZE))
+    flight.run(1.5)
+    assert flight.select()
+    companion = mavlink.MAVLink(None, 1, 191)
+    wire = flight.agent_pipe.other
+    assert wire is not None
+    for _ in range(10):
+        boot_ms = round(flight.autopilot.boot_ns(flight.time) * 1e-6 + 1e3 * ahead_s) & 0xFFFFFFFF
+        message = mavlink.MAVLink_attitude_quaternion_message(boot_ms, 0.7, 0.7, 0.1, 0.1, 0, 0, 0)
+        wire.send(bytes(message.pack(companion)), None)
+        flight.run(flight.time + 0.15)
+    last = flight.messages(pb.TargetState)[-1]
+    truth = flight.world.truth(last.frame)
+    assert np.hypot(last.centre[0] - truth.x, last.centre[1] - truth.y) < 10.0
+    status = flight.agent.status(0)
+    assert status.counters["telemetry.refused.component"] == 10
+    assert "ATTITUDE_QUATERNION of component 191 refused" in status.message
+    measured(f"attitude of a companion computer, {ahead_s:.0f} s ahead", "refused, target kept", "10 of 10 refused")
+
+
+def test_a_gimbal_with_its_own_boot_clock_gives_places_and_the_cameras_attitude() -> None:
+    world = patrol_world(3, 10.0, SIZE)
+    ground, yaw = world.target.ground[0], float(world.target.course[0])
+    flight = Flight(
+        world, flies="follow", gimbal=(-1.2, yaw), gimbal_ahead_s=45.0, start=np.array([*ground, -62.0]), yaw=yaw
+    )
+    flight.run(3.0)
+    assert flight.agent.status(0).state == "running"
+    camera_from_ned, centre = flight.aircraft.camera_from_ned(flight.time - 0.05, world.body_from_camera)
+    fov = flight.station.last("CAMERA_FOV_STATUS")
+    forward = rotation_from_quaternion(fov.q)[:, 0]
+    assert np.degrees(np.arccos(np.clip(forward @ camera_from_ned[2], -1.0, 1.0))) < 3.0
+    north, east, _ = flight.autopilot.origin.to_ned(1e-7 * fov.lat_image, 1e-7 * fov.lon_image, 0.0)
+    axis = camera_from_ned[2]
+    expected = centre[:2] - centre[2] / axis[2] * axis[:2]
+    assert np.hypot(north - expected[0], east - expected[1]) < 4.0
+    flight.station.command(mavlink.MAV_CMD_CAMERA_TRACK_POINT, 0.5, 0.5)
+    flight.run(4.0)
+    geo = flight.station.last("CAMERA_TRACKING_GEO_STATUS")
+    assert geo.lat != 0x7FFFFFFF
+    assert np.isfinite(geo.h_acc)
+    measured("gimbal whose clock is 45 s ahead", "places are given", f"h_acc {geo.h_acc:.1f} m")

@@ -107,6 +107,7 @@ class Flight:
     control: ControlConfig = field(default_factory=ControlConfig)
     flies: str = "path"
     gimbal: tuple[float, float] | None = None
+    gimbal_ahead_s: float = 0.0
     start: np.ndarray | None = None
     yaw: float = 0.0
     disturbances: tuple[Disturbance, ...] = ()
@@ -142,6 +143,7 @@ class Flight:
             faults=self.faults,
             seed=self.seed,
             signing=None if self.key is None else Signing(self.key),
+            gimbal_ahead_s=self.gimbal_ahead_s,
         )
         self.station = GroundStation(station_end, self.key)
         self.time = 0.0

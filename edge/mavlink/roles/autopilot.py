@@ -86,6 +86,7 @@ class Autopilot:
 
     origin: of the local NED frame. seed: of the faults. signing: signs all messages and accepts only signed ones.
     firmware: MAV_AUTOPILOT of its heartbeat. forwards: whether a link forwards, as MAV_n_FORWARD of PX4 sets it.
+    gimbal_ahead_s: how far the gimbal's clock is ahead of the autopilot's [s].
     """
 
     def __init__(
@@ -100,13 +101,14 @@ class Autopilot:
         signing: Signing | None = None,
         firmware: int = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
         forwards: Callable[[Address], bool] = lambda address: True,
+        gimbal_ahead_s: float = 0.0,
         seed: int = 0,
     ) -> None:
         self._airframe, self._transport = airframe, transport
         self.system = system
         self.origin = origin or DEFAULT_ORIGIN
         self.faults = faults or LinkFaults()
-        self._firmware, self._forwards = firmware, forwards
+        self._firmware, self._forwards, self._gimbal_ahead_s = firmware, forwards, gimbal_ahead_s
         self._random = random.Random(seed)
         self._boot_s = boot_s
         self._now = 0.0
@@ -302,10 +304,10 @@ class Autopilot:
             )
         elif kind == "GIMBAL_DEVICE_ATTITUDE_STATUS" and now.ned_from_gimbal is not None:
             flags = mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
+            own_ms = (boot_ms + round(1e3 * self._gimbal_ahead_s)) & 0xFFFFFFFF
+            q = quaternion_from_rotation(now.ned_from_gimbal)
             yield (
-                mavlink.MAVLink_gimbal_device_attitude_status_message(
-                    0, 0, boot_ms, flags, quaternion_from_rotation(now.ned_from_gimbal), 0.0, 0.0, 0.0, 0
-                ),
+                mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, own_ms, flags, q, 0.0, 0.0, 0.0, 0),
                 GIMBAL,
             )
         elif kind == "GIMBAL_MANAGER_STATUS" and now.ned_from_gimbal is not None:
