@@ -127,6 +127,11 @@ def make_agent(
     from edge.mavlink.roles.vehicle import Vehicle
 
     assert isinstance(settings, UavSettings)
+    detector = None
+    if config.detector is not None:
+        from edge.detectors.plugins import load_detector
+
+        detector = load_detector(config.detector, fps=settings.fps, seed=config.seed)
     numbers = tuple(int(part) for part in VERSION.split(".")[:3])
     bounds = config.control
     limits = GuidanceLimits(
@@ -163,6 +168,7 @@ def make_agent(
         shown=shown,
         now_ns=now_ns,
         boot_id=boot_id,
+        detector=detector,
     )
 
 

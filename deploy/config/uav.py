@@ -9,6 +9,7 @@ import msgspec
 from msgspec import Meta
 
 from deploy.config.agents import AgentConfig, OakConfig, Seconds, Seed, StrictConfig, VideoConfig
+from deploy.config.file import DetectorName
 from protocols.core.errors import InputError
 
 Degrees = Annotated[float, Meta(ge=-180.0, le=180.0)]
@@ -145,7 +146,9 @@ class UavConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """The UAV agent. rig: a rig.toml with this camera's matrix and body_from_camera, looked up by the agent's id.
 
     mount: "fixed" = on the airframe, "gimbal" = the attitude is the gimbal's, and body_from_camera refers to the gimbal
-    axes (default: the camera looks along the x axis). model, seed: of the tracker. pictures_hz, picture_width: rate of
+    axes (default: the camera looks along the x axis). model, seed: of the tracker. detector: the .toml file of an ONNX
+    network, or a detector that another package registers; a point that the operator selects then selects the object
+    detected there. pictures_hz, picture_width: rate of
     thumbnails on the bus while a view or a recorder subscribes to them, and their width [px]; 0 = never.
     """
 
@@ -158,6 +161,7 @@ class UavConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     mount: Literal["fixed", "gimbal"] = "fixed"
     model: Literal["ground", "paper", "plain"] = "ground"
     seed: Seed = 0
+    detector: DetectorName | None = None
     mavlink: MavlinkConfig = msgspec.field(default_factory=MavlinkConfig)
     control: ControlConfig = msgspec.field(default_factory=ControlConfig)
     video_out: VideoOutConfig | None = None

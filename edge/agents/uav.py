@@ -18,6 +18,7 @@ from google.protobuf.message import Message
 from edge.agents.publish_queue import PublishQueue
 from edge.agents.target_report import status_line, update_tracking_status
 from edge.agents.thumbnails import THUMBNAIL_WIDTH, thumbnail_message
+from edge.detectors.base import Detector
 from edge.devices.base import Device, Frame, Image
 from edge.mavlink.link.connection import Link, ReceivedMessage
 from edge.mavlink.link.receiver import Receiver
@@ -85,7 +86,8 @@ class UavAgent:
     """Tracks a target with the camera of one vehicle. ``step`` does the work; ``run`` adds threads and the bus.
 
     component: makes the camera component from the handler of operator commands. shown: called with every image, the
-    estimate and a line of text. now_ns: the host's monotonic clock.
+    estimate and a line of text. now_ns: the host's monotonic clock. detector: where given, a point that is selected
+    selects the box detected there.
     """
 
     def __init__(
@@ -101,7 +103,10 @@ class UavAgent:
         shown: Callable[[Image, Estimate | None, str], None] | None = None,
         now_ns: Callable[[], int] = time.monotonic_ns,
         boot_id: str | None = None,
+        detector: Detector | None = None,
     ) -> None:
+        self._detector = detector
+        self._last_image: Image | None = None
         self._device, self._link, self._vehicle, self._guidance = device, link, vehicle, guidance
         self._agent, self._settings, self._show, self._now_ns = agent, settings, shown, now_ns
         self.boot_id = uuid.uuid4().hex if boot_id is None else boot_id
@@ -334,6 +339,7 @@ class UavAgent:
             )
             self._publish(message)
             image = decode_image(message)
+        self._last_image = image
         for out in self.estimator.handle_frame(image, frame.frame, frame.device_time_ns):
             self._publish(out)
         self._update_tracking_status()
@@ -351,7 +357,7 @@ class UavAgent:
             x, y = command.left * width - 0.5, command.top * height - 0.5
             box = Box(x, y, (command.right - command.left) * width, (command.bottom - command.top) * height)
             if command.is_point:
-                box = self.estimator.box_around(x, y)
+                box = self._detected_at(x, y) or self.estimator.box_around(x, y)
             message.box.extend((box.x, box.y, box.width, box.height))
         refused = self.estimator.refused
         self._publish(message)
@@ -365,6 +371,15 @@ class UavAgent:
             self._last_visible_s = self._now_ns() / NANOSECONDS
         self._update_tracking_status()
         return accepted
+
+    def _detected_at(self, x: float, y: float) -> Box | None:
+        """The smallest box detected around a point (x, y) [px] of the last image; None without one."""
+        if self._detector is None or self._last_image is None:
+            return None
+        found = [one.box for one in self._detector.detect(self._last_image) if one.box is not None]
+        boxes = [Box(u - 0.5, v - 0.5, width, height) for u, v, width, height in found]  # from corners to pixel centres
+        around = [box for box in boxes if 0.0 <= x - box.x <= box.width and 0.0 <= y - box.y <= box.height]
+        return min(around, key=lambda box: box.width * box.height, default=None)
 
     def _check_clock_resets(self) -> None:
         """Reset the time alignment when the vehicle's or the camera's clock was reset or stepped."""

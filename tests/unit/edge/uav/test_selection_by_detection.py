@@ -1,0 +1,51 @@
+"""A point that the operator selects becomes the box of the object detected there."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from edge.agents.uav import UavAgent, UavSettings
+from edge.detectors.base import Detection, Detector
+from edge.devices.base import Frame
+from edge.mavlink.link.connection import Link
+from edge.mavlink.roles.camera import SelectTarget
+from edge.mavlink.roles.camera_messages import TrackingStatus
+from edge.mavlink.roles.vehicle import Vehicle
+
+BOXES = [(100.0, 100.0, 80.0, 60.0), (120.0, 110.0, 30.0, 20.0), (400.0, 300.0, 50.0, 40.0)]
+
+
+class Boxes:
+    def detect(self, image: Any, time_s: float | None = None, predictions: Any = ()) -> list[Detection]:
+        return [Detection(0.0, 0.0, kind="vehicle", box=box) for box in BOXES] + [Detection(1.0, 1.0)]
+
+
+def selected(detector: Detector | None, u: float, v: float) -> list[float]:
+    """The box [px] that is tracked after the point (u, v) of a 640x480 image was selected."""
+    anything = cast(Any, SimpleNamespace(begin=lambda position: None, status=TrackingStatus(), info=None))
+    vehicle = Vehicle(cast(Link, anything), gimbal=False)
+    settings = UavSettings((640, 480), 30.0, None, None, model="plain")
+    agent = UavAgent(
+        anything, anything, vehicle, lambda execute: anything, anything, "uav", settings, detector=detector
+    )
+    boxes: list[list[float]] = []
+    agent._publish = lambda message: boxes.append(list(getattr(message, "box", ())))
+    image = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    agent._take_frame(Frame(image, 0, 10**9), 10**9)
+    assert agent._execute(SelectTarget(u / 640, v / 480, u / 640, v / 480, 255))
+    return next(box for box in boxes if len(box) == 4)
+
+
+def test_the_smallest_box_around_the_point_is_selected() -> None:
+    assert selected(Boxes(), 130.0, 120.0) == pytest.approx([119.5, 109.5, 30.0, 20.0])
+    assert selected(Boxes(), 105.0, 150.0) == pytest.approx([99.5, 99.5, 80.0, 60.0])
+
+
+def test_where_nothing_is_detected_the_box_is_around_the_point() -> None:
+    for detector in (Boxes(), None):
+        x, y, width, height = selected(detector, 300.0, 50.0)
+        assert (x + 0.5 * width, y + 0.5 * height) == pytest.approx((299.5, 49.5))
