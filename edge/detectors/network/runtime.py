@@ -39,7 +39,7 @@ def open_runtime(
     check_model_file(file)
     installed = find_spec("onnxruntime") is not None
     if backend == "onnxruntime" and not installed:
-        remedy = 'pip install "syncline[onnx]", or set backend = "opencv"'
+        remedy = 'pip install onnxruntime, or set backend = "opencv"'
         raise InputError("onnxruntime is not installed", file=file, remedy=remedy)
     if installed and backend != "opencv":
         return OnnxRuntime(file, size, min(threads, os.cpu_count() or 1))
