@@ -96,6 +96,7 @@ def follow(
     from protocols.core.clocks import NANOSECONDS
     from protocols.session.rig import METRES_PER_UNIT
 
+    began = _cpu_seconds()
     known = read_known_calibration(calibration)
     limits = None if area is None else parse_area(area)
     if truth is not None:
@@ -145,7 +146,7 @@ def follow(
         kind=kind,
         command=command,
         times=times,
-        cpu_seconds=_cpu_seconds(),
+        cpu_seconds=_cpu_seconds() - began,
         warnings=warnings,
         scores=scores,
         seed=seed,

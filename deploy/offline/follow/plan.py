@@ -108,8 +108,6 @@ class PlanView:
 
     def paths(self, tracks: Sequence[FollowedTrack]) -> str:
         """All paths with their numbers, cameras, grid and scale."""
-        from deploy.offline.follow.report import track_colour
-
         scale, width, height = self._frame(_WIDTH, _MARGIN)
         parts = [f'<rect class="image" x="0.5" y="0.5" width="{at(width - 1)}" height="{at(height - 1)}"/>']
         parts += self._grid(scale, width, height)
@@ -201,3 +199,8 @@ def _state_runs(track: FollowedTrack) -> list[list[int]]:
     breaks = np.flatnonzero(np.diff(track.confirmed)) + 1
     runs = np.split(np.arange(len(track.times)), breaks)
     return [[max(int(run[0]) - 1, 0), *run.tolist()] for run in runs]
+
+
+def track_colour(number_of: int) -> str:
+    """A colour of an identity: successive numbers are far apart on the colour circle (the golden angle)."""
+    return f"hsl({round(137.508 * number_of) % 360} {62 + 14 * (number_of % 2)}% {34 + 6 * (number_of % 3)}%)"

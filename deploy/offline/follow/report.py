@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deploy.offline.follow.plan import MOST_NUMBERS, PlanView, plan_axes
+from deploy.offline.follow.plan import MOST_NUMBERS, PlanView, plan_axes, track_colour
 from hub.report.page import html_page, section
 from hub.report.svg import THIN, at, drawing, esc, line, number, points, short, text, tick_text, ticks, time_axis, whole
 from hub.report.tables import provenance, table
@@ -210,11 +210,6 @@ def _timeline(shown: Sequence[FollowedTrack], tracks: Sequence[FollowedTrack], s
         parts.append(text(_WIDTH - 6, y + row - 4, f"{short(seconds)}{THIN}s", "tick", "end"))
     parts.append(text(_LEFT + inner / 2, bottom + 32, "seconds on the reference clock", "tick", "middle"))
     return drawing(_WIDTH, bottom + 38, parts, "Identities over time")
-
-
-def track_colour(number_of: int) -> str:
-    """A colour of an identity: successive numbers are far apart on the colour circle (the golden angle)."""
-    return f"hsl({round(137.508 * number_of) % 360} {62 + 14 * (number_of % 2)}% {34 + 6 * (number_of % 3)}%)"
 
 
 def _seen(result: FollowResult, source: FollowInput, known: KnownCalibration) -> dict[str, _Seen]:

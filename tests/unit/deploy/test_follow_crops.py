@@ -1,0 +1,106 @@
+"""Pictures of heads, faces and torsos: each shows the region it is named after, in the right frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from deploy.offline.follow.crops import check_pictures, write_crops
+from deploy.offline.follow.source import FollowInput, read_known_calibration
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
+from protocols.geometry.types import Floats
+from protocols.messages import syncline_pb2 as pb
+from tests.support.crowds import SIZE, ends, places, write_calibration
+
+CAMERA, FPS, FRAMES = "left", 5.0, 6
+HEAD, TORSO, LEGS = (40, 40, 230), (60, 200, 60), (220, 90, 30)  # BGR
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    id: int
+    times: Floats
+    position: Floats
+    detections: list[tuple[str, int, int]]
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> FollowInput:
+    """A video of one camera, in which each person is a red head, a green torso and blue legs."""
+    folder = tmp_path_factory.mktemp("filmed")
+    video = folder / f"{CAMERA}.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), FPS, SIZE)
+    observations = []
+    for frame in range(FRAMES):
+        image = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
+        message = pb.Observation(camera=CAMERA, sequence=frame, device_time_ns=round(frame * NANOSECONDS / FPS))
+        for head, foot in zip(*ends(CAMERA, frame / FPS), strict=True):
+            for begin, end, colour in ((0.0, 0.17, HEAD), (0.17, 0.54, TORSO), (0.54, 1.0, LEGS)):
+                half = 0.2 * np.linalg.norm(foot - head)
+                low, high = head + begin * (foot - head), head + end * (foot - head)
+                corners = np.rint([low[0] - half, low[1], high[0] + half, high[1]]).astype(int).tolist()
+                cv2.rectangle(image, corners[:2], corners[2:], colour, -1)
+            message.detections.add(kind="person", head=head.tolist(), foot=foot.tolist())
+        writer.write(image)
+        observations.append(message)
+    writer.release()
+    times_ns = [message.device_time_ns for message in observations]
+    return FollowInput("filmed", observations, times_ns, (), {CAMERA: video})
+
+
+def track(person: int, number: int = 4) -> Track:
+    """The true track of one person, associated in every frame."""
+    times = np.arange(FRAMES) / FPS
+    place = np.array([[*places(float(time))[person], 0.0] for time in times])
+    return Track(number, times, place, [(CAMERA, frame, person) for frame in range(FRAMES)])
+
+
+def test_regions_are_cut_out_by_track_camera_and_time(filmed: FollowInput, tmp_path: Path) -> None:
+    known = read_known_calibration(write_calibration(tmp_path / "calibration.toml"))
+    out = tmp_path / "crops"
+    count = write_crops(out, filmed, [track(0), track(1, 5)], known)  # type: ignore[list-item]
+    assert sorted(path.name for path in out.iterdir()) == ["4", "5"]
+    files = sorted(path.name for path in (out / "4").iterdir())
+    assert count == len(files) + len(list((out / "5").iterdir()))
+    assert {"left_0.200_head.jpg", "left_0.200_torso.jpg", "left_1.000_head.jpg"} <= set(files)
+    assert not any(name.startswith(".") for name in files)
+    for name, colour in (("head", HEAD), ("torso", TORSO)):
+        off = []
+        for path in out.glob(f"*/*_{name}.jpg"):
+            image = cv2.imread(str(path))
+            assert image is not None
+            middle = image[image.shape[0] // 3 : -image.shape[0] // 3, image.shape[1] // 3 : -image.shape[1] // 3]
+            off.append(float(np.abs(middle.reshape(-1, 3).mean(axis=0) - colour).max()))
+        assert np.median(off) < 25  # in a frame or two another person stands before this one
+
+
+def test_a_face_is_shown_where_somebody_walks_towards_the_camera(filmed: FollowInput, tmp_path: Path) -> None:
+    known = read_known_calibration(write_calibration(tmp_path / "calibration.toml"))
+    towards = known.calibration.cameras[CAMERA].pose.position[:2]
+    times = np.arange(FRAMES) / FPS
+    for sign, faces in ((1.0, FRAMES), (-1.0, 0)):
+        step = sign * towards / np.linalg.norm(towards)
+        one = track(0, 1)
+        one.position[:, :2] = one.position[0, :2] + np.outer(times, step)
+        out = tmp_path / f"crops{sign:g}"
+        write_crops(out, filmed, [one], known)  # type: ignore[list-item]
+        assert len(list(out.glob("1/*_face.jpg"))) == faces
+        assert len(list(out.glob("1/*_head.jpg"))) == FRAMES
+
+
+def test_at_most_one_picture_between_two_wanted_times(filmed: FollowInput, tmp_path: Path) -> None:
+    known = read_known_calibration(write_calibration(tmp_path / "calibration.toml"))
+    few = FollowInput(filmed.name, filmed.observations, filmed.times_ns[::3], (), filmed.videos)
+    write_crops(tmp_path / "crops", few, [track(0)], known)  # type: ignore[list-item]
+    assert len(list((tmp_path / "crops").glob("4/*_head.jpg"))) == 3
+
+
+def test_a_session_without_pictures_is_named(filmed: FollowInput, tmp_path: Path) -> None:
+    bare = FollowInput(filmed.name, filmed.observations, filmed.times_ns, (), {})
+    with pytest.raises(InputError, match="this session has none"):
+        check_pictures(bare, tmp_path)

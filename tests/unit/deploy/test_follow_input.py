@@ -1,0 +1,168 @@
+"""What `syncline follow` reads: boxes, heads and feet, empty frames, times, units; bad input gets one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deploy.offline.follow.objects import followed_detections, object_messages, read_objects
+from deploy.offline.follow.source import FollowInput, read_follow_input, read_known_calibration
+from protocols.core.errors import InputError, Refused
+from tests.support.crowds import NAMES, SIZE, boxes_csv, ends, write_calibration
+
+SIZES = dict.fromkeys(NAMES, SIZE)
+BOXES = "camera,frame,time,x,y,width,height\n"
+
+
+def read(folder: Path, boxes: str, **options: object) -> FollowInput:
+    """Read boxes with the made-up calibration."""
+    (folder / "boxes.csv").write_text(boxes, encoding="utf-8")
+    known = read_known_calibration(write_calibration(folder / "calibration.toml"))
+    return read_follow_input(folder / "boxes.csv", known, "person", folder, **options)  # type: ignore[arg-type]
+
+
+def rows(folder: Path, text: str) -> Path:
+    """A CSV file."""
+    file = folder / "rows.csv"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def test_a_box_is_an_upright_person(tmp_path: Path) -> None:
+    table = read_objects(rows(tmp_path, BOXES + "left,0,0.5,100,200,40,-0\n".replace("-0", "160")), SIZES)
+    (message,), left = followed_detections(object_messages(table), "person", SIZES)
+    (one,) = message.detections
+    assert (list(one.head), list(one.foot)) == ([120.0, 200.0], [120.0, 360.0])
+    assert (one.u, one.v, one.size, one.kind) == (120.0, 280.0, 160.0, "person")
+    assert (message.sequence, message.device_time_ns) == (0, 500_000_000)
+    assert left.warnings == ()
+
+
+def test_a_box_that_ends_at_the_border_has_no_foot_there(tmp_path: Path) -> None:
+    text = BOXES + f"left,0,0,100,600,40,{SIZE[1] - 600}\nleft,0,0,300,0,40,90\n"
+    (message,), _ = followed_detections(object_messages(read_objects(rows(tmp_path, text), SIZES)), "person", SIZES)
+    low, high = message.detections
+    assert (list(low.head), list(low.foot)) == ([120.0, 600.0], [])
+    assert (list(high.head), list(high.foot)) == ([], [320.0, 90.0])
+
+
+def test_boxes_beyond_the_border_are_not_cut_there(tmp_path: Path) -> None:
+    text = BOXES + f"left,0,0,100,600,40,{SIZE[1] - 600}\nleft,0,0,300,-30,40,90\n"
+    (message,), _ = followed_detections(object_messages(read_objects(rows(tmp_path, text), SIZES)), "person", SIZES)
+    assert [len(one.foot) for one in message.detections] == [2, 2]
+
+
+def test_rows_of_head_and_foot_are_one_person(tmp_path: Path) -> None:
+    text = (
+        "camera,frame,time,u,v,label\n"
+        "left,3,0.1,50,20,ann-head\nleft,3,0.1,52,90,ann-foot\nleft,3,0.1,80,30,bob-head\nleft,3,0.1,9,9,marker\n"
+    )
+    (message,), left = followed_detections(object_messages(read_objects(rows(tmp_path, text), SIZES)), "person", SIZES)
+    (one,) = message.detections
+    assert (list(one.head), list(one.foot), one.label) == ([50.0, 20.0], [52.0, 90.0], "")
+    assert (one.u, one.v) == (51.0, 55.0)
+    assert left.counts.total() == 2
+
+
+def test_other_kinds_are_left_out(tmp_path: Path) -> None:
+    text = (
+        "camera,frame,time,u,v,kind,box_x,box_y,box_w,box_h\n"
+        "left,0,0,50,60,vehicle,10,10,80,80\nleft,0,0,50,60,person,10,10,80,80\nleft,0,0,50,60,marker,,,,\n"
+    )
+    messages = object_messages(read_objects(rows(tmp_path, text), SIZES))
+    for kind, ends_given in (("person", 2), ("vehicle", 0)):
+        (message,), left = followed_detections(messages, kind, SIZES)  # type: ignore[arg-type]
+        assert [(one.kind, len(one.foot)) for one in message.detections] == [(kind, ends_given)]
+        assert left.counts.total() == 2
+
+
+def test_frames_without_a_row_say_that_nobody_was_seen(tmp_path: Path) -> None:
+    lines = "".join(f"left,{frame},{0.2 * frame},100,200,40,160\n" for frame in (2, 4, 10, 12))
+    messages = object_messages(read_objects(rows(tmp_path, BOXES + lines), SIZES))
+    assert [message.sequence for message in messages] == [2, 4, 6, 8, 10, 12]
+    assert [len(message.detections) for message in messages] == [1, 1, 0, 0, 1, 1]
+    assert messages[3].device_time_ns == pytest.approx(1.6e9)
+
+
+def test_numbers_that_are_only_labels_add_no_frames(tmp_path: Path) -> None:
+    lines = "".join(f"left,{frame},{time},100,200,40,160\n" for time, frame in enumerate((1, 10**15, 3 * 10**15)))
+    assert len(object_messages(read_objects(rows(tmp_path, BOXES + lines), SIZES))) == 3
+
+
+def test_rows_are_wanted_at_the_reference_cameras_frames_or_at_a_rate(tmp_path: Path) -> None:
+    source = read(tmp_path, boxes_csv(2.0, 5.0))
+    assert source.times_ns == [round(2e8 * frame) for frame in range(10)]
+    assert read(tmp_path, boxes_csv(2.0, 5.0), fps=10.0).times_ns == [round(1e8 * index) for index in range(19)]
+    with pytest.raises(InputError, match="--fps"):
+        read(tmp_path, boxes_csv(2.0, 5.0) + "left,99999,99999999,100,200,40,160\n", fps=1000.0)
+
+
+def test_lags_of_the_calibration_are_applied(tmp_path: Path) -> None:
+    offsets = {"left": 10.0, "right": -3.0}
+    (tmp_path / "boxes.csv").write_text(boxes_csv(2.0, 5.0, offsets), encoding="utf-8")
+    known = read_known_calibration(write_calibration(tmp_path / "calibration.toml", offsets=offsets))
+    source = read_follow_input(tmp_path, known, "person", tmp_path)
+    assert source.times_ns[0] == 0
+    assert source.frame_times(known)[1] == pytest.approx(0.2)
+
+
+def bad(folder: Path, text: str) -> InputError:
+    with pytest.raises(InputError) as caught:
+        read(folder, text)
+    assert "\n" not in str(caught.value)
+    return caught.value
+
+
+@pytest.mark.parametrize(
+    ("row", "what"),
+    [
+        ("left,1,0.2,5000,200,40,160", "outside the 960x720 picture"),
+        ("left,1,0.2,100,-900,40,160", "outside the 960x720 picture"),
+        ("left,1,0.2,100,200,40,-160", "its foot is not below its head"),
+        ("left,1,0.2,100,nan,40,160", "y 'nan' is not a number"),
+        ("left,1,0.2,100,,40,160", "y '' is not a number"),
+        ("left,1,soon,100,200,40,160", "time 'soon' is not a number"),
+        ("left,1,1e18,100,200,40,160", "time '1e18' is not a number up to 9e+09"),
+        ("left,1.5,0.2,100,200,40,160", "frame 1.5 is not a whole number"),
+        ("loft,1,0.2,100,200,40,160", "camera 'loft' is not in the calibration (left, right, back)"),
+        ("left,1,0.2,100", "4 columns where the first line has 7"),
+    ],
+)
+def test_a_bad_row_is_named_with_its_line(row: str, what: str, tmp_path: Path) -> None:
+    error = bad(tmp_path, BOXES + f"left,0,0,100,200,40,160\n{row}\n")
+    assert what in str(error)
+    assert error.line == 3
+    assert error.file is not None
+    assert error.remedy
+
+
+def test_a_head_below_its_foot_is_named_with_its_line(tmp_path: Path) -> None:
+    text = "camera,frame,time,u,v,label\nleft,0,0,50,90,ann-head\nleft,0,0,52,20,ann-foot\n"
+    with pytest.raises(InputError, match=r"rows.csv:3: ann: the head is not above the foot"):
+        read_objects(rows(tmp_path, text), SIZES)
+
+
+@pytest.mark.parametrize("scale", [0.001, 100.0, 1000.0])
+def test_a_calibration_in_other_units_is_refused(scale: float, tmp_path: Path) -> None:
+    (tmp_path / "boxes.csv").write_text(boxes_csv(3.0), encoding="utf-8")
+    known = read_known_calibration(write_calibration(tmp_path / "calibration.toml", scale=scale))
+    with pytest.raises(
+        InputError, match=r"calibration.toml:2: the cameras' positions are about .* times too"
+    ) as caught:
+        read_follow_input(tmp_path, known, "person", tmp_path)
+    assert f"{max(scale, 1.0 / scale):g} times too {'large' if scale > 1.0 else 'small'}" in str(caught.value)
+
+
+def test_nobody_is_a_refusal(tmp_path: Path) -> None:
+    text = "camera,frame,time,u,v,kind\nleft,0,0,50,60,marker\n"
+    with pytest.raises(Refused, match="no person in any frame; 1 rows left out: of kind marker"):
+        read(tmp_path, text)
+
+
+def test_ends_of_the_made_up_people_are_in_every_picture() -> None:
+    for name in NAMES:
+        for time in np.linspace(0.0, 8.0, 9):
+            for end in ends(name, float(time)):
+                assert ((end > 0.0) & (end < SIZE)).all()
