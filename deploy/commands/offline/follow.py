@@ -89,15 +89,16 @@ def follow(
     from hub.tracking.offline import follow as follow_observations
 
     from deploy.evaluation.tracking_scores import parse_area, read_ground_truth, score_tracks
+    from deploy.offline.follow.calibration import read_given_calibration
     from deploy.offline.follow.crops import check_pictures, write_crops
     from deploy.offline.follow.report import follow_report
     from deploy.offline.follow.results import REPORT, RESULT, TRACKS, result_document, result_text, tracks_text
-    from deploy.offline.follow.source import read_follow_input, read_known_calibration
+    from deploy.offline.follow.source import read_follow_input
     from protocols.core.clocks import NANOSECONDS
     from protocols.session.rig import METRES_PER_UNIT
 
     began = _cpu_seconds()
-    known = read_known_calibration(calibration)
+    known = read_given_calibration(calibration)
     limits = None if area is None else parse_area(area)
     if truth is not None:
         if known.calibration.scale != "metric":

@@ -26,7 +26,8 @@ from protocols.session.rig import METRES_PER_UNIT
 if TYPE_CHECKING:
     from hub.tracking.offline import FollowedTrack
 
-    from deploy.offline.follow.source import FollowInput, KnownCalibration
+    from deploy.offline.follow.calibration import GivenCalibration
+    from deploy.offline.follow.source import FollowInput
     from edge.devices.base import Image
 
 Progress = Callable[[str, float], None]
@@ -65,7 +66,7 @@ def write_crops(
     folder: Path,
     source: FollowInput,
     tracks: Sequence[FollowedTrack],
-    known: KnownCalibration,
+    known: GivenCalibration,
     progress: Progress = lambda text, share: None,
 ) -> int:
     """Write ``folder/ID/CAMERA_TIME_{head,face,torso}.jpg``; returns the number of files.
@@ -83,7 +84,7 @@ def write_crops(
 
 
 def _wanted(
-    source: FollowInput, tracks: Sequence[FollowedTrack], known: KnownCalibration
+    source: FollowInput, tracks: Sequence[FollowedTrack], known: GivenCalibration
 ) -> dict[str, dict[int, list[_Wanted]]]:
     """By camera and frame number, who is cut out."""
     frames = {(message.camera, message.sequence): message for message in source.observations}
@@ -114,7 +115,7 @@ def _wanted(
     return out
 
 
-def _facing(track: FollowedTrack, times: Floats, camera: TrackingCamera, known: KnownCalibration) -> list[bool]:
+def _facing(track: FollowedTrack, times: Floats, camera: TrackingCamera, known: GivenCalibration) -> list[bool]:
     """Whether a face may be seen at times (n,), if people look where they walk."""
     if known.up is None or len(track.times) < 2 or not len(times):
         return [False] * len(times)

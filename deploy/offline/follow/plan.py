@@ -15,7 +15,7 @@ from protocols.geometry.types import Floats
 if TYPE_CHECKING:
     from hub.tracking.offline import FollowedTrack
 
-    from deploy.offline.follow.source import KnownCalibration
+    from deploy.offline.follow.calibration import GivenCalibration
 
 _WIDTH, _MARGIN = 1000.0, 44.0
 _SMALL = 320.0
@@ -59,7 +59,7 @@ class PlanView:
     def of(
         cls,
         tracks: Sequence[FollowedTrack],
-        known: KnownCalibration,
+        known: GivenCalibration,
         axes: tuple[Floats, tuple[str, str]],
         unit: str,
     ) -> Self:

@@ -19,7 +19,8 @@ from protocols.geometry.types import Floats
 if TYPE_CHECKING:
     from hub.tracking.offline import FollowedTrack, FollowResult
 
-    from deploy.offline.follow.source import FollowInput, KnownCalibration
+    from deploy.offline.follow.calibration import GivenCalibration
+    from deploy.offline.follow.source import FollowInput
 
 _WIDTH, _LEFT, _RIGHT = 1000.0, 130.0, 70.0
 _MAX_ROWS = 150
@@ -47,7 +48,7 @@ class _Seen:
     place: Floats
 
 
-def follow_report(result: FollowResult, source: FollowInput, known: KnownCalibration, document: dict[str, Any]) -> str:
+def follow_report(result: FollowResult, source: FollowInput, known: GivenCalibration, document: dict[str, Any]) -> str:
     """The page: one file that loads nothing; the same input gives the same bytes. document: of result.json."""
     tracks = sorted(result.tracks, key=lambda track: track.id)
     unit = str(document["units"])
@@ -212,7 +213,7 @@ def _timeline(shown: Sequence[FollowedTrack], tracks: Sequence[FollowedTrack], s
     return drawing(_WIDTH, bottom + 38, parts, "Identities over time")
 
 
-def _seen(result: FollowResult, source: FollowInput, known: KnownCalibration) -> dict[str, _Seen]:
+def _seen(result: FollowResult, source: FollowInput, known: GivenCalibration) -> dict[str, _Seen]:
     """By camera, when and where its detections were associated."""
     stamps: dict[tuple[str, int], float] = {}
     for name in result.cameras:
@@ -303,7 +304,7 @@ def _tracks(shown: Sequence[FollowedTrack], unit: str) -> str:
     return f"<details><summary>{len(rows)} tracks</summary>{listed}</details>"
 
 
-def _provenance(source: FollowInput, known: KnownCalibration, document: dict[str, Any]) -> str:
+def _provenance(source: FollowInput, known: GivenCalibration, document: dict[str, Any]) -> str:
     facts = {
         "Syncline": document["version"],
         "Session": source.name,

@@ -13,7 +13,7 @@ from protocols.core.version import VERSION
 if TYPE_CHECKING:
     from hub.tracking.offline import FollowedTrack, FollowResult
 
-    from deploy.offline.follow.source import KnownCalibration
+    from deploy.offline.follow.calibration import GivenCalibration
 
 TRACKS, RESULT, REPORT = "tracks.csv", "result.json", "report.html"
 HEADER = "time,id,kind,state,x,y,z,height,std"
@@ -35,7 +35,7 @@ def tracks_text(tracks: Sequence[FollowedTrack]) -> str:
 
 def result_document(
     result: FollowResult,
-    known: KnownCalibration,
+    known: GivenCalibration,
     *,
     kind: str,
     command: str,

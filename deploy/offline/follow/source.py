@@ -7,8 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
+from deploy.offline.follow.calibration import GivenCalibration
 from deploy.offline.follow.objects import (
     BOXES_FILE,
     Kind,
@@ -20,14 +19,11 @@ from deploy.offline.follow.units import check_units
 from hub.tracking.detections import TrackingCamera
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
-from protocols.core.version import VERSION
-from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
 from protocols.log.read.session import is_log
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.calibration import Calibration, read_calibration
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
-from protocols.session.rig import Rig, read_rig
+from protocols.session.rig import read_rig
 from protocols.topics import OBSERVATION
 
 Progress = Callable[[str, float], None]
@@ -35,32 +31,6 @@ LOG_OF_VIDEOS = "detections.mcap"
 _MAX_ROWS = 2_000_000
 """Reference times at which tracks are wanted: 18 h at 30 Hz."""
 _MAX_TIME_NS = 2**62
-_ANY_SIZE = 1_000_000
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class KnownCalibration:
-    """A calibration.toml. rig: its tables. up: (3,) in its world; None = not given."""
-
-    file: Path
-    rig: Rig
-    calibration: Calibration
-    up: Floats | None
-
-    @property
-    def sizes(self) -> dict[str, tuple[int, int]]:
-        """(width, height) of each calibrated camera's image [px]."""
-        return {name: (c.intrinsics.width, c.intrinsics.height) for name, c in self.calibration.cameras.items()}
-
-    @property
-    def file_sizes(self) -> dict[str, tuple[int, int]]:
-        """The same of all cameras that the calibration knows; a refused one has no table, and any size."""
-        return {**dict.fromkeys(self.calibration.refused, (_ANY_SIZE, _ANY_SIZE)), **self.sizes}
-
-    @property
-    def names(self) -> list[str]:
-        """The cameras that the calibration knows, refused ones included."""
-        return [*self.calibration.cameras, *self.calibration.refused]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +47,7 @@ class FollowInput:
     videos: dict[str, Path]
     log: Path | None = None
 
-    def frame_times(self, known: KnownCalibration) -> dict[int, float]:
+    def frame_times(self, known: GivenCalibration) -> dict[int, float]:
         """Reference times [s] of the reference camera's frames, and of frames that only others have, by number."""
         out: dict[int, float] = {}
         for name in (known.calibration.reference, *known.sizes):
@@ -88,29 +58,9 @@ class FollowInput:
         return out
 
 
-def read_known_calibration(file: Path) -> KnownCalibration:
-    """Read calibration.toml. Raises InputError."""
-    rig, cameras = read_calibration(file)
-    metadata = rig.metadata
-    refused = metadata.get("refused")
-    calibration = Calibration(
-        cameras=cameras,
-        reference=str(metadata.get("reference", next(iter(cameras)))),
-        scale=str(metadata.get("scale", "metric")),
-        units=rig.units,
-        solver=str(metadata.get("solver", "")),
-        version=str(metadata.get("version", VERSION)),
-        refused={str(name): str(why) for name, why in refused.items()} if isinstance(refused, dict) else {},
-    )
-    up = rig.up
-    if isinstance(up, str):
-        up = cameras[up].pose.rotation.T @ rig.up_in_camera(up)
-    return KnownCalibration(file, rig, calibration, None if up is None else np.asarray(up / np.linalg.norm(up)))
-
-
 def read_follow_input(
     session: Path,
-    known: KnownCalibration,
+    known: GivenCalibration,
     kind: Kind,
     out: Path,
     *,
@@ -195,7 +145,7 @@ def _read_log(file: Path) -> tuple[list[pb.Observation], tuple[str, ...]]:
 
 
 def _wanted_times(
-    messages: list[pb.Observation], known: KnownCalibration, shared: bool, fps: float | None
+    messages: list[pb.Observation], known: GivenCalibration, shared: bool, fps: float | None
 ) -> tuple[list[int], tuple[str, ...]]:
     """Reference times [ns] of rows: --fps, all times of a shared clock, or the reference camera's frames; warnings."""
     by_camera: dict[str, set[int]] = {}

@@ -18,7 +18,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import METRES_PER_UNIT
 
 if TYPE_CHECKING:
-    from deploy.offline.follow.source import KnownCalibration
+    from deploy.offline.follow.calibration import GivenCalibration
 
 _FACTORS = (1.0, 1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3)
 _FRAMES = 60
@@ -33,7 +33,7 @@ In the crowd of seven cameras the share is 0.42 in metres, and 0.05, by chance, 
 large or too small."""
 
 
-def check_units(messages: Sequence[pb.Observation], known: KnownCalibration, kind: str) -> None:
+def check_units(messages: Sequence[pb.Observation], known: GivenCalibration, kind: str) -> None:
     """Refuse a calibration in which people meet only if they are 10, 100 or 1000 times too tall or too short.
 
     Every camera alone gives a person's place in multiples of the person's height. In the right units the places that
@@ -69,7 +69,7 @@ class _Bodies:
     foot: Floats
 
 
-def _bodies(messages: Sequence[pb.Observation], known: KnownCalibration, up: Floats) -> _Bodies:
+def _bodies(messages: Sequence[pb.Observation], known: GivenCalibration, up: Floats) -> _Bodies:
     """The people with head and foot in some frames, spread over the session."""
     cameras = list(known.calibration.cameras.values())
     tracked = {camera.name: TrackingCamera.from_calibration(camera) for camera in cameras}
@@ -129,7 +129,7 @@ def _distance_per_height(head: Floats, foot: Floats, up: Floats) -> Floats:
         return np.asarray(-(across * wanted).sum(axis=1) / (across**2).sum(axis=1))
 
 
-def _line_of_units(known: KnownCalibration) -> int:
+def _line_of_units(known: GivenCalibration) -> int:
     lines = known.file.read_text(encoding="utf-8-sig").splitlines()
     patterns = (r"\s*units\s*=", r"\s*\[metadata\]", r"\s*translation\s*=")
     return next((n for p in patterns for n, line in enumerate(lines, 1) if re.match(p, line)), 1)

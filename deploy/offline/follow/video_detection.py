@@ -20,7 +20,7 @@ from protocols.core.errors import InputError
 from protocols.messages import syncline_pb2 as pb
 
 if TYPE_CHECKING:
-    from deploy.offline.follow.source import KnownCalibration
+    from deploy.offline.follow.calibration import GivenCalibration
     from edge.detectors.base import Detection, Detector
     from edge.devices.playback.video_reader import VideoReader
 
@@ -49,7 +49,7 @@ class _Detected:
 
 def detect_videos(
     folder: Path,
-    known: KnownCalibration,
+    known: GivenCalibration,
     kind: Kind,
     log: Path,
     *,
@@ -79,7 +79,7 @@ def detect_videos(
     return {video.camera: video.path for video in videos}, tuple(warnings)
 
 
-def _check_videos(videos: Sequence[VideoFile], known: KnownCalibration) -> None:
+def _check_videos(videos: Sequence[VideoFile], known: GivenCalibration) -> None:
     """Raise InputError for a video of an unknown camera or of another picture size than its lens."""
     from edge.devices.playback.video_reader import VideoReader
 

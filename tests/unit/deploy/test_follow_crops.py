@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from deploy.offline.follow.calibration import read_given_calibration
 from deploy.offline.follow.crops import check_pictures, write_crops
-from deploy.offline.follow.source import FollowInput, read_known_calibration
+from deploy.offline.follow.source import FollowInput
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
@@ -61,7 +62,7 @@ def track(person: int, number: int = 4) -> Track:
 
 
 def test_regions_are_cut_out_by_track_camera_and_time(filmed: FollowInput, tmp_path: Path) -> None:
-    known = read_known_calibration(write_calibration(tmp_path / "calibration.toml"))
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
     out = tmp_path / "crops"
     count = write_crops(out, filmed, [track(0), track(1, 5)], known)  # type: ignore[list-item]
     assert sorted(path.name for path in out.iterdir()) == ["4", "5"]
@@ -80,7 +81,7 @@ def test_regions_are_cut_out_by_track_camera_and_time(filmed: FollowInput, tmp_p
 
 
 def test_a_face_is_shown_where_somebody_walks_towards_the_camera(filmed: FollowInput, tmp_path: Path) -> None:
-    known = read_known_calibration(write_calibration(tmp_path / "calibration.toml"))
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
     towards = known.calibration.cameras[CAMERA].pose.position[:2]
     times = np.arange(FRAMES) / FPS
     for sign, faces in ((1.0, FRAMES), (-1.0, 0)):
@@ -94,7 +95,7 @@ def test_a_face_is_shown_where_somebody_walks_towards_the_camera(filmed: FollowI
 
 
 def test_at_most_one_picture_between_two_wanted_times(filmed: FollowInput, tmp_path: Path) -> None:
-    known = read_known_calibration(write_calibration(tmp_path / "calibration.toml"))
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
     few = FollowInput(filmed.name, filmed.observations, filmed.times_ns[::3], (), filmed.videos)
     write_crops(tmp_path / "crops", few, [track(0)], known)  # type: ignore[list-item]
     assert len(list((tmp_path / "crops").glob("4/*_head.jpg"))) == 3

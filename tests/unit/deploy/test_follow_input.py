@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deploy.offline.follow.calibration import read_given_calibration
 from deploy.offline.follow.objects import followed_detections, object_messages, read_objects
-from deploy.offline.follow.source import FollowInput, read_follow_input, read_known_calibration
+from deploy.offline.follow.source import FollowInput, read_follow_input
 from protocols.core.errors import InputError, Refused
 from tests.support.crowds import NAMES, SIZE, boxes_csv, ends, write_calibration
 
@@ -19,7 +20,7 @@ BOXES = "camera,frame,time,x,y,width,height\n"
 def read(folder: Path, boxes: str, **options: object) -> FollowInput:
     """Read boxes with the made-up calibration."""
     (folder / "boxes.csv").write_text(boxes, encoding="utf-8")
-    known = read_known_calibration(write_calibration(folder / "calibration.toml"))
+    known = read_given_calibration(write_calibration(folder / "calibration.toml"))
     return read_follow_input(folder / "boxes.csv", known, "person", folder, **options)  # type: ignore[arg-type]
 
 
@@ -102,7 +103,7 @@ def test_rows_are_wanted_at_the_reference_cameras_frames_or_at_a_rate(tmp_path: 
 def test_lags_of_the_calibration_are_applied(tmp_path: Path) -> None:
     offsets = {"left": 10.0, "right": -3.0}
     (tmp_path / "boxes.csv").write_text(boxes_csv(2.0, 5.0, offsets), encoding="utf-8")
-    known = read_known_calibration(write_calibration(tmp_path / "calibration.toml", offsets=offsets))
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml", offsets=offsets))
     source = read_follow_input(tmp_path, known, "person", tmp_path)
     assert source.times_ns[0] == 0
     assert source.frame_times(known)[1] == pytest.approx(0.2)
@@ -147,7 +148,7 @@ def test_a_head_below_its_foot_is_named_with_its_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize("scale", [0.001, 100.0, 1000.0])
 def test_a_calibration_in_other_units_is_refused(scale: float, tmp_path: Path) -> None:
     (tmp_path / "boxes.csv").write_text(boxes_csv(3.0), encoding="utf-8")
-    known = read_known_calibration(write_calibration(tmp_path / "calibration.toml", scale=scale))
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml", scale=scale))
     with pytest.raises(
         InputError, match=r"calibration.toml:2: the cameras' positions are about .* times too"
     ) as caught:

@@ -1,0 +1,60 @@
+"""The calibration that `syncline follow` is given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from protocols.core.version import VERSION
+from protocols.geometry.types import Floats
+from protocols.session.calibration import Calibration, read_calibration
+from protocols.session.rig import Rig
+
+_ANY_SIZE = 1_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GivenCalibration:
+    """A calibration.toml. rig: its tables. up: (3,) in its world; None = not given."""
+
+    file: Path
+    rig: Rig
+    calibration: Calibration
+    up: Floats | None
+
+    @property
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """(width, height) of each calibrated camera's image [px]."""
+        return {name: (c.intrinsics.width, c.intrinsics.height) for name, c in self.calibration.cameras.items()}
+
+    @property
+    def file_sizes(self) -> dict[str, tuple[int, int]]:
+        """The same of all cameras that the calibration knows; a refused one has no table, and any size."""
+        return {**dict.fromkeys(self.calibration.refused, (_ANY_SIZE, _ANY_SIZE)), **self.sizes}
+
+    @property
+    def names(self) -> list[str]:
+        """The cameras that the calibration knows, refused ones included."""
+        return [*self.calibration.cameras, *self.calibration.refused]
+
+
+def read_given_calibration(file: Path) -> GivenCalibration:
+    """Read calibration.toml. Raises InputError."""
+    rig, cameras = read_calibration(file)
+    metadata = rig.metadata
+    refused = metadata.get("refused")
+    calibration = Calibration(
+        cameras=cameras,
+        reference=str(metadata.get("reference", next(iter(cameras)))),
+        scale=str(metadata.get("scale", "metric")),
+        units=rig.units,
+        solver=str(metadata.get("solver", "")),
+        version=str(metadata.get("version", VERSION)),
+        refused={str(name): str(why) for name, why in refused.items()} if isinstance(refused, dict) else {},
+    )
+    up = rig.up
+    if isinstance(up, str):
+        up = cameras[up].pose.rotation.T @ rig.up_in_camera(up)
+    return GivenCalibration(file, rig, calibration, None if up is None else np.asarray(up / np.linalg.norm(up)))
