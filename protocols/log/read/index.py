@@ -18,6 +18,8 @@ from protocols.log.read.mcap_records import MAGIC
 _HEAD = struct.Struct("<BQ")
 _FOOTER = struct.Struct("<BQQQI")
 _CHUNK_INDEX = struct.Struct("<QQQ")
+_MAX_SUMMARY = 64 * 1024 * 1024
+"""Bytes: of some hundred thousand chunks. A file with more is read from its beginning."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +44,8 @@ def read_index(stream: BinaryIO) -> Index | None:
     footer = stream.read(_FOOTER.size)
     opcode, _, start, _, crc = _FOOTER.unpack(footer)
     if opcode != Opcode.FOOTER or stream.read(len(MAGIC)) != MAGIC or not 0 < start < size - tail or not crc:
+        return None
+    if size - tail - start > _MAX_SUMMARY:
         return None
     stream.seek(start)
     summary = stream.read(size - tail - start)

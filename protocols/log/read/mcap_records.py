@@ -2,6 +2,9 @@
 
 The library's readers stop at the first error with a misleading exception, ignore a truncated record, and do not check
 attachments. Here each record is read completely or not at all, and every error is described in a sentence.
+
+Time is linear in the file, and memory is bounded, whatever the file says of itself: a record is read only once its
+length is confirmed by what it leads to or by a few of its bytes, and a chunk is unpacked no further than it says.
 """
 
 from __future__ import annotations
@@ -15,19 +18,22 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+import lz4.frame
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Chunk
-from mcap.records import Metadata as MetadataRecord
-from mcap.stream_reader import get_chunk_data_stream
 
 from protocols.core.errors import InputError
 
 MAGIC = b"\x89MCAP0\r\n"
-MAX_CHUNK = 256 * 1024 * 1024
-"""Bytes, uncompressed. No writer makes larger chunks."""
+MAX_CHUNK = 64 * 1024 * 1024
+"""Bytes, uncompressed. Writers make chunks of 60 kB (this one) to some megabytes."""
+_MAX_RATIO, _MIN_UNPACKED = 256, 1 << 16
+"""Uncompressed bytes for one of a chunk, where it has more than these: telemetry that repeats itself has up to 50."""
+_MAX_CONTENT = MAX_CHUNK + (1 << 20)
+"""Bytes of a record that is read into memory; a longer one is left out."""
 
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
@@ -37,10 +43,10 @@ _KNOWN = frozenset(int(opcode) for opcode in Opcode)
 _FIRST_PRIVATE_OPCODE = 0x80
 _MAX_RECORD = 1 << 40
 """Bytes. A longer record is a damaged length."""
-_MAX_METADATA = 1 << 24
-_MIN_METADATA, _MIN_ATTACHMENT = 8, 36
+_MIN_ATTACHMENT = 36
 _FOOTER_LENGTH = 20
-_WINDOW = 1 << 20
+_FIRST_WINDOW, _MAX_WINDOW = 1 << 8, 1 << 20
+"""Bytes that are searched at once for the next record: more as the search goes on, so that it costs what it passes."""
 # Chunk, attachment, metadata, message index, end of data or footer, shorter than 4 GiB: a prefilter for headers.
 _CANDIDATE = re.compile(rb"(?=[\x06\x09\x0c\x07\x0f\x02][\x00-\xff]{4}\x00{4})")
 
@@ -116,11 +122,12 @@ def read_records(stream: BinaryIO, damage: Damage, begin: int = len(MAGIC)) -> I
         opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
         end = offset + _HEAD.size + length
         whole = _is_head(opcode, length) and end <= size
+        following = b""
         if whole:
-            block = stream.read(length + _HEAD.size)
-            content, following = block[:length], block[length:]
+            stream.seek(end)
+            following = stream.read(_HEAD.size)
             # A length that does not lead to another record is wrong, unless the content confirms it.
-            whole = _is_next(following) or _is_self_consistent(opcode, content)
+            whole = _is_next(following) or _is_self_consistent(stream, offset + _HEAD.size, opcode, length)
         if not whole:
             found = resync(stream, offset + 1, size) if offset < size else None
             damage.record(_flaw(offset, head, opcode, length, found))
@@ -131,6 +138,14 @@ def read_records(stream: BinaryIO, damage: Damage, begin: int = len(MAGIC)) -> I
             offset, unbroken = stream.seek(found), False
             head = stream.read(_HEAD.size)
             continue
+        stream.seek(offset + _HEAD.size)
+        if length > _MAX_CONTENT:
+            damage.record(f"the record at byte {offset} has {length} bytes, at most {_MAX_CONTENT} are read")
+            unbroken, offset, head = False, end, following
+            stream.seek(end + len(following))
+            continue
+        content = stream.read(length)
+        stream.seek(end + len(following))
         if opcode == Opcode.DATA_END and length >= 4:
             (expected,) = struct.unpack_from("<I", content)
             if unbroken and expected not in (0, crc):
@@ -169,94 +184,86 @@ def _is_next(head: bytes) -> bool:
     return len(head) < _HEAD.size or _is_head(*_HEAD.unpack(head))
 
 
-def _is_self_consistent(opcode: int, content: bytes) -> bool:
-    """Whether a record's content is consistent with its length, so that a false positive is practically excluded."""
+def _is_self_consistent(stream: BinaryIO, start: int, opcode: int, length: int) -> bool:
+    """Whether the lengths inside a record at ``start`` add up to its own: false positives are practically excluded.
+
+    Reads a few bytes only: a file may consist of nothing but false headers.
+    """
+
+    def number(at: int, size: int) -> int:
+        stream.seek(start + at)
+        return int.from_bytes(stream.read(size), "little") if at + size <= length else length + 1
+
     if opcode == Opcode.CHUNK:
-        return chunk_lengths_agree(content)
-    if opcode == Opcode.ATTACHMENT:
-        return len(content) > _MIN_ATTACHMENT and attachment_checksum_matches(content)
-    if opcode == Opcode.METADATA:
-        try:
-            MetadataRecord.read(ReadDataStream(BytesIO(content)))
-        except (McapError, ValueError, struct.error):
-            return False
-        return len(content) > _MIN_METADATA
-    if opcode not in _KNOWN:
-        return False
+        name = number(_CHUNK.size - 4, 4)
+        return name <= 4 and number(_CHUNK.size + name, 8) == length - _CHUNK.size - name - 8
+    if opcode == Opcode.ATTACHMENT:  # two times, name, media type, u64 size, data, checksum
+        media = 16 + 4 + number(16, 4)
+        data = media + 4 + number(media, 4)
+        return length > _MIN_ATTACHMENT and number(data, 8) == length - data - 12
+    if opcode == Opcode.METADATA:  # name, map
+        name = 4 + number(0, 4)
+        return length > 8 and number(name, 4) == length - name - 4
     if opcode == Opcode.MESSAGE_INDEX:
-        return len(content) >= 6 and int.from_bytes(content[2:6], "little") == len(content) - 6
-    return len(content) == {Opcode.FOOTER: _FOOTER_LENGTH, Opcode.DATA_END: 4}.get(Opcode(opcode), -1)
-
-
-def chunk_lengths_agree(content: bytes) -> bool:
-    """Whether the lengths inside a chunk add up; its data are not checked."""
-    if len(content) < _CHUNK.size:
-        return False
-    name = int(_CHUNK.unpack_from(content)[4])
-    start = _CHUNK.size + name + 8
-    return (
-        name <= 4
-        and len(content) >= start
-        and int.from_bytes(content[start - 8 : start], "little") == (len(content) - start)
-    )
+        return length >= 6 and number(2, 4) == length - 6
+    return opcode in _KNOWN and length == {Opcode.FOOTER: _FOOTER_LENGTH, Opcode.DATA_END: 4}.get(Opcode(opcode), -1)
 
 
 def resync(stream: BinaryIO, start: int, size: int) -> int | None:
     """The offset of the next self-consistent record at or after ``start``; None if there is none."""
-    begin = start
+    begin, length_of_window = start, _FIRST_WINDOW
     while begin < size:
         stream.seek(begin)
-        window = stream.read(_WINDOW + _HEAD.size)
+        window = stream.read(length_of_window + _HEAD.size)
         for match in _CANDIDATE.finditer(window):
             offset = begin + match.start()
+            if match.start() + _HEAD.size > len(window):
+                break
             opcode, length = _HEAD.unpack_from(window, match.start())
-            if length > size - offset - _HEAD.size:
-                continue
-            stream.seek(offset + _HEAD.size)
-            # Checking the first bytes avoids reading megabytes for each false header candidate.
-            if opcode == Opcode.CHUNK:
-                start_of_chunk = stream.read(_CHUNK.size + 12)
-                if not _begins_chunk(start_of_chunk, length):
-                    continue
-            elif opcode == Opcode.METADATA and length > _MAX_METADATA:
-                continue
-            stream.seek(offset + _HEAD.size)
-            if _is_self_consistent(opcode, stream.read(length)) and _is_next(stream.read(_HEAD.size)):
-                return offset
-        begin += _WINDOW
+            content = offset + _HEAD.size
+            if length <= size - content and _is_self_consistent(stream, content, opcode, length):
+                stream.seek(content + length)
+                if _is_next(stream.read(_HEAD.size)):
+                    return offset
+        begin += length_of_window
+        length_of_window = min(4 * length_of_window, _MAX_WINDOW)
     return None
-
-
-def _begins_chunk(start: bytes, length: int) -> bool:
-    if len(start) < _CHUNK.size + 8:
-        return False
-    name = int(_CHUNK.unpack_from(start)[4])
-    if name > 4:
-        return False
-    place = _CHUNK.size + name
-    return int.from_bytes(start[place : place + 8], "little") == length - place - 8
 
 
 def chunk_records(frame: McapRecord, damage: Damage) -> Iterator[tuple[int, bytes]]:
     """(opcode, content) of each record in a chunk; none if its checksum does not match."""
     try:
-        chunk: Chunk = Chunk.read(ReadDataStream(BytesIO(frame.content)))
-        if chunk.uncompressed_size > MAX_CHUNK:
-            raise ValueError("too big")
-        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-        data = stream.read(size)
-    except (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError):
+        data = _unpacked(Chunk.read(ReadDataStream(BytesIO(frame.content))))
+    except (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, EOFError):
         damage.record(f"the chunk at byte {frame.offset} is damaged and was left out")
         return
     offset = 0
     while offset + _HEAD.size <= len(data):
         opcode, length = _HEAD.unpack_from(data, offset)
         offset += _HEAD.size
-        if length > len(data) - offset:
+        if length > len(data) - offset or opcode == 0:
             damage.record(f"the chunk at byte {frame.offset} has a record that is cut off")
             return
         yield opcode, data[offset : offset + length]
         offset += length
+
+
+def _unpacked(chunk: Chunk) -> bytes:
+    """The records of a chunk, unpacked no further than it says. Raises ValueError and the codecs' errors."""
+    size = chunk.uncompressed_size
+    if size > min(MAX_CHUNK, max(_MIN_UNPACKED, _MAX_RATIO * len(chunk.data))):
+        raise ValueError("too big")
+    if chunk.compression == "zstd":
+        unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK)
+        with unpacker.stream_reader(BytesIO(chunk.data)) as stream:
+            data = stream.read(size + 1)
+    elif chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+    else:
+        data = chunk.data
+    if len(data) != size or (chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc):
+        raise ValueError("not what it says")
+    return data
 
 
 def message_record(content: bytes) -> RawMessage | None:

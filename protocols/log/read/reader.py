@@ -174,7 +174,7 @@ class LogReader:
 
     def attachments(self) -> list[Attachment]:
         """The stored files in file order; one whose checksum does not match is omitted and counts as damage."""
-        found: list[Attachment] = []
+        found: dict[Attachment, None] = {}
         for frame in self._frames():
             if frame.opcode != Opcode.ATTACHMENT:
                 continue
@@ -183,10 +183,9 @@ class LogReader:
                 continue
             record = self._parse(AttachmentRecord, frame)
             if record is not None:
-                attachment = Attachment(record.name, record.media_type, record.data, record.log_time)
-                if attachment not in found:  # each part of a log repeats them
-                    found.append(attachment)
-        return found
+                # Each part of a log repeats them.
+                found[Attachment(record.name, record.media_type, record.data, record.log_time)] = None
+        return list(found)
 
     def summary(self) -> LogSummary:
         """Count everything; reads the whole file, but decodes no message."""

@@ -1,0 +1,97 @@
+"""Files that are small and say that they are large: memory and reading stay in proportion to the file."""
+
+from __future__ import annotations
+
+import io
+import struct
+import tracemalloc
+from pathlib import Path
+
+import lz4.frame
+import pytest
+import zstandard
+from mcap.opcode import Opcode
+
+from protocols.log.read.mcap_records import MAGIC, Damage, McapRecord, chunk_records, read_records
+from protocols.log.read.reader import LogReader
+
+ZEROS = bytes(64 * 1024 * 1024)
+
+
+def record(opcode: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def chunk(compression: bytes, data: bytes, says: int) -> bytes:
+    head = struct.pack("<QQQII", 0, 0, says, 0, len(compression)) + compression
+    return record(Opcode.CHUNK, head + struct.pack("<Q", len(data)) + data)
+
+
+FOOTER = record(Opcode.DATA_END, bytes(4)) + record(Opcode.FOOTER, bytes(20)) + MAGIC
+PACKED = {b"zstd": zstandard.ZstdCompressor().compress(ZEROS), b"lz4": lz4.frame.compress(ZEROS)}
+
+
+@pytest.mark.parametrize("says", [1000, len(ZEROS), 2**31, 2**63])
+@pytest.mark.parametrize("compression", [b"zstd", b"lz4"])
+def test_a_chunk_is_unpacked_no_further_than_it_says(tmp_path: Path, compression: bytes, says: int) -> None:
+    """A file of 61 kB whose chunk said 1 kB took 2 GB and 100 s."""
+    file = tmp_path / "bomb.mcap"
+    file.write_bytes(MAGIC + chunk(compression, PACKED[compression], says) + FOOTER)
+    tracemalloc.start()
+    try:
+        summary = LogReader(file).summary()
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert summary.damaged
+    assert "chunk" in summary.reason
+    # What lz4 says may be within the ratio that telemetry has; it is then unpacked, and no more.
+    assert peak < (4 << 20 if says == 1000 or compression == b"zstd" else 3 * len(ZEROS))
+
+
+def test_a_chunk_of_empty_records_ends_at_the_first() -> None:
+    frame = McapRecord(0, Opcode.CHUNK, chunk(b"", bytes(60_000), 60_000)[9:])
+    damage = Damage()
+    assert list(chunk_records(frame, damage)) == []
+    assert damage.flaws == 1
+
+
+class Counting(io.BytesIO):
+    """Counts the bytes that are read of it."""
+
+    taken = 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        self.taken += len(data)
+        return data
+
+
+def false_heads(opcode: int, size: int) -> bytes:
+    """Heads of records that reach to the end of the file, one after the other."""
+    count = size // 9
+    return b"".join(struct.pack("<BQ", opcode, (count - number - 1) * 9) for number in range(count))
+
+
+@pytest.mark.parametrize("opcode", [Opcode.ATTACHMENT, Opcode.CHUNK, Opcode.METADATA, Opcode.MESSAGE_INDEX, 0x90])
+def test_false_heads_are_not_read_to_their_end_each(opcode: int) -> None:
+    """Every false head of an attachment was read to its end: quadratic in the file."""
+    stream = Counting(MAGIC + b"\xff" * 9 + false_heads(opcode, 400_000) + b"\x0b")
+    damage = Damage()
+    list(read_records(stream, damage))
+    assert stream.taken < 20 * len(stream.getvalue())
+    assert damage.flaws
+
+
+def test_a_damaged_length_before_every_record_costs_no_more_than_the_file() -> None:
+    """Each damaged length reached to the file's end, and was read to there before it was found to be wrong."""
+    good = record(Opcode.MESSAGE_INDEX, struct.pack("<HI", 1, 0))
+    body, count = b"", 10_000
+    pair = 9 + len(good)
+    for number in range(count):
+        body += struct.pack("<BQ", Opcode.STATISTICS, (count - number) * pair - 9 - 3) + good
+    stream = Counting(MAGIC + body + FOOTER)
+    damage = Damage()
+    assert sum(frame.opcode == Opcode.MESSAGE_INDEX for frame in read_records(stream, damage)) > 1
+    # A window is searched from each place where reading resumes.
+    assert stream.taken < 30 * len(stream.getvalue())
