@@ -41,6 +41,11 @@ COMMANDS: tuple[tuple[str, str, str], ...] = (
         "Estimate clock offsets and poses of all cameras of a session or log.",
     ),
     (
+        "follow",
+        "deploy.commands.offline.follow:follow",
+        "Follow people or vehicles through all cameras, offline.",
+    ),
+    (
         "triangulate",
         "deploy.commands.offline.triangulate:triangulate",
         "Triangulate labelled points with a given calibration.",

@@ -56,6 +56,7 @@ BENCHES = {
     "waving": Bench("how long and how fast a marker is waved", ("--seeds", "1")),
     "lenses": Bench("focal lengths that nobody measured", ("--sessions", "3")),
     "poses": Bench("distributed poses against the joint optimum", ("--quick", "--rows", "section4,bearings")),
+    "crowd": Bench("a crowd before seven cameras, boxes spoilt", ("--seeds", "2"), data=True),
     "logs": Bench("logs: rates, kill -9, damage", ("--quick",)),
     "view": Bench("help, first calibration, first paint, what watching costs", ("--quick",)),
     "people_detector": Bench("people before one camera, beside MOG2 alone", ("--seeds", "1", "--seconds", "20")),
