@@ -1,26 +1,82 @@
 """Motion JPEG over HTTP, as browsers, GStreamer, VLC and FFmpeg play it.
 
-Only the newest image is served, and it is compressed only while there are viewers.
+Only the newest image is served, and it is compressed only while there are viewers. Requests must name this machine by
+an address, as ``localhost`` or by its host name: a page of a foreign name that resolves to this machine (DNS rebinding)
+would otherwise read the video in a browser here. Of more than ``_MAX_CONNECTIONS`` connections the oldest that does not
+stream is closed.
 """
 
 from __future__ import annotations
 
+import ipaddress
+import socket
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
+from urllib.parse import urlsplit
 
 from protocols.core.errors import InputError
 
 PATH = "/stream.mjpg"
 _BOUNDARY = "frame"
 _MAX_VIEWERS = 4
-_SEND_TIMEOUT_S = 5.0
+_MAX_CONNECTIONS = 16
+_SEND_TIMEOUT_S = 5.0  # for a request's bytes, and for an image to a slow reader
 _PAGE = (
     b"<!doctype html><title>Syncline</title><style>body{margin:0;background:#111}img{width:100%}</style>"
     b"<img src=stream.mjpg>"
 )
+
+
+class _LimitedServer(ThreadingHTTPServer):
+    """Closes the oldest connection that does not stream where there are too many."""
+
+    request_queue_size = 64  # with five, a burst of connections makes the next one wait for seconds
+
+    def __init__(self, *arguments: Any) -> None:
+        self._open: dict[Any, bool] = {}
+        self._lock = threading.Lock()
+        super().__init__(*arguments)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Take a connection."""
+        with self._lock:
+            idle = [one for one, streams in self._open.items() if not streams]
+            if len(self._open) >= _MAX_CONNECTIONS and idle:
+                del self._open[idle[0]]
+                with suppress(OSError):
+                    idle[0].shutdown(socket.SHUT_RDWR)  # its thread ends and closes it
+            self._open[request] = False
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection."""
+        with self._lock:
+            self._open.pop(request, None)
+        super().shutdown_request(request)
+
+    def keep(self, request: Any) -> None:
+        """Note that a connection streams."""
+        with self._lock:
+            self._open[request] = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Whatever a client sends ends its own connection."""
+
+
+def names_this_machine(host: str) -> bool:
+    """Whether a Host header is an address, ``localhost``, this machine's host name, or empty (HTTP/1.0)."""
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+        ipaddress.ip_address(name)
+    except ValueError:
+        own = socket.gethostname().lower()
+        name = "?" if "[" in host else name.rstrip(".")
+        return name in ("", "localhost", own, f"{own.partition('.')[0]}.local")
+    return True
 
 
 class MjpegServer:
@@ -38,7 +94,7 @@ class MjpegServer:
         self._compress = compress
         self._jpeg: tuple[int, bytes | None] = (-1, None)
         try:
-            self._server = ThreadingHTTPServer((host, port), self._handler())
+            self._server = _LimitedServer((host, port), self._handler())
         except OSError as error:
             raise InputError(
                 f"the video cannot be served at {host}:{port}: {error.strerror}",
@@ -101,7 +157,9 @@ class MjpegServer:
 
             def _serve(self) -> None:
                 path = self.path.partition("?")[0]
-                if path == "/":
+                if not names_this_machine(self.headers.get("Host", "")):
+                    self.send_error(403, "this host is not served")
+                elif path == "/":
                     self._send_body("text/html", _PAGE)
                 elif path == "/snapshot.jpg":
                     _, data = server._next_jpeg(-1)
@@ -131,6 +189,7 @@ class MjpegServer:
                     self.send_header("Cache-Control", "no-store")
                     self.end_headers()
                     seen = -1
+                    server._server.keep(self.connection)
                     while not server._closed:
                         seen, data = server._next_jpeg(seen)
                         if data is None:

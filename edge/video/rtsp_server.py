@@ -2,6 +2,9 @@
 
 ``RtpEncoder`` encodes and packetises; this module holds the RTSP dialogue and distributes the packets: over UDP, or
 interleaved in the RTSP connection where a client asks for that. Images are drawn and encoded only while somebody plays.
+
+Places go by activity: who does not play holds one for ``_SETUP_TIMEOUT_S``, and of more than ``_MAX_CONNECTIONS``
+connections the one that has been idle longest is closed, so that silent ones do not lock others out.
 """
 
 from __future__ import annotations
@@ -28,6 +31,7 @@ _MAX_VIEWERS = 4
 _MAX_CONNECTIONS = 16
 _MAX_REQUEST_BYTES = 8192
 _SESSION_TIMEOUT_S = 60  # without a request for this long the client is dropped
+_SETUP_TIMEOUT_S = 5.0  # how long a viewer's place is held between SETUP (or PAUSE) and PLAY, and the first request
 _MAX_UNSENT_BYTES = 262_144  # queued for a slow client: beyond this it is skipped until the next key frame
 _STALL_TIMEOUT_S = 10.0
 _ENCODER_RETRY_S = 0.2  # pause before the encoder is recreated after a failure
@@ -71,7 +75,7 @@ class RtspServer:
         self.failures = 0
         """Number of images at which the encoder failed."""
         self._sessions: set[_Session] = set()
-        self._connections = 0
+        self._connections: set[_Session] = set()
         self._loop = asyncio.new_event_loop()
         try:
             self._socket = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
@@ -157,29 +161,39 @@ class RtspServer:
     async def _handle_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Handle one connection, which has at most one session."""
         session = _Session(writer)
-        self._connections += 1
+        idle = [other for other in self._connections if not other.playing]
+        if len(self._connections) >= _MAX_CONNECTIONS and idle:
+            longest = min(idle, key=lambda other: other.active_s)
+            self._connections.discard(longest)
+            longest.abort()
+        self._connections.add(session)
+        limit: float | None = _SETUP_TIMEOUT_S
         try:
-            while self._connections <= _MAX_CONNECTIONS:
-                request = await asyncio.wait_for(
-                    _read_request(reader), None if session.interleaved else _SESSION_TIMEOUT_S
-                )
-                if request is None:
-                    continue
+            while True:
+                request = await asyncio.wait_for(_read_request(reader), limit)
+                session.active_s = time.monotonic()
                 if isinstance(request, int):
                     session.respond("0", request)
                     return
-                self._handle_request(session, *request)
-                await asyncio.wait_for(writer.drain(), _STALL_TIMEOUT_S)
-        except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, UnicodeError):
+                if request is not None:
+                    self._handle_request(session, *request)
+                    await asyncio.wait_for(writer.drain(), _STALL_TIMEOUT_S)
+                # Who reads the stream in this connection shows thereby that it is there.
+                limit = None if session.interleaved and session.playing else _SESSION_TIMEOUT_S
+        except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, ValueError):
             pass  # disconnected, or not RTSP
         finally:
-            self._connections -= 1
+            self._connections.discard(session)
             self._sessions.discard(session)
             session.close()
 
     def _handle_request(self, session: _Session, method: str, uri: str, headers: dict[str, str]) -> None:
         number = headers.get("cseq", "0")
-        path = urlsplit(uri).path.rstrip("/")
+        try:
+            path = urlsplit(uri).path.rstrip("/")
+        except ValueError:
+            session.respond(number, 400)
+            return
         if method != "OPTIONS" and path not in (PATH, f"{PATH}/video"):
             session.respond(number, 404)
         elif method == "OPTIONS":
@@ -197,6 +211,8 @@ class RtspServer:
             session.respond(number, 200)  # keep-alive
         elif headers.get("session", "").partition(";")[0].strip() != session.id or session not in self._sessions:
             session.respond(number, 454 if "session" in headers else 455)
+        elif method == "PLAY" and self._is_full(session):
+            session.respond(number, 453)
         else:
             if method == "PLAY":
                 session.play()  # the response goes out first: packets are distributed later in the event loop
@@ -208,7 +224,7 @@ class RtspServer:
             session.respond(number, 200, {"Session": session.id, **({"Range": "npt=now-"} if method == "PLAY" else {})})
 
     def _set_up(self, session: _Session, number: str, transports: str) -> None:
-        if session not in self._sessions and len(self._sessions) >= _MAX_VIEWERS:
+        if self._is_full(session):
             session.respond(number, 453)
             return
         chosen = next((header for offer in transports.split(",") if (header := session.select_transport(offer))), None)
@@ -217,6 +233,12 @@ class RtspServer:
             return
         self._sessions.add(session)
         session.respond(number, 200, {"Transport": chosen, "Session": f"{session.id};timeout={_SESSION_TIMEOUT_S}"})
+
+    def _is_full(self, session: _Session) -> bool:
+        """Whether others hold all places: those who play, and who may be about to."""
+        now = time.monotonic()
+        holders = [one for one in self._sessions if one.playing or now - one.active_s < _SETUP_TIMEOUT_S]
+        return len(set(holders) - {session}) >= _MAX_VIEWERS
 
     def _description(self, session: _Session) -> bytes:
         """The stream as a session description (RFC 4566, RFC 6184 section 8.2.1)."""
@@ -252,6 +274,8 @@ class _Session:
         self._ports = (0, 0)
         self._awaiting_key_frame = True
         self._sent_s = 0.0
+        self.active_s = time.monotonic()
+        """When the last request came."""
         self.own_host = str(writer.get_extra_info("sockname")[0])
         # Only to the client's own address, so that the server cannot be used to flood a third party.
         self._host = str(writer.get_extra_info("peername")[0])
@@ -301,7 +325,7 @@ class _Session:
             if self._writer.transport.get_write_buffer_size() > _MAX_UNSENT_BYTES:
                 self._awaiting_key_frame = True
                 if time.monotonic() - self._sent_s > _STALL_TIMEOUT_S:
-                    self._writer.transport.abort()
+                    self.abort()
                 return False
             self._sent_s = time.monotonic()
             for packet in packets:
@@ -315,6 +339,10 @@ class _Session:
                     self._sockets[side].sendto(packet, (self._host, self._ports[side]))
         self._awaiting_key_frame = False
         return True
+
+    def abort(self) -> None:
+        """End the connection at once; its reader then closes the session."""
+        self._writer.transport.abort()
 
     def close(self) -> None:
         """Close the connection and the UDP sockets."""
@@ -338,7 +366,7 @@ async def _read_request(reader: asyncio.StreamReader) -> tuple[str, str, dict[st
         return None
     line, *lines = (first + await reader.readuntil(b"\r\n\r\n")).decode("ascii").strip().split("\r\n")
     parts = line.split(" ")
-    if len(parts) != 3:
+    if len(parts) != 3 or not line.isprintable():
         return 400
     if parts[2] != "RTSP/1.0":
         return 505

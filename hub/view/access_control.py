@@ -30,12 +30,17 @@ class AccessControl:
     def allows(self, path: str, headers: Any) -> bool:
         """Whether a request is accepted. path: with its query; headers: a mapping with ``get``."""
         host, origin = headers.get("Host") or "", headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
+        try:
+            site = None if origin is None else urlsplit(origin).netloc.lower()
+            name, query = urlsplit(f"//{host}").hostname or "", urlsplit(path).query
+        except ValueError:
+            return False  # malformed
+        if site is not None and site != host.lower():
             return False  # a page of another site
         if not self.token:
             # DNS rebinding: a foreign name that resolves to this machine has another Host.
-            return is_local(urlsplit(f"//{host}").hostname or "")
-        given = parse_qs(urlsplit(path).query).get("token", [""])[0] or _cookie(headers.get("Cookie") or "")
+            return is_local(name)
+        given = parse_qs(query).get("token", [""])[0] or _cookie(headers.get("Cookie") or "")
         return hmac.compare_digest(given.encode(), self.token.encode())
 
     def wrap(self, inner: Callable[[Any, Any], Any] | None) -> Callable[[Any, Any], Any]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from edge.video import rtsp_server
 from edge.video.rtp_encoder import RtpEncoder
 from edge.video.rtsp_server import PATH, RtspServer
 from protocols.core.errors import InputError
@@ -137,6 +138,8 @@ def test_a_viewer_that_never_reads_does_not_block_others() -> None:
         (b"OPTIONS * RTSP/2.0\r\nCSeq: 1\r\n\r\n", b"505"),
         (b"GET / HTTP/1.1\r\nHost: x\r\n\r\n", b"505"),
         (b"nonsense\r\n\r\n", b"400"),
+        (b"DESCRIBE rtsp://[ RTSP/1.0\r\nCSeq: 1\r\n\r\n", b"400"),
+        (b"DESCRIBE rtsp://x/overlay\nX:1 RTSP/1.0\r\nCSeq: 1\r\n\r\n", b"400"),
     ],
 )
 def test_requests_get_the_status_codes_of_the_standard(sent: bytes, status: bytes) -> None:
@@ -174,6 +177,38 @@ def test_a_session_can_be_resumed_after_pause_and_not_after_teardown() -> None:
             link.sendall(request(method, Session=session))
             assert link.recv(4096).decode().split()[1] == status
             assert server.viewers == viewers, method
+
+
+SETUP = request("SETUP", Transport="RTP/AVP/TCP;unicast;interleaved=0-1")
+
+
+def test_places_that_are_set_up_and_not_played_are_given_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four SETUPs without PLAY held all places for as long as their connections were open."""
+    monkeypatch.setattr(rtsp_server, "_SETUP_TIMEOUT_S", 0.3)
+    with serving() as server, contextlib.ExitStack() as stack:
+        for _ in range(4):
+            link = stack.enter_context(socket.create_connection(("127.0.0.1", server.port), timeout=10))
+            link.sendall(SETUP)
+            assert link.recv(4096).startswith(b"RTSP/1.0 200")
+        assert eventually(lambda: exchange(server, SETUP).startswith(b"RTSP/1.0 200"))
+
+
+def test_silent_connections_do_not_lock_others_out() -> None:
+    """Sixteen connections without a word were all that the server took, for a minute each."""
+    with serving() as server, contextlib.ExitStack() as stack:
+        for _ in range(40):
+            stack.enter_context(socket.create_connection(("127.0.0.1", server.port), timeout=10))
+        assert exchange(server, request("OPTIONS")).startswith(b"RTSP/1.0 200")
+        assert len(server._connections) <= 17
+
+
+def test_an_error_in_a_connection_is_no_traceback(caplog: pytest.LogCaptureFixture) -> None:
+    with serving() as server:
+        exchange(server, b"SETUP rtsp://[::1/overlay RTSP/1.0\r\nCSeq: 1\r\n\r\n", SETUP)
+        exchange(
+            server, request("SETUP", Transport="RTP/AVP;unicast;client_port=5000-\u0665".encode().decode("latin1"))
+        )
+    assert caplog.records == []
 
 
 def test_an_encoder_failure_costs_one_image_only(monkeypatch: pytest.MonkeyPatch) -> None:
