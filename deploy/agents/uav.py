@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from edge.devices.simulated.aircraft import SimulatedAircraft
     from edge.mavlink.link.connection import Link
     from edge.mavlink.roles.autopilot import Autopilot
-    from edge.mavlink.roles.camera import CameraComponent, SelectTarget, StopTracking
+    from edge.mavlink.roles.camera import CameraComponent, OperatorCommand
     from edge.mavlink.roles.camera_messages import VideoStream
     from edge.uav.base import Estimate, Image
     from edge.uav.world.flight_world import FlightWorld
@@ -143,9 +143,11 @@ def make_agent(
         std_m=bounds.std_m,
         range_m=bounds.range_m,
         speed=bounds.speed,
+        fence_m=bounds.fence_m,
+        height=bounds.height_m,
     )
 
-    def component(on_command: Callable[[SelectTarget | StopTracking], bool]) -> CameraComponent:
+    def component(on_command: Callable[[OperatorCommand], bool]) -> CameraComponent:
         return CameraComponent(
             link,
             settings.size,

@@ -22,7 +22,7 @@ from edge.detectors.base import Detector
 from edge.devices.base import Device, Frame, Image
 from edge.mavlink.link.connection import Link, ReceivedMessage
 from edge.mavlink.link.receiver import Receiver
-from edge.mavlink.roles.camera import CameraComponent, SelectTarget, StopTracking
+from edge.mavlink.roles.camera import ArmFollow, CameraComponent, OperatorCommand, SelectTarget
 from edge.mavlink.roles.guidance import Guidance, GuidanceTarget
 from edge.mavlink.roles.vehicle import MountSample, Vehicle
 from edge.uav.base import Box, Estimate, Telemetry, TrackState
@@ -95,7 +95,7 @@ class UavAgent:
         device: Device,
         link: Link,
         vehicle: Vehicle,
-        component: Callable[[Callable[[SelectTarget | StopTracking], bool]], CameraComponent],
+        component: Callable[[Callable[[OperatorCommand], bool]], CameraComponent],
         guidance: Guidance,
         agent: str,
         settings: UavSettings,
@@ -348,8 +348,10 @@ class UavAgent:
         if self._show is not None:
             self._show(frame.image, self.estimator.estimate, status_line(self.estimator.estimate))
 
-    def _execute(self, command: SelectTarget | StopTracking) -> bool:
-        """Execute an operator's command; whether the estimator accepted it."""
+    def _execute(self, command: OperatorCommand) -> bool:
+        """Execute an operator's command; whether it was accepted."""
+        if isinstance(command, ArmFollow):
+            return self._arm_follow(command)
         width, height = self._settings.size
         message = pb.TargetCommand(**self._message_header(), kind="stop", by=command.by)
         if isinstance(command, SelectTarget):
@@ -364,7 +366,8 @@ class UavAgent:
         for out in self.estimator.handle(message):
             self._publish(out)
         accepted = self.estimator.refused == refused
-        if isinstance(command, StopTracking):
+        if not isinstance(command, SelectTarget):
+            self._guidance.disarm()
             self._guidance.hold("stopped by the operator")
         elif accepted:
             self._guidance.begin(self._vehicle.position)
@@ -381,6 +384,20 @@ class UavAgent:
         around = [box for box in boxes if 0.0 <= x - box.x <= box.width and 0.0 <= y - box.y <= box.height]
         return min(around, key=lambda box: box.width * box.height, default=None)
 
+    def _arm_follow(self, command: ArmFollow) -> bool:
+        """Let the vehicle follow the present target, or end that."""
+        guidance = self._guidance
+        if not command.follow:
+            guidance.disarm()
+            self.camera.say("Syncline: follow ended")
+            return True
+        if not self.estimator.has_target or not self._vehicle.armed:
+            self.camera.say(f"Syncline: no follow, {'vehicle disarmed' if self.estimator.has_target else 'no target'}")
+            return False
+        accepted = guidance.arm(command.by)
+        self.camera.say(f"Syncline: follow armed by {command.by}" if accepted else "Syncline: no follow, it is off")
+        return accepted
+
     def _check_clock_resets(self) -> None:
         """Reset the time alignment when the vehicle's or the camera's clock was reset or stepped."""
         resets = (*self._vehicle.clock_resets, self.camera_clock.steps)
@@ -393,6 +410,16 @@ class UavAgent:
     def _send_guidance(self, now: int) -> None:
         """Send gimbal and follow commands, or hold them with a reason; see ``Guidance``."""
         now_s = now / NANOSECONDS
+        guidance = self._guidance
+        station = guidance.armed_by
+        if station is not None and not self.camera.is_present(station, now_s):
+            guidance.disarm(f"station {station} is silent")
+            guidance.hold(f"station {station} is silent")
+        self._guide(now, now_s)
+        if station is not None and guidance.armed_by is None and guidance.hold_reason:
+            self.camera.say(f"Syncline: follow ended, {guidance.hold_reason}")
+
+    def _guide(self, now: int, now_s: float) -> None:
         estimate, vehicle = self.estimator.estimate, self._vehicle
         if estimate is None:
             if self._guidance.hold_reason != "stopped by the operator":
@@ -403,6 +430,7 @@ class UavAgent:
         position, velocity = vehicle.position, vehicle.velocity
         if estimate.state is TrackState.LOST:
             self._guidance.hold("the target is lost")
+            self._guidance.disarm()
         elif (
             now - self._link.last_received_ns > _LINK_STALE_S * NANOSECONDS
             or now_s - self._last_sample_s > _LINK_STALE_S

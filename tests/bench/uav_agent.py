@@ -194,6 +194,8 @@ def loops(seeds: list[int], kind: str) -> bool:
             print(f"{kind}: seed {seed}: no target could be selected")
             exits += len(disturbances)
             continue
+        if control.follow:
+            flight.arm_follow()
         flight.run(_FLIGHT_S)
         table = np.array(inside)
         for push in disturbances:

@@ -14,6 +14,7 @@ from deploy.demo.flight_outcome import compare_log_with_world
 from deploy.demo.flight_report import write_report
 from deploy.logs.replay_uav import replay_through_uav
 from edge.agents.uav import TOPICS
+from edge.devices.simulated.aircraft import Disturbance
 from edge.mavlink.roles.autopilot import LinkFaults
 from edge.uav.base import TrackState
 from edge.uav.world.flight_world import FlightWorld
@@ -22,6 +23,7 @@ from protocols.core.errors import InputError
 from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
+from tests.faults.matrix import measured
 from tests.support.uav_flights import Flight, mavlink
 
 SIZE = (320, 240)
@@ -113,7 +115,9 @@ def test_an_aircraft_with_permission_is_commanded_to_follow_and_stops_on_the_ope
     )
     flight.run(1.5)
     assert flight.select()
-    flight.run(3.0)
+    assert not flight.autopilot.counters["follow_targets"]
+    assert flight.arm_follow()
+    flight.run(3.1)
     sent = flight.autopilot.counters["follow_targets"]
     assert sent > 10
     geo_status = flight.station.last("CAMERA_TRACKING_GEO_STATUS")
@@ -125,12 +129,55 @@ def test_an_aircraft_with_permission_is_commanded_to_follow_and_stops_on_the_ope
     car = world.target.ground[flight.frame] - world.target.ground[flight.frame - 30]
     moving = flight.aircraft.pose(flight.time).velocity[:2]
     assert float(moving @ car) / float(np.linalg.norm(car)) > 2.0  # from a standstill, after the car
-    flight.station.command(mavlink.MAV_CMD_CAMERA_STOP_TRACKING)
+    present, flight.agent.camera.is_present = flight.agent.camera.is_present, lambda system, now_s: False  # type: ignore[method-assign]
     flight.run(3.2)
+    assert flight.agent.status(0).message == "station 255 is silent"
+    assert flight.station.received["STATUSTEXT"][-1].text == "Syncline: follow ended, station 255 is silent"
+    flight.agent.camera.is_present = present  # type: ignore[method-assign]
+    assert flight.arm_follow()
+    flight.station.command(mavlink.MAV_CMD_CAMERA_STOP_TRACKING)
+    flight.run(3.5)
     sent = flight.autopilot.counters["follow_targets"]
     flight.run(4.0)
     assert flight.autopilot.counters["follow_targets"] == sent
     assert flight.agent.status(0).message == "stopped by the operator"
+
+
+def test_a_vehicle_that_follows_in_wind_stops_at_the_fence(world: FlightWorld) -> None:
+    """Gusts of 8 m/s. The car comes to 46 m from the take-off place, and crosses the fence on its way out again."""
+    radius = np.hypot(*world.target.ground.T[:2])
+    crossing = 7.5
+    fence = float(radius[round(crossing * world.fps)])
+    start = np.array([*world.target.ground[60], -62.0])
+    assert float(np.hypot(*start[:2])) < fence
+    gusts = tuple(
+        Disturbance(begin, 1.0, velocity=(8.0 * float(np.cos(begin)), 8.0 * float(np.sin(begin))))
+        for begin in (3.0, 4.5, 6.0)
+    )
+    flight = Flight(
+        world,
+        control=ControlConfig(follow=True, fence_m=fence),
+        flies="follow",
+        start=start,
+        gimbal=(-0.5 * np.pi, 0.0),
+        disturbances=gusts,
+    )
+    flight.run(1.8)
+    assert not flight.arm_follow()  # there is no target yet
+    assert flight.select()
+    assert flight.arm_follow()
+    flight.run(4.0)
+    assert flight.autopilot.counters["follow_targets"] > 5
+    flight.run(crossing + 1.5)
+    sent = flight.autopilot.counters["follow_targets"]
+    texts = [message.text for message in flight.station.received["STATUSTEXT"]]
+    assert f"Syncline: follow ended, fence: {fence:.0f} m from take-off"[:50] in texts, texts
+    flight.run(flight.time + 3.0)
+    assert flight.autopilot.counters["follow_targets"] == sent
+    pose = flight.aircraft.pose(flight.time)
+    assert np.hypot(*pose.position[:2]) < fence + 30.0  # its way to stop, and the wind
+    assert np.hypot(*pose.velocity[:2]) < 1.0
+    measured("follow in gusts of 8 m/s, fence", "stops there", f"{np.hypot(*pose.position[:2]) - fence:+.0f} m")
 
 
 def test_the_demos_report_shows_map_and_images_of_what_was_recorded(world: FlightWorld, tmp_path: Path) -> None:
@@ -166,6 +213,7 @@ def test_commands_stop_while_the_link_is_silent_or_no_frames_come_and_when_the_t
 
     flight.run(1.5)
     assert flight.select()
+    assert flight.arm_follow()
     flight.run(2.5)
     step, flight.autopilot.step = flight.autopilot.step, lambda time: None  # type: ignore[method-assign]
     flight.run(4.1)
@@ -181,6 +229,8 @@ def test_commands_stop_while_the_link_is_silent_or_no_frames_come_and_when_the_t
     assert sent(0.5) == 0
     assert control.hold_reason == "the target is lost"
     flight.agent.estimator.estimate = estimate
+    assert sent(0.3) == 0  # to follow it again needs the operator again
+    assert flight.arm_follow()
     assert sent(0.5) > 0
     flight.run(flight.time + 1.2)  # more than two seconds without a frame
     assert sent(0.5) == 0

@@ -219,6 +219,14 @@ class Flight:
         answers = [m for m in self.station.received.get("COMMAND_ACK", []) if m.get_srcComponent() == CAMERA]
         return bool(answers) and answers[-1].result == mavlink.MAV_RESULT_ACCEPTED
 
+    def arm_follow(self, follow: bool = True) -> bool:
+        """Let the vehicle follow the target, as a station does; returns whether that was accepted."""
+        self.station.command(mavlink.MAV_CMD_DO_FOLLOW, 1.0 if follow else 0.0)
+        self.station.received.pop("COMMAND_ACK", None)
+        self.run(self.time + 0.1)
+        answer = self.station.last("COMMAND_ACK")
+        return answer is not None and answer.result == mavlink.MAV_RESULT_ACCEPTED
+
     def truth(self, frame: int) -> GroundTruth:
         """Ground truth of a frame for the camera pose of that time; at most 3 s ago."""
         rotation, centre = self.aircraft.camera_from_ned(self.world.time(frame), self.world.body_from_camera)

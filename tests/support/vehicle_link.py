@@ -17,7 +17,7 @@ from edge.mavlink.link.connection import Link
 from edge.mavlink.link.transport import Transport, Udp, Url, parse_url
 from edge.mavlink.roles import camera, telemetry
 from edge.mavlink.roles.autopilot import Autopilot
-from edge.mavlink.roles.camera import CameraComponent, SelectTarget, StopTracking
+from edge.mavlink.roles.camera import CameraComponent, OperatorCommand, SelectTarget
 from edge.mavlink.roles.camera_messages import VideoStream
 from edge.mavlink.roles.vehicle import Vehicle
 from protocols.geometry.camera import Intrinsics
@@ -65,7 +65,7 @@ class CameraOnLink:
     url: str = ""
     transport: Transport | None = None
     now_ns: Callable[[], int] = time.monotonic_ns
-    commands: list[SelectTarget | StopTracking] = field(default_factory=list)
+    commands: list[OperatorCommand] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.link = Link(
@@ -89,7 +89,7 @@ class CameraOnLink:
             self.component.handle(received, 1e-9 * now_ns)
         self.component.tick(1e-9 * now_ns, frame=True)
 
-    def _execute(self, command: SelectTarget | StopTracking) -> bool:
+    def _execute(self, command: OperatorCommand) -> bool:
         self.commands.append(command)
         status = self.component.status
         status.state = "visible" if isinstance(command, SelectTarget) else "idle"

@@ -47,10 +47,21 @@ class StopTracking:
     by: int
 
 
+@dataclass(frozen=True, slots=True)
+class ArmFollow:
+    """Command to follow the target with the vehicle, or to stop following."""
+
+    follow: bool
+    by: int
+
+
+OperatorCommand = SelectTarget | StopTracking | ArmFollow
+
+
 class CameraComponent:
     """The camera component on one link. size: (width, height) [px]; lens: None where not calibrated.
 
-    stream: None without video. on_command: called with SelectTarget and StopTracking; whether the command was accepted.
+    stream: None without video. on_command: called with an operator's command; whether it was accepted.
     stations: system ids that may send commands; empty: all.
     """
 
@@ -61,7 +72,7 @@ class CameraComponent:
         fps: float,
         lens: Intrinsics | None,
         stream: VideoStream | None,
-        on_command: Callable[[SelectTarget | StopTracking], bool],
+        on_command: Callable[[OperatorCommand], bool],
         *,
         stations: frozenset[int] = frozenset(),
         version: tuple[int, int, int] = (0, 1, 0),
@@ -148,6 +159,14 @@ class CameraComponent:
         for kind in ("CAMERA_TRACKING_IMAGE_STATUS", "CAMERA_TRACKING_GEO_STATUS"):
             self._send_message(kind)
 
+    def is_present(self, system: int, now_s: float) -> bool:
+        """Whether a station was heard within the last 10 s."""
+        return self._rates.is_present(system, now_s)
+
+    def say(self, text: str) -> None:
+        """Send a line of at most 50 characters to the stations' message lists."""
+        self._send_text((text, mavlink.MAV_SEVERITY_WARNING))
+
     def _command(self, command: int, p: tuple[float, ...], received: ReceivedMessage) -> Any:
         """Execute one command; its MAV_RESULT, None where it is not for a camera."""
         accepted, denied = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED
@@ -174,6 +193,11 @@ class CameraComponent:
             selection = SelectTarget(
                 min(p[0], p[2]), min(p[1], p[3]), max(p[0], p[2]), max(p[1], p[3]), received.system
             )
+        elif command == mavlink.MAV_CMD_DO_FOLLOW:
+            if received.message.target_component != CAMERA:
+                return None  # a broadcast is the autopilot's own follow-me
+            by_station = math.isfinite(p[0]) and received.system != self._link.vehicle
+            return accepted if by_station and self._on_command(ArmFollow(p[0] > 0, received.system)) else denied
         elif command == mavlink.MAV_CMD_CAMERA_STOP_TRACKING:
             self.counters["stops"] += 1
             return accepted if self._on_command(StopTracking(received.system)) else mavlink.MAV_RESULT_FAILED

@@ -1,7 +1,8 @@
 """Guidance commands to the vehicle: gimbal pointing and FOLLOW_TARGET. Disabled unless allowed by configuration.
 
 Every command is bounded, and none is sent unless the target is visible or predicted within limits, the link is alive
-and the operator has not stopped it. Silence is the safe state: an autopilot that receives no more FOLLOW_TARGET hovers.
+and the operator has not stopped it. FOLLOW_TARGET moves the vehicle: it also has to be armed by an operator for each
+target, and ends for good at the fence. Silence is the safe state: an autopilot that receives no more of it hovers.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from protocols.geometry.types import Floats
 _CONFIGURE_S = 5.0
 _MIN_HORIZONTAL_M = 3.0  # horizontal distance below which the bearing to the target is undefined
 _TARGET_HEIGHT_M = 0.7
+_NOT_ARMED = "follow is not armed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +30,9 @@ class GuidanceLimits:
 
     pitch: lowest and highest [rad]; rate: greatest angular rate [rad/s]. coast_s: longest time without seeing the
     target. std_m: greatest std of its position. range_m: greatest distance from where the vehicle was when the target
-    was selected. speed: greatest target speed that is sent [m/s].
+    was selected. speed: greatest target speed that is sent [m/s]. fence_m: greatest distance of vehicle and target from
+    the origin of the local frame, where the vehicle took off. height: least and greatest height of a vehicle that
+    follows [m above the origin].
     """
 
     gimbal: bool = False
@@ -39,6 +43,8 @@ class GuidanceLimits:
     std_m: float = 15.0
     range_m: float = 300.0
     speed: float = 20.0
+    fence_m: float = 500.0
+    height: tuple[float, float] = (5.0, 120.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +62,10 @@ class GuidanceTarget:
 
 
 class Guidance:
-    """Sends guidance commands at ``rate_hz`` while allowed. hold_reason: why none are sent; "" while they are."""
+    """Sends guidance commands at ``rate_hz`` while allowed. hold_reason: why none are sent; "" while they are.
+
+    armed_by: the station that armed FOLLOW_TARGET for the present target; None while it is not armed.
+    """
 
     def __init__(self, link: Link, limits: GuidanceLimits, *, rate_hz: float = 10.0) -> None:
         self._link, self.limits = link, limits
@@ -64,6 +73,8 @@ class Guidance:
         self._due_s = self._configure_s = -math.inf
         self._angles: tuple[float, float] | None = None
         self._start_position: Floats | None = None
+        self.armed_by: int | None = None
+        self._disarmed = _NOT_ARMED
         self.counters: Counter[str] = Counter()
         self.hold_reason = "off" if not (limits.gimbal or limits.follow) else "no target"
 
@@ -71,6 +82,20 @@ class Guidance:
         """A target was selected while the vehicle was at a position (3,) NED [m]."""
         self._start_position = None if vehicle is None else vehicle.copy()
         self._angles = None
+        self.armed_by, self._disarmed = None, _NOT_ARMED
+
+    def arm(self, station: int) -> bool:
+        """An operator allows FOLLOW_TARGET for the present target; whether the configuration does too."""
+        if self.limits.follow:
+            self.armed_by = station
+            self.counters["armed"] += 1
+        return self.limits.follow
+
+    def disarm(self, reason: str = "") -> None:
+        """FOLLOW_TARGET has to be armed again."""
+        if self.armed_by is not None:
+            self.armed_by, self._disarmed = None, reason or _NOT_ARMED
+            self.counters["disarmed"] += 1
 
     def hold(self, hold_reason: str) -> None:
         """Stop sending commands, for the given reason."""
@@ -91,14 +116,32 @@ class Guidance:
         if reason:
             self.hold(reason)
             return
-        self.hold_reason = ""
-        self._due_s = max(self._due_s + self._period, now_s + 0.5 * self._period)
         ahead = now_s - target.time_s
         position = target.position + float(np.clip(ahead, 0.0, 1.0)) * target.velocity
+        reason = self._follow_refusal(position, vehicle) if limits.follow else "off"
+        if reason and not limits.gimbal:
+            self.hold(reason)
+            return
+        self.hold_reason = ""
+        self._due_s = max(self._due_s + self._period, now_s + 0.5 * self._period)
         if limits.gimbal:
             self._point(now_s, position, vehicle)
-        if limits.follow and origin is not None:
+        if not reason and origin is not None:
             self._follow(now_s, position, target, origin)
+
+    def _follow_refusal(self, position: Floats, vehicle: Floats) -> str:
+        """Why the vehicle may not follow; at the fence and beyond its heights it has to be armed again."""
+        if self.armed_by is None:
+            return self._disarmed
+        limits = self.limits
+        reason = ""
+        if not max(float(np.hypot(*position[:2])), float(np.hypot(*vehicle[:2]))) <= limits.fence_m:
+            reason = f"fence: {limits.fence_m:.0f} m from take-off"
+        elif not limits.height[0] <= -vehicle[2] <= limits.height[1]:
+            reason = f"height {-vehicle[2]:.0f} m, not {limits.height[0]:.0f} to {limits.height[1]:.0f} m"
+        if reason:
+            self.disarm(reason)
+        return reason
 
     def _refusal(self, target: GuidanceTarget, vehicle: Floats) -> str:
         limits = self.limits

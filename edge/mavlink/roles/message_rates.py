@@ -41,6 +41,11 @@ class MessageRates:
         if len(self._stations) > _MAX_STATIONS:
             del self._stations[min(self._stations, key=lambda one: self._stations[one].heard_s)]
 
+    def is_present(self, system: int, now_s: float) -> bool:
+        """Whether a component of a system was heard lately."""
+        self._forget(now_s)
+        return any(station[0] == system for station in self._stations)
+
     def set_interval(self, station: Station, kind: str, interval_us: float) -> None:
         """What a station asks for, as in SET_MESSAGE_INTERVAL: 0 = the default, negative = none."""
         presence = self._stations[station]

@@ -13,7 +13,7 @@ from edge.mavlink.dialect import mavlink
 from edge.mavlink.link.connection import Link
 from edge.mavlink.link.transport import Pipe
 from edge.mavlink.roles import status_texts
-from edge.mavlink.roles.camera import CameraComponent, SelectTarget, StopTracking
+from edge.mavlink.roles.camera import ArmFollow, CameraComponent, OperatorCommand, SelectTarget, StopTracking
 from edge.mavlink.roles.camera_messages import VideoStream
 from edge.mavlink.roles.message_rates import MessageRates
 from protocols.geometry.camera import Intrinsics
@@ -27,7 +27,7 @@ class CameraUnderTest:
 
     def __init__(
         self,
-        on_command: Callable[[SelectTarget | StopTracking], bool] = lambda command: True,
+        on_command: Callable[[OperatorCommand], bool] = lambda command: True,
         stream: VideoStream | None = None,
         stations: frozenset[int] = frozenset(),
     ) -> None:
@@ -157,7 +157,7 @@ def test_the_fields_of_view_follow_from_the_intrinsics() -> None:
 
 
 def test_a_rectangle_is_a_selection_whichever_corner_comes_first() -> None:
-    commands: list[SelectTarget | StopTracking] = []
+    commands: list[OperatorCommand] = []
     under_test = CameraUnderTest(on_command=lambda command: commands.append(command) or True)  # type: ignore[func-returns-value]
     assert (
         under_test.result(mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, 0.75, 0.5, 0.25, 0.125) == mavlink.MAV_RESULT_ACCEPTED
@@ -176,7 +176,7 @@ def test_a_rectangle_is_a_selection_whichever_corner_comes_first() -> None:
     [(0.1, 0.1, 1.2, 0.2), (math.nan, 0.1, 0.2, 0.2), (-0.1, 0.1, 0.2, 0.2), (0.5, 0.1, 0.5, 0.2), (0.5,) * 4],
 )
 def test_an_invalid_box_is_denied_and_not_passed_on(corners: tuple[float, ...]) -> None:
-    commands: list[SelectTarget | StopTracking] = []
+    commands: list[OperatorCommand] = []
     under_test = CameraUnderTest(on_command=lambda command: commands.append(command) or True)  # type: ignore[func-returns-value]
     assert under_test.command(mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, *corners)[0].result == mavlink.MAV_RESULT_DENIED
     assert commands == []
@@ -184,7 +184,7 @@ def test_an_invalid_box_is_denied_and_not_passed_on(corners: tuple[float, ...]) 
 
 
 def test_a_retransmitted_command_is_acknowledged_again_but_not_executed_again() -> None:
-    commands: list[SelectTarget | StopTracking] = []
+    commands: list[OperatorCommand] = []
     under_test = CameraUnderTest(on_command=lambda command: commands.append(command) or True)  # type: ignore[func-returns-value]
     box = (0.25, 0.25, 0.5, 0.5)
     assert under_test.result(mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, *box) == mavlink.MAV_RESULT_ACCEPTED
@@ -198,7 +198,7 @@ def test_a_retransmitted_command_is_acknowledged_again_but_not_executed_again() 
 
 
 def test_a_station_that_is_not_allowed_is_denied() -> None:
-    commands: list[SelectTarget | StopTracking] = []
+    commands: list[OperatorCommand] = []
     under_test = CameraUnderTest(
         on_command=lambda command: commands.append(command) or True,  # type: ignore[func-returns-value]
         stations=frozenset({254}),
@@ -349,3 +349,18 @@ def test_status_texts_say_what_happens_to_the_target() -> None:
     fly("idle", 1)
     assert texts == ["Syncline: target lost, select it again", "Syncline: tracking stopped"]
     assert all(len(text) <= 50 for text, _ in status_texts._TEXTS.values())
+
+
+def test_only_a_station_arms_following_and_only_at_the_camera() -> None:
+    commands: list[OperatorCommand] = []
+    under_test = CameraUnderTest(on_command=lambda command: commands.append(command) or True)  # type: ignore[func-returns-value]
+    follow = mavlink.MAV_CMD_DO_FOLLOW
+    assert under_test.result(follow, 1, by=QGC) == mavlink.MAV_RESULT_ACCEPTED
+    assert under_test.result(follow, 0, by=QGC) == mavlink.MAV_RESULT_ACCEPTED
+    assert under_test.result(follow, math.nan, by=QGC) == mavlink.MAV_RESULT_DENIED
+    assert under_test.result(follow, 1, by=1) == mavlink.MAV_RESULT_DENIED  # the vehicle itself
+    assert under_test.command(follow, 1, component=0, by=QGC) == []  # the autopilot's own follow-me
+    assert commands == [ArmFollow(True, QGC), ArmFollow(False, QGC)]
+    assert under_test.camera.is_present(QGC, under_test.now)
+    assert not under_test.camera.is_present(QGC, under_test.now + 11.0)
+    assert not under_test.camera.is_present(OTHER, under_test.now)

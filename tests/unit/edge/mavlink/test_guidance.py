@@ -31,6 +31,7 @@ class GuidanceUnderTest:
         self._link.poll()
         self.guidance = Guidance(self._link, GuidanceLimits(**limits))
         self.guidance.begin(VEHICLE)
+        self.guidance.arm(255)
         self._pipe.receive()
 
     def tick(self, now_s: float, target: GuidanceTarget = TARGET, vehicle: np.ndarray = VEHICLE) -> list[Any]:
@@ -71,6 +72,43 @@ def test_beyond_the_limits_nothing_is_sent_and_the_reason_is_given(
     assert under_test.tick(1.0, target, vehicle) == []
     assert reason in under_test.guidance.hold_reason
     assert under_test.tick(2.0) != []  # and it resumes within the limits
+
+
+def test_the_vehicle_follows_only_once_it_is_armed_and_for_one_target() -> None:
+    under_test = GuidanceUnderTest(follow=True)
+    assert kinds(under_test.tick(0.0)) == {"FOLLOW_TARGET"}
+    under_test.guidance.begin(VEHICLE)  # another target
+    assert under_test.tick(1.0) == []
+    assert under_test.guidance.hold_reason == "follow is not armed"
+    assert under_test.guidance.arm(255)
+    assert kinds(under_test.tick(2.0)) == {"FOLLOW_TARGET"}
+    under_test.guidance.disarm()
+    assert under_test.tick(3.0) == []
+    assert not GuidanceUnderTest(gimbal=True).guidance.arm(255)
+    pointing = GuidanceUnderTest(gimbal=True, follow=True)
+    pointing.guidance.disarm()
+    assert "FOLLOW_TARGET" not in kinds(pointing.tick(0.0))
+
+
+@pytest.mark.parametrize(
+    ("target", "vehicle", "reason"),
+    [
+        (replace(TARGET, position=np.array([30.0, 96.0])), VEHICLE, "fence: 100 m"),
+        (TARGET, np.array([80.0, 70.0, -50.0]), "fence: 100 m"),
+        (TARGET, np.array([0.0, 0.0, -121.0]), "height 121 m"),
+        (TARGET, np.array([0.0, 0.0, -4.0]), "height 4 m"),
+    ],
+)
+def test_at_the_fence_and_beyond_its_heights_following_ends_until_it_is_armed_again(
+    target: GuidanceTarget, vehicle: np.ndarray, reason: str
+) -> None:
+    under_test = GuidanceUnderTest(follow=True, fence_m=100.0)
+    assert under_test.tick(0.0) != []
+    assert under_test.tick(1.0, target, vehicle) == []
+    assert reason in under_test.guidance.hold_reason
+    assert under_test.tick(2.0) == []
+    under_test.guidance.arm(255)
+    assert under_test.tick(3.0) != []
 
 
 def test_follow_target_has_the_extrapolated_position_and_a_limited_speed() -> None:
