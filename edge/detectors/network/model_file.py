@@ -29,11 +29,16 @@ _FIELDS: dict[str, dict[str, tuple[int, str, bool]]] = {
     "Graph": {
         "node": (1, "Node", True),
         "initializer": (5, "Tensor", True),
-        "output": (12, "Value", True),
+        "input": (11, "Value", True),
         "sparse_initializer": (15, "Sparse", True),
     },
     "Value": {"name": (1, "string", False)},
-    "Node": {"op_type": (4, "string", False), "attribute": (5, "Attribute", True)},
+    "Node": {
+        "input": (1, "string", True),
+        "output": (2, "string", True),
+        "op_type": (4, "string", False),
+        "attribute": (5, "Attribute", True),
+    },
     "Attribute": {
         "t": (5, "Tensor", False),
         "g": (6, "Graph", False),
@@ -43,7 +48,11 @@ _FIELDS: dict[str, dict[str, tuple[int, str, bool]]] = {
         "sparse_tensors": (23, "Sparse", True),
     },
     "Sparse": {"values": (1, "Tensor", False), "indices": (2, "Tensor", False)},
-    "Tensor": {"external_data": (13, "Entry", True), "data_location": (14, "int64", False)},
+    "Tensor": {
+        "name": (8, "string", False),
+        "external_data": (13, "Entry", True),
+        "data_location": (14, "int64", False),
+    },
     "Entry": {"key": (1, "string", False), "value": (2, "string", False)},
 }
 
@@ -67,6 +76,7 @@ def check_model_file(file: Path) -> None:
         raise InputError("the model is not an ONNX file, or damaged", file=file, remedy=_REMEDY) from None
     if not model.HasField("graph") or not model.graph.node or model.ir_version <= 0:
         raise InputError("the model is not an ONNX file, or empty", file=file, remedy=_REMEDY)
+    _check_inputs(model.graph, frozenset(), file)
     for message in _messages(model, file):
         if message.DESCRIPTOR.name == "Node" and message.op_type in _LOOPS:
             what = f"the model has a {message.op_type}, whose duration is not bounded"
@@ -75,6 +85,21 @@ def check_model_file(file: Path) -> None:
             size += _external_size(message, file)
             if size > MAX_BYTES:
                 raise InputError(f"the model's data exceeds {MAX_BYTES >> 20} MiB", file=file, remedy=_REMEDY)
+
+
+def _check_inputs(graph: Any, outer: frozenset[str], file: Path) -> None:
+    """Raise InputError unless each node's inputs are computed before it: OpenCV does not check that. outer: names."""
+    known = outer | {one.name for one in (*graph.input, *graph.initializer)} | {""}  # "": an input that is left out
+    known |= {one.values.name for one in graph.sparse_initializer}
+    for node in graph.node:
+        unknown = [name for name in node.input if name not in known]
+        if unknown:
+            what = f"the model uses {unknown[0][:80]!r}, which nothing in it computes"
+            raise InputError(what, file=file, remedy=_REMEDY)
+        for attribute in node.attribute:
+            for inner in (*([attribute.g] if attribute.HasField("g") else []), *attribute.graphs):
+                _check_inputs(inner, known, file)
+        known |= set(node.output)
 
 
 def _external_size(tensor: Any, file: Path) -> int:
@@ -110,7 +135,7 @@ def _messages(message: Any, file: Path, depth: int = 0) -> Iterator[Any]:
 def _message(name: str) -> type[Any]:
     """The class of a message of ``_FIELDS``."""
     package = "syncline.onnx"
-    file = descriptor_pb2.FileDescriptorProto(name="syncline_onnx.proto", package=package, syntax="proto2")
+    file = descriptor_pb2.FileDescriptorProto(name="syncline_onnx.proto", package=package, syntax="proto3")
     kinds = descriptor_pb2.FieldDescriptorProto
     scalars = {"int64": kinds.TYPE_INT64, "string": kinds.TYPE_STRING}
     for message, fields in _FIELDS.items():
