@@ -11,6 +11,7 @@ import pytest
 
 from deploy.cli import run
 from tests.browser.conftest import Tab
+from tests.support.crowds import boxes_csv, write_calibration
 
 SIZE_LIMIT = 6 * 1024 * 1024
 
@@ -52,6 +53,21 @@ def test_a_report_opens_offline_without_requests(name: str, reports: dict[str, P
     tab.shot(f"report-{name}", full_page=True)
     assert [url for url in tab.requests if not url.startswith(("file:", "data:", "blob:"))] == []
     assert reports[name].stat().st_size <= SIZE_LIMIT
+
+
+def test_the_report_of_followed_people_opens_offline(tmp_path: Path, tab: Tab) -> None:
+    (tmp_path / "boxes.csv").write_text(boxes_csv(), encoding="utf-8")
+    calibration = str(write_calibration(tmp_path / "calibration.toml"))
+    assert run(["follow", str(tmp_path), "--calibration", calibration, "--out", str(tmp_path)]) == 0
+    tab.context.set_offline(True)
+    tab.page.goto((tmp_path / "report.html").as_uri())
+    assert tab.page.inner_text("h1") == "3 people followed through 3 cameras"
+    assert tab.page.locator("polyline.walk").count() >= 3
+    plan = tab.page.locator("svg[aria-label='Paths from above']").bounding_box()
+    assert plan is not None
+    assert plan["width"] > 300
+    tab.shot("report-follow", full_page=True)
+    assert [url for url in tab.requests if not url.startswith("file:")] == []
 
 
 def test_figures_are_distinguished_without_colour(reports: dict[str, Path], tab: Tab) -> None:

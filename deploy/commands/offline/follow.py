@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from deploy.offline.progress import progress_bar
-from protocols.core.errors import EXIT_DONE, InputError
+from protocols.core.errors import EXIT_DONE, InputError, Refused
 from protocols.core.files import check_folder, write_together
 
 
@@ -58,7 +58,8 @@ def follow(
     kind
         What to follow. Detections of other kinds are left out.
     observations
-        Another file of detections to use instead of the session's own.
+        Another file of detections to use instead of the session's own; of videos, with the number of the decoded frame
+        from 0 as frame and its presentation time.
     detector
         For videos: person, vehicle, a detector that another package registers, or a network's .toml file. Default: what
         moves before the background. With it, the videos of a folder are used even if observations lie beside them.
@@ -126,6 +127,13 @@ def follow(
             source.times_ns,
             up=known.up,
             progress=lambda share: progress("", share),
+        )
+    if not result.tracks:
+        count = sum(len(message.detections) for message in source.observations)
+        raise Refused(
+            f"none of {count} detections made a track: no two cameras see a {kind} at one place for long enough; check "
+            "that the calibration is of these cameras, and their time offsets",
+            warnings=result.warnings,
         )
     times = [time_ns / NANOSECONDS for time_ns in source.times_ns]
     scores = None

@@ -72,11 +72,12 @@ def read_follow_input(
 ) -> FollowInput:
     """Read the detections of any kind of session; videos are detected in first, into a log in ``out``.
 
-    detector: see ``detect_videos``; where it is given, a folder's videos are used in place of its observations.
+    observations: a file of detections in place of the session's own, or of what a detector would find in a folder of
+    videos. detector: see ``detect_videos``; where it is given, a folder's videos are used in place of its observations.
     Raises InputError (file, line, what, remedy), and Refused where there is nothing to follow.
     """
     from deploy.offline.follow.video_detection import detect_videos
-    from deploy.offline.video_folder import is_video_folder
+    from deploy.offline.video_folder import is_video_folder, list_videos
 
     shared, log = known.rig.shared_clock, None
     videos: dict[str, Path] = {}
@@ -98,6 +99,8 @@ def read_follow_input(
         raise InputError(what, file=session, remedy=remedy)
     else:
         messages = object_messages(read_objects(file, known.file_sizes))
+        if is_video_folder(session):
+            videos = {video.camera: video.path for video in list_videos(session)[0]}
         if session.is_dir() and (session / RIG_FILE).exists():
             shared |= read_rig(session / RIG_FILE).shared_clock
     found, left_out = followed_detections(messages, kind, known.sizes)

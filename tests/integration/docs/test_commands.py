@@ -121,6 +121,22 @@ def test_from_the_tutorial_to_a_session_a_calibration_a_report_and_other_tools(t
     assert len(list((tmp_path / "for-opencv").iterdir())) == 4
 
 
+def test_from_a_folder_of_videos_to_followed_people_in_three_commands(tmp_path: Path) -> None:
+    text = (ROOT / "docs" / "tutorials" / "follow-people.md").read_text(encoding="utf-8")
+    run_as_written(line_with(text, "simulate people", "--render"), tmp_path)
+    printed = run_as_written(line_with(text, "follow room"), tmp_path)
+    mota = re.search(r"MOTA (\S+),", printed)
+    assert mota is not None
+    assert float(mota[1]) > 0.6
+    out = tmp_path / "followed"
+    assert {file.name for file in out.iterdir()} == {
+        "tracks.csv", "report.html", "result.json", "detections.mcap", "crops"
+    }  # fmt: skip
+    assert len(list(out.glob("crops/*/*_head.jpg"))) > 20
+    run_as_written(line_with(text, "replay followed"), tmp_path)
+    assert (tmp_path / "live.mcap").stat().st_size > 10_000
+
+
 def test_the_overview_lists_every_command() -> None:
     app = build_app()
     result = subprocess.run(
