@@ -4,19 +4,23 @@ from protocols.core.lazy import lazy_names
 
 TYPE_CHECKING = False  # as typing's, whose import alone would take most of the package's import time
 if TYPE_CHECKING:
-    from edge.detectors.base import Detection
+    from edge.detectors.base import Detection, Detector, DetectorOptions
+    from edge.detectors.plugins import load_detector
     from edge.devices.base import Frame
     from edge.devices.camera import open_camera
     from edge.offline.video import detect_video
 
-__all__ = ["Detection", "Frame", "detect_video", "open_camera"]
+__all__ = ["Detection", "Detector", "DetectorOptions", "Frame", "detect_video", "load_detector", "open_camera"]
 
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "Detection": "edge.detectors.base",
+        "Detector": "edge.detectors.base",
+        "DetectorOptions": "edge.detectors.base",
         "Frame": "edge.devices.base",
         "detect_video": "edge.offline.video",
+        "load_detector": "edge.detectors.plugins",
         "open_camera": "edge.devices.camera",
     },
 )

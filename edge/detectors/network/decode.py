@@ -7,14 +7,16 @@ Shapes for a batch of B images, N candidates, C classes and K keypoints of V val
     end2end    detections (B, N, 6 + P): box, score, class, keypoints. YOLOv10, YOLO26, exports with built-in NMS
     detr       scores (B, N, C or C + 1), boxes (B, N, 4): DETR and RT-DETR as Hugging Face exports them, logits and
                pred_boxes; with softmax the last class is *no object*
-    separate   boxes (B, N, 4), scores (B, N), labels (B, N): RT-DETR, torchvision; B may be left out for one image
+    separate   boxes (B, N, 4), scores (B, N), labels (B, N): RT-DETR, torchvision
 
-Of detections the other order of the last two axes is recognised: there are more candidates than values of each. Of the
-last two layouts, ``keypoints`` is (B, N, K, V) or (B, N, P).
+For one image the axis of the batch may be missing in all of them. Of detections the other order of the last two axes is
+recognised: there are more candidates than values of each. Of the last two layouts, ``keypoints`` is (B, N, K, V) or
+(B, N, P).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,7 +97,7 @@ def _parts(outputs: Mapping[str, Array], description: NetworkDescription, images
     roles = _ROLES[layout]
     if "keypoints" in description.outputs or (description.keypoints and len(roles) > 1):
         roles = (*roles, "keypoints")
-    parts = {}
+    named = {}
     for role in roles:
         usual = next(iter(outputs), "") if role == "detections" else _USUAL_NAMES.get((layout, role), role)
         name = description.outputs.get(role, usual)  # type: ignore[call-overload]
@@ -103,7 +105,9 @@ def _parts(outputs: Mapping[str, Array], description: NetworkDescription, images
             known = ", ".join(f"{one} {'x'.join(map(str, outputs[one].shape))}" for one in list(outputs)[:8])
             what = f"the model has no output {name!r} for {role}; its outputs are {known}"
             raise InputError(what, file=file, remedy=f'set outputs = {{ {role} = "…" }} in the network\'s .toml file')
-        parts[role] = _with_batch(outputs[name], role, images, file)
+        named[role] = outputs[name]
+    lone = images == 1 and named.get("boxes", named.get("detections", np.zeros(0))).ndim == 2
+    parts = {role: _with_batch(values[None] if lone else values, role, images, file) for role, values in named.items()}
     counts = {one.shape[1] for one in parts.values()}
     if len(counts) > 1:
         raise _not_as_described(parts, description, file)
@@ -113,16 +117,11 @@ def _parts(outputs: Mapping[str, Array], description: NetworkDescription, images
     return parts
 
 
-def _with_batch(values: Array, role: str, images: int, file: Path) -> Array:
-    """An output as (images, N, ...): a lone image's batch axis may be missing."""
+def _with_batch(array: Array, role: str, images: int, file: Path) -> Array:
+    """An output (images, N, ...). Raises InputError where it is none."""
     dims = {"scores": (2, 3), "labels": (2,), "keypoints": (3, 4)}.get(role, (3,))
-    array = (
-        values[None]
-        if images == 1 and values.ndim + 1 in dims and (values.ndim not in dims or len(values) != 1)
-        else values
-    )
     if array.ndim not in dims or array.shape[0] != images:
-        shape = "x".join(map(str, values.shape)) or "a single number"
+        shape = "x".join(map(str, array.shape)) or "a single number"
         what = f"the model's output for {role} is {shape} for {images} images"
         raise InputError(what, file=file, remedy="correct layout or outputs in the network's .toml file")
     if not np.issubdtype(array.dtype, np.number):
@@ -172,7 +171,7 @@ def _separate(parts: dict[str, Array], description: NetworkDescription, file: Pa
     else:
         score, label = scores.astype(np.float64), _whole(parts["labels"].astype(np.float64))
     points = parts.get("keypoints", np.zeros((len(boxes), 0)))
-    flat = points.reshape(len(boxes), -1)
+    flat = points.reshape(len(boxes), math.prod(points.shape[1:]))
     if flat.shape[1] != len(description.keypoints) * description.keypoint_values:
         raise _not_as_described(parts, description, file)
     return _Candidates(boxes.astype(np.float64), score, label, _keypoints(flat, description))

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from edge.detectors.base import Detection
+from edge.detectors.network.decode import decode
+from edge.detectors.network.description import NetworkDescription
 from edge.detectors.plugins import load_detector
 from protocols.core.errors import InputError
 from tests.support.networks import Array, constant_model, write_network
@@ -138,6 +140,22 @@ def test_two_people_that_overlap_less_than_the_threshold_both_stay(tmp_path: Pat
     outputs = {"o": rows.T[None]}
     assert [one.kind for one in detect(tmp_path, outputs, "nms = 0.5")] == ["person", "person", "vehicle"]
     assert [one.kind for one in detect(tmp_path, outputs, "nms = 0.4")] == ["person", "vehicle"]
+
+
+def test_torchvision_leaves_out_the_axis_of_the_batch() -> None:
+    description = NetworkDescription(
+        model="", layout="separate", classes={"1": "person"}, input=(64, 48), keypoints=("nose",)
+    )
+    for count in (0, 1, 3):
+        outputs = {
+            "boxes": np.tile(corners(PERSON), (count, 1)),
+            "labels": np.ones(count, np.int64),
+            "scores": np.full(count, 0.9, np.float32),
+            "keypoints": np.ones((count, 1, 3), np.float32),
+        }
+        (found,) = decode(outputs, description, 1, None, Path("m.onnx"))
+        assert len(found) == count
+        assert found.keypoints.shape == (count, 1, 3)
 
 
 @pytest.mark.parametrize(("batch", "size"), [("n", 4), (3, 3), (1, 1)])
