@@ -16,6 +16,7 @@ from protocols.topics import OBSERVATION, TRACK
 from tests.support.crowds import HEIGHT, NAMES, SIZE, boxes_csv, truth_csv, write_calibration
 from tests.support.videos import write_video
 
+SECONDS, FPS = 5.0, 5.0
 OFFSETS = {"left": 0.0, "right": 12.5, "back": -3.25}
 
 
@@ -23,8 +24,8 @@ OFFSETS = {"left": 0.0, "right": 12.5, "back": -3.25}
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with boxes of three people by three cameras that are 50 ms apart and share no clock."""
     folder = tmp_path_factory.mktemp("crowd")
-    (folder / "boxes.csv").write_text(boxes_csv(8.0, 5.0, OFFSETS), encoding="utf-8")
-    (folder / "truth.csv").write_text(truth_csv(), encoding="utf-8")
+    (folder / "boxes.csv").write_text(boxes_csv(SECONDS, FPS, OFFSETS), encoding="utf-8")
+    (folder / "truth.csv").write_text(truth_csv(SECONDS, FPS), encoding="utf-8")
     write_calibration(folder / "calibration.toml", offsets=OFFSETS)
     return folder
 
@@ -48,7 +49,7 @@ def test_three_people_are_three_tracks_with_their_heights(followed: Path) -> Non
     assert {row["id"] for row in table} == {"1", "2", "3"}
     assert {row["kind"] for row in table} == {"person"}
     assert {row["state"] for row in table} <= {"confirmed", "coasting"}
-    assert sorted({float(row["time"]) for row in table})[-1] == pytest.approx(7.8)
+    assert sorted({float(row["time"]) for row in table})[-1] == pytest.approx(SECONDS - 1.0 / FPS)
     late = [row for row in table if float(row["time"]) > 2.0]
     assert all(abs(float(row["height"]) - HEIGHT) < 0.08 for row in late)
     assert all(abs(float(row["z"])) < 0.15 and 0.0 < float(row["std"]) < 0.3 for row in late)
@@ -63,7 +64,7 @@ def test_the_scores_say_that_nobody_is_lost_or_exchanged(followed: Path) -> None
     assert scores["switches"] == 0
     assert document["count"] == 3
     assert set(document["cameras"]) == set(NAMES)
-    assert all(camera["used"] > 0.9 and camera["frames"] == 40 for camera in document["cameras"].values())
+    assert all(camera["used"] > 0.9 and camera["frames"] == SECONDS * FPS for camera in document["cameras"].values())
     assert [track["cameras"] for track in document["tracks"]] == [sorted(NAMES)] * 3
 
 
@@ -78,7 +79,7 @@ def test_the_report_is_one_file_that_loads_nothing(followed: Path) -> None:
 def test_rows_at_another_rate_and_json(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--calibration", str(session / "calibration.toml"), "--out", str(tmp_path / "out"), "--fps", "20"]
     assert run(["follow", str(session / "boxes.csv"), *arguments, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["times"] == 20 * 8 - 3
+    assert json.loads(capsys.readouterr().out)["times"] == 99  # 0 s to the last camera's last frame at 4.9 s
     times = sorted({float(row["time"]) for row in rows(tmp_path / "out" / "tracks.csv")})
     assert times[1] - times[0] == pytest.approx(0.05)
 
@@ -125,7 +126,7 @@ def refused(arguments: list[str], status: int, capsys: pytest.CaptureFixture[str
 def test_bad_input_is_one_line_and_status_2(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = (session / "boxes.csv").read_text(encoding="utf-8")
     bad = tmp_path / "boxes.csv"
-    bad.write_text(text + "left,40,8.0,90000,10,40,160\n", encoding="utf-8")
+    bad.write_text(text + "left,40,5.0,90000,10,40,160\n", encoding="utf-8")
     known = ["--calibration", str(session / "calibration.toml"), "--out", str(tmp_path / "out")]
     line = refused(["follow", str(bad), *known], 2, capsys)
     assert f"boxes.csv:{len(text.splitlines()) + 1}: the box lies outside the 960x720 picture" in line
