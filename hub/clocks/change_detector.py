@@ -50,6 +50,8 @@ _MIN_PRESTEP_BINS, _MAX_PRESTEP_BINS = 8, 20
 """Bins before a step that give its baseline"""
 _MAX_PERIODS = 120
 _MAX_NAME_LENGTH = 63
+_MAX_RUNS = 8
+"""Runs of one camera's agent that are remembered"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +117,9 @@ class ClockChangeDetector:
         """
         clock = self._clocks.get((camera, boot))
         if clock is None:
+            runs = [key for key in self._clocks if key[0] == camera]
+            if len(runs) >= _MAX_RUNS:
+                del self._clocks[runs[0]]
             clock = self._clocks[camera, boot] = _ClockState([(0, boot)])
         if clock.last is not None and sequence <= clock.last[0]:
             name = next((name for first, name in reversed(clock.segments) if first <= sequence), boot)

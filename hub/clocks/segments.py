@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import replace
 
 from hub.clocks.change_detector import ClockChange, ClockChangeDetector
@@ -13,6 +14,8 @@ from protocols.session.calibration import Calibration
 SEGMENT_MIN_ROWS = 600
 """Detections in a new segment from which on it is calibrated by itself; until then the moved map is more precise."""
 _MAX_ALARMS = 32
+_MAX_CHANGES = 64
+"""Changes of one camera's clock; who has more has no clock, and is no longer watched."""
 
 
 class ClockSegments:
@@ -22,13 +25,18 @@ class ClockSegments:
         self._detector = ClockChangeDetector()
         self._runs: dict[str, str] = {}
         self.alarms: dict[str, str] = {}
+        self._changes: Counter[str] = Counter()
 
     def assign(self, message: pb.Observation, arrival: float | None) -> tuple[pb.Observation, ClockChange | None]:
         """The observation with its clock segment as boot id, and the clock change that begins with it, if any."""
+        if self._changes[message.camera] >= _MAX_CHANGES:
+            return message, None
         segment, change = self._detector.handle(
             message.camera, message.boot_id, message.sequence, message.frame, message.device_time_ns, arrival
         )
         self._runs[message.camera] = message.boot_id
+        if change is not None:
+            self._changes[message.camera] += 1
         if change is not None and len(self.alarms) < _MAX_ALARMS:
             step, ppm = f"stepped by {change.step_s:+.3f} s", f"drifts {1e6 * change.rate_change:+.0f} ppm"
             text = step if change.kind == "step" else ppm

@@ -13,8 +13,9 @@ from google.protobuf.message import Message
 
 from hub.distributed.network.host import ROLE as NODES
 from hub.distributed.network.host import NodeHost
+from hub.live.fair_share import FairShare
 from hub.live.live_hub import LiveHub
-from protocols.bus.base import Bus, Publisher
+from protocols.bus.base import Bus, Publisher, Received
 from protocols.bus.commands import CommandSubscription
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
@@ -36,6 +37,8 @@ ROLE = "hub"
 _TICK_S = 0.05
 _ROUND_S = 0.012
 """Least time between two rounds: observations that arrive closer together are processed together."""
+_MESSAGES_S = 0.4
+"""What the messages of a round may take together: tracks, and the status within 2 s, are published between rounds."""
 _BACKLOG_S = 2.0
 """After its start a hub gets what cameras had published before, all at once."""
 _FINISH_S = 20.0
@@ -44,6 +47,7 @@ _PROGRESS_S = 2.0
 _STATUS_S = 1.0
 _RIG_S = 5.0
 _MAX_TEXT = 2000  # characters of a status message
+_NAMED_CAMERAS = 16  # that a status has counters of their own for
 
 
 def run_hub(
@@ -84,6 +88,13 @@ def run_hub(
     began = time.monotonic()
     finish_by: float | None = None
 
+    def handle(received: Received) -> None:
+        if received.agent != agent or not isinstance(received.message, pb.Calibration):
+            backlog = time.monotonic() < began + _BACKLOG_S
+            hub.handle(received.message, received.arrival_ns * 1e-9, backlog=backlog)
+
+    shares = FairShare(handle, time.monotonic, _MESSAGES_S)
+
     def publish(messages: list[Message]) -> None:
         for message in messages:
             publishers[message.DESCRIPTOR.name].put(message)
@@ -105,14 +116,10 @@ def run_hub(
                 if stop.is_set() and finish_by is None:
                     finish_by = time.monotonic() + _FINISH_S
                 finishing = finish_by is not None
-                backlog = time.monotonic() < began + _BACKLOG_S
                 if nodes is not None and watch is not None:
                     for event in watch.drain():
                         nodes.on_liveliness(event.role, event.agent, event.boot_id, alive=event.alive)
-                for subscription in subscriptions:
-                    for received in subscription.drain():
-                        if received.agent != agent or not isinstance(received.message, pb.Calibration):
-                            hub.handle(received.message, received.arrival_ns * 1e-9, backlog=backlog)
+                shares.take(received for subscription in subscriptions for received in subscription.drain())
                 for action in orders.take():
                     hub.counters[f"asked.{action}"] += 1
                     if action == "recalibrate":
@@ -148,6 +155,10 @@ def run_hub(
                         status.state = "degraded"
                         status.message = f"no router can be reached; {status.message}"
                     needs_advice = hub.calibration is None or hub.refusal is not None or hub.calibration.refused
+                    if shares.dropped:
+                        status.counters["dropped_behind"] = shares.dropped.total()
+                    if shares.behind:
+                        status.message = f"{status.message}; messages wait of {', '.join(shares.behind[:8])}"
                     advice = [one.text for one in hub.guidance.advice()] if needs_advice else []
                     status.message = "; ".join(text for text in (status.message, *advice, last_action) if text)[
                         :_MAX_TEXT
@@ -214,6 +225,9 @@ def status_message(
     )
     for name, count in hub.counters.items():
         message.counters[name] = count
+    for kind, of_cameras in (("over_budget", hub.budgets.counts), ("fault", hub.faults)):
+        for camera, count in of_cameras.most_common(_NAMED_CAMERAS):
+            message.counters[f"{kind}.{camera}"[:64]] = count
     for camera, ppm in hub.clocks.rates_ppm().items():
         message.gauges[f"ppm.{camera}"[:64]] = ppm
     alarms = [*hub.clocks.alarms.values(), *hub.clock_contradictions()]

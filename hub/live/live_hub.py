@@ -21,6 +21,7 @@ from hub.clocks.rate_change import RateChanges
 from hub.clocks.segments import SEGMENT_MIN_ROWS, ClockSegments
 from hub.distributed.network.host import NodeHost
 from hub.distributed.solver import node_calibration
+from hub.live.budgets import CameraBudgets
 from hub.live.messages import calibration_message, refusal_message, solver_event
 from hub.live.solver import InlineSolver, Solver, SolverAnswer, SolverJob
 from hub.tracking.calibration.people import PeopleTracklets
@@ -58,6 +59,12 @@ _VERIFY_ROWS, _VERIFY_S = 60, 15.0
 _VERIFY_EVERY_S = 0.5
 _SAME_CLOCK_S = 1.0
 """Largest change of a camera's delay against the hub's clock for a reloaded time map to be of the same clock."""
+_BUDGET_NOTICE_S = 10.0
+"""How long the status names a camera that exceeded its budget."""
+_MAX_FAULTS = 3
+"""Errors that a camera's messages may raise before they are not used any more, until its agent is restarted."""
+_LEFT_OUT_S = 60.0
+"""How long a camera is left out without which the solver does not fail."""
 _MAX_STD_GROWTH = 1.5
 """An answer whose stds are larger than the present one's by this factor is not taken: its rows say less."""
 
@@ -128,6 +135,14 @@ class LiveHub:
         """What the agent around has to say of its own health."""
         self.finished = False
         """Whether the last job was handed over, or there is none."""
+        self.budgets = CameraBudgets()
+        self.faults: Counter[str] = Counter()
+        """By camera, errors that its messages raised."""
+        self.notices: dict[str, str] = {}
+        """By camera, why it is left out."""
+        self._muted: dict[str, str] = {}
+        self._left_out, self._left_out_until = "", 0.0
+        self._suspects: list[str] = []
         self._begin()
 
     def _begin(self) -> None:
@@ -157,8 +172,37 @@ class LiveHub:
         """Process one message from the bus or a log.
 
         arrival: its arrival time [s, any fixed clock]; None = unknown. backlog: it may have waited for this hub, so its
-        arrival says little about its camera's clock.
+        arrival says little about its camera's clock. Whatever a camera sends costs that camera: an error in it is
+        counted, and after some of them its messages are left out until its agent is restarted.
         """
+        if isinstance(message, pb.Observation | pb.CameraInfo):
+            if self._muted.get(message.camera) == message.boot_id:
+                return
+            if not self.budgets.admits_camera(message.camera):
+                self.counters["too_many_cameras"] += 1
+                return
+        if isinstance(message, pb.Observation):
+            admitted = self.budgets.admit(message, self._now)
+            if admitted is None:
+                self.counters["over_budget"] += 1
+                return
+            message = admitted
+        try:
+            self._handle(message, arrival, backlog)
+        except Exception as error:  # noqa: BLE001 - of whatever kind it is, it must not cost the other cameras
+            self._record_fault(message, error)
+
+    def _record_fault(self, message: Message, error: Exception) -> None:
+        self.counters["faults"] += 1
+        camera = getattr(message, "camera", "")
+        if not camera:
+            return
+        self.faults[camera] += 1
+        if self.faults[camera] >= _MAX_FAULTS:
+            self._muted[camera] = getattr(message, "boot_id", "")
+            self.notices[camera] = f"{camera} is left out until it is restarted: {type(error).__name__}: {error}"[:200]
+
+    def _handle(self, message: Message, arrival: float | None, backlog: bool) -> None:
         if isinstance(message, pb.AgentStatus):
             self.clock_priors.handle(message)
             return
@@ -182,7 +226,10 @@ class LiveHub:
         if isinstance(message, pb.CameraInfo):
             self._infos[message.camera] = message
         if isinstance(message, pb.Observation) and any(d.kind and tracked_kind(d) for d in message.detections):
-            self._people.handle(message)
+            if self.budgets.admits_people(message):
+                self._people.handle(message)
+            else:
+                self.counters["people_over_budget"] += 1
             message = without_tracked(message)
         self._builder.handle(message, self._now)
         if isinstance(message, pb.Observation):
@@ -248,7 +295,20 @@ class LiveHub:
             self.finished = True
         out += self._calibrate(now, final)
         out += self._poll(now)
-        return out + ([] if self.tracking is None else self.tracking.tick(now))
+        return out + self._track(now)
+
+    def _track(self, now: float) -> list[Message]:
+        if self.tracking is None:
+            return []
+        try:
+            return self.tracking.tick(now)
+        except Exception as error:  # noqa: BLE001 - tracks begin anew; calibration and status go on
+            self.counters["tracking_faults"] += 1
+            self.tracking = LiveTracking()
+            if self.calibration is not None:
+                self._track_with(*self._tracked_with)
+            self.notices["tracking"] = f"tracking began anew: {type(error).__name__}: {error}"[:200]
+            return []
 
     def _poll(self, now: float) -> list[Message]:
         answer = self.solver.poll(now)
@@ -303,6 +363,12 @@ class LiveHub:
                 if frame is None or now - frame > _SILENT_S
             ]
             out += [f"no frames from {', '.join(silent)}"] if silent else []
+        exceeding = self.budgets.exceeded(now, _BUDGET_NOTICE_S)
+        if exceeding:
+            out.append(f"frames left out of {', '.join(exceeding[:8])}: more than a camera may send")
+        if self._left_out:
+            out.append(f"{self._left_out} is left out: the solver failed with its rows")
+        out += [*self.notices.values()][:8]
         if self.solver.busy and now - self._submitted_at > _BEHIND_S:
             out.append(f"the solver is behind: {now - self._submitted_at:.0f} s for one job")
         return out + [text for text in (self.solver_failure, self.notice) if text]
@@ -366,6 +432,10 @@ class LiveHub:
             self.counters["bad_sessions"] += 1
             self.refusal = Refused(str(error))
             return []
+        if self._left_out and now >= self._left_out_until:
+            self._left_out = ""
+        if self._left_out in rig.cameras and len(rig.cameras) > 2:
+            rig, observations = without_camera(rig, observations, self._left_out)
         boots = {name: self._source().boot(name) for name in rig.cameras}
         last = self._start_from(boots)
         self._solved_at = self._received
@@ -394,7 +464,7 @@ class LiveHub:
             self.clock_priors.for_boots(boots),
             arrivals,
         )
-        ranges = self._builder.ranges() if self._has_marker() else []
+        ranges = [one for one in self._builder.ranges() if one[0] in rig.cameras] if self._has_marker() else []
         return self._hand_over(job, boots, ranges, now)
 
     def _hand_over(
@@ -426,7 +496,9 @@ class LiveHub:
         self.solver_failure = answer.reason if answer.failed else ""
         if answer.failed:
             self.counters["solver_failures"] += 1
+            self._suspect(job, now)
             return [solver_event(job, "failed", [], answer)]
+        self._suspects = []
         event = solver_event(job, "applied", [], answer)
         if answer.calibration is None:
             self.counters["refused"] += 1
@@ -457,6 +529,15 @@ class LiveHub:
         self.calibration = found
         self._solved_boot_ids = {name: boots[name] for name in found.cameras if name in boots}
         return [event, *self._publish_present()]
+
+    def _suspect(self, job: SolverJob, now: float) -> None:
+        """Leave one camera of a job that failed out, first those without which there was an answer, each in turn."""
+        if not self._suspects:
+            tied = () if self.calibration is None else self.calibration.cameras
+            self._suspects = (
+                sorted(job.rig.cameras, key=lambda name: name in tied) if len(job.rig.cameras) > 2 else [""]
+            )
+        self._left_out, self._left_out_until = self._suspects.pop(0), now + _LEFT_OUT_S
 
     def _says_more(self, found: Calibration, moved: Mapping[str, float]) -> bool:
         """Whether a new answer has stds like the present one's or smaller, or is about other cameras or poses."""
@@ -579,6 +660,7 @@ class LiveHub:
 
     def _track_with(self, calibration: Calibration, rig: Rig | None, boot_ids: dict[str, str]) -> None:
         """Pass a new calibration to tracking. With ``up`` in the rig, the world's z axis is up."""
+        self._tracked_with = calibration, rig, boot_ids
         if self.tracking is not None:
             up = None if rig is None or rig.up is None else np.array([0.0, 0.0, 1.0])
             self.tracking.calibrate(
@@ -609,6 +691,15 @@ class LiveHub:
         """The calibration in the clocks' present segments, and the boot ids of those."""
         boots = {name: self._solved_boot_ids.get(name) or self._source().boot(name) for name in calibration.cameras}
         return self.clocks.to_present(calibration, boots)
+
+
+def without_camera(rig: Rig, observations: Observations, camera: str) -> tuple[Rig, Observations]:
+    """A session without one of its cameras."""
+    cameras = {name: one for name, one in rig.cameras.items() if name != camera}
+    distances = tuple(one for one in rig.distances if camera not in one[:2])
+    tracks = {key: track for key, track in observations.tracks.items() if key[0] != camera}
+    up = None if isinstance(rig.up, str) and rig.up == camera else rig.up
+    return replace(rig, cameras=cameras, distances=distances, up=up), replace(observations, tracks=tracks)
 
 
 def without_tracked(message: pb.Observation) -> pb.Observation:

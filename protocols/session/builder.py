@@ -33,6 +33,13 @@ _MOVING = 20.0
 """Motion in a chunk [px] from which a camera saw its target move."""
 _MAX_CHUNK_ROWS = 8_000
 """Detections of one camera in a chunk: twelve points at 330 frames a second. A camera that floods costs only itself."""
+_MAX_ROWS = 750_000
+"""Detections of all cameras that a live hub holds, 64 bytes each: three minutes of 140 cameras at 30 Hz. Above, the
+camera with the most gives up its oldest."""
+_MAX_LABELS = 256
+"""Labels of one camera: whole bodies have 133 points."""
+_MAX_BOOTS = 8
+"""Runs of one camera that are remembered, segments of its clock included."""
 MIN_ROWS_AFTER_RESTART = 90
 """Detections from which on the new clock of a restarted camera is used."""
 
@@ -124,6 +131,7 @@ class SessionBuilder:
         self._boots: dict[str, dict[str, _BootBuffer]] = {}
         self._settled: dict[str, int] = {}
         self._labels: dict[str, int] = {}
+        self._labels_of: dict[str, set[str]] = {}
         self._since: dict[tuple[str, str], int] = {}
         self._selection: dict[str, list[tuple[str, int, int]]] | None = None
         self.counters: Counter[str] = Counter()
@@ -206,7 +214,8 @@ class SessionBuilder:
             return np.concatenate([np.array(getattr(rows, name))[used] for rows, used in taken]).astype(np.int64)
 
         labels = sorted(self._labels)
-        rank = np.array([labels.index(label) for label in self._labels], dtype=np.int64)
+        place = {label: number for number, label in enumerate(labels)}
+        rank = np.array([place[label] for label in self._labels], dtype=np.int64)
         observations = gather_columns(
             names,
             labels,
@@ -275,6 +284,7 @@ class SessionBuilder:
         boots = self._boots.setdefault(message.camera, {})
         boot = boots.get(message.boot_id)
         if boot is None:
+            self._forget_a_boot(message.camera)
             boot = boots[message.boot_id] = _BootBuffer()
         known = boot.is_duplicate if self._chunks is None else boot.is_recent_duplicate
         if known(message.sequence):
@@ -296,6 +306,11 @@ class SessionBuilder:
                 self.counters["second_detections"] += 1
                 continue
             labels.add(label)
+            own = self._labels_of.setdefault(message.camera, set())
+            if label not in own and len(own) >= _MAX_LABELS:
+                self.counters["too_many_labels"] += 1
+                continue
+            own.add(label)
             index = self._labels.setdefault(label, len(self._labels))
             rows = boot.rows
             rows.time_ns.append(message.device_time_ns)
@@ -330,7 +345,32 @@ class SessionBuilder:
                         kept = np.flatnonzero(np.array(boot.rows.chunk, dtype=np.int64) != dropped)
                         if len(kept) < len(boot.rows):
                             boot.rows.take(kept)
+            self._drop_excess()
         return chunk
+
+    def _drop_excess(self) -> None:
+        """Where all cameras together have too many rows, those with the most give up their oldest."""
+        held = {camera: self.rows(camera) for camera in self._boots}
+        excess = sum(held.values()) - _MAX_ROWS
+        while excess > 0:
+            camera = max(held, key=lambda name: held[name])
+            boot = max(self._boots[camera].values(), key=lambda one: len(one.rows))
+            drop = min(excess, max(len(boot.rows) // 2, 1))
+            boot.rows.take(np.arange(drop, len(boot.rows)))
+            held[camera] -= drop
+            excess -= drop
+            self.counters["excess_rows"] += drop
+
+    def _forget_a_boot(self, camera: str) -> None:
+        """Forget the run with the fewest rows of a camera that restarts again and again, but not the one in use."""
+        boots = self._boots[camera]
+        if self._chunks is None or len(boots) < _MAX_BOOTS:
+            return
+        used = self.boot(camera)
+        least = min((name for name in boots if name != used), key=lambda name: len(boots[name].rows))
+        del boots[least]
+        self._settled.pop(least, None)
+        self._since.pop((camera, least), None)
 
     def _build_rig(self, order: list[str]) -> Rig:
         info = self._rig

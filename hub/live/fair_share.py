@@ -1,0 +1,72 @@
+"""Shares the hub's time between cameras: who sends more than its share waits, and the others do not."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+
+from protocols.bus.base import Received
+from protocols.messages import syncline_pb2 as pb
+
+_MAX_WAITING, _MAX_WAITING_ROWS = 20_000, 40_000
+"""Messages and detections of one sender that wait; the oldest are dropped."""
+_LEAST_SHARE_S = 0.01
+
+
+class FairShare:
+    """Passes messages on in the order of their arrival, as long as their senders take no more than their share.
+
+    handle: takes one message. clock: [s], any. round_s: what all messages of a round may take together; a message of a
+    sender that has used up its share of that waits for the rounds after it.
+    """
+
+    def __init__(self, handle: Callable[[Received], None], clock: Callable[[], float], round_s: float) -> None:
+        self._handle, self._clock, self._round_s = handle, clock, round_s
+        self._waiting: dict[str, deque[Received]] = {}
+        self._rows: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
+
+    @property
+    def behind(self) -> list[str]:
+        """Senders whose messages wait."""
+        return sorted(self._waiting)
+
+    def take(self, received: Iterable[Received]) -> None:
+        """Pass on what has arrived, and of what waits as much as there is time for."""
+        received = list(received)
+        begin = self._clock()
+        senders = {one.agent for one in received} | set(self._waiting)
+        share = max(self._round_s / max(len(senders), 1), _LEAST_SHARE_S)
+        used: Counter[str] = Counter()
+        for one in received:
+            if one.agent in self._waiting or used[one.agent] > share:
+                self._put(one)
+            else:
+                used[one.agent] += self._timed(one)  # type: ignore[assignment]
+        while self._waiting and self._clock() - begin < self._round_s:
+            for sender in list(self._waiting):
+                self._timed(self._next(sender))
+
+    def _timed(self, one: Received) -> float:
+        before = self._clock()
+        self._handle(one)
+        return self._clock() - before
+
+    def _put(self, one: Received) -> None:
+        waiting = self._waiting.setdefault(one.agent, deque())
+        waiting.append(one)
+        self._rows[one.agent] += _rows(one)
+        while len(waiting) > _MAX_WAITING or self._rows[one.agent] > _MAX_WAITING_ROWS:
+            self._next(one.agent)
+            self.dropped[one.agent] += 1
+
+    def _next(self, sender: str) -> Received:
+        one = self._waiting[sender].popleft()
+        self._rows[sender] -= _rows(one)
+        if not self._waiting[sender]:
+            del self._waiting[sender], self._rows[sender]
+        return one
+
+
+def _rows(one: Received) -> int:
+    return len(one.message.detections) if isinstance(one.message, pb.Observation) else 1
