@@ -18,14 +18,15 @@ from google.protobuf.message import Message
 from edge.agents.publish_queue import PublishQueue
 from edge.agents.target_report import status_line, update_tracking_status
 from edge.agents.thumbnails import THUMBNAIL_WIDTH, thumbnail_message
+from edge.agents.uav_guidance import FRAME_TIMEOUT_S, LINK_STALE_S, GuidanceControl
 from edge.detectors.base import Detector
 from edge.devices.base import Device, Frame, Image
 from edge.mavlink.link.connection import Link, ReceivedMessage
 from edge.mavlink.link.receiver import Receiver
 from edge.mavlink.roles.camera import ArmFollow, CameraComponent, OperatorCommand, SelectTarget
-from edge.mavlink.roles.guidance import Guidance, GuidanceTarget
+from edge.mavlink.roles.guidance import Guidance
 from edge.mavlink.roles.vehicle import MountSample, Vehicle
-from edge.uav.base import Box, Estimate, Telemetry, TrackState
+from edge.uav.base import Box, Estimate, Telemetry
 from edge.uav.estimator import TargetEstimator, decode_image
 from edge.uav.navigation import quaternion_from_rotation
 from edge.uav.timing.clock_alignment import CameraHostClock, ClockAligner
@@ -52,8 +53,6 @@ ROLE = "uav"
 _READ_S = 0.02
 _QUEUE_CAPACITY = 2048
 _INFO_S, _STATUS_S = 2.0, 1.0
-_FRAME_TIMEOUT_S = 2.0  # without a frame the agent is degraded
-_LINK_STALE_S = 1.5  # without messages from the vehicle no command is sent
 _STEP_BACK_S = 0.2
 _DELAY_STD_S = 0.03  # std of the unknown delays of frames and attitudes, until the offset is estimated from the images
 TOPICS = {
@@ -111,6 +110,7 @@ class UavAgent:
         self._agent, self._settings, self._show, self._now_ns = agent, settings, shown, now_ns
         self.boot_id = uuid.uuid4().hex if boot_id is None else boot_id
         self.camera = component(self._execute)
+        self._control = GuidanceControl(guidance, link, vehicle, self.camera)
         self.estimator = TargetEstimator(
             agent,
             self.boot_id,
@@ -132,7 +132,6 @@ class UavAgent:
         self._order = 0
         self._last_sample_s = -math.inf
         self._telemetry_ns = 0
-        self._last_visible_s = -math.inf
         self._last_frame_s = -math.inf
         self._last_frame: int | None = None
         self._resets = (0, 0, 0)
@@ -174,7 +173,7 @@ class UavAgent:
         self.camera.tick(now / NANOSECONDS, frame=frame is not None)
         if frame is not None and self.estimator.has_target:
             self.latencies.append((self._now_ns() - earliest_arrival_ns(frame, self.camera_clock, now)) / NANOSECONDS)
-        self._send_guidance(now)
+        self._control.update(now, self.estimator.estimate, self._last_frame_s, self._last_sample_s)
 
     def info(self) -> pb.UavInfo:
         """The message with the settings that a replay of the estimator needs."""
@@ -206,7 +205,7 @@ class UavAgent:
         frame_silent_s = now_s - self._last_frame_s
         link_silent_s = (self._now_ns() - link.last_received_ns) / NANOSECONDS
         reason = link.problem or link.report(self._now_ns())
-        if not ended and frame_silent_s > _FRAME_TIMEOUT_S:
+        if not ended and frame_silent_s > FRAME_TIMEOUT_S:
             state, message = (
                 "degraded",
                 "no frame yet" if math.isinf(frame_silent_s) else f"no frame for {frame_silent_s:.0f} s",
@@ -214,7 +213,7 @@ class UavAgent:
         elif not ended and link.vehicle is None:
             state = "degraded"
             message = f"no heartbeat received: {link.problem}" if link.problem else "no heartbeat received yet"
-        elif not ended and link_silent_s > _LINK_STALE_S:
+        elif not ended and link_silent_s > LINK_STALE_S:
             state, message = "degraded", f"the vehicle is silent for {link_silent_s:.0f} s {reason}".rstrip()
         elif not ended:
             problem = vehicle.problem(self._now_ns()) or reason
@@ -351,7 +350,7 @@ class UavAgent:
     def _execute(self, command: OperatorCommand) -> bool:
         """Execute an operator's command; whether it was accepted."""
         if isinstance(command, ArmFollow):
-            return self._arm_follow(command)
+            return self._control.arm(command, has_target=self.estimator.has_target)
         width, height = self._settings.size
         message = pb.TargetCommand(**self._message_header(), kind="stop", by=command.by)
         if isinstance(command, SelectTarget):
@@ -367,11 +366,9 @@ class UavAgent:
             self._publish(out)
         accepted = self.estimator.refused == refused
         if not isinstance(command, SelectTarget):
-            self._guidance.disarm()
-            self._guidance.hold("stopped by the operator")
+            self._control.stop()
         elif accepted:
-            self._guidance.begin(self._vehicle.position)
-            self._last_visible_s = self._now_ns() / NANOSECONDS
+            self._control.begin(self._now_ns() / NANOSECONDS)
         self._update_tracking_status()
         return accepted
 
@@ -384,20 +381,6 @@ class UavAgent:
         around = [box for box in boxes if 0.0 <= x - box.x <= box.width and 0.0 <= y - box.y <= box.height]
         return min(around, key=lambda box: box.width * box.height, default=None)
 
-    def _arm_follow(self, command: ArmFollow) -> bool:
-        """Let the vehicle follow the present target, or end that."""
-        guidance = self._guidance
-        if not command.follow:
-            guidance.disarm()
-            self.camera.say("Syncline: follow ended")
-            return True
-        if not self.estimator.has_target or not self._vehicle.armed:
-            self.camera.say(f"Syncline: no follow, {'vehicle disarmed' if self.estimator.has_target else 'no target'}")
-            return False
-        accepted = guidance.arm(command.by)
-        self.camera.say(f"Syncline: follow armed by {command.by}" if accepted else "Syncline: no follow, it is off")
-        return accepted
-
     def _check_clock_resets(self) -> None:
         """Reset the time alignment when the vehicle's or the camera's clock was reset or stepped."""
         resets = (*self._vehicle.clock_resets, self.camera_clock.steps)
@@ -406,55 +389,6 @@ class UavAgent:
             self._telemetry_ns = 0
             if self.aligner is not None:
                 self.aligner.reset()
-
-    def _send_guidance(self, now: int) -> None:
-        """Send gimbal and follow commands, or hold them with a reason; see ``Guidance``."""
-        now_s = now / NANOSECONDS
-        guidance = self._guidance
-        station = guidance.armed_by
-        if station is not None and not self.camera.is_present(station, now_s):
-            guidance.disarm(f"station {station} is silent")
-            guidance.hold(f"station {station} is silent")
-        self._guide(now, now_s)
-        if station is not None and guidance.armed_by is None and guidance.hold_reason:
-            self.camera.say(f"Syncline: follow ended, {guidance.hold_reason}")
-
-    def _guide(self, now: int, now_s: float) -> None:
-        estimate, vehicle = self.estimator.estimate, self._vehicle
-        if estimate is None:
-            if self._guidance.hold_reason != "stopped by the operator":
-                self._guidance.hold("no target")
-            return
-        if estimate.state is TrackState.VISIBLE:
-            self._last_visible_s = now_s
-        position, velocity = vehicle.position, vehicle.velocity
-        if estimate.state is TrackState.LOST:
-            self._guidance.hold("the target is lost")
-            self._guidance.disarm()
-        elif (
-            now - self._link.last_received_ns > _LINK_STALE_S * NANOSECONDS
-            or now_s - self._last_sample_s > _LINK_STALE_S
-        ):
-            self._guidance.hold("the link is stale")
-        elif now_s - self._last_frame_s > _FRAME_TIMEOUT_S:
-            self._guidance.hold("no frames")
-        elif (
-            position is None
-            or velocity is None
-            or not (math.isfinite(estimate.north) and math.isfinite(estimate.std_m))
-        ):
-            self._guidance.hold("no metric ground")
-        else:
-            speed = estimate.speed if math.isfinite(estimate.speed) and math.isfinite(estimate.course) else 0.0
-            course = estimate.course if math.isfinite(estimate.course) else 0.0
-            target = GuidanceTarget(
-                self._last_frame_s,
-                np.array([estimate.north, estimate.east]),
-                speed * np.array([math.cos(course), math.sin(course)]),
-                estimate.std_m,
-                now_s - self._last_visible_s,
-            )
-            self._guidance.tick(now_s, target, position, velocity, vehicle.origin)
 
     def _update_tracking_status(self) -> None:
         """Update the status that the camera component reports."""

@@ -7,6 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -304,7 +305,8 @@ class Link:
     def _handle_failure(self, error: OSError | ValueError) -> None:
         """Close the transport and schedule the next attempt with exponential back-off."""
         if self._transport is not None:
-            self._transport.close()
+            with suppress(OSError):  # a device that was pulled out
+                self._transport.close()
             self._transport = None
         self._framers.clear()
         self._outbox.clear()

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import select
@@ -24,6 +25,16 @@ ONLY: Address = ("", 0)
 _MAX_DATAGRAM = 65_535
 _MAX_DATAGRAMS = 256  # datagrams read per call, so that a flood cannot block the caller
 _DEFAULT_BAUD = 57_600
+_LOST = {
+    errno.EAGAIN,
+    errno.ECONNREFUSED,
+    errno.EHOSTUNREACH,
+    errno.ENETUNREACH,
+    errno.ENETDOWN,
+    errno.ENOBUFS,
+    errno.EPERM,
+}
+"""Errors of a send that cost the datagram only: a network that is away comes back, and the socket still receives."""
 _REMEDY = 'write it like "udpin:0.0.0.0:14550", "udpout:192.168.1.10:14550", "tcp:…" or "serial:/dev/ttyAMA0:921600"'
 _NETWORK = re.compile(r"(?P<kind>udp|udpin|udpout|tcp):(?P<host>[^:\s]+):(?P<port>\d{1,5})\Z")
 _SERIAL = re.compile(r"(?:serial:)?(?P<device>/[^:,\s]+|COM\d+)(?:[:,](?P<baud>\d{3,8}))?\Z")
@@ -124,8 +135,9 @@ class Udp:
                 self._socket.send(data)
             elif address is not None and address != ONLY:
                 self._socket.sendto(data, address)
-        except (BlockingIOError, ConnectionRefusedError):
-            pass  # equivalent to a lost datagram
+        except OSError as error:
+            if error.errno not in _LOST:
+                raise
         return True
 
     def close(self) -> None:

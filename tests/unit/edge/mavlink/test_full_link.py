@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import socket
@@ -9,6 +10,7 @@ import tty
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -153,6 +155,30 @@ def test_over_udp_nothing_waits() -> None:
     assert len(peer.receive()) == 5
     link.close()
     peer.close()
+
+
+@pytest.mark.parametrize("error", [errno.ENETUNREACH, errno.ENETDOWN, errno.EPERM])
+def test_a_network_that_is_away_costs_datagrams_and_not_the_socket(error: int) -> None:
+    transport = Udp(Url("udpin", "127.0.0.1", 0), bound=True)
+    link = Link(None, system=1, component=100, allowed=("HEARTBEAT",), transport=transport)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+        beat = bytes(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(mavlink.MAVLink(None, 1, 1)))
+        vehicle.sendto(beat, ("127.0.0.1", transport.port))
+        link.wait(1.0)
+        assert len(link.poll()) == 1
+
+        def away(*_: object) -> int:
+            raise OSError(error, os.strerror(error))
+
+        working = transport._socket
+        transport._socket = SimpleNamespace(sendto=away, recvfrom=working.recvfrom)  # type: ignore[assignment]
+        assert link.send(mavlink.MAVLink_heartbeat_message(30, 8, 0, 0, 4, 3))
+        transport._socket = working
+        vehicle.sendto(beat, ("127.0.0.1", transport.port))
+        link.wait(1.0)
+        assert len(link.poll()) == 1
+    assert link.counters["broken"] == 0
+    link.close()
 
 
 def test_the_queue_is_bounded_and_the_least_important_goes_first() -> None:
