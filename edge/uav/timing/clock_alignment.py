@@ -24,25 +24,38 @@ _FIRST_SOLVE_S, _SOLVE_EVERY_S = 6.0, 2.0
 _GOOD_STD_S = 0.003  # precise enough to pause the estimation
 _PAUSE_S = 60.0
 _MAX_CHANGE_WHILE_TRACKING_S = 0.015  # a larger change of the offset is not applied while a tracker uses it
+_LATE_NS = 2 * NANOSECONDS  # a frame that is later was stamped by another clock
+_CONFIRMING_FRAMES = 8  # a quarter of a second at 30 fps; of frames that queued up, at most five agree
 _CLOCK_STEP_S = 0.15  # a larger step invalidates the delays collected so far
 
 
 class CameraHostClock:
-    """The camera's clock against the host's: the minimum of recent arrival delays. Times in ns. steps: clock steps."""
+    """The camera's clock against the host's: the minimum of recent arrival delays. Times in ns. steps: clock steps.
+
+    A single frame never moves it: what contradicts the delays so far is left out, until frames in a row agree.
+    """
 
     def __init__(self) -> None:
         self._delays: deque[int] = deque(maxlen=_DELAY_BUFFER)
+        self._contradicting: list[int] = []
         self.steps = 0
 
     def handle_frame(self, device_ns: int, arrival_ns: int) -> None:
         """Add a frame stamped ``device_ns`` that arrived at ``arrival_ns``."""
         delay = arrival_ns - device_ns
-        if self._delays and delay < min(self._delays) - round(_CLOCK_STEP_S * NANOSECONDS):
-            self._delays.clear()  # the camera's clock stepped forward
-            self.steps += 1
-        elif len(self._delays) >= 30 and delay - min(self._delays) > 2 * NANOSECONDS:
-            self._delays.clear()
-            self.steps += 1
+        if self._delays:
+            step = round(_CLOCK_STEP_S * NANOSECONDS)
+            later = delay - min(self._delays)
+            if later < -step or later > _LATE_NS:
+                if self._contradicting and abs(delay - self._contradicting[0]) > step:
+                    self._contradicting.clear()  # also frames that queued up, each less late than the one before
+                self._contradicting.append(delay)
+                if len(self._contradicting) < _CONFIRMING_FRAMES:
+                    return
+                self._delays.clear()
+                self._delays.extend(self._contradicting)
+                self.steps += 1
+        self._contradicting.clear()
         self._delays.append(delay)
 
     def camera_ns(self, host_ns: int) -> int | None:

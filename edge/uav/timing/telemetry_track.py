@@ -19,6 +19,7 @@ MAX_OFFSET_S = 0.6
 _STEP_S = 0.02
 _PRIOR_STD_S = 0.3
 _MAX_GAP_S = 2.5  # between two samples for interpolation
+_CONFIRMING_SAMPLES = 3  # one alone is an error, not a clock
 _FORGETTING_FACTOR = 0.995  # of the cost, per sample
 _NOISE_RAD = np.deg2rad(0.4)
 _MIN_SPACING_S = 0.06  # samples closer than this are not independent
@@ -44,22 +45,31 @@ class TelemetryTrack:
         self._last_update = 0.0
         self.offset = 0.0
         self.offset_std = _PRIOR_STD_S
+        self._set_back = 0
         self.rejected = 0
 
     def add(self, sample: Telemetry) -> None:
-        """Add one sample; NaN, no rotation matrix or a time that does not increase is counted in ``rejected``."""
+        """Add one sample; NaN, no rotation matrix or a time that does not increase is counted in ``rejected``.
+
+        Three in a row that go back by more than the longest gap are a clock that was set back, and begin a new series.
+        """
         rotation = np.asarray(sample.ned_from_body, dtype=np.float64)
         valid = np.isfinite(sample.time) and rotation.shape == (3, 3) and bool(np.isfinite(rotation).all())
         if valid:
             valid = bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < 0.05)
         if valid and self._times and sample.time <= self._times[-1]:
-            valid = False
+            self._set_back = self._set_back + 1 if sample.time < self._times[-1] - _MAX_GAP_S else 0
+            valid = self._set_back >= _CONFIRMING_SAMPLES
+            if valid:
+                for samples in (self._times, self._rotations, self._positions, self._pending):
+                    samples.clear()
         if not valid:
             self.rejected += 1
             return
         position = None if sample.position is None else np.asarray(sample.position, dtype=np.float64)
         if position is not None and not np.isfinite(position).all():
             position = None
+        self._set_back = 0
         camera_from_ned = self._camera_from_body @ rotation.T
         self._times.append(float(sample.time))
         self._rotations.append(camera_from_ned)

@@ -9,7 +9,9 @@ import pytest
 
 from edge.uav.base import Telemetry
 from edge.uav.navigation import Origin
+from edge.uav.timing.clock_alignment import CameraHostClock
 from edge.uav.timing.telemetry_offset import OffsetEstimate, RelativeRotations, find_offset
+from edge.uav.timing.telemetry_track import TelemetryTrack
 from edge.uav.timing.vehicle_clock import VehicleClock
 from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA, Flight, grid_times, rotation
 from edge.uav.world.noise import smoothed_noise
@@ -96,6 +98,46 @@ def test_round_trips_of_negative_or_excessive_duration_are_rejected() -> None:
     assert clock.rejected == 2
     with pytest.raises(RuntimeError):
         clock.host_time(0)
+
+
+FRAME = SECOND // 30
+
+
+@pytest.mark.parametrize("error_s", [86_400, 1, -3, -86_400])
+def test_one_frame_with_a_wrong_stamp_does_not_move_the_cameras_clock(error_s: int) -> None:
+    clock = CameraHostClock()
+    for k in range(100):
+        wrong = k % 10 == 9
+        clock.handle_frame(k * FRAME + wrong * error_s * SECOND, k * FRAME + 7 * SECOND + 20_000_000)
+        assert clock.camera_ns(7 * SECOND + 20_000_000) == 0
+    assert clock.steps == 0
+
+
+@pytest.mark.parametrize("step_s", [10, -10])
+def test_a_step_of_the_cameras_clock_is_followed(step_s: int) -> None:
+    clock = CameraHostClock()
+    for k in range(100):
+        stepped = (k >= 50) * step_s * SECOND
+        clock.handle_frame(k * FRAME + stepped, k * FRAME + 20_000_000)
+    assert clock.steps == 1
+    assert clock.camera_ns(20_000_000) == step_s * SECOND
+
+
+def test_frames_that_queued_up_are_no_clock_step() -> None:
+    clock = CameraHostClock()
+    for k in range(200):
+        held_back = max(0, (190 - k) * FRAME) if k >= 100 else 0  # three seconds of them arrive at once
+        clock.handle_frame(k * FRAME, k * FRAME + 20_000_000 + held_back)
+    assert clock.steps == 0
+
+
+def test_telemetry_goes_on_after_a_clock_was_set_back() -> None:
+    track = TelemetryTrack(np.eye(3))
+    for time in (100.0, 100.1, 99.9, 100.2, 49.9, 50.0, 50.1, 50.2):
+        track.add(Telemetry(time, np.eye(3)))
+    assert track.rejected == 3
+    assert track.rotation_at(50.15) is not None
+    assert track.rotation_at(100.1) is None
 
 
 def flight(seed: int, seconds: float) -> Flight:
