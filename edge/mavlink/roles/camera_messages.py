@@ -15,6 +15,7 @@ from protocols.geometry.camera import Intrinsics
 
 NAN = float("nan")
 _UNKNOWN_INT = 0x7FFFFFFF
+_MAX_ALTITUDE_M = 2e6  # more does not fit into millimetres of 32 bits
 _MODEL = b"Syncline UAV tracker"
 STREAM_ID = 1
 """Id of the only video stream."""
@@ -210,7 +211,7 @@ _STATUS_FLAGS = {
 
 
 def _scaled_position(geo: tuple[float, float, float] | None) -> tuple[int, int, float]:
-    """Latitude, longitude in 1e-7 degrees and altitude [m]; INT32_MAX and NaN where unknown."""
-    if geo is None:
+    """Latitude, longitude in 1e-7 degrees and altitude [m]; INT32_MAX and NaN where unknown or impossible."""
+    if geo is None or not (abs(geo[0]) <= 90.0 and abs(geo[1]) <= 180.0 and abs(geo[2]) < _MAX_ALTITUDE_M):
         return _UNKNOWN_INT, _UNKNOWN_INT, NAN
     return round(1e7 * geo[0]), round(1e7 * geo[1]), geo[2]

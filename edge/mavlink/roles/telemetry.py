@@ -23,6 +23,8 @@ MESSAGE_TYPES = (
     "SYSTEM_TIME",
     "TIMESYNC",
 )
+_MAX_DISTANCE_M = 100_000.0  # from the local origin, and of a height: beyond it the flat local frame means nothing
+_MAX_SPEED_M_S = 1_000.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +77,10 @@ TelemetryReport = Attitude | LocalPosition | GlobalPosition | GimbalAttitude | S
 
 
 def parse_telemetry(message: Any) -> TelemetryReport | None:
-    """Parse a telemetry message; None for other types and for invalid values."""
+    """Parse a telemetry message; None for other types and for invalid values.
+
+    Positions and speeds that no vehicle has are invalid: they would not fit into the messages made of them.
+    """
     kind = message.get_type()
     boot = 1e-3 * float(getattr(message, "time_boot_ms", 0))
     if kind == "ATTITUDE":
@@ -85,10 +90,15 @@ def parse_telemetry(message: Any) -> TelemetryReport | None:
         return None if rotation is None else Attitude(boot, rotation)
     if kind == "LOCAL_POSITION_NED":
         position = np.array([message.x, message.y, message.z], np.float64)
-        return LocalPosition(boot, position, np.array([message.vx, message.vy, message.vz], np.float64))
+        velocity = np.array([message.vx, message.vy, message.vz], np.float64)
+        if np.abs(position).max() > _MAX_DISTANCE_M or np.abs(velocity).max() > _MAX_SPEED_M_S:
+            return None
+        return LocalPosition(boot, position, velocity)
     if kind == "GLOBAL_POSITION_INT":
         if (message.lat == 0 and message.lon == 0) or abs(message.lat) > 900_000_000:
             return None  # no fix yet
+        if max(abs(message.alt), abs(message.relative_alt)) > 1e3 * _MAX_DISTANCE_M:
+            return None
         velocity = 0.01 * np.array([message.vx, message.vy, message.vz], np.float64)
         return GlobalPosition(
             boot, 1e-7 * message.lat, 1e-7 * message.lon, 1e-3 * message.alt, 1e-3 * message.relative_alt, velocity

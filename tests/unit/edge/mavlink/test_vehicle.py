@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
+import random
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 
+from edge.agents.target_report import update_tracking_status
 from edge.mavlink.dialect import AUTOPILOT, GIMBAL, mavlink
-from edge.mavlink.link.connection import ReceivedMessage
+from edge.mavlink.link.connection import Link, ReceivedMessage
+from edge.mavlink.link.transport import Pipe
+from edge.mavlink.roles.camera_messages import CameraMessages
 from edge.mavlink.roles.vehicle import MountSample, Vehicle
 
 BOOT_S, DELAY_S = 123.0, 0.01
@@ -81,7 +86,7 @@ def test_attitude_position_and_time_of_another_component_are_refused_and_reporte
         assert len(under_test.attitude(0.1 * k)) == 1
         assert under_test.attitude(0.1 * k + 0.05, COMPANION, ahead_s, yaw=2.0) == []
         under_test.take(mavlink.MAVLink_system_time_message(0, boot_ms(0.1 * k + ahead_s)), 0.1 * k, COMPANION)
-        under_test.take(mavlink.MAVLink_local_position_ned_message(boot_ms(0.1 * k), 9e9, 0, 0, 0, 0, 0), 0.1 * k, 191)
+        under_test.take(mavlink.MAVLink_local_position_ned_message(boot_ms(0.1 * k), 9e4, 0, 0, 0, 0, 0), 0.1 * k, 191)
     (sample,) = under_test.attitude(2.0)
     np.testing.assert_allclose(sample.ned_from_mount, np.eye(3), atol=1e-9)
     assert sample.position is not None
@@ -156,3 +161,39 @@ def test_samples_are_later_than_each_other_and_never_later_than_their_arrival() 
             assert last < sample.host_ns <= arrival
             last = sample.host_ns
     assert count > 250
+
+
+def test_whatever_numbers_the_vehicle_sends_nothing_raises_and_every_sample_is_bounded() -> None:
+    rng = random.Random(4)
+    big = (0.0, 1.0, -1.0, 1e4, -1e6, 3e38, -3e38, 1e-38)
+    whole = (0, 1, -1, 2**31 - 1, -(2**31), 473977000)
+    ours, theirs = Pipe.pair()
+    link = Link(None, system=1, component=100, allowed=(), transport=ours, vehicle=1)
+    messages = CameraMessages((640, 480), 30.0, None, None, (0, 1, 0))
+    vehicle = Vehicle(link, gimbal=False)
+    count = 0
+    for k in range(3000):
+        now = 10**9 + k * 10_000_000
+        number, integer = partial(rng.choice, big), partial(rng.choice, whole)
+        boot = rng.choice((k * 10, k * 10, rng.randrange(2**32), 0, 2**32 - 1))
+        q = rng.choice(([1.0, 0.0, 0.0, 0.0], [number() for _ in range(4)]))
+        message = rng.choice(
+            (
+                mavlink.MAVLink_attitude_quaternion_message(boot, *q, 0, 0, 0),
+                mavlink.MAVLink_attitude_message(boot, number(), number(), number(), 0, 0, 0),
+                mavlink.MAVLink_local_position_ned_message(boot, *(number() for _ in range(6))),
+                mavlink.MAVLink_global_position_int_message(
+                    boot, integer(), integer(), integer(), integer(), 0, 0, 0, 0
+                ),
+                mavlink.MAVLink_timesync_message(integer() * 2**30, rng.choice((now, integer() * 2**30))),
+            )
+        )
+        received = ReceivedMessage(message, message.get_type(), 1, AUTOPILOT, now)
+        for sample in vehicle.handle(received):
+            count += 1
+            assert now - 5 * 10**9 <= sample.host_ns <= now
+        update_tracking_status(messages.status, None, vehicle, (640, 480), None, np.eye(3), now)
+        assert link.send(messages.build("CAMERA_FOV_STATUS"))
+        assert link.send(messages.build("CAMERA_TRACKING_GEO_STATUS"))
+        theirs.receive()
+    assert count > 100
