@@ -14,6 +14,7 @@ from edge.detectors.moving.vehicle import VehicleDetector
 from edge.detectors.people.person import PersonDetector
 from edge.devices.playback.video_reader import VideoReader
 from edge.offline.detections import Collected, VideoDetections, detection_rows, run_detector
+from protocols.core.errors import Refused
 
 if TYPE_CHECKING:
     from edge.devices.base import Image
@@ -22,6 +23,8 @@ MovingDetector = PersonDetector | VehicleDetector
 _LEARN_S, _LEARN_IMAGES = 60.0, 48
 _HEIGHT_FRAMES = 400
 _MIN_FRAMES = 5
+MAX_MOVING_SHARE = 0.3
+"""Share of the time: where a camera moves for longer, people are not detected."""
 
 
 def moving_detector(what: str, model: SubtractorName, fps: float) -> MovingDetector:
@@ -99,6 +102,11 @@ def learn_background(
         if frame.frame >= min(_HEIGHT_FRAMES, span):
             break
         detector.detect(frame.image(), frame.time)
+    if isinstance(detector, PersonDetector) and detector.moving_share > MAX_MOVING_SHARE:
+        raise Refused(
+            f"{video.path}: the camera moves in {100 * detector.moving_share:.0f} % of the time, and people are "
+            "detected before a fixed camera only: use a detector network"
+        )
     detector.rewind()
 
 

@@ -34,6 +34,8 @@ _PAUSE_S = 2.0  # a longer time between two images is a pause and does not count
 _PERIOD_GAIN = 0.05  # gain of the estimate of the frame period
 _BOOTSTRAP_UPDATES = 8  # images of a bootstrap that the model is updated with
 _BOOTSTRAP_WEIGHT, _BOOTSTRAP_RATES = 0.8, (0.03, 0.2)  # total weight of these images; limits of the rate of one
+_SWAY, _SWAY_STEP = 0.004, 8
+"""Over the image width: displacement of swaying leaves; 8-bit steps of noise about the colours beside a pixel."""
 _PASSING_STEP = 40  # 8-bit steps
 _SCENE_CHANGE_SHARE = 0.4  # share of foreground pixels at which the camera has moved or the light has changed
 _SUBSAMPLE = 8
@@ -97,6 +99,7 @@ class BackgroundSubtractor:
         self._ghost_image: Image | None = None
         self._ghost_mask: Image | None = None  # 255 where there is a ghost
         self._background: Image | None = None
+        self._background_range: tuple[Image, Image] | None = None  # of the colours around each pixel
         self._background_mean: npt.NDArray[np.float32] | None = None  # the background with fractions of 8-bit steps
         self._bootstrap = BackgroundBootstrap()
         self._pending_bootstraps = list(_BOOTSTRAP_S)
@@ -127,7 +130,7 @@ class BackgroundSubtractor:
         self._set_background(middle)
 
     def _set_background(self, image: Image) -> None:
-        self._background = image
+        self._background, self._background_range = image, None
         self._background_mean = image.astype(np.float32)
 
     def _bootstrap_step(self, compensated: Image) -> None:
@@ -186,7 +189,7 @@ class BackgroundSubtractor:
             self._reset()
             self.resets += 1
             return self._segment(image, ())
-        foreground = self._without_ghosts(compensated, foreground)
+        foreground = self._without_ghosts(compensated, self._without_moved_edges(compensated, foreground))
         if self._pending_bootstraps and self._age < _INITIAL_GHOSTS_S:
             foreground = self._without_initial_ghosts(compensated, foreground)
         else:
@@ -269,6 +272,30 @@ class BackgroundSubtractor:
         self._changed_frames += 1
         return self._changed_frames >= 2  # one frame may be a flash
 
+    def _without_moved_edges(self, compensated: Image, foreground: Image) -> Image:
+        """Remove thin structures with colours of the background beside them: leaves in the wind, a camera that shakes.
+
+        A displaced edge leaves strips as wide as its displacement; bodies are broader.
+        """
+        assert self._background is not None
+        x, y, w, h = cv2.boundingRect(foreground)
+        if w == 0:
+            return foreground
+        size = 2 * round(_SWAY * foreground.shape[1]) + 3
+        if self._background_range is None:
+            box, noise = np.ones((size, size), np.uint8), np.full_like(self._background, _SWAY_STEP)
+            low, high = cv2.erode(self._background, box), cv2.dilate(self._background, box)
+            darkest, brightest = cv2.subtract(low, noise), cv2.add(high, noise)
+            self._background_range = np.asarray(darkest, dtype=np.uint8), np.asarray(brightest, dtype=np.uint8)
+        part = slice(y, y + h), slice(x, x + w)
+        mask = foreground[part]
+        core = cv2.erode(mask, np.ones((size, size), np.uint8))
+        alone = cv2.bitwise_not(cv2.dilate(core, np.ones((3 * size, 3 * size), np.uint8)))
+        moved = cv2.inRange(compensated[part], *(one[part] for one in self._background_range))
+        kept = foreground.copy()
+        kept[part] = cv2.subtract(mask, cv2.bitwise_and(moved, alone))
+        return kept
+
     def _without_ghosts(self, compensated: Image, foreground: Image) -> Image:
         if self._ghost_image is None or self._ghost_mask is None:
             return foreground
@@ -293,6 +320,7 @@ class BackgroundSubtractor:
         kept = np.full(foreground.shape, 255, np.uint8) if self._age < _INITIAL_S else cv2.bitwise_not(foreground)
         cv2.accumulateWeighted(update_image, self._background_mean, min(max(rate, 0.02), 0.5), kept)
         self._background = np.asarray(cv2.convertScaleAbs(self._background_mean), dtype=np.uint8)
+        self._background_range = None
         self._frames_since_update = 0
 
 

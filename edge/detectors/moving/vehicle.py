@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from edge.detectors.base import Detection, Prediction
 from edge.detectors.moving.association import match_predictions
+from edge.detectors.moving.camera_motion import ImageMotion
 from edge.detectors.moving.foreground import BackgroundSubtractor, SubtractorName
 from edge.detectors.moving.tracklets import ImageTracklet, ShortTermTracker
 from protocols.geometry.types import Floats
@@ -28,8 +29,6 @@ _MIN_AREA_SHARE = 0.00025  # over the image area: smaller silhouettes are ignore
 _MOVING_SHIFT_PX = 0.35  # per frame: above it for a while, the camera moves
 _MOVING_TRAVEL_PX = 3.0  # between images seconds apart
 _DECISION_FRAMES = 8  # frames
-_SPREAD_CELLS = 4  # cells per side of the image over which inlier corners must be spread to be the camera's motion
-_CORNERS = 400
 _MAX_GROWTH = 2.5  # factor: a silhouette this much larger than a vehicle contains more than that
 _DIFFERENCE_STEP = 26  # 8-bit steps
 _STALE_FRAMES = 20
@@ -240,14 +239,10 @@ def _growth(box: Box, piece: npt.NDArray[np.int32]) -> float:
 
 
 class _CompensatedBackground:
-    """A background that is warped along with the camera's motion.
-
-    shift: median motion of its corners in the last frame [px].
-    """
+    """A background that is warped along with the camera's motion."""
 
     def __init__(self) -> None:
-        self._last: Image | None = None
-        self._corners: npt.NDArray[np.float32] | None = None
+        self._image_motion = ImageMotion()
         self._mean: npt.NDArray[np.float32] | None = None
         self._age: npt.NDArray[np.float32] | None = None
         self._stale: npt.NDArray[np.float32] = np.zeros((1, 1), np.float32)
@@ -255,48 +250,24 @@ class _CompensatedBackground:
         self._next_reference: npt.NDArray[np.float32] | None = None
         self._next_reference_age = 0
         self._reference_age = _REFERENCE_FRAMES
-        self._motion: Floats | None = np.eye(3)
-        self.shift = 0.0
+
+    @property
+    def shift(self) -> float:
+        """Median motion of the corners in the last frame [px]."""
+        return self._image_motion.shift
+
+    @property
+    def _motion(self) -> Floats | None:
+        return self._image_motion.motion
 
     def estimate_motion(self, image: Image) -> None:
         """Estimate the image motion since the last frame."""
-        grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
-        if self._last is not None and self._last.shape == grey.shape:
-            self._motion = self._homography(grey)
-        self._last = grey
+        self._image_motion.estimate(image)
 
     def forget(self) -> None:
         """Forget the background; the image motion stays known."""
         self._mean = self._reference = self._next_reference = None
         self._next_reference_age, self._reference_age = 0, _REFERENCE_FRAMES
-
-    def _homography(self, grey: Image) -> Floats | None:
-        assert self._last is not None
-        corners = cv2.goodFeaturesToTrack(self._last, _CORNERS, 0.01, max(grey.shape[1] // 50, 6))
-        if corners is None or len(corners) < 12:
-            self.shift = 0.0
-            return np.eye(3)  # without corners, a bare wall, no motion is observable
-        corners = np.asarray(corners, dtype=np.float32).reshape(-1, 1, 2)
-        guess = corners.copy()
-        moved, good, _ = cv2.calcOpticalFlowPyrLK(self._last, grey, corners, guess, winSize=(17, 17), maxLevel=3)
-        kept = good.ravel() == 1
-        before, after = corners[kept].reshape(-1, 2), np.asarray(moved)[kept].reshape(-1, 2)
-        if len(before) < 12:
-            self.shift = math.nan
-            return None
-        motion, inliers = cv2.findHomography(before, after, cv2.RANSAC, 1.0)
-        if motion is None or inliers is None or inliers.sum() < max(10, 0.3 * len(before)):
-            self.shift = math.nan
-            return None
-        own = inliers.ravel() == 1
-        cells = np.unique(
-            (before[own] * _SPREAD_CELLS / np.array(grey.shape[::-1])).astype(int) @ np.array([1, _SPREAD_CELLS])
-        )
-        if len(cells) < 0.4 * _SPREAD_CELLS**2:
-            self.shift = 0.0  # the corners of one object are not the camera's motion
-            return np.eye(3)
-        self.shift = float(np.median(np.linalg.norm(after[own] - before[own], axis=1)))
-        return np.asarray(motion, dtype=np.float64)
 
     def moving_pixels(self, image: Image) -> Image | None:
         """Pixels (H, W) 0/255 that do not move with the ground; None where the homography could not be estimated."""
@@ -385,9 +356,9 @@ def _camera_shift(images: Sequence[Image]) -> float | None:
     """Median motion [px] between images over a longer time, 0 for a fixed camera; None where it is not observable."""
     moved = []
     for one, other in zip(images[:-1:4], images[1::4], strict=False):
-        compensated = _CompensatedBackground()
-        compensated.estimate_motion(one)
-        compensated.estimate_motion(other)
-        if math.isfinite(compensated.shift):
-            moved.append(compensated.shift)
+        motion = ImageMotion()
+        motion.estimate(one)
+        motion.estimate(other)
+        if math.isfinite(motion.shift):
+            moved.append(motion.shift)
     return float(np.median(moved)) if len(moved) >= 3 else None

@@ -9,6 +9,8 @@ import numpy as np
 
 from protocols.geometry.types import Floats
 
+LEAST_HEIGHT = 12.0
+"""Height [px] of the smallest people."""
 _BANDS, _PER_BAND = 16, 60  # bands of image rows; observations kept in each
 # observations for a first fit; from which predictions and tentative ones are not used
 _MIN_SIGHTINGS, _FULL_SIGHTINGS = 8, 40
@@ -151,9 +153,12 @@ class HeightModel:
         if sightings is self._predicted:
             parameters = parameters + np.array([0.0, 0.0, np.log(self._observed_scale(parameters)), 0.0])
         self._parameters = parameters
-        low, high = np.percentile(height[agree], [5, 95])
-        self._range = (0.4 * float(low), 2.5 * float(high))
-        self.median_height = float(np.median(height[agree]))
+        # Weighted by the height: a swaying tree has dozens of small silhouettes that agree with the model far away.
+        ordered = np.sort(height[agree])
+        share = np.cumsum(ordered) / ordered.sum()
+        low, middle, high = ordered[np.searchsorted(share, [0.05, 0.5, 0.95])]
+        self._range = (max(0.4 * float(low), LEAST_HEIGHT), 2.5 * float(high))
+        self.median_height = float(middle)
 
     def _consensus(self, v: Floats, height: Floats, counts: Floats) -> Floats:
         """The parameters (4,) with zero roll that most observations (n,) support, with the prior as penalty.

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from edge.detectors.base import Detection, Prediction
 from edge.detectors.moving.association import match_predictions
+from edge.detectors.moving.camera_motion import CameraTravel
 from edge.detectors.moving.foreground import BackgroundSubtractor, ForegroundMasks, SubtractorName, is_ghost
 from edge.detectors.moving.tracklets import ImageTracklet, ShortTermTracker
 from edge.detectors.people.height_model import HeightModel
@@ -33,12 +34,9 @@ _U_STD, _V_STD = 0.024, 0.105  # std of the representative point over the size, 
 _FLOOR_STD = 0.6  # px
 _MIN_PREDICTED_PX = 12.0  # px: smaller predictions do not update the height model
 _MAX_PREDICTED_STD = 0.12  # over the size: largest std of a predicted place that updates the height model
+_FRAGMENT_HEIGHT = 0.5  # over the tallest silhouette's: lower ones may be fragments
 _GAP_WIDTH = 0.12  # over the height: width of gaps that are closed where they seem a shadow
 _FOOT_BELOW = 0.62  # over the height: distance of the foot point below the predicted representative point
-_WALKING_GAP_S, _WALKING_STEP, _HEIGHT_TOLERANCE = (0.2, 1.0), (0.12, 1.0), 0.15
-"""Of a walking person between two isolated detections: limits of the time [s], of the distance over the height, and of
-the log ratio of heights.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +65,10 @@ class PersonDetector:
         max_pixels: int = _MAX_PIXELS,
     ) -> None:
         self._fps = fps if fps > 0 and math.isfinite(fps) else 25.0
+        self._model: SubtractorName = model
         self._foreground = BackgroundSubtractor(model, self._fps)
+        self._travel = CameraTravel()
+        self._moving = False
         self._tracker = ShortTermTracker(prefix, min_displacement=0.35)
         self._confirmed_only = confirmed_only
         self._max_pixels = max_pixels
@@ -77,13 +78,16 @@ class PersonDetector:
         self._time = -1.0
         self._confirmed: set[str] = set()
         self._learns_heights = True  # whether the height model is updated
-        # time, foot point and height of recent isolated people
-        self._recent_isolated: list[tuple[float, float, float, float]] = []
 
     @property
     def resets(self) -> int:
         """How often the background model was reset because the camera was moved or the light changed suddenly."""
         return self._foreground.resets
+
+    @property
+    def moving_share(self) -> float:
+        """Share (0..1) of the time in which the camera moved; people are not detected then."""
+        return self._travel.share
 
     def is_confirmed(self, label: str) -> bool:
         """Whether the track of this label was confirmed: detected several times, and moving."""
@@ -98,7 +102,7 @@ class PersonDetector:
     def rewind(self) -> None:
         """Restart at an earlier time with the learnt background and heights, and without tracks."""
         self._tracker.clear()
-        self._recent_isolated = []
+        self._travel = CameraTravel()
         self._time = -1.0
         if self._height_model is not None:
             self._height_model.refit()
@@ -117,6 +121,13 @@ class PersonDetector:
             now = self._time + 1.0 / self._fps
         self._time = now
         small = self._downscaled(image)
+        if self._travel.moves(small, now):
+            self._tracker.clear()
+            self._moving = True
+            return []
+        if self._moving:
+            self._moving = False
+            self._foreground = BackgroundSubtractor(self._model, self._fps)
         tracked_boxes = [one.box for one in self._tracker.tracklets if one.confirmed and one.moved]
         masks = self._foreground.segment(small, tracked_boxes, now)
         if masks.initialising:
@@ -181,22 +192,12 @@ class PersonDetector:
         tracklets = list(tracker.tracklets)
         boxes = [one.predicted_box(now) for one in tracklets]
         moving = [(box, one.name) for box, one in zip(boxes, tracklets, strict=True) if one.confirmed and one.moved]
-        isolated = IsolatedPeople(foreground) if self._learns_heights else None
-        isolated_people = [(now, *one) for one in isolated.find()] if isolated else []
-        for _, u, v, height in isolated_people:
+        fitted = self._height_model.is_fitted
+        for u, v, height in IsolatedPeople(foreground).find() if self._learns_heights else ():
             # A static silhouette may be a ghost.
-            who = [name for box, name in moving if _matches_box(box, u, v, height)]
-            if who or self._is_walking(now, u, v, height):
-                self._height_model.add(u, v, height, who[0] if who else "")
-        if isolated and self._foreground.bootstrapping:
-            tentative = isolated.find(strict=False)
-            greatest_height = max((one[2] for one in tentative), default=0.0)
-            for u, v, height in tentative:
-                if height > 0.5 * greatest_height:  # others may be fragments
-                    self._height_model.add_tentative(u, v, height)
-        self._recent_isolated = [
-            one for one in self._recent_isolated if now - one[0] < _WALKING_GAP_S[1]
-        ] + isolated_people
+            who = next((name for box, name in moving if _matches_box(box, u, v, height)), None)
+            if who is not None:
+                self._height_model.add(u, v, height, who)
         bodies = segment_people(
             foreground,
             masks.shadow,
@@ -210,11 +211,15 @@ class PersonDetector:
         preassigned = [tracklets[body.expected] if body.expected >= 0 else None for body in bodies]
         assigned = tracker.assign([body.box for body in bodies], colours, now, preassigned)
         found = []
+        tallest = max((body.box[3] for body in bodies), default=0.0)
         for body, tracklet, colour in zip(bodies, assigned, colours, strict=True):
+            x, y, w, h = body.box
             if body.isolated and not body.truncated and self._height_model.is_fitted:
-                x, y, w, h = body.box
                 model_height = float(self._height_model.heights_at(np.array(x + 0.5 * w), np.array(y + h)))
                 tracklet.update_height(h / model_height)
+            learns = (tracklet.moved and not fitted) or self._foreground.bootstrapping
+            if learns and h > _FRAGMENT_HEIGHT * tallest and not body.truncated:
+                self._height_model.add_tentative(x + 0.5 * w, y + h, h)
             if tracklet.time < now or tracklet.hits == 1:
                 if tracklet.time < now:
                     gain = 0.9 if body.isolated and not body.truncated else 0.6 if body.visible > 0.6 else 0.35
@@ -226,18 +231,6 @@ class PersonDetector:
                     self._foreground.absorb_ghost(image, body.box)
         tracker.prune(now, (image.shape[1], image.shape[0]))
         return found
-
-    def _is_walking(self, now: float, u: float, v: float, height: float) -> bool:
-        """Whether an isolated person of this foot point and height was detected somewhere else a moment ago."""
-        for when, u2, v2, height2 in self._recent_isolated:
-            away = math.hypot(u - u2, v - v2) / height
-            if (
-                now - when >= _WALKING_GAP_S[0]
-                and _WALKING_STEP[0] < away < _WALKING_STEP[1]
-                and abs(math.log(height / height2)) < _HEIGHT_TOLERANCE
-            ):
-                return True
-        return False
 
     def _report(self, image: Image, foreground: Image, one: _TrackedSilhouette) -> Detection:
         body, tracklet = one.body, one.tracklet

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.detectors.people.height_model import HeightModel
-from edge.detectors.people.templates import BARS, Box
+from edge.detectors.people.height_model import LEAST_HEIGHT, HeightModel
+from edge.detectors.people.templates import BACKGROUND_WEIGHT, BARS, TEMPLATE_AREA, Box
 from protocols.geometry.types import Bools, Floats
 
 Image = npt.NDArray[np.uint8]
@@ -25,8 +25,12 @@ along.
 """
 _MIN_TEMPLATE_OVERLAP = 0.7  # overlap of template and silhouette of an isolated person, over either
 _SLIM, _STOUT = 1.15, 7.0  # height over breadth of an isolated person, without a height model
+_FRAGMENT_GAP, _MIN_UNION_FIT = 0.25, 0.28
+"""Largest gap between fragments of a person over the height, and smallest gain of their common template over its area:
+as of a template that is kept (``occupancy``).
+"""
+_LEAST_FRAGMENT, _MAX_FRAGMENTS = 4, 60  # px; largest silhouettes that are joined
 _THIN, _SPECK = 0.05, 0.02  # over the height: lower structures are no limbs; over its square: smaller areas are specks
-_LEAST_HEIGHT = 12.0  # px
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,22 +64,18 @@ class IsolatedPeople:
         self._boxes = [(int(x), int(y), int(w), int(h)) for x, y, w, h in reversed(boxes)]
         self._is_fragment = _fragments(np.array(self._boxes, dtype=np.float64).reshape(-1, 4))
 
-    def find(self, *, strict: bool = True) -> list[tuple[float, float, float]]:
-        """Foot points u, v and heights [px] of isolated people.
-
-        strict: test the shape too. Otherwise only the aspect ratio is tested, with a lower limit: a person who starts
-        to walk and the ghost of the starting place are one broader silhouette.
-        """
+    def find(self) -> list[tuple[float, float, float]]:
+        """Foot points u, v and heights [px] of isolated people."""
         found = []
         for (x, y, w, h), is_fragment in zip(self._boxes, self._is_fragment, strict=True):
             if (
-                h < _LEAST_HEIGHT
+                h < LEAST_HEIGHT
                 or is_truncated((x, y, w, h), self._figure.shape)
-                or not (1.8 if strict else 1.2) * w < h < 4.5 * w
+                or not 1.8 * w < h < 4.5 * w
                 or is_fragment
             ):
                 continue
-            if not strict or _matches_template(_touching_all_sides(self._figure[y : y + h, x : x + w])):
+            if _matches_template(_touching_all_sides(self._figure[y : y + h, x : x + w])):
                 found.append((x + 0.5 * w, float(y + h), float(h)))
         return found
 
@@ -115,21 +115,69 @@ def _matches_template(mask: Bools) -> bool:
 def segment_by_shape(foreground: Image, expected: Sequence[Box]) -> list[PersonSilhouette]:
     """People without a height model: silhouettes (H, W) 0/255 with the aspect ratio of one person.
 
-    expected: predicted boxes [px].
+    Fragments are joined where one template of their common box explains them. expected: predicted boxes [px].
     """
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(foreground, connectivity=8, ltype=cv2.CV_16U)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(foreground, connectivity=8, ltype=cv2.CV_16U)
     owners = [_owner(np.asarray(labels, dtype=np.uint16), box) for box in expected]
     bodies = []
-    for one in range(1, count):
-        x, y, w, h, area = (int(value) for value in stats[one])
-        if h < _LEAST_HEIGHT or w < 3 or area < 0.16 * min(w, h) * h:
+    for members in _joined_fragments(foreground, np.asarray(stats[1:], dtype=np.int32)):
+        low = stats[members, :2].min(axis=0)
+        w, h = (int(side) for side in (stats[members, :2] + stats[members, 2:4]).max(axis=0) - low)
+        x, y, area = int(low[0]), int(low[1]), int(stats[members, cv2.CC_STAT_AREA].sum())
+        if h < LEAST_HEIGHT or w < 3 or area < 0.16 * min(w, h) * h:
             continue
         truncated = is_truncated((x, y, w, h), foreground.shape)
         if _SLIM <= h / w <= _STOUT or (truncated and h >= 0.8 * w):
             # Predictions of former fragments do not split a whole silhouette.
-            mine = [at for at, owner in enumerate(owners) if owner == one and expected[at][3] > 0.6 * h]
+            mine = [at for at, owner in enumerate(owners) if owner in members and expected[at][3] > 0.6 * h]
             bodies.append(PersonSilhouette((x, y, w, h), area / (w * h), 1.0, True, mine[0] if mine else -1, truncated))
     return bodies
+
+
+def _joined_fragments(foreground: Image, stats: npt.NDArray[np.int32]) -> list[list[int]]:
+    """Labels of the silhouettes (H, W) 0/255 of each person; stats: x, y, w, h, area (n, 5) of labels 1 …
+
+    The largest come first: each takes the fragments with which one template explains both.
+    """
+    sums = np.asarray(cv2.integral(cv2.threshold(foreground, 0, 1, cv2.THRESH_BINARY)[1]), dtype=np.int32)
+    order = [int(index) for index in np.argsort(-stats[:, cv2.CC_STAT_AREA]) if stats[index, 3] >= _LEAST_FRAGMENT]
+    order = order[:_MAX_FRAGMENTS]
+    groups: list[list[int]] = []
+    for seed in order:
+        if any(seed + 1 in group for group in groups):
+            continue
+        group, left, top = [seed + 1], int(stats[seed, 0]), int(stats[seed, 1])
+        right, bottom = left + int(stats[seed, 2]), top + int(stats[seed, 3])
+        for other in order:
+            if other == seed or any(other + 1 in each for each in (*groups, group)):
+                continue
+            x, y, w, h = (int(value) for value in stats[other, :4])
+            union = min(left, x), min(top, y), max(right, x + w), max(bottom, y + h)
+            wide, high = union[2] - union[0], union[3] - union[1]
+            gap = max(y - bottom, top - y - h, 0)
+            if gap > _FRAGMENT_GAP * high or high < _SLIM * wide:
+                continue
+            if _template_fit(sums, union) >= _MIN_UNION_FIT:
+                group.append(other + 1)
+                left, top, right, bottom = union
+        groups.append(group)
+    return groups
+
+
+def _template_fit(sums: npt.NDArray[np.int32], box: tuple[int, int, int, int]) -> float:
+    """Log-likelihood ratio of a template in a box (left, top, right, bottom) to background, over the template's area.
+
+    sums: integral image (H + 1, W + 1) of the silhouettes, 0 or 1.
+    """
+    left, top, right, bottom = box
+    height, middle, gain = bottom - top, 0.5 * (left + right), 0.0
+    for half, high, low in BARS:
+        a, b = round(middle - half * height), round(middle + half * height)
+        c, d = round(top + high * height), round(top + low * height)
+        a0, b0 = (min(max(edge, 0), sums.shape[1] - 1) for edge in (a, b))
+        inside = int(sums[d, b0]) - int(sums[c, b0]) - int(sums[d, a0]) + int(sums[c, a0])
+        gain += inside + BACKGROUND_WEIGHT * ((b - a) * (d - c) - inside)
+    return gain / (TEMPLATE_AREA * max(height, 1) ** 2)
 
 
 def _owner(labels: npt.NDArray[np.uint16], box: Box) -> int:
@@ -207,7 +255,7 @@ def as_single_person(
     mask = main_silhouette(mask, (rows.stop - rows.start) / fy)
     x, y, w, h = cv2.boundingRect(mask)
     box = float(left + x), float(top + y), float(w), float(h)
-    if h < _LEAST_HEIGHT or is_truncated(box, foreground.shape):
+    if h < LEAST_HEIGHT or is_truncated(box, foreground.shape):
         return None
     model_height = float(height_model.heights_at(np.array([box[0] + 0.5 * w]), np.array([box[1] + h]))[0])
     fill = cv2.countNonZero(mask) / (w * h)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.scenes.common import background
+from edge.scenes.common.background import LIGHT_WORLD, room
 from edge.scenes.common.base import Renderer
 from edge.scenes.common.sensor import PEDESTAL, SensorNoise, pixel_rays, subtract_pedestal
 from edge.scenes.people.scene import RADII, Person, joint_radii
@@ -37,7 +37,8 @@ _LIMBS = ("hip", "knee", "ankle", "toe"), ("shoulder", "elbow", "hand")
 class PeopleRenderer(Renderer):
     """Images of a people scene from one camera.
 
-    noise_rng: sensor noise. noise_std: its std [8-bit steps]. shadows: whether people cast shadows.
+    noise_rng: sensor noise. noise_std: its std [8-bit steps]. shadows: whether people cast shadows. background: (H, W,
+    3) BGR in place of the scene's room.
     """
 
     def __init__(
@@ -47,19 +48,26 @@ class PeopleRenderer(Renderer):
         noise_rng: np.random.Generator,
         noise_std: float = _NOISE_STD,
         shadows: bool = True,
+        background: Image | None = None,
     ) -> None:
         self._scene = scene
         self._name = camera
         self._camera = scene.camera(camera)
         self._shadows = shadows
         lens = self._camera.intrinsics
-        u, v = np.meshgrid(np.arange(lens.width, dtype=float), np.arange(lens.height, dtype=float))
-        rays = pixel_rays(lens, u, v) @ self._camera.pose.rotation
-        rng = np.random.default_rng([scene.seed, _BACKGROUND_STREAM])
-        self._dimmed = subtract_pedestal(background.room(rays, self._camera.pose.position, *scene.room, rng))
+        if background is None:
+            u, v = np.meshgrid(np.arange(lens.width, dtype=float), np.arange(lens.height, dtype=float))
+            rays = pixel_rays(lens, u, v) @ self._camera.pose.rotation
+            rng = np.random.default_rng([scene.seed, _BACKGROUND_STREAM])
+            background = room(rays, self._camera.pose.position, *scene.room, rng)
+        self.replace_background(background)
         self._noise = SensorNoise(lens.width, lens.height, noise_std, noise_rng)
         self._cloth = [_cloth(scene.seed, index, person.pattern) for index, person in enumerate(scene.people)]
         self._reach = joint_radii(scene.heights)
+
+    def replace_background(self, image: Image) -> None:
+        """Draw people before another background (H, W, 3) BGR from now on."""
+        self._dimmed = subtract_pedestal(image)
 
     def render(self, true_time: float) -> Image:
         return self._noise.add(self._draw(true_time, None))
@@ -83,7 +91,7 @@ class PeopleRenderer(Renderer):
     def _shaded(self, joints: Floats) -> Image:
         """The room with soft shadows of the bodies on its floor."""
         lens = self._camera.intrinsics
-        light = background.LIGHT_WORLD
+        light = LIGHT_WORLD
         ground = joints - joints[..., 2:] / light[2] * light
         near = np.concatenate([ground[..., :2], np.zeros((*ground.shape[:-1], 1))], axis=-1)
         pixels = self._scene.seen_by(self._name, near)
