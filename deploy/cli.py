@@ -6,6 +6,7 @@ Subcommands are imported when they are called, so that `--help` takes a fraction
 from __future__ import annotations
 
 import difflib
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -148,6 +149,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
         # The reader of our output has closed the pipe (a pager, head): not an error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_DONE
+    except MemoryError:
+        print("syncline: out of memory; give it more, or less to do", file=sys.stderr)
+        return EXIT_INPUT
     except OSError as error:
         # A full disk, a file name that is too long, missing permissions: the state of the machine, not a bug.
         place = f"{error.filename}: " if error.filename else ""
@@ -174,6 +178,8 @@ def _command_of(words: Sequence[str]) -> str:
 
 def main() -> NoReturn:
     """Entry point of the console script."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal without UTF-8 shows what it cannot print as an escape
+        sys.stdout.reconfigure(errors="backslashreplace")
     status = run()
     if len(sys.argv) > 1 and sys.argv[1] in _AGENTS:
         # A thread that blocks in the transport during interpreter shutdown aborts the process: an agent that has

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import printable
 from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import OBSERVATION
@@ -134,13 +135,13 @@ def as_table(description: LogDescription) -> RenderableType:
 
     begin = datetime.fromtimestamp(description.begin_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     head = (
-        f"{escape(description.path)}: {description.messages} messages, {description.duration_s:.1f} s from "
+        f"{escape(printable(description.path))}: {description.messages} messages, {description.duration_s:.1f} s from "
         f"{begin}, {description.bytes / 1e6:.2f} MB"
     )
     topics = Table("key", "messages", "Hz", "from s", "to s", box=None, header_style="bold")
     for entry in description.topics:
         topics.add_row(
-            entry.key,
+            escape(printable(entry.key)),
             str(entry.count),
             f"{entry.rate_hz:.1f}",
             f"{entry.first_s:.1f}",
@@ -148,21 +149,23 @@ def as_table(description: LogDescription) -> RenderableType:
         )
     parts: list[RenderableType] = [head]
     if description.damage:
-        parts.append(f"[red]damaged: {escape(description.damage)}[/red]")
+        parts.append(f"[red]damaged: {escape(printable(description.damage))}[/red]")
     if description.messages:
         parts.append(topics)
     if description.cameras:
         cameras = Table("camera", "boot", "observations", "detections", "missing", box=None, header_style="bold")
         for camera in description.cameras:
             cameras.add_row(
-                camera.camera,
+                escape(camera.camera),
                 camera.boot_id[:8],
                 str(camera.observations),
                 str(camera.detections),
                 str(camera.missing),
             )
         parts.append(cameras)
-    parts += [f"{escape(item.name)}: {item.bytes} bytes, {item.media_type}" for item in description.attachments]
+    parts += [
+        escape(printable(f"{item.name}: {item.bytes} bytes, {item.media_type}")) for item in description.attachments
+    ]
     parts += [f"[red]{count} messages not used: {reason}[/red]" for reason, count in description.rejected.items()]
     return Group(*parts)
 

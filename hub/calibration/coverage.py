@@ -24,6 +24,7 @@ MIN_COVERAGE = 0.35
 MIN_DETECTIONS = 90
 """Detections below which a camera can hardly be calibrated with another."""
 _MAX_ADVICE = 2  # pieces of advice at a time: people do not follow more
+_MAX_ADVISED = 64  # cameras that are considered: of a thousand it would take a second
 
 Kind = Literal["silent", "unseen", "few", "narrow"]
 
@@ -84,7 +85,7 @@ class CoverageMonitor:
 
     def advice(self, max_advice: int = _MAX_ADVICE) -> list[CoverageAdvice]:
         """Advice, the most urgent first; empty when every camera has seen enough."""
-        cameras = sorted({*self._sizes, *self._frames})
+        cameras = sorted({*self._sizes, *self._frames})[:_MAX_ADVISED]
         found = [
             camera_advice(name, self._frames.get(name, 0), self._rows.get(name, 0), self.covered_cells(name))
             for name in cameras

@@ -39,7 +39,7 @@ class FairShare:
         share = max(self._round_s / max(len(senders), 1), _LEAST_SHARE_S)
         used: Counter[str] = Counter()
         for one in received:
-            if one.agent in self._waiting or used[one.agent] > share:
+            if one.agent in self._waiting or used[one.agent] > share or self._clock() - begin > self._round_s:
                 self._put(one)
             else:
                 used[one.agent] += self._timed(one)  # type: ignore[assignment]

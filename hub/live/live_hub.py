@@ -7,7 +7,7 @@ No sockets, threads, files or wall clock: ``handle`` takes messages, ``tick(now)
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -276,11 +276,11 @@ class LiveHub:
         if len(ready) < 2 and self._people.cameras:
             durations = {name: self._people.seconds(name) for name in self._people.cameras}
             if sum(seconds >= _MIN_PEOPLE_S for seconds in durations.values()) < 2:
-                counts = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in durations.items())
+                counts = _listed(f"{name} {seconds:.0f} s" for name, seconds in durations.items())
                 return f"people observed too briefly yet ({counts}; two cameras need {_MIN_PEOPLE_S:.0f} s): walk about"
             return ""
         if len(ready) < 2:
-            counts = ", ".join(f"{name} {rows}" for name, rows in rows_by_camera.items())
+            counts = _listed(f"{name} {rows}" for name, rows in rows_by_camera.items())
             return f"too few detections yet ({counts}; two cameras need {self.settings.least_rows}): move the marker"
         return ""
 
@@ -362,10 +362,10 @@ class LiveHub:
                 for name, frame in last.items()
                 if frame is None or now - frame > _SILENT_S
             ]
-            out += [f"no frames from {', '.join(silent)}"] if silent else []
+            out += [f"no frames from {_listed(silent)}"] if silent else []
         exceeding = self.budgets.exceeded(now, _BUDGET_NOTICE_S)
         if exceeding:
-            out.append(f"frames left out of {', '.join(exceeding[:8])}: more than a camera may send")
+            out.append(f"frames left out of {_listed(exceeding)}: more than a camera may send")
         if self._left_out:
             out.append(f"{self._left_out} is left out: the solver failed with its rows")
         out += [*self.notices.values()][:8]
@@ -379,6 +379,7 @@ class LiveHub:
         tied = {} if self.calibration is None else self.calibration.cameras
         waiting = {} if self.calibration is None else self.calibration.refused
         out = []
+        shared = self._builder.shared_motions_s()
         for name in self._builder.cameras:
             reason = waiting.get(name, refused.get(name, ""))
             state = "searching" if self._builder.rows(name) >= self.settings.least_rows else "collecting"
@@ -389,7 +390,7 @@ class LiveHub:
                 pb.CameraProgress(
                     camera=name,
                     state=state,
-                    shared_motion_s=self._builder.shared_motion_s(name),
+                    shared_motion_s=shared.get(name, 0.0),
                     coverage=self.guidance.coverage(name),
                     reason=reason[:300],
                 )
@@ -436,7 +437,8 @@ class LiveHub:
             self._left_out = ""
         if self._left_out in rig.cameras and len(rig.cameras) > 2:
             rig, observations = without_camera(rig, observations, self._left_out)
-        boots = {name: self._source().boot(name) for name in rig.cameras}
+        source = self._source()
+        boots = {name: source.boot(name) for name in rig.cameras}
         last = self._start_from(boots)
         self._solved_at = self._received
         rows = len(observations)
@@ -575,7 +577,8 @@ class LiveHub:
             return [refusal_message(refusal.reason, refusal.cameras, self._revision, "refused")]
         self.counters["solved"] += 1
         self.refusal = None
-        self._solved_boot_ids = {name: self._source().boot(name) for name in self.calibration.cameras}
+        source = self._source()
+        self._solved_boot_ids = {name: source.boot(name) for name in self.calibration.cameras}
         return self._publish_present()
 
     def _publish_unverified(self) -> list[Message]:
@@ -689,8 +692,15 @@ class LiveHub:
 
     def _in_present_segments(self, calibration: Calibration) -> tuple[Calibration, dict[str, str]]:
         """The calibration in the clocks' present segments, and the boot ids of those."""
-        boots = {name: self._solved_boot_ids.get(name) or self._source().boot(name) for name in calibration.cameras}
+        source = self._source()
+        boots = {name: self._solved_boot_ids.get(name) or source.boot(name) for name in calibration.cameras}
         return self.clocks.to_present(calibration, boots)
+
+
+def _listed(names: Iterable[str], most: int = 16) -> str:
+    """The first of very many, as a message has room for."""
+    every = list(names)
+    return ", ".join(every[:most]) + (f" and {len(every) - most} more" if len(every) > most else "")
 
 
 def without_camera(rig: Rig, observations: Observations, camera: str) -> tuple[Rig, Observations]:

@@ -19,6 +19,15 @@ EXIT_INPUT = 2
 EXIT_REFUSED = 3
 
 
+def printable(text: str) -> str:
+    """``text`` with what a terminal would obey (escape sequences, directions of writing) written as an escape."""
+    if text.isprintable():
+        return text
+    return "".join(
+        one if one.isprintable() or one == "\u200d" else one.encode("unicode_escape").decode() for one in text
+    )
+
+
 class SynclineError(Exception):
     """Base of the errors that are reported to a user as one line."""
 
@@ -40,7 +49,7 @@ class InputError(SynclineError):
         self.remedy = remedy
         place = "" if file is None else f"{file}:{line}: " if line is not None else f"{file}: "
         text = f"{place}{what}; {remedy}" if remedy else f"{place}{what}"
-        super().__init__(" ".join(text.split()))
+        super().__init__(printable(" ".join(text.split())))
 
 
 class Refused(SynclineError):
@@ -63,6 +72,6 @@ class Refused(SynclineError):
         warnings: tuple[str, ...] = (),
     ) -> None:
         self.pairs, self.warnings = pairs, warnings
-        self.reason = " ".join(reason.split())
+        self.reason = printable(" ".join(reason.split()))
         self.cameras = dict(cameras or {})
         super().__init__(self.reason)

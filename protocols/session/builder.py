@@ -147,10 +147,15 @@ class SessionBuilder:
 
     def shared_motion_s(self, camera: str) -> float:
         """Duration of the kept intervals [s] in which the camera and another one saw motion."""
-        return CHUNK_S * sum(
-            camera in moved and moved[camera] > _MOVING and sum(one > _MOVING for one in moved.values()) > 1
-            for moved in self._motion.values()
-        )
+        return self.shared_motions_s().get(camera, 0.0)
+
+    def shared_motions_s(self) -> dict[str, float]:
+        """The same of every camera that saw any; with a thousand cameras one by one would take seconds."""
+        out: Counter[str] = Counter()
+        for moved in self._motion.values():
+            moving = [camera for camera, motion in moved.items() if motion > _MOVING]
+            out.update(moving if len(moving) > 1 else ())
+        return {camera: CHUNK_S * count for camera, count in out.items()}
 
     def forget_before(self, camera: str, time: float) -> None:
         """Do not use a camera's detections before a time on its clock [s]: it was moved then."""

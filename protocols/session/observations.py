@@ -183,6 +183,10 @@ def read_rows(file: Path, cameras: Iterable[str], optional: Sequence[str] = ()) 
         size = np.where(size > 0, size, np.nan)
     names = [row[columns["camera"]].strip() for row in rows]
     labels = [row[columns["label"]].strip() or DEFAULT_LABEL for row in rows] if "label" in columns else None
+    for label, line in zip(labels or (), lines, strict=False):
+        if not label.isprintable():
+            what = f"label {label[:80]!a} has a character that cannot be printed"
+            raise InputError(what, file=file, line=line, remedy="rename the point")
     _check_cameras(names, lines, list(cameras), file)
     return ObservationRows(
         file,

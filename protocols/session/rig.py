@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from protocols.core.errors import InputError
-from protocols.core.names import check_name
+from protocols.core.names import check_name, is_name
 from protocols.core.ranges import (
     MAX_DISTORTION,
     MAX_FOCAL,
@@ -149,14 +149,29 @@ class _Table:
         return None if array is None else np.where(array < MIN_STD, 0.0, array)
 
 
+_MAX_BYTES = 16 * 1024 * 1024
+_MAX_CAMERAS = 1024
+"""As many as messages have."""
+_MANY_PARTS = re.compile(r"(?:[\w\"'-]{1,99}[ \t]{0,9}\.[ \t]{0,9}){32}")
+"""A dotted key of more parts than any table has; the parser takes time with the square of their number."""
+
+
 def read_toml(file: Path, what: str = "file") -> tuple[dict[str, Any], str]:
     """The parsed TOML file and its text. Raises InputError with file, line and remedy."""
     try:
-        text = file.read_text(encoding="utf-8-sig")
+        with file.open("rb") as stream:
+            data = stream.read(_MAX_BYTES + 1)
+        text = data.decode("utf-8-sig").replace("\r\n", "\n")
     except FileNotFoundError:
         raise InputError(f"this {what} does not exist", file=file, remedy="check the path") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot be read: {error}", file=file, remedy="check the file and its permissions") from None
+    if len(data) > _MAX_BYTES:
+        raise InputError(f"has more than {_MAX_BYTES} bytes", file=file, remedy="write a plain TOML file")
+    parts = _MANY_PARTS.search(text)
+    if parts is not None:
+        line = text.count("\n", 0, parts.start()) + 1
+        raise InputError("a key of more than 32 parts", file=file, line=line, remedy="write a plain TOML file")
     try:
         return tomllib.loads(text), text
     except (RecursionError, OverflowError):
@@ -187,6 +202,8 @@ def parse_rig(values: dict[str, Any], file: Path, text: str) -> Rig:
     if not isinstance(metadata, dict):
         raise InputError("metadata is not a table", file=file, remedy="write [metadata] and its keys below it")
     meta = _Table(metadata, "metadata", file, text)
+    if len(values) > _MAX_CAMERAS:
+        raise InputError(f"{len(values)} cameras, at most {_MAX_CAMERAS}", file=file, remedy="split the rig")
     for name, table in values.items():
         if not isinstance(table, dict):
             raise InputError(
@@ -266,7 +283,8 @@ def _read_camera(table: _Table) -> RigCamera:
     name = table.values.get("name", table.where)
     if not isinstance(name, str):
         raise table.fail("name", f"name = {name!r} is not text", 'give name = "cam0"')
-    check_name(name, file=table.file, line=table.line("name" if "name" in table.values else None))
+    if not is_name(name):
+        check_name(name, file=table.file, line=table.line("name" if "name" in table.values else None))
     # aniposelib's own files call their tables cam_0, cam_1, … and put the camera's name inside.
     theirs = re.fullmatch(r"cam_\d+", table.where) is not None
     if name != table.where and not theirs:

@@ -61,6 +61,8 @@ class VideoReader:
     def __init__(self, path: Path, fps: float | None = None) -> None:
         if not path.exists():
             raise InputError("this video does not exist", file=path, remedy="check the path")
+        if not path.is_file() and not path.is_dir():  # a pipe that nobody writes to would be waited for
+            raise InputError("is not a regular file", file=path, remedy="give a video file, or a folder of images")
         self.path = path
         self.corrupt = 0
         self.repaired = 0

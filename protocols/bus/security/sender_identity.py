@@ -11,7 +11,7 @@ it. Without certificates the router does not prevent this, so every receiver enf
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -27,17 +27,19 @@ from protocols.validation.rules import MAX_NUMBERS, RejectionReason
 
 SOURCE_TIMEOUT_S = 10.0
 """Silence after which a boot may use another connection: a log that is replayed twice has the same boot ids."""
-_MAX_SOURCES = 4096
+_MAX_SOURCES = _MAX_AGENTS = 4096
+_MAX_HEARD = 16
+"""Boots of one agent whose late messages are accepted, and that may be alive at once."""
 _PUBLISHED_SOURCES = 48
 _MAX_COUNTER_NAME = 64
 
 
 @dataclass(slots=True)
 class _AgentBoots:
-    """One (role, id): boots alive in order of arrival (alive), and every boot that was ever the first (heard)."""
+    """One (role, id): boots alive in order of arrival (alive), and the last boots that were the first (heard)."""
 
     alive: list[str] = field(default_factory=list)
-    heard: set[str] = field(default_factory=set)
+    heard: deque[str] = field(default_factory=lambda: deque(maxlen=_MAX_HEARD))
 
 
 class SenderValidator:
@@ -49,13 +51,18 @@ class SenderValidator:
 
     def handle(self, event: AgentEvent) -> None:
         """Process the appearance or disappearance of an agent."""
+        if (event.role, event.agent) not in self._agents and len(self._agents) >= _MAX_AGENTS:
+            self._agents = {who: agent for who, agent in self._agents.items() if agent.alive}
+            if len(self._agents) >= _MAX_AGENTS:
+                return
         agent = self._agents.setdefault((event.role, event.agent), _AgentBoots())
         if event.alive and event.boot_id not in agent.alive:
-            agent.alive.append(event.boot_id)
+            if len(agent.alive) < _MAX_HEARD:
+                agent.alive.append(event.boot_id)
         elif not event.alive and event.boot_id in agent.alive:
             agent.alive.remove(event.boot_id)
-        if agent.alive:
-            agent.heard.add(agent.alive[0])
+        if agent.alive and agent.alive[0] not in agent.heard:
+            agent.heard.append(agent.alive[0])
 
     def refuse(self, received: Received, now: float) -> tuple[RejectionReason, str] | None:
         """The reason and details why a message is rejected; None if it is accepted. now: any monotonic clock [s]."""

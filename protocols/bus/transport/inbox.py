@@ -7,6 +7,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from typing import TypeAlias
 
 from google.protobuf.message import Message
 
@@ -17,12 +18,19 @@ from protocols.validation.codec import MAX_PAYLOAD, Rejected, RejectionReason, a
 
 MAX_BYTES = 64 * 1024 * 1024
 """Upper bound of one inbox in bytes, so that a reader that has stopped does not exhaust the memory."""
-MAX_BYTES_OF_KEY = MAX_BYTES // 4
-"""The same of one sender, twice as much of images: who floods pays, not the others."""
+MAX_BYTES_OF_KEY = MAX_BYTES // 8
+"""The same of one sender, four times as much of images: who floods pays, not the others."""
+_MAX_DRAIN, _LEAST_DRAIN = 4096, 16
+"""Messages that are decoded at once, which takes 0.2 s, and of each sender, where there are so many."""
 _MAX_NUMBERED = 4096
 """Boots of plain publishers whose last number is remembered."""
+_MAX_ALIVE = 16_384
+"""Runs of agents that are alive at once."""
 _MAX_REFUSALS = 256
 """Rejections that are kept for reports; all of them are counted."""
+
+_Queued: TypeAlias = tuple[int, bytes, int, str, bool]
+"""Order, payload, arrival [ns], source, whether the transport counts its publisher's messages."""
 
 
 class Inbox:
@@ -35,8 +43,8 @@ class Inbox:
     def __init__(self, topic: Topic, clock_ns: Callable[[], int] = time.time_ns) -> None:
         self._clock_ns = clock_ns
         self._capacity = topic.queue
-        self._most_of_key = MAX_BYTES_OF_KEY * (2 if topic.bulky else 1)
-        self._queues: dict[str, deque[tuple[int, bytes, int, str, bool]]] = {}
+        self._most_of_key = MAX_BYTES_OF_KEY * (4 if topic.bulky else 1)
+        self._queues: dict[str, deque[_Queued]] = {}
         self._sizes: Counter[str] = Counter()
         self._length = self._bytes = self._order = 0
         self._newest: dict[tuple[str, str], int] = {}
@@ -71,6 +79,8 @@ class Inbox:
 
     def _drop(self, key: str) -> None:
         self._add(key, -1, -len(self._queues[key].popleft()[1]))
+        if not self._queues[key]:
+            del self._queues[key], self._sizes[key]
         self._counts["dropped"] += 1
 
     def refuse(self, error: Rejected, key: str, sequence: int | None = None) -> None:
@@ -99,11 +109,9 @@ class Inbox:
             self._counts["skipped"] += count
 
     def drain(self) -> list[Received]:
-        """Decode and validate everything that is queued."""
+        """Decode and validate what is queued: all of it or, of who sends very much, a share."""
         with self._ready:
-            queues, self._queues = self._queues, {}
-            self._sizes.clear()
-            self._length = self._bytes = 0
+            queues = self._taken()
         messages: list[Received] = []
         merged = heapq.merge(*([(item[0], key, item) for item in queue] for key, queue in queues.items()))
         for _, key, (_, payload, arrival_ns, source, numbered) in merged:
@@ -118,6 +126,23 @@ class Inbox:
         with self._ready:
             self._counts["received"] += len(messages)
         return messages
+
+    def _taken(self) -> dict[str, list[_Queued]]:
+        """What is decoded now, by key, removed from the queues."""
+        if self._length <= _MAX_DRAIN:
+            queues = {key: list(queue) for key, queue in self._queues.items()}
+            self._queues = {}
+            self._sizes.clear()
+            self._length = self._bytes = 0
+            return queues
+        share = max(_MAX_DRAIN // len(self._queues), _LEAST_DRAIN)
+        queues = {}
+        for key, queue in list(self._queues.items()):
+            queues[key] = [queue.popleft() for _ in range(min(share, len(queue)))]
+            self._add(key, -len(queues[key]), -sum(len(item[1]) for item in queues[key]))
+            if not queue:
+                del self._queues[key], self._sizes[key]
+        return queues
 
     def _count_gap(self, key: str, message: Message) -> None:
         """Count the losses of a plain publisher by the numbers in its messages."""
@@ -161,7 +186,7 @@ class LivenessTracker:
             return
         who = (parts[3], agent, parts[5])
         with self._lock:
-            if alive == (who in self._alive):
+            if alive == (who in self._alive) or (alive and len(self._alive) >= _MAX_ALIVE):
                 return
             if alive:
                 self._alive.add(who)

@@ -30,7 +30,7 @@ HEARTBEAT_S = 0.5
 _POLL_S = 0.005
 _HISTORY_QUERY_S = 2.0
 _GAP_QUERY_S = 10.0
-_MAX_KEYS, _KEYS_PER_CALL = 8192, 64
+_MAX_KEYS, _KEYS_PER_CALL = 8192, 8
 
 _Source: TypeAlias = tuple[str, int]
 """A publisher's identity in Zenoh: session id and entity id."""

@@ -90,6 +90,8 @@ class Damage:
 def open_log(path: Path) -> BinaryIO:
     """Open an MCAP file and check its magic; raises InputError."""
     try:
+        if path.exists() and not path.is_file():
+            raise InputError("is not a regular file", file=path, remedy="give a .mcap file that syncline recorded")
         stream = path.open("rb")
     except OSError as error:
         raise InputError(

@@ -15,11 +15,14 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
+from edge.devices.playback.video_reader import VideoReader
 from hub.calibration.pipeline import calibrate
 from protocols.core.errors import InputError
 from protocols.core.files import write_together
+from protocols.log.write.writer import LogWriter
 from protocols.session.folder import write_observations
 from protocols.session.observations import Observations
+from protocols.session.rig import read_rig
 from tests.support.rigs import Session, simulate
 
 
@@ -193,3 +196,67 @@ def agents_of(out: Path) -> list[str]:
             if f"{out}/config/" in line:
                 found.append(line)
     return found
+
+
+def test_a_named_pipe_is_no_video_and_no_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Opening a pipe that nobody writes to waits for ever."""
+    os.mkfifo(tmp_path / "cam0.mp4")
+    os.mkfifo(tmp_path / "log.mcap")
+    with pytest.raises(InputError, match="not a regular file"):
+        VideoReader(tmp_path / "cam0.mp4")
+    assert run(["info", str(tmp_path / "log.mcap")]) == 2
+    assert "not a regular file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (".".join(["a"] * 50_000) + " = 1\n", "more than 32 parts"),
+        ("".join(f"[cam{number}]\nsize = [640, 480]\n" for number in range(2_000)), "2000 cameras, at most 1024"),
+    ],
+    ids=["dotted", "cameras"],
+)
+def test_a_rig_that_takes_long_to_read_is_refused_at_once(tmp_path: Path, text: str, words: str) -> None:
+    """Time was quadratic: 38 s for a key of 50,000 parts."""
+    file = tmp_path / "rig.toml"
+    file.write_text(text)
+    began = time.process_time()
+    with pytest.raises(InputError, match=words):
+        read_rig(file)
+    assert time.process_time() - began < 10.0
+
+
+def test_what_a_terminal_would_obey_is_shown_as_an_escape(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "\x1b[2Jgone"
+    assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 2
+    assert "\x1b" not in (shown := capsys.readouterr().err)
+    assert "\\x1b[2Jgone" in shown
+    log = tmp_path / "log.mcap"
+    with LogWriter(log) as writer:
+        writer.attach("\x1b]0;owned\x07[/red]", "text/plain", b"", 0)
+    assert run(["info", str(log)]) == 0
+    assert "\x1b]0;" not in capsys.readouterr().out
+
+
+def test_a_terminal_without_unicode_gets_escapes_and_no_traceback(tmp_path: Path, filmed: Session) -> None:
+    write_session(tmp_path / "session", filmed)
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(
+        [sys.executable, "-m", "deploy", "info", str(tmp_path / "session")],
+        env=environment,
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 0
+    assert b"Traceback" not in done.stderr
+
+
+def test_out_of_memory_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def fails(*arguments: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("deploy.logs.info.describe_log", fails)
+    monkeypatch.setattr("deploy.commands.data.logs.describe_log", fails, raising=False)
+    monkeypatch.setattr("protocols.log.read.reader.LogReader.__init__", fails)
+    assert run(["info", "log.mcap"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
