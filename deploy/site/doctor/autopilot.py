@@ -143,7 +143,7 @@ def listen(link: Any, hello: Any, *, gimbal: bool, rate_hz: float, seconds: floa
                     due = elapsed if heard.firmware != before else due
                 heard.samples += [sample.host_ns / NANOSECONDS for sample in vehicle.handle(received)]
         link.wait(0.05)
-    heard.synchronised = vehicle.clock.std_s < 0.02
+    heard.synchronised = vehicle.clock.answered
     heard.refusal = vehicle.problem(time.monotonic_ns())
     return heard
 

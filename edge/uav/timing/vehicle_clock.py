@@ -72,6 +72,11 @@ class VehicleClock:
         """Whether there is an estimate."""
         return bool(self._round_trips or self._one_way)
 
+    @property
+    def answered(self) -> bool:
+        """Whether a round trip was measured."""
+        return bool(self._round_trips)
+
     def handle_message(self, vehicle_ns: int, host_ns: int) -> bool:
         """Add a message stamped ``vehicle_ns`` that arrived at ``host_ns``. False if it is refused; see ``reason``."""
         offset = vehicle_ns - host_ns
