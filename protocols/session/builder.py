@@ -230,6 +230,7 @@ class SessionBuilder:
             column("time_ns") / NANOSECONDS,
             np.ascontiguousarray(values[:, :2]),
             np.where(values[:, 2] > 0, values[:, 2], np.nan),
+            frames_may_repeat=True,
         )
         return self._build_rig(order), observations
 

@@ -234,8 +234,12 @@ def gather_columns(
     *,
     file: Path | None = None,
     lines: list[int] | None = None,
+    frames_may_repeat: bool = False,
 ) -> Observations:
-    """The same for rows (n,) with indices of their camera ``c`` and label ``k``; label_names: sorted."""
+    """The same for rows (n,) with indices of their camera ``c`` and label ``k``; label_names: sorted.
+
+    frames_may_repeat: repeated frame numbers are a warning, as from cameras that nobody can correct.
+    """
     sorting = np.lexsort((frame, time, k, c))
     c, k, frame, time, pixels, size = (
         c[sorting],
@@ -253,7 +257,8 @@ def gather_columns(
     for start, end in zip(starts, ends, strict=True):
         part = slice(start, end)
         camera, label = camera_names[c[start]], label_names[k[start]]
-        _check_repeats(camera, label, frame[part], time[part], None if line is None else line[part], file, warnings)
+        lines_of = None if line is None else line[part]
+        _check_repeats(camera, label, frame[part], time[part], lines_of, file, warnings, frames_may_repeat)
         tracks[camera, label] = Track(camera, label, frame[part], time[part], pixels[part], size[part])
     return Observations(tracks, tuple(warnings))
 
@@ -266,6 +271,7 @@ def _check_repeats(
     line: Ints | None,
     file: Path | None,
     warnings: list[str],
+    frames_may_repeat: bool,
 ) -> None:
     same_time = np.flatnonzero(np.diff(time) == 0)
     where = f"camera {camera}, label {label}" if label != DEFAULT_LABEL else f"camera {camera}"
@@ -281,7 +287,7 @@ def _check_repeats(
     repeated = int((counts - 1).sum())
     if not repeated:
         return
-    if repeated <= max(1.0, _MAX_REPEATED_SHARE * len(frame)):
+    if repeated <= max(1.0, _MAX_REPEATED_SHARE * len(frame)) and not frames_may_repeat:
         twice = unique[counts > 1][0]
         at = np.flatnonzero(frame == twice)
         raise InputError(

@@ -15,7 +15,7 @@ from protocols.bus.base import AgentEvent, Bus, BusDead, BusStopped, Received
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.backfill import RecoveryQuery
-from protocols.bus.transport.inbox import MAX_BYTES, MAX_BYTES_OF_KEY, Inbox
+from protocols.bus.transport.inbox import BYTES_PER_S, MAX_BYTES, MAX_BYTES_OF_KEY, Inbox
 from protocols.bus.transport.session import open_session
 from protocols.bus.transport.zenoh_bus import ZenohSubscription, open_bus
 from protocols.core.errors import InputError
@@ -156,18 +156,37 @@ def test_a_gap_of_a_topic_that_is_not_recovered_is_counted_once() -> None:
 
 
 def test_a_reader_that_stands_still_holds_so_many_bytes_and_no_more() -> None:
-    inbox = Inbox(OBSERVATION)
+    now = [0]
+    inbox = Inbox(OBSERVATION, lambda: now[0])
+
+    def push(camera: int, index: int) -> None:
+        now[0] += 10**9
+        inbox.push(f"syncline/local/camera/cam{camera}/observation", bytes([index]) * 1_000_000)
+
     for index in range(100):
-        inbox.push("syncline/local/camera/cam0/observation", bytes([index]) * 1_000_000)
+        push(0, index)
     kept = MAX_BYTES_OF_KEY // 1_000_000
     assert inbox.counters["dropped"] == 100 - kept
     inbox.drain()
     for index in range(kept):
-        inbox.push("syncline/local/camera/cam0/observation", bytes([index]) * 1_000_000)
+        push(0, index)
     assert inbox.counters["dropped"] == 100 - kept
     for index in range(400):
-        inbox.push(f"syncline/local/camera/cam{index % 10}/observation", bytes([index % 256]) * 1_000_000)
+        push(index % 10, index % 256)
     assert inbox._bytes <= MAX_BYTES
+
+
+def test_bytes_beyond_what_a_sender_may_send_are_not_even_queued() -> None:
+    """What passes the gate takes time there: 20 MB a second of one camera took most of a core."""
+    now = [0]
+    inbox = Inbox(OBSERVATION, lambda: now[0])
+    taken = 0
+    for _ in range(300):
+        now[0] += 33_000_000
+        inbox.push("syncline/local/camera/cam0/observation", bytes(700_000))
+        taken += len(inbox._queues)
+        inbox._taken()
+    assert 10.0 * BYTES_PER_S / 700_000 < taken < 15.0 * BYTES_PER_S / 700_000
 
 
 def test_who_floods_loses_messages_and_the_others_none() -> None:

@@ -208,7 +208,7 @@ def test_a_lens_that_cannot_be_costs_only_its_camera(session: Session) -> None:
 
 
 def test_a_repeated_time_stamp_does_not_refuse_the_session_of_a_log(session: Session) -> None:
-    """Two frames of one time in a log refused all cameras."""
+    """Two frames of one time, or of one number, refused all cameras."""
     builder = SessionBuilder()
     stream = messages(session)
     for message in stream:
@@ -219,6 +219,11 @@ def test_a_repeated_time_stamp_does_not_refuse_the_session_of_a_log(session: Ses
     builder.handle(twice)
     _, observations = builder.build()
     assert sum(len(track) for track in observations.tracks.values()) == len(stream) - 3
+    twice.sequence += 1
+    twice.device_time_ns += 1_000_000
+    builder.handle(twice)
+    _, observations = builder.build()
+    assert sum(len(track) for track in observations.tracks.values()) == len(stream) - 2
 
 
 class StuckSolver(InlineSolver):
