@@ -16,8 +16,14 @@ import struct
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+import lz4.frame
+import numpy as np
+import zstandard
 from google.protobuf.message import Message
 
 from protocols.validation.codec import Rejected, admit, sender
@@ -54,8 +60,11 @@ def damaged(rng: random.Random, payloads: list[bytes]) -> bytes:
     return bytes(data)
 
 
-_NUMBERS = (math.nan, math.inf, -math.inf, -1.0, 0.0, 1e308, -1e308, 5e-324, 1e6, -1e-9)
-_COUNTS = (0, 1, 2, 99, 2**31 - 1, 2**32 - 1)
+# The last of each stand at the ends of the ranges that pass (`protocols.core.ranges`).
+_NUMBERS = (
+    math.nan, math.inf, -math.inf, -1.0, 0.0, 1e308, -1e308, 5e-324, 1e6, -1e-9, 1e5, 1e7, 1e9, -1e9, 1e11, -1e11, 1e-9,
+)  # fmt: skip
+_COUNTS = (0, 1, 2, 99, 2**31 - 1, 2**32 - 1, 2**53, 2**62, -(2**62), 2**63 - 1)
 _TEXTS = ("", "cam0", "cam?", "**", "a" * 5000, "\x00", "\u202e", "-", "Cam0")
 
 
@@ -83,7 +92,8 @@ def spoiled(rng: random.Random, message: Message) -> bytes:
             if listed or hasattr(value, "append"):
                 _spoil_list(rng, value)
             elif not hasattr(value, "values"):
-                setattr(one, field.name, _absurd(rng, value))
+                with suppress(ValueError):  # beyond the field's bits
+                    setattr(one, field.name, _absurd(rng, value))
             break
     return copy.SerializeToString()
 
@@ -91,7 +101,8 @@ def spoiled(rng: random.Random, message: Message) -> bytes:
 def _spoil_list(rng: random.Random, values: Any) -> None:
     kind = rng.randrange(3)
     if kind == 0 and len(values):
-        values[rng.randrange(len(values))] = _absurd(rng, values[0])
+        with suppress(ValueError):
+            values[rng.randrange(len(values))] = _absurd(rng, values[0])
     elif kind == 1 and len(values):
         del values[rng.randrange(len(values)) :]
     elif 0 < len(values) < 1000:
@@ -169,9 +180,6 @@ def fuzz_mavlink(count: int, seed: int) -> Counter[str]:
 
 def fuzz_config(count: int, seed: int) -> Counter[str]:
     """``count`` inputs for the configuration reader: InputError, or a configuration."""
-    import tempfile
-    from pathlib import Path
-
     from deploy.config.agents import CameraConfig, load
     from protocols.core.errors import InputError
 
@@ -180,7 +188,7 @@ def fuzz_config(count: int, seed: int) -> Counter[str]:
         b'id = "cam0"\nsite = "yard"\n[bus]\nmode = "client"\nconnect = ["tcp/127.0.0.1:7447"]\noutage_s = 60.0\n',
         b'id = "cam1"\ndriver = "simulated"\n[simulated]\nscene = "marker"\nseed = 3\ncameras = 4\n',
     ]
-    with tempfile.TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder:
         file = Path(folder) / "camera.toml"
         for _ in range(count):
             file.write_bytes(damaged(rng, valid))
@@ -192,6 +200,78 @@ def fuzz_config(count: int, seed: int) -> Counter[str]:
                 counts["refused"] += 1
             except Exception as error:
                 raise AssertionError(f"config: {type(error).__name__} on {file.read_bytes().hex()}") from error
+    return counts
+
+
+def fuzz_rig(count: int, seed: int) -> Counter[str]:
+    """``count`` inputs for the reader of rig.toml: InputError, or a rig whose lenses take any pixel."""
+    from protocols.core.errors import InputError
+    from protocols.session.rig import read_rig
+
+    rng, counts = random.Random(f"{seed} rig"), Counter[str]()
+    lens = b"size = [640, 480]\nfps = 1e5\nmatrix = [[500.0, 0, 320.0], [0, 1e7, 240.0], [0, 0, 1]]\n"
+    valid = [
+        b"[cam0]\n"
+        + lens
+        + b"distortions = [1e9, -1e9, 1e9, -1e9, 1e9]\nposition = [1e11, 0, 0]\nposition_std = 1e-9\n",
+        b'[cam_0]\nname = "../../evil"\n' + lens + b"distortions = [1e308, 0, 0, 0, 0]\n",
+        b'["GoPro 2"]\n' + lens + b"fisheye = true\ndistortions = [-1e9, 1, 1, 1]\nrotation = [100, -100, 1e-300]\n",
+        b".".join([b"a"] * 100) + b" = 1\n[cam0]\n" + lens,
+        b"".join(b"[cam%d]\nsize = [1, 65535]\n" % number for number in range(40)) + b"[metadata]\nunits = 'mm'\n",
+    ]
+    pixels = np.array([[0.0, 0.0], [1e6, -1e6], [320.0, 240.0]])
+    with TemporaryDirectory() as folder, np.errstate(all="ignore"):
+        file = Path(folder) / "rig.toml"
+        for _ in range(count):
+            file.write_bytes(damaged(rng, valid))
+            try:
+                for camera in read_rig(file).cameras.values():
+                    if camera.intrinsics is not None:
+                        camera.intrinsics.unproject(pixels)
+                counts["let in"] += 1
+            except InputError as error:
+                _one_line(str(error))
+                counts["refused"] += 1
+            except Exception as error:
+                raise AssertionError(f"rig: {type(error).__name__} on {file.read_bytes().hex()}") from error
+    return counts
+
+
+def fuzz_log(count: int, seed: int) -> Counter[str]:
+    """``count`` inputs for the log reader: InputError, or all that is whole, and the memory of the largest chunk."""
+    from protocols.core.errors import InputError
+    from protocols.log.read.reader import LogReader
+    from protocols.log.write.writer import LogWriter
+    from tests.unit.protocols.log.test_bombs import FOOTER, MAGIC, chunk, false_heads
+
+    rng, counts = random.Random(f"{seed} log"), Counter[str]()
+    zeros = bytes(1 << 20)
+    packed = {b"zstd": zstandard.ZstdCompressor().compress(zeros), b"lz4": lz4.frame.compress(zeros)}
+    bombs = [
+        MAGIC + chunk(name, data, says) + FOOTER for name, data in packed.items() for says in (1000, 1 << 20, 1 << 31)
+    ]
+    heads = [MAGIC + b"\xff" * 9 + false_heads(opcode, 2_000) for opcode in (6, 7, 9, 12, 0x90)]
+    with TemporaryDirectory() as folder:
+        good, file = Path(folder) / "good.mcap", Path(folder) / "damaged.mcap"
+        with LogWriter(good) as log:
+            log.attach("../../evil", "text/plain", b"x" * 100, 0)
+            for topic, make in SAMPLES.items():
+                log.write(topic, sender(make()) or "cam0", "local", make(), 1)
+        valid = [good.read_bytes()] * len(bombs + heads) + bombs + heads
+        for _ in range(count):
+            file.write_bytes(damaged(rng, valid))
+            try:
+                reader = LogReader(file)
+                reader.summary()
+                for logged in reader.messages():
+                    assert all_finite(logged.message)
+                reader.attachments()
+                counts["damaged" if reader.damage else "whole"] += 1
+            except InputError as error:
+                _one_line(str(error))
+                counts["refused"] += 1
+            except Exception as error:
+                raise AssertionError(f"log: {type(error).__name__} on {file.read_bytes().hex()}") from error
     return counts
 
 
@@ -220,6 +300,8 @@ def main() -> None:
     others: tuple[tuple[str, Callable[[int, int], Counter[str]], int], ...] = (
         ("mavlink", fuzz_mavlink, words.count),
         ("config", fuzz_config, max(1, words.count // 10)),
+        ("rig", fuzz_rig, max(1, words.count // 10)),
+        ("log", fuzz_log, max(1, words.count // 20)),
     )
     for name, run, count in others:
         report(name, run(count, words.seed))

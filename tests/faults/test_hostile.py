@@ -15,7 +15,7 @@ from protocols.bus.transport.session import open_session
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import OBSERVATION
-from tests.faults.fuzz import fuzz_config, fuzz_gate, fuzz_mavlink
+from tests.faults.fuzz import fuzz_config, fuzz_gate, fuzz_log, fuzz_mavlink, fuzz_rig
 from tests.faults.matrix import measured
 from tests.faults.processes import wait_until
 from tests.support.receiving import collect, matched, sequences
@@ -121,3 +121,10 @@ def test_random_damage_never_gets_through_mavlink() -> None:
 def test_random_damage_to_a_configuration_is_reported_in_one_line() -> None:
     counts = fuzz_config(IN_CI // 5, 1)
     measured("fuzz: configuration", "one line each", f"{sum(counts.values())} inputs, {counts['refused']} refused")
+
+
+def test_random_damage_to_a_rig_or_a_log_is_reported_in_one_line() -> None:
+    for name, run in (("rig", fuzz_rig), ("log", fuzz_log)):
+        counts = run(IN_CI // 20, 1)
+        assert len(counts) > 1
+        measured(f"fuzz: {name}", "one line each", ", ".join(f"{count} {kind}" for kind, count in counts.items()))
