@@ -1,13 +1,14 @@
 """The person detector on rendered rooms with ground truth, compared with the plain background model.
 
-    python -m tests.bench.people_detector [--seeds 3] [--first-seed 700] [--seconds 30] [--people 5]
+    python -m tests.bench.people_detector [--seeds 3] [--first-seed 700] [--seconds 30] [--people 5] [--network N]
     python -m tests.bench.people_detector --labels LABELS.csv --detections PEOPLE.csv
 
 Precision and recall at an overlap (intersection over union) of 0.5, as in pedestrian benchmarks: people less than half
 visible and people truncated by the image border are ignored. file: two passes, as in `syncline detect person`; live:
-one pass from the first frame on; MOG2 alone: its silhouettes without further processing. Noise 4, shadows on. CPU
-milliseconds per frame. Also the squared error of the representative point over its covariance, across and down, of
-isolated people and of people in groups, against that point of the visible part of the true silhouette.
+one pass from the first frame on; MOG2 alone: its silhouettes without further processing; with --network that one alone,
+image by image. Noise 4, shadows on. CPU milliseconds per frame. Also the squared error of the representative point over
+its covariance, across and down, of isolated people and of people in groups, against that point of the visible part of
+the true silhouette; of a network the distances of head and foot point from the truth.
 
 The second form evaluates the output of `syncline detect person VIDEO --out PEOPLE.csv` on a video of your own, in the
 frames that have boxes in LABELS.csv: frame,x,y,w,h,ignore (1 = ignored).
@@ -18,7 +19,10 @@ from __future__ import annotations
 import argparse
 import csv
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,6 +31,7 @@ import numpy.typing as npt
 from edge import scenes
 from edge.detectors.base import Detection
 from edge.detectors.people.person import PersonDetector, silhouette_features
+from edge.detectors.plugins import load_detector
 from edge.scenes.people.renderer import PeopleRenderer
 from edge.scenes.people.scene import PeopleScene
 from protocols.geometry.types import Bools, Floats
@@ -97,6 +102,39 @@ def live(images: list[Image], fps: float) -> tuple[list[list[Detection]], float]
     return seen, spent
 
 
+def by_network(file: Path, images: list[Image], fps: float) -> tuple[list[list[Detection]], float]:
+    """People by a network, and CPU ms per frame."""
+    detector = load_detector(file, kind="person", fps=fps)
+    begun = time.process_time()
+    seen = [detector.detect(image, index / fps) for index, image in enumerate(images)]
+    return seen, 1e3 * (time.process_time() - begun) / len(images)
+
+
+def end_errors(
+    seed: int, people: int, fps: float, boxes: list[tuple[Floats, Bools]], found: list[list[Detection]]
+) -> list[list[float]]:
+    """Of each evaluated person whose head and foot were detected: their distances from the truth over the size."""
+    scene: PeopleScene = scenes.get_people_scene(seed, None, people)
+    camera, times = scene.cameras[0].name, np.arange(len(boxes)) / fps
+    heads, feet = (scene.seen_by(camera, points) for points in (scene.heads(times), scene.feet(times)))
+    errors = []
+    for index, ((true, counts), shown) in enumerate(zip(boxes, found, strict=True)):
+        who = np.flatnonzero(np.isfinite(scene.boxes(camera, float(times[index]))).all(axis=1))
+        for person, box in zip(who[counts], true[counts], strict=True):
+            near = max(shown, key=lambda one: overlap(box, one.box or (0.0, 0.0, 0.0, 0.0)), default=None)
+            if (
+                near is None
+                or near.box is None
+                or near.head is None
+                or near.foot is None
+                or overlap(box, near.box) < 0.5
+            ):
+                continue
+            ends = (near.head - heads[index, person], near.foot - feet[index, person])
+            errors.append([float(np.hypot(*end)) / near.size for end in ends])
+    return errors
+
+
 def plain(images: list[Image], fps: float) -> tuple[list[list[Floats]], float]:
     """MOG2 with its own shadow test, initialised from the same images; every silhouette of some size is a person."""
     model = cv2.createBackgroundSubtractorMOG2(500, 16.0, True)
@@ -143,6 +181,7 @@ def main() -> int:
     parser.add_argument("--first-seed", type=int, default=700)
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--people", type=int, default=5)
+    parser.add_argument("--network", type=Path, help="the .toml file of an ONNX network to measure in their place")
     parser.add_argument("--labels", type=Path, help="boxes of people in some frames of a video")
     parser.add_argument("--detections", type=Path, help="output of `syncline detect person` for it")
     options = parser.parse_args()
@@ -151,9 +190,12 @@ def main() -> int:
     if options.labels is not None:
         return evaluate_video(options.labels, options.detections)
     cv2.setNumThreads(1)
-    methods = {"file": from_file, "live": live, "MOG2 alone": plain}
+    methods: dict[str, Callable[..., Any]] = {"file": from_file, "live": live, "MOG2 alone": plain}
+    if options.network is not None:
+        methods = {"network": partial(by_network, options.network)}
     rows: dict[str, list[tuple[int, int, int, float, float]]] = {name: [] for name in methods}
     spread: list[tuple[bool, float, float]] = []
+    ends: list[list[float]] = []
     for seed in range(options.first_seed, options.first_seed + options.seeds):
         images, boxes, middles, fps = render_video(seed, options.people, options.seconds)
         for name, method in methods.items():
@@ -161,6 +203,8 @@ def main() -> int:
             if name == "file":
                 for true, points, shown in zip(boxes, middles, found, strict=True):
                     spread += errors(true, points, shown)
+            if name == "network":
+                ends += end_errors(seed, options.people, fps, boxes, found)
             boxes_found = [[np.array(getattr(one, "box", one)) for one in shown] for shown in found]
             total = [score_boxes(*true, shown) for true, shown in zip(boxes, boxes_found, strict=True)]
             right, wrong, missed = (sum(int(one[part]) for one in total) for part in range(3))
@@ -174,12 +218,15 @@ def main() -> int:
         overlap = sum(one[3] for one in all_seeds) / max(right, 1)
         spent = float(np.mean([one[4] for one in all_seeds]))
         print(f"| {name} | {precision:.3f} | {recall:.3f} | {overlap:.3f} | {spent:.1f} |")
-        short |= name == "file" and min(precision, recall) < _BAR
-    for alone in (True, False):
+        short |= name in ("file", "network") and min(precision, recall) < _BAR
+    for alone in () if options.network is not None else (True, False):
         u, v = np.array([one[1:] for one in spread if one[0] is alone]).reshape(-1, 2).mean(axis=0)
         print(f"error²/covariance in files, {'alone' if alone else 'among others'}: {u:.2f} across, {v:.2f} down")
+    if options.network is not None:
+        head, foot = np.median(np.array(ends), axis=0)
+        print(f"median error of the network over the size: head {head:.3f}, foot point {foot:.3f} ({len(ends)} people)")
     if short:
-        print(f"missed: precision and recall of {_BAR} in files")
+        print(f"missed: precision and recall of {_BAR}")
     return int(short)
 
 
