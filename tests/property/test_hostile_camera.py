@@ -29,8 +29,8 @@ _PUBLISHED = {"Calibration": "calibration", "Track": "track", "SolverEvent": "so
 
 @cache
 def stream() -> tuple[Message, ...]:
-    """Half a minute of three cameras."""
-    return tuple(messages(simulate(71, 3, 20)))
+    """Twelve seconds of three cameras."""
+    return tuple(messages(simulate(71, 3, 12)))
 
 
 @cache
