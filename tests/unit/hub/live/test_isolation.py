@@ -83,6 +83,16 @@ def test_labels_and_runs_without_end_are_not_kept() -> None:
     assert len(hub.clocks._detector._clocks) <= 8
 
 
+def test_a_clock_that_is_set_again_and_again_is_no_longer_watched() -> None:
+    """Every step of the clock began a segment that was remembered for ever."""
+    hub = LiveHub(LiveSettings(track=False))
+    for number in range(2_000):
+        time_ns = number * 33_000_000 + 3600 * NANOSECONDS * (number // 10 % 2)
+        hub.handle(frame("a", number, device_time_ns=time_ns), number / 30.0)
+    assert 60 <= hub.counters["clock_steps"] <= 64
+    assert len(hub._builder._boots["a"]) <= 8
+
+
 def test_who_has_most_rows_gives_them_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("protocols.session.builder._MAX_ROWS", 2_000)
     builder = SessionBuilder(window_s=60.0)
