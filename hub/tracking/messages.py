@@ -9,8 +9,8 @@ from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY
 from hub.tracking.filter.measurement import POINT, predict_measurement
 from hub.tracking.filter.target_models import MARKER, TARGET_MODELS
 from hub.tracking.filter.target_states import LostTrack, Targets
-from hub.tracking.frame_update import TrackerParameters, track_label
 from hub.tracking.marker_filter import MarkerState
+from hub.tracking.parameters import TrackerParameters, track_label
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb

@@ -9,8 +9,9 @@ import numpy as np
 
 from hub.tracking.detections import FrameDetections, TrackingCamera, frame_detections
 from hub.tracking.filter.target_states import MultiTargetState, Targets
-from hub.tracking.frame_update import TrackerParameters, predict_targets, process_frame
+from hub.tracking.frame_update import jointly, predict_targets, process_frame
 from hub.tracking.lag_buffer import LagBuffer
+from hub.tracking.parameters import TrackerParameters
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.pose import Similarity
 from protocols.messages import syncline_pb2 as pb
@@ -38,6 +39,7 @@ class Tracker:
             lag_ns,
             lag_ns,
         )
+        self._joint: tuple[MultiTargetState, MultiTargetState] | None = None
         self._boot_ids: dict[str, str] = {}
         self._ahead_ns: dict[str, int] = {}
         self.newest_frame: FrameDetections | None = None
@@ -64,7 +66,10 @@ class Tracker:
     @property
     def state(self) -> MultiTargetState:
         """The state after all processed frames."""
-        return self._frames.state
+        state = self._frames.state
+        if self._joint is None or self._joint[0] is not state:
+            self._joint = state, jointly(state, self.parameters)
+        return self._joint[1]
 
     @property
     def boot_ids(self) -> dict[str, str]:
@@ -125,7 +130,7 @@ class Tracker:
         for state in self._frames.states[:-1]:
             time_ns = state.time_ns or 0
             if time_ns >= after_ns + every_ns and (self.time_ns or 0) - time_ns >= every_ns:
-                out.append(state)
+                out.append(jointly(state, self.parameters))
                 after_ns = time_ns
         return out
 
@@ -169,6 +174,5 @@ def transform_state(state: MultiTargetState, change: Similarity) -> MultiTargetS
         unassociated={},
         last_frame_ns={},
         lost_tracks=tuple(lost_tracks),
-        floor_height=0.0,
-        floor_weight=0.0,
+        floor=None,
     )

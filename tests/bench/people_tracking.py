@@ -25,7 +25,7 @@ from edge.scenes.people.scene import PeopleScene
 from hub.calibration.pipeline import calibrate
 from hub.tracking.calibration.people import PeopleTracklets
 from hub.tracking.detections import TrackingCamera
-from hub.tracking.frame_update import TrackerParameters, track_label
+from hub.tracking.parameters import TrackerParameters, track_label
 from hub.tracking.messages import prediction_message
 from hub.tracking.tracker import Tracker
 from protocols.bus.transport.memory import MemoryBus, MemoryHub

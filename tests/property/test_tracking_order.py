@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from edge import scenes
 from hub.tracking.filter.target_states import MultiTargetState
-from hub.tracking.frame_update import TrackerParameters
+from hub.tracking.parameters import TrackerParameters
 from hub.tracking.tracker import Tracker
 from protocols.messages import syncline_pb2 as pb
 from tests.support.people_traffic import cameras_of, film
@@ -52,7 +52,7 @@ def bits(state: MultiTargetState) -> list[bytes]:
     targets = state.targets
     return [getattr(targets, name).tobytes() for name in targets.__slots__ if name != "seen_by"] + [
         str(sorted(zip(state.cameras, targets.seen_by.T.tolist(), strict=True))).encode(),
-        str((state.time_ns, state.next_initiation_number, state.next_number, state.floor_height)).encode(),
+        str((state.time_ns, state.next_initiation_number, state.next_number)).encode(),
     ]
 
 

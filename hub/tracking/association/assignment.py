@@ -1,4 +1,4 @@
-"""Detection-to-track assignment: global nearest neighbour on Mahalanobis distance and colour, with occlusion tests."""
+"""Detection-to-track assignment: likelihood ratios of position, size and colour, with occlusion tests."""
 
 from __future__ import annotations
 
@@ -8,8 +8,16 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from hub.tracking.detections import FrameDetections, TrackingCamera
+from hub.tracking.filter import kalman
 from hub.tracking.filter.kalman import LOG_SIZE
-from hub.tracking.filter.measurement import FOOT, HEAD, LOG_IMAGE_SIZE, POINT, PredictedMeasurement
+from hub.tracking.filter.measurement import (
+    FOOT,
+    HEAD,
+    LOG_IMAGE_SIZE,
+    POINT,
+    PredictedMeasurement,
+    student_t_inflation,
+)
 from hub.tracking.filter.target_models import TARGET_MODELS
 from hub.tracking.filter.target_states import Targets
 from protocols.geometry.types import Bools, Floats, Ints
@@ -19,23 +27,23 @@ POINT_GATE = 18.4
 PART_GATE = 13.8
 """Gate of head and foot: false-rejection probability 1e-3; outside it, that point is not used."""
 _SIZE_GATE = 9.0
-_UNASSIGNED_COST = 45.0
-"""Cost of leaving a detection unassigned: that of a fit at the gate for a target predicted to about 10 px."""
-_PART_WEIGHT, _PART_MAX = 0.5, 12.0
+_LOG_OUTLIER = float(np.log(0.05))
+"""Of a head or foot outside its gate, while the point is inside: occluded or merged silhouettes, one in twenty."""
+_CLUTTER_RADIUS = 0.25
+"""Head and foot of a false detection lie anywhere within a quarter of its size of where a target's would be."""
+_CLUTTER_COLOUR_STD = 60.0
+"""Of a channel of false detections and of other people."""
 COLOUR_STD = 28.0
 """Largest std of one channel between cameras: light and white balance differ. Adapted by `update_colour_variance`."""
 _MIN_COLOUR_STD, _COLOUR_STD_FACTOR = 14.0, 2.0
 """Smallest std, and the factor by which the estimated std is widened: a box also holds parts of other people."""
 _CERTAIN, _COLOUR_VARIANCE_GAIN = 0.05, 0.002
 """Pairs with a larger mismatch probability do not adapt the colour variance; gain of one that does."""
-_COLOUR_MAX = 12.0
-_CAMERA_MATCH_BONUS = 2.0
-"""Cost reduction where the camera's own tracker matched the detection to the target."""
-_CLUTTER_COST = 30.0
-"""Cost at which a person's detection may equally be clutter: somebody who is not tracked yet."""
-_TEMPERATURE = 4.0
-"""Cost difference that makes a pair e times less likely. It would be 2 for independent frames, but their errors are
-correlated in time."""
+_COLOUR_MAX = 24.0
+_LOG_CAMERA_MATCH = 1.0
+"""Added where the camera's own tracker matched the detection to the target."""
+_MIN_WEIGHT = 0.1
+"""Fraction of the weight that a detection keeps when it fits another target equally well."""
 _WIDTH = 0.2
 _LENGTH = 0.6
 """Silhouettes touch within these fractions of the sum of two lengths, across and along the body."""
@@ -43,17 +51,18 @@ _UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AssociationCosts:
-    """Association costs of n targets and m detections. total: (n, m), inf outside the gate.
+class AssociationScores:
+    """Of n targets and m detections. log_ratio: (n, m), logarithm of the likelihood of a pair over that of a false
+    detection that is uniform in the image, -inf outside the gate.
 
     distance: (n, m, 3) squared Mahalanobis distances of point, head, foot, NaN where not measured.
     """
 
-    total: Floats
+    log_ratio: Floats
     distance: Floats
 
 
-def association_costs(
+def association_scores(
     frame: FrameDetections,
     value: Floats,
     noise: Floats,
@@ -61,89 +70,102 @@ def association_costs(
     predicted: PredictedMeasurement,
     names: tuple[str, ...],
     colour_std: float = COLOUR_STD,
-) -> AssociationCosts:
-    """The cost of assigning each detection to each target: -2 log likelihood with capped head, foot and colour terms.
+) -> AssociationScores:
+    """The scores of each target with each detection: of position, size and colour.
 
     value, noise: (m, 7), (m, 7, 7) measurements of the frame. names: labels of the targets. colour_std: of a channel.
     """
     n, m = len(targets), len(frame)
     distance = np.full((n, m, 3), np.nan)
-    spread = np.zeros((n, m))
     for part, rows in enumerate((POINT, HEAD, FOOT)):
         jacobian = predicted.jacobian[:, rows]
-        own_cost = jacobian @ targets.covariance @ jacobian.transpose(0, 2, 1) + predicted.model_noise[:, rows, rows]
-        both = own_cost[:, None] + noise[None, :, rows, rows]
+        own = jacobian @ targets.covariance @ jacobian.transpose(0, 2, 1) + predicted.model_noise[:, rows, rows]
+        both = own[:, None] + noise[None, :, rows, rows]
         a, b, c = both[..., 0, 0], both[..., 0, 1], both[..., 1, 1]
-        determinant = a * c - b * b
         off = value[None, :, rows] - predicted.value[:, None, rows]
         x, y = off[..., 0], off[..., 1]
         with np.errstate(invalid="ignore", divide="ignore"):
-            distance[:, :, part] = (c * x * x - 2.0 * b * x * y + a * y * y) / determinant
-            if rows is POINT:
-                spread = np.log(determinant / frame.units_per_px[None, :] ** 4)
-    parts = np.minimum(np.nan_to_num(distance[:, :, 1:], nan=_PART_MAX / 3.0), _PART_MAX).sum(axis=2)
-    with np.errstate(invalid="ignore"):
-        colour_distance = ((frame.colour[None] - targets.colour[:, None]) ** 2).sum(axis=2) / colour_std**2
-    colour_distance = np.minimum(np.nan_to_num(colour_distance, nan=_COLOUR_MAX / 4.0), _COLOUR_MAX)
-    total = distance[:, :, 0] + spread + _PART_WEIGHT * parts + colour_distance
+            distance[:, :, part] = (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
+    log_ratio = np.full((n, m), -np.inf)
+    row, column = np.nonzero((distance[:, :, 0] < POINT_GATE) & (targets.kind[:, None] == frame.kind[None, :]))
+    if not len(row):
+        return AssociationScores(log_ratio, distance)
+    selected = predicted.select(row)
+    used = gated_rows(value[column], selected, distance[row, column], targets.covariance[row])
+    innovation = np.where(used, value[column] - selected.value, 0.0)
+    total = matched_noise(noise[column], selected, distance[row, column])
+    log_likelihood = -0.5 * kalman.minus_two_log_likelihood(
+        targets.covariance[row], innovation, selected.jacobian, total, used
+    ) - 0.5 * np.log(2.0 * np.pi) * used.sum(axis=1)
+    log_ratio[row, column] = log_likelihood - _log_clutter(frame, column, used, np.isfinite(value[column]))
+    if np.isfinite(frame.colour).any():
+        off2 = ((frame.colour[column] - targets.colour[row]) ** 2).sum(axis=1)
+        score = 3.0 * np.log(_CLUTTER_COLOUR_STD / colour_std) - 0.5 * np.minimum(off2 / colour_std**2, _COLOUR_MAX)
+        log_ratio[row, column] += np.nan_to_num(score)
     if any(frame.target):
-        total = total - _CAMERA_MATCH_BONUS * (np.array(names)[:, None] == np.array(frame.target)[None, :])
-    gated = (
-        (distance[:, :, 0] < POINT_GATE) & (targets.kind[:, None] == frame.kind[None, :]) & (total < _UNASSIGNED_COST)
-    )
-    return AssociationCosts(np.where(gated, total, np.inf), distance)
+        log_ratio += _LOG_CAMERA_MATCH * (np.array(names)[:, None] == np.array(frame.target)[None, :])
+    return AssociationScores(log_ratio, distance)
 
 
-def combine_hypotheses(one: AssociationCosts, other: AssociationCosts, prior_odds: Floats) -> AssociationCosts:
-    """Costs under a mixture of two hypotheses of each target. prior_odds: (n,) of the second against the first."""
+def matched_noise(
+    noise: Floats, predicted: PredictedMeasurement, distance: Floats, sure: Floats | None = None
+) -> Floats:
+    """Measurement covariances (k, 7, 7) of k pairs: of detection and model, heads and feet with Student's t tails.
+
+    sure: (k,) probability of each pair. A detection that is as probably another's has next to no weight: where two
+    targets cross, the cameras that resolve them decide.
+    """
+    total = np.where(np.isfinite(noise), noise, 0.0) + predicted.model_noise
+    for part, rows in ((1, HEAD), (2, FOOT)):
+        total[:, rows, rows] *= student_t_inflation(distance[:, part])[:, None, None]
+    if sure is not None:
+        total /= np.maximum(2.0 * sure - 1.0, _MIN_WEIGHT)[:, None, None] ** 2
+    return total
+
+
+def _log_clutter(frame: FrameDetections, column: Ints, used: Bools, measured: Bools) -> Floats:
+    """Log density (k,) of a false detection in the used rows, and what heads and feet outside their gates cost."""
+    low, high = frame.camera.low, frame.camera.high
+    density = np.full(len(column), -float(np.log(np.prod(high - low))))
+    size = frame.size[column]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        part = -np.log(np.pi * (_CLUTTER_RADIUS * size) ** 2)
+    part = np.where(np.isfinite(part), part, 0.0)
+    for rows in (HEAD, FOOT):
+        there = used[:, rows].all(axis=1)
+        density += np.where(there, part, np.where(measured[:, rows].all(axis=1), -_LOG_OUTLIER, 0.0))
+    return density - np.where(used[:, LOG_IMAGE_SIZE], np.log(2.0), 0.0)
+
+
+def combine_hypotheses(one: AssociationScores, other: AssociationScores, prior_odds: Floats) -> AssociationScores:
+    """Scores under a mixture of two hypotheses of each target. prior_odds: (n,) of the second against the first."""
     with np.errstate(divide="ignore"):
-        less = 2.0 * np.log(prior_odds)[:, None]
-    better = other.total - less < one.total
-    total = -2.0 * np.logaddexp(-0.5 * one.total, 0.5 * (less - other.total))
-    return AssociationCosts(np.asarray(total), np.where(better[:, :, None], other.distance, one.distance))
+        second = other.log_ratio + np.log(prior_odds)[:, None]
+    better = second > one.log_ratio
+    return AssociationScores(
+        np.asarray(np.logaddexp(one.log_ratio, second)), np.where(better[:, :, None], other.distance, one.distance)
+    )
 
 
-def assign(total: Floats) -> tuple[Ints, Ints]:
-    """Rows and columns of the optimal assignment (Hungarian algorithm) within the gate. total: (n, m) costs."""
-    if not np.isfinite(total).any():
+def assign(log_ratio: Floats) -> tuple[Ints, Ints]:
+    """Rows and columns of the most probable assignment (Hungarian algorithm).
+
+    log_ratio: (n, m), of a pair against a missed target and a false detection; only pairs above 0 are assigned.
+    """
+    good = log_ratio > 0.0
+    if not good.any():
         none = np.zeros(0, dtype=np.int64)
         return none, none
-    rows, columns = linear_sum_assignment(np.where(np.isfinite(total), total, _UNASSIGNED_COST))
-    gated = np.isfinite(total[rows, columns])
-    return rows[gated].astype(np.int64), columns[gated].astype(np.int64)
-
-
-def clutter_cost(kind: Ints) -> Floats:
-    """The cost (k,) of explaining a detection as clutter, that is as an object that is not tracked.
-
-    kind: (k,) of the targets. There may be many similar people; another marker is rare.
-    """
-    return np.where(_UPRIGHT[kind], _CLUTTER_COST, np.inf)
-
-
-def misassociation_probability(total: Floats, row: Ints, column: Ints, clutter: Floats) -> Floats:
-    """The probability (k,) that the detection of a matched pair belongs to something else: 0 to 1/2.
-
-    The alternatives are that two matched targets exchange their detections, that an unassigned target takes it, or
-    that it is clutter. total: (n, m) costs, inf = impossible. clutter: (k,) from `clutter_cost`.
-    """
-    if not len(row):
-        return np.zeros(0)
-    own_cost = total[row, column]
-    crossed = total[np.ix_(row, column)]
-    np.fill_diagonal(crossed, np.inf)
-    margin = (crossed + crossed.T - own_cost[:, None] - own_cost[None, :]).min(axis=1)
-    unassigned = np.setdiff1d(np.arange(len(total)), row)
-    if len(unassigned):
-        margin = np.minimum(margin, total[np.ix_(unassigned, column)].min(axis=0) - own_cost)
-    margin = np.minimum(margin, clutter - own_cost)
-    return np.asarray(1.0 / (1.0 + np.exp(np.clip(margin / _TEMPERATURE, 0.0, 60.0))))
+    rows, columns = linear_sum_assignment(np.where(good, -log_ratio, 0.0))
+    kept = good[rows, columns]
+    return rows[kept].astype(np.int64), columns[kept].astype(np.int64)
 
 
 def update_colour_variance(before: float, observed: Floats, stored: Floats, mismatch_probability: Floats) -> float:
     """Running estimate of the variance of one colour channel between detections and their targets.
 
-    observed, stored: (k, 3) colours, NaN where missing. mismatch_probability: (k,) from `misassociation_probability`.
+    observed, stored: (k, 3) colours, NaN where missing. mismatch_probability: (k,) that the detection belongs to
+    something else.
     """
     off = np.minimum(((observed - stored) ** 2).mean(axis=1), COLOUR_STD**2)
     for one in off[(mismatch_probability < _CERTAIN) & np.isfinite(off)].tolist():

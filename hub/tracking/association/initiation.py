@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hub.tracking.detections import FrameDetections, TrackingCamera
+from hub.tracking.filter import kalman
+from hub.tracking.filter.floor import Floor
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM, VELOCITY
 from hub.tracking.filter.measurement import (
     BLOCKS,
@@ -31,11 +33,18 @@ _COLOUR_GATE = 75.0
 _MAX_STARTS = 2
 _GAUSS_NEWTON_STEPS = 3
 _GATE_SIGMAS = 3.5
+_MAX_FLOOR_DISTANCE = 40.0
+"""Of a person on the floor, in heights: further away, a pixel of the foot is metres on the floor."""
+_ARRIVALS = 0.1
+"""People expected to appear in a frame, against the false detections of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnassociatedDetection:
-    """A detection that is associated with no target, and its time. value, noise: as in `measurements_of`."""
+    """A detection that is associated with no target, its time, and its index in the frame.
+
+    value, noise: as in `measurements_of`.
+    """
 
     camera: TrackingCamera
     reference_ns: int
@@ -43,6 +52,18 @@ class UnassociatedDetection:
     noise: Floats
     colour: Floats
     kind: int
+    index: int = 0
+
+    def heights_below(self, up: Floats) -> float:
+        """How far the foot is below the camera, as a fraction of the person's height; NaN unless both ends are seen."""
+        rays = (
+            np.column_stack([self.value[HEAD.start : FOOT.stop].reshape(2, 2), np.ones(2)]) @ self.camera.pose.rotation
+        )
+        if not np.isfinite(rays).all():
+            return np.nan
+        # Distances d along the two rays, in heights: d_head r_head - d_foot r_foot = up, by least squares.
+        distances, *_ = np.linalg.lstsq(np.column_stack([rays[0], -rays[1]]), up, rcond=None)
+        return np.nan if distances[1] <= 0.0 else -float(distances[1] * rays[1] @ up)
 
     @property
     def ray(self) -> Floats:
@@ -52,14 +73,13 @@ class UnassociatedDetection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackCandidate:
-    """An accepted candidate. mean, covariance: of the state at the anchor's time. opportunities: cameras that should
-    have detected it."""
+    """An accepted candidate. mean, covariance: of the state at the anchor's time. existence: its probability."""
 
     mean: Floats
     covariance: Floats
     detections: tuple[UnassociatedDetection, ...]
     chi2_per_dof: float
-    opportunities: int
+    existence: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +95,9 @@ def unassociated_detections(
 ) -> tuple[UnassociatedDetection, ...]:
     """The unassociated detections of a frame; which: their indices."""
     return tuple(
-        UnassociatedDetection(frame.camera, frame.reference_ns, value[j], noise[j], frame.colour[j], int(frame.kind[j]))
+        UnassociatedDetection(
+            frame.camera, frame.reference_ns, value[j], noise[j], frame.colour[j], int(frame.kind[j]), j
+        )
         for j in which.tolist()
     )
 
@@ -113,7 +135,7 @@ def best_candidate(
 
 
 def _is_better(one: TrackCandidate, other: TrackCandidate) -> bool:
-    more = len(one.detections) / one.opportunities - len(other.detections) / other.opportunities
+    more = one.existence - other.existence
     return more > 0.01 or (
         more > -0.01 and (-len(one.detections), one.chi2_per_dof) < (-len(other.detections), other.chi2_per_dof)
     )
@@ -147,7 +169,57 @@ def _fit_with_rejection(
                 opportunities += int(camera.sees(inside[:, :2] / depth[:, None], depth)[0])
     if len(names) < 0.5 * opportunities:
         return None
-    return TrackCandidate(mean, covariance, (anchor, *support), misfit / max(dof, 1), opportunities)
+    share = len(names) / opportunities
+    return TrackCandidate(
+        mean, covariance, (anchor, *support), misfit / max(dof, 1), share * (1.0 - 0.5 ** len(support))
+    )
+
+
+def candidate_on(
+    floor: Floor, detection: UnassociatedDetection, scale: LengthScale, clutter: float
+) -> TrackCandidate | None:
+    """A person at one detection, who stands on the floor; None if nobody of a person's height could.
+
+    clutter: expected number of false detections in a frame.
+    """
+    camera, model = detection.camera, TARGET_MODELS[detection.kind]
+    height, rotation = floor.height, camera.pose.rotation
+    origin = camera.pose.position
+    points = ((FOOT, 0.0), (HEAD, height), (POINT, (0.5 + model.point_offset) * height))
+    rows, above = next(one for one in points if np.isfinite(detection.value[one[0]]).all())
+    ray = np.append(detection.value[rows], 1.0) @ rotation
+    centre = origin
+    for _ in range(2):  # the second time at the floor's height there
+        level = float(floor.heights(centre[None])[0][0]) + above
+        down = float(ray @ floor.up)
+        distance = (level - float(origin @ floor.up)) / down if down else -1.0
+        if not 0.0 < distance < _MAX_FLOOR_DISTANCE * height:
+            return None
+        centre = origin + distance * ray + (0.5 * height - above) * floor.up
+    mean = np.zeros(STATE_DIM)
+    mean[POSITION], mean[LOG_SIZE] = centre, np.log(height)
+    covariance = np.diag(
+        [(_MAX_FLOOR_DISTANCE * height) ** 2] * 3
+        + [(model.speed_std_m_s * scale.units_per_m) ** 2] * 3
+        + [model.log_size_std**2]
+    )
+    _, jacobian, variance = floor.constraint(mean[None])
+    one = np.ones((1, 1), dtype=np.bool_)
+    means, covariances = kalman.update(
+        mean[None], covariance[None], np.zeros((1, 1)), jacobian[:, None], variance[:, None, None], one
+    )
+    kind = np.array([detection.kind])
+    predicted = predict_measurement(camera, means, kind, floor.up)
+    used = np.isfinite(detection.value[None]) & np.isfinite(predicted.value)
+    innovation = np.where(used, detection.value[None] - predicted.value, 0.0)
+    noise = np.where(np.isfinite(detection.noise[None]), detection.noise[None], 0.0) + predicted.model_noise
+    misfit = float(kalman.normalised_innovation_squared(covariances, innovation, predicted.jacobian, noise, used)[0])
+    dof = int(used.sum())
+    if not misfit < chi2_limit(dof):
+        return None
+    means, covariances = kalman.update(means, covariances, innovation, predicted.jacobian, noise, used)
+    odds = _ARRIVALS / clutter * np.exp(-0.5 * max(misfit - dof, 0.0))
+    return TrackCandidate(means[0], covariances[0], (detection,), misfit / dof, float(odds / (1.0 + odds)))
 
 
 def fit_state(

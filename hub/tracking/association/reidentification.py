@@ -20,7 +20,10 @@ _MAX_MOTION_S = 4.0
 """A target lost for longer may be anywhere: only its appearance is compared."""
 _MAX_COST, _MIN_MARGIN = 14.0, 4.0
 _SPEED_FACTOR = 2.5
-_COASTING_NS = 400_000_000
+_COASTING_S = 0.4
+"""A person without detections for this long, and for one and a half frames, may be the one that begins again; a
+marker, of which there are few and which may change its velocity abruptly, after a quarter of a frame."""
+_UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
 
 
 def reidentify(state: MultiTargetState, ready: Bools, scale: LengthScale) -> MultiTargetState:
@@ -30,7 +33,8 @@ def reidentify(state: MultiTargetState, ready: Bools, scale: LengthScale) -> Mul
     assert state.time_ns is not None
     targets = state.targets
     number, keep = targets.number.copy(), np.ones(len(targets), dtype=np.bool_)
-    coasting = targets.confirmed & (targets.seen_ns < state.time_ns - _COASTING_NS)
+    unseen_s = np.where(_UPRIGHT[targets.kind], max(_COASTING_S, 1.5 * state.interval_s), 0.25 * state.interval_s)
+    coasting = targets.confirmed & ((state.time_ns - targets.seen_ns) / NANOSECONDS > unseen_s)
     coasting_rows = [-1] * len(state.lost_tracks) + np.flatnonzero(coasting).tolist()
     lost_tracks = [
         *state.lost_tracks,

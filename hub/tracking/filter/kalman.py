@@ -59,10 +59,24 @@ def minus_two_log_likelihood(
     covariance: Floats, innovation: Floats, jacobian: Floats, noise: Floats, used: Bools
 ) -> Floats:
     """-2 log likelihood (n,) of one measurement each, without the constant term; arguments as in `update`."""
+    squared, innovation_covariance = _innovation(covariance, innovation, jacobian, noise, used)
+    return np.asarray(squared + np.linalg.slogdet(innovation_covariance)[1])
+
+
+def normalised_innovation_squared(
+    covariance: Floats, innovation: Floats, jacobian: Floats, noise: Floats, used: Bools
+) -> Floats:
+    """Squared Mahalanobis distances (n,) of one measurement each; arguments as in `update`."""
+    return _innovation(covariance, innovation, jacobian, noise, used)[0]
+
+
+def _innovation(
+    covariance: Floats, innovation: Floats, jacobian: Floats, noise: Floats, used: Bools
+) -> tuple[Floats, Floats]:
     innovation, jacobian, noise = mask_rows(innovation, jacobian, noise, used)
     innovation_covariance = jacobian @ covariance @ jacobian.transpose(0, 2, 1) + noise
     solved = np.linalg.solve(innovation_covariance, innovation[:, :, None])[:, :, 0]
-    return np.asarray((innovation * solved).sum(axis=1) + np.linalg.slogdet(innovation_covariance)[1])
+    return np.asarray((innovation * solved).sum(axis=1)), innovation_covariance
 
 
 def moment_match(one: tuple[Floats, Floats], other: tuple[Floats, Floats], weight: Floats) -> tuple[Floats, Floats]:

@@ -28,6 +28,7 @@ _UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
 _POINT_OFFSET = np.array([model.point_offset for model in TARGET_MODELS])
 _POINT_STD = np.array([model.point_std for model in TARGET_MODELS])
 _HEAD_STD = np.array([model.head_std for model in TARGET_MODELS])
+_COMMON_STD = np.array([model.common_std for model in TARGET_MODELS])
 _FOOT_STD = np.array([model.foot_std for model in TARGET_MODELS])
 
 
@@ -37,25 +38,17 @@ class PredictedMeasurement:
 
     value: (n, 7), NaN in rows that do not apply (head and foot of targets that are not upright). jacobian: (n, 7, 7).
     model_noise: (n, 7, 7), from the spread of the points on the target and from the uncertainty of the capture time.
-    depth: (n,), along the optical axis. part_std: (n, 3) standard deviations of point, head and foot on the target, as
-    fractions of its size; part_noise: (n, 3, 2, 2) the image covariance for a std of one size.
+    depth: (n,), along the optical axis.
     """
 
     value: Floats
     jacobian: Floats
     model_noise: Floats
     depth: Floats
-    part_std: Floats
-    part_noise: Floats
 
-    def with_occlusion_noise(self, extra: Floats) -> PredictedMeasurement:
-        """The same with more noise under occlusion. extra: (n,) fractions of the size added to the points' stds."""
-        noise = self.model_noise.copy()
-        more = ((self.part_std + extra[:, None]) ** 2 - self.part_std**2)[:, :, None, None] * self.part_noise
-        for part, rows in enumerate((POINT, HEAD, FOOT)):
-            noise[:, rows, rows] += more[:, part]
-        noise[:, LOG_IMAGE_SIZE, LOG_IMAGE_SIZE] = (_LOG_SIZE_STD + extra) ** 2
-        return replace(self, model_noise=noise)
+    def with_noise_factor(self, factor: Floats) -> PredictedMeasurement:
+        """The same with the model's noise multiplied. factor: (n,)."""
+        return replace(self, model_noise=self.model_noise * factor[:, None, None])
 
     def select(self, which: Ints) -> PredictedMeasurement:
         """The rows of some targets."""
@@ -99,11 +92,16 @@ def predict_measurement(camera: TrackingCamera, mean: Floats, kind: Ints, up: Fl
     unit = (size**2)[:, None, None, None] * (by_camera @ by_camera.swapaxes(2, 3))
     moving = (by_camera @ velocity[:, None, :, None])[..., 0] * camera.time_std
     both = (std**2)[:, :, None, None] * unit + moving[:, :, :, None] * moving[:, :, None, :]
+    # A box, or a leaning body, is displaced as a whole: the three points have this part of their noise in common.
+    scale = _COMMON_STD[kind] * size
     for part, rows in enumerate((POINT, HEAD, FOOT)):
-        noise[:, rows, rows] = both[:, part]
+        for other, columns in enumerate((POINT, HEAD, FOOT)):
+            common = by_camera[:, part] @ by_camera[:, other].swapaxes(1, 2)
+            noise[:, rows, columns] = (scale**2)[:, None, None] * common
+        noise[:, rows, rows] += both[:, part]
     _predict_log_image_size(value, jacobian, mean, depth, upright, rotation)
     noise[:, LOG_IMAGE_SIZE, LOG_IMAGE_SIZE] = _LOG_SIZE_STD**2
-    return PredictedMeasurement(value, jacobian, noise, depth, std, unit)
+    return PredictedMeasurement(value, jacobian, noise, depth)
 
 
 def _predict_log_image_size(

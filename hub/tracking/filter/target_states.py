@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hub.tracking.detections import FrameDetections
+from hub.tracking.filter.floor import Floor
 from hub.tracking.filter.kalman import STATE_DIM
 from protocols.geometry.types import Bools, Floats, Ints
 
@@ -23,9 +25,8 @@ class Targets:
     initiation_number: (n,) in order of initiation. number: (n,) in order of confirmation, 0 = tentative. kind: (n,)
     index in TARGET_MODELS. mean, covariance: (n, 7), (n, 7, 7). colour: (n, 3) mean RGB, NaN where never measured;
     colour_count: (n,) measurements of it. born_ns, seen_ns: (n,) reference times of initiation and last detection.
-    hits, opportunities: (n,) detections, and frames in which one was expected. detection_rate: (n,) recent fraction of
-    hits. seen_by: (n, c) time of the last detection [ns] by camera. overlap_s: (n,) time spent at the position of an
-    older target, less the time spent apart from it.
+    hits: (n,) detections. existence: (n,) probability that there is such a target. seen_by: (n, c) time of the last
+    detection [ns] by camera. overlap: (n,) log likelihood ratio of this being the same as its older neighbour.
     """
 
     initiation_number: Ints
@@ -38,10 +39,9 @@ class Targets:
     born_ns: Ints
     seen_ns: Ints
     hits: Ints
-    opportunities: Ints
-    detection_rate: Floats
+    existence: Floats
     seen_by: Ints
-    overlap_s: Floats
+    overlap: Floats
 
     def __len__(self) -> int:
         return len(self.initiation_number)
@@ -51,7 +51,7 @@ class Targets:
         """(n,) whether the track is confirmed, and therefore published."""
         return np.asarray(self.number > 0)
 
-    def select(self, keep: Bools) -> Targets:
+    def select(self, keep: Bools | Ints) -> Targets:
         """The targets given by a mask or by indices."""
         return Targets(*(getattr(self, name)[keep] for name in self.__slots__))
 
@@ -74,7 +74,6 @@ class Targets:
             no_integers,
             no_integers,
             no_integers,
-            no_integers,
             np.zeros(0),
             np.zeros((0, cameras), dtype=np.int64),
             np.zeros(0),
@@ -94,13 +93,52 @@ class LostTrack:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class DetectionStatistics:
+    """What one camera's detector does, as estimated from the tracks.
+
+    clear, occluded: probability of detecting a target in full view, and one behind another. clutter: expected false
+    detections a frame. noise: variance of the detected points over their model's. interval_s: between two frames.
+    """
+
+    clear: float = 0.85
+    occluded: float = 0.5
+    clutter: float = 0.5
+    noise: float = 2.0
+    touching_noise: float = 4.0
+    interval_s: float = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanFrame:
+    """A frame of the scan. value, noise: its measurements. ids: (k,) initiation numbers of the targets, column: (k,)
+    their detections. ambiguous: whether another association was nearly as probable."""
+
+    frame: FrameDetections
+    value: Floats
+    noise: Floats
+    statistics: DetectionStatistics
+    ids: Ints
+    column: Ints
+    ambiguous: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """The frames since ``prior``, the targets before the first of them, at ``prior_ns``."""
+
+    prior: Targets
+    prior_ns: int | None
+    frames: tuple[ScanFrame, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class MultiTargetState:
     """The complete tracker state after a frame: a function of the frames so far, in the order of their keys.
 
     time_ns: reference time of the last frame. unassociated: by camera, the detections of its last frame that are
-    associated with no target. last_frame_ns: by camera. lost_tracks: oldest first. floor_height, floor_weight: running
-    mean and weight of the foot heights of confirmed upright targets. colour_variance: of one channel, between a
-    detection's colour and the stored colour of its target.
+    associated with no target. last_frame_ns, statistics: by camera. lost_tracks: oldest first. floor: on which upright
+    targets stand. colour_variance: of one channel, between a detection's colour and the stored colour of its target.
+    scan: the last frames of all cameras, whose association may still change.
     """
 
     time_ns: int | None
@@ -111,9 +149,15 @@ class MultiTargetState:
     lost_tracks: tuple[LostTrack, ...] = ()
     next_initiation_number: int = 1
     next_number: int = 1
-    floor_height: float = 0.0
-    floor_weight: float = 0.0
+    floor: Floor | None = None
     colour_variance: float = 400.0
+    statistics: dict[str, DetectionStatistics] = field(default_factory=dict)
+    scan: Scan | None = None
+
+    @property
+    def interval_s(self) -> float:
+        """Between two frames of the fastest camera [s]."""
+        return min((one.interval_s for one in self.statistics.values()), default=0.5)
 
     @classmethod
     def empty(cls) -> MultiTargetState:

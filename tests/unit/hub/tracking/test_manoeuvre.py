@@ -13,7 +13,7 @@ from hub.tracking.filter.kalman import STATE_DIM
 from hub.tracking.filter.manoeuvre import gpb1_update, manoeuvre_hypothesis
 from hub.tracking.filter.target_models import KIND_INDEX, MARKER
 from hub.tracking.filter.target_states import Targets
-from hub.tracking.frame_update import TrackerParameters
+from hub.tracking.parameters import TrackerParameters
 from hub.tracking.tracker import Tracker
 from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry.camera import Intrinsics
@@ -83,7 +83,7 @@ def seen_before(kind: str, unseen_s: float) -> Targets:
     return Targets(
         initiation_number=one, number=one, kind=np.array([KIND_INDEX[kind]]), mean=np.zeros((1, STATE_DIM)),
         covariance=np.eye(STATE_DIM)[None], colour=np.zeros((1, 3)), colour_count=np.ones(1), born_ns=seen,
-        seen_ns=seen, hits=one, opportunities=one, detection_rate=np.ones(1), seen_by=seen[None], overlap_s=np.zeros(1),
+        seen_ns=seen, hits=one, existence=np.ones(1), seen_by=seen[None], overlap=np.zeros(1),
     )  # fmt: skip
 
 

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from hub.tracking.association.assignment import (
     COLOUR_STD,
     matching_colour_std,
-    misassociation_probability,
     update_colour_variance,
 )
+from hub.tracking.association.marginals import marginal_probabilities
 from hub.tracking.detections import TrackingCamera, frame_detections
+from hub.tracking.filter.floor import Floor
 from hub.tracking.filter.measurement import student_t_cost, student_t_inflation
-from hub.tracking.filter.target_states import MultiTargetState, Targets
-from hub.tracking.frame_update import TrackerParameters, process_frame
+from hub.tracking.filter.target_states import DetectionStatistics, MultiTargetState, Targets
+from hub.tracking.frame_update import process_frame
+from hub.tracking.parameters import TrackerParameters
 from hub.tracking.tracker import Tracker
 from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry.camera import Intrinsics
@@ -78,8 +84,8 @@ def standing(cameras: dict[str, TrackingCamera], foot: float, seen_by: int) -> M
         mean=np.array([[0.4, -0.3, foot + 0.5 * TALL, 0.0, 0.0, 0.0, np.log(TALL)]]),
         covariance=np.diag([0.01, 0.01, 0.01, 0.1, 0.1, 0.1, 0.002])[None],
         colour=np.array([[90.0, 120.0, 60.0]]), colour_count=np.array([9.0]), born_ns=np.array([0]),
-        seen_ns=np.array([now]), hits=np.array([50]), opportunities=np.array([50]), detection_rate=np.ones(1),
-        seen_by=seen, overlap_s=np.zeros(1),
+        seen_ns=np.array([now]), hits=np.array([50]), existence=np.array([0.99]),
+        seen_by=seen, overlap=np.zeros(1),
     )  # fmt: skip
     empty = MultiTargetState.empty()
     return replace(
@@ -89,7 +95,7 @@ def standing(cameras: dict[str, TrackingCamera], foot: float, seen_by: int) -> M
         targets=targets,
         next_initiation_number=2,
         next_number=2,
-        floor_weight=1e3,
+        floor=replace(Floor.unknown(UP, 1.0), covariance=np.diag([1e-4, 1e-6, 1e-6])),
     )
 
 
@@ -106,20 +112,32 @@ def test_a_target_off_the_floor_seen_by_two_cameras_is_deleted() -> None:
         assert len(after.lost_tracks) == 1 - kept, "it is kept for re-identification"
 
 
-def test_mismatch_probability_follows_from_the_next_best_assignment() -> None:
-    rows, columns = np.array([0, 1]), np.array([0, 1])
-    no_clutter = np.full(2, np.inf)
-    clear = misassociation_probability(np.array([[4.0, 200.0], [200.0, 4.0]]), rows, columns, no_clutter)
-    assert clear.max() < 1e-6
-    even = misassociation_probability(np.array([[4.0, 5.0], [6.0, 7.0]]), rows, columns, no_clutter)
-    assert np.allclose(even, 0.5)
-    alone = misassociation_probability(np.array([[4.0], [np.inf]]), rows[:1], columns[:1], no_clutter[:1])
-    assert alone.max() < 1e-6
-    either = misassociation_probability(np.array([[4.0], [4.0]]), rows[:1], columns[:1], no_clutter[:1])
-    assert np.allclose(either, 0.5), "an unassigned target may own the detection"
-    poor = misassociation_probability(np.array([[4.0, np.inf], [np.inf, 40.0]]), rows, columns, np.full(2, 40.0))
-    assert poor[0] < 1e-3
-    assert np.allclose(poor[1], 0.5), "a poor fit may be clutter"
+def exact_marginals(ratio: Floats) -> tuple[Floats, Floats]:
+    """By enumeration of all assignments."""
+    n, m = ratio.shape
+    pairs, free, total = np.zeros((n, m)), np.zeros(m), 0.0
+    for choice in itertools.product(range(-1, m), repeat=n):
+        taken = [j for j in choice if j >= 0]
+        if len(taken) != len(set(taken)):
+            continue
+        weight = float(np.prod([ratio[i, j] for i, j in enumerate(choice) if j >= 0]))
+        total += weight
+        for i, j in enumerate(choice):
+            if j >= 0:
+                pairs[i, j] += weight
+        free += [weight * (j not in taken) for j in range(m)]
+    return pairs / total, free / total
+
+
+@given(arrays(np.float64, (3, 4), elements=st.floats(-3.0, 3.0)))
+def test_marginal_probabilities_are_near_those_of_all_assignments(log_ratio: Floats) -> None:
+    """Belief propagation is exact without loops, and near with them."""
+    pairs, free = marginal_probabilities(np.exp(log_ratio))
+    exact, exact_free = exact_marginals(np.exp(log_ratio))
+    assert np.abs(pairs - exact).max() < 0.2
+    assert np.abs(free - exact_free).max() < 0.2
+    alone = marginal_probabilities(np.exp(log_ratio[:1]))
+    assert np.allclose(alone[0], exact_marginals(np.exp(log_ratio[:1]))[0])
 
 
 def test_clutter_does_not_pull_a_track_away() -> None:
@@ -153,7 +171,9 @@ def test_an_ambiguous_detection_moves_no_target() -> None:
     shift = np.zeros((1, 7))
     shift[0, :3] = 0.5 * side
     twin = replace(twin, mean=first.mean + shift)
-    both = replace(alone, targets=first.concatenate(twin))
+    # One is behind the other for the camera, and is expected to be detected all the same.
+    alike = {"cam0": DetectionStatistics(clear=0.85, occluded=0.85)}
+    both = replace(alone, targets=first.concatenate(twin), statistics=alike)
     (pixel,) = LENS.project(camera.pose.camera_from_world(first.mean[:, :3] + 0.25 * side))
     message = pb.Observation(schema_version=1, camera="cam0", boot_id="b", device_time_ns=NANOSECONDS + 1)
     message.detections.add(u=pixel[0], v=pixel[1], kind="marker", covariance=[4.0, 0.0, 4.0])
@@ -162,7 +182,7 @@ def test_an_ambiguous_detection_moves_no_target() -> None:
         after = process_frame(state, frame_detections(camera, message), cameras, TrackerParameters(up=UP)).targets
         moved.append(float(np.linalg.norm(after.mean[:, :3] - state.targets.mean[:, :3], axis=1).max()))
     assert moved[0] > 0.2
-    assert moved[1] < 0.2 * moved[0]
+    assert moved[1] < 0.4 * moved[0]
 
 
 def test_the_student_t_weight_is_the_derivative_of_its_cost() -> None:

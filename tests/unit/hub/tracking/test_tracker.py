@@ -12,8 +12,9 @@ from edge import scenes
 from hub.tracking.association.initiation import LengthScale
 from hub.tracking.calibration.vertical import VerticalEstimator
 from hub.tracking.detections import TrackingCamera, frame_detections
-from hub.tracking.frame_update import TrackerParameters, process_frame
+from hub.tracking.frame_update import process_frame
 from hub.tracking.live_tracking import LiveTracking
+from hub.tracking.parameters import TrackerParameters
 from hub.tracking.tracker import Tracker
 from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry import so3
@@ -191,7 +192,7 @@ def test_identities_survive_two_seconds_without_detections(traffic: Traffic) -> 
 
 
 def test_two_tracks_at_one_position_become_the_older_one(traffic: Traffic) -> None:
-    """Every person is detected twice, so both tracks keep a full detection rate: the overlap test must remove one."""
+    """They share the detections, so each keeps about half of them: the overlap test removes the younger one."""
     cameras, world = cameras_of(traffic.scene, "cam0"), TrackerParameters(up=UP)
     messages = list(traffic.messages())
     state = follow(tracker_of(cameras, world), messages[: len(messages) // 2]).state
@@ -201,23 +202,16 @@ def test_two_tracks_at_one_position_become_the_older_one(traffic: Traffic) -> No
     one = state.targets.select(np.arange(len(state.targets)) == known[0])
     twin = replace(one, initiation_number=np.array([1000]), number=np.array([state.next_number]))
     twin = replace(twin, mean=one.mean + 0.08 * np.eye(7)[:1])
-    state = replace(state, targets=state.targets.concatenate(twin), next_number=state.next_number + 1)
-    later = []
-    for message in messages:
-        doubled = pb.Observation()
-        doubled.CopyFrom(message)
-        doubled.detections.extend(message.detections)
-        frame = frame_detections(cameras[message.camera], doubled)
-        if frame.reference_ns > begun:
-            later.append(frame)
+    state = replace(state, targets=state.targets.concatenate(twin), next_number=state.next_number + 1, scan=None)
+    frames = [frame_detections(cameras[message.camera], message) for message in messages]
+    later = sorted((frame for frame in frames if frame.reference_ns > begun), key=lambda each: each.key)
     numbers = []
-    for frame in sorted(later, key=lambda each: each.key):
+    for frame in later:
         state = process_frame(state, frame, cameras, world)
         numbers.append((frame.reference_ns - begun, set(state.targets.number[state.targets.confirmed].tolist())))
     names = {int(number) for number in one.number} | {int(number) for number in twin.number}
-    assert all(names <= confirmed for after, confirmed in numbers if after < 0.8 * NANOSECONDS)
     assert all(
-        names & confirmed == set(one.number.tolist()) for after, confirmed in numbers if after > 2.5 * NANOSECONDS
+        names & confirmed == set(one.number.tolist()) for after, confirmed in numbers if after > 1.5 * NANOSECONDS
     )
 
 

@@ -1,0 +1,191 @@
+"""Joint association over a scan: the last frames of all cameras, each at most once.
+
+The tracker takes frames one after another. In a crowd, and at few frames a second, one camera alone cannot tell whose
+detection is whose, while all cameras of an instant together can. So the association of each frame of the scan is
+repeated given the detections of all others, until nothing changes: iterated conditional modes of the joint posterior
+(Besag 1986), one camera's assignment at a time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hub.tracking.association.assignment import assign, association_scores, gated_rows, matched_noise, occlusions
+from hub.tracking.association.marginals import marginal_probabilities
+from hub.tracking.filter import kalman
+from hub.tracking.filter.detection_model import (
+    detection_probability,
+    independent_fraction,
+    log_odds,
+    posterior_existence,
+    visible_fraction,
+    with_frame_noise,
+)
+from hub.tracking.filter.kalman import STATE_DIM
+from hub.tracking.filter.measurement import PredictedMeasurement, predict_measurement
+from hub.tracking.filter.target_states import ScanFrame, Targets
+from protocols.core.clocks import NANOSECONDS
+from protocols.geometry.types import Floats, Ints
+
+MAX_SWEEPS = 4
+MAX_LOG_ODDS = 9.0
+AMBIGUOUS = 0.95
+"""Association probability below which a frame's association is repeated with the others of its scan."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Evidence:
+    """What one frame says of n targets: information (n, 7, 7) and its vector (n, 7) at the scan's time, change of the
+    log odds of existence (n,), that change had it not been detected (n,), and the associated detection (n,), -1 =
+    none."""
+
+    information: Floats
+    vector: Floats
+    odds: Floats
+    missed: Floats
+    column: Ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanResult:
+    """Joint association of a scan. targets: with its frames. frames: with their associations. information: (n, 7, 7),
+    vector: (n, 7), odds: (n,), what the frames add to the states and to the log odds of existence. changed: whether an
+    association is another one than before. hits: (n,) detections of each target. missed: (n,) log odds without any."""
+
+    targets: Targets
+    frames: tuple[ScanFrame, ...]
+    information: Floats
+    vector: Floats
+    odds: Floats
+    changed: bool
+    hits: Ints
+    missed: Floats
+
+
+def associate_jointly(
+    frames: tuple[ScanFrame, ...],
+    targets: Targets,
+    now_ns: int,
+    prior: Targets,
+    up: Floats | None,
+    colour_std: float,
+    sweeps: int = MAX_SWEEPS,
+) -> ScanResult:
+    """The joint association of frames with targets.
+
+    targets: at ``now_ns``, with the frames' present associations. prior: the same targets without these frames.
+    """
+    row = {number: i for i, number in enumerate(targets.initiation_number.tolist())}
+    before = []
+    for one in frames:
+        column = np.full(len(targets), -1)
+        for number, j in zip(one.ids.tolist(), one.column.tolist(), strict=True):
+            if number in row:
+                column[row[number]] = j
+        before.append(column)
+    evidence = [
+        _evidence(one, targets, now_ns, up, colour_std, column) for one, column in zip(frames, before, strict=True)
+    ]
+    information = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
+    vector = (information @ prior.mean[:, :, None])[:, :, 0]
+    odds = log_odds(prior.existence)
+    for _ in range(sweeps):
+        changed = False
+        for index, one in enumerate(frames):
+            others = [each for k, each in enumerate(evidence) if k != index]
+            without = _combined(targets, information, vector, odds, others)
+            new = _evidence(one, without, now_ns, up, colour_std, None)
+            changed |= not np.array_equal(new.column, evidence[index].column)
+            evidence[index] = new
+        if not changed:
+            break
+    ids = targets.initiation_number
+    hits = np.sum([each.column >= 0 for each in evidence], axis=0)
+    after = _combined(targets, information, vector, odds, evidence)
+    return ScanResult(
+        replace(after, hits=targets.hits + hits - np.sum([column >= 0 for column in before], axis=0)),
+        tuple(
+            replace(one, ids=ids[each.column >= 0], column=each.column[each.column >= 0], ambiguous=False)
+            for one, each in zip(frames, evidence, strict=True)
+        ),
+        np.sum([each.information for each in evidence], axis=0),
+        np.sum([each.vector for each in evidence], axis=0),
+        np.sum([each.odds for each in evidence], axis=0),
+        any(not np.array_equal(each.column, column) for each, column in zip(evidence, before, strict=True)),
+        hits,
+        np.sum([each.missed for each in evidence], axis=0),
+    )
+
+
+def _combined(
+    targets: Targets, information: Floats, vector: Floats, odds: Floats, evidence: list[_Evidence]
+) -> Targets:
+    total = information + sum(one.information for one in evidence)
+    covariance = np.linalg.inv(total)
+    covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+    mean = (covariance @ (vector + sum(one.vector for one in evidence))[:, :, None])[:, :, 0]
+    every = np.clip(odds + sum(one.odds for one in evidence), -MAX_LOG_ODDS, MAX_LOG_ODDS)
+    return replace(targets, mean=mean, covariance=covariance, existence=1.0 / (1.0 + np.exp(-every)))
+
+
+def _evidence(
+    one: ScanFrame, targets: Targets, now_ns: int, up: Floats | None, colour_std: float, fixed: Ints | None
+) -> _Evidence:
+    """What a frame says, given the targets' states without it; fixed: (n,) its association, where that is known."""
+    n = len(targets)
+    elapsed = (one.frame.reference_ns - now_ns) / NANOSECONDS
+    step = np.eye(STATE_DIM)
+    step[kalman.POSITION, kalman.VELOCITY] = elapsed * np.eye(3)
+    there = replace(targets, mean=targets.mean @ step.T, covariance=step @ targets.covariance @ step.T)
+    predicted = predict_measurement(one.frame.camera, there.mean, there.kind, up)
+    touching, occluded = occlusions(one.frame.camera, predicted, there)
+    predicted = with_frame_noise(predicted, touching, there.kind, one.statistics)
+    probability = detection_probability(one.statistics, visible_fraction(one.frame.camera, predicted), occluded)
+    information, vector = np.zeros((n, STATE_DIM, STATE_DIM)), np.zeros((n, STATE_DIM))
+    column, detected = np.full(n, -1), np.zeros(n)
+    if len(one.frame):
+        scores = association_scores(one.frame, one.value, one.noise, there, predicted, ("",) * n, colour_std)
+        expected = there.existence * probability
+        log_ratio = scores.log_ratio + np.log(expected / ((1.0 - expected) * one.statistics.clutter))[:, None]
+        marginal, _ = marginal_probabilities(np.exp(np.minimum(log_ratio, 50.0)))
+        detected = np.minimum(marginal.sum(axis=1), 1.0)
+        if fixed is None:
+            rows, columns = assign(log_ratio)
+            column[rows] = columns
+        else:
+            column = fixed
+        rows = np.flatnonzero(column >= 0)
+        if len(rows):
+            sure = marginal[rows, column[rows]]
+            information[rows], vector[rows] = _linearised(
+                one, there, predicted, scores.distance, rows, column[rows], sure, step
+            )
+    fraction = independent_fraction(one.statistics.interval_s)
+    odds = log_odds(posterior_existence(there.existence, probability, detected, fraction)) - log_odds(there.existence)
+    return _Evidence(information, vector, odds, fraction * np.log1p(-probability), column)
+
+
+def _linearised(
+    one: ScanFrame,
+    there: Targets,
+    predicted: PredictedMeasurement,
+    distance: Floats,
+    rows: Ints,
+    columns: Ints,
+    sure: Floats,
+    step: Floats,
+) -> tuple[Floats, Floats]:
+    """Information of pairs and its vector, of the state at the scan's time."""
+    selected = predicted.select(rows)
+    used = gated_rows(one.value[columns], selected, distance[rows, columns], there.covariance[rows])
+    innovation = np.where(used, one.value[columns] - selected.value, 0.0)
+    total = matched_noise(one.noise[columns], selected, distance[rows, columns], sure)
+    innovation, jacobian, total = kalman.mask_rows(innovation, selected.jacobian, total, used)
+    jacobian = jacobian @ step
+    weighted = np.linalg.solve(total, jacobian).transpose(0, 2, 1)
+    # The state at the scan's time is the inverse step of that at the frame's.
+    now = there.mean[rows] @ np.linalg.inv(step).T
+    measured = innovation + (jacobian @ now[:, :, None])[:, :, 0]
+    return weighted @ jacobian, (weighted @ measured[:, :, None])[:, :, 0]

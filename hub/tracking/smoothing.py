@@ -1,0 +1,358 @@
+"""Tracks of a whole recording: association, smoothing and linking repeated over all scans.
+
+After the tracker has gone forward through a recording, each scan is associated again given the past and the future of
+all tracks (a two-filter smoother: Fraser and Potter 1969), and at each boundary between two scans the tracks' pasts are
+assigned to the futures that continue them best, which mends exchanged, broken and doubly initiated tracks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
+
+from hub.tracking.association.assignment import matching_colour_std
+from hub.tracking.association.scan import associate_jointly
+from hub.tracking.filter.floor import Floor
+from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM, VELOCITY
+from hub.tracking.filter.target_models import TARGET_MODELS
+from hub.tracking.filter.target_states import ScanFrame, Targets
+from hub.tracking.frame_update import on_floor, predict_targets, prior_of_births
+from hub.tracking.parameters import TrackerParameters
+from protocols.core.clocks import NANOSECONDS
+from protocols.geometry.types import Floats, Ints
+
+ITERATIONS = 3
+"""Association, smoothing and linking: of ten crowds none changed after the third."""
+_INSIDE, _BESIDE = 0.99, 0.3
+"""Existence of a target between its first and its last detection, and one scan before and after."""
+_MAX_GAP_S = 6.0
+"""Longest time over which a lost track is continued by its motion."""
+_LOG_CONTINUED = 3.0
+"""Log odds of a track going on against one ending and another beginning: one in twenty does, a scan."""
+_LOG_ABSENT = -7.0
+"""Log odds of existence in a gap, from which on a track is cut there."""
+_PRESENT = 1.0
+"""Log odds by which another link must be better than the present one."""
+_ARRIVAL_AREA_M2 = 200.0
+"""In which new tracks begin."""
+_MAX_LINK_M = 6.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedScan:
+    """A scan of a recording. now_ns: its reference time. frames: with the numbers of tracks (rows of ``tracks``)."""
+
+    now_ns: int
+    frames: tuple[ScanFrame, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SmoothedScan:
+    """Tracks at the time of a scan. row: (k,) which. mean, covariance: (k, 7), (k, 7, 7), from past and future. hits:
+    (k,) detections in the scan. odds: (k,) what it adds to the log odds of existence, and missed: (k,), what it would
+    have added without any."""
+
+    now_ns: int
+    row: Ints
+    mean: Floats
+    covariance: Floats
+    hits: Ints
+    odds: Floats
+    missed: Floats
+
+
+@dataclass(slots=True, eq=False)
+class _Filtered:
+    """States of the tracks ``row`` at a scan, before and after its own detections."""
+
+    row: Ints
+    predicted: Targets
+    mean: Floats
+    covariance: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ScanEvidence:
+    """What a scan says of the tracks ``row`` (k,), as in `ScanResult`."""
+
+    row: Ints
+    information: Floats
+    vector: Floats
+    missed: Floats
+
+    def renamed(self, names: Ints) -> _ScanEvidence:
+        """The same of tracks with other numbers."""
+        return replace(self, row=names[self.row])
+
+
+class BatchSmoother:
+    """Scans, tracks and the evidence between them. tracks: one row a track; linearisation begins at their states."""
+
+    def __init__(
+        self,
+        scans: Sequence[RecordedScan],
+        tracks: Targets,
+        states: Sequence[tuple[Ints, Floats, Floats]],
+        floor: Floor | None,
+        parameters: TrackerParameters,
+        colour_variance: float,
+    ) -> None:
+        self.scans = list(scans)
+        self.tracks = tracks
+        self.floor, self.parameters = floor, parameters
+        self.colour_std = matching_colour_std(colour_variance)
+        self.evidence: list[_ScanEvidence] = []
+        for scan, (row, mean, covariance) in zip(self.scans, states, strict=True):
+            there = replace(tracks.select(row), mean=mean, covariance=covariance)
+            found = associate_jointly(scan.frames, there, scan.now_ns, there, parameters.up, self.colour_std, 0)
+            self.evidence.append(_ScanEvidence(row, found.information, found.vector, found.missed))
+        self._initial(states)
+
+    def _initial(self, states: Iterable[tuple[Ints, Floats, Floats]]) -> None:
+        """A mean of every track at its first state."""
+        mean = self.tracks.mean.copy()
+        done = np.zeros(len(self.tracks), dtype=np.bool_)
+        for row, means, _ in states:
+            fresh = ~done[row]
+            mean[row[fresh]] = means[fresh]
+            done[row] = True
+        self.tracks = replace(self.tracks, mean=mean)
+
+    def run(self, iterations: int = ITERATIONS, progress: Callable[[float], None] | None = None) -> list[SmoothedScan]:
+        """The smoothed scans after ``iterations`` of association, smoothing and linking."""
+        out: list[SmoothedScan] = []
+        for number in range(iterations + 1):
+            if number:
+                self._cut(out)
+                forward, backward = self._filter(1), self._filter(-1)
+                self._link(forward, backward)
+            forward, backward = self._filter(1), self._filter(-1)
+            out = self._associate(forward, backward, relink=number < iterations)
+            if progress is not None:
+                progress((number + 1) / (iterations + 1))
+        return out
+
+    def _extents(self) -> tuple[Ints, Ints]:
+        """First and last scan (n,) in which each track has a detection; first > last = none."""
+        n = len(self.tracks)
+        first, last = np.full(n, len(self.scans)), np.full(n, -1)
+        for index, scan in enumerate(self.scans):
+            for one in scan.frames:
+                first[one.ids] = np.minimum(first[one.ids], index)
+                last[one.ids] = np.maximum(last[one.ids], index)
+        return first, last
+
+    def _filter(self, direction: int) -> list[_Filtered]:
+        """The filter over all scans, forward (1) or backward in time (-1)."""
+        first, last = self._extents()
+        empty = first > last
+        first, last = np.maximum(first - 1, 0), np.minimum(last + 1, len(self.scans) - 1)
+        first[empty] = len(self.scans)
+        out: list[_Filtered | None] = [None] * len(self.scans)
+        running = self.tracks.select(np.zeros(0, dtype=np.int64))
+        rows = np.zeros(0, dtype=np.int64)
+        previous_ns: int | None = None
+        for index in range(len(self.scans))[::direction]:
+            scan = self.scans[index]
+            elapsed = 0.0 if previous_ns is None else (scan.now_ns - previous_ns) / NANOSECONDS
+            alive = (first <= index) & (index <= last)
+            keep = alive[rows]
+            predicted = predict_targets(running.select(np.flatnonzero(keep)), elapsed, self.parameters)
+            predicted = on_floor(predicted, self.floor, abs(elapsed))
+            alive[rows] = False
+            entering = np.flatnonzero(alive)
+            births = prior_of_births(self.tracks.select(entering), self.floor, self.parameters)
+            rows = np.concatenate([rows[keep], entering])
+            predicted = predicted.concatenate(births)
+            mean, covariance = self._updated(index, rows, predicted.mean, predicted.covariance)
+            running = replace(predicted, mean=mean, covariance=covariance)
+            out[index] = _Filtered(rows, predicted, mean, covariance)
+            previous_ns = scan.now_ns
+        return [one for one in out if one is not None]
+
+    def _updated(self, index: int, rows: Ints, mean: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+        """States with the evidence of a scan."""
+        found = self.evidence[index]
+        _, a, b = np.intersect1d(rows, found.row, return_indices=True)
+        if not len(a):
+            return mean, covariance
+        mean, covariance = mean.copy(), covariance.copy()
+        prior = np.linalg.inv(covariance[a])
+        covariance[a] = _symmetric(np.linalg.inv(prior + found.information[b]))
+        mean[a] = (covariance[a] @ ((prior @ mean[a, :, None])[:, :, 0] + found.vector[b])[:, :, None])[:, :, 0]
+        return mean, covariance
+
+    def _associate(self, forward: list[_Filtered], backward: list[_Filtered], relink: bool) -> list[SmoothedScan]:
+        """Every scan associated again, given past and future."""
+        first, last = self._extents()
+        out = []
+        for index, (scan, past, future) in enumerate(zip(self.scans, forward, backward, strict=True)):
+            _, a, b = np.intersect1d(past.row, future.row, return_indices=True)
+            row = past.row[a]
+            mean, covariance = _fused(
+                past.predicted.mean[a],
+                past.predicted.covariance[a],
+                future.predicted.mean[b],
+                future.predicted.covariance[b],
+            )
+            inside = (first[row] <= index) & (index <= last[row])
+            prior = replace(
+                past.predicted.select(a), mean=mean, covariance=covariance,
+                existence=np.where(inside, _INSIDE, _BESIDE), initiation_number=row,
+            )  # fmt: skip
+            mean, covariance = self._updated(index, row, mean, covariance)
+            there = replace(prior, mean=mean, covariance=covariance)
+            found = associate_jointly(
+                scan.frames, there, scan.now_ns, prior, self.parameters.up, self.colour_std, 2 if relink else 0
+            )
+            self.scans[index] = replace(scan, frames=found.frames)
+            self.evidence[index] = _ScanEvidence(row, found.information, found.vector, found.missed)
+            after = found.targets
+            out.append(
+                SmoothedScan(scan.now_ns, row, after.mean, after.covariance, found.hits, found.odds, found.missed)
+            )
+        means = self.tracks.mean.copy()
+        for one in reversed(out):
+            means[one.row] = one.mean
+        self.tracks = replace(self.tracks, mean=means)
+        return out
+
+    def _cut(self, smoothed: Sequence[SmoothedScan]) -> None:
+        """Cut tracks where cameras that should have seen them did not: whoever follows is somebody else."""
+        first, last = self._extents()
+        label, count, source = np.arange(len(self.tracks)), len(self.tracks), list(range(len(self.tracks)))
+        unseen = np.zeros(len(self.tracks))
+        for index, one in enumerate(smoothed):
+            hit = one.row[one.hits > 0]
+            for track in hit[unseen[hit] < _LOG_ABSENT].tolist():
+                label[track] = count
+                source.append(track)
+                count += 1
+            unseen[hit] = 0.0
+            missed = (one.hits == 0) & (first[one.row] < index) & (index < last[one.row])
+            unseen[one.row[missed]] += one.odds[missed]
+            self._rename(index, label)
+        self._select(source)
+
+    def _rename(self, index: int, names: Ints) -> None:
+        scan = self.scans[index]
+        frames = tuple(replace(one, ids=names[one.ids]) for one in scan.frames)
+        self.scans[index] = replace(scan, frames=frames)
+        self.evidence[index] = self.evidence[index].renamed(names)
+
+    def _select(self, source: list[int]) -> None:
+        """Tracks with the states of others."""
+        tracks = self.tracks.select(np.array(source, dtype=np.int64))
+        self.tracks = replace(tracks, initiation_number=np.arange(len(source)))
+
+    def _link(self, forward: list[_Filtered], backward: list[_Filtered]) -> None:
+        """The tracks' pasts assigned to the futures that continue them best, at every boundary of two scans."""
+        first, last = self._extents()
+        n = len(self.tracks)
+        label, count, source = np.arange(n), n, list(range(n))
+        lost: dict[int, tuple[int, int]] = {}  # by track: scan of its last detection, label
+        missed = np.zeros(n)
+        for index in range(len(self.scans)):
+            missed[self.evidence[index].row] = self.evidence[index].missed
+            if index + 1 == len(self.scans):
+                self._rename(index, label)
+                break
+            after = self.scans[index + 1].now_ns
+            alive = (first <= index) & (index <= last)
+            tails = np.flatnonzero((first <= index + 1) & (index + 1 <= last))
+            for track in np.flatnonzero(last == index).tolist():
+                lost[track] = index, int(label[track])
+            lost = {t: v for t, v in lost.items() if (after - self.scans[v[0]].now_ns) / NANOSECONDS <= _MAX_GAP_S}
+            heads = np.concatenate([np.flatnonzero(alive & (last > index)), np.array(list(lost), dtype=np.int64)])
+            new = label.copy()
+            if len(heads) and len(tails):
+                ends = np.array([lost[head][0] if head in lost else index for head in heads.tolist()])
+                score = self._link_scores(forward, backward[index + 1], heads, tails, ends, index)
+                score += ((index - ends) * missed[heads])[:, None]
+                score = np.where(heads[:, None] == tails[None, :], score + _PRESENT, score)
+                a, b = linear_sum_assignment(np.where(score > 0.0, -score, 0.0))
+                linked = score[a, b] > 0.0
+                follows = {int(tails[j]): int(heads[i]) for i, j in zip(a[linked], b[linked], strict=True)}
+                for tail in tails.tolist():
+                    head = follows.get(tail)
+                    if head is not None:
+                        new[tail] = lost.pop(head)[1] if head in lost else label[head]
+                    elif alive[tail]:  # its past goes on elsewhere, or ends
+                        new[tail] = count
+                        source.append(tail)
+                        count += 1
+                for head in set(heads.tolist()) - set(follows.values()) - set(lost):
+                    lost[head] = index, int(label[head])
+            self._rename(index, label)
+            label = new
+        self._select(source)
+
+    def _link_scores(
+        self, forward: list[_Filtered], after: _Filtered, heads: Ints, tails: Ints, ends: Ints, index: int
+    ) -> Floats:
+        """Log odds (h, t) of tail t continuing head h, against h ending and t beginning."""
+        scan = self.scans[index + 1]
+        mean, covariance = np.zeros((len(heads), STATE_DIM)), np.zeros((len(heads), STATE_DIM, STATE_DIM))
+        gap = np.zeros(len(heads))
+        for at in np.unique(ends).tolist():
+            chosen = ends == at
+            past = forward[at]
+            place = {track: i for i, track in enumerate(past.row.tolist())}
+            rows = np.array([place[track] for track in heads[chosen].tolist()])
+            state = replace(past.predicted.select(rows), mean=past.mean[rows], covariance=past.covariance[rows])
+            elapsed = (scan.now_ns - self.scans[at].now_ns) / NANOSECONDS
+            state = on_floor(predict_targets(state, elapsed, self.parameters), self.floor, elapsed)
+            mean[chosen], covariance[chosen] = state.mean, state.covariance
+            gap[chosen] = (self.scans[index].now_ns - self.scans[at].now_ns) / NANOSECONDS
+        place = {track: i for i, track in enumerate(after.row.tolist())}
+        rows = np.array([place[track] for track in tails.tolist()])
+        begun, spread = after.mean[rows], after.covariance[rows]
+        kinds = self.tracks.kind
+        unit = self.parameters.scale.units_per_m
+        off = mean[:, None] - begun[None]
+        near = np.linalg.norm(off[..., POSITION], axis=2) < _MAX_LINK_M * unit
+        near &= kinds[heads][:, None] == kinds[tails][None, :]
+        a, b = np.nonzero(near)
+        score = np.full(near.shape, -np.inf)
+        if not len(a):
+            return score
+        total = covariance[a] + spread[b]
+        solved = np.linalg.solve(total, off[a, b][:, :, None])[:, :, 0]
+        fit = -0.5 * ((off[a, b] * solved).sum(axis=1) + np.linalg.slogdet(total)[1])
+        # The same, had the tail begun anywhere: position uniform, velocity and size from their priors.
+        model = [TARGET_MODELS[k] for k in kinds[tails].tolist()]
+        speed = np.array([one.speed_std_m_s for one in model]) * unit
+        size = np.array([one.log_size_std for one in model])
+        free = spread[:, VELOCITY, VELOCITY] + speed[:, None, None] ** 2 * np.eye(3)
+        velocity = begun[:, VELOCITY]
+        chance = -0.5 * (
+            np.einsum("ni,nij,nj->n", velocity, np.linalg.inv(free), velocity) + np.linalg.slogdet(free)[1]
+        )
+        typical = np.median(self.tracks.mean[:, LOG_SIZE])
+        size2 = size**2 + spread[:, LOG_SIZE, LOG_SIZE]
+        chance -= 0.5 * ((begun[:, LOG_SIZE] - typical) ** 2 / size2 + np.log(size2))
+        # The height is that of the floor in both cases: only the two horizontal dimensions are free.
+        height = total[:, :3, :3]
+        vertical = np.linalg.eigvalsh(height)[:, 0]
+        chance_of = chance[b] - np.log(_ARRIVAL_AREA_M2 * unit**2) - 0.5 * np.log(vertical) + np.log(2.0 * np.pi)
+        colour = self.tracks.colour
+        off2 = ((colour[heads[a]] - colour[tails[b]]) ** 2).sum(axis=1) / self.colour_std**2
+        alike = np.nan_to_num(3.0 * np.log(60.0 / self.colour_std) - 0.5 * np.minimum(off2, 12.0))
+        score[a, b] = fit - chance_of + _LOG_CONTINUED - gap[a] + np.where(heads[a] == tails[b], 0.0, alike)
+        return score
+
+
+def _fused(mean: Floats, covariance: Floats, other_mean: Floats, other_covariance: Floats) -> tuple[Floats, Floats]:
+    """Two independent estimates (n, 7), (n, 7, 7) of the same states as one."""
+    one, two = np.linalg.inv(covariance), np.linalg.inv(other_covariance)
+    both = _symmetric(np.linalg.inv(one + two))
+    return (both @ (one @ mean[:, :, None] + two @ other_mean[:, :, None]))[:, :, 0], both
+
+
+def _symmetric(matrix: npt.NDArray[np.floating[Any]]) -> Floats:
+    return np.asarray(0.5 * (matrix + matrix.transpose(0, 2, 1)))
