@@ -64,6 +64,6 @@ def read_index(stream: BinaryIO) -> Index | None:
                 channel = Channel.read(ReadDataStream(BytesIO(summary[offset : offset + length])))
                 channels[channel.id] = channel.topic
             offset += length
-    except (McapError, ValueError, struct.error):
+    except (McapError, ValueError, OverflowError, struct.error):
         return None
     return Index(tuple(chunks), channels)

@@ -236,7 +236,16 @@ def chunk_records(frame: McapRecord, damage: Damage) -> Iterator[tuple[int, byte
     """(opcode, content) of each record in a chunk; none if its checksum does not match."""
     try:
         data = _unpacked(Chunk.read(ReadDataStream(BytesIO(frame.content))))
-    except (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, EOFError):
+    except (
+        McapError,
+        ValueError,
+        OverflowError,
+        struct.error,
+        zstandard.ZstdError,
+        RuntimeError,
+        MemoryError,
+        EOFError,
+    ):
         damage.record(f"the chunk at byte {frame.offset} is damaged and was left out")
         return
     offset = 0

@@ -57,7 +57,7 @@ def log_format(path: Path) -> dict[str, str]:
             if frame.opcode == Opcode.METADATA:
                 try:
                     record = Metadata.read(ReadDataStream(BytesIO(frame.content)))
-                except (McapError, ValueError):
+                except (McapError, ValueError, OverflowError):
                     continue
                 if record.name == FORMAT_RECORD and record.metadata == with_checksum(record.metadata):
                     return dict(record.metadata)

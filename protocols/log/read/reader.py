@@ -315,7 +315,7 @@ class LogReader:
         read: Callable[[ReadDataStream], _Record] = cast(Any, kind).read
         try:
             return read(ReadDataStream(BytesIO(frame.content)))
-        except (McapError, ValueError, struct.error):
+        except (McapError, ValueError, OverflowError, struct.error):
             self._damage.record(f"the record at byte {frame.offset} is garbled and was left out")
             return None
 
@@ -327,7 +327,7 @@ def _channel_of_record(frame: McapRecord) -> tuple[int, str] | None:
         if record.name != CHANNEL_RECORD:
             return None
         number, key = int(record.metadata["id"]), record.metadata["key"]
-    except (McapError, ValueError, struct.error, KeyError):
+    except (McapError, ValueError, OverflowError, struct.error, KeyError):
         return None
     return (number, key) if record.metadata == channel_record(number, key) else None
 

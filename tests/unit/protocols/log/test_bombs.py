@@ -56,6 +56,14 @@ def test_a_chunk_of_empty_records_ends_at_the_first() -> None:
     assert damage.flaws == 1
 
 
+def test_a_length_of_2_to_the_64_is_damage(tmp_path: Path) -> None:
+    """Found by fuzzing: the library reads as many bytes as a record says, which no system can."""
+    file = tmp_path / "long.mcap"
+    inside = struct.pack("<QQQII", 0, 0, 1000, 0, 4) + b"zstd" + struct.pack("<Q", 2**64 - 1) + b"data"
+    file.write_bytes(MAGIC + record(Opcode.CHUNK, inside) + FOOTER)
+    assert LogReader(file).summary().damaged
+
+
 class Counting(io.BytesIO):
     """Counts the bytes that are read of it."""
 
