@@ -9,11 +9,10 @@ from io import BytesIO
 from typing import BinaryIO
 
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel
 
-from protocols.log.read.mcap_records import MAGIC
+from protocols.log.read.mcap_records import MAGIC, MALFORMED
 
 _HEAD = struct.Struct("<BQ")
 _FOOTER = struct.Struct("<BQQQI")
@@ -64,6 +63,6 @@ def read_index(stream: BinaryIO) -> Index | None:
                 channel = Channel.read(ReadDataStream(BytesIO(summary[offset : offset + length])))
                 channels[channel.id] = channel.topic
             offset += length
-    except (McapError, ValueError, OverflowError, struct.error):
+    except MALFORMED:
         return None
     return Index(tuple(chunks), channels)

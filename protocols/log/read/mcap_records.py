@@ -28,6 +28,8 @@ from mcap.records import Chunk
 from protocols.core.errors import InputError
 
 MAGIC = b"\x89MCAP0\r\n"
+MALFORMED = (McapError, ValueError, OverflowError, struct.error)
+"""What the library raises for records that are cut off or say what cannot be; lengths of 2⁶⁴ overflow its reads."""
 MAX_CHUNK = 64 * 1024 * 1024
 """Bytes, uncompressed. Writers make chunks of 60 kB (this one) to some megabytes."""
 _MAX_RATIO, _MIN_UNPACKED = 256, 1 << 16

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from protocols.core.errors import InputError
 from protocols.log.layout import FORMAT_RECORD, part_path, with_checksum
-from protocols.log.read.mcap_records import Damage, open_log, read_records
+from protocols.log.read.mcap_records import MALFORMED, Damage, open_log, read_records
 
 _PART = re.compile(r"(?P<stem>.+)-(?P<number>\d{3,6})\Z")
 
@@ -57,7 +56,7 @@ def log_format(path: Path) -> dict[str, str]:
             if frame.opcode == Opcode.METADATA:
                 try:
                     record = Metadata.read(ReadDataStream(BytesIO(frame.content)))
-                except (McapError, ValueError, OverflowError):
+                except MALFORMED:
                     continue
                 if record.name == FORMAT_RECORD and record.metadata == with_checksum(record.metadata):
                     return dict(record.metadata)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -13,7 +12,6 @@ from typing import Any, NamedTuple, Self, TypeVar, cast
 
 from google.protobuf.message import Message
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment as AttachmentRecord
 from mcap.records import Channel
@@ -23,6 +21,7 @@ from protocols.core.errors import InputError
 from protocols.log.layout import CHANNEL_RECORD, channel_record
 from protocols.log.read.index import read_index
 from protocols.log.read.mcap_records import (
+    MALFORMED,
     Damage,
     McapRecord,
     RawMessage,
@@ -315,7 +314,7 @@ class LogReader:
         read: Callable[[ReadDataStream], _Record] = cast(Any, kind).read
         try:
             return read(ReadDataStream(BytesIO(frame.content)))
-        except (McapError, ValueError, OverflowError, struct.error):
+        except MALFORMED:
             self._damage.record(f"the record at byte {frame.offset} is garbled and was left out")
             return None
 
@@ -327,7 +326,7 @@ def _channel_of_record(frame: McapRecord) -> tuple[int, str] | None:
         if record.name != CHANNEL_RECORD:
             return None
         number, key = int(record.metadata["id"]), record.metadata["key"]
-    except (McapError, ValueError, OverflowError, struct.error, KeyError):
+    except (*MALFORMED, KeyError):
         return None
     return (number, key) if record.metadata == channel_record(number, key) else None
 

@@ -64,6 +64,13 @@ def test_a_length_of_2_to_the_64_is_damage(tmp_path: Path) -> None:
     assert LogReader(file).summary().damaged
 
 
+def test_a_format_record_that_is_cut_off_is_damage(tmp_path: Path) -> None:
+    """Found by fuzzing: the record that is read first was read without a check."""
+    file = tmp_path / "cut.mcap"
+    file.write_bytes(MAGIC + record(Opcode.METADATA, b"\x02\x00") + FOOTER)
+    assert LogReader(file).summary().messages == 0
+
+
 class Counting(io.BytesIO):
     """Counts the bytes that are read of it."""
 
