@@ -24,6 +24,7 @@ from hub.tracking.filter import kalman
 from hub.tracking.filter.detection_model import (
     CORRELATION_S,
     detection_probability,
+    false_detections,
     independent_fraction,
     posterior_existence,
     updated_statistics,
@@ -209,7 +210,8 @@ def _associate_and_update(
             other = association_scores(frame, value, noise, manoeuvring, predicted, names, colour_std)
             scores = combine_hypotheses(scores, other, manoeuvre.prior_odds)
         expected = targets.existence * probability
-        log_ratio = scores.log_ratio + np.log(expected / ((1.0 - expected) * statistics.clutter))[:, None]
+        clutter_rate = false_detections(statistics, targets.kind)
+        log_ratio = scores.log_ratio + np.log(expected / ((1.0 - expected) * clutter_rate))[:, None]
         marginal, clutter = marginal_probabilities(np.exp(np.minimum(log_ratio, 50.0)))
         row, column = assign(log_ratio)
         order = np.argsort(row, kind="stable")

@@ -26,6 +26,9 @@ MAX_EXISTENCE = 0.99
 _CONFIRMED, _DELETED = 0.9, 0.02
 """Existence probabilities."""
 _MIN_HITS = 2
+_ALONE_S = 1.0
+"""Age from which on a person on the floor whom one camera alone sees is confirmed: a part of the background that was
+taken for somebody is learned by then."""
 _TENTATIVE_S = 0.5
 _UNSEEN_S = 0.5
 _SAME_TARGET_RADIUS = 0.3
@@ -195,6 +198,7 @@ def manage_tracks(state: MultiTargetState, elapsed: float, parameters: TrackerPa
     assert now is not None
     cameras = (targets.seen_by > now - recent_ns).sum(axis=1)
     placed = _UPRIGHT[targets.kind] & (state.floor is not None and state.floor.known)
+    placed &= now - targets.born_ns >= _ALONE_S * NANOSECONDS
     ready = (targets.existence >= _CONFIRMED) & (targets.hits >= _MIN_HITS) & ((cameras >= 2) | placed)
     state = reidentify(state, ~targets.confirmed & ready, parameters.scale)
     targets = state.targets

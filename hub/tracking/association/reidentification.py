@@ -43,8 +43,8 @@ def reidentify(state: MultiTargetState, ready: Bools, scale: LengthScale) -> Mul
     next_number = state.next_number
     for index in np.flatnonzero(ready).tolist():
         mean, colour = targets.mean[index], targets.colour[index]
-        kind, born_ns = int(targets.kind[index]), int(targets.born_ns[index])
-        cost = [_dissimilarity(lost, mean, colour, kind, born_ns, scale) for lost in lost_tracks]
+        kind = int(targets.kind[index])
+        cost = [_dissimilarity(lost, mean, colour, kind, state.time_ns, scale) for lost in lost_tracks]
         order = np.argsort(cost, kind="stable") if cost else np.zeros(0, dtype=np.int64)
         is_match = len(order) and cost[order[0]] < _MAX_COST
         if is_match and len(order) > 1 and cost[order[1]] - cost[order[0]] < _MIN_MARGIN:
@@ -79,11 +79,11 @@ def _lost_track(targets: Targets, i: int, time_ns: int) -> LostTrack:
     return LostTrack(number, kind, mean, seen, targets.colour[i], float(targets.colour_count[i]))
 
 
-def _dissimilarity(lost: LostTrack, mean: Floats, colour: Floats, kind: int, born_ns: int, scale: LengthScale) -> float:
-    """The cost of identifying a new target with a lost one; inf where that is impossible."""
+def _dissimilarity(lost: LostTrack, mean: Floats, colour: Floats, kind: int, time_ns: int, scale: LengthScale) -> float:
+    """The cost of identifying a new target, as it is at ``time_ns``, with a lost one; inf where that is impossible."""
     if lost.kind != kind:
         return float("inf")
-    gap_s = (born_ns - lost.seen_ns) / NANOSECONDS
+    gap_s = (time_ns - lost.seen_ns) / NANOSECONDS
     model = TARGET_MODELS[kind]
     units_per_m = float(np.exp(lost.mean[LOG_SIZE])) / model.size_m if model.upright else scale.units_per_m
     distance = float(np.linalg.norm(mean[POSITION] - lost.mean[POSITION]))

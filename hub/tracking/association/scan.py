@@ -17,6 +17,7 @@ from hub.tracking.association.marginals import marginal_probabilities
 from hub.tracking.filter import kalman
 from hub.tracking.filter.detection_model import (
     detection_probability,
+    false_detections,
     independent_fraction,
     log_odds,
     posterior_existence,
@@ -148,7 +149,8 @@ def _evidence(
     if len(one.frame):
         scores = association_scores(one.frame, one.value, one.noise, there, predicted, ("",) * n, colour_std)
         expected = there.existence * probability
-        log_ratio = scores.log_ratio + np.log(expected / ((1.0 - expected) * one.statistics.clutter))[:, None]
+        clutter_rate = false_detections(one.statistics, there.kind)
+        log_ratio = scores.log_ratio + np.log(expected / ((1.0 - expected) * clutter_rate))[:, None]
         marginal, _ = marginal_probabilities(np.exp(np.minimum(log_ratio, 50.0)))
         detected = np.minimum(marginal.sum(axis=1), 1.0)
         if fixed is None:

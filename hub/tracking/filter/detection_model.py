@@ -21,6 +21,9 @@ _PROBABILITY = (0.1, 0.98)
 _CLUTTER = (0.02, 50.0)
 _NOISE = (0.5, 16.0)
 _PERSON = KIND_INDEX["person"]
+_OTHER_OBJECTS = 1e-3
+"""Expected detections of markers and vehicles that are not tracked: others are rare, so that even a poor fit is the
+target."""
 _UNSEEN_PROBABILITY = 0.02
 """Of detecting a target outside the picture, by the uncertainty of its position."""
 
@@ -39,6 +42,11 @@ def detection_probability(statistics: DetectionStatistics, visible: Floats, occl
     """The probability (n,) of detecting each target. visible: (n,) from `visible_fraction`."""
     full = np.where(occluded, statistics.occluded, statistics.clear)
     return np.asarray(np.maximum(full * visible, _UNSEEN_PROBABILITY))
+
+
+def false_detections(statistics: DetectionStatistics, kind: Ints) -> Floats:
+    """Expected false detections (n,) that may be taken for targets of each kind."""
+    return np.where(kind == _PERSON, statistics.clutter, np.minimum(statistics.clutter, _OTHER_OBJECTS))
 
 
 def independent_fraction(interval_s: float) -> float:

@@ -33,7 +33,7 @@ class TargetModel:
     manoeuvres_per_s: float = 0.0
 
 
-PERSON = TargetModel("person", True, 1.70, 0.07, 1.0, 0.3, 0.12, 0.035, 0.02, 0.035, 0.03)
+PERSON = TargetModel("person", True, 1.70, 0.07, 1.0, 0.5, 0.12, 0.035, 0.02, 0.035, 0.03)
 VEHICLE = TargetModel("vehicle", False, 1.8, 0.5, 6.0, 3.0, 0.0, 0.05)
 MARKER = TargetModel("marker", False, 0.1, 1.5, 1.5, 2.0, manoeuvre_std_m_s=4.0, manoeuvres_per_s=0.3)
 TARGET_MODELS = (PERSON, VEHICLE, MARKER)
