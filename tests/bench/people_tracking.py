@@ -25,8 +25,8 @@ from edge.scenes.people.scene import PeopleScene
 from hub.calibration.pipeline import calibrate
 from hub.tracking.calibration.people import PeopleTracklets
 from hub.tracking.detections import TrackingCamera
-from hub.tracking.parameters import TrackerParameters, track_label
 from hub.tracking.messages import prediction_message
+from hub.tracking.parameters import TrackerParameters, track_label
 from hub.tracking.tracker import Tracker
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.clocks import NANOSECONDS, TimeMap
