@@ -60,6 +60,7 @@ BENCHES = {
     "logs": Bench("logs: rates, kill -9, damage", ("--quick",)),
     "view": Bench("help, first calibration, first paint, what watching costs", ("--quick",)),
     "people_detector": Bench("people before one camera, beside MOG2 alone", ("--seeds", "1", "--seconds", "20")),
+    "people_clips": Bench("people counted in clips of a second or two", ("--seeds", "1")),
     "people_tracking": Bench(
         "people followed, what clocks are worth, walkers as markers", ("--quick", "--seconds", "30")
     ),

@@ -12,11 +12,15 @@ import numpy.typing as npt
 from protocols.geometry.types import Floats
 
 Image = npt.NDArray[np.uint8]
-_SPREAD_CELLS = 4  # cells per side of the image over which inlier corners must be spread to be the camera's motion
-_CORNERS = 400
-_TRAVEL_WIDTH = 320  # px: larger images are downscaled to this width
-_STATIC_PX, _STATIC_SHARE = 0.3, 0.4  # px; share of corners without motion at which the camera does not move
-_TRAVEL_PERIOD_S, _TRAVEL_WINDOW_S = 0.4, 2.0  # time between images that are compared, and over which motion adds up
+_SPREAD_CELLS, _MIN_SPREAD = 4, 0.4
+"""Cells per side of the image, and share of the cells in which corners must agree to show the camera's motion."""
+_CORNERS, _MIN_CORNERS = 400, 12  # tracked at most, at least
+_TRAVEL_WIDTH = 240  # px: larger images are downscaled to this width
+_STATIC_PX, _ALIKE_PX, _STATIC_SHARE = 0.5, 1.5, 0.3
+"""Motion of a cell that is none, and difference of two that agree [px]; share of cells without motion at which the
+camera has none.
+"""
+_TRAVEL_PERIOD_S, _TRAVEL_WINDOW_S = 0.5, 2.0  # time between images that are compared, and over which motion adds up
 _MAX_TRAVEL = 0.02
 """Over the image width: larger motion within the window is a moving camera; hands shake by 1 %."""
 
@@ -25,14 +29,13 @@ class ImageMotion:
     """Motion between consecutive images.
 
     motion: (3, 3) homography from the last image to this one; None = not known. shift: median motion of the corners
-    [px]. travel: the same as a vector (2,).
+    [px].
     """
 
     def __init__(self) -> None:
         self._last: Image | None = None
         self.motion: Floats | None = np.eye(3)
         self.shift = 0.0
-        self.travel: Floats = np.zeros(2)
 
     def estimate(self, image: Image) -> None:
         """Estimate the motion since the last image (H, W, 3) BGR."""
@@ -42,66 +45,95 @@ class ImageMotion:
         self._last = grey
 
     def _homography(self, last: Image, grey: Image) -> Floats | None:
-        self.shift, self.travel = 0.0, np.zeros(2)
-        corners = cv2.goodFeaturesToTrack(last, _CORNERS, 0.01, max(grey.shape[1] // 50, 6))
-        if corners is None or len(corners) < 12:
+        self.shift = 0.0
+        tracked = _tracked_corners(last, grey)
+        if tracked is None:
             return np.eye(3)  # without corners, a bare wall, no motion is observable
-        corners = np.asarray(corners, dtype=np.float32).reshape(-1, 1, 2)
-        guess = corners.copy()
-        moved, good, _ = cv2.calcOpticalFlowPyrLK(last, grey, corners, guess, winSize=(17, 17), maxLevel=3)
-        kept = good.ravel() == 1
-        before, after = corners[kept].reshape(-1, 2), np.asarray(moved)[kept].reshape(-1, 2)
-        if len(before) < 12:
+        before, after = tracked
+        if len(before) < _MIN_CORNERS:
             self.shift = math.nan
             return None
-        if np.mean(np.linalg.norm(after - before, axis=1) < _STATIC_PX) > _STATIC_SHARE:
-            return np.eye(3)  # others are moving objects, or noise
         motion, inliers = cv2.findHomography(before, after, cv2.RANSAC, 1.0)
         if motion is None or inliers is None or inliers.sum() < max(10, 0.3 * len(before)):
             self.shift = math.nan
             return None
         own = inliers.ravel() == 1
-        cells = np.unique(
-            (before[own] * _SPREAD_CELLS / np.array(grey.shape[::-1])).astype(int) @ np.array([1, _SPREAD_CELLS])
-        )
-        if len(cells) < 0.4 * _SPREAD_CELLS**2:
+        if len(np.unique(_cells(before[own], grey.shape))) < _MIN_SPREAD * _SPREAD_CELLS**2:
             return np.eye(3)  # the corners of one object are not the camera's motion
         self.shift = float(np.median(np.linalg.norm(after[own] - before[own], axis=1)))
-        self.travel = np.asarray(np.median(after[own] - before[own], axis=0), dtype=np.float64)
         return np.asarray(motion, dtype=np.float64)
 
 
-class CameraTravel:
-    """Decides from a camera's images whether it moves: pans, drives or flies, in contrast to shaking in place.
+def _tracked_corners(last: Image, grey: Image) -> tuple[Floats, Floats] | None:
+    """Corners (n, 2) [px] of the last image (H, W), and their places (n, 2) in this one; None without corners."""
+    corners = cv2.goodFeaturesToTrack(last, _CORNERS, 0.01, max(grey.shape[1] // 50, 6))
+    if corners is None or len(corners) < _MIN_CORNERS:
+        return None
+    corners = np.asarray(corners, dtype=np.float32).reshape(-1, 1, 2)
+    guess = corners.copy()
+    moved, good, _ = cv2.calcOpticalFlowPyrLK(last, grey, corners, guess, winSize=(17, 17), maxLevel=3)
+    kept = good.ravel() == 1
+    return corners[kept].reshape(-1, 2), np.asarray(moved)[kept].reshape(-1, 2)
 
-    share: of the time in which it moved, 0..1.
-    """
+
+def _cells(corners: Floats, shape: tuple[int, ...]) -> npt.NDArray[np.intp]:
+    """The cell (n,) of an image (H, W) in which each corner (n, 2) [px] is."""
+    at = (corners * _SPREAD_CELLS / np.array(shape[1::-1])).astype(np.intp)
+    return np.asarray(at @ np.array([1, _SPREAD_CELLS]), dtype=np.intp)
+
+
+class CameraTravel:
+    """Decides from a camera's images whether it moves: pans, drives or flies, in contrast to shaking in place."""
 
     def __init__(self) -> None:
-        self._motion = ImageMotion()
+        self._last: Image | None = None
         self._places: deque[tuple[float, Floats]] = deque()
         self._samples = self._moved = 0
 
     @property
     def share(self) -> float:
+        """Share (0..1) of the time in which it moved."""
         return self._moved / max(self._samples, 1)
 
     def moves(self, image: Image, now: float) -> bool:
         """Whether the camera moves in an image (H, W, 3) BGR at a time [s]."""
-        if self._places and 0.0 <= now - self._places[-1][0] < _TRAVEL_PERIOD_S:
+        since = now - self._places[-1][0] if self._places else math.inf
+        if 0.0 <= since < _TRAVEL_PERIOD_S:
             return self._is_away()
-        if self._places and not 0.0 <= now - self._places[-1][0] < _TRAVEL_WINDOW_S:
-            self.__init__()  # type: ignore[misc]
+        if not 0.0 <= since < _TRAVEL_WINDOW_S:
+            self._places.clear()
         size = _TRAVEL_WIDTH, max(round(_TRAVEL_WIDTH * image.shape[0] / image.shape[1]), 1)
-        self._motion.estimate(np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8))
-        place = self._places[-1][1] if self._places else np.zeros(2)
-        self._places.append((now, place + self._motion.travel))
+        small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), size, interpolation=cv2.INTER_AREA)
+        grey = np.asarray(small, dtype=np.uint8)
+        step = self._step(grey) if self._places else np.zeros(2)
+        self._last = grey
+        self._places.append((now, self._places[-1][1] + step if self._places else step))
         while now - self._places[0][0] > _TRAVEL_WINDOW_S:
             self._places.popleft()
         away = self._is_away()
         self._samples += 1
         self._moved += away
         return away
+
+    def _step(self, grey: Image) -> Floats:
+        """Motion (2,) [px] since the last image (H, W) that corners all over the image have in common.
+
+        No homography: noise makes its search slow.
+        """
+        assert self._last is not None
+        tracked = _tracked_corners(self._last, grey) if self._last.shape == grey.shape else None
+        if tracked is None or len(tracked[0]) < _MIN_CORNERS:
+            return np.zeros(2)
+        cells = _cells(tracked[0], grey.shape)
+        moved = np.array([np.median((tracked[1] - tracked[0])[cells == one], axis=0) for one in np.unique(cells)])
+        step = np.median(moved, axis=0)
+        alike = int(np.sum(np.linalg.norm(moved - step, axis=1) < _ALIKE_PX))
+        if (
+            alike < _MIN_SPREAD * _SPREAD_CELLS**2
+            or np.mean(np.linalg.norm(moved, axis=1) < _STATIC_PX) > _STATIC_SHARE
+        ):
+            return np.zeros(2)  # moving objects, or noise
+        return np.asarray(step, dtype=np.float64)
 
     def _is_away(self) -> bool:
         places = np.array([place for _, place in self._places])

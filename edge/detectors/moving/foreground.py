@@ -281,16 +281,16 @@ class BackgroundSubtractor:
         x, y, w, h = cv2.boundingRect(foreground)
         if w == 0:
             return foreground
-        size = 2 * round(_SWAY * foreground.shape[1]) + 3
+        part, size = (slice(y, y + h), slice(x, x + w)), 2 * round(_SWAY * foreground.shape[1]) + 3
+        mask, box = foreground[part], np.ones((size, size), np.uint8)
+        alone = cv2.subtract(mask, cv2.dilate(cv2.erode(mask, box), np.ones((3 * size, 3 * size), np.uint8)))
+        if not cv2.countNonZero(alone):
+            return foreground
         if self._background_range is None:
-            box, noise = np.ones((size, size), np.uint8), np.full_like(self._background, _SWAY_STEP)
             low, high = cv2.erode(self._background, box), cv2.dilate(self._background, box)
+            noise = np.full_like(self._background, _SWAY_STEP)
             darkest, brightest = cv2.subtract(low, noise), cv2.add(high, noise)
             self._background_range = np.asarray(darkest, dtype=np.uint8), np.asarray(brightest, dtype=np.uint8)
-        part = slice(y, y + h), slice(x, x + w)
-        mask = foreground[part]
-        core = cv2.erode(mask, np.ones((size, size), np.uint8))
-        alone = cv2.bitwise_not(cv2.dilate(core, np.ones((3 * size, 3 * size), np.uint8)))
         moved = cv2.inRange(compensated[part], *(one[part] for one in self._background_range))
         kept = foreground.copy()
         kept[part] = cv2.subtract(mask, cv2.bitwise_and(moved, alone))

@@ -23,7 +23,7 @@ from edge.detectors.moving.foreground import BackgroundSubtractor, ForegroundMas
 from edge.detectors.moving.tracklets import ImageTracklet, ShortTermTracker
 from edge.detectors.people.height_model import HeightModel
 from edge.detectors.people.segmentation import segment_people
-from edge.detectors.people.silhouettes import IsolatedPeople, PersonSilhouette
+from edge.detectors.people.silhouettes import BULK, IsolatedPeople, PersonSilhouette
 from protocols.geometry.types import Floats
 
 Image = npt.NDArray[np.uint8]
@@ -217,7 +217,9 @@ class PersonDetector:
             if body.isolated and not body.truncated and self._height_model.is_fitted:
                 model_height = float(self._height_model.heights_at(np.array(x + 0.5 * w), np.array(y + h)))
                 tracklet.update_height(h / model_height)
-            learns = (tracklet.moved and not fitted) or self._foreground.bootstrapping
+            # While the background is learnt, a person and the ghost of the starting place are one broader silhouette.
+            moves = tracklet.moved and body.fill * w < BULK * h
+            learns = self._foreground.bootstrapping or (moves and not fitted)
             if learns and h > _FRAGMENT_HEIGHT * tallest and not body.truncated:
                 self._height_model.add_tentative(x + 0.5 * w, y + h, h)
             if tracklet.time < now or tracklet.hits == 1:

@@ -15,9 +15,11 @@ from protocols.geometry.types import Bools, Floats
 
 Image = npt.NDArray[np.uint8]
 WORK_HEIGHT = 64.0  # px: images of taller people are downscaled to this height
-_LOW, _HIGH, _BROAD, _BULK, _HEAD, _SLENDER = 0.85, 1.17, 0.62, 0.28, 0.22, 0.34
-"""Of one whole silhouette: height over the height model; breadth, area over height, breadth of the head, and breadth up
-to which the shape is not tested, over the height.
+BULK = 0.28
+"""Largest area of one person over the square of the height."""
+_LOW, _HIGH, _BROAD, _HEAD, _SLENDER = 0.85, 1.17, 0.62, 0.22, 0.34
+"""Of one whole silhouette: height over the height model; breadth, breadth of the head, and breadth up to which the
+shape is not tested, over the height.
 """
 _FRAGMENT_HEIGHT, _FRAGMENT_BESIDE, _FRAGMENT_ALONG = 0.6, 0.15, 0.6
 """Over the height of a silhouette: largest height of its fragments, and their largest distance from it, across and
@@ -25,7 +27,7 @@ along.
 """
 _MIN_TEMPLATE_OVERLAP = 0.7  # overlap of template and silhouette of an isolated person, over either
 _SLIM, _STOUT = 1.15, 7.0  # height over breadth of an isolated person, without a height model
-_FRAGMENT_GAP, _MIN_UNION_FIT = 0.25, 0.28
+_FRAGMENT_GAP, _MIN_UNION_FIT = 0.15, 0.28
 """Largest gap between fragments of a person over the height, and smallest gain of their common template over its area:
 as of a template that is kept (``occupancy``).
 """
@@ -259,7 +261,7 @@ def as_single_person(
         return None
     model_height = float(height_model.heights_at(np.array([box[0] + 0.5 * w]), np.array([box[1] + h]))[0])
     fill = cv2.countNonZero(mask) / (w * h)
-    if not (_LOW * model_height < h < _HIGH * model_height and w < _BROAD * h and fill * w < _BULK * h):
+    if not (_LOW * model_height < h < _HIGH * model_height and w < _BROAD * h and fill * w < BULK * h):
         return None
     # Two heads side by side are broader than one, whatever the legs' pose.
     head = np.flatnonzero(mask[y : y + max(round(0.12 * h), 2), x : x + w].any(axis=0))
