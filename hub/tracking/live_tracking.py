@@ -30,6 +30,9 @@ _TYPICAL_SPACING_M = 5.0
 """Assumed distance of cameras if the scale is unknown, until it is estimated from the heights of people."""
 _POSITION_TOLERANCE, _ANGLE_TOLERANCE = 1e-6, 1e-6
 _UP_EVERY_FRAMES = 20
+_WAIT = 0.25
+"""Of a frame interval above ``_SLOW_S``: how long an instant's other cameras are awaited after the last arrival."""
+_SLOW_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +64,8 @@ class LiveTracking:
         self._predictions = 0
         self._next = -float("inf")
         self._published_ns: int | None = None
+        self._published_steps = self._seen_steps = 0
+        self._seen_at = 0.0
         self._published: set[int] = set()
         self._used_frames = 0
         self._clock: tuple[str, str] | None = None
@@ -155,10 +160,16 @@ class LiveTracking:
         """Track and prediction messages of people, vehicles and unlabelled markers."""
         if now < self._next or not self.tracker.cameras or not self.has_detections:
             return []
-        self._next = now + self.settings.interval_s
         state = self.tracker.advance()
-        if state.time_ns is None or state.time_ns == self._published_ns:
+        steps = self.tracker.counters["track.steps"]
+        if state.time_ns is None or steps == self._published_steps:
             return []
+        if steps != self._seen_steps:
+            self._seen_steps, self._seen_at = steps, now
+        slow = state.interval_s > _SLOW_S
+        if slow and not state.scan_complete and now - self._seen_at < _WAIT * state.interval_s:
+            return []  # at few frames a second, the cameras of an instant are awaited
+        self._next, self._published_steps = now + self.settings.interval_s, steps
         published_ns, self._published_ns = self._published_ns, state.time_ns
         every_ns = round(self.settings.interval_s * NANOSECONDS)
         # If a busy machine delayed the hub, the missed times are published now, so that tracks have no gaps.

@@ -32,7 +32,8 @@ def track_messages(
     """Messages of confirmed and coasting targets at a reference time, then of the lost tracks."""
     out: list[pb.Track] = []
     angles = headings(targets.mean, parameters)
-    for i in np.flatnonzero(targets.confirmed).tolist():
+    # A track that is as likely to have ended is not published, until it is seen again or lost.
+    for i in np.flatnonzero(targets.confirmed & (targets.existence >= 0.5)).tolist():
         mean, covariance, model = targets.mean[i], targets.covariance[i], TARGET_MODELS[int(targets.kind[i])]
         unseen = max(time_ns - int(targets.seen_ns[i]), 0) / NANOSECONDS
         message = pb.Track(

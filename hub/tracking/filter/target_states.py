@@ -10,6 +10,7 @@ import numpy as np
 from hub.tracking.detections import FrameDetections
 from hub.tracking.filter.floor import Floor
 from hub.tracking.filter.kalman import STATE_DIM
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -153,6 +154,15 @@ class MultiTargetState:
     colour_variance: float = 400.0
     statistics: dict[str, DetectionStatistics] = field(default_factory=dict)
     scan: Scan | None = None
+
+    @property
+    def scan_complete(self) -> bool:
+        """Whether every camera that had a frame lately has one in the scan."""
+        if self.scan is None or self.time_ns is None:
+            return False
+        recent_ns = round(1.5 * self.interval_s * NANOSECONDS)
+        recent = {name for name, time_ns in self.last_frame_ns.items() if self.time_ns - time_ns <= recent_ns}
+        return recent <= {one.frame.camera.name for one in self.scan.frames}
 
     @property
     def interval_s(self) -> float:
