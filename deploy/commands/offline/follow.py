@@ -87,14 +87,13 @@ def follow(
         check_folder(crops)
         if kind != "person":
             raise InputError("--crops shows heads and torsos of people", remedy="leave it out for vehicles")
-    from hub.tracking.offline import follow as follow_observations
-
     from deploy.evaluation.tracking_scores import parse_area, read_ground_truth, score_tracks
     from deploy.offline.follow.calibration import read_given_calibration
     from deploy.offline.follow.crops import check_pictures, write_crops
     from deploy.offline.follow.report import follow_report
     from deploy.offline.follow.results import REPORT, RESULT, TRACKS, result_document, result_text, tracks_text
     from deploy.offline.follow.source import read_follow_input
+    from hub.tracking.offline import follow as follow_observations
     from protocols.core.clocks import NANOSECONDS
     from protocols.session.rig import METRES_PER_UNIT
 

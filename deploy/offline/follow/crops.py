@@ -24,11 +24,10 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import METRES_PER_UNIT
 
 if TYPE_CHECKING:
-    from hub.tracking.offline import FollowedTrack
-
     from deploy.offline.follow.calibration import GivenCalibration
     from deploy.offline.follow.source import FollowInput
     from edge.devices.base import Image
+    from hub.tracking.offline import FollowedTrack
 
 Progress = Callable[[str, float], None]
 _HEAD_MARGIN = 1.3

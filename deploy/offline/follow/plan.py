@@ -13,9 +13,8 @@ from hub.report.svg import THIN, at, drawing, esc, line, number, points, round_b
 from protocols.geometry.types import Floats
 
 if TYPE_CHECKING:
-    from hub.tracking.offline import FollowedTrack
-
     from deploy.offline.follow.calibration import GivenCalibration
+    from hub.tracking.offline import FollowedTrack
 
 _WIDTH, _MARGIN = 1000.0, 44.0
 _SMALL = 320.0

@@ -17,10 +17,9 @@ from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats
 
 if TYPE_CHECKING:
-    from hub.tracking.offline import FollowedTrack, FollowResult
-
     from deploy.offline.follow.calibration import GivenCalibration
     from deploy.offline.follow.source import FollowInput
+    from hub.tracking.offline import FollowedTrack, FollowResult
 
 _WIDTH, _LEFT, _RIGHT = 1000.0, 130.0, 70.0
 _MAX_ROWS = 150

@@ -11,9 +11,8 @@ import numpy as np
 from protocols.core.version import VERSION
 
 if TYPE_CHECKING:
-    from hub.tracking.offline import FollowedTrack, FollowResult
-
     from deploy.offline.follow.calibration import GivenCalibration
+    from hub.tracking.offline import FollowedTrack, FollowResult
 
 TRACKS, RESULT, REPORT = "tracks.csv", "result.json", "report.html"
 HEADER = "time,id,kind,state,x,y,z,height,std"
