@@ -138,6 +138,13 @@ class DemoProcesses:
                         process.wait()
         return live
 
+    def check_calibrated(self) -> None:
+        """Raise Refused with the hub's last words if it ended without a calibration."""
+        if not (self.out / "calibration.toml").exists():
+            raise Refused(
+                f"no calibration from {self.settings.seconds:g} s ({self._last_line('hub')}): give more --seconds"
+            )
+
     def _make_listener(self, bus: Bus) -> Callable[[DemoProgress], None]:
         """A function that polls further topics of a scene's demo; called in every cycle."""
         return lambda live: None

@@ -419,10 +419,10 @@ class LiveHub:
         if missing:
             self._revision += 1
             return [self._waiting(missing, "collecting")]
-        return self._submit(now)
+        return self._submit(now, final)
 
-    def _submit(self, now: float) -> list[Message]:
-        """Hand the present observations to the solver."""
+    def _submit(self, now: float, final: bool) -> list[Message]:
+        """Hand the present observations to the solver; a final job searches for every camera that is not tied."""
         try:
             rig, observations = self._build_session()
         except Refused as refusal:
@@ -444,10 +444,10 @@ class LiveHub:
         rows = len(observations)
         arrivals = {name: p for name, p in self._arrivals.priors().items() if p.boot_id == boots.get(name)}
         untied = last is None or any(name not in last.cameras for name in observations.cameras)
-        search = untied and now >= self._next_search
+        search = untied and (final or now >= self._next_search)
         if last is None and arrivals and not self._next_full:
             self._next_full = now + _FIRST_FULL_S
-        full = (search and now >= self._next_full) or (last is not None and rows > _FULL_GROWTH * self._full_rows)
+        full = (search and (final or now >= self._next_full)) or (last is not None and rows > _FULL_GROWTH * self._full_rows)
         if search:
             self._next_search = now + _SEARCH_EVERY_S
         if full:

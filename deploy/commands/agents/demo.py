@@ -89,6 +89,7 @@ def demo(
     fleet = DemoProcesses(settings)
     with _ProgressDisplay(seconds, fleet.names, quiet=json) as show:
         live = fleet.run(show)
+    fleet.check_calibrated()
     comparison = compare_with_truth(out, scene, seed, cameras)
     if json:
         print(comparison.as_json(live.first_calibration_s))

@@ -272,3 +272,19 @@ def test_more_rows_replace_an_answer_whatever_their_stds_and_the_session_is_the_
     assert hub.counters["not_better"] == 0
     assert hub.calibration.cameras["cam1"].position_std.max() > 1e-7 * early.cameras["cam1"].position_std.max()
     assert len(hub.session[1]) > 1.5 * rows
+
+
+def test_a_last_job_searches_for_every_camera_that_is_not_tied(session: Session) -> None:
+    """A hub that is stopped soon after a search must not leave a camera out that waits for the next one."""
+    hub = LiveHub(SETTINGS)
+    stream = messages(session)
+    late = [m for m in stream if isinstance(m, pb.Observation) and m.camera == "cam2"]
+    early = [m for m in stream if not (isinstance(m, pb.Observation) and m.camera == "cam2")]
+    for message in early:
+        hub.handle(message)
+    hub.tick(10.0)
+    assert hub.calibration is not None
+    for message in late:
+        hub.handle(message)
+    hub.tick(10.5, final=True)
+    assert set(hub.calibration.cameras) == {"cam0", "cam1", "cam2"}
