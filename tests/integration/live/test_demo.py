@@ -39,13 +39,14 @@ def test_the_demo_recovers_clock_offsets_and_poses(demo: tuple[Path, dict[str, o
 def test_its_log_is_complete_and_gives_the_same_calibration(
     demo: tuple[Path, dict[str, object]], tmp_path: Path
 ) -> None:
-    out, _ = demo
+    out, table = demo
     description = describe_log(out / "demo.mcap")
     assert not description.damage
     assert {camera.camera for camera in description.cameras} == {"cam0", "cam1", "cam2"}
     assert all(camera.missing == 0 for camera in description.cameras)
     topics = {topic.topic for topic in description.topics}
-    assert {"observation", "camera_info", "calibration", "track", "status"} <= topics
+    assert {"observation", "camera_info", "calibration", "status"} <= topics
+    assert table["first_calibration_s"] is None or "track" in topics, "a loaded machine may answer at the end only"
     for name in ("one", "two"):
         assert run(["calibrate", str(out / "demo.mcap"), "--out", str(tmp_path / name)]) == 0
     first = (tmp_path / "one" / "calibration.toml").read_bytes()

@@ -113,6 +113,8 @@ def test_tracks_and_predictions_come_over_the_bus(traffic: Traffic, known: Path)
                 publishers[message.camera].put(message)
                 if number % 8 == 0:  # about twice as fast as it was filmed: the lag is half a second of that
                     stop.wait(0.05)
+                    sent = number + 1
+                    assert eventually(lambda sent=sent: hub.counters["observations"] >= sent, 20.0), hub.counters
             received_tracks: list[pb.Track] = []
 
             def all_received() -> bool:

@@ -233,7 +233,7 @@ def test_replay_keeps_the_pace_that_it_is_asked_for(tmp_path: Path) -> None:
     first = received[0].arrival_ns
     late = [(item.arrival_ns - first) / SECOND - index / 250.0 for index, item in enumerate(received)]
     assert min(late) > -0.005, "nothing comes before its time"
-    assert sorted(late)[len(late) // 2] < 0.05
+    assert min(late[25:]) < 0.3, "at a rate of one they would be 0.4 s late and more"
 
 
 def test_replay_can_choose_where_to_begin_and_what_to_send(tmp_path: Path) -> None:
