@@ -447,7 +447,9 @@ class LiveHub:
         search = untied and (final or now >= self._next_search)
         if last is None and arrivals and not self._next_full:
             self._next_full = now + _FIRST_FULL_S
-        full = (search and (final or now >= self._next_full)) or (last is not None and rows > _FULL_GROWTH * self._full_rows)
+        full = (search and (final or now >= self._next_full)) or (
+            last is not None and rows > _FULL_GROWTH * self._full_rows
+        )
         if search:
             self._next_search = now + _SEARCH_EVERY_S
         if full:
