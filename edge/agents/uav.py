@@ -214,7 +214,8 @@ class UavAgent:
             state = "degraded"
             message = f"no heartbeat received: {link.problem}" if link.problem else "no heartbeat received yet"
         elif not ended and link_silent_s > LINK_STALE_S:
-            state, message = "degraded", f"the vehicle is silent for {link_silent_s:.0f} s {reason}".rstrip()
+            state, message = "degraded", f"the vehicle is silent for {link_silent_s:.0f} s"
+            message += f": {reason}" if reason else ""
         elif not ended:
             problem = vehicle.problem(self._now_ns()) or reason
             state = "degraded" if problem.startswith("no attitude") else state

@@ -89,6 +89,7 @@ class Link:
         self._reply_address: Address | None = None
         self._fixed = vehicle is not None
         self._identity = Evidence()
+        self._first: tuple[Address, int, Evidence] | None = None
         self._candidates: dict[tuple[Address, int], Evidence] = {}
         self._conflict = (-_CONFLICT_SHOWN_NS, "")
         self.vehicle = vehicle
@@ -183,7 +184,8 @@ class Link:
 
     def _process(self, data: bytes, address: Address, now: int) -> list[ReceivedMessage]:
         self.counters["bytes"] += len(data)
-        if self._address is not None and address != self._address and now - self.last_received_ns <= _SILENT_NS:
+        silent = now - self.last_received_ns > _SILENT_NS
+        if self._address not in (None, address) and not silent and (self._first is None or address != self._first[0]):
             self.counters["refused.address"] += 1
             self._conflict = (now, f"{address[0]}:{address[1]} sends as well, and is not followed")
             return []
@@ -260,9 +262,12 @@ class Link:
         if len(self._candidates) > _MAX_SENDERS:
             del self._candidates[min(self._candidates, key=lambda one: self._candidates[one].heard_ns)]
         silent_ns = now - self.last_received_ns
-        if silent_ns <= _SILENT_NS:
+        returned = self._is_first(key, candidate, now)
+        if silent_ns <= _SILENT_NS and not returned:
             return  # another vehicle behind the same router
-        if self._fixed and system != self.vehicle:
+        if returned:
+            objection = ""
+        elif self._fixed and system != self.vehicle:
             objection = "vehicle is set in the configuration"
         elif self._signing is not None:
             objection = "" if beats or system == self.vehicle else "no heartbeat yet"
@@ -279,7 +284,16 @@ class Link:
         self.last_received_ns = now
         self.counters["handed_over"] += 1
 
+    def _is_first(self, key: tuple[Address, int], candidate: Evidence, now: int) -> bool:
+        """Whether the vehicle is back where it was first: who was followed meanwhile only resembled it."""
+        if self._first is None or key != self._first[:2] or key == (self._address, self.vehicle):
+            return False
+        known = self._first[2]
+        return known.offset_ns is None or not known.objection(candidate, now, same_system=True)
+
     def _lock_to(self, address: Address, system: int, identity: Evidence) -> None:
+        if self._first is None or (address, system) == self._first[:2]:
+            self._first = (address, system, identity)
         self._address, self.vehicle, self._identity = address, system, identity
         self._candidates.clear()
         self._conflict, self.problem = (-_CONFLICT_SHOWN_NS, ""), ""

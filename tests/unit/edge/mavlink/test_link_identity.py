@@ -67,10 +67,11 @@ class LinkUnderTest:
         boot_s: float = 500.0,
         place: tuple[int, int] | None = HOME,
         behind_s: float = 0.0,
+        telemetry: bool = True,
     ) -> float | None:
         """An autopilot sends for some time at 10 Hz; when it was first accepted, after its start [s].
 
-        boot_s: its uptime at time 0. behind_s: how far its signing time is behind.
+        boot_s: its uptime at time 0. behind_s: how far its signing time is behind. telemetry: not only heartbeats.
         """
         codec = mavlink.MAVLink(None, system, 1)
         if self.key is not None:
@@ -80,10 +81,10 @@ class LinkUnderTest:
             if self.key is not None:
                 codec.signing.timestamp = ticks(UNIX_S + self.now - behind_s)
             boot_ms = round(1e3 * (boot_s + self.now))
-            messages = [mavlink.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0)]
+            messages = [mavlink.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0)] if telemetry else []
             if k % 10 == 0:
                 messages.insert(0, mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
-            if place is not None and k % 2 == 0:
+            if telemetry and place is not None and k % 2 == 0:
                 messages.append(mavlink.MAVLink_global_position_int_message(boot_ms, *place, 500000, 20000, 0, 0, 0, 0))
             self.socket.waiting = [(bytes(message.pack(codec)), address) for message in messages]
             got = self.link.poll()
@@ -133,6 +134,20 @@ def test_an_unsigned_stranger_never_takes_the_link_and_the_vehicle_gets_it_back(
     back = under_test.autopilot(B, 3.0)
     assert back is not None
     assert back <= 0.2
+
+
+@pytest.mark.parametrize("telemetry", [True, False])
+def test_a_vehicle_that_is_back_at_its_address_gets_the_link_from_whoever_resembled_it(telemetry: bool) -> None:
+    under_test = LinkUnderTest()
+    under_test.autopilot(A, 3.0, telemetry=telemetry)
+    under_test.silence(12.0)
+    assert under_test.autopilot(C, 3.0, telemetry=telemetry) is not None  # nothing tells it from the vehicle
+    for _ in range(3):
+        under_test.autopilot(A, 0.5, telemetry=telemetry)
+        under_test.received.clear()
+        under_test.autopilot(C, 0.5, telemetry=telemetry)
+        assert under_test.received == []
+    assert under_test.report() == "10.0.0.9:5000 sends as well, and is not followed"
 
 
 def test_a_stranger_beside_the_vehicle_is_reported_and_not_followed() -> None:

@@ -130,6 +130,40 @@ def test_a_gimbal_with_its_own_clock_is_mapped_by_itself(ahead_s: float, flags: 
     assert under_test.vehicle.problem(2_000_000_000) == ""
 
 
+@pytest.mark.parametrize("gimbal", [True, False])
+@pytest.mark.parametrize("back_s", [0.3, 0.9, 1.5, 3.0, 50.0, 122.0])
+def test_a_clock_that_is_set_back_is_followed_within_three_seconds(back_s: float, gimbal: bool) -> None:
+    under_test = VehicleUnderTest(gimbal=gimbal)
+    errors: list[tuple[float, float]] = []
+    for k in range(160):
+        time_s, ahead_s = 0.05 * k, -back_s if k >= 80 else 0.0
+        samples = under_test.gimbal(time_s, ahead_s) if gimbal else under_test.attitude(time_s, ahead_s=ahead_s)
+        errors += [(time_s, abs(1e-9 * sample.host_ns - time_s)) for sample in samples]
+    late = [error for time_s, error in errors if time_s > 7.0]
+    assert len(late) == 20 - 1
+    assert max(late) < 0.02
+    assert sum(under_test.vehicle.clock_resets) == 1
+
+
+@pytest.mark.parametrize("gimbal", [True, False])
+def test_a_source_that_does_not_stamp_is_as_late_as_the_link(gimbal: bool) -> None:
+    under_test = VehicleUnderTest(gimbal=gimbal)
+    for k in range(100):
+        send = under_test.gimbal if gimbal else under_test.attitude
+        samples = send(0.1 * k, ahead_s=-BOOT_S - 0.1 * k)
+        assert [round(1e-9 * sample.host_ns - 0.1 * k, 3) for sample in samples] == [DELAY_S]
+    assert under_test.vehicle.problem(10_000_000_000) == ""
+
+
+def test_on_the_airframe_a_gimbal_is_not_listened_to() -> None:
+    under_test = VehicleUnderTest()
+    for k in range(40):
+        under_test.attitude(0.1 * k)
+        under_test.gimbal(0.1 * k, 45.0 if k < 20 else 0.0, GIMBAL if k % 2 else AUTOPILOT)
+    assert under_test.vehicle.clock_resets == (0, 0)
+    assert under_test.vehicle.problem(4_000_000_000) == ""
+
+
 def test_a_second_gimbal_is_not_mixed_with_the_first_and_takes_over_when_that_is_silent() -> None:
     under_test = VehicleUnderTest(gimbal=True)
     for k in range(10):
@@ -175,7 +209,7 @@ def test_whatever_numbers_the_vehicle_sends_nothing_raises_and_every_sample_is_b
     for k in range(3000):
         now = 10**9 + k * 10_000_000
         number, integer = partial(rng.choice, big), partial(rng.choice, whole)
-        boot = rng.choice((k * 10, k * 10, rng.randrange(2**32), 0, 2**32 - 1))
+        boot = rng.choice((k * 10, k * 10, rng.randrange(2**32), 0, 2**32 - 1)) if k > 10 else 1 + k * 10
         q = rng.choice(([1.0, 0.0, 0.0, 0.0], [number() for _ in range(4)]))
         message = rng.choice(
             (
