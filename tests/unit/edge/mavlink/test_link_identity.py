@@ -9,6 +9,7 @@ import pytest
 from edge.mavlink.dialect import mavlink
 from edge.mavlink.link.connection import Link
 from edge.mavlink.link.signing import TICKS, Signing, ticks
+from tests.faults.stations import exchanged
 
 A, B, C = ("10.0.0.1", 5000), ("10.0.0.1", 6000), ("10.0.0.9", 5000)
 KEY = bytes(range(32))
@@ -110,6 +111,9 @@ def test_a_restarted_router_is_followed_to_its_new_port_within_two_seconds(down_
     assert relocked is not None
     assert relocked <= 2.0
     assert under_test.link.counters["handed_over"] == 1
+    exchanged(
+        "mavlink-router, udpin", f"away for {down_s:g} s, back on another port", f"heard again after {relocked:.1f} s"
+    )
 
 
 @pytest.mark.parametrize(
@@ -134,6 +138,11 @@ def test_an_unsigned_stranger_never_takes_the_link_and_the_vehicle_gets_it_back(
     back = under_test.autopilot(B, 3.0)
     assert back is not None
     assert back <= 0.2
+    exchanged(
+        "second autopilot, unsigned",
+        f"in a silence of 12 s: {' '.join(f'{key} {value}' for key, value in stranger.items())}",
+        f'not followed, "… {why} …"',
+    )
 
 
 @pytest.mark.parametrize("telemetry", [True, False])
@@ -174,6 +183,7 @@ def test_a_changed_system_id_is_followed_once_the_old_one_is_silent() -> None:
     assert changed is not None
     assert 1.0 < changed <= 2.0
     assert under_test.link.vehicle == 7
+    exchanged("autopilot, unsigned", "its system id changes", f"followed after {changed:.1f} s")
     fixed = LinkUnderTest(vehicle=1)
     fixed.autopilot(A, 3.0)
     assert fixed.autopilot(A, 4.0, system=7) is None
@@ -199,6 +209,7 @@ def test_a_signed_autopilot_a_day_behind_is_named_and_answered() -> None:
     assert int.from_bytes(data[-12:-6], "little") >= ticks(UNIX_S)
     assert under_test.autopilot(A, 1.0) == 0.0
     assert under_test.link.problem == ""
+    exchanged("signed autopilot, udpin", "its clock a day behind", "named, answered, followed once it has the time")
 
 
 @pytest.mark.parametrize(("key", "why"), [(None, "does not sign"), (bytes(32), "signs with another key")])
