@@ -80,15 +80,12 @@ class Vehicle:
         self._first_s: float | None = None
         self._resets = (0, 0)
 
-    @property
-    def velocity(self) -> Floats | None:
-        """Velocity of the vehicle, (3,) NED [m/s]."""
-        return None if self._last_position is None else self._last_position[2]
-
-    @property
-    def position(self) -> Floats | None:
-        """Position of the vehicle, (3,) NED [m] from ``origin``."""
-        return None if self._last_position is None else self._last_position[1]
+    def motion_at(self, time_s: float) -> tuple[Floats, Floats] | None:
+        """Position from ``origin`` and velocity (3,) NED [m, m/s] at a host time; None if not known for a second."""
+        if self._last_position is None or abs(time_s - self._last_position[0]) >= _MAX_POSITION_AGE_S:
+            return None
+        at, position, velocity = self._last_position
+        return np.asarray(position + (time_s - at) * velocity), velocity
 
     @property
     def clock_resets(self) -> tuple[int, int]:
@@ -259,10 +256,7 @@ class Vehicle:
             self.counters["order"] += 1
             return []
         self._sample_s = time
-        position = velocity = None
-        if self._last_position is not None and abs(time - self._last_position[0]) < _MAX_POSITION_AGE_S:
-            velocity = self._last_position[2]
-            position = np.asarray(self._last_position[1] + (time - self._last_position[0]) * velocity)
+        position, velocity = self.motion_at(time) or (None, None)
         vehicle_ns = host_ns + (self.clock.offset_ns if self.clock.known else clock.offset_ns)
         self.mount = MountSample(host_ns, vehicle_ns, clock.std_s, rotation, position, velocity)
         return [self.mount]

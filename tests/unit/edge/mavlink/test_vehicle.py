@@ -174,6 +174,24 @@ def test_a_second_gimbal_is_not_mixed_with_the_first_and_takes_over_when_that_is
     assert len(under_test.gimbal(3.6, 0.0, AUTOPILOT)) == 1
 
 
+def test_a_position_that_is_no_longer_reported_is_not_known_after_a_second() -> None:
+    under_test = VehicleUnderTest()
+    for k in range(20):
+        under_test.position(0.1 * k)
+        under_test.attitude(0.1 * k)
+    motion = under_test.vehicle.motion_at(2.4)
+    assert motion is not None
+    assert motion[0] == pytest.approx([24.0, 0.0, -50.0], abs=0.2)
+    for k in range(20, 40):
+        samples = under_test.attitude(0.1 * k)
+    assert samples[0].position is None
+    assert under_test.vehicle.motion_at(4.0) is None
+    status = CameraMessages((640, 480), 30.0, None, None, (0, 1, 0)).status
+    update_tracking_status(status, None, under_test.vehicle, (640, 480), None, np.eye(3), 4 * 10**9)
+    assert status.camera is None
+    assert status.quaternion is not None
+
+
 def test_a_gimbal_that_never_reports_is_named() -> None:
     under_test = VehicleUnderTest(gimbal=True)
     for k in range(40):
