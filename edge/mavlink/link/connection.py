@@ -173,7 +173,7 @@ class Link:
                 self._codec.srcSystem = self.vehicle
             data = bytes(message.pack(self._codec))
             try:
-                if not self._transport.send(data, self._address or self._reply_address):
+                if not self._transport.send(data, self._reply_address or self._address):
                     return
             except OSError as error:
                 self._handle_failure(error)
@@ -210,7 +210,7 @@ class Link:
         if self._signing is not None:
             reason = self._signing.rejection_reason(frame, system, component, self._unix_s())
             if reason is not None:
-                self._reject(reason, address, component)
+                self._reject(reason, address, component, now)
                 return None
         elif frame[0] == V2 and frame[2] & SIGNED:
             self.counters["signed"] += 1  # which cannot be verified
@@ -230,17 +230,18 @@ class Link:
             self.counters["refused.other_vehicle"] += 1
             return None
         if system == self.vehicle and component == AUTOPILOT:
-            self.last_received_ns = now
+            self.last_received_ns, self._reply_address, self.problem = now, None, ""
             self._identity.add(message, now)
         self.counters["received"] += 1
         return ReceivedMessage(message, kind, system, component, now)
 
-    def _reject(self, reason: str, address: Address, component: int) -> None:
+    def _reject(self, reason: str, address: Address, component: int, now: int) -> None:
         """Count a message that the signing rejects, and say why the vehicle cannot be heard."""
         self.counters[f"refused.{reason}"] += 1
-        if self._address is not None or component != AUTOPILOT or self._signing is None:
+        heard = self._address is not None and now - self.last_received_ns <= _SILENT_NS
+        if heard or component != AUTOPILOT or self._signing is None:
             return
-        if reason in ("late", "future"):
+        if reason in ("late", "future", "replayed"):
             behind = self._signing.behind_s
             self.problem = f"the autopilot signs with the key, but its clock is {abs(behind):.0f} s " + (
                 "behind" if behind > 0.0 else "ahead of this machine's"

@@ -212,6 +212,18 @@ def test_a_signed_autopilot_a_day_behind_is_named_and_answered() -> None:
     exchanged("signed autopilot, udpin", "its clock a day behind", "named, answered, followed once it has the time")
 
 
+def test_a_signed_vehicle_that_was_switched_off_and_lost_its_time_is_named_and_answered_at_its_new_port() -> None:
+    under_test = LinkUnderTest(key=KEY)
+    under_test.autopilot(A, 2.0)
+    under_test.silence(20.0)
+    assert under_test.autopilot(B, 1.0, boot_s=-22.0, behind_s=86_400.0) is None
+    assert "its clock is 86400 s behind" in under_test.link.problem
+    under_test.link.send(mavlink.MAVLink_heartbeat_message(30, 8, 0, 0, 4, 3))
+    assert under_test.socket.sent[-1][1] == B
+    assert under_test.autopilot(B, 1.0, boot_s=-22.0) == 0.0
+    assert under_test.link.problem == ""
+
+
 @pytest.mark.parametrize(("key", "why"), [(None, "does not sign"), (bytes(32), "signs with another key")])
 def test_an_autopilot_without_the_key_is_named(key: bytes | None, why: str) -> None:
     under_test = LinkUnderTest(key=KEY)
