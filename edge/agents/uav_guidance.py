@@ -47,7 +47,9 @@ class GuidanceControl:
             say(f"Syncline: no follow, {'vehicle disarmed' if has_target else 'no target'}")
             return False
         accepted = guidance.arm(command.by)
-        say(f"Syncline: follow armed by {command.by}" if accepted else "Syncline: no follow, it is off")
+        fence_m, height = guidance.limits.fence_m, guidance.limits.height
+        within = f"fence {fence_m:.0f} m, {height[0]:.0f}-{height[1]:.0f} m"
+        say(f"Syncline: follow by {command.by}, {within}" if accepted else "Syncline: no follow, it is off")
         return accepted
 
     def update(self, now_ns: int, estimate: Estimate | None, frame_s: float, sample_s: float) -> None:
