@@ -75,7 +75,7 @@ async def dialogue(client: str, port: int) -> None:
             texts.append(text.text)
 
     reading = asyncio.create_task(read_texts())
-    await asyncio.sleep(0.2)
+    await asyncio.sleep(1.0)
     for step, parameters in (
         ("start_video_streaming", (1,)),
         ("track_rectangle", (0.1, 0.2, 0.3, 0.4)),
@@ -93,7 +93,7 @@ async def dialogue(client: str, port: int) -> None:
         if step == "track_stop":
             while "Syncline: tracking stopped" not in texts:
                 await asyncio.sleep(0.05)
-            exchanged(client, "status texts", ", ".join(texts))
+            exchanged(client, "status texts", ", ".join(dict.fromkeys(texts)))
     reading.cancel()
 
 

@@ -22,7 +22,7 @@ from protocols.core.clocks import NANOSECONDS
 _DEFAULT_SYSTEM = 1
 _MAX_SENDERS = 8  # senders whose bytes are parsed while no vehicle is locked
 _SILENT_NS = 1_500_000_000  # of an autopilot, which sends a heartbeat each second and here 30 attitudes
-_UNKNOWN_SILENT_NS = 10 * NANOSECONDS  # … of one of which nothing but heartbeats is known
+_UNKNOWN_SILENT_NS = 10 * NANOSECONDS  # … of one of which only heartbeats are known, before another host is followed
 _MIN_RETRY_S, _MAX_RETRY_S = 0.2, 1.0
 _CONFLICT_SHOWN_NS = 10 * NANOSECONDS
 _NAN_ALLOWED = frozenset({"COMMAND_LONG", "COMMAND_INT", "GIMBAL_MANAGER_SET_PITCHYAW", "CAMERA_TRACKING_IMAGE_STATUS",
@@ -273,7 +273,9 @@ class Link:
         elif self._signing is not None:
             objection = "" if beats or system == self.vehicle else "no heartbeat yet"
         elif self._identity.offset_ns is None and system == self.vehicle:
-            objection = "" if beats and silent_ns > _UNKNOWN_SILENT_NS else "nothing identifies it"
+            same_host = self._address is not None and address[0] == self._address[0]
+            known = beats and (same_host or silent_ns > _UNKNOWN_SILENT_NS)
+            objection = "" if known else "nothing identifies it"
         else:
             objection = self._identity.objection(candidate, now, same_system=system == self.vehicle)
         if objection:

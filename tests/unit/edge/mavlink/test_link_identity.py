@@ -116,6 +116,15 @@ def test_a_restarted_router_is_followed_to_its_new_port_within_two_seconds(down_
     )
 
 
+def test_of_a_vehicle_that_only_sends_heartbeats_another_port_is_followed_soon_and_another_host_late() -> None:
+    for address, soon in ((B, True), (C, False)):
+        under_test = LinkUnderTest()
+        under_test.autopilot(A, 3.0, telemetry=False)
+        relocked = under_test.autopilot(address, 12.0, telemetry=False)
+        assert relocked is not None
+        assert (relocked <= 2.0) == soon
+
+
 @pytest.mark.parametrize(
     ("stranger", "why"),
     [
