@@ -35,7 +35,8 @@ def update_tracking_status(
     size: (width, height) of the image [px]. mounting: body_from_camera (3, 3). now_ns: the host's clock.
     """
     width, height = size
-    origin, position = vehicle.origin, vehicle.position
+    origin, motion = vehicle.origin, vehicle.motion_at(now_ns / NANOSECONDS)
+    position = None if motion is None else motion[0]
     status.camera = status.image_centre = status.quaternion = None
     if origin is not None and position is not None:
         status.camera = origin.to_geodetic(float(position[0]), float(position[1]), float(position[2]))

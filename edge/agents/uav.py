@@ -8,7 +8,7 @@ import time
 import uuid
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -134,7 +134,7 @@ class UavAgent:
         self._telemetry_ns = 0
         self._last_frame_s = -math.inf
         self._last_frame: int | None = None
-        self._resets = (0, 0, 0)
+        self._resets = (0, 0)
         self.counters: Counter[str] = Counter()
         self.latencies: deque[float] = deque(maxlen=900)
         """Latencies from a frame's arrival until its status was sent on the link [s]."""
@@ -168,6 +168,7 @@ class UavAgent:
             self.camera.handle(message, now / NANOSECONDS)
         self._check_clock_resets()
         if frame is not None:
+            frame = replace(frame, device_time_ns=self.camera_clock.handle_frame(frame.device_time_ns, now))
             self._take_frame(frame, now)
         now = self._now_ns()
         self.camera.tick(now / NANOSECONDS, frame=frame is not None)
@@ -214,7 +215,8 @@ class UavAgent:
             state = "degraded"
             message = f"no heartbeat received: {link.problem}" if link.problem else "no heartbeat received yet"
         elif not ended and link_silent_s > LINK_STALE_S:
-            state, message = "degraded", f"the vehicle is silent for {link_silent_s:.0f} s {reason}".rstrip()
+            state, message = "degraded", f"the vehicle is silent for {link_silent_s:.0f} s"
+            message += f": {reason}" if reason else ""
         elif not ended:
             problem = vehicle.problem(self._now_ns()) or reason
             state = "degraded" if problem.startswith("no attitude") else state
@@ -231,6 +233,7 @@ class UavAgent:
             {
                 "vehicle.reboots": vehicle.clock_resets[0],
                 "vehicle.clock_steps": vehicle.clock_resets[1],
+                "camera.clock_steps": self.camera_clock.steps,
                 "target.refused": self.estimator.refused,
                 "undecodable": self.estimator.undecodable,
                 "unpublished": unpublished,
@@ -317,7 +320,6 @@ class UavAgent:
         self.estimator.handle(message)
 
     def _take_frame(self, frame: Frame, now: int) -> None:
-        self.camera_clock.handle_frame(frame.device_time_ns, now)
         self.counters["frames"] += 1
         if self._last_frame is not None and frame.frame > self._last_frame + 1:
             self.counters["dropped"] += frame.frame - self._last_frame - 1
@@ -382,8 +384,8 @@ class UavAgent:
         return min(around, key=lambda box: box.width * box.height, default=None)
 
     def _check_clock_resets(self) -> None:
-        """Reset the time alignment when the vehicle's or the camera's clock was reset or stepped."""
-        resets = (*self._vehicle.clock_resets, self.camera_clock.steps)
+        """Reset the time alignment when the vehicle's clock was reset or stepped."""
+        resets = self._vehicle.clock_resets
         if resets != self._resets:
             self._resets = resets
             self._telemetry_ns = 0

@@ -27,7 +27,8 @@ class GuidanceControl:
 
     def begin(self, now_s: float) -> None:
         """A target was selected."""
-        self._guidance.begin(self._vehicle.position)
+        motion = self._vehicle.motion_at(now_s)
+        self._guidance.begin(None if motion is None else motion[0])
         self._last_visible_s = now_s
 
     def stop(self) -> None:
@@ -46,7 +47,9 @@ class GuidanceControl:
             say(f"Syncline: no follow, {'vehicle disarmed' if has_target else 'no target'}")
             return False
         accepted = guidance.arm(command.by)
-        say(f"Syncline: follow armed by {command.by}" if accepted else "Syncline: no follow, it is off")
+        fence_m, height = guidance.limits.fence_m, guidance.limits.height
+        within = f"fence {fence_m:.0f} m, {height[0]:.0f}-{height[1]:.0f} m"
+        say(f"Syncline: follow by {command.by}, {within}" if accepted else "Syncline: no follow, it is off")
         return accepted
 
     def update(self, now_ns: int, estimate: Estimate | None, frame_s: float, sample_s: float) -> None:
@@ -68,7 +71,7 @@ class GuidanceControl:
             return
         if estimate.state is TrackState.VISIBLE:
             self._last_visible_s = now_s
-        position, velocity = vehicle.position, vehicle.velocity
+        motion = vehicle.motion_at(now_s)
         heard_s = min(self._link.last_received_ns / NANOSECONDS, sample_s)
         if estimate.state is TrackState.LOST:
             guidance.hold("the target is lost")
@@ -77,11 +80,9 @@ class GuidanceControl:
             guidance.hold("the link is stale")
         elif now_s - frame_s > FRAME_TIMEOUT_S:
             guidance.hold("no frames")
-        elif (
-            position is None
-            or velocity is None
-            or not (math.isfinite(estimate.north) and math.isfinite(estimate.std_m))
-        ):
+        elif motion is None:
+            guidance.hold("the vehicle's position is not known")
+        elif not (math.isfinite(estimate.north) and math.isfinite(estimate.std_m)):
             guidance.hold("no metric ground")
         else:
             speed = estimate.speed if math.isfinite(estimate.speed) and math.isfinite(estimate.course) else 0.0
@@ -93,4 +94,4 @@ class GuidanceControl:
                 estimate.std_m,
                 now_s - self._last_visible_s,
             )
-            guidance.tick(now_s, target, position, velocity, vehicle.origin)
+            guidance.tick(now_s, target, *motion, vehicle.origin)

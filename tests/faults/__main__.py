@@ -16,22 +16,13 @@ from pathlib import Path
 import pytest
 
 from tests.faults.matrix import VARIABLE, table
+from tests.faults.stations import fetch_stations
 
 _HERE = str(Path(__file__).parent)
-_STATIONS = ("mavsdk>=3.10,<4", "MAVProxy>=1.8.70")
-"""Ground stations run as processes. Without their requirements, which would replace OpenCV by another build."""
-
-
-def _fetch_stations() -> None:
-    folder = Path(sys.prefix) / "stations"
-    if not folder.is_dir():
-        pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
-        if subprocess.run([*pip, "--target", str(folder), *_STATIONS], check=False).returncode:
-            print("left out: MAVSDK and MAVProxy could not be installed", flush=True)
 
 
 def main() -> int:
-    _fetch_stations()
+    fetch_stations()
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "matrix.jsonl"
         os.environ[VARIABLE] = str(file)

@@ -1,7 +1,7 @@
-"""Ground stations as real processes, MAVSDK's server and MAVProxy, at a simulated autopilot with a camera behind it.
+"""Ground stations as real processes, MAVSDK's servers and MAVProxy, at a simulated autopilot with a camera behind it.
 
-`make faults` installs both into the folder `stations` of its environment (MAVProxy's own requirements would replace
-OpenCV by another build). Where they cannot be had, these tests are skipped.
+`make faults` installs them into the folder `stations` of its environment. Where they cannot be had, these tests are
+skipped.
 """
 
 from __future__ import annotations
@@ -15,18 +15,17 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 pytest.importorskip("pymavlink")
 from edge.mavlink.dialect import mavlink as M
 from edge.mavlink.link.transport import Udp, Url
-from tests.faults.matrix import measured
-from tests.support.vehicle_link import URI, autopilot, camera_on
+from edge.mavlink.roles.camera import SelectTarget
+from tests.faults.stations import STATIONS, exchanged
+from tests.support.vehicle_link import autopilot, camera_on
 
-STATIONS = Path(sys.prefix) / "stations"
-SERVER = STATIONS / "mavsdk" / "bin" / "mavsdk_server"
+SERVERS = {"MAVSDK 3": "mavsdk", "MAVSDK 4": "mavsdk_grpc"}
 MAVPROXY = STATIONS / "bin" / "mavproxy.py"
 
 
@@ -53,66 +52,71 @@ def process(*command: str, folder: Path) -> Iterator[None]:
             running.wait()
 
 
-async def dialogue(port: int) -> dict[str, Any]:
-    """What an application with MAVSDK does with a camera."""
-    import mavsdk
+async def dialogue(client: str, port: int) -> None:
+    """What an application with MAVSDK does with a camera, through the server of either version."""
+    import mavsdk_grpc as mavsdk
 
     drone = mavsdk.System(mavsdk_server_address="127.0.0.1", port=port)
     await drone.connect()
-    seen: dict[str, Any] = {"texts": []}
     async for cameras in drone.camera.camera_list():
         if cameras.cameras:
-            seen["model"] = cameras.cameras[0].model_name
             camera = cameras.cameras[0].component_id
+            exchanged(client, "camera list", cameras.cameras[0].model_name)
             break
-    for _ in range(50):  # MAVSDK asks for it after the camera's information
-        seen["uri"] = (await drone.camera.get_video_stream_info(camera)).settings.uri
-        if seen["uri"]:
-            break
+    uri = ""
+    while not uri:  # MAVSDK asks for it some seconds after the camera's information
+        uri = (await drone.camera.get_video_stream_info(camera)).settings.uri
         await asyncio.sleep(0.1)
+    exchanged(client, "video stream address", uri)
+    texts: list[str] = []
 
     async def read_texts() -> None:
         async for text in drone.telemetry.status_text():
-            seen["texts"].append(text.text)
+            texts.append(text.text)
 
     reading = asyncio.create_task(read_texts())
-    await asyncio.sleep(0.2)
-    await drone.camera.start_video_streaming(camera, 1)
-    await drone.camera.track_rectangle(camera, 0.1, 0.2, 0.3, 0.4)
-    await drone.camera.track_point(camera, 0.5, 0.25, 0.1)
-    await drone.camera.track_stop(camera)
-    for _ in range(50):
-        if "Syncline: tracking stopped" in seen["texts"]:
-            break
-        await asyncio.sleep(0.05)
-    with pytest.raises(mavsdk.camera.CameraError, match="DENIED"):
-        await drone.camera.start_video_streaming(camera, 7)
+    await asyncio.sleep(1.0)
+    for step, parameters in (
+        ("start_video_streaming", (1,)),
+        ("track_rectangle", (0.1, 0.2, 0.3, 0.4)),
+        ("track_point", (0.5, 0.25, 0.1)),
+        ("track_stop", ()),
+        ("stop_video_streaming", (1,)),
+        ("start_video_streaming", (7,)),
+    ):
+        try:
+            await getattr(drone.camera, step)(camera, *parameters)
+            result = "SUCCESS"
+        except mavsdk.camera.CameraError as error:
+            result = str(error).partition(":")[0]
+        exchanged(client, f"{step}({', '.join(map(str, parameters))})", result)
+        if step == "track_stop":
+            while "Syncline: tracking stopped" not in texts:
+                await asyncio.sleep(0.05)
+            exchanged(client, "status texts", ", ".join(dict.fromkeys(texts)))
     reading.cancel()
-    return seen
 
 
-@pytest.mark.skipif(not SERVER.exists(), reason="NO MAVSDK HERE: `make faults` installs it")
-@pytest.mark.filterwarnings("ignore::FutureWarning")
+@pytest.mark.parametrize("client", SERVERS)
 def test_an_application_with_mavsdk_finds_the_camera_and_selects(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, client: str
 ) -> None:
+    server = STATIONS / SERVERS[client] / "bin" / "mavsdk_server"
+    if not server.exists():
+        pytest.skip(f"NO {client} HERE: `make faults` installs it")
     monkeypatch.syspath_prepend(str(STATIONS))
     port = free_port(socket.SOCK_STREAM)
     with (
         autopilot() as (_, mavlink_port),
         camera_on(f"udpout:127.0.0.1:{mavlink_port}") as camera,
-        process(str(SERVER), "-p", str(port), f"udpout://127.0.0.1:{mavlink_port}", folder=tmp_path),
+        process(str(server), "-p", str(port), f"udpout://127.0.0.1:{mavlink_port}", folder=tmp_path),
     ):
-        seen = asyncio.run(asyncio.wait_for(dialogue(port), 30.0))
-    assert (seen["model"], seen["uri"]) == ("Syncline UAV tracker", URI)
-    assert seen["texts"][-1] == "Syncline: tracking stopped"
-    left, top, right, bottom = 0.1, 0.2, 0.3, 0.4
+        asyncio.run(asyncio.wait_for(dialogue(client, port), 60.0))
     rectangle, point, _ = camera.commands
-    assert (rectangle.left, rectangle.top, rectangle.right, rectangle.bottom) == pytest.approx(  # type: ignore[union-attr]
-        (left, top, right, bottom)
-    )
-    assert point.is_point  # type: ignore[union-attr]
-    measured("MAVSDK: camera, stream, rectangle, point, stop", "all answered", f"texts: {len(seen['texts'])}")
+    assert isinstance(rectangle, SelectTarget)
+    assert (rectangle.left, rectangle.top, rectangle.right, rectangle.bottom) == pytest.approx((0.1, 0.2, 0.3, 0.4))
+    assert isinstance(point, SelectTarget)
+    assert point.is_point
 
 
 def hears_camera(port: int, patience_s: float) -> bool:
@@ -156,4 +160,5 @@ def test_behind_mavproxy_the_camera_is_seen_only_if_it_is_on_the_autopilot(tmp_p
             heard = hears_camera(for_station, 15.0 if routed else 3.0)
     assert heard == routed
     assert bool(camera.commands) == routed
-    measured(f"MAVProxy: camera on the {camera_at}", "seen" if routed else "not seen", "as the guide says")
+    step = f"camera on the {camera_at}, station at an output: heartbeat, CAMERA_TRACK_RECTANGLE"
+    exchanged("MAVProxy", step, "seen, accepted" if routed else "the station does not see the camera")

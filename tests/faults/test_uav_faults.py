@@ -110,6 +110,24 @@ def test_a_companions_attitude_with_a_clock_of_its_own_does_not_touch_the_target
     measured(f"attitude of a companion computer, {ahead_s:.0f} s ahead", "refused, target kept", "10 of 10 refused")
 
 
+@pytest.mark.parametrize("back_s", [3.0, 0.8, -3.0])
+def test_a_cameras_clock_that_is_set_does_not_touch_the_target(back_s: float) -> None:
+    flight = Flight(patrol_world(3, 10.0, SIZE))
+    stamped = flight.device.device_time_ns
+    flight.device.device_time_ns = lambda index: stamped(index) - (round(1e9 * back_s) if index >= 70 else 0)  # type: ignore[method-assign]
+    flight.run(1.5)
+    assert flight.select()
+    flight.run(3.8)
+    errors = [
+        np.hypot(state.centre[0] - truth.x, state.centre[1] - truth.y)
+        for state in flight.messages(pb.TargetState)
+        for truth in [flight.world.truth(state.frame)]
+    ]
+    assert max(errors) < 10.0
+    assert flight.agent.status(0).counters["camera.clock_steps"] == 1
+    measured(f"the camera's clock is set back by {back_s:.1f} s", "target kept", f"at most {max(errors):.1f} px")
+
+
 def test_a_gimbal_with_its_own_boot_clock_gives_places_and_the_cameras_attitude() -> None:
     world = patrol_world(3, 10.0, SIZE)
     ground, yaw = world.target.ground[0], float(world.target.course[0])

@@ -166,6 +166,7 @@ def test_a_vehicle_that_follows_in_wind_stops_at_the_fence(world: FlightWorld) -
     assert not flight.arm_follow()  # there is no target yet
     assert flight.select()
     assert flight.arm_follow()
+    assert flight.station.received["STATUSTEXT"][-1].text == f"Syncline: follow by 255, fence {fence:.0f} m, 5-120 m"
     flight.run(4.0)
     assert flight.autopilot.counters["follow_targets"] > 5
     flight.run(crossing + 1.5)

@@ -11,16 +11,16 @@ from deploy.site.doctor.check_result import CheckResult, misconfigured, ok, unav
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 
-_FORWARDING = {
-    "PX4": ("MAV_0_FORWARD", "MAV_1_FORWARD", "MAV_2_FORWARD", "MAV_HB_FORW_EN"),
-    "ArduPilot": tuple(f"SERIAL{port}_OPTIONS" for port in range(1, 6)),
+_PARAMETERS = {
+    "PX4": (*(f"MAV_{port}_{name}" for port in range(3) for name in ("CONFIG", "FORWARD")), "MAV_HB_FORW_EN"),
+    "ArduPilot": (*(f"{name}_OPTIONS" for port in range(1, 6) for name in (f"SERIAL{port}", f"MAV{port}")),),
 }
-"""Parameters that keep a station and a component apart, by firmware."""
+"""Parameters by which a station and a component are kept apart, by firmware."""
 _REMEDIES = {
     "PX4": "set MAV_x_FORWARD = 1 for this port and the station's (x as in MAV_x_CONFIG) and MAV_HB_FORW_EN = 1",
-    "ArduPilot": "clear bit 10 (don't forward MAVLink) in SERIALx_OPTIONS of this port and the station's",
+    "ArduPilot": "clear bit 10 of SERIALx_OPTIONS, since 4.7 bit 1 of MAVx_OPTIONS, of this port and the station's "
+    "(don't forward MAVLink)",
 }
-_NOT_FORWARDED = 1 << 10  # bit of ArduPilot's SERIALn_OPTIONS
 _LEAST_RATE = 0.5  # of the requested rate: one message in two may be lost
 
 
@@ -126,7 +126,7 @@ def listen(link: Any, hello: Any, *, gimbal: bool, rate_hz: float, seconds: floa
         if elapsed >= due:
             due += 1.0
             link.send(hello)
-            for name in _FORWARDING.get(heard.firmware, ()):
+            for name in _PARAMETERS.get(heard.firmware, ()):
                 if name not in heard.parameters:
                     link.send(mavlink.MAVLink_param_request_read_message(link.vehicle, AUTOPILOT, name.encode(), -1))
         vehicle.tick(time.monotonic_ns())
@@ -192,10 +192,14 @@ def ground_station(heard: Heard) -> CheckResult:
 
 def _not_forwarded(heard: Heard) -> str:
     """The parameters by which the autopilot keeps the camera and a station apart, as text; "" if there are none."""
-    names = [
-        name
-        for name in _FORWARDING.get(heard.firmware, ())
-        if name in heard.parameters
-        and (heard.parameters[name] == 0.0 if heard.firmware == "PX4" else int(heard.parameters[name]) & _NOT_FORWARDED)
-    ]
-    return f"; {', '.join(names)} {'= 0' if heard.firmware == 'PX4' else 'has bit 10'}" if names else ""
+    found = []
+    for name, value in heard.parameters.items():
+        if heard.firmware == "PX4":  # integers come as the bits of a float
+            port = name.partition("FORWARD")[0] + "CONFIG"
+            if value == 0.0 and not name.endswith("CONFIG") and heard.parameters.get(port, 1.0) != 0.0:
+                found.append(f"{name} = 0")
+        elif heard.firmware == "ArduPilot":
+            bit = 10 if name.startswith("SERIAL") else 1
+            if int(value) >> bit & 1:
+                found.append(f"{name} has bit {bit}")
+    return "".join(f"; {one}" for one in sorted(found))

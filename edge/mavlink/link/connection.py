@@ -22,7 +22,7 @@ from protocols.core.clocks import NANOSECONDS
 _DEFAULT_SYSTEM = 1
 _MAX_SENDERS = 8  # senders whose bytes are parsed while no vehicle is locked
 _SILENT_NS = 1_500_000_000  # of an autopilot, which sends a heartbeat each second and here 30 attitudes
-_UNKNOWN_SILENT_NS = 10 * NANOSECONDS  # … of one of which nothing but heartbeats is known
+_UNKNOWN_SILENT_NS = 10 * NANOSECONDS  # … of one of which only heartbeats are known, before another host is followed
 _MIN_RETRY_S, _MAX_RETRY_S = 0.2, 1.0
 _CONFLICT_SHOWN_NS = 10 * NANOSECONDS
 _NAN_ALLOWED = frozenset({"COMMAND_LONG", "COMMAND_INT", "GIMBAL_MANAGER_SET_PITCHYAW", "CAMERA_TRACKING_IMAGE_STATUS",
@@ -89,6 +89,7 @@ class Link:
         self._reply_address: Address | None = None
         self._fixed = vehicle is not None
         self._identity = Evidence()
+        self._first: tuple[Address, int, Evidence] | None = None
         self._candidates: dict[tuple[Address, int], Evidence] = {}
         self._conflict = (-_CONFLICT_SHOWN_NS, "")
         self.vehicle = vehicle
@@ -172,7 +173,7 @@ class Link:
                 self._codec.srcSystem = self.vehicle
             data = bytes(message.pack(self._codec))
             try:
-                if not self._transport.send(data, self._address or self._reply_address):
+                if not self._transport.send(data, self._reply_address or self._address):
                     return
             except OSError as error:
                 self._handle_failure(error)
@@ -183,7 +184,8 @@ class Link:
 
     def _process(self, data: bytes, address: Address, now: int) -> list[ReceivedMessage]:
         self.counters["bytes"] += len(data)
-        if self._address is not None and address != self._address and now - self.last_received_ns <= _SILENT_NS:
+        silent = now - self.last_received_ns > _SILENT_NS
+        if self._address not in (None, address) and not silent and (self._first is None or address != self._first[0]):
             self.counters["refused.address"] += 1
             self._conflict = (now, f"{address[0]}:{address[1]} sends as well, and is not followed")
             return []
@@ -208,7 +210,7 @@ class Link:
         if self._signing is not None:
             reason = self._signing.rejection_reason(frame, system, component, self._unix_s())
             if reason is not None:
-                self._reject(reason, address, component)
+                self._reject(reason, address, component, now)
                 return None
         elif frame[0] == V2 and frame[2] & SIGNED:
             self.counters["signed"] += 1  # which cannot be verified
@@ -228,17 +230,18 @@ class Link:
             self.counters["refused.other_vehicle"] += 1
             return None
         if system == self.vehicle and component == AUTOPILOT:
-            self.last_received_ns = now
+            self.last_received_ns, self._reply_address, self.problem = now, None, ""
             self._identity.add(message, now)
         self.counters["received"] += 1
         return ReceivedMessage(message, kind, system, component, now)
 
-    def _reject(self, reason: str, address: Address, component: int) -> None:
+    def _reject(self, reason: str, address: Address, component: int, now: int) -> None:
         """Count a message that the signing rejects, and say why the vehicle cannot be heard."""
         self.counters[f"refused.{reason}"] += 1
-        if self._address is not None or component != AUTOPILOT or self._signing is None:
+        heard = self._address is not None and now - self.last_received_ns <= _SILENT_NS
+        if heard or component != AUTOPILOT or self._signing is None:
             return
-        if reason in ("late", "future"):
+        if reason in ("late", "future", "replayed"):
             behind = self._signing.behind_s
             self.problem = f"the autopilot signs with the key, but its clock is {abs(behind):.0f} s " + (
                 "behind" if behind > 0.0 else "ahead of this machine's"
@@ -260,14 +263,19 @@ class Link:
         if len(self._candidates) > _MAX_SENDERS:
             del self._candidates[min(self._candidates, key=lambda one: self._candidates[one].heard_ns)]
         silent_ns = now - self.last_received_ns
-        if silent_ns <= _SILENT_NS:
+        returned = self._is_first(key, candidate, now)
+        if silent_ns <= _SILENT_NS and not returned:
             return  # another vehicle behind the same router
-        if self._fixed and system != self.vehicle:
+        if returned:
+            objection = ""
+        elif self._fixed and system != self.vehicle:
             objection = "vehicle is set in the configuration"
         elif self._signing is not None:
             objection = "" if beats or system == self.vehicle else "no heartbeat yet"
         elif self._identity.offset_ns is None and system == self.vehicle:
-            objection = "" if beats and silent_ns > _UNKNOWN_SILENT_NS else "nothing identifies it"
+            same_host = self._address is not None and address[0] == self._address[0]
+            known = beats and (same_host or silent_ns > _UNKNOWN_SILENT_NS)
+            objection = "" if known else "nothing identifies it"
         else:
             objection = self._identity.objection(candidate, now, same_system=system == self.vehicle)
         if objection:
@@ -279,7 +287,16 @@ class Link:
         self.last_received_ns = now
         self.counters["handed_over"] += 1
 
+    def _is_first(self, key: tuple[Address, int], candidate: Evidence, now: int) -> bool:
+        """Whether the vehicle is back where it was first: who was followed meanwhile only resembled it."""
+        if self._first is None or key != self._first[:2] or key == (self._address, self.vehicle):
+            return False
+        known = self._first[2]
+        return known.offset_ns is None or not known.objection(candidate, now, same_system=True)
+
     def _lock_to(self, address: Address, system: int, identity: Evidence) -> None:
+        if self._first is None or (address, system) == self._first[:2]:
+            self._first = (address, system, identity)
         self._address, self.vehicle, self._identity = address, system, identity
         self._candidates.clear()
         self._conflict, self.problem = (-_CONFLICT_SHOWN_NS, ""), ""

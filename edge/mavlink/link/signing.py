@@ -30,7 +30,7 @@ class Signing:
 
     The timestamps are kept in memory first: a disk that is full or gone is reported in ``problem`` and tried again.
     monotonic_s: advances the time of the last run while the machine's clock is not set. behind_s: how far the last
-    rejected message of a new sender was behind.
+    message that was rejected for its time was behind.
     """
 
     def __init__(
@@ -78,16 +78,17 @@ class Signing:
         stamp = int.from_bytes(frame[-12:-6], "little")
         # This machine's time alone: measured by what others send, it could be pushed ahead message by message.
         now = self._now(unix_s)
+        last = self._last_times.get(stream := f"{frame[-13]}.{system}.{component}")
+        reason = None
         if stamp > now + _MAX_AHEAD:
+            reason = "future"
+        elif last is None and stamp <= now - _MAX_BEHIND:
+            reason = "late"
+        elif last is not None and stamp <= last:
+            reason = "replayed"
+        if reason is not None:
             self.behind_s = (now - stamp) / TICKS
-            return "future"
-        stream = f"{frame[-13]}.{system}.{component}"
-        last = self._last_times.get(stream)
-        if last is None and stamp <= now - _MAX_BEHIND:
-            self.behind_s = (now - stamp) / TICKS
-            return "late"
-        if last is not None and stamp <= last:
-            return "replayed"
+            return reason
         if last is None and len(self._last_times) >= _MAX_STREAMS:
             # All that an old one has sent is late by now, and may be forgotten.
             oldest = min(self._last_times, key=lambda one: self._last_times[one])

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from edge.mavlink.dialect import mavlink
+from edge.mavlink.dialect import AUTOPILOT, mavlink
 from edge.mavlink.link.connection import is_autopilot
 from edge.mavlink.roles.telemetry import Attitude, GlobalPosition, LocalPosition, parse_telemetry
 from edge.uav.base import Telemetry
@@ -29,7 +29,7 @@ _REBOOT_S = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tlog:
-    """Telemetry from a .tlog. samples: of one vehicle and one boot, by its clock [s], strictly increasing.
+    """Telemetry from a .tlog. samples: of one vehicle's autopilot and one boot, by its clock [s], strictly increasing.
 
     system: the vehicle's id. left_out: invalid or out-of-order samples. unreadable: bytes that belong to no message.
     boots: number of boots in the log.
@@ -65,7 +65,7 @@ def read_tlog(file: Path) -> Tlog:
 
 
 def _messages(data: bytes) -> tuple[list[Any], int]:
-    """All valid messages of the wanted types, and the number of bytes that belong to no message."""
+    """All valid messages of autopilots of the wanted types, and the number of bytes that belong to no message."""
     codec: Any = mavlink.MAVLink(None)
     wanted = {"HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT"}
     out: list[Any] = []
@@ -91,7 +91,7 @@ def _messages(data: bytes) -> tuple[list[Any], int]:
         if message is None or (isinstance(message, mavlink.MAVLink_unknown) and not follows):
             at, unreadable = at + 1, unreadable + 1
             continue
-        if message.get_type() in wanted:
+        if message.get_type() in wanted and message.get_srcComponent() == AUTOPILOT:
             out.append(message)
         at = end
     return out, unreadable

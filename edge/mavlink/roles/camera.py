@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from edge.mavlink.dialect import CAMERA, mavlink
+from edge.mavlink.dialect import AUTOPILOT, CAMERA, mavlink
 from edge.mavlink.link.connection import Link, ReceivedMessage
 from edge.mavlink.roles.camera_messages import STREAM_ID, CameraMessages, TrackingStatus, VideoStream
 from edge.mavlink.roles.message_rates import MessageRates
@@ -97,8 +97,8 @@ class CameraComponent:
         """Handle a message if it addresses the camera."""
         message = received.message
         station = (received.system, received.component)
-        if received.kind == "HEARTBEAT" and message.type == mavlink.MAV_TYPE_GCS:
-            self._rates.hear(station, now_s)
+        if received.kind == "HEARTBEAT" and received.component != AUTOPILOT:
+            self._rates.hear(station, now_s, new=message.type == mavlink.MAV_TYPE_GCS)
         if received.kind not in ("COMMAND_LONG", "COMMAND_INT"):
             return
         if message.target_system not in (0, self._link.vehicle) or message.target_component not in (0, CAMERA):
@@ -170,6 +170,8 @@ class CameraComponent:
     def _command(self, command: int, p: tuple[float, ...], received: ReceivedMessage) -> Any:
         """Execute one command; its MAV_RESULT, None where it is not for a camera."""
         accepted, denied = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED
+        if command in _CAMERA_ID and not (math.isnan(p[_CAMERA_ID[command]]) or p[_CAMERA_ID[command]] in (0, CAMERA)):
+            return denied if received.message.target_component == CAMERA else None  # for another camera
         if command in _REQUESTS or command == mavlink.MAV_CMD_REQUEST_MESSAGE:
             kind = self._requested(command, p)
             if kind not in self._available:
@@ -214,7 +216,7 @@ class CameraComponent:
         if not self._on_command(selection):
             return mavlink.MAV_RESULT_FAILED
         self.status.mode_point = selection.is_point
-        self._rates.restore((received.system, received.component))  # who selects wants to see
+        self._rates.select((received.system, received.component))
         self._send_text(self._texts.select(received.system))
         return accepted
 
@@ -271,13 +273,13 @@ _REQUESTS = {
     mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_STATUS: "VIDEO_STREAM_STATUS",
 }
 """Commands from before MAV_CMD_REQUEST_MESSAGE, which stations still send."""
-_TRACKING = frozenset(
-    {
-        mavlink.MAV_CMD_CAMERA_TRACK_POINT,
-        mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE,
-        mavlink.MAV_CMD_CAMERA_STOP_TRACKING,
-    }
-)
+_TRACKING = {
+    mavlink.MAV_CMD_CAMERA_TRACK_POINT: 3,
+    mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE: 4,
+    mavlink.MAV_CMD_CAMERA_STOP_TRACKING: 0,
+}
+_CAMERA_ID = _TRACKING | {mavlink.MAV_CMD_VIDEO_START_STREAMING: 2, mavlink.MAV_CMD_VIDEO_STOP_STREAMING: 2}
+"""Index of the parameter "Target Camera ID", by command."""
 
 
 def _parameters(message: Any) -> tuple[float, ...]:

@@ -2,7 +2,8 @@
 
 A message has no addressee, so it is sent at the highest rate that any station present expects: what it asked for with
 SET_MESSAGE_INTERVAL, or else the default. One station that slows or stops a message therefore changes nothing for the
-others, and what a station asked for ends with it.
+others, and what a station asked for ends with it. Who selected the target counts as present, also where it sends no
+heartbeats, as scripts do.
 """
 
 from __future__ import annotations
@@ -32,10 +33,13 @@ class MessageRates:
         self._defaults = {kind: 1.0 / rate for kind, rate in defaults.items()}
         self._stations: dict[Station, _Presence] = {}
         self._sent = dict.fromkeys(defaults, -math.inf)
+        self._operator: Station | None = None
 
-    def hear(self, station: Station, now_s: float) -> None:
-        """A station has sent a heartbeat or a command."""
+    def hear(self, station: Station, now_s: float, *, new: bool = True) -> None:
+        """A station has sent a heartbeat or a command. new: also if it was not present before."""
         self._forget(now_s)
+        if not new and station not in self._stations:
+            return
         presence = self._stations.setdefault(station, _Presence(now_s))
         presence.heard_s = now_s
         if len(self._stations) > _MAX_STATIONS:
@@ -55,17 +59,19 @@ class MessageRates:
             presence.intervals[kind] = math.inf if interval_us < 0 else max(1e-6 * interval_us, 1.0 / _MAX_RATE_HZ)
         self._sent[kind] = -math.inf
 
-    def restore(self, station: Station) -> None:
-        """Forget what a station has asked for."""
-        if station in self._stations:
-            self._stations[station].intervals.clear()
+    def select(self, station: Station) -> None:
+        """A station has selected a target, and wants to see it: what it asked for before is forgotten."""
+        self._operator = station
+        self._stations[station].intervals.clear()
 
     def interval(self, kind: str, now_s: float) -> float:
         """The present interval of a message [s]; inf = it is not sent."""
         self._forget(now_s)
         default = self._defaults[kind]
         wanted = [presence.intervals.get(kind, default) for presence in self._stations.values()]
-        return min(wanted, default=default)
+        if not wanted or self._operator not in (None, *self._stations):
+            wanted.append(default)
+        return min(wanted)
 
     def is_due(self, kind: str, now_s: float) -> bool:
         """Whether a message is due; then it counts as sent."""

@@ -80,15 +80,12 @@ class Vehicle:
         self._first_s: float | None = None
         self._resets = (0, 0)
 
-    @property
-    def velocity(self) -> Floats | None:
-        """Velocity of the vehicle, (3,) NED [m/s]."""
-        return None if self._last_position is None else self._last_position[2]
-
-    @property
-    def position(self) -> Floats | None:
-        """Position of the vehicle, (3,) NED [m] from ``origin``."""
-        return None if self._last_position is None else self._last_position[1]
+    def motion_at(self, time_s: float) -> tuple[Floats, Floats] | None:
+        """Position from ``origin`` and velocity (3,) NED [m, m/s] at a host time; None if not known for a second."""
+        if self._last_position is None or abs(time_s - self._last_position[0]) >= _MAX_POSITION_AGE_S:
+            return None
+        at, position, velocity = self._last_position
+        return np.asarray(position + (time_s - at) * velocity), velocity
 
     @property
     def clock_resets(self) -> tuple[int, int]:
@@ -130,6 +127,8 @@ class Vehicle:
             if kind != "HEARTBEAT" and hasattr(message, "time_boot_ms"):
                 self._refuse("component", f"{kind} of component {component} refused: not the autopilot", received)
             return []
+        if from_gimbal and not self._gimbal:
+            return []  # a camera on the airframe: whatever a gimbal's clock does is of no interest
         if kind == "TIMESYNC":
             if message.tc1 > 0:
                 self._take_clock(self.clock.handle_round_trip(message.ts1, message.tc1, received.received_ns))
@@ -146,6 +145,8 @@ class Vehicle:
             return []
         clock = self.clock if component == AUTOPILOT else self._gimbal_clock
         boot_ns = round(telemetry.boot_s * NANOSECONDS)
+        if boot_ns == 0 and not clock.stamped:  # this source has no clock: its messages are as old as the link's delay
+            return self._take(telemetry, received.received_ns, clock, quaternion=kind == "ATTITUDE_QUATERNION")
         if not self._take_clock(clock.handle_message(boot_ns, received.received_ns)):
             self._refuse("time", f"{kind} of component {component} refused: {clock.reason}", received)
             return []
@@ -212,7 +213,7 @@ class Vehicle:
             body = self._attitude
             fresh = body is not None and abs(time - body[0]) < _MAX_HEADING_AGE_S
             rotation = ned_from_gimbal(telemetry, body[1].ned_from_body if fresh and body is not None else None)
-            return self._sample(host_ns, clock, rotation) if self._gimbal and rotation is not None else []
+            return [] if rotation is None else self._sample(host_ns, clock, rotation)
         if isinstance(telemetry, LocalPosition):
             if self._local_s == _NEVER:
                 self.origin = None  # so far it was the vehicle's first global position, not the local frame's origin
@@ -228,7 +229,7 @@ class Vehicle:
             self._quaternion_s = time
         elif time - self._quaternion_s < 1.0:
             return []  # the same attitude at lower resolution
-        if self._attitude is not None and telemetry.boot_s <= self._attitude[1].boot_s:
+        if self._attitude is not None and 0.0 < telemetry.boot_s <= self._attitude[1].boot_s:
             return []
         self._attitude = (time, telemetry)
         return [] if self._gimbal else self._sample(host_ns, self.clock, telemetry.ned_from_body)
@@ -255,10 +256,7 @@ class Vehicle:
             self.counters["order"] += 1
             return []
         self._sample_s = time
-        position = velocity = None
-        if self._last_position is not None and abs(time - self._last_position[0]) < _MAX_POSITION_AGE_S:
-            velocity = self._last_position[2]
-            position = np.asarray(self._last_position[1] + (time - self._last_position[0]) * velocity)
+        position, velocity = self.motion_at(time) or (None, None)
         vehicle_ns = host_ns + (self.clock.offset_ns if self.clock.known else clock.offset_ns)
         self.mount = MountSample(host_ns, vehicle_ns, clock.std_s, rotation, position, velocity)
         return [self.mount]

@@ -13,7 +13,6 @@ import numpy as np
 from edge.uav.base import Image, Telemetry
 from edge.uav.timing.telemetry_offset import OffsetEstimate, find_offset
 from edge.uav.timing.visual_rotation import VisualRotationEstimator
-from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
@@ -24,39 +23,52 @@ _FIRST_SOLVE_S, _SOLVE_EVERY_S = 6.0, 2.0
 _GOOD_STD_S = 0.003  # precise enough to pause the estimation
 _PAUSE_S = 60.0
 _MAX_CHANGE_WHILE_TRACKING_S = 0.015  # a larger change of the offset is not applied while a tracker uses it
-_LATE_NS = 2 * NANOSECONDS  # a frame that is later was stamped by another clock
-_CONFIRMING_FRAMES = 8  # a quarter of a second at 30 fps; of frames that queued up, at most five agree
-_CLOCK_STEP_S = 0.15  # a larger step invalidates the delays collected so far
+_CONFIRMING_FRAMES = 8  # a quarter of a second at 30 fps
+_CLOCK_STEP_NS = 150_000_000  # a smaller step of the clock cannot be told from delays
 
 
 class CameraHostClock:
-    """The camera's clock against the host's: the minimum of recent arrival delays. Times in ns. steps: clock steps.
+    """The camera's clock against the host's: the minimum of recent arrival delays. Times in ns.
 
-    A single frame never moves it: what contradicts the delays so far is left out, until frames in a row agree.
+    Where the camera's clock is set, its time goes on as before, so that no estimator sees it jump; steps: how often. A
+    single wrong stamp, or frames that queue up, never move it.
     """
 
     def __init__(self) -> None:
         self._delays: deque[int] = deque(maxlen=_DELAY_BUFFER)
-        self._contradicting: list[int] = []
+        self._jumped: list[int] = []
+        self._shift = self._newest_arrival = 0
+        self._newest = -(2**63)
         self.steps = 0
 
-    def handle_frame(self, device_ns: int, arrival_ns: int) -> None:
-        """Add a frame stamped ``device_ns`` that arrived at ``arrival_ns``."""
-        delay = arrival_ns - device_ns
-        if self._delays:
-            step = round(_CLOCK_STEP_S * NANOSECONDS)
-            later = delay - min(self._delays)
-            if later < -step or later > _LATE_NS:
-                if self._contradicting and abs(delay - self._contradicting[0]) > step:
-                    self._contradicting.clear()  # also frames that queued up, each less late than the one before
-                self._contradicting.append(delay)
-                if len(self._contradicting) < _CONFIRMING_FRAMES:
-                    return
-                self._delays.clear()
-                self._delays.extend(self._contradicting)
-                self.steps += 1
-        self._contradicting.clear()
-        self._delays.append(delay)
+    def handle_frame(self, device_ns: int, arrival_ns: int) -> int:
+        """Add a frame stamped ``device_ns`` that arrived at ``arrival_ns``. Returns its time, later than all before."""
+        time = device_ns + self._shift
+        delay = arrival_ns - time
+        correction = self._correction(time, delay, arrival_ns) if self._delays else 0
+        if not correction:
+            self._jumped.clear()
+            self._delays.append(delay)
+        elif len(self._jumped) >= _CONFIRMING_FRAMES:
+            self._shift += correction
+            self._jumped.clear()
+            self.steps += 1
+        self._newest = max(time + correction, self._newest + 1)
+        self._newest_arrival = arrival_ns
+        return self._newest
+
+    def _correction(self, time: int, delay: int, arrival_ns: int) -> int:
+        """What a frame's time lacks if the clock was set since the last frame, or the stamp is wrong; 0 if neither."""
+        agrees = bool(self._jumped) and abs(delay - self._jumped[0]) <= _CLOCK_STEP_NS
+        ahead = time - self._newest - (arrival_ns - self._newest_arrival)
+        if abs(delay - min(self._delays)) <= _CLOCK_STEP_NS or not (
+            agrees or time <= self._newest or ahead > _CLOCK_STEP_NS
+        ):
+            return 0
+        if not agrees:
+            self._jumped.clear()
+        self._jumped.append(delay)
+        return min(self._jumped) - min(self._delays)
 
     def camera_ns(self, host_ns: int) -> int | None:
         """Camera time of a host time; None before the first frame."""

@@ -24,6 +24,7 @@ _ONE_WAY_STD_NS = 20_000_000
 _CONFIRMATIONS = 3  # agreeing messages in a row that replace the estimate …
 _CONFIRM_NS = 500_000_000  # … over at least this time, in which an autopilot at its default 4 Hz contradicts them
 _AGREE_NS = 500_000_000  # jitter of the delays of messages that agree
+_SET_BACK_NS = 2 * NANOSECONDS  # after stamps went back by little: nothing earlier than the midway delay in this time
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +63,7 @@ class VehicleClock:
         self._newest_ns = -1
         self._candidate: _Candidate | None = None
         self._trip_candidate: _Candidate | None = None
+        self._set_back: _Candidate | None = None
         self.reboots = 0
         self.steps = 0
         self.rejected = 0
@@ -71,6 +73,11 @@ class VehicleClock:
     def known(self) -> bool:
         """Whether there is an estimate."""
         return bool(self._round_trips or self._one_way)
+
+    @property
+    def stamped(self) -> bool:
+        """Whether a stamped message was accepted."""
+        return self._newest_ns >= 0
 
     @property
     def answered(self) -> bool:
@@ -91,6 +98,9 @@ class VehicleClock:
             self._reset()
             self.reboots += restarted
             self.steps += not restarted
+        elif self._is_set_back(vehicle_ns, host_ns):
+            self._reset()
+            self.steps += 1
         self.reason = ""
         self._candidate = None
         self._newest_ns = max(self._newest_ns, vehicle_ns)
@@ -160,6 +170,22 @@ class VehicleClock:
             return f"stamped {-ahead / NANOSECONDS:.1f} s in the past", False
         return "", False
 
+    def _is_set_back(self, vehicle_ns: int, host_ns: int) -> bool:
+        """Whether the clock was set back by less than ``_contradiction`` notices.
+
+        Out of order alone is no proof: it would make every later message later as well.
+        """
+        offset, best = vehicle_ns - host_ns, self._estimate()
+        if self._set_back is None and vehicle_ns < self._newest_ns - _STEP_NS:
+            self._set_back = _Candidate(host_ns, vehicle_ns, offset)
+        candidate = self._set_back
+        if candidate is None or best is None:
+            return False
+        if 2 * offset > candidate.offset + best.offset:
+            self._set_back = None
+            return False
+        return host_ns - candidate.since_ns >= _SET_BACK_NS
+
     def _estimate(self) -> _OffsetBound | None:
         if self._round_trips:
             return self._best(self._round_trips, self._round_trips[-1].host_ns)
@@ -178,4 +204,4 @@ class VehicleClock:
         self._round_trips.clear()
         self._one_way.clear()
         self._newest_ns = -1
-        self._candidate = self._trip_candidate = None
+        self._candidate = self._trip_candidate = self._set_back = None

@@ -16,6 +16,7 @@ from edge.devices.simulated.aircraft import SimulatedAircraft
 from edge.mavlink.dialect import mavlink as M
 from edge.mavlink.link.transport import Pipe
 from edge.mavlink.roles.autopilot import Autopilot
+from tests.faults.stations import exchanged
 from tests.support.uav_flights import Air
 from tests.support.vehicle_link import URI, CameraOnLink
 
@@ -25,9 +26,10 @@ BOX = (0.4, 0.4, 0.6, 0.5)
 
 
 class Station:
-    """A ground station on a pipe. received: all of the camera's messages."""
+    """A ground station on a pipe. name: in the table of results. received: all of the camera's messages."""
 
-    def __init__(self, site: Site, pipe: Pipe, system: int) -> None:
+    def __init__(self, site: Site, pipe: Pipe, system: int, name: str) -> None:
+        self.name = name
         self._site, self._pipe, self._codec = site, pipe, M.MAVLink(None, system, 190)
         self._reader = M.MAVLink(None)
         self.received: list[Any] = []
@@ -60,7 +62,15 @@ class Station:
         self._send(M.MAVLink_command_long_message(1, 100, command, 0, *filled))
         self._site.run(0.5)
         acks = [m for m in self.received if m.get_type() == "COMMAND_ACK" and m.command == command]
-        return int(acks[0].result) if acks else None
+        result = int(acks[0].result) if acks else None
+        step = M.enums["MAV_CMD"][command].name.removeprefix("MAV_CMD_")
+        words = [f"{parameter:g}" for parameter in parameters]
+        if command in (M.MAV_CMD_REQUEST_MESSAGE, M.MAV_CMD_SET_MESSAGE_INTERVAL):
+            words[0] = M.mavlink_map[int(parameters[0])].msgname
+        came = {m.get_type() for m in self.received} & {words[0] if words else "", step.removeprefix("REQUEST_")}
+        outcome = "no answer" if result is None else M.enums["MAV_RESULT"][result].name.removeprefix("MAV_RESULT_")
+        exchanged(self.name, f"{step} {' '.join(words)}".rstrip(), ", ".join((outcome, *came)))
+        return result
 
     def start_tracking(self) -> None:
         """startTracking(QRectF), then _requestTrackingStatus."""
@@ -77,6 +87,12 @@ class Station:
         self.received.clear()
         self._site.run(seconds)
         return sum(message.get_type() == "CAMERA_TRACKING_IMAGE_STATUS" for message in self.received)
+
+    def shown(self) -> str:
+        """What the operator sees: the box, and the newest message."""
+        if self.tracking_rect is not None:
+            assert self.tracking_rect == pytest.approx(BOX)
+        return ("no box" if self.tracking_rect is None else "box") + f'; "{self.messages[-1]}"'
 
     def answer(self, kind: str) -> Any:
         """The newest message of a type."""
@@ -100,7 +116,9 @@ class Site:
             forwards=lambda address: camera_forwards or address != ("pipe", 0),
         )
         self.camera = CameraOnLink(transport=pipe, now_ns=lambda: round(1e9 * (100.0 + self.time)))
-        self.qgc, self.other = Station(self, air.join(), 255), Station(self, air.join(), 253)
+        name = "QGroundControl" if camera_forwards else "QGroundControl, PX4 with MAV_1_FORWARD = 0"
+        self.qgc = Station(self, air.join(), 255, name)
+        self.other = Station(self, air.join(), 253, "second station")
         self.run(2.5)
 
     def run(self, seconds: float) -> None:
@@ -120,6 +138,7 @@ def test_qgroundcontrol_finds_the_camera_shows_its_video_and_tracks(firmware: in
     site = Site(firmware=firmware)
     qgc = site.qgc
     assert any(m.get_type() == "HEARTBEAT" and m.type == M.MAV_TYPE_CAMERA for m in qgc.received)
+    exchanged(qgc.name, "heartbeat", "the camera is found")
     # _requestCameraInfo, _requestCameraSettings, _requestStorageInfo
     assert qgc.send_mav_command(M.MAV_CMD_REQUEST_MESSAGE, M.MAVLINK_MSG_ID_CAMERA_INFORMATION) == ACCEPTED
     information = qgc.answer("CAMERA_INFORMATION")
@@ -134,20 +153,23 @@ def test_qgroundcontrol_finds_the_camera_shows_its_video_and_tracks(firmware: in
     assert qgc.send_mav_command(M.MAV_CMD_VIDEO_STOP_STREAMING, 1) == ACCEPTED
     assert qgc.send_mav_command(M.MAV_CMD_VIDEO_START_STREAMING, 1) == ACCEPTED
     assert qgc.send_mav_command(M.MAV_CMD_REQUEST_MESSAGE, M.MAVLINK_MSG_ID_VIDEO_STREAM_STATUS, 1) == ACCEPTED
+    # _requestStreamInfo(7); QGCCameraManager::requestCameraFovForComp
+    assert qgc.send_mav_command(M.MAV_CMD_REQUEST_VIDEO_STREAM_INFORMATION, 7) == DENIED
+    assert qgc.send_mav_command(M.MAV_CMD_REQUEST_MESSAGE, M.MAVLINK_MSG_ID_CAMERA_FOV_STATUS) == ACCEPTED
     qgc.start_tracking()
-    assert qgc.tracking_rect == pytest.approx(BOX)
-    site.camera.component.status.state = "coasting"
-    site.run(2.5)
-    assert qgc.tracking_rect is None  # the box is hidden; the text says why
-    site.camera.component.status.state = "visible"
-    site.run(3.0)
-    assert qgc.tracking_rect == pytest.approx(BOX)
+    exchanged(qgc.name, "target seen", qgc.shown())
+    for state, seconds in (("coasting", 2.5), ("visible", 3.0), ("lost", 2.5)):
+        site.camera.component.status.state = state
+        site.run(seconds)
+        exchanged(qgc.name, f"target {state}", qgc.shown())
+        assert (qgc.tracking_rect is not None) == (state == "visible")
     qgc.stop_tracking()
-    assert qgc.tracking_rect is None
+    exchanged(qgc.name, "after that", qgc.shown())
     assert qgc.messages == [
         "Syncline: tracking started",
         "Syncline: target not seen, position predicted",
         "Syncline: target found again",
+        "Syncline: target lost, select it again",
         "Syncline: tracking stopped",
     ]
 
@@ -158,10 +180,14 @@ def test_the_next_station_hears_everything_after_qgroundcontrol_has_stopped() ->
     site.qgc.stop_tracking()
     assert site.other.send_mav_command(M.MAV_CMD_CAMERA_TRACK_POINT, 0.5, 0.5, 0.1) == ACCEPTED
     assert site.other.statuses(2.0) >= 18
+    exchanged(site.other.name, "after QGroundControl's interval of -1", "10 statuses a second")
     assert site.qgc.send_mav_command(M.MAV_CMD_SET_MESSAGE_INTERVAL, IMAGE, 500_000) == ACCEPTED
     assert site.other.statuses(2.0) >= 18
+    exchanged(site.other.name, "after QGroundControl's interval of 500 ms", "10 statuses a second")
     assert site.qgc.send_mav_command(M.MAV_CMD_CAMERA_TRACK_RECTANGLE, *BOX) == ACCEPTED
-    assert "Syncline: station 255 took over from 253" in site.other.messages
+    text = "Syncline: station 255 took over from 253"
+    assert text in site.other.messages
+    exchanged(site.other.name, "selection by QGroundControl", f'"{text}"')
 
 
 def test_without_forwarding_on_its_port_a_px4_keeps_station_and_camera_apart() -> None:

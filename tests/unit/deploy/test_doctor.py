@@ -265,6 +265,10 @@ def test_vehicle_telemetry(heard: dict[str, Any], verdict: str, remedy: str) -> 
     [
         ("PX4", {"MAV_0_FORWARD": 1e-45, "MAV_1_FORWARD": 0.0}, "MAV_1_FORWARD = 0", "set MAV_x_FORWARD = 1"),
         ("PX4", {"MAV_1_FORWARD": 1e-45}, "none is heard", "two --out do not meet"),
+        ("PX4", {"MAV_2_FORWARD": 0.0, "MAV_2_CONFIG": 0.0}, "none is heard", "two --out do not meet"),  # unused
+        ("PX4", {"MAV_2_FORWARD": 0.0, "MAV_2_CONFIG": 1.4e-43}, "MAV_2_FORWARD = 0", "set MAV_x_FORWARD = 1"),
+        ("PX4", {"MAV_HB_FORW_EN": 0.0}, "MAV_HB_FORW_EN = 0", "MAV_HB_FORW_EN = 1"),
+        ("ArduPilot", {"MAV2_OPTIONS": 2.0, "SERIAL2_OPTIONS": 0.0}, "MAV2_OPTIONS has bit 1", "bit 1 of MAVx_OPTIONS"),
         ("ArduPilot", {"SERIAL2_OPTIONS": 1024.0}, "SERIAL2_OPTIONS has bit 10", "clear bit 10"),
         ("ArduPilot", {"SERIAL2_OPTIONS": 8.0}, "none is heard", "two --out do not meet"),
     ],

@@ -32,7 +32,8 @@ def fov_status(
 ) -> Any:
     """CAMERA_FOV_STATUS of a camera on a gimbal with rotation ned_from_gimbal."""
     mount = None if gimbal is None else MountSample(NOW - age_ns, NOW, 0.01, gimbal, position, np.zeros(3))
-    vehicle = SimpleNamespace(origin=ORIGIN, position=position, mount=mount)
+    motion = None if position is None else (position, np.zeros(3))
+    vehicle = SimpleNamespace(origin=ORIGIN, motion_at=lambda time_s: motion, mount=mount)
     ours, theirs = Pipe.pair()
     link = Link(None, system=1, component=100, allowed=(), transport=ours, vehicle=1)
     component = CameraComponent(link, SIZE, 30.0, lens, None, lambda command: True)

@@ -197,6 +197,27 @@ def test_a_retransmitted_command_is_acknowledged_again_but_not_executed_again() 
     assert len(commands) == 2
 
 
+@pytest.mark.parametrize(
+    ("command", "before"),
+    [
+        (mavlink.MAV_CMD_CAMERA_TRACK_POINT, (0.5, 0.5, 0.1)),
+        (mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, (0.1, 0.1, 0.2, 0.2)),
+        (mavlink.MAV_CMD_CAMERA_STOP_TRACKING, ()),
+        (mavlink.MAV_CMD_VIDEO_START_STREAMING, (1, 0)),
+    ],
+)
+def test_a_command_for_another_camera_is_not_executed(command: int, before: tuple[float, ...]) -> None:
+    commands: list[OperatorCommand] = []
+    stream = VideoStream("rtsp", "rtsp://10.0.0.7:8554/overlay")
+    under_test = CameraUnderTest(on_command=lambda one: commands.append(one) or True, stream=stream)  # type: ignore[func-returns-value]
+    for other in (1, 101):
+        assert under_test.result(command, *before, other) == mavlink.MAV_RESULT_DENIED
+        assert under_test.command(command, *before, other, component=0) == []
+    assert commands == []
+    for ours in (0, 100, math.nan):
+        assert under_test.result(command, *before, ours) == mavlink.MAV_RESULT_ACCEPTED
+
+
 def test_a_station_that_is_not_allowed_is_denied() -> None:
     commands: list[OperatorCommand] = []
     under_test = CameraUnderTest(
@@ -278,6 +299,29 @@ def test_a_selection_and_a_departure_restore_the_default_rate() -> None:
     under_test.fly(0.1)
     under_test.now += 10.0  # the station is gone
     assert under_test.fly(3.0)["CAMERA_TRACKING_IMAGE_STATUS"] == pytest.approx(30, abs=2)
+
+
+def test_a_script_that_selects_and_sends_no_heartbeats_is_not_forgotten_while_others_slow_the_status() -> None:
+    under_test = CameraUnderTest()
+    under_test.fly(0.1, QGC)
+    tracked(under_test, OTHER)
+    for interval_us in (-1, 500_000):
+        under_test.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, IMAGE, interval_us, by=QGC)
+        for _ in range(2):  # longer than a station's silence
+            assert under_test.fly(6.0, QGC)["CAMERA_TRACKING_IMAGE_STATUS"] == pytest.approx(60, abs=2)
+
+
+def test_a_companion_that_has_given_a_command_is_present_by_its_own_heartbeats() -> None:
+    rates = MessageRates({"CAMERA_FOV_STATUS": 1.0})
+    companion, now = (1, 191), 0.0
+    rates.hear(companion, now, new=False)
+    assert not rates.is_present(1, now)
+    rates.hear(companion, now)
+    rates.set_interval(companion, "CAMERA_FOV_STATUS", 100_000)
+    for _ in range(30):
+        now += 1.0
+        rates.hear(companion, now, new=False)
+        assert rates.interval("CAMERA_FOV_STATUS", now) == pytest.approx(0.1)
 
 
 def test_any_number_of_stations_is_remembered_only_up_to_a_limit() -> None:

@@ -19,8 +19,10 @@ from edge.mavlink.dialect import mavlink
 from edge.mavlink.link.connection import Link
 from edge.mavlink.link.outbox import Outbox
 from edge.mavlink.link.transport import Tcp, Udp, Url, parse_url
+from tests.faults.stations import exchanged
 
 NAN = float("nan")
+SENT = {"HEARTBEAT": 10, "COMMAND_ACK": 10, "CAMERA_TRACKING_IMAGE_STATUS": 600, "CAMERA_FOV_STATUS": 2400}
 
 
 def camera_messages(time_s: float) -> list[Any]:
@@ -91,6 +93,8 @@ def test_a_full_serial_line_carries_what_matters_first() -> None:
     late = [time - k for k, (time, _) in enumerate(one for one in arrived if one[1].get_type() == "HEARTBEAT")]
     assert max(late) < 0.1
     assert link.counters["dropped.CAMERA_FOV_STATUS"] > 1000
+    loads = f"more than 3 times its capacity for 10 s: {', '.join(f'{sent} {kind}' for kind, sent in SENT.items())}"
+    exchanged("serial port, 57,600 baud", loads, ", ".join(f"{counts[kind]} {kind}" for kind in SENT))
     sequence = [message.get_seq() for _, message in arrived]
     assert sequence == [k % 256 for k in range(len(sequence))]  # nothing that got a number was lost
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from edge.agents.uav_guidance import GuidanceControl
 from edge.mavlink.dialect import mavlink
 from edge.mavlink.link.connection import Link
 from edge.mavlink.link.transport import Pipe
 from edge.mavlink.roles.guidance import Guidance, GuidanceLimits, GuidanceTarget
+from edge.uav.base import Estimate, TrackState
 from edge.uav.navigation import Origin
 
 ORIGIN = Origin(47.4, 8.5, 480.0)
@@ -142,3 +145,19 @@ def test_the_gimbal_points_at_the_target_with_a_limited_rate() -> None:
 def test_commands_come_ten_times_a_second_at_most() -> None:
     under_test = GuidanceUnderTest(follow=True)
     assert sum(len(under_test.tick(k / 100)) for k in range(100)) == pytest.approx(10, abs=1)
+
+
+def test_a_vehicle_whose_position_is_no_longer_reported_is_not_commanded() -> None:
+    under_test = GuidanceUnderTest(gimbal=True)
+    seen = Estimate(1.0, TrackState.VISIBLE, *([0.0] * 6), north=30.0, east=40.0, std_m=1.0)
+    known: list[tuple[np.ndarray, np.ndarray] | None] = [(VEHICLE, STILL)]
+    vehicle: Any = SimpleNamespace(motion_at=lambda time_s: known[0], origin=ORIGIN, armed=True)
+    link: Any = SimpleNamespace(last_received_ns=10**9)
+    control = GuidanceControl(under_test.guidance, link, vehicle, SimpleNamespace(is_present=lambda *_: True))  # type: ignore[arg-type]
+    control.begin(1.0)
+    control.update(10**9, seen, 1.0, 1.0)
+    assert under_test.guidance.counters["pointed"] == 1
+    known[0] = None
+    control.update(2 * 10**9, seen, 2.0, 2.0)
+    assert under_test.guidance.counters["pointed"] == 1
+    assert under_test.guidance.hold_reason == "the vehicle's position is not known"

@@ -9,6 +9,7 @@ import pytest
 from edge.mavlink.dialect import mavlink
 from edge.mavlink.link.connection import Link
 from edge.mavlink.link.signing import TICKS, Signing, ticks
+from tests.faults.stations import exchanged
 
 A, B, C = ("10.0.0.1", 5000), ("10.0.0.1", 6000), ("10.0.0.9", 5000)
 KEY = bytes(range(32))
@@ -67,10 +68,11 @@ class LinkUnderTest:
         boot_s: float = 500.0,
         place: tuple[int, int] | None = HOME,
         behind_s: float = 0.0,
+        telemetry: bool = True,
     ) -> float | None:
         """An autopilot sends for some time at 10 Hz; when it was first accepted, after its start [s].
 
-        boot_s: its uptime at time 0. behind_s: how far its signing time is behind.
+        boot_s: its uptime at time 0. behind_s: how far its signing time is behind. telemetry: not only heartbeats.
         """
         codec = mavlink.MAVLink(None, system, 1)
         if self.key is not None:
@@ -80,10 +82,10 @@ class LinkUnderTest:
             if self.key is not None:
                 codec.signing.timestamp = ticks(UNIX_S + self.now - behind_s)
             boot_ms = round(1e3 * (boot_s + self.now))
-            messages = [mavlink.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0)]
+            messages = [mavlink.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0)] if telemetry else []
             if k % 10 == 0:
                 messages.insert(0, mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
-            if place is not None and k % 2 == 0:
+            if telemetry and place is not None and k % 2 == 0:
                 messages.append(mavlink.MAVLink_global_position_int_message(boot_ms, *place, 500000, 20000, 0, 0, 0, 0))
             self.socket.waiting = [(bytes(message.pack(codec)), address) for message in messages]
             got = self.link.poll()
@@ -109,6 +111,18 @@ def test_a_restarted_router_is_followed_to_its_new_port_within_two_seconds(down_
     assert relocked is not None
     assert relocked <= 2.0
     assert under_test.link.counters["handed_over"] == 1
+    exchanged(
+        "mavlink-router, udpin", f"away for {down_s:g} s, back on another port", f"heard again after {relocked:.1f} s"
+    )
+
+
+def test_of_a_vehicle_that_only_sends_heartbeats_another_port_is_followed_soon_and_another_host_late() -> None:
+    for address, soon in ((B, True), (C, False)):
+        under_test = LinkUnderTest()
+        under_test.autopilot(A, 3.0, telemetry=False)
+        relocked = under_test.autopilot(address, 12.0, telemetry=False)
+        assert relocked is not None
+        assert (relocked <= 2.0) == soon
 
 
 @pytest.mark.parametrize(
@@ -133,6 +147,25 @@ def test_an_unsigned_stranger_never_takes_the_link_and_the_vehicle_gets_it_back(
     back = under_test.autopilot(B, 3.0)
     assert back is not None
     assert back <= 0.2
+    exchanged(
+        "second autopilot, unsigned",
+        f"in a silence of 12 s: {' '.join(f'{key} {value}' for key, value in stranger.items())}",
+        f'not followed, "… {why} …"',
+    )
+
+
+@pytest.mark.parametrize("telemetry", [True, False])
+def test_a_vehicle_that_is_back_at_its_address_gets_the_link_from_whoever_resembled_it(telemetry: bool) -> None:
+    under_test = LinkUnderTest()
+    under_test.autopilot(A, 3.0, telemetry=telemetry)
+    under_test.silence(12.0)
+    assert under_test.autopilot(C, 3.0, telemetry=telemetry) is not None  # nothing tells it from the vehicle
+    for _ in range(3):
+        under_test.autopilot(A, 0.5, telemetry=telemetry)
+        under_test.received.clear()
+        under_test.autopilot(C, 0.5, telemetry=telemetry)
+        assert under_test.received == []
+    assert under_test.report() == "10.0.0.9:5000 sends as well, and is not followed"
 
 
 def test_a_stranger_beside_the_vehicle_is_reported_and_not_followed() -> None:
@@ -159,6 +192,7 @@ def test_a_changed_system_id_is_followed_once_the_old_one_is_silent() -> None:
     assert changed is not None
     assert 1.0 < changed <= 2.0
     assert under_test.link.vehicle == 7
+    exchanged("autopilot, unsigned", "its system id changes", f"followed after {changed:.1f} s")
     fixed = LinkUnderTest(vehicle=1)
     fixed.autopilot(A, 3.0)
     assert fixed.autopilot(A, 4.0, system=7) is None
@@ -183,6 +217,19 @@ def test_a_signed_autopilot_a_day_behind_is_named_and_answered() -> None:
     assert address == A  # by which it gets the time: it takes over the greatest timestamp it receives
     assert int.from_bytes(data[-12:-6], "little") >= ticks(UNIX_S)
     assert under_test.autopilot(A, 1.0) == 0.0
+    assert under_test.link.problem == ""
+    exchanged("signed autopilot, udpin", "its clock a day behind", "named, answered, followed once it has the time")
+
+
+def test_a_signed_vehicle_that_was_switched_off_and_lost_its_time_is_named_and_answered_at_its_new_port() -> None:
+    under_test = LinkUnderTest(key=KEY)
+    under_test.autopilot(A, 2.0)
+    under_test.silence(20.0)
+    assert under_test.autopilot(B, 1.0, boot_s=-22.0, behind_s=86_400.0) is None
+    assert "its clock is 86400 s behind" in under_test.link.problem
+    under_test.link.send(mavlink.MAVLink_heartbeat_message(30, 8, 0, 0, 4, 3))
+    assert under_test.socket.sent[-1][1] == B
+    assert under_test.autopilot(B, 1.0, boot_s=-22.0) == 0.0
     assert under_test.link.problem == ""
 
 

@@ -130,6 +130,40 @@ def test_a_gimbal_with_its_own_clock_is_mapped_by_itself(ahead_s: float, flags: 
     assert under_test.vehicle.problem(2_000_000_000) == ""
 
 
+@pytest.mark.parametrize("gimbal", [True, False])
+@pytest.mark.parametrize("back_s", [0.3, 0.9, 1.5, 3.0, 50.0, 122.0])
+def test_a_clock_that_is_set_back_is_followed_within_three_seconds(back_s: float, gimbal: bool) -> None:
+    under_test = VehicleUnderTest(gimbal=gimbal)
+    errors: list[tuple[float, float]] = []
+    for k in range(160):
+        time_s, ahead_s = 0.05 * k, -back_s if k >= 80 else 0.0
+        samples = under_test.gimbal(time_s, ahead_s) if gimbal else under_test.attitude(time_s, ahead_s=ahead_s)
+        errors += [(time_s, abs(1e-9 * sample.host_ns - time_s)) for sample in samples]
+    late = [error for time_s, error in errors if time_s > 7.0]
+    assert len(late) == 20 - 1
+    assert max(late) < 0.02
+    assert sum(under_test.vehicle.clock_resets) == 1
+
+
+@pytest.mark.parametrize("gimbal", [True, False])
+def test_a_source_that_does_not_stamp_is_as_late_as_the_link(gimbal: bool) -> None:
+    under_test = VehicleUnderTest(gimbal=gimbal)
+    for k in range(100):
+        send = under_test.gimbal if gimbal else under_test.attitude
+        samples = send(0.1 * k, ahead_s=-BOOT_S - 0.1 * k)
+        assert [round(1e-9 * sample.host_ns - 0.1 * k, 3) for sample in samples] == [DELAY_S]
+    assert under_test.vehicle.problem(10_000_000_000) == ""
+
+
+def test_on_the_airframe_a_gimbal_is_not_listened_to() -> None:
+    under_test = VehicleUnderTest()
+    for k in range(40):
+        under_test.attitude(0.1 * k)
+        under_test.gimbal(0.1 * k, 45.0 if k < 20 else 0.0, GIMBAL if k % 2 else AUTOPILOT)
+    assert under_test.vehicle.clock_resets == (0, 0)
+    assert under_test.vehicle.problem(4_000_000_000) == ""
+
+
 def test_a_second_gimbal_is_not_mixed_with_the_first_and_takes_over_when_that_is_silent() -> None:
     under_test = VehicleUnderTest(gimbal=True)
     for k in range(10):
@@ -138,6 +172,24 @@ def test_a_second_gimbal_is_not_mixed_with_the_first_and_takes_over_when_that_is
     assert under_test.vehicle.counters["gimbal"] == 10
     assert under_test.gimbal(3.5, 0.0, COMPANION) == []
     assert len(under_test.gimbal(3.6, 0.0, AUTOPILOT)) == 1
+
+
+def test_a_position_that_is_no_longer_reported_is_not_known_after_a_second() -> None:
+    under_test = VehicleUnderTest()
+    for k in range(20):
+        under_test.position(0.1 * k)
+        under_test.attitude(0.1 * k)
+    motion = under_test.vehicle.motion_at(2.4)
+    assert motion is not None
+    assert motion[0] == pytest.approx([24.0, 0.0, -50.0], abs=0.2)
+    for k in range(20, 40):
+        samples = under_test.attitude(0.1 * k)
+    assert samples[0].position is None
+    assert under_test.vehicle.motion_at(4.0) is None
+    status = CameraMessages((640, 480), 30.0, None, None, (0, 1, 0)).status
+    update_tracking_status(status, None, under_test.vehicle, (640, 480), None, np.eye(3), 4 * 10**9)
+    assert status.camera is None
+    assert status.quaternion is not None
 
 
 def test_a_gimbal_that_never_reports_is_named() -> None:
@@ -175,7 +227,7 @@ def test_whatever_numbers_the_vehicle_sends_nothing_raises_and_every_sample_is_b
     for k in range(3000):
         now = 10**9 + k * 10_000_000
         number, integer = partial(rng.choice, big), partial(rng.choice, whole)
-        boot = rng.choice((k * 10, k * 10, rng.randrange(2**32), 0, 2**32 - 1))
+        boot = rng.choice((k * 10, k * 10, rng.randrange(2**32), 0, 2**32 - 1)) if k > 10 else 1 + k * 10
         q = rng.choice(([1.0, 0.0, 0.0, 0.0], [number() for _ in range(4)]))
         message = rng.choice(
             (

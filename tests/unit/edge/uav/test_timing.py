@@ -108,27 +108,43 @@ def test_one_frame_with_a_wrong_stamp_does_not_move_the_cameras_clock(error_s: i
     clock = CameraHostClock()
     for k in range(100):
         wrong = k % 10 == 9
-        clock.handle_frame(k * FRAME + wrong * error_s * SECOND, k * FRAME + 7 * SECOND + 20_000_000)
+        time = clock.handle_frame(k * FRAME + wrong * error_s * SECOND, k * FRAME + 7 * SECOND + 20_000_000)
+        assert time == k * FRAME
         assert clock.camera_ns(7 * SECOND + 20_000_000) == 0
     assert clock.steps == 0
 
 
-@pytest.mark.parametrize("step_s", [10, -10])
-def test_a_step_of_the_cameras_clock_is_followed(step_s: int) -> None:
-    clock = CameraHostClock()
-    for k in range(100):
-        stepped = (k >= 50) * step_s * SECOND
-        clock.handle_frame(k * FRAME + stepped, k * FRAME + 20_000_000)
+@pytest.mark.parametrize("step_s", [10.0, 0.5, -0.3, -1.0, -10.0])
+def test_where_the_cameras_clock_is_set_its_time_goes_on(step_s: float) -> None:
+    clock, rng = CameraHostClock(), np.random.default_rng(1)
+    last = -1
+    for k in range(200):
+        stepped = round((k >= 100) * step_s * SECOND)
+        jitter = int(rng.integers(0, 20_000_000))
+        time = clock.handle_frame(k * FRAME + stepped, k * FRAME + 20_000_000 + jitter)
+        assert abs(time - k * FRAME) <= 20_000_000
+        assert time > last
+        last = time
     assert clock.steps == 1
-    assert clock.camera_ns(20_000_000) == step_s * SECOND
+    camera_ns = clock.camera_ns(20_000_000)
+    assert camera_ns is not None
+    assert abs(camera_ns) < 2_000_000
 
 
 def test_frames_that_queued_up_are_no_clock_step() -> None:
     clock = CameraHostClock()
     for k in range(200):
         held_back = max(0, (190 - k) * FRAME) if k >= 100 else 0  # three seconds of them arrive at once
-        clock.handle_frame(k * FRAME, k * FRAME + 20_000_000 + held_back)
+        assert clock.handle_frame(k * FRAME, k * FRAME + 20_000_000 + held_back) == k * FRAME
     assert clock.steps == 0
+
+
+def test_a_camera_that_begins_with_old_frames_has_the_clock_of_its_new_ones() -> None:
+    clock = CameraHostClock()
+    for k in range(100):
+        arrival = max(k * FRAME, 60 * FRAME) + 20_000_000  # two seconds of them arrive at once
+        assert clock.handle_frame(k * FRAME, arrival) == k * FRAME
+    assert clock.camera_ns(20_000_000) == 0
 
 
 def test_telemetry_goes_on_after_a_clock_was_set_back() -> None:

@@ -1,0 +1,39 @@
+"""Telemetry logs in which several components of a vehicle report an attitude."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from edge.mavlink.dialect import mavlink
+from edge.mavlink.link.tlog import read_tlog
+
+
+@pytest.mark.parametrize("ahead_s", [86_400.0, 40.0, -20.0])
+def test_only_the_autopilots_attitudes_and_positions_are_read(tmp_path: Path, ahead_s: float) -> None:
+    autopilot, companion = (mavlink.MAVLink(None, 1, component) for component in (1, 191))
+    data = bytearray()
+    for k in range(200):
+        boot_ms = 60_000 + 50 * k
+        messages = [
+            (autopilot, mavlink.MAVLink_attitude_message(boot_ms, 0.0, 0.0, 0.01 * k, 0, 0, 0)),
+            (autopilot, mavlink.MAVLink_local_position_ned_message(boot_ms, 0.5 * k, 0, -50, 10, 0, 0)),
+        ]
+        if k % 20 == 0:
+            messages.append((autopilot, mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)))
+            other_ms = round(boot_ms + 1e3 * ahead_s)
+            attitude = mavlink.MAVLink_attitude_quaternion_message(other_ms, 0.7, 0.7, 0, 0, 0, 0, 0)
+            position = mavlink.MAVLink_local_position_ned_message(other_ms, 9e3, 0, 0, 0, 0, 0)
+            messages += [(companion, attitude), (companion, position)]
+        for codec, message in messages:
+            data += (1_700_000_000_000_000 + 50_000 * k).to_bytes(8, "big") + message.pack(codec)
+    file = tmp_path / "flight.tlog"
+    file.write_bytes(data)
+    log = read_tlog(file)
+    assert (len(log.samples), log.boots, log.left_out, log.unreadable) == (200, 1, 0, 0)
+    last = log.samples[-1]
+    assert last.position is not None
+    assert last.position == pytest.approx([99.5, 0.0, -50.0])
+    assert math.atan2(last.ned_from_body[1, 0], last.ned_from_body[0, 0]) == pytest.approx(1.99)
