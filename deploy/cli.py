@@ -17,6 +17,9 @@ from typing import NoReturn
 # orders that don't depend on the number of cores give identical bytes everywhere. Must run before numpy is imported.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+# 400 MB: the header of a small file may claim eight times as many. Must be set before cv2 is imported.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet: what is wrong with a video is said in one line
 
 from cyclopts import App, CycloptsError  # noqa: E402
 from cyclopts.exceptions import UnknownCommandError  # noqa: E402
