@@ -134,8 +134,6 @@ def read_records(stream: BinaryIO, damage: Damage, begin: int = len(MAGIC)) -> I
             # A length that does not lead to another record is wrong, unless the content confirms it.
             inside = partial(_read_at, stream)
             whole = _is_next(following) or _is_self_consistent(inside, offset + _HEAD.size, opcode, length)
-                partial(_read_at, stream), offset + _HEAD.size, opcode, length
-            )
         if not whole:
             found = resync(stream, offset + 1, size) if offset < size else None
             damage.record(_flaw(offset, head, opcode, length, found))
