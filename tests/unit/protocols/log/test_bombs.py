@@ -12,12 +12,17 @@ from pathlib import Path
 import lz4.frame
 import pytest
 import zstandard
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from mcap.opcode import Opcode
 
 from protocols.log.read.index import read_index
 from protocols.log.read.mcap_records import MAGIC, Damage, McapRecord, chunk_records, read_records
 from protocols.log.read.reader import LogReader
+from protocols.log.write.foxglove import FoxgloveConverter
 from protocols.log.write.writer import LogWriter
+from protocols.messages import syncline_pb2 as pb
+from protocols.topics import OBSERVATION
+from tests.support.samples import observation
 
 ZEROS = bytes(64 * 1024 * 1024)
 
@@ -112,6 +117,24 @@ def test_attachments_are_read_one_at_a_time(tmp_path: Path) -> None:
         assert tracemalloc.get_traced_memory()[1] < 15_000_000
     finally:
         tracemalloc.stop()
+
+
+def test_a_log_has_room_for_so_many_keys_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The format numbers them with 16 bits: who invented 65,536 names ended the recorder."""
+    monkeypatch.setattr("protocols.log.write.writer.MAX_CHANNELS", 3)
+    with LogWriter(tmp_path / "log.mcap") as writer:
+        taken = [writer.write(OBSERVATION, f"a{number}", "local", observation(f"a{number}"), 1) for number in range(5)]
+        assert writer.write(OBSERVATION, "a0", "local", observation("a0", 1), 2)
+    assert taken == [True, True, True, False, False]
+    assert LogReader(tmp_path / "log.mcap").summary().messages == 4
+
+
+def test_invented_labels_do_not_fill_every_cloud_of_points() -> None:
+    views = FoxgloveConverter()
+    for number in range(1500):
+        track = pb.Track(label=f"l{number}", state="confirmed", position=[0.0, 0.0, 1.0])
+        clouds = [one.message for one in views.of("local", track, number) if isinstance(one.message, PointCloud)]
+    assert len(clouds[0].data) == 12 * 1024
 
 
 class Counting(io.BytesIO):
