@@ -117,7 +117,7 @@ def write_together(files: Mapping[Path, str]) -> None:
                 raise IsADirectoryError(errno.EISDIR, "this is a folder, but a file is needed")
             handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name[:40]}.")
             prepared.append((Path(name), file))
-            with os.fdopen(handle, "w", encoding="utf-8", newline="") as out:
+            with os.fdopen(handle, "w", encoding="utf-8", errors="replace", newline="") as out:
                 out.write(text)
                 out.flush()
                 os.fsync(out.fileno())

@@ -302,6 +302,51 @@ def test_a_terminal_without_unicode_gets_escapes_and_no_traceback(tmp_path: Path
     assert b"Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize("closed", ["stdin", "stdout", "stderr"])
+def test_a_stream_that_is_closed_from_the_start_is_no_error(tmp_path: Path, filmed: Session, closed: str) -> None:
+    """Python has None in its place."""
+    write_session(tmp_path / "session", filmed)
+    place = {"stdin": 0, "stdout": 1, "stderr": 2}[closed]
+    command = f'exec "$0" -m deploy info "$1" {place}>&-'
+    done = subprocess.run(
+        ["sh", "-c", command, sys.executable, str(tmp_path / "session")], capture_output=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_a_reader_that_closes_the_pipe_is_no_error() -> None:
+    command = '"$0" -m deploy --help 2>&1; echo "status $?" >&2'
+    done = subprocess.run(["sh", "-c", f"({command}) | true", sys.executable], capture_output=True, check=False)
+    assert done.stderr.strip() == b"status 0"
+
+
+def test_names_that_are_no_unicode_or_not_in_the_locale_are_no_bug(tmp_path: Path, filmed: Session) -> None:
+    folder = write_session(tmp_path / "session\udcff", filmed)
+    assert run(["calibrate", str(folder), "--out", str(tmp_path / "out\udcff")]) == 0
+    text = (tmp_path / "out\udcff/calibration.toml").read_text().replace("cam1", "cämera 日")
+    calibration = tmp_path / "calibration.toml"
+    calibration.write_text(text.replace("[cämera 日]", '["cämera 日"]'), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", "deploy", "export", str(calibration), "--to", "opencv", "--out", str(tmp_path / "cv")],
+        env={**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+        capture_output=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr.count(b"\n")) == (2, 1), done.stderr
+    assert not list((tmp_path / "cv").iterdir())
+
+
+@pytest.mark.parametrize("megabytes", [120, 300, 400])
+def test_little_memory_is_one_line(tmp_path: Path, filmed: Session, megabytes: int) -> None:
+    """Libraries that cannot be loaded, and OpenBLAS, which waits for ever."""
+    write_session(tmp_path / "session", filmed)
+    command = f'ulimit -v {megabytes * 1000}; exec "$0" -m deploy calibrate "$1" --out "$1/out"'
+    done = subprocess.run(
+        ["sh", "-c", command, sys.executable, str(tmp_path / "session")], capture_output=True, check=False, timeout=60
+    )
+    assert (done.returncode, done.stderr.count(b"\n")) == (2, 1), done.stderr
+
+
 def test_out_of_memory_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def fails(*arguments: object) -> None:
         raise MemoryError
