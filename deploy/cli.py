@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import io
 import os
+import resource
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -17,6 +18,9 @@ from typing import NoReturn
 # orders that don't depend on the number of cores give identical bytes everywhere. Must run before numpy is imported.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+# 400 MB: the header of a small file may claim eight times as many. Must be set before cv2 is imported.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet: what is wrong with a video is said in one line
 
 from cyclopts import App, CycloptsError  # noqa: E402
 from cyclopts.exceptions import UnknownCommandError  # noqa: E402
@@ -100,6 +104,15 @@ COMMANDS: tuple[tuple[str, str, str], ...] = (
     ),
 )
 
+_NO_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory", "can't start new thread")
+"""What the loader of libraries and the threads say of it."""
+_LEAST_ADDRESS_SPACE = 768 << 20
+"""Bytes of a limit (`ulimit -v`) for commands that compute: with 350 to 500 MB, OpenBLAS waits for memory for ever or
+ends the process."""
+_COMPUTING = frozenset(
+    ("calibrate", "camera", "demo", "detect", "follow", "hub", "intrinsics", "quick", "sync", "track", "triangulate")
+    + ("replay", "uav")
+)
 _AGENTS = ("camera", "uav", "hub", "record", "router")
 
 
@@ -130,6 +143,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
     """Run one subcommand and return its exit status: 0 done, 1 bug, 2 wrong usage or input, 3 refused."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if words[:1] and words[0] in _COMPUTING and limit != resource.RLIM_INFINITY and limit < _LEAST_ADDRESS_SPACE:
+            raise MemoryError
         result = build_app(words[0] if words else "")(words, exit_on_error=False, print_error=False)
     except SynclineError as error:
         print(f"syncline: {error}", file=sys.stderr)
@@ -145,11 +161,17 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("syncline: interrupted", file=sys.stderr)
         return 130
-    except BrokenPipeError:
-        # The reader of our output has closed the pipe (a pager, head): not an error.
+    except (BrokenPipeError, SystemExit):
+        # The reader of our output has closed the pipe (a pager, head): not an error. Rich exits for it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_DONE
-    except MemoryError:
+    except UnicodeEncodeError as error:
+        name = error.object.encode(errors="backslashreplace").decode()
+        print(f"syncline: {name}: not a file name in this locale; set LC_ALL=C.UTF-8", file=sys.stderr)
+        return EXIT_INPUT
+    except (MemoryError, ImportError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and not any(words in str(error) for words in _NO_MEMORY):
+            raise
         print("syncline: out of memory; give it more, or less to do", file=sys.stderr)
         return EXIT_INPUT
     except OSError as error:
@@ -178,6 +200,10 @@ def _command_of(words: Sequence[str]) -> str:
 
 def main() -> NoReturn:
     """Entry point of the console script."""
+    for name, place in (("stdin", 0), ("stdout", 1), ("stderr", 2)):
+        if getattr(sys, name) is None:  # closed by who started it; the next file opened would take its place
+            os.open(os.devnull, os.O_RDWR)
+            setattr(sys, name, open(place, "r" if place == 0 else "w", encoding="utf-8", closefd=False))  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal without UTF-8 shows what it cannot print as an escape
         sys.stdout.reconfigure(errors="backslashreplace")
     status = run()

@@ -183,9 +183,9 @@ def _record(
     arrived = [received for subscription in subscriptions for received in subscription.drain()]
     batch = [received for received in arrived if limiter.accepts(received)]
     batch.sort(key=lambda received: received.arrival_ns)
-    for received in batch:
-        writer.write(received.topic, received.agent, site, received.message, received.arrival_ns)
-    return len(batch)
+    return sum(
+        writer.write(received.topic, received.agent, site, received.message, received.arrival_ns) for received in batch
+    )
 
 
 def _counters(subscriptions: list[Subscription], messages: int) -> dict[str, int]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import difflib
 import math
 import re
-import tomllib
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 import msgspec
 
 from protocols.core.errors import InputError
+from protocols.core.files import read_toml
 
 _Config = TypeVar("_Config", bound=msgspec.Struct)
 
@@ -40,22 +40,7 @@ def load(path: Path | str, kind: type[_Config]) -> _Config:
     determined), key and remedy.
     """
     file = Path(path)
-    try:
-        text = file.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(
-            f"cannot be read: {error.strerror or error}", file=file, remedy="check the name of the file"
-        ) from None
-    except UnicodeDecodeError:
-        raise InputError("is not UTF-8 text", file=file, remedy="give a TOML file") from None
-    try:
-        table = tomllib.loads(text)
-    except (RecursionError, OverflowError):
-        raise InputError(
-            "too deeply nested, or a number is out of range", file=file, remedy="write a plain TOML file"
-        ) from None
-    except ValueError as error:
-        raise _syntax_error(file, text, str(error)) from None
+    table, text = read_toml(file, "configuration")
     bad = _not_finite(table, "")
     if bad:
         raise InputError(f"{bad} is not finite", file=file, line=_line(text, bad), remedy="give a number")
@@ -105,15 +90,6 @@ def _not_finite(value: object, path: str) -> str:
     elif isinstance(value, list):
         inner = [(f"{path}[{index}]", item) for index, item in enumerate(value)]
     return next((bad for name, item in inner if (bad := _not_finite(item, name))), "")
-
-
-def _syntax_error(file: Path, text: str, message: str) -> InputError:
-    found = re.search(r" \(at (?:line (\d+), column \d+|end of document)\)\Z", message)
-    line = None
-    if found:
-        line = int(found[1]) if found[1] else len(text.splitlines())
-        message = message[: found.start()]
-    return InputError(f"is not TOML: {message}", file=file, line=line, remedy="correct the line")
 
 
 def _content_error(file: Path, text: str, kind: type[msgspec.Struct], message: str) -> InputError:

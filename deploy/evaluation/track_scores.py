@@ -13,6 +13,7 @@ import numpy as np
 from deploy.offline.track import TrackedFrame
 from edge.uav.base import TrackState
 from protocols.core.errors import InputError
+from protocols.core.files import read_text
 from protocols.geometry.types import Bools, Floats
 
 NEAR_PX = 20.0
@@ -26,13 +27,7 @@ def read_truth(file: Path) -> dict[int, dict[str, float]]:
 
     inside: fraction of the target within the image; visible: fraction that is visible. Raises InputError.
     """
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError("this truth file does not exist", file=file, remedy="check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {error}", file=file, remedy="save it as UTF-8 CSV") from None
-    reader = csv.DictReader(io.StringIO(text))
+    reader = csv.DictReader(io.StringIO(read_text(file, "truth file")))
     missing = [name for name in ("frame", "x", "y") if name not in (reader.fieldnames or ())]
     if missing:
         remedy = "the first line must name frame,x,y[,width,height][,inside][,visible]"

@@ -13,6 +13,9 @@ from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import OBSERVATION
 
+_SHOWN = 100
+"""Rows of a table; a file may hold 65,000 keys."""
+
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
@@ -139,9 +142,9 @@ def as_table(description: LogDescription) -> RenderableType:
         f"{begin}, {description.bytes / 1e6:.2f} MB"
     )
     topics = Table("key", "messages", "Hz", "from s", "to s", box=None, header_style="bold")
-    for entry in description.topics:
+    for entry in description.topics[:_SHOWN]:
         topics.add_row(
-            escape(printable(entry.key)),
+            escape(printable(entry.key[:200])),
             str(entry.count),
             f"{entry.rate_hz:.1f}",
             f"{entry.first_s:.1f}",
@@ -154,7 +157,7 @@ def as_table(description: LogDescription) -> RenderableType:
         parts.append(topics)
     if description.cameras:
         cameras = Table("camera", "boot", "observations", "detections", "missing", box=None, header_style="bold")
-        for camera in description.cameras:
+        for camera in description.cameras[:_SHOWN]:
             cameras.add_row(
                 escape(camera.camera),
                 camera.boot_id[:8],
@@ -164,8 +167,12 @@ def as_table(description: LogDescription) -> RenderableType:
             )
         parts.append(cameras)
     parts += [
-        escape(printable(f"{item.name}: {item.bytes} bytes, {item.media_type}")) for item in description.attachments
+        escape(printable(f"{item.name[:200]}: {item.bytes} bytes, {item.media_type[:80]}"))
+        for item in description.attachments[:_SHOWN]
     ]
+    for what in ("topics", "cameras", "attachments"):
+        more = len(getattr(description, what)) - _SHOWN
+        parts += [f"{more} more {what}: see --json"] if more > 0 else []
     parts += [f"[red]{count} messages not used: {reason}[/red]" for reason, count in description.rejected.items()]
     return Group(*parts)
 

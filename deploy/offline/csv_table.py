@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from protocols.core.errors import InputError
+from protocols.core.files import read_text
 from protocols.geometry.types import Bools, Floats, Ints
 
 _LARGEST_WHOLE = 2.0**53
@@ -82,24 +84,17 @@ def _read(file: Path, what: str, most: int | None = None) -> tuple[list[list[str
     """The rows that are not empty, with stripped cells, and their line numbers; at least one row."""
     rows: list[list[str]] = []
     lines: list[int] = []
+    reader = csv.reader(io.StringIO(read_text(file, f"{what} file")), strict=True)
     try:
-        with file.open(encoding="utf-8-sig", newline="") as text:
-            reader = csv.reader(text, strict=True)
-            for row in reader:
-                cells = [cell.strip() for cell in row]
-                if any(cells):
-                    rows.append(cells)
-                    lines.append(reader.line_num)
-                if len(rows) == most:
-                    break
-    except FileNotFoundError:
-        raise InputError(f"this {what} file does not exist", file=file, remedy="check the path") from None
+        for row in reader:
+            cells = [cell.strip() for cell in row]
+            if any(cells):
+                rows.append(cells)
+                lines.append(reader.line_num)
+            if len(rows) == most:
+                break
     except csv.Error as error:
         raise InputError(f"not CSV: {error}", file=file, line=reader.line_num, remedy="correct this row") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"cannot be read: {error}", file=file, line=len(rows) + 1, remedy="save it as UTF-8 CSV"
-        ) from None
     if not rows:
         raise InputError("this file is empty", file=file, line=1, remedy=f"give the rows of the {what}")
     return rows, lines

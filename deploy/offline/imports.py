@@ -15,6 +15,7 @@ from deploy.offline.csv_table import read_csv_header
 from deploy.offline.follow.objects import BOXES_FILE, complete_detections, is_boxes_file, object_messages, read_objects
 from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.core.errors import InputError
+from protocols.core.files import read_text, read_toml
 from protocols.formats import colmap, points, toml_rigs, yaml_rigs
 from protocols.formats.cameras import ForeignRig, rig_tables
 from protocols.geometry.types import Floats, Ints
@@ -22,7 +23,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration, read_calibration
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
 from protocols.session.observations import Observations
-from protocols.session.rig import Rig, parse_camera_table, read_rig, read_toml
+from protocols.session.rig import Rig, parse_camera_table, read_rig
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
@@ -281,12 +282,7 @@ def _kind_of(file: Path) -> str | None:
         return toml_rigs.detect_format(read_toml(file, "calibration")[0])
     if suffix in _YAML:
         return yaml_rigs.detect_format(yaml_rigs.load(file)[0])
-    try:
-        with file.open(encoding="utf-8-sig") as text:
-            begin = text.read(1 << 16)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {error}", file=file, remedy="give a text file") from None
-    return points.detect_format(begin)
+    return points.detect_format(read_text(file)[: 1 << 16])
 
 
 def _stamps_of(camera: str, videos: Path) -> Floats:

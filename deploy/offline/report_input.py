@@ -17,6 +17,7 @@ from hub.report.convergence import OffsetStdSample
 from protocols import topics
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
+from protocols.core.files import read_text
 from protocols.core.pair_report import PairReport
 from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
@@ -190,9 +191,7 @@ def _find_session(folder: Path, command: str) -> Path | None:
 def _document(file: Path) -> dict[str, Any]:
     remedy = "calibrate again"
     try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", file=file, remedy="check its permissions") from None
+        document = json.loads(read_text(file, "result"))
     except (ValueError, RecursionError):
         raise InputError("is not JSON", file=file, remedy=remedy) from None
     if not isinstance(document, dict) or document.get("status") not in ("solved", "refused"):

@@ -15,10 +15,11 @@ import cv2
 import numpy as np
 
 from edge.devices.base import Frame
-from edge.devices.playback.video_file import IMAGE_SUFFIXES
+from edge.devices.playback.video_file import image_files
 from edge.uav.base import Box, Estimate, Image, Telemetry, Tracker, TrackState
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
+from protocols.core.files import read_text
 from protocols.geometry.types import Floats
 from protocols.session.rig import RigCamera, read_rig
 
@@ -89,13 +90,7 @@ def read_telemetry(file: Path) -> TelemetryFile:
     if file.suffix.lower() in (".bin", ".ulg"):
         remedy = "give the .tlog, or export a telemetry.csv with time,qw,qx,qy,qz[,north,east,down]"
         raise InputError(f"{file.suffix} telemetry can't be read by this version", file=file, remedy=remedy)
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError("this telemetry file does not exist", file=file, remedy="check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {error}", file=file, remedy="save it as UTF-8 CSV") from None
-    reader = csv.reader(io.StringIO(text), strict=True)
+    reader = csv.reader(io.StringIO(read_text(file, "telemetry file")), strict=True)
     try:
         header = [cell.strip() for cell in next(reader, [])]
         missing = [name for name in ("time", *_QUATERNION) if name not in header]
@@ -170,7 +165,7 @@ def check_clock(telemetry: TelemetryFile, file: Path, start: float, end: float) 
 def count_frames(video: Path) -> int:
     """Number of frames of a video according to its header, or of images in a folder; 0 if unknown."""
     if video.is_dir():
-        return sum(1 for path in video.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+        return len(image_files(video))
     capture = cv2.VideoCapture(str(video))
     count = capture.get(cv2.CAP_PROP_FRAME_COUNT) if capture.isOpened() else 0.0
     capture.release()

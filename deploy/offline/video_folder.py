@@ -24,13 +24,13 @@ from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader, has_
 from edge.offline.detections import HEADER, VideoDetections, observations_csv, run_detector
 from edge.offline.video import MARKER_FILE, read_marker_model
 from protocols.core.errors import InputError
-from protocols.core.files import write_together
+from protocols.core.files import read_toml, write_together
 from protocols.core.names import name_from_file
 from protocols.core.version import VERSION
 from protocols.geometry.camera import Intrinsics
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, read_folder
 from protocols.session.observations import Observations
-from protocols.session.rig import Rig, read_rig, read_toml
+from protocols.session.rig import Rig, read_rig
 from protocols.session.session import Session
 
 Progress = Callable[[str, float], None]

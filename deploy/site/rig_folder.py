@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import socket
 import time
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -23,6 +22,7 @@ from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig, Simula
 from deploy.config.file import effective_toml, load
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import InputError
+from protocols.core.files import read_toml
 from protocols.session.rig import Rig, read_rig
 
 SHIPPED = Path(__file__).parents[1] / "examples" / "rigs"
@@ -164,7 +164,7 @@ def client_bus(endpoint: str) -> BusConfig:
 
 
 def _output_path(agent: Agent, out: Path) -> Path:
-    given = tomllib.loads(agent.file.read_text(encoding="utf-8")).get("out")
+    given = read_toml(agent.file)[0].get("out")
     default = "recordings" if agent.role == "recorder" else agent.name
     place = Path(given or default).expanduser()
     return place if place.is_absolute() else out.resolve() / place

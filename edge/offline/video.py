@@ -18,9 +18,9 @@ from edge.devices.base import check_size
 from edge.devices.playback.video_reader import VideoReader
 from edge.offline.detections import Collected, VideoDetections, detection_rows, run_detector
 from protocols.core.errors import InputError
+from protocols.core.files import read_toml
 from protocols.core.names import check_name, name_from_file
 from protocols.geometry.camera import Intrinsics
-from protocols.session.rig import read_toml
 
 VideoDetector = Literal["marker", "bright", "tag", "person", "vehicle"]
 MARKER_FILE = "marker.toml"

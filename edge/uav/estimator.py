@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-import cv2
 import numpy as np
 from google.protobuf.message import Message
 
@@ -21,6 +20,7 @@ from edge.uav.georeference import Georeference
 from edge.uav.navigation import Origin, rotation_from_quaternion
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
+from protocols.core.jpeg import decode_jpeg
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
@@ -217,15 +217,8 @@ class TargetEstimator:
 
 def decode_image(message: pb.FlightImage) -> Image | None:
     """The image (h, w, 3) BGR of a message; None if it is missing or damaged."""
-    if not message.jpeg:
-        return None
-    try:
-        image = cv2.imdecode(np.frombuffer(message.jpeg, np.uint8), cv2.IMREAD_COLOR)
-    except cv2.error:
-        return None
-    if image is None or image.shape[:2] != (message.height, message.width):
-        return None
-    return np.asarray(image, np.uint8)
+    image = decode_jpeg(message.jpeg)
+    return None if image is None or image.shape[:2] != (message.height, message.width) else image
 
 
 def _clipped(value: float) -> float:

@@ -182,6 +182,8 @@ class RtspServer:
                 limit = None if session.interleaved and session.playing else _SESSION_TIMEOUT_S
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, ValueError):
             pass  # disconnected, or not RTSP
+        except asyncio.CancelledError:
+            pass  # the server ends; as the end of its task, asyncio would report it as an error
         finally:
             self._connections.discard(session)
             self._sessions.discard(session)
@@ -218,7 +220,7 @@ class RtspServer:
                 session.play()  # the response goes out first: packets are distributed later in the event loop
                 self._key_frame_wanted.set()
             elif method in ("PAUSE", "TEARDOWN"):
-                session.playing = False
+                session.playing, session.held_s = False, time.monotonic()
             if method == "TEARDOWN":
                 self._sessions.discard(session)
             session.respond(number, 200, {"Session": session.id, **({"Range": "npt=now-"} if method == "PLAY" else {})})
@@ -231,13 +233,15 @@ class RtspServer:
         if chosen is None:
             session.respond(number, 461)
             return
+        if session not in self._sessions:
+            session.held_s = time.monotonic()
         self._sessions.add(session)
         session.respond(number, 200, {"Transport": chosen, "Session": f"{session.id};timeout={_SESSION_TIMEOUT_S}"})
 
     def _is_full(self, session: _Session) -> bool:
         """Whether others hold all places: those who play, and who may be about to."""
         now = time.monotonic()
-        holders = [one for one in self._sessions if one.playing or now - one.active_s < _SETUP_TIMEOUT_S]
+        holders = [one for one in self._sessions if one.playing or now - one.held_s < _SETUP_TIMEOUT_S]
         return len(set(holders) - {session}) >= _MAX_VIEWERS
 
     def _description(self, session: _Session) -> bytes:
@@ -276,6 +280,8 @@ class _Session:
         self._sent_s = 0.0
         self.active_s = time.monotonic()
         """When the last request came."""
+        self.held_s = 0.0
+        """When SETUP or PAUSE came: requests that keep a connection alive do not keep a place."""
         self.own_host = str(writer.get_extra_info("sockname")[0])
         # Only to the client's own address, so that the server cannot be used to flood a third party.
         self._host = str(writer.get_extra_info("peername")[0])

@@ -15,12 +15,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from protocols.core.clocks import NANOSECONDS, CameraTime
+from protocols.core.ranges import MAX_TIME_S
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration
 
 MAX_CAMERA_DELAY_S = 0.1
 """Largest delay from exposure to time stamp [s], unknown to time services: frames stamped on arrival are late."""
 _TEST_SIGMAS = 3.0
+_MAX_PRIORS = 1024
+"""Cameras; as many as a hub has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,12 +50,11 @@ class ExternalClockPriors:
         if message.role != "camera":
             return
         gauges = message.gauges
-        synchronised = gauges.get("clock_synchronised", 0.0) > 0.0 and "clock_error_s" in gauges
-        if synchronised and "unix_minus_camera_s" in gauges:
-            prior = ExternalClockPrior(message.boot_id, gauges["unix_minus_camera_s"], gauges["clock_error_s"])
-            self._priors[message.agent] = prior
-        else:
-            self._priors.pop(message.agent, None)
+        self._priors.pop(message.agent, None)
+        offset, bound = gauges.get("unix_minus_camera_s", math.nan), gauges.get("clock_error_s", math.nan)
+        plausible = abs(offset) <= MAX_TIME_S and 0.0 <= bound <= MAX_TIME_S
+        if gauges.get("clock_synchronised", 0.0) > 0.0 and plausible and len(self._priors) < _MAX_PRIORS:
+            self._priors[message.agent] = ExternalClockPrior(message.boot_id, offset, bound)
 
     def for_boots(self, boots: Mapping[str, str]) -> dict[str, ExternalClockPrior]:
         """The priors that belong to the given boot ids, by camera."""

@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterable
 from protocols.bus.base import Received
 from protocols.messages import syncline_pb2 as pb
 
-_MAX_WAITING, _MAX_WAITING_ROWS = 20_000, 40_000
-"""Messages and detections of one sender that wait; the oldest are dropped."""
+_MAX_WAITING_ROWS, _MAX_WAITING_IN_ALL = 40_000, 200_000
+"""Messages and detections of one sender that wait, and of all, some 100 bytes each; the oldest are dropped, of who has
+most of them where all together have too many."""
 _LEAST_SHARE_S = 0.01
 
 
@@ -24,6 +25,7 @@ class FairShare:
         self._handle, self._clock, self._round_s = handle, clock, round_s
         self._waiting: dict[str, deque[Received]] = {}
         self._rows: Counter[str] = Counter()
+        self._in_all = 0
         self.dropped: Counter[str] = Counter()
 
     @property
@@ -56,17 +58,24 @@ class FairShare:
         waiting = self._waiting.setdefault(one.agent, deque())
         waiting.append(one)
         self._rows[one.agent] += _rows(one)
-        while len(waiting) > _MAX_WAITING or self._rows[one.agent] > _MAX_WAITING_ROWS:
-            self._next(one.agent)
-            self.dropped[one.agent] += 1
+        self._in_all += _rows(one)
+        while self._rows[one.agent] > _MAX_WAITING_ROWS:
+            self._drop(one.agent)
+        while self._in_all > _MAX_WAITING_IN_ALL:
+            self._drop(max(self._rows, key=self._rows.__getitem__))
+
+    def _drop(self, sender: str) -> None:
+        self._next(sender)
+        self.dropped[sender] += 1
 
     def _next(self, sender: str) -> Received:
         one = self._waiting[sender].popleft()
         self._rows[sender] -= _rows(one)
+        self._in_all -= _rows(one)
         if not self._waiting[sender]:
             del self._waiting[sender], self._rows[sender]
         return one
 
 
 def _rows(one: Received) -> int:
-    return len(one.message.detections) if isinstance(one.message, pb.Observation) else 1
+    return 2 + len(one.message.detections) if isinstance(one.message, pb.Observation) else 2

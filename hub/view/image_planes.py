@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hub.view.page import draw_detections
-from hub.view.scene_renderer import decode_jpeg
+from hub.view.scene_renderer import decode_rgb
 from hub.view.state import ViewState
 from protocols.geometry.types import Floats
 
@@ -42,7 +42,7 @@ class ImagePlanes:
             camera = state.cameras[name]
             if camera.picture is None or self._shown.get(name) == camera.pictures:
                 continue
-            image = decode_jpeg(camera.picture.jpeg)
+            image = decode_rgb(camera.picture.jpeg)
             if image is None:
                 continue
             self._shown[name] = camera.pictures

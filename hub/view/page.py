@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from hub.view.export import calibration_file
 from hub.view.lag_chart import lag_charts
 from hub.view.panels import camera_details, camera_table, overview, picture_tiles, recording_html
-from hub.view.scene_renderer import DisplayOptions, decode_jpeg
+from hub.view.scene_renderer import DisplayOptions, decode_rgb
 from hub.view.state import CameraView, ViewState
 from hub.view.uav_overlay import draw_uav, pad_to_aspect, uav_panel_html
 from hub.view.uav_state import UavView
@@ -248,7 +248,7 @@ class _UavPanel:
             if uav.picture is None:
                 self._decoded_image = (0, None)
             elif self._decoded_image[0] != id(uav.picture):
-                self._decoded_image = (id(uav.picture), decode_jpeg(uav.picture.jpeg))
+                self._decoded_image = (id(uav.picture), decode_rgb(uav.picture.jpeg))
             drawing = self._picture.image = draw_uav(uav, self._decoded_image[1])
         text = uav_panel_html(uav, now)
         if text != self._text:

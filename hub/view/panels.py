@@ -10,7 +10,7 @@ from hub.calibration.coverage import MIN_COVERAGE
 from hub.report.measures import COLUMNS, ROWS
 from hub.report.svg import at, drawing
 from hub.view.state import STALE_S, AgentView, CameraState, CameraView, PathView, ViewState
-from protocols.log.write.thumbnails import jpeg_size
+from protocols.core.jpeg import jpeg_fits
 
 SIGNS: dict[CameraState, str] = {
     "calibrated": "✓",
@@ -24,7 +24,6 @@ SIGNS: dict[CameraState, str] = {
 """Sign before a camera's name, so that its state can be read without colour."""
 
 TRACK_SIGNS = {"confirmed": "●", "tentative": "◐", "coasting": "◌", "stale": "–"}
-_MAX_PIXELS = 16_000_000  # of an image; a few bytes of JPEG may claim 4 thousand million
 _MAX_TRACKS = 8  # in words
 _STALE_PICTURE_S = 5.0
 
@@ -197,12 +196,6 @@ def _tile(camera: CameraView, now: float, *, wanted: bool) -> str:
         f"<figure data-picture='{name}'><div class='frame'{aspect}>{shown}</div>"
         f"<figcaption>{caption}</figcaption></figure>"
     )
-
-
-def jpeg_fits(jpeg: bytes) -> bool:
-    """Whether a JPEG is small enough to be decoded."""
-    size = jpeg_size(jpeg)
-    return size is not None and size[0] * size[1] <= _MAX_PIXELS
 
 
 def camera_details(state: ViewState, camera: CameraView, now: float) -> str:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from hub.view.panels import SIGNS, jpeg_fits, track_text
+from hub.view.panels import SIGNS, track_text
 from hub.view.state import CameraState, CameraView, PathView, ViewState
+from protocols.core.jpeg import decode_jpeg
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
@@ -332,7 +333,7 @@ class SceneRenderer:
             camera = state.cameras[name]
             assert camera.picture is not None
             self._drawn[f"picture {name}"], self._drawn[f"picture at {name}"] = camera.pictures, now
-            image = decode_jpeg(camera.picture.jpeg)
+            image = decode_rgb(camera.picture.jpeg)
             if image is not None:
                 self._frusta[name].image = image
 
@@ -400,13 +401,9 @@ def _nearest_point(starts: Floats, ends: Floats, tolerance: float) -> Floats | N
     return np.asarray(point) if float(off.max()) < tolerance else None
 
 
-def decode_jpeg(jpeg: bytes) -> Any:
+def decode_rgb(jpeg: bytes) -> Any:
     """A JPEG decoded to (H, W, 3) RGB; None if it is invalid or too large."""
-    import cv2
-
-    if not jpeg_fits(jpeg):
-        return None
-    image = cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), cv2.IMREAD_COLOR) if jpeg else None
+    image = decode_jpeg(jpeg)
     return None if image is None else np.ascontiguousarray(image[..., ::-1])
 
 

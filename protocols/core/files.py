@@ -1,14 +1,97 @@
-"""Atomic file writing: a temporary file beside the target, fsync, rename; several files together or none."""
+"""Bounded reading of text and TOML, and atomic writing: several files together or none.
+
+Writing: a temporary file beside the target, fsync, rename.
+"""
 
 from __future__ import annotations
 
 import errno
 import os
+import re
+import stat
 import tempfile
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from protocols.core.errors import InputError
+
+MAX_TEXT = 1 << 30
+"""Bytes of a table: 20 million rows, as ten cameras at 60 Hz have in nine hours."""
+MAX_TOML = 4 << 20
+"""Bytes: eight times a calibration of 1,024 cameras. The parser takes some seconds for it."""
+_PART = r"(?:\"(?:[^\"\\\n]|\\.)*+\"?|'[^'\n]*+'?|[\w-]++)"
+_KEY = re.compile(rf"(?:{_PART}[ \t]*+\.[ \t]*+){{2,}}|{_PART}")
+_MAX_PARTS = 32
+"""Of a dotted key: more than any table has. The parser takes time with the square of their number."""
+
+
+def read_bytes(file: Path, what: str = "file", most: int = MAX_TEXT) -> bytes:
+    """The bytes of a regular file, at most ``most``. Raises InputError.
+
+    Pipes and devices are refused without waiting for them: they may have no end. what: names the file in messages.
+    """
+    try:
+        with os.fdopen(os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as stream:
+            about = os.fstat(stream.fileno())
+            if not stat.S_ISREG(about.st_mode):
+                raise InputError("is not a regular file", file=file, remedy="save what it gives to a file first")
+            data = stream.read() if about.st_size <= most else None
+    except FileNotFoundError:
+        raise InputError(f"this {what} does not exist", file=file, remedy="check the path") from None
+    except (OSError, ValueError) as error:  # a ValueError: a name with a zero byte
+        what = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"cannot be read: {what}", file=file, remedy="check the file and its permissions") from None
+    if data is None:
+        raise InputError(f"has more than {most} bytes", file=file, remedy=f"check that it is a {what}")
+    return data
+
+
+def read_text(file: Path, what: str = "file", most: int = MAX_TEXT) -> str:
+    """The text of a regular UTF-8 file, lines ended by a line feed. Raises InputError as ``read_bytes``."""
+    data = read_bytes(file, what, most)
+    try:
+        if b"\0" in data[:65_536]:
+            raise ValueError
+        return re.sub("\r\n?", "\n", data.decode("utf-8-sig"))
+    except ValueError:
+        raise InputError("cannot be read: it is not UTF-8 text", file=file, remedy="save it as UTF-8 text") from None
+
+
+def read_toml(file: Path, what: str = "file") -> tuple[dict[str, Any], str]:
+    """The parsed TOML file and its text. Raises InputError with file, line and remedy."""
+    text = read_text(file, what, MAX_TOML)
+    for key in _KEY.finditer(text):
+        if key[0].count(".") > _MAX_PARTS and len(re.findall(_PART, key[0])) > _MAX_PARTS:
+            line = text.count("\n", 0, key.start()) + 1
+            what = f"a key of more than {_MAX_PARTS} parts"
+            raise InputError(what, file=file, line=line, remedy="write a plain TOML file")
+    try:
+        values = tomllib.loads(text)
+        _check_integers(values)
+        return values, text
+    except (RecursionError, OverflowError):
+        raise InputError(
+            "nested too deeply or a number too large", file=file, remedy="write a plain TOML file"
+        ) from None
+    except ValueError as error:
+        message = str(error)
+        place = re.search(r"at line (\d+)", message)
+        line = int(place.group(1)) if place else len(text.splitlines()) or 1
+        short = re.sub(r"\s*\(at .*\)", "", message)
+        raise InputError(f"not valid TOML: {short}", file=file, line=line, remedy="correct this line") from None
+
+
+def _check_integers(values: object) -> None:
+    """Raise OverflowError for an integer of more than 64 bits, which no TOML file has and Python may not print."""
+    rest = [values]
+    while rest:
+        one = rest.pop()
+        if isinstance(one, dict | list):
+            rest += one.values() if isinstance(one, dict) else one
+        elif isinstance(one, int) and not -(2**63) <= one < 2**63:
+            raise OverflowError
 
 
 def write_atomically(file: Path, text: str) -> None:
@@ -34,7 +117,7 @@ def write_together(files: Mapping[Path, str]) -> None:
                 raise IsADirectoryError(errno.EISDIR, "this is a folder, but a file is needed")
             handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name[:40]}.")
             prepared.append((Path(name), file))
-            with os.fdopen(handle, "w", encoding="utf-8", newline="") as out:
+            with os.fdopen(handle, "w", encoding="utf-8", errors="replace", newline="") as out:
                 out.write(text)
                 out.flush()
                 os.fsync(out.fileno())

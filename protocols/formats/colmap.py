@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from protocols.core.errors import InputError
+from protocols.core.files import read_text
 from protocols.core.names import check_name, key_segment, name_of_segment
 from protocols.formats.cameras import (
     ExportedFiles,
@@ -133,11 +134,7 @@ def _read_cameras(file: Path) -> dict[str, Intrinsics]:
 
 def _rows(file: Path, keep_empty: bool = False) -> list[tuple[int, list[str]]]:
     """Line numbers and words of all lines that are no comments."""
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        remedy = "give the folder of a COLMAP model saved as text"
-        raise InputError(f"cannot be read: {error}", file=file, remedy=remedy) from None
+    text = read_text(file, "file of a COLMAP model saved as text")
     rows = [(number, row.split()) for number, row in enumerate(text.splitlines(), 1) if not row.startswith("#")]
     return rows if keep_empty else [(number, words) for number, words in rows if words]
 

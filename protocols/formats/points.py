@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from protocols.core.errors import InputError
+from protocols.core.files import read_text
 from protocols.core.names import check_name, name_from_file
 from protocols.geometry.types import Floats, Ints
 from protocols.session.observations import Observations, gather_tracks
@@ -168,7 +169,7 @@ def _deeplabcut(file: Path, camera: str, rows: _Rows, least: float) -> None:
 
 def _mvus(file: Path, camera: str, rows: _Rows) -> None:
     """One camera's mvus file: columns x, y, frame (mvus itself reads them as columns 3, 1, 2)."""
-    for line, row in enumerate(_text(file).splitlines(), 1):
+    for line, row in enumerate(read_text(file).splitlines(), 1):
         words = row.split("#")[0].replace(",", " ").split()
         if not words:
             continue
@@ -184,15 +185,8 @@ def _mvus(file: Path, camera: str, rows: _Rows) -> None:
         rows.line.append(line)
 
 
-def _text(file: Path) -> str:
-    try:
-        return file.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {error}", file=file, remedy="save it as UTF-8 text") from None
-
-
 def _table(file: Path) -> list[tuple[int, list[str]]]:
-    reader = csv.reader(io.StringIO(_text(file)), strict=True)
+    reader = csv.reader(io.StringIO(read_text(file)), strict=True)
     out: list[tuple[int, list[str]]] = []
     try:
         for cells in reader:

@@ -16,11 +16,12 @@ import tomli_w
 
 from protocols.core.clocks import TimeMap
 from protocols.core.errors import InputError
+from protocols.core.files import read_toml
 from protocols.formats.cameras import ExportedFiles, ForeignCamera, ForeignRig, convert_units, parse_array
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.session.calibration import CameraCalibration
-from protocols.session.rig import METRES_PER_UNIT, RigCamera, parse_camera_table, read_toml
+from protocols.session.rig import METRES_PER_UNIT, RigCamera, parse_camera_table
 
 PROJECT_UNITS = {"aniposelib": None, "caliscope": "m", "pose2sim": "m", "freemocap": "mm"}
 """Units of a tool's lengths; None = the units of the calibration."""

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from protocols.core.errors import InputError
+from protocols.core.files import read_text
 from protocols.geometry.types import Floats, Ints
 from protocols.session.rig import METRES_PER_UNIT
 
@@ -64,11 +65,7 @@ def _frames(paths: Mapping[str, Floats]) -> tuple[Floats, Ints]:
 def _read_paths(file: Path) -> dict[str, Floats]:
     """time, x, y, z (n, 4) by label."""
     remedy = "give the trajectory.csv of `calibrate` or the track.csv of `triangulate`"
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError):
-        raise InputError("cannot be read", file=file, remedy=remedy) from None
-    reader = csv.DictReader(io.StringIO(text))
+    reader = csv.DictReader(io.StringIO(read_text(file, "trajectory")))
     missing = [key for key in ("time", "x", "y", "z") if key not in (reader.fieldnames or [])]
     if missing:
         raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)

@@ -16,6 +16,7 @@ import numpy as np
 
 from protocols.core.clocks import TimeMap
 from protocols.core.errors import InputError
+from protocols.core.files import MAX_TOML, read_text
 from protocols.core.names import check_name, key_segment, name_from_file
 from protocols.formats.cameras import (
     ExportedFiles,
@@ -43,10 +44,7 @@ def load(file: Path) -> tuple[dict[str, Any], str]:
     """A YAML file's mapping and its text; OpenCV's matrices as their lists of rows. Raises InputError."""
     import yaml
 
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {error}", file=file, remedy="check the file and its permissions") from None
+    text = read_text(file, "calibration", MAX_TOML)
 
     class Loader(yaml.SafeLoader):
         """Safe, with OpenCV's tag, and with names as they are written: a camera may be called 007 or true."""

@@ -11,13 +11,13 @@ import tomli_w
 
 from protocols.core.clocks import TimeMap
 from protocols.core.errors import InputError
-from protocols.core.files import write_atomically
+from protocols.core.files import read_toml, write_atomically
 from protocols.core.pair_report import PairReport
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
-from protocols.session.rig import Rig, read_rig, read_toml
+from protocols.session.rig import Rig, read_rig
 
 _REPLACED_METADATA = ("distances", "wand", "refused", "scale", "solver", "version", "reference")
 """Metadata keys of rig.toml that the result replaces."""

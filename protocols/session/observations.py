@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from protocols.core.errors import InputError
+from protocols.core.files import read_text
 from protocols.core.ranges import MAX_COUNT, MAX_PIXEL, MAX_TIME_S
 from protocols.geometry.types import Bools, Floats, Ints
 
@@ -131,13 +132,7 @@ def read_rows(file: Path, cameras: Iterable[str], optional: Sequence[str] = ()) 
 
     optional: names of further columns, which every row must then have. Raises InputError: file, line, what, remedy.
     """
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError("this observations file does not exist", file=file, remedy="check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {error}", file=file, remedy="save it as UTF-8 CSV") from None
-    reader = csv.reader(io.StringIO(text), strict=True)
+    reader = csv.reader(io.StringIO(read_text(file, "observations file")), strict=True)
     try:
         header = [cell.strip() for cell in next(reader, [])]
     except csv.Error as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from protocols.core.errors import InputError
+from protocols.core.files import read_toml
 from protocols.core.names import check_name, is_name
 from protocols.core.ranges import (
     MAX_DISTORTION,
@@ -149,41 +149,8 @@ class _Table:
         return None if array is None else np.where(array < MIN_STD, 0.0, array)
 
 
-_MAX_BYTES = 16 * 1024 * 1024
 _MAX_CAMERAS = 1024
 """As many as messages have."""
-_MANY_PARTS = re.compile(r"(?:[\w\"'-]{1,99}[ \t]{0,9}\.[ \t]{0,9}){32}")
-"""A dotted key of more parts than any table has; the parser takes time with the square of their number."""
-
-
-def read_toml(file: Path, what: str = "file") -> tuple[dict[str, Any], str]:
-    """The parsed TOML file and its text. Raises InputError with file, line and remedy."""
-    try:
-        with file.open("rb") as stream:
-            data = stream.read(_MAX_BYTES + 1)
-        text = data.decode("utf-8-sig").replace("\r\n", "\n")
-    except FileNotFoundError:
-        raise InputError(f"this {what} does not exist", file=file, remedy="check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {error}", file=file, remedy="check the file and its permissions") from None
-    if len(data) > _MAX_BYTES:
-        raise InputError(f"has more than {_MAX_BYTES} bytes", file=file, remedy="write a plain TOML file")
-    parts = _MANY_PARTS.search(text)
-    if parts is not None:
-        line = text.count("\n", 0, parts.start()) + 1
-        raise InputError("a key of more than 32 parts", file=file, line=line, remedy="write a plain TOML file")
-    try:
-        return tomllib.loads(text), text
-    except (RecursionError, OverflowError):
-        raise InputError(
-            "nested too deeply or a number too large", file=file, remedy="write a plain TOML file"
-        ) from None
-    except ValueError as error:
-        message = str(error)
-        place = re.search(r"at line (\d+)", message)
-        line = int(place.group(1)) if place else len(text.splitlines()) or 1
-        short = re.sub(r"\s*\(at .*\)", "", message)
-        raise InputError(f"not valid TOML: {short}", file=file, line=line, remedy="correct this line") from None
 
 
 def read_rig(file: Path) -> Rig:

@@ -28,7 +28,7 @@ from tests.bench.load import resident_mb
 from tests.faults.processes import Process, router
 from tests.faults.soak import configurations
 
-Messages = Iterator[tuple[float, pb.Observation | pb.CameraInfo]]
+Messages = Iterator[tuple[float, pb.Observation | pb.CameraInfo | pb.AgentStatus]]
 """(pause before it [s], message)"""
 
 
@@ -117,10 +117,28 @@ def lens() -> Messages:
         yield 1 / 30.0, frame("evil", number, 1)
 
 
+def several() -> Messages:
+    """Twenty cameras together, 400 labelled detections a frame each."""
+    for name in range(20):
+        yield 0.0, info(f"evil{name}")
+    for number in itertools.count():
+        yield 1 / 1200.0, frame(f"evil{number % 20}", number // 20, 400)
+
+
+def statuses() -> Messages:
+    """Statuses of invented agents, whose clocks cannot be."""
+    for number in itertools.count():
+        message = pb.AgentStatus(schema_version=1, agent=f"evil{number}", role="camera", boot_id="b0", state="running")
+        for name in ("clock_synchronised", "unix_minus_camera_s", "clock_error_s"):
+            message.gauges[name] = 1e308
+        yield 1 / 1000.0, message
+
+
 _PEACE_S = 120.0
 """Longest wait for the first calibration."""
 ATTACKS: dict[str, Callable[[], Messages]] = {
-    one.__name__: one for one in (crawling_clock, people, labels, boots, names, as_fast_as_it_goes, clock_steps, lens)
+    one.__name__: one
+    for one in (crawling_clock, people, labels, boots, names, as_fast_as_it_goes, clock_steps, lens, several, statuses)
 }
 
 
@@ -130,8 +148,12 @@ def attack(endpoint: str, name: str) -> None:
     for pause, message in ATTACKS[name]():
         if pause:
             time.sleep(pause)
-        topic = CAMERA_INFO if isinstance(message, pb.CameraInfo) else OBSERVATION
-        session.put(topic.key_for("local", message.camera), message.SerializeToString())
+        if isinstance(message, pb.AgentStatus):
+            key = STATUS.key_for("local", message.agent)
+        else:
+            topic = CAMERA_INFO if isinstance(message, pb.CameraInfo) else OBSERVATION
+            key = topic.key_for("local", message.camera)
+        session.put(key, message.SerializeToString())
 
 
 def family(pid: int) -> list[int]:

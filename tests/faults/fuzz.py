@@ -187,6 +187,7 @@ def fuzz_config(count: int, seed: int) -> Counter[str]:
     valid = [
         b'id = "cam0"\nsite = "yard"\n[bus]\nmode = "client"\nconnect = ["tcp/127.0.0.1:7447"]\noutage_s = 60.0\n',
         b'id = "cam1"\ndriver = "simulated"\n[simulated]\nscene = "marker"\nseed = 3\ncameras = 4\n',
+        b'id = "cam2"\n[bus]\noutage_s = 0x' + b"F" * 40 + b"\n[" + b'"!".' * 40 + b"a]\n",
     ]
     with TemporaryDirectory() as folder:
         file = Path(folder) / "camera.toml"
@@ -217,6 +218,7 @@ def fuzz_rig(count: int, seed: int) -> Counter[str]:
         b'[cam_0]\nname = "../../evil"\n' + lens + b"distortions = [1e308, 0, 0, 0, 0]\n",
         b'["GoPro 2"]\n' + lens + b"fisheye = true\ndistortions = [-1e9, 1, 1, 1]\nrotation = [100, -100, 1e-300]\n",
         b".".join([b"a"] * 100) + b" = 1\n[cam0]\n" + lens,
+        b"[cam0]\n" + lens + b"focal_std = 0x" + b"F" * 5000 + b"\n",
         b"".join(b"[cam%d]\nsize = [1, 65535]\n" % number for number in range(40)) + b"[metadata]\nunits = 'mm'\n",
     ]
     pixels = np.array([[0.0, 0.0], [1e6, -1e6], [320.0, 240.0]])
@@ -251,6 +253,7 @@ def fuzz_log(count: int, seed: int) -> Counter[str]:
         MAGIC + chunk(name, data, says) + FOOTER for name, data in packed.items() for says in (1000, 1 << 20, 1 << 31)
     ]
     heads = [MAGIC + b"\xff" * 9 + false_heads(opcode, 2_000) for opcode in (6, 7, 9, 12, 0x90)]
+    bombs.append(MAGIC + chunk(b"", b"\x0c" + bytes(8) + b"\x0c" + bytes(8), 18) + FOOTER)
     with TemporaryDirectory() as folder:
         good, file = Path(folder) / "good.mcap", Path(folder) / "damaged.mcap"
         with LogWriter(good) as log:
@@ -265,7 +268,8 @@ def fuzz_log(count: int, seed: int) -> Counter[str]:
                 reader.summary()
                 for logged in reader.messages():
                     assert all_finite(logged.message)
-                reader.attachments()
+                list(reader.attachments())
+                list(reader.messages(start_ns=1))
                 counts["damaged" if reader.damage else "whole"] += 1
             except InputError as error:
                 _one_line(str(error))

@@ -22,7 +22,7 @@ CASES = {
     ),
     "certificates without files": ("hub", '[bus]\nmode = "client"\nconnect = ["tls/127.0.0.1:7447"]\n', "[bus.tls]"),
     "access rules of a client": ("hub", '[bus]\nmode = "client"\naccess = "rules.json5"\n', "access is for a router"),
-    "dangling access rules": ("router", '[bus]\naccess = "rules.json5"\n', "access rules cannot be read"),
+    "dangling access rules": ("router", '[bus]\naccess = "rules.json5"\n', "this file of access rules does not exist"),
     "health open to the network": (
         "record",
         '[health]\nlisten = "0.0.0.0:9100"\n',

@@ -160,7 +160,8 @@ def _completed(file: Path, name: str, table: dict[str, Any]) -> str:
     """The rig file's text with this camera's intrinsics; all other entries are kept. Raises InputError."""
     import tomli_w
 
-    from protocols.session.rig import read_rig, read_toml
+    from protocols.core.files import read_toml
+    from protocols.session.rig import read_rig
 
     values: dict[str, Any] = {}
     if file.exists():

@@ -17,6 +17,7 @@ from hub.tracking.messages import face_regions, head_views
 from hub.tracking.parameters import TrackerParameters
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
+from protocols.core.jpeg import decode_jpeg
 from protocols.geometry.types import Floats
 from protocols.log.read.images import image_runs, read_images
 from protocols.log.read.reader import LogReader
@@ -153,9 +154,9 @@ def _pictures(source: FollowInput, camera: str, wanted: Collection[int]) -> Iter
             sequence = numbers.get((run.boot, picture.device_time_ns))
             if sequence not in missing:
                 continue
-            image = cv2.imdecode(np.frombuffer(picture.jpeg, dtype=np.uint8), cv2.IMREAD_COLOR)
+            image = decode_jpeg(picture.jpeg)
             if image is not None and sequence is not None and picture.width > 0:
-                yield sequence, np.asarray(image, dtype=np.uint8), image.shape[1] / picture.width
+                yield sequence, image, image.shape[1] / picture.width
 
 
 def _cut(folder: Path, camera: str, one: _Wanted, image: Image, scale: float) -> int:

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.target_models import PERSON
 from protocols.core.errors import InputError
+from protocols.core.files import read_text
 from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import METRES_PER_UNIT
@@ -130,6 +131,6 @@ def _distance_per_height(head: Floats, foot: Floats, up: Floats) -> Floats:
 
 
 def _line_of_units(known: GivenCalibration) -> int:
-    lines = known.file.read_text(encoding="utf-8-sig").splitlines()
+    lines = read_text(known.file).splitlines()
     patterns = (r"\s*units\s*=", r"\s*\[metadata\]", r"\s*translation\s*=")
     return next((n for p in patterns for n, line in enumerate(lines, 1) if re.match(p, line)), 1)

@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ import tomli_w
 from deploy.config.file import Source, load
 from deploy.site.install import units
 from protocols.core.errors import InputError, Refused
+from protocols.core.files import read_toml
 from protocols.core.names import key_segment
 from protocols.session.rig import read_rig
 
@@ -77,7 +77,7 @@ def plan_install(role: str, file: Path, program: str | None = None) -> Plan:
     """
     kind = config_type(role)
     config = load(file, kind)
-    table = tomllib.loads(file.read_text(encoding="utf-8"))
+    table = read_toml(file)[0]
     # A unit's name allows ASCII letters, digits and a few marks; `%` is an escape character in unit files.
     name = f"{role}-{key_segment(getattr(config, 'id', role)).replace('%', '.')}"
     plan = Plan(name)

@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Meta
 
 from protocols.core.errors import InputError
-from protocols.session.rig import read_toml
+from protocols.core.files import read_toml
 
 Layout = Literal["yolov5", "yolov8", "end2end", "detr", "separate"]
 BoxFormat = Literal["cxcywh", "xyxy", "xywh"]
@@ -21,7 +21,6 @@ _Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 _Level = Annotated[float, Meta(ge=-1e4, le=1e4)]
 _Spread = Annotated[float, Meta(gt=0.0, le=1e4)]
 _OutputName = Annotated[str, Meta(min_length=1, max_length=200)]
-_MAX_BYTES = 65_536
 MAX_INPUT_PIXELS = 50_000_000
 """Of all images of a batch: 30 of 1280x1280; 0.6 GB as 32-bit numbers."""
 
@@ -91,8 +90,6 @@ class NetworkDescription(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
 
 def read_description(file: Path) -> NetworkDescription:
     """Read the TOML file of a network. Raises InputError."""
-    if file.is_file() and file.stat().st_size > _MAX_BYTES:
-        raise InputError(f"larger than {_MAX_BYTES >> 10} KiB", file=file, remedy="give a network's .toml file")
     values, _ = read_toml(file, "network's file")
     try:
         return msgspec.convert(values, NetworkDescription)

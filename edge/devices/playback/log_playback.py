@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from edge.devices.base import DeviceInfo, Frame, Image, check_size
+from edge.devices.base import DeviceInfo, Frame, check_size
 from edge.devices.playback.playback_clock import PlaybackClock
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
+from protocols.core.jpeg import decode_jpeg
 from protocols.geometry.camera import Intrinsics
 from protocols.log.read.images import ImageRun, image_runs, read_images
 from protocols.log.read.reader import LogReader
@@ -119,7 +119,7 @@ class LogPlayback:
         newest: int | None = None
         shape: tuple[int, ...] | None = None
         for logged in read_images(reader, run):
-            image = _decode_jpeg(logged.jpeg)
+            image = decode_jpeg(logged.jpeg)
             out_of_order = newest is not None and logged.device_time_ns <= newest
             if image is None or out_of_order or image.shape != (shape or image.shape):
                 self.skipped += 1
@@ -128,11 +128,6 @@ class LogPlayback:
                 self._full = (logged.width, logged.height)
             newest, shape = logged.device_time_ns, image.shape
             yield Frame(image, logged.device_time_ns, logged.frame)
-
-
-def _decode_jpeg(jpeg: bytes) -> Image | None:
-    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
-    return None if image is None else np.asarray(image, dtype=np.uint8)
 
 
 def _logged_intrinsics(info: pb.CameraInfo | None) -> Intrinsics | None:

@@ -19,6 +19,28 @@ FOLDER_FPS = 30.0
 """Default frame rate of an image folder [Hz]."""
 
 
+def check_recording(path: Path) -> None:
+    """Raise InputError unless ``path`` is a regular file or a folder: a pipe that nobody writes to is waited for."""
+    if not path.exists():
+        raise InputError("this video does not exist", file=path, remedy="check the path")
+    if not path.is_file() and not path.is_dir():
+        raise InputError("is not a regular file", file=path, remedy="give a video file, or a folder of images")
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The images in a folder, by name."""
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+
+
+def read_image(file: Path) -> Image | None:
+    """The image (h, w, 3) BGR of a file; None if it cannot be decoded or is larger than OpenCV's limit."""
+    try:
+        image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+    except cv2.error:
+        return None
+    return None if image is None else np.asarray(image, dtype=np.uint8)
+
+
 class VideoPlayback:
     """Plays a video file or a folder of images as a device.
 
@@ -111,10 +133,9 @@ class VideoPlayback:
     def _rewind(self) -> Image:
         """(Re)open the source and return the first frame."""
         self._file_index = 0
-        if not self._path.exists():
-            raise InputError("this video does not exist", file=self._path, remedy="check the path")
+        check_recording(self._path)
         if self._path.is_dir():
-            self._image_files = sorted(p for p in self._path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+            self._image_files = image_files(self._path)
             if not self._image_files:
                 kinds = ", ".join(sorted(IMAGE_SUFFIXES))
                 raise InputError("no images in this folder", file=self._path, remedy=f"put {kinds} files in it")
@@ -147,7 +168,7 @@ class VideoPlayback:
 
     def _read_image(self, index: int) -> Image:
         assert self._image_files is not None
-        image = cv2.imread(str(self._image_files[index]), cv2.IMREAD_COLOR)
+        image = read_image(self._image_files[index])
         if image is None:
             remedy = "remove or replace it"
             raise InputError("this image cannot be read", file=self._image_files[index], remedy=remedy)
@@ -157,7 +178,7 @@ class VideoPlayback:
             raise InputError(
                 f"this image is {size}, the first one is not", file=self._image_files[index], remedy=remedy
             )
-        return np.asarray(image, dtype=np.uint8)
+        return image
 
     def _container_time(self) -> float:
         """The pending frame's time [s] from the container or the given rate."""

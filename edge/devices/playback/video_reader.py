@@ -18,7 +18,14 @@ import cv2
 import numpy as np
 
 from edge.devices.base import Image
-from edge.devices.playback.video_file import FOLDER_FPS, IMAGE_SUFFIXES, VideoPlayback
+from edge.devices.playback.video_file import (
+    FOLDER_FPS,
+    IMAGE_SUFFIXES,
+    VideoPlayback,
+    check_recording,
+    image_files,
+    read_image,
+)
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 
@@ -59,16 +66,13 @@ class VideoReader:
     """
 
     def __init__(self, path: Path, fps: float | None = None) -> None:
-        if not path.exists():
-            raise InputError("this video does not exist", file=path, remedy="check the path")
-        if not path.is_file() and not path.is_dir():  # a pipe that nobody writes to would be waited for
-            raise InputError("is not a regular file", file=path, remedy="give a video file, or a folder of images")
+        check_recording(path)
         self.path = path
         self.corrupt = 0
         self.repaired = 0
         self._given_fps = fps
         if path.is_dir():
-            self._image_files = sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+            self._image_files = image_files(path)
             self.info = self._folder_info(fps or FOLDER_FPS)
         elif has_pyav():
             self.info = self._file_info()
@@ -87,7 +91,7 @@ class VideoReader:
             kinds = ", ".join(sorted(IMAGE_SUFFIXES))
             raise InputError("no images in this folder", file=self.path, remedy=f"put {kinds} files in it")
         for file in self._image_files:
-            image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+            image = read_image(file)
             if image is not None:
                 return VideoInfo((image.shape[1], image.shape[0]), fps, len(self._image_files))
         raise InputError("none of its images can be read", file=self.path, remedy="replace them")
@@ -95,13 +99,12 @@ class VideoReader:
     def _read_folder(self) -> Iterator[VideoFrame]:
         frame = 0
         for index, file in enumerate(self._image_files):
-            image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+            image = read_image(file)
             if image is None or (image.shape[1], image.shape[0]) != self.info.size:
                 self.corrupt += 1
                 continue
-            decoded = np.asarray(image, dtype=np.uint8)
             # A skipped image still advances the time.
-            yield VideoFrame(frame, index / self.info.fps, partial(np.asarray, decoded))
+            yield VideoFrame(frame, index / self.info.fps, partial(np.asarray, image))
             frame += 1
 
     def _file_info(self) -> VideoInfo:

@@ -19,6 +19,7 @@ from edge.mavlink.roles.telemetry import Attitude, GlobalPosition, LocalPosition
 from edge.uav.base import Telemetry
 from edge.uav.navigation import Origin
 from protocols.core.errors import InputError
+from protocols.core.files import read_bytes
 from protocols.geometry.types import Floats
 
 _STAMP = 8
@@ -44,11 +45,7 @@ class Tlog:
 
 def read_tlog(file: Path) -> Tlog:
     """Read the attitudes and positions of a .tlog. Raises InputError."""
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", file=file, remedy="check the path") from None
-    messages, unreadable = _messages(data)
+    messages, unreadable = _messages(read_bytes(file, "MAVLink log"))
     if not messages:
         raise InputError("holds no MAVLink message", file=file, remedy="give a .tlog as ground stations write it")
     kinds = ("ATTITUDE", "ATTITUDE_QUATERNION")

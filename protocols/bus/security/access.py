@@ -13,6 +13,7 @@ from typing import Any
 
 from protocols.bus.settings import TlsConfig
 from protocols.core.errors import InputError
+from protocols.core.files import MAX_TOML, read_text
 from protocols.core.names import check_identifier, key_segment
 
 ROLES = ("camera", "uav", "hub", "record", "view", "router")
@@ -154,9 +155,7 @@ def read_access(file: Path) -> dict[str, Any]:
     """The ``access_control`` in a generated router file. Raises InputError if they do not deny by default."""
     remedy = "make it again with `syncline keys issue`"
     try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"access rules cannot be read: {error.strerror}", file=file, remedy=remedy) from None
+        document = json.loads(read_text(file, "file of access rules", MAX_TOML))
     except (ValueError, RecursionError) as error:
         line = getattr(error, "lineno", None)
         raise InputError("access rules are not JSON", file=file, line=line, remedy=remedy) from None

@@ -168,16 +168,16 @@ class Backfill(Generic[_Source]):
             if number == held.low and not held.joining:
                 self._continue(who, held, payload)
                 return self._release(who) if held.low == held.first else None
+            if held.joining and (number - held.first) % _SEQUENCE_MODULUS >= _SEQUENCE_MODULUS // 2:
+                # A publisher's numbers arrive in order: what came first was another's.
+                self._bytes -= self._held.pop(who).bytes
+                return self._begin(who, number, payload, held.since)
             held.later.append((number, payload))
             self._keep(held, len(payload))
             return None
         if expected is None:
             self._remember(who)
-            if number == 0:
-                self._next[who] = 1
-                self._push(source, key, payload)
-                return None
-            return self._hold(who, 0, number, payload, joining=True)
+            return self._begin(who, number, payload, self._clock())
         if (number - expected) % _SEQUENCE_MODULUS >= _SEQUENCE_MODULUS // 2:
             return None
         if number < expected:  # a gap at the wrap-around of the sequence numbers: once in years
@@ -186,6 +186,18 @@ class Backfill(Generic[_Source]):
             self._push(source, key, payload)
             return None
         return self._hold(who, expected, number, payload, joining=False)
+
+    def _begin(
+        self, who: tuple[str, _Source], number: int, payload: bytes, since: float
+    ) -> RecoveryQuery[_Source] | None:
+        """The first message of a publisher that was not known; since: when that was."""
+        if number == 0:
+            self._next[who] = 1
+            self._push(who[1], who[0], payload)
+            return None
+        question = self._hold(who, 0, number, payload, joining=True)
+        self._held[who].since = since
+        return question
 
     def _hold(
         self, who: tuple[str, _Source], low: int, first: int, payload: bytes, *, joining: bool
@@ -227,7 +239,8 @@ class Backfill(Generic[_Source]):
         missing = held.first - held.low - len(held.early)
         if missing and not held.joining:
             self._lost(missing)
-        expected = held.first
+        # What a late joiner heard first is its publisher's only if the cache has what was before it.
+        expected = max(held.early, default=held.first - 1) + 1 if held.joining else held.first
         while held.later:
             number, payload = held.later.popleft()
             behind = (number - expected) % _SEQUENCE_MODULUS >= _SEQUENCE_MODULUS // 2

@@ -25,6 +25,8 @@ BYTES_PER_S, _BURST_S = 8 * 1024 * 1024, 4.0
 all their fields at 30 Hz are 0.6 MB/s, and a log that is replayed as fast as it goes 2 MB/s."""
 _MAX_DRAIN, _LEAST_DRAIN = 4096, 16
 """Messages that are decoded at once, which takes 0.2 s, and of each sender, where there are so many."""
+_MAX_DRAIN_BYTES = 1024 * 1024
+"""The same in bytes: frames of hundreds of detections take 50 ms a megabyte."""
 _MAX_NUMBERED = 4096
 """Boots of plain publishers whose last number is remembered."""
 _MAX_ALIVE = 16_384
@@ -148,19 +150,31 @@ class Inbox:
 
     def _taken(self) -> dict[str, list[_Queued]]:
         """What is decoded now, by key, removed from the queues."""
-        if self._length <= _MAX_DRAIN:
+        if self._length <= _MAX_DRAIN and (self._bulky or self._bytes <= _MAX_DRAIN_BYTES):
             queues = {key: list(queue) for key, queue in self._queues.items()}
             self._queues = {}
             self._sizes.clear()
             self._length = self._bytes = 0
             return queues
         share = max(_MAX_DRAIN // len(self._queues), _LEAST_DRAIN)
-        queues = {}
-        for key, queue in list(self._queues.items()):
-            queues[key] = [queue.popleft() for _ in range(min(share, len(queue)))]
-            self._add(key, -len(queues[key]), -sum(len(item[1]) for item in queues[key]))
-            if not queue:
-                del self._queues[key], self._sizes[key]
+        share_bytes = _MAX_DRAIN_BYTES // len(self._queues)
+        queues, total = {}, 0
+        # Those with little first; of the others who was served last comes last.
+        for key in sorted(self._queues, key=lambda one: self._sizes[one] > share_bytes):
+            queue = self._queues[key]
+            taken, size = [queue.popleft()], 0
+            while queue and len(taken) < share and (size := size + len(taken[-1][1])) < share_bytes:
+                taken.append(queue.popleft())
+            queues[key] = taken
+            self._add(key, -len(taken), -sum(len(item[1]) for item in taken))
+            del self._queues[key]
+            if queue:
+                self._queues[key] = queue
+            else:
+                del self._sizes[key]
+            total += sum(len(item[1]) for item in taken)
+            if total >= _MAX_DRAIN_BYTES and not self._bulky:
+                break
         return queues
 
     def _count_gap(self, key: str, message: Message) -> None:

@@ -58,7 +58,10 @@ def read_index(stream: BinaryIO) -> Index | None:
             opcode, length = _HEAD.unpack_from(summary, offset)
             offset += _HEAD.size
             if opcode == Opcode.CHUNK_INDEX:
-                chunks.append(_CHUNK_INDEX.unpack_from(summary, offset))
+                first, last, place = _CHUNK_INDEX.unpack(summary[offset : offset + min(length, _CHUNK_INDEX.size)])
+                if not len(MAGIC) <= place < start:
+                    return None
+                chunks.append((first, last, place))
             elif opcode == Opcode.CHANNEL:
                 channel = Channel.read(ReadDataStream(BytesIO(summary[offset : offset + length])))
                 channels[channel.id] = channel.topic

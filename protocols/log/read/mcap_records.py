@@ -12,8 +12,9 @@ from __future__ import annotations
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -131,7 +132,8 @@ def read_records(stream: BinaryIO, damage: Damage, begin: int = len(MAGIC)) -> I
             stream.seek(end)
             following = stream.read(_HEAD.size)
             # A length that does not lead to another record is wrong, unless the content confirms it.
-            whole = _is_next(following) or _is_self_consistent(stream, offset + _HEAD.size, opcode, length)
+            inside = partial(_read_at, stream)
+            whole = _is_next(following) or _is_self_consistent(inside, offset + _HEAD.size, opcode, length)
         if not whole:
             found = resync(stream, offset + 1, size) if offset < size else None
             damage.record(_flaw(offset, head, opcode, length, found))
@@ -188,15 +190,19 @@ def _is_next(head: bytes) -> bool:
     return len(head) < _HEAD.size or _is_head(*_HEAD.unpack(head))
 
 
-def _is_self_consistent(stream: BinaryIO, start: int, opcode: int, length: int) -> bool:
+def _read_at(stream: BinaryIO, offset: int, size: int) -> bytes:
+    stream.seek(offset)
+    return stream.read(size)
+
+
+def _is_self_consistent(read: Callable[[int, int], bytes], start: int, opcode: int, length: int) -> bool:
     """Whether the lengths inside a record at ``start`` add up to its own: false positives are practically excluded.
 
-    Reads a few bytes only: a file may consist of nothing but false headers.
+    read: gives the bytes at an offset. Reads a few only: a file may consist of nothing but false headers.
     """
 
     def number(at: int, size: int) -> int:
-        stream.seek(start + at)
-        return int.from_bytes(stream.read(size), "little") if at + size <= length else length + 1
+        return int.from_bytes(read(start + at, size), "little") if at + size <= length else length + 1
 
     if opcode == Opcode.CHUNK:
         name = number(_CHUNK.size - 4, 4)
@@ -215,20 +221,23 @@ def _is_self_consistent(stream: BinaryIO, start: int, opcode: int, length: int) 
 
 def resync(stream: BinaryIO, start: int, size: int) -> int | None:
     """The offset of the next self-consistent record at or after ``start``; None if there is none."""
-    begin, length_of_window = start, _FIRST_WINDOW
+    begin, length_of_window, window = start, _FIRST_WINDOW, b""
+
+    def read(offset: int, count: int) -> bytes:
+        inside = offset - begin
+        return window[inside : inside + count] if inside + count <= len(window) else _read_at(stream, offset, count)
+
     while begin < size:
-        stream.seek(begin)
-        window = stream.read(length_of_window + _HEAD.size)
+        window = _read_at(stream, begin, length_of_window + _HEAD.size)
         for match in _CANDIDATE.finditer(window):
             offset = begin + match.start()
             if match.start() + _HEAD.size > len(window):
                 break
             opcode, length = _HEAD.unpack_from(window, match.start())
             content = offset + _HEAD.size
-            if length <= size - content and _is_self_consistent(stream, content, opcode, length):
-                stream.seek(content + length)
-                if _is_next(stream.read(_HEAD.size)):
-                    return offset
+            fits = length <= size - content and _is_self_consistent(read, content, opcode, length)
+            if fits and _is_next(read(content + length, _HEAD.size)):
+                return offset
         begin += length_of_window
         length_of_window = min(4 * length_of_window, _MAX_WINDOW)
     return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -171,9 +172,9 @@ class LogReader:
         for key, raw in self._raw_messages():
             yield RawLogMessage(self._part, key, raw)
 
-    def attachments(self) -> list[Attachment]:
+    def attachments(self) -> Iterator[Attachment]:
         """The stored files in file order; one whose checksum does not match is omitted and counts as damage."""
-        found: dict[Attachment, None] = {}
+        found: set[bytes] = set()
         for frame in self._frames():
             if frame.opcode != Opcode.ATTACHMENT:
                 continue
@@ -181,10 +182,10 @@ class LogReader:
                 self._damage.record(f"the attachment at byte {frame.offset} is damaged and was left out")
                 continue
             record = self._parse(AttachmentRecord, frame)
-            if record is not None:
-                # Each part of a log repeats them.
-                found[Attachment(record.name, record.media_type, record.data, record.log_time)] = None
-        return list(found)
+            digest = hashlib.sha256(frame.content).digest()
+            if record is not None and digest not in found:  # each part of a log repeats them
+                found.add(digest)
+                yield Attachment(record.name, record.media_type, record.data, record.log_time)
 
     def summary(self) -> LogSummary:
         """Count everything; reads the whole file, but decodes no message."""
@@ -252,7 +253,7 @@ class LogReader:
                 if channel is not None:
                     channels[channel.id] = channel.topic
             elif opcode == Opcode.METADATA:
-                noted = _channel_of_record(frame)
+                noted = _channel_of_record(content)
                 if noted is not None:
                     channels.setdefault(*noted)
             elif opcode == Opcode.MESSAGE:
@@ -319,10 +320,10 @@ class LogReader:
             return None
 
 
-def _channel_of_record(frame: McapRecord) -> tuple[int, str] | None:
+def _channel_of_record(content: bytes) -> tuple[int, str] | None:
     """(id, key) of a metadata record that names a channel; None for other metadata."""
     try:
-        record = MetadataRecord.read(ReadDataStream(BytesIO(frame.content)))
+        record = MetadataRecord.read(ReadDataStream(BytesIO(content)))
         if record.name != CHANNEL_RECORD:
             return None
         number, key = int(record.metadata["id"]), record.metadata["key"]

@@ -79,14 +79,13 @@ def recover(path: Path, out: Path) -> Recovery:
 
 def _copy(reader: LogReader, temporary: Path, out: Path) -> Recovery:
     metadata = reader.metadata()
-    attachments = reader.attachments()
     schema = int(reader.format.get("schema", "1"))
     numbers: dict[tuple[Path, str], int] = {}
     missing: Counter[str] = Counter()
     written, times, messages, foreign = _MessageDigest(), [0, 0], 0, 0
     try:
         with LogWriter(temporary, metadata, schema=schema) as log:
-            for attachment in attachments:
+            for attachment in reader.attachments():
                 log.attach(attachment.name, attachment.media_type, attachment.data, attachment.log_time_ns)
             for part, key, raw in reader.raw():
                 if schema_of(key) is None:

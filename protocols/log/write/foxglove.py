@@ -47,6 +47,8 @@ _ORANGE = Color(r=1.0, g=0.55, b=0.0, a=1.0)
 _POINT_FIELDS = [
     PackedElementField(name=name, offset=4 * place, type=PackedElementField.FLOAT32) for place, name in enumerate("xyz")
 ]
+_MAX_POINTS = 1024
+"""Of a cloud, the newest: who invents labels would have every message written with all of them."""
 _TRACK_LIFETIME_S = 2
 """A track without further messages disappears from the scene after this time."""
 
@@ -182,6 +184,8 @@ class FoxgloveConverter:
             points[track.label] = (now_ns, self._metres * np.array(track.position))
         for label in [label for label, (at, _) in points.items() if abs(now_ns - at) > _TRACK_LIFETIME_S * NANOSECONDS]:
             del points[label]
+        if len(points) > _MAX_POINTS:
+            del points[next(iter(points))]
         places = np.array([place for _, place in points.values()], dtype="<f4")
         return PointCloud(
             timestamp=stamp,

@@ -60,7 +60,7 @@ class RotatingWriter:
         """How many files there are."""
         return self._number + 1
 
-    def write(self, topic: Topic, agent: str, site: str, message: Message, log_time_ns: int) -> None:
+    def write(self, topic: Topic, agent: str, site: str, message: Message, log_time_ns: int) -> bool:
         """As LogWriter.write; begins a new part first where one is due."""
         if self._first_ns is None:
             self._first_ns = log_time_ns
@@ -71,7 +71,7 @@ class RotatingWriter:
             for name, media_type, data, time_ns in self._attachments:
                 self._writer.attach(name, media_type, data, time_ns)
             self._first_ns = log_time_ns
-        self._writer.write(topic, agent, site, message, log_time_ns)
+        return self._writer.write(topic, agent, site, message, log_time_ns)
 
     def attach(self, name: str, media_type: str, data: bytes, log_time_ns: int = 0) -> None:
         """Store a whole file in this part and all that follow."""

@@ -6,28 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from protocols.core.jpeg import jpeg_size
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
-
-_STANDALONE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a segment
-_START_OF_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start of frame: the others are tables
-
-
-def jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """(width, height) [px] from the JPEG's start-of-frame segment (ITU-T T.81, B.2.2); None where there is none."""
-    place = 2
-    if data[:2] != b"\xff\xd8":
-        return None
-    while place + 9 <= len(data) and data[place] == 0xFF:
-        marker = data[place + 1]
-        if marker == 0xFF or marker in _STANDALONE_MARKERS:
-            place += 1 if marker == 0xFF else 2
-            continue
-        if marker in _START_OF_FRAME_MARKERS:
-            height, width = (int.from_bytes(data[place + at : place + at + 2], "big") for at in (5, 7))
-            return (width, height) if width and height else None
-        place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
-    return None
 
 
 class ThumbnailScale(NamedTuple):

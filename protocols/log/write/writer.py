@@ -30,6 +30,8 @@ CHUNK_SIZE = 60 * 1024
 
 An unfinished chunk is lost if the process dies; 1 MiB of small messages is 12 s.
 """
+MAX_CHANNELS = 16_384
+"""Keys in one file: 1,000 cameras have 12,000, with those for viewers. The format numbers them with 16 bits."""
 
 
 class LogWriter:
@@ -85,8 +87,8 @@ class LogWriter:
         """Bytes in the file so far."""
         return self._file.tell()
 
-    def write(self, topic: Topic, agent: str, site: str, message: Message, log_time_ns: int) -> None:
-        """Append one message under the key it has on the bus.
+    def write(self, topic: Topic, agent: str, site: str, message: Message, log_time_ns: int) -> bool:
+        """Append one message under the key it has on the bus; False if the file has too many keys for a new one.
 
         log_time_ns: the recorder's clock (Unix, ns); the devices' own times stay in the message.
         """
@@ -96,6 +98,8 @@ class LogWriter:
         name = (topic.name, agent, site)
         key = self._keys.get(name)
         if key is None:
+            if len(self._channels) >= MAX_CHANNELS:
+                return False
             key = self._keys[name] = topic.key_for(site, agent)
         try:
             self._put(key, payload, log_time_ns)
@@ -104,9 +108,12 @@ class LogWriter:
                     self._put(view.key, view.message.SerializeToString(deterministic=True), log_time_ns)
         except OSError as error:
             self._failed(error)
+        return True
 
     def copy(self, key: str, payload: bytes, log_time_ns: int, publish_time_ns: int, sequence: int) -> None:
-        """Append a message of another log unchanged. Its channel must be known."""
+        """Append a message of another log unchanged. Its channel must be known. Raises InputError for too many keys."""
+        if key not in self._channels and len(self._channels) >= MAX_CHANNELS:
+            raise InputError(f"more than {MAX_CHANNELS} keys", file=self.path, remedy="recover its parts one by one")
         try:
             self._put(key, payload, log_time_ns, publish_time_ns, sequence)
         except OSError as error:

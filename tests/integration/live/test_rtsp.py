@@ -183,14 +183,22 @@ SETUP = request("SETUP", Transport="RTP/AVP/TCP;unicast;interleaved=0-1")
 
 
 def test_places_that_are_set_up_and_not_played_are_given_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four SETUPs without PLAY held all places for as long as their connections were open."""
+    """Four SETUPs without PLAY held all places for as long as their connections were open, or kept alive."""
     monkeypatch.setattr(rtsp_server, "_SETUP_TIMEOUT_S", 0.3)
+    links: list[socket.socket] = []
     with serving() as server, contextlib.ExitStack() as stack:
         for _ in range(4):
             link = stack.enter_context(socket.create_connection(("127.0.0.1", server.port), timeout=10))
             link.sendall(SETUP)
             assert link.recv(4096).startswith(b"RTSP/1.0 200")
-        assert eventually(lambda: exchange(server, SETUP).startswith(b"RTSP/1.0 200"))
+            links.append(link)
+
+        def others_are_served() -> bool:
+            for link in links:
+                link.sendall(request("OPTIONS"))
+            return exchange(server, SETUP).startswith(b"RTSP/1.0 200")
+
+        assert eventually(others_are_served)
 
 
 def test_silent_connections_do_not_lock_others_out() -> None:
@@ -200,6 +208,15 @@ def test_silent_connections_do_not_lock_others_out() -> None:
             stack.enter_context(socket.create_connection(("127.0.0.1", server.port), timeout=10))
         assert exchange(server, request("OPTIONS")).startswith(b"RTSP/1.0 200")
         assert len(server._connections) <= 17
+
+
+def test_connections_that_are_open_at_the_end_are_no_error(caplog: pytest.LogCaptureFixture) -> None:
+    """Each was a traceback."""
+    with contextlib.ExitStack() as stack, serving() as server:
+        for _ in range(3):
+            stack.enter_context(socket.create_connection(("127.0.0.1", server.port), timeout=10))
+        exchange(server, request("OPTIONS"))
+    assert caplog.records == []
 
 
 def test_an_error_in_a_connection_is_no_traceback(caplog: pytest.LogCaptureFixture) -> None:

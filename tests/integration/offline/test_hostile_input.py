@@ -11,11 +11,13 @@ import time
 import tomllib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from deploy.cli import run
-from edge.devices.playback.video_reader import VideoReader
+from deploy.config.agents import HubConfig
+from deploy.config.file import load
 from hub.calibration.pipeline import calibrate
 from protocols.core.errors import InputError
 from protocols.core.files import write_together
@@ -198,31 +200,80 @@ def agents_of(out: Path) -> list[str]:
     return found
 
 
-def test_a_named_pipe_is_no_video_and_no_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Opening a pipe that nobody writes to waits for ever."""
-    os.mkfifo(tmp_path / "cam0.mp4")
-    os.mkfifo(tmp_path / "log.mcap")
-    with pytest.raises(InputError, match="not a regular file"):
-        VideoReader(tmp_path / "cam0.mp4")
-    assert run(["info", str(tmp_path / "log.mcap")]) == 2
-    assert "not a regular file" in capsys.readouterr().err
+COMMANDS = {
+    "log": ["info", "X.mcap"],
+    "video": ["detect", "marker", "X.mp4", "--out", "OUT"],
+    "flight": ["track", "X.mp4", "--target", "1,1,9,9", "--out", "OUT"],
+    "configuration": ["hub", "X.toml", "--print-config"],
+    "rig": ["detect", "marker", "images", "--rig", "X.toml", "--out", "OUT"],
+    "observations": ["calibrate", "session", "--observations", "X.csv", "--out", "OUT"],
+    "calibration": ["export", "X.toml", "--to", "opencv", "--out", "OUT"],
+    "trajectory": ["export", "X.csv", "--to", "trc", "--out", "OUT"],
+    "telemetry": ["track", "images", "--target", "1,1,9,9", "--telemetry", "X.csv", "--out", "OUT"],
+    "tlog": ["track", "images", "--target", "1,1,9,9", "--telemetry", "X.tlog", "--out", "OUT"],
+    "yaml": ["import", "X.yaml", "--out", "OUT"],
+    "points": ["import", "X.csv", "--out", "OUT"],
+}
+
+
+@pytest.mark.parametrize("what", COMMANDS)
+@pytest.mark.parametrize("kind", ["pipe", "device", "binary"])
+def test_what_is_no_file_of_its_kind_is_refused(
+    filmed: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, what: str
+) -> None:
+    """A pipe that nobody writes to was waited for; /dev/zero was read until the memory was full."""
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images/0.png"), np.zeros((48, 64, 3), np.uint8))
+    write_session(tmp_path / "session", filmed)
+    command = [str(tmp_path / word) if word[0].isupper() or "/" in word else word for word in COMMANDS[what]]
+    command = [str(tmp_path / word) if word in ("images", "session") else word for word in command]
+    file = Path(next(word for word in command if word.startswith(str(tmp_path / "X."))))
+    if kind == "pipe":
+        os.mkfifo(file)
+    elif kind == "device":
+        file.symlink_to("/dev/zero")
+    else:
+        file.write_bytes(bytes(5000))
+
+    def too_long(*_: object) -> None:
+        raise AssertionError("it waits")
+
+    signal.signal(signal.SIGALRM, too_long)
+    signal.alarm(30)
+    try:
+        assert run(command) == 2
+    finally:
+        signal.alarm(0)
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    assert not (tmp_path / "OUT").exists() or not list((tmp_path / "OUT").iterdir())
+
+
+_LENS = "[cam0]\nsize = [640, 480]\n"
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         (".".join(["a"] * 50_000) + " = 1\n", "more than 32 parts"),
+        ("[" + ".".join(['"!"'] * 50_000) + "]\n", "more than 32 parts"),
+        ("x = { " + " . ".join(["a" * 150] * 9_000) + " = 1 }\n", "more than 32 parts"),
         ("".join(f"[cam{number}]\nsize = [640, 480]\n" for number in range(2_000)), "2000 cameras, at most 1024"),
+        (f"{_LENS}fps = 0x{'F' * 5000}\n", "a number too large"),
+        ("#" * 5_000_000, "more than 4194304 bytes"),
     ],
-    ids=["dotted", "cameras"],
+    ids=["dotted", "quoted", "inline", "cameras", "digits", "size"],
 )
 def test_a_rig_that_takes_long_to_read_is_refused_at_once(tmp_path: Path, text: str, words: str) -> None:
-    """Time was quadratic: 38 s for a key of 50,000 parts."""
+    """Time was quadratic: 38 s for a key of 50,000 parts, also of a configuration; a hexadecimal number of 5,000
+    digits could not be printed in the message about it."""
     file = tmp_path / "rig.toml"
     file.write_text(text)
     began = time.process_time()
     with pytest.raises(InputError, match=words):
         read_rig(file)
+    if "cameras" not in words:
+        with pytest.raises(InputError, match=words):
+            load(file, HubConfig)
     assert time.process_time() - began < 10.0
 
 
@@ -249,6 +300,51 @@ def test_a_terminal_without_unicode_gets_escapes_and_no_traceback(tmp_path: Path
     )
     assert done.returncode == 0
     assert b"Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("closed", ["stdin", "stdout", "stderr"])
+def test_a_stream_that_is_closed_from_the_start_is_no_error(tmp_path: Path, filmed: Session, closed: str) -> None:
+    """Python has None in its place."""
+    write_session(tmp_path / "session", filmed)
+    place = {"stdin": 0, "stdout": 1, "stderr": 2}[closed]
+    command = f'exec "$0" -m deploy info "$1" {place}>&-'
+    done = subprocess.run(
+        ["sh", "-c", command, sys.executable, str(tmp_path / "session")], capture_output=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_a_reader_that_closes_the_pipe_is_no_error() -> None:
+    command = '"$0" -m deploy --help 2>&1; echo "status $?" >&2'
+    done = subprocess.run(["sh", "-c", f"({command}) | true", sys.executable], capture_output=True, check=False)
+    assert done.stderr.strip() == b"status 0"
+
+
+def test_names_that_are_no_unicode_or_not_in_the_locale_are_no_bug(tmp_path: Path, filmed: Session) -> None:
+    folder = write_session(tmp_path / "session\udcff", filmed)
+    assert run(["calibrate", str(folder), "--out", str(tmp_path / "out\udcff")]) == 0
+    text = (tmp_path / "out\udcff/calibration.toml").read_text().replace("cam1", "cämera 日")
+    calibration = tmp_path / "calibration.toml"
+    calibration.write_text(text.replace("[cämera 日]", '["cämera 日"]'), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", "deploy", "export", str(calibration), "--to", "opencv", "--out", str(tmp_path / "cv")],
+        env={**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+        capture_output=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr.count(b"\n")) == (2, 1), done.stderr
+    assert not list((tmp_path / "cv").iterdir())
+
+
+@pytest.mark.parametrize("megabytes", [120, 300, 400])
+def test_little_memory_is_one_line(tmp_path: Path, filmed: Session, megabytes: int) -> None:
+    """Libraries that cannot be loaded, and OpenBLAS, which waits for ever."""
+    write_session(tmp_path / "session", filmed)
+    command = f'ulimit -v {megabytes * 1000}; exec "$0" -m deploy calibrate "$1" --out "$1/out"'
+    done = subprocess.run(
+        ["sh", "-c", command, sys.executable, str(tmp_path / "session")], capture_output=True, check=False, timeout=60
+    )
+    assert (done.returncode, done.stderr.count(b"\n")) == (2, 1), done.stderr
 
 
 def test_out_of_memory_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -122,8 +122,8 @@ def _resolved(config: msgspec.Struct, folder: Path) -> dict[str, Path]:
         ),
         ('id = "a"\nrig = 3', "agent.toml:2: rig: expected"),
         ('id = "a"\nrig = ""', "agent.toml:2: rig: expected a text that is not empty"),
-        ('id = "a"\nid = "b"', "agent.toml:2: is not TOML: Cannot overwrite a value"),
-        ('id = "a', "agent.toml:1: is not TOML"),
+        ('id = "a"\nid = "b"', "agent.toml:2: not valid TOML: Cannot overwrite a value"),
+        ('id = "a', "agent.toml:1: not valid TOML"),
     ],
 )
 def test_a_mistake_is_reported_with_its_line_and_a_remedy(tmp_path: Path, text: str, expected: str) -> None:
@@ -135,10 +135,10 @@ def test_a_mistake_is_reported_with_its_line_and_a_remedy(tmp_path: Path, text: 
 
 
 def test_a_file_that_cannot_be_read_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.toml: cannot be read: No such file"):
+    with pytest.raises(InputError, match=r"none\.toml: this configuration does not exist"):
         load(tmp_path / "none.toml", HubConfig)
     (tmp_path / "latin.toml").write_bytes(b'id = "\xe9"')
-    with pytest.raises(InputError, match="is not UTF-8"):
+    with pytest.raises(InputError, match="it is not UTF-8"):
         load(tmp_path / "latin.toml", HubConfig)
 
 

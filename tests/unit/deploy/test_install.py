@@ -133,7 +133,7 @@ def test_a_dry_run_prints_everything_and_changes_nothing(files: Path, capsys: py
         ("hub", 'id = "main"\nrig = "none.toml"\n', "cannot be read"),
         ("hub", 'id = "main"\nout = "/data"\n', "mount a larger disk at /var/lib/syncline"),
         ("hub", 'id = "main"\nout = "../../etc"\n', "below /var/lib/syncline/hub-main only"),
-        ("hub", "id = ", "is not TOML"),
+        ("hub", "id = ", "not valid TOML"),
         ("camera", 'id = "cam0"\ndriver = "video"\n', "needs a [video] table"),
         ("camera", 'id = "cam0"\ndriver = "video"\n[video]\nsource = "/home/me/a.mp4"\n', "may not read /home"),
     ],

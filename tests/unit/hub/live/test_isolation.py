@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -65,6 +66,37 @@ def test_there_are_so_many_cameras_and_no_more() -> None:
     for number in range(MAX_CAMERAS + 10):
         hub.handle(info(f"cam{number}"))
     assert hub.counters["too_many_cameras"] == 10
+
+
+def test_messages_of_many_senders_wait_within_one_bound() -> None:
+    """Each of a thousand invented cameras had room for 40,000 rows of its own."""
+    shares = FairShare(lambda one: None, itertools.count().__next__, 0.5)  # no time for any of them
+    for number in range(20):
+        shares.take(Received(OBSERVATION, f"cam{name}", frame(f"cam{name}", number, 1000), 0) for name in range(30))
+    waiting = sum(len(one.message.detections) for queue in shares._waiting.values() for one in queue)  # type: ignore[attr-defined]
+    assert 100_000 < waiting <= 200_000
+    assert set(shares.dropped) == {f"cam{name}" for name in range(30)}
+
+
+@pytest.mark.parametrize(("offset", "bound"), [(1e308, 0.1), (0.0, -5.0), (0.0, 1e308)])
+def test_a_clock_prior_that_cannot_be_is_not_used(offset: float, bound: float) -> None:
+    """The hub's own message about it was refused by who received it, and its log could not be replayed."""
+    status = pb.AgentStatus(agent="a", role="camera", boot_id="b0")
+    for name, value in {"clock_synchronised": 1.0, "unix_minus_camera_s": offset, "clock_error_s": bound}.items():
+        status.gauges[name] = value
+    hub = LiveHub()
+    hub.handle(status)
+    assert hub.clock_priors.for_boots({"a": "b0"}) == {}
+
+
+def test_clock_priors_of_invented_agents_are_not_kept_without_end() -> None:
+    hub = LiveHub()
+    for number in range(MAX_CAMERAS + 50):
+        status = pb.AgentStatus(agent=f"a{number}", role="camera", boot_id="b0")
+        for name in ("clock_synchronised", "unix_minus_camera_s", "clock_error_s"):
+            status.gauges[name] = 1.0
+        hub.handle(status)
+    assert len(hub.clock_priors._priors) == MAX_CAMERAS
 
 
 def test_labels_and_runs_without_end_are_not_kept() -> None:

@@ -201,3 +201,26 @@ def test_invented_publishers_of_one_key_are_forgotten_first() -> None:
     assert len(stage.backfill._next) < 20
     stage.take("a", 2)
     assert stage.out[-1] == "a2"
+
+
+def test_a_forged_number_before_the_first_message_silences_nobody() -> None:
+    """A receiver that restarts, and hears a forged number first, took the camera's own messages for old ones."""
+    stage = Stage()
+    stage.take("a", 2**31)  # forged, with the camera's own source id
+    stage.take("a", 500, 501)
+    stage.take("a", 2**31 + 1)
+    stage.after(0.5)
+    stage.answer(*range(495, 500), served=False)  # what the camera's cache still has
+    stage.take("a", 502)
+    stage.after(GAP_TIMEOUT_S + 0.1)
+    stage.take("a", 503, 504)
+    delivered = [name for name in stage.out if int(name[1:]) < 2**31]
+    assert delivered == names(*range(495, 505))
+
+
+def test_a_forged_number_alone_does_not_outlast_what_the_camera_has_published() -> None:
+    stage = Stage()
+    stage.take("a", 2**31)
+    stage.answer(0, 1, 2, served=False)
+    stage.take("a", 3, 4)
+    assert stage.out == names(0, 1, 2, 3, 4)

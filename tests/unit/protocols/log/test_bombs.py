@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import io
 import struct
+import time
 import tracemalloc
+import zlib
 from pathlib import Path
 
 import lz4.frame
 import pytest
 import zstandard
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from mcap.opcode import Opcode
 
+from protocols.log.read.index import read_index
 from protocols.log.read.mcap_records import MAGIC, Damage, McapRecord, chunk_records, read_records
 from protocols.log.read.reader import LogReader
+from protocols.log.write.foxglove import FoxgloveConverter
+from protocols.log.write.writer import LogWriter
+from protocols.messages import syncline_pb2 as pb
+from protocols.topics import OBSERVATION
+from tests.support.samples import observation
 
 ZEROS = bytes(64 * 1024 * 1024)
 
@@ -69,6 +78,63 @@ def test_a_format_record_that_is_cut_off_is_damage(tmp_path: Path) -> None:
     file = tmp_path / "cut.mcap"
     file.write_bytes(MAGIC + record(Opcode.METADATA, b"\x02\x00") + FOOTER)
     assert LogReader(file).summary().messages == 0
+
+
+def test_metadata_in_a_chunk_is_read_once(tmp_path: Path) -> None:
+    """Each record of metadata inside a chunk was parsed from the whole chunk: quadratic, hours for 12 MB."""
+    inside = record(Opcode.METADATA, b"") * 100_000
+    head = struct.pack("<QQQII", 600_000, 0, len(inside), 0, 0) + struct.pack("<Q", len(inside))
+    file = tmp_path / "nested.mcap"
+    file.write_bytes(MAGIC + record(Opcode.CHUNK, head + inside) + FOOTER)
+    began = time.process_time()
+    assert LogReader(file).summary().messages == 0
+    assert time.process_time() - began < 10.0
+
+
+@pytest.mark.parametrize("place", [3, 2**62, 2**64 - 1])
+def test_an_index_that_leads_out_of_the_data_is_not_used(tmp_path: Path, place: int) -> None:
+    """An offset beyond what a file can have raised OverflowError."""
+    data = MAGIC + record(Opcode.DATA_END, bytes(4))
+    summary = record(Opcode.CHUNK_INDEX, struct.pack("<QQQ", 0, 2**63, place) + bytes(40))
+    footer = record(Opcode.FOOTER, struct.pack("<QQI", len(data), 0, 0))[:-4]
+    footer += struct.pack("<I", zlib.crc32(footer, zlib.crc32(summary)))
+    file = tmp_path / "index.mcap"
+    file.write_bytes(data + summary + footer + MAGIC)
+    assert list(LogReader(file).messages(start_ns=1)) == []
+    with file.open("rb") as stream:
+        assert read_index(stream) is None
+
+
+def test_attachments_are_read_one_at_a_time(tmp_path: Path) -> None:
+    """`info` held all of them, and a sparse file has as many as it says."""
+    file = tmp_path / "attachments.mcap"
+    with LogWriter(file) as writer:
+        for number in range(20):
+            writer.attach(f"a{number}", "text/plain", bytes(2_000_000), number)
+    tracemalloc.start()
+    try:
+        assert sum(len(one.data) for one in LogReader(file).attachments()) == 40_000_000
+        assert tracemalloc.get_traced_memory()[1] < 15_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_log_has_room_for_so_many_keys_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The format numbers them with 16 bits: who invented 65,536 names ended the recorder."""
+    monkeypatch.setattr("protocols.log.write.writer.MAX_CHANNELS", 3)
+    with LogWriter(tmp_path / "log.mcap") as writer:
+        taken = [writer.write(OBSERVATION, f"a{number}", "local", observation(f"a{number}"), 1) for number in range(5)]
+        assert writer.write(OBSERVATION, "a0", "local", observation("a0", 1), 2)
+    assert taken == [True, True, True, False, False]
+    assert LogReader(tmp_path / "log.mcap").summary().messages == 4
+
+
+def test_invented_labels_do_not_fill_every_cloud_of_points() -> None:
+    views = FoxgloveConverter()
+    for number in range(1500):
+        track = pb.Track(label=f"l{number}", state="confirmed", position=[0.0, 0.0, 1.0])
+        clouds = [one.message for one in views.of("local", track, number) if isinstance(one.message, PointCloud)]
+    assert len(clouds[0].data) == 12 * 1024
 
 
 class Counting(io.BytesIO):

@@ -168,7 +168,7 @@ def test_external_data_beside_the_model_is_read_and_counted(tmp_path: Path, monk
         ("score = ", "not valid TOML"),
         ("mean = [nan, 0.0, 0.0]", "mean"),
         ('fill = 0\nresize = "stretch"', "fill has no effect"),
-        ("#" * 70_000, "larger than 64 KiB"),
+        ("#" * 5_000_000, "has more than 4194304 bytes"),
     ],
 )
 def test_a_wrong_description_is_one_line(tmp_path: Path, toml: str, message: str) -> None:

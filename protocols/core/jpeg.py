@@ -1,0 +1,49 @@
+"""JPEG images that others send: their size from the header, and decoding within a bound."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+MAX_JPEG_PIXELS = 1 << 25
+"""An 8K video has as many. A header of 600 bytes can claim a hundred times more, and the decoder would allocate it."""
+_STANDALONE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a segment
+_START_OF_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start of frame: the others are tables
+
+
+def jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """(width, height) [px] from the JPEG's start-of-frame segment (ITU-T T.81, B.2.2); None where there is none."""
+    place = 2
+    if data[:2] != b"\xff\xd8":
+        return None
+    while place + 9 <= len(data) and data[place] == 0xFF:
+        marker = data[place + 1]
+        if marker == 0:  # no marker: decoders search on for one, and would find another segment than this does
+            return None
+        if marker == 0xFF or marker in _STANDALONE_MARKERS:
+            place += 1 if marker == 0xFF else 2
+            continue
+        if marker in _START_OF_FRAME_MARKERS:
+            height, width = (int.from_bytes(data[place + at : place + at + 2], "big") for at in (5, 7))
+            return (width, height) if width and height else None
+        place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+    return None
+
+
+def jpeg_fits(data: bytes) -> bool:
+    """Whether it is a JPEG of at most ``MAX_JPEG_PIXELS``."""
+    size = jpeg_size(data)
+    return size is not None and size[0] * size[1] <= MAX_JPEG_PIXELS
+
+
+def decode_jpeg(data: bytes) -> npt.NDArray[np.uint8] | None:
+    """The image (h, w, 3), BGR; None if it is missing, damaged, or has more than ``MAX_JPEG_PIXELS``."""
+    import cv2
+
+    if not jpeg_fits(data):
+        return None
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error:
+        return None
+    return None if image is None else np.asarray(image, np.uint8)
