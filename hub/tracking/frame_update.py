@@ -53,6 +53,8 @@ _LIFETIME_S = 60.0
 """Mean time that a target stays, where nothing is seen of it."""
 _MIN_COLOUR_GAIN = 0.02
 _LOG_SIZE_PSD = 1e-4
+_WALKING_M_S, _STANDING_SHARE = 0.4, 0.05
+"""Turning and swaying grow with speed: somebody who stands has this share of a walker's acceleration (variance)."""
 _ACCELERATION_PSD = np.array([model.acceleration_psd for model in TARGET_MODELS])
 _UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
 _TYPICAL_SIZE_M = np.array([model.size_m for model in TARGET_MODELS])
@@ -100,7 +102,10 @@ def predict_targets(targets: Targets, elapsed: float, parameters: TrackerParamet
         return targets
     size = np.exp(targets.mean[:, LOG_SIZE])
     units_per_m = np.where(_UPRIGHT[targets.kind], size / _TYPICAL_SIZE_M[targets.kind], parameters.scale.units_per_m)
-    acceleration_psd = _ACCELERATION_PSD[targets.kind] * units_per_m**2
+    speed = np.linalg.norm(targets.mean[:, VELOCITY], axis=1) / units_per_m
+    share = np.clip((speed / _WALKING_M_S) ** 2, _STANDING_SHARE, 1.0)
+    share = np.where(_UPRIGHT[targets.kind], share, 1.0)
+    acceleration_psd = _ACCELERATION_PSD[targets.kind] * units_per_m**2 * share
     mean, covariance = kalman.predict(targets.mean, targets.covariance, elapsed, acceleration_psd, _LOG_SIZE_PSD)
     existence = targets.existence * np.exp(-max(elapsed, 0.0) / _LIFETIME_S)
     return replace(targets, mean=mean, covariance=covariance, existence=existence)

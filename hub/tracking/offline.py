@@ -15,7 +15,7 @@ from hub.tracking.filter.target_models import TARGET_MODELS
 from hub.tracking.filter.target_states import MultiTargetState, Targets
 from hub.tracking.frame_update import jointly, process_frame
 from hub.tracking.parameters import TrackerParameters
-from hub.tracking.smoothing import BatchSmoother, RecordedScan, SmoothedScan
+from hub.tracking.smoothing import LOG_ABSENT, BatchSmoother, RecordedScan, SmoothedScan
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import Refused
 from protocols.geometry.types import Bools, Floats, Ints
@@ -187,6 +187,7 @@ def _sampled(
     for index, scan in enumerate(scans):
         for place, row in enumerate(scan.row.tolist()):
             own[row].append((index, place))
+    absent = _absences(scans, count)
     for row in range(count):
         if not seen_ns[row] or odds[row] < _MIN_LOG_ODDS:
             continue
@@ -195,6 +196,8 @@ def _sampled(
         covariance = np.array([scans[index].covariance[place] for index, place in own[row]])
         seen = np.sort(np.array(seen_ns[row]))
         inside = (times_ns > seen[0] - 0.5 * interval_ns) & (times_ns < seen[-1] + 0.5 * interval_ns)
+        for begin, end in absent[row]:
+            inside &= (times_ns <= begin + 0.5 * interval_ns) | (times_ns >= end - 0.5 * interval_ns)
         wanted = times_ns[inside]
         if not len(wanted):
             continue
@@ -217,6 +220,19 @@ def _sampled(
         FollowedTrack(number, kind, times, position, std, size, confirmed, tuple(found))
         for number, (_, kind, times, position, std, size, confirmed, found) in enumerate(out, 1)
     )
+
+
+def _absences(scans: list[SmoothedScan], count: int) -> list[list[tuple[int, int]]]:
+    """Of each track, the spans [ns] between two detections in which cameras that should have seen it did not."""
+    out: list[list[tuple[int, int]]] = [[] for _ in range(count)]
+    last, unseen = np.full(count, -1), np.zeros(count)
+    for scan in scans:
+        hit, missed = scan.row[scan.hits > 0], scan.hits == 0
+        for row in hit[(unseen[hit] < LOG_ABSENT) & (last[hit] >= 0)].tolist():
+            out[row].append((int(last[row]), scan.now_ns))
+        last[hit], unseen[hit] = scan.now_ns, 0.0
+        unseen[scan.row[missed]] += scan.odds[missed]
+    return out
 
 
 def _summaries(

@@ -16,31 +16,33 @@ import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
 from hub.tracking.association.assignment import matching_colour_std
-from hub.tracking.association.scan import associate_jointly
+from hub.tracking.association.continuation import continuation_scores
+from hub.tracking.association.scan import FrameEvidence, associate_jointly
 from hub.tracking.filter.floor import Floor
-from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM, VELOCITY
-from hub.tracking.filter.target_models import TARGET_MODELS
+from hub.tracking.filter.kalman import LOG_SIZE
 from hub.tracking.filter.target_states import ScanFrame, Targets
 from hub.tracking.frame_update import on_floor, predict_targets, prior_of_births
 from hub.tracking.parameters import TrackerParameters
 from protocols.core.clocks import NANOSECONDS
-from protocols.geometry.types import Floats, Ints
+from protocols.geometry.types import Bools, Floats, Ints
 
-ITERATIONS = 3
-"""Association, smoothing and linking: of ten crowds none changed after the third."""
+ITERATIONS = 4
+"""Association, smoothing and linking. Of two crowds a fifth changed MOTA and IDF1 by less than 0.003."""
 _INSIDE, _BESIDE = 0.99, 0.3
 """Existence of a target between its first and its last detection, and one scan before and after."""
 _MAX_GAP_S = 6.0
 """Longest time over which a lost track is continued by its motion."""
-_LOG_CONTINUED = 3.0
-"""Log odds of a track going on against one ending and another beginning: one in twenty does, a scan."""
-_LOG_ABSENT = -7.0
+LOG_ABSENT = -7.0
 """Log odds of existence in a gap, from which on a track is cut there."""
+_LOG_HIDDEN = -5.0
+"""Log probability that no camera detects somebody for a while, whatever it should see: one in 150 is behind something
+that is not known, or where nobody looks for people."""
 _PRESENT = 1.0
 """Log odds by which another link must be better than the present one."""
-_ARRIVAL_AREA_M2 = 200.0
-"""In which new tracks begin."""
-_MAX_LINK_M = 6.0
+_IMPOSSIBLE = -1e3
+"""Below all log odds of a link."""
+_REACH_S = 1.5
+"""Associations further than this from a change are not tried again: what else is known of a track outweighs it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,8 +56,7 @@ class RecordedScan:
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothedScan:
     """Tracks at the time of a scan. row: (k,) which. mean, covariance: (k, 7), (k, 7, 7), from past and future. hits:
-    (k,) detections in the scan. odds: (k,) what it adds to the log odds of existence, and missed: (k,), what it would
-    have added without any."""
+    (k,) detections in the scan. odds: (k,) what it adds to the log odds of existence."""
 
     now_ns: int
     row: Ints
@@ -63,7 +64,6 @@ class SmoothedScan:
     covariance: Floats
     hits: Ints
     odds: Floats
-    missed: Floats
 
 
 @dataclass(slots=True, eq=False)
@@ -78,16 +78,11 @@ class _Filtered:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ScanEvidence:
-    """What a scan says of the tracks ``row`` (k,), as in `ScanResult`."""
+    """What a scan's frames say of the tracks ``row`` (k,), each and in all."""
 
     row: Ints
-    information: Floats
-    vector: Floats
-    missed: Floats
-
-    def renamed(self, names: Ints) -> _ScanEvidence:
-        """The same of tracks with other numbers."""
-        return replace(self, row=names[self.row])
+    frames: tuple[FrameEvidence, ...]
+    total: FrameEvidence
 
 
 class BatchSmoother:
@@ -110,7 +105,8 @@ class BatchSmoother:
         for scan, (row, mean, covariance) in zip(self.scans, states, strict=True):
             there = replace(tracks.select(row), mean=mean, covariance=covariance)
             found = associate_jointly(scan.frames, there, scan.now_ns, there, parameters.up, self.colour_std, 0)
-            self.evidence.append(_ScanEvidence(row, found.information, found.vector, found.missed))
+            self.evidence.append(_ScanEvidence(row, found.evidence, found.total))
+        self._changed = np.ones(len(self.scans), dtype=np.bool_)
         self._initial(states)
 
     def _initial(self, states: Iterable[tuple[Ints, Floats, Floats]]) -> None:
@@ -131,6 +127,8 @@ class BatchSmoother:
                 self._cut(out)
                 forward, backward = self._filter(1), self._filter(-1)
                 self._link(forward, backward)
+                forward, backward = self._filter(1), self._filter(-1)
+                self._exchange(forward, backward)
             forward, backward = self._filter(1), self._filter(-1)
             out = self._associate(forward, backward, relink=number < iterations)
             if progress is not None:
@@ -177,19 +175,16 @@ class BatchSmoother:
 
     def _updated(self, index: int, rows: Ints, mean: Floats, covariance: Floats) -> tuple[Floats, Floats]:
         """States with the evidence of a scan."""
-        found = self.evidence[index]
-        _, a, b = np.intersect1d(rows, found.row, return_indices=True)
-        if not len(a):
-            return mean, covariance
-        mean, covariance = mean.copy(), covariance.copy()
-        prior = np.linalg.inv(covariance[a])
-        covariance[a] = _symmetric(np.linalg.inv(prior + found.information[b]))
-        mean[a] = (covariance[a] @ ((prior @ mean[a, :, None])[:, :, 0] + found.vector[b])[:, :, None])[:, :, 0]
-        return mean, covariance
+        found = self.evidence[index].total.of(_places(self.evidence[index].row, rows))
+        prior = np.linalg.inv(covariance)
+        vector = (prior @ mean[:, :, None])[:, :, 0] + found.vector
+        covariance = _symmetric(np.linalg.inv(prior + found.information))
+        return (covariance @ vector[:, :, None])[:, :, 0], covariance
 
     def _associate(self, forward: list[_Filtered], backward: list[_Filtered], relink: bool) -> list[SmoothedScan]:
         """Every scan associated again, given past and future."""
         first, last = self._extents()
+        due, self._changed = self._near_changes(), np.zeros(len(self.scans), dtype=np.bool_)
         out = []
         for index, (scan, past, future) in enumerate(zip(self.scans, forward, backward, strict=True)):
             _, a, b = np.intersect1d(past.row, future.row, return_indices=True)
@@ -207,20 +202,34 @@ class BatchSmoother:
             )  # fmt: skip
             mean, covariance = self._updated(index, row, mean, covariance)
             there = replace(prior, mean=mean, covariance=covariance)
+            places = _places(self.evidence[index].row, row)
             found = associate_jointly(
-                scan.frames, there, scan.now_ns, prior, self.parameters.up, self.colour_std, 2 if relink else 0
-            )
+                scan.frames, there, scan.now_ns, prior, self.parameters.up, self.colour_std,
+                2 if relink and due[index] else 0,
+                tuple(one.of(places) for one in self.evidence[index].frames),
+            )  # fmt: skip
+            self._changed[index] = found.changed
             self.scans[index] = replace(scan, frames=found.frames)
-            self.evidence[index] = _ScanEvidence(row, found.information, found.vector, found.missed)
+            self.evidence[index] = _ScanEvidence(row, found.evidence, found.total)
             after = found.targets
-            out.append(
-                SmoothedScan(scan.now_ns, row, after.mean, after.covariance, found.hits, found.odds, found.missed)
-            )
+            out.append(SmoothedScan(scan.now_ns, row, after.mean, after.covariance, found.hits, found.total.odds))
         means = self.tracks.mean.copy()
         for one in reversed(out):
             means[one.row] = one.mean
         self.tracks = replace(self.tracks, mean=means)
         return out
+
+    def _near_changes(self) -> Bools:
+        """Which scans (n,) are within ``_REACH_S`` of one whose association or links have changed."""
+        times = np.array([scan.now_ns for scan in self.scans])
+        changed = times[self._changed]
+        if not len(changed):
+            return self._changed
+        nearest = (
+            np.searchsorted(changed, times).clip(1, len(changed) - 1) if len(changed) > 1 else np.zeros_like(times)
+        )
+        off = np.minimum(np.abs(times - changed[nearest]), np.abs(times - changed[np.maximum(nearest - 1, 0)]))
+        return np.asarray(off <= _REACH_S * NANOSECONDS)
 
     def _cut(self, smoothed: Sequence[SmoothedScan]) -> None:
         """Cut tracks where cameras that should have seen them did not: whoever follows is somebody else."""
@@ -229,7 +238,8 @@ class BatchSmoother:
         unseen = np.zeros(len(self.tracks))
         for index, one in enumerate(smoothed):
             hit = one.row[one.hits > 0]
-            for track in hit[unseen[hit] < _LOG_ABSENT].tolist():
+            for track in hit[unseen[hit] < LOG_ABSENT].tolist():
+                self._changed[index] = True
                 label[track] = count
                 source.append(track)
                 count += 1
@@ -239,11 +249,50 @@ class BatchSmoother:
             self._rename(index, label)
         self._select(source)
 
+    def _exchange(self, forward: list[_Filtered], backward: list[_Filtered]) -> None:
+        """Exchange tracks that continue each other better if the scan between is left out.
+
+        Where two people meet, a scan's detections of both may be mixed, so that neither boundary of it shows which past
+        belongs to which future. It is associated anew.
+        """
+        first, last = self._extents()
+        label, untouched = np.arange(len(self.tracks)), 1
+        for index in range(len(self.scans)):
+            new = label
+            tracks = np.flatnonzero((first < index) & (index < last))
+            if index >= untouched and len(tracks) > 1:
+                ends = np.full(len(tracks), index - 1)
+                score = self._link_scores(forward, backward[index + 1], tracks, tracks, ends, index)
+                score += np.diag(np.full(len(tracks), _PRESENT))
+                _, follows = linear_sum_assignment(-np.maximum(score, _IMPOSSIBLE))
+                heads, tails = tracks[moved := follows != np.arange(len(tracks))], tracks[follows[moved]]
+                if len(heads) and score[moved, follows[moved]].min() > _IMPOSSIBLE:
+                    new = label.copy()
+                    new[tails] = label[heads]
+                    self._forget(index, heads)
+                    untouched = index + 2
+            self._rename(index, label)
+            label = new
+
+    def _forget(self, index: int, rows: Ints) -> None:
+        """Leave a scan's detections of some tracks to be associated anew."""
+        scan, found = self.scans[index], self.evidence[index]
+        frames = tuple(
+            replace(one, ids=one.ids[kept := ~np.isin(one.ids, rows)], column=one.column[kept]) for one in scan.frames
+        )
+        self.scans[index] = replace(scan, frames=frames)
+        known = np.where(np.isin(found.row, rows), -1, np.arange(len(found.row)))
+        self.evidence[index] = _ScanEvidence(
+            found.row, tuple(one.of(known) for one in found.frames), found.total.of(known)
+        )
+        self._changed[index] = True
+
     def _rename(self, index: int, names: Ints) -> None:
         scan = self.scans[index]
         frames = tuple(replace(one, ids=names[one.ids]) for one in scan.frames)
         self.scans[index] = replace(scan, frames=frames)
-        self.evidence[index] = self.evidence[index].renamed(names)
+        found = self.evidence[index]
+        self.evidence[index] = replace(found, row=names[found.row])
 
     def _select(self, source: list[int]) -> None:
         """Tracks with the states of others."""
@@ -258,7 +307,7 @@ class BatchSmoother:
         lost: dict[int, tuple[int, int]] = {}  # by track: scan of its last detection, label
         missed = np.zeros(n)
         for index in range(len(self.scans)):
-            missed[self.evidence[index].row] = self.evidence[index].missed
+            missed[self.evidence[index].row] = self.evidence[index].total.missed
             if index + 1 == len(self.scans):
                 self._rename(index, label)
                 break
@@ -273,13 +322,14 @@ class BatchSmoother:
             if len(heads) and len(tails):
                 ends = np.array([lost[head][0] if head in lost else index for head in heads.tolist()])
                 score = self._link_scores(forward, backward[index + 1], heads, tails, ends, index)
-                score += ((index - ends) * missed[heads])[:, None]
+                score += np.maximum((index - ends) * missed[heads], _LOG_HIDDEN)[:, None]
                 score = np.where(heads[:, None] == tails[None, :], score + _PRESENT, score)
                 a, b = linear_sum_assignment(np.where(score > 0.0, -score, 0.0))
                 linked = score[a, b] > 0.0
                 follows = {int(tails[j]): int(heads[i]) for i, j in zip(a[linked], b[linked], strict=True)}
                 for tail in tails.tolist():
                     head = follows.get(tail)
+                    self._changed[index] |= head != tail and bool(alive[tail])
                     if head is not None:
                         new[tail] = lost.pop(head)[1] if head in lost else label[head]
                     elif alive[tail]:  # its past goes on elsewhere, or ends
@@ -295,56 +345,29 @@ class BatchSmoother:
     def _link_scores(
         self, forward: list[_Filtered], after: _Filtered, heads: Ints, tails: Ints, ends: Ints, index: int
     ) -> Floats:
-        """Log odds (h, t) of tail t continuing head h, against h ending and t beginning."""
+        """Log odds (h, t) of tail t, at the scan after ``index``, continuing head h, last seen in scan ends[h]."""
         scan = self.scans[index + 1]
-        mean, covariance = np.zeros((len(heads), STATE_DIM)), np.zeros((len(heads), STATE_DIM, STATE_DIM))
-        gap = np.zeros(len(heads))
+        past = self.tracks.select(heads)
+        mean, covariance, gap = past.mean.copy(), past.covariance.copy(), np.zeros(len(heads))
         for at in np.unique(ends).tolist():
             chosen = ends == at
-            past = forward[at]
-            place = {track: i for i, track in enumerate(past.row.tolist())}
-            rows = np.array([place[track] for track in heads[chosen].tolist()])
-            state = replace(past.predicted.select(rows), mean=past.mean[rows], covariance=past.covariance[rows])
+            rows = _places(forward[at].row, heads[chosen])
+            state = replace(past.select(chosen), mean=forward[at].mean[rows], covariance=forward[at].covariance[rows])
             elapsed = (scan.now_ns - self.scans[at].now_ns) / NANOSECONDS
             state = on_floor(predict_targets(state, elapsed, self.parameters), self.floor, elapsed)
             mean[chosen], covariance[chosen] = state.mean, state.covariance
             gap[chosen] = (self.scans[index].now_ns - self.scans[at].now_ns) / NANOSECONDS
-        place = {track: i for i, track in enumerate(after.row.tolist())}
-        rows = np.array([place[track] for track in tails.tolist()])
-        begun, spread = after.mean[rows], after.covariance[rows]
-        kinds = self.tracks.kind
-        unit = self.parameters.scale.units_per_m
-        off = mean[:, None] - begun[None]
-        near = np.linalg.norm(off[..., POSITION], axis=2) < _MAX_LINK_M * unit
-        near &= kinds[heads][:, None] == kinds[tails][None, :]
-        a, b = np.nonzero(near)
-        score = np.full(near.shape, -np.inf)
-        if not len(a):
-            return score
-        total = covariance[a] + spread[b]
-        solved = np.linalg.solve(total, off[a, b][:, :, None])[:, :, 0]
-        fit = -0.5 * ((off[a, b] * solved).sum(axis=1) + np.linalg.slogdet(total)[1])
-        # The same, had the tail begun anywhere: position uniform, velocity and size from their priors.
-        model = [TARGET_MODELS[k] for k in kinds[tails].tolist()]
-        speed = np.array([one.speed_std_m_s for one in model]) * unit
-        size = np.array([one.log_size_std for one in model])
-        free = spread[:, VELOCITY, VELOCITY] + speed[:, None, None] ** 2 * np.eye(3)
-        velocity = begun[:, VELOCITY]
-        chance = -0.5 * (
-            np.einsum("ni,nij,nj->n", velocity, np.linalg.inv(free), velocity) + np.linalg.slogdet(free)[1]
-        )
-        typical = np.median(self.tracks.mean[:, LOG_SIZE])
-        size2 = size**2 + spread[:, LOG_SIZE, LOG_SIZE]
-        chance -= 0.5 * ((begun[:, LOG_SIZE] - typical) ** 2 / size2 + np.log(size2))
-        # The height is that of the floor in both cases: only the two horizontal dimensions are free.
-        height = total[:, :3, :3]
-        vertical = np.linalg.eigvalsh(height)[:, 0]
-        chance_of = chance[b] - np.log(_ARRIVAL_AREA_M2 * unit**2) - 0.5 * np.log(vertical) + np.log(2.0 * np.pi)
-        colour = self.tracks.colour
-        off2 = ((colour[heads[a]] - colour[tails[b]]) ** 2).sum(axis=1) / self.colour_std**2
-        alike = np.nan_to_num(3.0 * np.log(60.0 / self.colour_std) - 0.5 * np.minimum(off2, 12.0))
-        score[a, b] = fit - chance_of + _LOG_CONTINUED - gap[a] + np.where(heads[a] == tails[b], 0.0, alike)
-        return score
+        past = replace(past, mean=mean, covariance=covariance)
+        rows = _places(after.row, tails)
+        future = replace(self.tracks.select(tails), mean=after.mean[rows], covariance=after.covariance[rows])
+        typical = float(np.median(self.tracks.mean[:, LOG_SIZE]))
+        return continuation_scores(past, future, gap, self.parameters.scale.units_per_m, typical, self.colour_std)
+
+
+def _places(rows: Ints, wanted: Ints) -> Ints:
+    """Where each of ``wanted`` is in ``rows``, -1 = nowhere."""
+    place = {track: at for at, track in enumerate(rows.tolist())}
+    return np.array([place.get(track, -1) for track in wanted.tolist()], dtype=np.int64)
 
 
 def _fused(mean: Floats, covariance: Floats, other_mean: Floats, other_covariance: Floats) -> tuple[Floats, Floats]:

@@ -70,6 +70,13 @@ def read_objects(file: Path, sizes: Mapping[str, tuple[int, int]]) -> DetectionR
     if boxes:
         return _box_rows(table, sizes)
     rows = read_detections(file, sizes)
+    limit = np.array([sizes[name] for name in names], dtype=np.float64)
+    for what, point in (("u, v", rows.pixels), ("the head", rows.head), ("the foot", rows.foot)):
+        # The end of somebody whom the border cuts may be estimated beyond it.
+        outside = ((point < -limit) | (point > 2.0 * limit)).any(axis=1)
+        table.refuse(
+            outside, lambda row, what=what: f"{what} lies outside the {limit[row, 0]:g}x{limit[row, 1]:g} picture"
+        )
     _check_pairs(rows, file)
     return rows
 

@@ -8,7 +8,9 @@ repeated given the detections of all others, until nothing changes: iterated con
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 
@@ -37,7 +39,7 @@ AMBIGUOUS = 0.95
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Evidence:
+class FrameEvidence:
     """What one frame says of n targets: information (n, 7, 7) and its vector (n, 7) at the scan's time, change of the
     log odds of existence (n,), that change had it not been detected (n,), and the associated detection (n,), -1 =
     none."""
@@ -48,21 +50,45 @@ class _Evidence:
     missed: Floats
     column: Ints
 
+    def of(self, index: Ints) -> FrameEvidence:
+        """The same of other targets; index: (k,) which of these each is, -1 = none of them: nothing is said of it."""
+        known = index >= 0
+
+        def part(values: Floats) -> Floats:
+            out = np.zeros((len(index), *values.shape[1:]))
+            out[known] = values[index[known]]
+            return out
+
+        column = np.full(len(index), -1)
+        column[known] = self.column[index[known]]
+        return FrameEvidence(part(self.information), part(self.vector), part(self.odds), part(self.missed), column)
+
+    def __add__(self, other: FrameEvidence) -> FrameEvidence:
+        """What both say; ``column`` is no longer of any frame."""
+        return FrameEvidence(
+            self.information + other.information,
+            self.vector + other.vector,
+            self.odds + other.odds,
+            self.missed + other.missed,
+            np.full_like(self.column, -1),
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanResult:
-    """Joint association of a scan. targets: with its frames. frames: with their associations. information: (n, 7, 7),
-    vector: (n, 7), odds: (n,), what the frames add to the states and to the log odds of existence. changed: whether an
-    association is another one than before. hits: (n,) detections of each target. missed: (n,) log odds without any."""
+    """Joint association of a scan. targets: with its frames. frames: with their associations. evidence: of each frame.
+    changed: whether an association is another one than before. hits: (n,) detections of each target."""
 
     targets: Targets
     frames: tuple[ScanFrame, ...]
-    information: Floats
-    vector: Floats
-    odds: Floats
+    evidence: tuple[FrameEvidence, ...]
     changed: bool
     hits: Ints
-    missed: Floats
+
+    @property
+    def total(self) -> FrameEvidence:
+        """What all frames say together."""
+        return reduce(operator.add, self.evidence)
 
 
 def associate_jointly(
@@ -73,10 +99,12 @@ def associate_jointly(
     up: Floats | None,
     colour_std: float,
     sweeps: int = MAX_SWEEPS,
+    evidence: tuple[FrameEvidence, ...] | None = None,
 ) -> ScanResult:
     """The joint association of frames with targets.
 
     targets: at ``now_ns``, with the frames' present associations. prior: the same targets without these frames.
+    evidence: of the frames, where it is known from before.
     """
     row = {number: i for i, number in enumerate(targets.initiation_number.tolist())}
     before = []
@@ -86,42 +114,45 @@ def associate_jointly(
             if number in row:
                 column[row[number]] = j
         before.append(column)
-    evidence = [
-        _evidence(one, targets, now_ns, up, colour_std, column) for one, column in zip(frames, before, strict=True)
-    ]
+    found = list(evidence or ())
+    if evidence is None:
+        found = [
+            _evidence(one, targets, now_ns, up, colour_std, column) for one, column in zip(frames, before, strict=True)
+        ]
     information = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
     vector = (information @ prior.mean[:, :, None])[:, :, 0]
     odds = log_odds(prior.existence)
+    due = set(range(len(frames)))
     for _ in range(sweeps):
-        changed = False
         for index, one in enumerate(frames):
-            others = [each for k, each in enumerate(evidence) if k != index]
+            if index not in due:
+                continue
+            due.discard(index)
+            others = [each for k, each in enumerate(found) if k != index]
             without = _combined(targets, information, vector, odds, others)
             new = _evidence(one, without, now_ns, up, colour_std, None)
-            changed |= not np.array_equal(new.column, evidence[index].column)
-            evidence[index] = new
-        if not changed:
+            if not np.array_equal(new.column, found[index].column):
+                due |= set(range(len(frames))) - {index}
+            found[index] = new
+        if not due:
             break
     ids = targets.initiation_number
-    hits = np.sum([each.column >= 0 for each in evidence], axis=0)
-    after = _combined(targets, information, vector, odds, evidence)
+    hits = np.sum([each.column >= 0 for each in found], axis=0)
+    after = _combined(targets, information, vector, odds, found)
     return ScanResult(
         replace(after, hits=targets.hits + hits - np.sum([column >= 0 for column in before], axis=0)),
         tuple(
             replace(one, ids=ids[each.column >= 0], column=each.column[each.column >= 0], ambiguous=False)
-            for one, each in zip(frames, evidence, strict=True)
+            for one, each in zip(frames, found, strict=True)
         ),
-        np.sum([each.information for each in evidence], axis=0),
-        np.sum([each.vector for each in evidence], axis=0),
-        np.sum([each.odds for each in evidence], axis=0),
-        any(not np.array_equal(each.column, column) for each, column in zip(evidence, before, strict=True)),
+        tuple(found),
+        any(not np.array_equal(each.column, column) for each, column in zip(found, before, strict=True)),
         hits,
-        np.sum([each.missed for each in evidence], axis=0),
     )
 
 
 def _combined(
-    targets: Targets, information: Floats, vector: Floats, odds: Floats, evidence: list[_Evidence]
+    targets: Targets, information: Floats, vector: Floats, odds: Floats, evidence: list[FrameEvidence]
 ) -> Targets:
     total = information + sum(one.information for one in evidence)
     covariance = np.linalg.inv(total)
@@ -133,7 +164,7 @@ def _combined(
 
 def _evidence(
     one: ScanFrame, targets: Targets, now_ns: int, up: Floats | None, colour_std: float, fixed: Ints | None
-) -> _Evidence:
+) -> FrameEvidence:
     """What a frame says, given the targets' states without it; fixed: (n,) its association, where that is known."""
     n = len(targets)
     elapsed = (one.frame.reference_ns - now_ns) / NANOSECONDS
@@ -166,7 +197,7 @@ def _evidence(
             )
     fraction = independent_fraction(one.statistics.interval_s)
     odds = log_odds(posterior_existence(there.existence, probability, detected, fraction)) - log_odds(there.existence)
-    return _Evidence(information, vector, odds, fraction * np.log1p(-probability), column)
+    return FrameEvidence(information, vector, odds, fraction * np.log1p(-probability), column)
 
 
 def _linearised(

@@ -89,16 +89,14 @@ def predict_measurement(camera: TrackingCamera, mean: Floats, kind: Ints, up: Fl
     jacobian[:, :LOG_IMAGE_SIZE, POSITION] = (by_camera @ rotation).reshape(n, 6, 3)
     jacobian[:, :LOG_IMAGE_SIZE, LOG_SIZE] = ((by_camera @ axis) * along[:, :, None]).reshape(n, 6)
     std = np.stack([_POINT_STD[kind], _HEAD_STD[kind], _FOOT_STD[kind]], axis=1)
-    unit = (size**2)[:, None, None, None] * (by_camera @ by_camera.swapaxes(2, 3))
     moving = (by_camera @ velocity[:, None, :, None])[..., 0] * camera.time_std
-    both = (std**2)[:, :, None, None] * unit + moving[:, :, :, None] * moving[:, :, None, :]
+    flat = by_camera.reshape(n, 6, 3)
+    unit = (size**2)[:, None, None] * (flat @ flat.swapaxes(1, 2))
     # A box, or a leaning body, is displaced as a whole: the three points have this part of their noise in common.
-    scale = _COMMON_STD[kind] * size
+    noise[:, :LOG_IMAGE_SIZE, :LOG_IMAGE_SIZE] = (_COMMON_STD[kind] ** 2)[:, None, None] * unit
     for part, rows in enumerate((POINT, HEAD, FOOT)):
-        for other, columns in enumerate((POINT, HEAD, FOOT)):
-            common = by_camera[:, part] @ by_camera[:, other].swapaxes(1, 2)
-            noise[:, rows, columns] = (scale**2)[:, None, None] * common
-        noise[:, rows, rows] += both[:, part]
+        noise[:, rows, rows] += (std[:, part] ** 2)[:, None, None] * unit[:, rows, rows]
+        noise[:, rows, rows] += moving[:, part, :, None] * moving[:, part, None, :]
     _predict_log_image_size(value, jacobian, mean, depth, upright, rotation)
     noise[:, LOG_IMAGE_SIZE, LOG_IMAGE_SIZE] = _LOG_SIZE_STD**2
     return PredictedMeasurement(value, jacobian, noise, depth)
@@ -128,7 +126,7 @@ def student_t_inflation(squared: Floats) -> Floats:
     The inverse of the Student's t weight in iteratively reweighted least squares, limited to weights of at most 1
     (Lange, Little and Taylor 1989).
     """
-    return np.maximum(np.nan_to_num((_STUDENT_T_DOF + squared) / (_STUDENT_T_DOF + 2.0), nan=1.0), 1.0)
+    return np.asarray(np.fmax((_STUDENT_T_DOF + squared) / (_STUDENT_T_DOF + 2.0), 1.0))
 
 
 def student_t_cost(squared: Floats) -> Floats:

@@ -139,6 +139,13 @@ def test_a_bad_row_is_named_with_its_line(row: str, what: str, tmp_path: Path) -
     assert error.remedy
 
 
+@pytest.mark.parametrize(("u", "head_u", "what"), [(9000, 50, "u, v lies"), (50, 5000, "the head lies")])
+def test_a_person_outside_the_picture_is_named_with_its_line(u: int, head_u: int, what: str, tmp_path: Path) -> None:
+    text = f"camera,frame,time,u,v,head_u,head_v,foot_u,foot_v\nleft,0,0,{u},50,{head_u},30,50,90\n"
+    with pytest.raises(InputError, match=f"rows.csv:2: {what} outside the 960x720 picture"):
+        read_objects(rows(tmp_path, text), SIZES)
+
+
 def test_a_head_below_its_foot_is_named_with_its_line(tmp_path: Path) -> None:
     text = "camera,frame,time,u,v,label\nleft,0,0,50,90,ann-head\nleft,0,0,52,20,ann-foot\n"
     with pytest.raises(InputError, match=r"rows.csv:3: ann: the head is not above the foot"):

@@ -107,6 +107,61 @@ def test_a_crowd_at_two_frames_a_second(lag_s: float, turn: float) -> None:
     assert 1.55 < np.median([np.median(track.height) for track in result.tracks]) < 1.9
 
 
+def test_who_vanishes_from_all_cameras_is_the_same_person_afterwards_and_has_no_rows_between() -> None:
+    """Nobody is detected for 1.5 s, as where people walk off the part of the ground that is looked at."""
+    messages, calibration, truth = crowd(3, 0.0, 0.0)
+    for message in messages:
+        if 10 <= message.sequence < 13:
+            del message.detections[:]
+    result = follow(messages, calibration, [round(frame / FPS * NANOSECONDS) for frame in range(FRAMES)])
+    hidden = np.array([5.0, 5.5, 6.0])
+    assert not any(np.isin(np.round(track.times, 6), hidden).any() for track in result.tracks)
+    truth[10:13] = np.inf
+    assert scores(result, truth).idf1 > 0.93
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_who_walks_up_to_somebody_and_stops_is_not_exchanged_with_him(seed: int) -> None:
+    """0.55 m apart before three low cameras at 2 Hz: a scan's detections of both may be mixed where one stops."""
+    rng = np.random.default_rng(seed)
+    time, count = np.arange(36) / FPS, 36
+    paths = []
+    for stand, angle, arrival in (
+        (-np.ones(2), rng.uniform(0.0, 6.28), 4.0),
+        (np.array([1.5, 1.0]), rng.uniform(0.0, 6.28), 7.0),
+    ):
+        away = np.clip(0.55 + 1.4 * (arrival - time), 0.55, 5.0)
+        paths += [np.tile(stand, (count, 1)), stand + away[:, None] * [np.cos(angle), np.sin(angle)]]
+    place = np.stack(paths, axis=1) + rng.normal(0.0, 0.02, (count, 4, 2))
+    messages, calibration = boxes(rng, place, cameras=3, height=2.2)
+    result = follow(messages, calibration, [round(at * NANOSECONDS) for at in time])
+    assert scores(result, place).idf1 > 0.95
+
+
+def boxes(
+    rng: np.random.Generator, place: Floats, cameras: int, height: float
+) -> tuple[list[pb.Observation], Calibration]:
+    """Boxes of people at places (frames, p, 2), with 10 % misses and 3 % noise, by cameras on a ring."""
+    messages, known = [], {}
+    for index in range(cameras):
+        name, angle = f"cam{index}", 2.0 * np.pi * index / cameras + 0.2
+        pose = looking_at(np.array([11.0 * np.cos(angle), 11.0 * np.sin(angle), height]), 0.9 * UP)
+        known[name] = CameraCalibration(name, LENS, pose, TimeMap(1.0, 0.0), 1e-3, np.zeros(3), 1.0)
+        for frame, here in enumerate(place):
+            foot = np.column_stack([here, np.zeros(len(here))])
+            feet, heads = (LENS.project(pose.camera_from_world(foot + up)) for up in (0.0 * UP, 1.72 * UP))
+            message = pb.Observation(
+                schema_version=1, camera=name, boot_id="b", sequence=frame, frame=frame,
+                device_time_ns=round(frame / FPS * NANOSECONDS),
+            )  # fmt: skip
+            for (u, bottom), (_, top) in zip(feet, heads, strict=True):
+                noise = 0.03 * (bottom - top) * rng.normal(size=3)
+                if rng.random() > 0.1:
+                    add(message, u + noise[0], top + noise[1], bottom + noise[2])
+            messages.append(message)
+    return messages, Calibration(cameras=known, reference="cam0", scale="metric", units="m", solver="given", version="")
+
+
 def test_nothing_to_follow_is_refused() -> None:
     _, calibration, _ = crowd(3, 0.0, 0.0)
     with pytest.raises(Refused, match="no calibrated camera"):
