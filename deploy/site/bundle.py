@@ -313,12 +313,12 @@ def _script(role: str, target: Target) -> str:
     return f"""\
 #!/bin/sh
 # Installs Syncline {VERSION} for the role {role} from this folder, without a network.
-# Usage: sh install.sh [TARGET]      default /opt/syncline; PYTHON=python3 chooses the interpreter.
+# Usage: sh install.sh [TARGET]      default /opt/syncline; SYNCLINE_PYTHON=python3 chooses the interpreter.
 # Once more with a newer bundle updates it; then restart the agents.
 set -eu
 here=$(CDPATH= cd -- "$(dirname -- "$0")" && pwd)
 target=${{1:-/opt/syncline}}
-python=${{PYTHON:-python3}}
+python=${{SYNCLINE_PYTHON:-python3}}
 "$python" - <<'CHECK'
 import platform, sys
 found = (platform.machine(), "%d.%d" % sys.version_info[:2])
