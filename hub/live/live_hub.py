@@ -52,8 +52,10 @@ _FIRST_FULL_S = 60.0
 arrival it finds nothing more."""
 _BEHIND_S = 10.0
 """A job that takes longer than this degrades a calibrated hub: warm ones take about a second."""
-_SILENT_S = 3.0
-"""A calibrated camera without a frame for longer than this degrades the hub."""
+SILENT_S = 3.0
+"""A camera without a frame for longer than this degrades the hub."""
+_FORGOTTEN_S = 600.0
+"""A camera that is not calibrated is not waited for after this time without a frame."""
 _VERIFY_ROWS, _VERIFY_S = 60, 15.0
 """Detections of two cameras that a reloaded calibration is verified with, and seconds after which it is dropped."""
 _VERIFY_EVERY_S = 0.5
@@ -160,6 +162,8 @@ class LiveHub:
         self.session: tuple[Rig, Observations] | None = None
         self.refusal: Refused | None = None
         self.solver_failure = ""
+        self.calibrated_at = self._now
+        """When the present calibration was estimated or, of a given one, began to be used."""
         self._solved_boot_ids: dict[str, str] = {}
         self._unverified: Calibration | None = None
         self._unverified_boots: dict[str, str] = {}
@@ -343,26 +347,34 @@ class LiveHub:
             reasons = self.degradations(now)
             count = f"{len(self.calibration.cameras)} cameras calibrated"
             return ("degraded", "; ".join([*reasons, count])) if reasons else ("calibrated", count)
-        missing = self.missing()
+        missing = "; ".join([*self.degradations(now), text]) if (text := self.missing()) else ""
         if missing:
             return "collecting", missing
         if self.refusal is not None and self.refusal.permanent:
             return "refused", self.refusal.reason
         return "searching", "searching" if self.refusal is None else f"searching: {self.refusal.reason}"
 
+    def frame_ages(self, now: float) -> dict[str, float]:
+        """Seconds since the last frame of each camera that is calibrated or was heard of lately."""
+        kept = {} if self.calibration is None else self.calibration.cameras
+        ages = {name: now - last for name, last in self._last_frame.items()}
+        return {name: age for name, age in ages.items() if name in kept or age < _FORGOTTEN_S}
+
+    def offset_stds(self) -> dict[str, float]:
+        """Standard deviation [s] of each calibrated camera's time offset."""
+        cameras = {} if self.calibration is None else self.calibration.cameras
+        return {name: camera.time_offset_std for name, camera in cameras.items()}
+
     def degradations(self, now: float) -> list[str]:
         """What impairs a calibrated hub at ``now``, one line each."""
         out = []
         if self.unverified:
             out.append("the calibration was reloaded and is not verified yet")
-        if self.calibration is not None:
-            last = {name: self._last_frame.get(name) for name in self.calibration.cameras}
-            silent = [
-                f"{name} (never)" if frame is None else f"{name} ({now - frame:.0f} s)"
-                for name, frame in last.items()
-                if frame is None or now - frame > _SILENT_S
-            ]
-            out += [f"no frames from {_listed(silent)}"] if silent else []
+        ages = self.frame_ages(now)
+        never = [] if self.calibration is None else [name for name in self.calibration.cameras if name not in ages]
+        silent = [f"{name} ({age:.0f} s)" for name, age in ages.items() if age > SILENT_S]
+        silent += [f"{name} (never)" for name in never]
+        out += [f"no frames from {_listed(silent)}"] if silent else []
         exceeding = self.budgets.exceeded(now, _BUDGET_NOTICE_S)
         if exceeding:
             out.append(f"frames left out of {_listed(exceeding)}: more than a camera may send")
@@ -384,7 +396,7 @@ class LiveHub:
             reason = waiting.get(name, refused.get(name, ""))
             state = "searching" if self._builder.rows(name) >= self.settings.least_rows else "collecting"
             if name in tied:
-                silent = self._now - self._last_frame.get(name, self._now) > _SILENT_S
+                silent = self._now - self._last_frame.get(name, self._now) > SILENT_S
                 state, reason = ("degraded", "no frames") if silent else ("calibrated", "")
             out.append(
                 pb.CameraProgress(
@@ -528,7 +540,7 @@ class LiveHub:
         self._unverified = None
         self._answer_rows = np.inf if job.verify else rows  # of a reloaded answer the rows are not known
         self.session = job.rig, job.observations
-        self.calibration = found
+        self.calibration, self.calibrated_at = found, now
         self._solved_boot_ids = {name: boots[name] for name in found.cameras if name in boots}
         return [event, *self._publish_present()]
 

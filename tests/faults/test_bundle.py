@@ -10,7 +10,6 @@ import platform
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -143,7 +142,7 @@ def images(
         place = tmp_path_factory.mktemp(f"image-{role}")
         # As an engine has it: the names of ARG and ENV are the environment of RUN.
         built[role] = image_builds.build(context / "Containerfile", role, place, {"PYTHON_VERSION": HERE})
-    yield built
+    return built
 
 
 def test_the_site_of_the_compose_file_runs_from_images_built_without_a_network(

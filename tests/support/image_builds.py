@@ -70,9 +70,8 @@ class Image:
             lines.append(f"install -d -o {self.user.partition(':')[0]} {root}/run/syncline")
         environment = [f"{name}={value}" for name, value in self.environment.items()]
         inside = f"cd {shlex.quote(self.folder)} && exec {shlex.join(command)}"
-        lines.append(
-            f"exec chroot --userspec={self.user} {root} /usr/bin/env -i {shlex.join(environment)} /bin/sh -c {shlex.quote(inside)}"
-        )
+        enter = f"exec chroot --userspec={self.user} {root} /usr/bin/env -i"
+        lines.append(f"{enter} {shlex.join(environment)} /bin/sh -c {shlex.quote(inside)}")
         return ["unshare", "--mount", *([] if network else ["--net"]), "sh", "-ec", "\n".join(lines)]
 
 

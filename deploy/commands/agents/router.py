@@ -57,7 +57,7 @@ def router(config: Path, /, *, print_config: Annotated[bool, Parameter(negative=
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
     stop = stop_on_signals()
-    health = Health()
+    health = Health(site=settings.site, role="router", agent=settings.id)
     try:
         with serve_health(settings, health):
             run_router(

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from deploy.site.doctor.check_result import CheckResult, misconfigured, ok, skip, warn
 from edge.agents.clock_quality import kernel_clock
+from protocols.core.clocks import UNSET_CLOCK_UNIX_S
 
 PACKAGES: dict[str, tuple[str, ...]] = {
     "": ("numpy", "zenoh", "msgspec", "google.protobuf"),
@@ -34,7 +35,6 @@ _RECOMMENDED = {"usb": (("linuxpy", "frames are stamped on arrival, and lost one
 _EXTRAS = {"pymavlink": "uav", "serial": "uav", "depthai": "oak", "linuxpy": "v4l2", "av": "video"}
 _MAX_TEMPERATURE_C = 80.0  # boards throttle above about this
 _LOW_DISK_MB = 2000.0  # about two hours of four cameras
-_MIN_UNIX_S = 1_735_689_600.0  # 2025: before that a clock was never set
 Run = Callable[[Sequence[str]], tuple[int, str]]
 
 
@@ -209,7 +209,7 @@ def clock(
     certificates: bool, state: Callable[[], tuple[bool, float]] = kernel_clock, now: Callable[[], float] = time.time
 ) -> CheckResult:
     """Check the machine's Unix time. Certificates and log names need it; timing between cameras does not."""
-    if now() < _MIN_UNIX_S:
+    if now() < UNSET_CLOCK_UNIX_S:
         remedy = "set it: `sudo timedatectl set-ntp true` with a network, `sudo date -s …` without one"
         text = f"the clock is at {time.strftime('%Y-%m-%d', time.gmtime(now()))}: it was never set"
         return misconfigured("clock", text, remedy) if certificates else warn("clock", text, remedy)
