@@ -29,7 +29,7 @@ _TICK_S = 0.02
 _SYNC_S = 0.5
 """Interval of fsync: half of the second that may be lost, because writing and the disk take time too."""
 _STATUS_S = 1.0
-_MISSING_S = 4.0
+_MISSING_S = 2.0
 """How long a status names messages that went missing."""
 
 

@@ -77,7 +77,6 @@ class Space:
             return f"{share:.1f} % of the disk are free, min_free_percent is {self._config.min_free_percent:g}"
         return ""
 
-
     def never_enough(self) -> bool:
         """Whether even the empty disk has too little: a configuration to correct, and nothing to wait for."""
         return self._free is free_bytes and _usage(self._folder).total < self._config.min_free_mb * 1e6

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from deploy.config.file import DetectorName, Source, effective_toml, load
+from deploy.config.file import DetectorName, KnownName, Source, effective_toml, load
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import InputError
 from protocols.core.names import check_identifier, check_name
@@ -311,27 +311,29 @@ class CameraConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields
 class HubConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The hub. rig: a rig.toml with what is known of the rig; out: folder in which calibrations are written.
 
-    state: folder in which every answer is kept, so that a hub that was killed goes on from the last one; default:
-    in ``out``, else in the user's state folder. window_s: total duration of the observations that are kept; interval_s:
-    least time between two solves. solve:
+    state: folder in which the last ``history`` answers are kept, so that a hub that was killed goes on from the last
+    one; default: in ``out``, else in the user's state folder. window_s: total duration of the kept observations;
+    interval_s: least time between two solves. solve:
     false = this hub does not estimate timing itself. nodes: cameras whose pose nodes always run on this hub; the others
     are distributed among all hubs. pose_nodes: whether pose nodes run here; default:
     where this hub does not solve, or ``nodes`` names some. leave_after_s: time after which a camera that has
     disappeared is removed. known: a calibration.toml whose poses, intrinsics and clocks are kept fixed; nothing is
-    solved then. track: whether people, vehicles and unlabelled markers are tracked.
+    solved then. known = "last": the last answer of this hub, however old, is used until the rows give a new one, also
+    where cameras were restarted since. track: whether people, vehicles and unlabelled markers are tracked.
     """
 
     id: str = "hub"
     rig: Path | None = None
     out: Path | None = None
     state: Path | None = None
+    history: Annotated[int, Meta(ge=1, le=100_000)] = 200
     window_s: Seconds = 180.0
     interval_s: Seconds = 2.0
     solve: bool = True
     pose_nodes: bool | None = None
     nodes: tuple[str, ...] = ()
     leave_after_s: Seconds = 30.0
-    known: Path | None = None
+    known: KnownName | None = None
     track: bool = True
 
 

@@ -28,6 +28,12 @@ class DetectorName(str):
     __slots__ = ()
 
 
+class KnownName(str):
+    """A calibration.toml, or "last": the hub's own last answer."""
+
+    __slots__ = ()
+
+
 _PLACE = re.compile(r" - at `\$\.?(?P<path>[^`]*)`\Z")
 _UNKNOWN = re.compile(r"Object contains unknown field `(?P<key>[^`]*)`\Z")
 _MISSING = re.compile(r"Object missing required field `(?P<key>[^`]*)`\Z")
@@ -81,6 +87,8 @@ def _from_text(wanted: type, value: object, folder: Path) -> object:
     if wanted is Source:
         elsewhere = "://" in value or value.isdigit()
         return Source(value if elsewhere else folder / Path(value).expanduser())
+    if wanted is KnownName:
+        return KnownName(value if value == "last" else folder / Path(value).expanduser())
     if wanted is DetectorName:
         path = folder / Path(value).expanduser()
         return DetectorName(path if path.suffix.lower() == ".toml" else value)

@@ -234,6 +234,7 @@ def status_message(
     if hub.calibration is not None:
         message.gauges["calibrated_cameras"] = len(hub.calibration.cameras)
         message.gauges["calibration_age_s"] = max(now - hub.calibrated_at, 0.0)
+        message.gauges["calibration_verified"] = float(not hub.unverified)
     alarms = [*hub.clocks.alarms.values(), *hub.clock_contradictions()]
     if alarms:
         message.message = "; ".join([*alarms, message.message])[:1000]

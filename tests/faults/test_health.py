@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -79,7 +80,7 @@ class Site:
 
     def reported(self, reasons: dict[str, str]) -> bool:
         answers = {name: self.ready(name) for name in reasons}
-        return all(answers[name][0] == 503 and text in answers[name][1] for name, text in reasons.items())
+        return all(answers[name][0] == 503 and re.search(text, answers[name][1]) for name, text in reasons.items())
 
 
 @pytest.fixture
@@ -115,7 +116,7 @@ def test_each_loss_is_reported_with_its_reason_and_cleared_when_it_is_over(site:
 
     site.kill("cam1")
     site.kill("cam2")
-    told = wait_until(lambda: site.reported({"hub": "no frames from cam1 (3 s), cam2 (3 s)"}), 15.0)
+    told = wait_until(lambda: site.reported({"hub": r"no frames from cam1 \(\d s\), cam2 \(\d s\)"}), 15.0)
     assert site.all_ready("recorder", "cam0"), "they do their job"
     site.start("cam1", "cam2")
     wait_until(lambda: site.all_ready("cam1", "cam2"), 30.0)

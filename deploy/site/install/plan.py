@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import tomli_w
 
-from deploy.config.file import Source, load
+from deploy.config.file import KnownName, Source, load
 from deploy.site.install import units
 from protocols.core.errors import InputError, Refused
 from protocols.core.names import key_segment
@@ -253,6 +253,8 @@ def _paths(config: msgspec.Struct) -> Iterator[tuple[tuple[str, ...], Path | Sou
             yield from (((item.encode_name, *path), inner) for path, inner in _paths(value))
         elif isinstance(value, Path | Source):
             yield (item.encode_name,), value
+        elif isinstance(value, KnownName) and value != "last":
+            yield (item.encode_name,), Path(value)
         elif value is None and item.name == "out":
             yield ("out",), Path()
 
