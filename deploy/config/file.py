@@ -54,6 +54,15 @@ def load(path: Path | str, kind: type[_Config]) -> _Config:
         ) from None
     except UnicodeDecodeError:
         raise InputError("is not UTF-8 text", file=file, remedy="give a TOML file") from None
+    return _convert(text, kind, file, file.resolve().parent)
+
+
+def convert(text: str, kind: type[_Config], folder: Path) -> _Config:
+    """The same for the text of a file that lies elsewhere. folder: what relative paths in it are resolved from."""
+    return _convert(text, kind, folder, folder)
+
+
+def _convert(text: str, kind: type[_Config], file: Path, folder: Path) -> _Config:
     try:
         table = tomllib.loads(text)
     except (RecursionError, OverflowError):
@@ -65,7 +74,6 @@ def load(path: Path | str, kind: type[_Config]) -> _Config:
     bad = _not_finite(table, "")
     if bad:
         raise InputError(f"{bad} is not finite", file=file, line=_line(text, bad), remedy="give a number")
-    folder = file.resolve().parent
     try:
         return msgspec.convert(table, kind, dec_hook=lambda wanted, value: _from_text(wanted, value, folder))
     except msgspec.ValidationError as error:

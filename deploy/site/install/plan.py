@@ -321,7 +321,12 @@ def _is_secret(file: Path) -> bool:
 
 
 def _running_program() -> str:
-    beside = Path(sys.executable).parent / "syncline"
+    folder = Path(sys.executable).parent
+    # Of two versions side by side, the link to the present one: an update changes only that.
+    current = folder.parent.with_name("current")
+    if current.is_symlink() and current.resolve() == folder.parent.resolve():
+        folder = current / folder.name
+    beside = folder / "syncline"
     found = str(beside) if beside.is_file() else shutil.which("syncline")
     if not found:
         raise InputError("the program `syncline` is not found", remedy="install it (pip install .), or give --program")
