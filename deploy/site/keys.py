@@ -401,4 +401,6 @@ def need_cryptography() -> None:
     try:
         import cryptography  # noqa: F401
     except ImportError:
-        raise InputError("this needs the package cryptography", remedy='pip install "syncline[keys]"') from None
+        raise InputError(
+            "this needs the package cryptography", remedy='pip install "syncline[keys]"; bundles have it'
+        ) from None

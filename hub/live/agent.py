@@ -231,6 +231,10 @@ def status_message(
     for kind, values in (("ppm", rates), ("frame_age_s", ages), ("offset_std_s", hub.offset_stds())):
         for camera, value in list(values.items())[:_MEASURED_CAMERAS]:
             message.gauges[f"{kind}.{camera}"[:64]] = value
+    if state in ("collecting", "searching"):
+        # What is waited for, per camera: the search needs motion that two cameras see at the same time.
+        shared = [f"{one.camera} {one.shared_motion_s:.0f} s" for one in hub.progress()[:_NAMED_CAMERAS]]
+        message.message += f"; motion shared with another camera: {', '.join(shared)}" if shared else ""
     if hub.calibration is not None:
         message.gauges["calibrated_cameras"] = len(hub.calibration.cameras)
         message.gauges["calibration_age_s"] = max(now - hub.calibrated_at, 0.0)

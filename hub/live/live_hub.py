@@ -412,7 +412,10 @@ class LiveHub:
         shared = self._builder.shared_motions_s()
         for name in self._builder.cameras:
             reason = waiting.get(name, refused.get(name, ""))
-            state = "searching" if self._builder.rows(name) >= self.settings.least_rows else "collecting"
+            rows, least = self._builder.rows(name), self.settings.least_rows
+            state = "searching" if rows >= least else "collecting"
+            if state == "collecting" and not reason:
+                reason = f"{rows} of {least} detections"
             if name in tied:
                 silent = self._now - self._last_frame.get(name, self._now) > SILENT_S
                 state, reason = ("degraded", "no frames") if silent else ("calibrated", "")

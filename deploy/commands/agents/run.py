@@ -20,6 +20,7 @@ from protocols.core.errors import EXIT_BUG, EXIT_DONE
 if TYPE_CHECKING:
     from deploy.agents.systemd_notify import Notifier
 
+_PROGRESS_S = 5.0
 PrintConfig = Annotated[bool, Parameter(negative="")]
 
 
@@ -156,7 +157,8 @@ def _with_bus(settings: Any, start: Any) -> int:
             open_bus(settings.site, settings.bus, stop=_stop_condition(stop, settings.bus, notifier)) as bus,
         ):
             amend = Conditions(settings, bus.connected).amend
-            guarded = SenderCheckedBus(bus, time.monotonic, amend=amend, seen=health.seen, refused=health.refused)
+            show = _progress_lines(health.seen)
+            guarded = SenderCheckedBus(bus, time.monotonic, amend=amend, seen=show, refused=health.refused)
             try:
                 return int(start(guarded, stop, lambda: notifier.beat(ending=stop.is_set())))
             except BusDead as error:
@@ -166,6 +168,21 @@ def _with_bus(settings: Any, start: Any) -> int:
         return EXIT_DONE
     finally:
         notifier.stopping()
+
+
+def _progress_lines(seen: Callable[[Any], None]) -> Callable[[Any], None]:
+    """Passes statuses on; of an agent that is starting, prints every few seconds what it waits for."""
+    printed, text = -_PROGRESS_S, ""
+
+    def show(status: Any) -> None:
+        nonlocal printed, text
+        seen(status)
+        now = time.monotonic()
+        if status.state == "starting" and status.message != text and now - printed >= _PROGRESS_S:
+            printed, text = now, status.message
+            print(text, flush=True)
+
+    return show
 
 
 def _stop_condition(stop: threading.Event, bus: BusConfig, notifier: Notifier) -> Callable[[], bool]:

@@ -22,6 +22,8 @@ from deploy.config.file import load
 from deploy.site import keys
 from deploy.site.install.plan import CONFIG, apply, config_type, plan_install
 from protocols.bus.security.access import certificate_name
+from protocols.bus.security.tls import check_files, validity
+from protocols.core.clocks import utc_text
 from protocols.core.errors import InputError, Refused
 from protocols.core.files import file_in
 
@@ -29,6 +31,8 @@ SLOTS, CURRENT = ("a", "b"), "current"
 NEW_KEY = "key.new.pem"
 CONFIG_FILE = "config.toml"
 READY_S = 60.0
+_EPOCH = "usr/lib/clock-epoch"
+"""systemd sets the clock at least to this file's time when it starts (systemd(1))."""
 _TIMESYNC = "etc/systemd/timesyncd.conf.d/70-syncline.conf"
 
 
@@ -79,18 +83,17 @@ def accept(
             (staged / NEW_KEY).replace(staged / keys.KEY_FILE)
         program = _program(root)
         plan_install(role, staged / CONFIG_FILE, program)
+        notes = _take_time(staged / keys.CERTIFICATE_FILE, root)
         _check_pair(staged, role)
         _swap(staged, folder)
         if time_servers:
             _write_time_servers(root, time_servers)
-        return apply(plan_install(role, folder / CONFIG_FILE, program), root)
+        return [*notes, *apply(plan_install(role, folder / CONFIG_FILE, program), root)]
     finally:
         shutil.rmtree(staged, ignore_errors=True)
 
 
 def _check_pair(folder: Path, role: str) -> None:
-    from protocols.bus.security.tls import check_files
-
     tls = load(folder / CONFIG_FILE, config_type(role)).bus.tls  # type: ignore[attr-defined]
     if tls is not None:
         check_files(tls)
@@ -125,6 +128,32 @@ def _program(root: Path) -> str | None:
         return None
     single = Path("opt/syncline/bin/syncline")
     return f"/{single}" if (root / single).exists() else f"/opt/syncline/{CURRENT}/bin/syncline"
+
+
+def _take_time(certificate: Path, root: Path) -> list[str]:
+    """Of a board without a clock: it is no earlier than the begin of a certificate that its site's authority made.
+
+    Sets the clock where it is behind, and leaves the time for systemd, which begins no earlier at each start.
+    """
+    if not certificate.is_file():
+        return []
+    begin = validity(certificate)[0]
+    epoch = root / _EPOCH
+    if not epoch.exists() or epoch.stat().st_mtime < begin:
+        epoch.parent.mkdir(parents=True, exist_ok=True)
+        epoch.touch()
+        os.utime(epoch, (begin, begin))
+    if root != Path("/") or time.time() >= begin:
+        return []
+    try:
+        time.clock_settime(time.CLOCK_REALTIME, begin + 1.0)
+    except OSError as error:
+        raise InputError(
+            f"this machine's clock says {utc_text(time.time())}, before the certificate's begin, and cannot be set: "
+            f"{error.strerror}",
+            remedy="run it as root, or set the clock (`date -s`)",
+        ) from None
+    return [f"set the clock, which was behind, to {utc_text(begin)}, the certificate's begin"]
 
 
 def _write_time_servers(root: Path, servers: tuple[str, ...]) -> None:

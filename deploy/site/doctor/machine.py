@@ -63,7 +63,11 @@ def packages(
     if not gone:
         worse = [one for kind in kinds for one in _RECOMMENDED.get(kind, ()) if not _is_installed(one[0], there)]
         for name, what in worse:
-            return warn("packages", f"{name} missing: {what}", f'pip install "syncline[{_EXTRAS[name]}]"')
+            return warn(
+                "packages",
+                f"{name} missing: {what}",
+                f'pip install "syncline[{_EXTRAS[name]}]"; without a network: bundle --extra {_EXTRAS[name]}',
+            )
         return ok("packages", f"{len(wanted)} of {len(wanted)} are installed")
     extras = sorted({_EXTRAS[name] for name in gone if name in _EXTRAS})
     how = f'pip install "syncline[{",".join(extras)}]"' if extras else "pip install --force-reinstall syncline"

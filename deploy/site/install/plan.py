@@ -237,6 +237,11 @@ def _run(commands: list[list[str]], changes: list[str]) -> None:
         ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
         if ended.returncode:
             lines = (ended.stderr or ended.stdout).strip().splitlines()
+            if (
+                command[0] == "udevadm"
+            ):  # a container, or a system without udev: its rules are for names of cameras only
+                changes.append(f"left out: {' '.join(command)} ({lines[-1] if lines else 'udev does not run here'})")
+                continue
             raise Refused(f"`{' '.join(command)}` failed: {lines[-1] if lines else f'status {ended.returncode}'}")
         changes.append(f"ran {' '.join(command)}")
 

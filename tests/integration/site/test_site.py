@@ -165,6 +165,24 @@ def test_a_board_is_reached_by_ssh(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         board_of(site, away).request()
 
 
+def test_a_board_without_a_clock_takes_it_from_the_authority(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    keys.make_site(tmp_path / "keys", "yard")
+    certificate = keys.issue(tmp_path / "keys", "camera", "cam00").folder / "certificate.pem"
+    begin = validity(certificate)[0]
+    board._take_time(certificate, tmp_path / "image")
+    assert (tmp_path / "image/usr/lib/clock-epoch").stat().st_mtime == begin, "systemd begins no earlier"
+
+    clock = [1000.0]
+    monkeypatch.setattr("deploy.site.boards.board._EPOCH", str(tmp_path / "epoch"))
+    monkeypatch.setattr("deploy.site.boards.board.time.time", lambda: clock[0])
+    monkeypatch.setattr(
+        "deploy.site.boards.board.time.clock_settime", lambda which, moment: clock.__setitem__(0, moment)
+    )
+    assert "set the clock" in board._take_time(certificate, Path("/"))[0]
+    assert clock[0] >= begin
+    assert board._take_time(certificate, Path("/")) == []
+
+
 class FakeBoard:
     """A board whose agent is ready or not; what was done to it."""
 
