@@ -120,6 +120,14 @@ def test_while_nothing_is_solved_the_page_says_what_each_camera_is_waited_for() 
     assert "data-waiting" not in overview(state, 3.0)
 
 
+def test_a_view_without_its_router_says_so_first() -> None:
+    state = ViewState()
+    filming(state)
+    state.lost_at = 4.0
+    assert state.problems(7.2)[0] == "this view reaches no router for 3 s"
+    assert "▲ degraded: this view reaches no router" in overview(state, 7.2)
+
+
 def test_the_path_not_updated_for_longest_is_dropped() -> None:
     state = ViewState()
     for index in range(100):
