@@ -278,6 +278,26 @@ def monitoring(file: Path, /, *, out: Path) -> int:
 
 
 @SITE.command
+def image(root: Path, /, *, bundle: Path) -> int:
+    """Put a bundle into a mounted system image; the board installs it when it first starts, without a network.
+
+    Example: sudo syncline site image /mnt/pi --bundle camera-bundle
+
+    Parameters
+    ----------
+    root
+        Folder in which the image's root is mounted.
+    bundle
+        Folder that `syncline bundle` has made for the board.
+    """
+    from deploy.site.boards.image import prepare_image
+
+    for line in prepare_image(root, bundle):
+        print(f"wrote {line}")
+    return EXIT_DONE
+
+
+@SITE.command
 def request(*, role: Role, id: str, out: Path | None = None, root: Path = Path("/")) -> int:
     """On a board: make a new key, which stays here, and print a signing request for it.
 

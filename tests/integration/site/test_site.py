@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+import subprocess
 import sys
 from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
@@ -181,6 +184,20 @@ def test_a_board_without_a_clock_takes_it_from_the_authority(tmp_path: Path, mon
     assert "set the clock" in board._take_time(certificate, Path("/"))[0]
     assert clock[0] >= begin
     assert board._take_time(certificate, Path("/")) == []
+
+
+def test_an_image_installs_its_bundle_at_the_first_start(tmp_path: Path) -> None:
+    root, bundle = tmp_path / "image", tmp_path / "bundle"
+    (root / "etc").mkdir(parents=True)
+    bundle.mkdir()
+    assert run(["site", "image", str(root), "--bundle", str(bundle)]) == 2, "there is no bundle"
+    (bundle / "install.sh").write_text('mkdir -p "$1/bin"; touch "$1/bin/syncline"')
+    assert run(["site", "image", str(root), "--bundle", str(bundle)]) == 0
+    unit = root / "etc/systemd/system/multi-user.target.wants/syncline-first-start.service"
+    script = re.findall("ExecStart=/bin/sh (.*)", unit.read_text())[0]
+    subprocess.run(["sh", str(root / script.lstrip("/"))], env={**os.environ, "ROOT": str(root)}, check=True)
+    assert (root / "opt/syncline/current/bin/syncline").exists()
+    assert not (root / "var/lib/syncline-bundle").exists()
 
 
 class FakeBoard:
