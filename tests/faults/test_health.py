@@ -40,7 +40,7 @@ class Site:
         self._own = {
             "router": "",
             "recorder": f'out = "{disk / "recordings"}"\nmin_free_mb = 5.0\nmin_free_percent = 0.0\n',
-            "hub": f'out = "{folder / "hub"}"\n',
+            "hub": f'out = "{folder / "hub"}"\nknown = "last"\n',
             **{
                 name: f"[simulated]\nscene = 'marker'\nwidth = 320\nstart_unix_s = {time.time():.0f}\n"
                 for name in CAMERAS
@@ -142,6 +142,21 @@ def test_each_loss_is_reported_with_its_reason_and_cleared_when_it_is_over(site:
         told = wait_until(lambda: site.reported({"recorder": "MB are free"}), 15.0)
         filler.unlink()
         _drill("the recorder's disk full", told, wait_until(lambda: site.all_ready("recorder"), 30.0))
+    # A power cut of the hub and of all cameras: nobody stops in order, and all clocks begin anew.
+    for name in ("hub", *CAMERAS):
+        site.kill(name)
+        site.processes[name].child.wait()
+    state = site.folder / "hub" / "state"
+    assert (state / "current.toml").read_bytes() == (site.folder / "hub" / "calibration.toml").read_bytes()
+    assert (state / "current.toml").resolve().parent == (state / "history").resolve()
+    site.start("hub", *CAMERAS)
+    told = wait_until(lambda: site.reported({"hub": "reloaded and is not verified yet"}), 60.0)
+    verified = wait_until(lambda: site.all_ready("hub"), 60.0)
+    measured(
+        "power cut of hub and cameras, known = last",
+        "the last calibration again, not verified, then verified",
+        f"published {told:.1f} s after the start of all processes, verified {verified:.1f} s later",
+    )
     # A line for each state, not for each second of it.
     for name in everyone:
         lines = (site.folder / f"{name}.txt").read_text(encoding="utf-8").splitlines()

@@ -415,6 +415,8 @@ def update(bundle: Path, /, *, role: Role, id: str, patience: float = 60.0, home
     from deploy.site.boards import board
 
     def is_ready() -> tuple[bool, str]:
+        if not board.folder_of(role, id).is_dir():
+            return True, "not enrolled yet"
         return board.ready(role, id, patience)
 
     print(f"updated: {board.update(bundle, home, board.restart_units, is_ready)}")
