@@ -78,8 +78,8 @@ def run_router(
 
     restarts: number of restarts so far, for the status. ready: called with the endpoints once messages pass; beat:
     called in every round from then on; seen: called with every status before it is published; may add to it. died:
-    called when no message has passed for DEAD_AFTER_S although the process is alive; it must replace the process and not
-    return, because closing a router in that state may hang. Raises RulesChanged where the router must be reopened.
+    called when no message has passed for DEAD_AFTER_S although the process is alive; it must replace the process and
+    not return, because closing a router in that state may hang. Raises RulesChanged where the router must be reopened.
     """
     boot = uuid.uuid4().hex
     config = msgspec.structs.replace(config, listen=tuple(map(_with_port, config.endpoints()[1])))
