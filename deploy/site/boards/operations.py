@@ -155,7 +155,7 @@ def status(site: Site, agents: Sequence[SiteAgent], boards: Boards) -> list[Agen
 
     def ask(agent: SiteAgent) -> AgentState:
         state = known[agent.name]
-        if state.until is None:
+        if state.until is None or agent.host == "stick":
             return state
         try:
             ready, text = boards(agent).ready(0.0)
