@@ -91,6 +91,7 @@ COMMANDS: tuple[tuple[str, str, str], ...] = (
     ("keys", "deploy.commands.site.keys:KEYS", "Certificates and access rules of a site."),
     ("install", "deploy.commands.site.install:install", "Install an agent as a systemd service."),
     ("uninstall", "deploy.commands.site.install:uninstall", "Remove the agents' systemd services."),
+    ("site", "deploy.commands.site.site:SITE", "Enrol, update, renew and watch all boards of a site."),
     ("fleet", "deploy.commands.site.fleet:fleet", "Run all agents of a rig on this machine."),
     (
         "bundle",

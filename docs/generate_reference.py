@@ -37,8 +37,9 @@ _ROOTS = {
     "router": "RouterConfig",
     "uav": "UavConfig",
     "fleet": "FleetFile",
+    "site": "SiteFile",
 }
-_CONFIG_MODULE = re.compile(r"config|fleet|rig")
+_CONFIG_MODULE = re.compile(r"config|fleet|rig|site_file")
 
 
 def on_page_markdown(markdown: str, page: Any = None, config: Any = None, files: Any = None) -> str:

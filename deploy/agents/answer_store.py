@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -14,11 +15,12 @@ from protocols.core.version import VERSION
 from protocols.session.calibration import Calibration, calibration_text, read_calibration
 from protocols.session.rig import Rig
 
-LAST = "last.toml"
+LAST = "current.toml"
+"""A link to the newest answer in the history."""
 HISTORY = "history"
 _MAX_AGE_S = 900.0
 """An answer older than this is not reloaded: the cameras' clocks have drifted, and who knows where they stand now."""
-_MAX_HISTORY = 200
+_NUMBER = re.compile(r"(\d+)-")
 
 
 def default_folder(out: Path | None, site: str, agent: str) -> Path:
@@ -32,12 +34,15 @@ def default_folder(out: Path | None, site: str, agent: str) -> Path:
 class AnswerStore:
     """Writes answers in a thread of its own, atomically; the hub's loop never waits for a disk.
 
-    problem: why the last answer could not be kept; "" if it was.
+    history: how many answers are kept. copy: another file for the newest one. problem: why the last answer could not be
+    kept; "" if it was. kept_unix_s: when the loaded answer was kept.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, history: int = 200, copy: Path | None = None) -> None:
         self.folder = folder
         self.problem = ""
+        self.kept_unix_s = 0.0
+        self._history, self._copy = history, copy
         self._writer = ThreadPoolExecutor(1, "answers")
         self._pending: Future[None] | None = None
 
@@ -45,15 +50,14 @@ class AnswerStore:
         """Write an answer. boot_ids, delays: by camera, see `LiveHub.reload`."""
         if self._pending is not None and not self._pending.done():
             self._pending.cancel()  # a slow disk: only the newest counts
-        self._pending = self._writer.submit(
-            self._write, calibration, rig, {"boot_ids": dict(boot_ids), "delays": dict(delays)}
-        )
+        clocks = {"boot_ids": dict(boot_ids), "delays": dict(delays), "kept_unix_s": time.time()}
+        self._pending = self._writer.submit(self._write, calibration, rig, clocks)
 
-    def load(self) -> tuple[Calibration, dict[str, str], dict[str, float]] | None:
-        """The last answer with its boot ids and delays, if it is recent and readable."""
+    def load(self, of_any_age: bool = False) -> tuple[Calibration, dict[str, str], dict[str, float]] | None:
+        """The last answer with its boot ids and delays, if it is recent, or of any age, and readable."""
         file = self.folder / LAST
         try:
-            if not file.is_file() or abs(time.time() - file.stat().st_mtime) > _MAX_AGE_S:
+            if not file.is_file() or not (of_any_age or abs(time.time() - file.stat().st_mtime) <= _MAX_AGE_S):
                 return None
             rig, cameras = read_calibration(file)
         except (InputError, OSError):
@@ -62,6 +66,8 @@ class AnswerStore:
         if not isinstance(boots, dict) or not isinstance(delays, dict) or len(cameras) < 2:
             return None
         metadata = {key: str(rig.metadata.get(key, "")) for key in ("reference", "scale")}
+        kept = rig.metadata.get("kept_unix_s")
+        self.kept_unix_s = float(kept) if isinstance(kept, int | float) else file.stat().st_mtime
         calibration = Calibration(cameras, metadata["reference"], metadata["scale"], rig.units, "joint", VERSION)
         seconds = {name: float(delay) for name, delay in delays.items() if isinstance(delay, int | float)}
         return calibration, {name: str(boot) for name, boot in boots.items()}, seconds
@@ -74,10 +80,23 @@ class AnswerStore:
         text = calibration_text(calibration, replace(rig, metadata={**rig.metadata, **clocks}))
         history = self.folder / HISTORY
         try:
-            write_together({self.folder / LAST: text, history / f"{time.time_ns() // 1_000_000}.toml": text})
-            for old in sorted(history.glob("*.toml"))[:-_MAX_HISTORY]:
+            there = sorted(history.glob("*.toml"), key=_number)
+            # By number, and not by the time alone: a clock may be set back.
+            number = _number(there[-1]) + 1 if there else 1
+            newest = history / f"{number:06d}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}.toml"
+            write_together({newest: text, **({} if self._copy is None else {self._copy: text})})
+            link = self.folder / f".{LAST}.new"
+            link.unlink(missing_ok=True)
+            link.symlink_to(newest.relative_to(self.folder))
+            link.replace(self.folder / LAST)
+            for old in there[: max(len(there) + 1 - self._history, 0)]:
                 old.unlink(missing_ok=True)
         except (InputError, OSError) as error:
             self.problem = str(error)
         else:
             self.problem = ""
+
+
+def _number(file: Path) -> int:
+    found = _NUMBER.match(file.name)
+    return 0 if found is None else int(found[1])

@@ -118,14 +118,16 @@ def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable
     # A hub that solves publishes its own poses: nodes beside it cost more than all else, and only serve other hubs.
     runs_nodes = config.pose_nodes if config.pose_nodes is not None else bool(config.nodes) or not config.solve
     nodes = NodeHost(config.id, config.nodes, leave_after_s=config.leave_after_s) if runs_nodes else None
-    known = None if config.known is None else KnownCalibration(*read_calibration(config.known))
+    goes_on = config.known == "last"
+    known = None if config.known is None or goes_on else KnownCalibration(*read_calibration(Path(config.known)))
     settings = LiveSettings(config.window_s, config.interval_s, solve=config.solve, track=config.track)
     hub = LiveHub(settings, rig, None if known is not None else nodes, known, WorkerSolver())
     export = None if config.out is None else partial(_export, out=config.out)
-    store = AnswerStore(config.state or default_folder(config.out, config.site, config.id))
-    last = store.load() if config.solve else None
+    state = config.state or default_folder(config.out, config.site, config.id)
+    store = AnswerStore(state, config.history, None if config.out is None else config.out / "calibration.toml")
+    last = store.load(of_any_age=goes_on) if config.solve else None
     if last is not None:
-        hub.reload(*last)
+        hub.reload(*last, arrival=store.kept_unix_s if goes_on else None)
 
     def keep(hub: LiveHub) -> None:
         if config.solve and known is None and hub.calibration is not None and hub.session is not None:

@@ -1,4 +1,4 @@
-"""Health endpoints of an agent: /metrics, /livez and /readyz over HTTP, and JSON log lines on standard error.
+"""Health endpoints of an agent: /metrics, /livez, /readyz and /status over HTTP, and JSON log lines on standard error.
 
 All values come from the status messages that the agent publishes anyway, so agents do not depend on this module.
 """
@@ -6,15 +6,18 @@ All values come from the status messages that the agent publishes anyway, so age
 from __future__ import annotations
 
 import json
+import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 
+from deploy.agents.metrics import LABELS, status_metrics
 from deploy.config.agents import HealthConfig
 from protocols.bus.base import Refusal
 from protocols.core.errors import InputError
+from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 
 if TYPE_CHECKING:
@@ -31,11 +34,14 @@ _REFUSALS_PER_WINDOW = 5
 class Health:
     """The last status of an agent and its refused messages; ``seen`` and ``refused`` are thread-safe.
 
-    now: a monotonic clock [s].
+    now: a monotonic clock [s]. site, role, agent: whose health it is.
     """
 
-    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, now: Callable[[], float] = time.monotonic, *, site: str = "local", role: str = "", agent: str = ""
+    ) -> None:
         self._now = now
+        self._who = (site, role, agent)
         self._lock = threading.Lock()
         self._status: pb.AgentStatus | None = None
         self._status_at = self._started_at = now()
@@ -52,7 +58,9 @@ class Health:
         if unheard and self._unheard_statuses == 1:  # the first status after the start may precede any subscriber
             self._log_event("warning", "unheard", role=status.role, agent=status.agent, message=status.message)
         self._unheard_statuses = self._unheard_statuses + 1 if unheard else 0
-        description = f"{status.state}: {status.message}" if status.state == "degraded" else status.state
+        # Without numbers: "silent for 4 s" is no other state than "silent for 5 s".
+        text = re.sub(r"[0-9]+(\.[0-9]+)?", "#", status.message)
+        description = f"{status.state}: {text}" if status.state == "degraded" else status.state
         if description != self._reported_state and (status.state == "degraded" or self._reported_state):
             self._log_event(
                 "warning" if status.state == "degraded" else "info",
@@ -102,40 +110,41 @@ class Health:
             return False, text
         return status.state == "running", f"{status.state}: {status.message}".rstrip(": ")
 
-    def collect(self) -> Iterator[Metric]:
-        """The status as Prometheus metrics: counters by name, refusals by reason and source, gauges, age."""
-        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
-
+    def report(self) -> dict[str, Any]:
+        """State, reasons and identity, for machines; see /status."""
+        live, ready = self.live(), self.ready()
         with self._lock:
             status, age = self._status, self._now() - self._status_at
-        yield GaugeMetricFamily("syncline_up_seconds", "Time since the start.", value=self._now() - self._started_at)
-        yield GaugeMetricFamily("syncline_status_age_seconds", "Time since the last status.", value=age)
-        if status is None:
-            return
-        names = ["role", "agent"]
-        who = [status.role, status.agent]
-        state = GaugeMetricFamily("syncline_state", "1 for the current state.", labels=[*names, "state"])
-        state.add_metric([*who, status.state], 1.0)
-        yield state
-        rejected = CounterMetricFamily("syncline_rejected", "Refused messages.", labels=[*names, "reason"])
-        sources = CounterMetricFamily(
-            "syncline_rejected_by_source", "Refused messages by the id in the key.", labels=[*names, "reason", "source"]
-        )
-        events = CounterMetricFamily("syncline_events", "Counters of the agent.", labels=[*names, "name"])
-        for name, value in status.counters.items():
-            if name.startswith("rejected."):
-                reason, _, source = name.removeprefix("rejected.").partition("@")
-                if source:
-                    sources.add_metric([*who, reason, source], value)
-                else:
-                    rejected.add_metric([*who, reason], value)
-            else:
-                events.add_metric([*who, name], value)
-        yield from (rejected, sources, events)
-        gauges = GaugeMetricFamily("syncline_gauge", "Gauges of the agent.", labels=[*names, "name"])
-        for name, value in status.gauges.items():
-            gauges.add_metric([*who, name], value)
-        yield gauges
+        return {
+            **dict(zip(LABELS, self._who, strict=True)),
+            "version": VERSION,
+            "live": live[0],
+            "ready": ready[0],
+            "state": "starting" if status is None else status.state if live[0] else "degraded",
+            "message": live[1] if status is None or not live[0] else status.message,
+            "status_age_s": round(age, 1),
+            "counters": {} if status is None else dict(status.counters),
+            "gauges": {} if status is None else dict(status.gauges),
+        }
+
+    def collect(self) -> Iterator[Metric]:
+        """The status as Prometheus metrics; of an agent whose status is old, only that."""
+        from prometheus_client.core import GaugeMetricFamily
+
+        live, ready = self.live()[0], self.ready()[0]
+        with self._lock:
+            status, age = self._status, self._now() - self._status_at
+        for name, text, value in (
+            ("syncline_uptime_seconds", "Time since the start.", self._now() - self._started_at),
+            ("syncline_status_age_seconds", "Time since the last status.", age),
+            ("syncline_live", "1 while the agent publishes its status, as /livez.", float(live)),
+            ("syncline_ready", "1 while the agent does its job, as /readyz.", float(ready)),
+        ):
+            made = GaugeMetricFamily(name, text, labels=LABELS)
+            made.add_metric(self._who, value)
+            yield made
+        if status is not None and live:
+            yield from status_metrics(status, self._who[0])
 
     def _log_event(self, level: str, event: str, **values: Any) -> None:
         if self._logger is None:
@@ -203,15 +212,20 @@ def _handler(health: Health) -> type[BaseHTTPRequestHandler]:
             elif self.path in ("/livez", "/readyz"):
                 good, text = health.live() if self.path == "/livez" else health.ready()
                 self._answer(200 if good else 503, f"{text}\n".encode(), "text/plain; charset=utf-8")
+            elif self.path == "/status":
+                self._answer(200, json.dumps(health.report()).encode(), "application/json")
             else:
-                self._answer(404, b"/metrics, /livez, /readyz\n", "text/plain; charset=utf-8")
+                self._answer(404, b"/metrics, /livez, /readyz, /status\n", "text/plain; charset=utf-8")
+
+        do_HEAD = do_GET
 
         def _answer(self, status: int, body: bytes, kind: str) -> None:
             self.send_response(status)
             self.send_header("Content-Type", kind)
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
-            self.wfile.write(body)
+            if self.command != "HEAD":
+                self.wfile.write(body)
 
         def log_message(self, format: str, *args: Any) -> None:
             pass

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import threading
 import time
 import uuid
@@ -13,6 +12,7 @@ from datetime import UTC, datetime
 from math import inf
 from pathlib import Path
 
+from deploy.agents.retention import Retention, Space, free_bytes, unused_log_path
 from deploy.config.agents import RecorderConfig, effective_toml
 from protocols.bus.base import Bus, Received, Subscription
 from protocols.core.clocks import NANOSECONDS
@@ -29,6 +29,8 @@ _TICK_S = 0.02
 _SYNC_S = 0.5
 """Interval of fsync: half of the second that may be lost, because writing and the disk take time too."""
 _STATUS_S = 1.0
+_MISSING_S = 2.0
+"""How long a status names messages that went missing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,23 +47,11 @@ class RecorderResult:
     stopped: str = ""
 
 
-def free_bytes(folder: Path) -> int:
-    """Free bytes on the disk of ``folder``, which need not exist yet."""
-    place = next(parent for parent in (folder, *folder.absolute().parents) if parent.is_dir())
-    return shutil.disk_usage(place).free
-
-
-def disk_bytes(folder: Path) -> int:
-    """Size in bytes of the disk of ``folder``, which need not exist yet."""
-    place = next(parent for parent in (folder, *folder.absolute().parents) if parent.is_dir())
-    return shutil.disk_usage(place).total
-
-
 def log_path(out: Path, now: datetime) -> Path:
     """The file to write: ``out`` itself if its suffix is .mcap, else a new file in the folder ``out``."""
     if out.suffix == ".mcap":
         return out
-    return out / now.strftime("syncline-%Y%m%dT%H%M%SZ.mcap")
+    return unused_log_path(out, now)
 
 
 def run_recorder(
@@ -77,12 +67,15 @@ def run_recorder(
     """Record until ``stop`` is set, until ``stop_when(messages so far)`` is true, or until the disk is nearly full.
 
     Log times are arrival times. The log is flushed to disk (fsync) twice a second; the recorder's status is published
-    each second. free: free bytes on the log's disk. beat: called in every cycle. Raises InputError if the log exists
-    already or cannot be written, or if the disk is too full to start.
+    each second. free: free bytes on a folder's disk. beat: called in every cycle. Raises
+    InputError if the log exists already or cannot be opened, or if the disk is too full to start.
     """
     boot = boot_id or uuid.uuid4().hex
     path = log_path(config.out, datetime.now(UTC))
-    full = _too_full(config, path, free)
+    space = Space(config, free)
+    retention = Retention(config, space)
+    retention.clean(None)
+    full = space.lack()
     if full:
         raise InputError(f"not recorded: {full}", file=path, remedy="make room, or lower min_free_mb")
     with _writer(config, path, bus.site, boot) as writer, bus.announce(ROLE, config.id, boot):
@@ -95,25 +88,34 @@ def run_recorder(
             schema_version=SCHEMA_VERSION, agent=config.id, role=ROLE, boot_id=boot, state="running", version=VERSION
         )
         messages = 0
+        missing = MissingMessages()
         next_sync = next_status = time.monotonic()
         try:
             while not stop.is_set() and not (stop_when is not None and stop_when(messages)) and not full:
-                messages += _record(writer, bus.site, subscriptions, limiter)
                 now = time.monotonic()
-                if now >= next_sync:
+                try:
+                    messages += _record(writer, bus.site, subscriptions, limiter)
+                    if now >= next_sync:
+                        writer.sync()
+                        retention.clean(writer.current)
+                        full = space.lack()
+                except InputError as error:  # a disk that is full all at once, or gone; the log is closed
+                    full = error.what
+                if now >= next_sync or full:
                     next_sync = now + _SYNC_S
-                    writer.sync()
-                    full = _too_full(config, path, free)
                     # Only directly after a sync, so that everything reported as recorded is on the disk.
                     if now >= next_status or full:
                         next_status = now + _STATUS_S - _SYNC_S / 2
-                        _report(status, subscriptions, messages, writer.size, full)
+                        counters = {**_counters(subscriptions, messages), "deleted_files": retention.deleted}
+                        _report(status, counters, missing.news(counters, now), full)
+                        status.gauges.update({"log_bytes": writer.size, "disk_free_bytes": space.free_mb * 1e6})
                         publisher.put(status)
                         status.sequence += 1
                 beat()
                 if not full:
                     stop.wait(_TICK_S)
-            messages += _record(writer, bus.site, subscriptions, limiter)
+            if not full:
+                messages += _record(writer, bus.site, subscriptions, limiter)
             counters = _counters(subscriptions, messages)
         finally:
             publisher.close()
@@ -145,15 +147,18 @@ def _writer(config: RecorderConfig, path: Path, site: str, boot: str) -> LogWrit
     return RotatingWriter(path, metadata, boot, max_bytes=max_bytes, max_s=config.part_s, views=config.foxglove)
 
 
-def _too_full(config: RecorderConfig, path: Path, free: Callable[[Path], int]) -> str:
-    """Why the disk is too full to continue; "" while it is not."""
-    left = free(path.parent) / 1e6
-    if left < config.min_free_mb:
-        return f"{left:.0f} MB are free on the disk, min_free_mb is {config.min_free_mb:g}"
-    share = 100.0 * left * 1e6 / disk_bytes(path.parent) if free is free_bytes else 100.0
-    if share < config.min_free_percent:
-        return f"{share:.1f} % of the disk are free, min_free_percent is {config.min_free_percent:g}"
-    return ""
+class MissingMessages:
+    """Whether messages went missing just now: what was lost an hour ago is counted, and no state of today."""
+
+    def __init__(self) -> None:
+        self._total, self._until = 0, -inf
+
+    def news(self, counters: Mapping[str, int], now: float) -> int:
+        """The number that is missing from the log if it has grown in the last seconds, else 0."""
+        total = sum(counters.get(name, 0) for name in ("dropped", "lost", "skipped"))
+        if total > self._total:
+            self._total, self._until = total, now + _MISSING_S
+        return total if now < self._until else 0
 
 
 class ThumbnailRateLimiter:
@@ -196,14 +201,13 @@ def _counters(subscriptions: list[Subscription], messages: int) -> dict[str, int
     return {"recorded": messages, **counts}
 
 
-def _report(status: pb.AgentStatus, subscriptions: list[Subscription], messages: int, size: int, full: str) -> None:
-    counters = _counters(subscriptions, messages)
-    missing = counters.get("dropped", 0) + counters.get("lost", 0) + counters.get("skipped", 0)
+def _report(status: pb.AgentStatus, counters: Mapping[str, int], missing: int, full: str) -> None:
     status.state = "degraded" if missing else "running"
-    status.message = f"{missing} messages are missing from the log" if missing else f"{messages} messages"
+    recorded = counters["recorded"]
+    status.message = f"{missing} messages are missing from the log" if missing else f"{recorded} messages"
     if full:
         status.state, status.message = "stopping", f"recording ended: {full}"
     status.counters.clear()
     for name, count in counters.items():
         status.counters[name] = count
-    status.gauges["log_bytes"] = size
+    status.gauges["recording"] = 1.0

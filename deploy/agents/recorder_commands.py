@@ -1,8 +1,10 @@
-"""A recorder that is paused and resumed by commands on the bus; each start writes a new log."""
+"""A recorder that pauses on command and waits for space on the disk; each start writes a new log."""
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 import uuid
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +12,7 @@ from pathlib import Path
 import msgspec
 
 from deploy.agents.recorder import ROLE, RecorderResult, run_recorder
+from deploy.agents.retention import RESUME_MARGIN, Retention, Space, free_bytes
 from deploy.config.agents import RecorderConfig
 from protocols.bus.base import Bus
 from protocols.bus.commands import CommandSubscription
@@ -28,16 +31,21 @@ def record_on_command(
     bus: Bus,
     stop: threading.Event,
     *,
+    free: Callable[[Path], int] = free_bytes,
     beat: Callable[[], None] = lambda: None,
     report: Callable[[str], None] = lambda text: None,
 ) -> RecorderResult:
     """Record until ``stop`` is set, with pauses that a view commands; returns the result of the last log.
 
-    report: called with one line for each finished log. Raises InputError as ``run_recorder`` does for the first log.
-    If a later one cannot be started, that is reported and the recorder stays paused.
+    Without space, and after a disk's failure, the recorder waits, degraded, and then begins a new log. free: as for
+    ``run_recorder``. report: called with one line for each finished log. Raises InputError where the first log exists
+    already or cannot be opened, or where the whole disk is smaller than what must stay free.
     """
     boot = uuid.uuid4().hex
     recording_commands = CommandSubscription(bus, config.id, boot, (_START, _STOP))
+    space = Space(config, free)
+    retention = Retention(config, space)
+    waiting = _Waiting(config.id, bus, boot, recording_commands, stop, beat)
     paused = False
 
     def is_paused(messages: int) -> bool:
@@ -46,23 +54,38 @@ def record_on_command(
             paused = action == _STOP
         return paused
 
+    def can_record() -> bool:
+        retention.clean(None)
+        return not space.lack(RESUME_MARGIN)
+
+    result: RecorderResult | None = None
+    problem = "" if can_record() or space.never_enough() else space.lack(RESUME_MARGIN)
     try:
-        result = run_recorder(config, bus, stop, stop_when=is_paused, boot_id=boot, beat=beat)
-        while paused and not stop.is_set() and not result.stopped:
-            report(f"recorded {result.messages} messages to {result.path}; paused, as a view asked")
-            _wait_for_start(config.id, bus, boot, recording_commands, stop, beat, f"paused after {result.path.name}")
+        while True:
+            if problem:
+                report(f"not recording: {problem}; waiting for it to be over")
+                waiting.until(can_record, "degraded", f"not recording: {problem}")
+                problem = ""
+            elif paused and result is not None:
+                report(f"recorded {result.messages} messages to {result.path}; paused, as a view asked")
+                waiting.until(lambda: False, "running", f"paused after {result.path.name}")
+                paused = False
             if stop.is_set():
                 break
-            paused = False
-            again = with_unused_log_path(config)
+            again = config if result is None else with_unused_log_path(config)
             try:
-                result = run_recorder(again, bus, stop, stop_when=is_paused, boot_id=boot, beat=beat)
+                result = run_recorder(again, bus, stop, stop_when=is_paused, boot_id=boot, free=free, beat=beat)
             except InputError as error:
-                report(f"not recorded: {error}")
-                paused = True
+                if result is None and (not space.lack() or space.never_enough()):
+                    raise
+                problem = str(error)
+                continue
+            problem = result.stopped
+            if stop.is_set() or not (paused or problem):
+                break
     finally:
         recording_commands.close()
-    return result
+    return result or RecorderResult(config.out, 0, {}, 0, space.lack())
 
 
 def with_unused_log_path(config: RecorderConfig) -> RecorderConfig:
@@ -80,36 +103,50 @@ def _log_exists(path: Path) -> bool:
     return path.exists() or any(path.parent.glob(f"{path.stem}-[0-9][0-9][0-9].mcap"))
 
 
-def _wait_for_start(
-    agent: str,
-    bus: Bus,
-    boot: str,
-    recording_commands: CommandSubscription,
-    stop: threading.Event,
-    beat: Callable[[], None],
-    text: str,
-) -> None:
-    """Publish the status, and record nothing, until a start command arrives or ``stop`` is set."""
-    status = pb.AgentStatus(
-        schema_version=SCHEMA_VERSION,
-        agent=agent,
-        role=ROLE,
-        boot_id=boot,
-        state="running",
-        message=text,
-        version=VERSION,
-        gauges={"recording": 0.0},
-    )
-    publisher = bus.publisher(STATUS, agent)
-    rounds = 0
-    try:
-        with bus.announce(ROLE, agent, boot):
-            while not stop.is_set() and _START not in recording_commands.take():
-                if rounds % 10 == 0:
-                    status.sequence += 1
-                    publisher.put(status)
-                rounds += 1
-                beat()
-                stop.wait(_STATUS_S / 10)
-    finally:
-        publisher.close()
+class _Waiting:
+    """Publishes a recorder's status while it records nothing."""
+
+    def __init__(
+        self,
+        agent: str,
+        bus: Bus,
+        boot: str,
+        recording_commands: CommandSubscription,
+        stop: threading.Event,
+        beat: Callable[[], None],
+    ) -> None:
+        self._agent, self._bus, self._boot = agent, bus, boot
+        self._commands, self._stop, self._beat = recording_commands, stop, beat
+        self._sequence = 0
+
+    def until(self, over: Callable[[], bool], state: str, text: str) -> None:
+        """Wait until ``over``, a start command, or the stop event."""
+        publisher = self._bus.publisher(STATUS, self._agent)
+        next_status = -math.inf
+        try:
+            with self._bus.announce(ROLE, self._agent, self._boot):
+                while not self._stop.is_set() and _START not in self._commands.take():
+                    now = time.monotonic()
+                    if now >= next_status:
+                        next_status = now + _STATUS_S
+                        if over():
+                            return
+                        self._sequence += 1
+                        publisher.put(self._status(state, text))
+                    self._beat()
+                    self._stop.wait(_STATUS_S / 10)
+        finally:
+            publisher.close()
+
+    def _status(self, state: str, text: str) -> pb.AgentStatus:
+        return pb.AgentStatus(
+            schema_version=SCHEMA_VERSION,
+            agent=self._agent,
+            role=ROLE,
+            boot_id=self._boot,
+            sequence=self._sequence,
+            state=state,
+            message=text,
+            version=VERSION,
+            gauges={"recording": 0.0},
+        )

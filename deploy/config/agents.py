@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from deploy.config.file import DetectorName, Source, effective_toml, load
+from deploy.config.file import DetectorName, KnownName, Source, effective_toml, load
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import InputError
 from protocols.core.names import check_identifier, check_name
@@ -101,8 +101,9 @@ class RecorderConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fiel
     """The recorder. out: the log to write; in a folder, the file is named by its start time.
 
     part_s, part_mb: start a new file, name-000.mcap, name-001.mcap, …, when the current one reaches this age or size
-    [MB]; None = one file. min_free_mb, min_free_percent: recording ends, with a complete log, before less than this is
-    free on the disk.
+    [MB]; None = one file. keep_days, keep_mb, keep_free_mb: the oldest closed files are deleted where they are older,
+    together larger, or where less is free on the disk; None = never. min_free_mb, min_free_percent: where less than
+    this is free, the log is completed, and the recorder waits for space.
     foxglove: also write images, calibration, transforms, scene and annotations in Foxglove's schemas, which rerun
     reads too. pictures_hz: largest rate at which thumbnails of each camera are recorded, 8 kB each; 0 = none, and none
     are requested from the cameras.
@@ -112,10 +113,23 @@ class RecorderConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fiel
     out: Path = Path("recordings")
     part_s: Seconds | None = None
     part_mb: Annotated[float, Meta(ge=0.1, le=1e6)] | None = None
+    keep_days: Annotated[float, Meta(gt=0.0, le=36_500.0)] | None = None
+    keep_mb: Annotated[float, Meta(ge=1.0, le=1e9)] | None = None
+    keep_free_mb: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
     min_free_mb: Annotated[float, Meta(ge=0.0, le=1e9)] = 200.0
     min_free_percent: Annotated[float, Meta(ge=0.0, le=100.0)] = 5.0
     foxglove: bool = True
     pictures_hz: Annotated[float, Meta(ge=0.0, le=30.0)] = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        keeps = [name for name in ("keep_days", "keep_mb", "keep_free_mb") if getattr(self, name) is not None]
+        if keeps and self.part_s is None and self.part_mb is None:
+            raise ValueError(
+                f"{keeps[0]} needs parts, because the file that is being written is never deleted; add part_mb = 100.0"
+            )
+        if self.keep_mb is not None and self.part_mb is not None and self.part_mb > self.keep_mb:
+            raise ValueError("keep_mb is less than one part; make part_mb smaller")
 
 
 class SimulatedConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -297,27 +311,29 @@ class CameraConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields
 class HubConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The hub. rig: a rig.toml with what is known of the rig; out: folder in which calibrations are written.
 
-    state: folder in which every answer is kept, so that a hub that was killed goes on from the last one; default:
-    in ``out``, else in the user's state folder. window_s: total duration of the observations that are kept; interval_s:
-    least time between two solves. solve:
+    state: folder in which the last ``history`` answers are kept, so that a hub that was killed goes on from the last
+    one; default: in ``out``, else in the user's state folder. window_s: total duration of the kept observations;
+    interval_s: least time between two solves. solve:
     false = this hub does not estimate timing itself. nodes: cameras whose pose nodes always run on this hub; the others
     are distributed among all hubs. pose_nodes: whether pose nodes run here; default:
     where this hub does not solve, or ``nodes`` names some. leave_after_s: time after which a camera that has
     disappeared is removed. known: a calibration.toml whose poses, intrinsics and clocks are kept fixed; nothing is
-    solved then. track: whether people, vehicles and unlabelled markers are tracked.
+    solved then. known = "last": the last answer of this hub, however old, is used until the rows give a new one, also
+    where cameras were restarted since. track: whether people, vehicles and unlabelled markers are tracked.
     """
 
     id: str = "hub"
     rig: Path | None = None
     out: Path | None = None
     state: Path | None = None
+    history: Annotated[int, Meta(ge=1, le=100_000)] = 200
     window_s: Seconds = 180.0
     interval_s: Seconds = 2.0
     solve: bool = True
     pose_nodes: bool | None = None
     nodes: tuple[str, ...] = ()
     leave_after_s: Seconds = 30.0
-    known: Path | None = None
+    known: KnownName | None = None
     track: bool = True
 
 

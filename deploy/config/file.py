@@ -11,7 +11,7 @@ from typing import Any, TypeVar, get_args
 import msgspec
 
 from protocols.core.errors import InputError
-from protocols.core.files import read_toml
+from protocols.core.files import parse_toml, read_toml
 
 _Config = TypeVar("_Config", bound=msgspec.Struct)
 
@@ -24,6 +24,12 @@ class Source(str):
 
 class DetectorName(str):
     """A detector: a name, or the .toml file of a network."""
+
+    __slots__ = ()
+
+
+class KnownName(str):
+    """A calibration.toml, or "last": the hub's own last answer."""
 
     __slots__ = ()
 
@@ -41,10 +47,18 @@ def load(path: Path | str, kind: type[_Config]) -> _Config:
     """
     file = Path(path)
     table, text = read_toml(file, "configuration")
+    return _convert(table, text, kind, file, file.resolve().parent)
+
+
+def convert(text: str, kind: type[_Config], folder: Path) -> _Config:
+    """The same for the text of a file that lies elsewhere. folder: what relative paths in it are resolved from."""
+    return _convert(parse_toml(text, folder), text, kind, folder, folder)
+
+
+def _convert(table: dict[str, Any], text: str, kind: type[_Config], file: Path, folder: Path) -> _Config:
     bad = _not_finite(table, "")
     if bad:
         raise InputError(f"{bad} is not finite", file=file, line=_line(text, bad), remedy="give a number")
-    folder = file.resolve().parent
     try:
         return msgspec.convert(table, kind, dec_hook=lambda wanted, value: _from_text(wanted, value, folder))
     except msgspec.ValidationError as error:
@@ -66,6 +80,8 @@ def _from_text(wanted: type, value: object, folder: Path) -> object:
     if wanted is Source:
         elsewhere = "://" in value or value.isdigit()
         return Source(value if elsewhere else folder / Path(value).expanduser())
+    if wanted is KnownName:
+        return KnownName(value if value == "last" else folder / Path(value).expanduser())
     if wanted is DetectorName:
         path = folder / Path(value).expanduser()
         return DetectorName(path if path.suffix.lower() == ".toml" else value)

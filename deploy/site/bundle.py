@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from packaging.requirements import Requirement
 
 _COMMON_PACKAGES = (
+    "cryptography",
     "cyclopts",
     "eclipse-zenoh",
     "msgspec",
@@ -41,7 +42,7 @@ _LOG_PACKAGES = ("mcap", "zstandard", "foxglove-schemas-protobuf")
 ROLE_PACKAGES: dict[str, tuple[str, ...]] = {
     "camera": (*_COMMON_PACKAGES, "opencv-python-headless", "mcap"),
     "uav": (*_COMMON_PACKAGES, "opencv-python-headless", "pymavlink", "pyserial"),
-    "hub": (*_COMMON_PACKAGES, *_LOG_PACKAGES, "opencv-python-headless", "scipy", "plotly"),
+    "hub": (*_COMMON_PACKAGES, *_LOG_PACKAGES, "opencv-python-headless", "scipy", "plotly", "viser"),
     "recorder": (*_COMMON_PACKAGES, *_LOG_PACKAGES),
     "router": _COMMON_PACKAGES,
 }
@@ -56,7 +57,7 @@ _PRECOMPILED_MODULES = {
     "uav": "deploy.agents.uav, deploy.agents.systemd_notify, edge.agents.uav, edge.mavlink.link.connection, "
     "edge.uav.ground_tracker, edge.devices.playback.open_video, protocols.bus.transport.zenoh_bus",
     "hub": "deploy.agents.assembly, hub.live.agent, hub.calibration.pipeline, hub.distributed.network.host, "
-    "hub.report, protocols.bus.transport.zenoh_bus",
+    "hub.report, hub.view.server, protocols.bus.transport.zenoh_bus",
     "recorder": "deploy.agents.recorder, protocols.bus.transport.zenoh_bus",
     "router": "deploy.commands.agents.router, protocols.bus.router.zenoh_router",
 }
@@ -313,12 +314,12 @@ def _script(role: str, target: Target) -> str:
     return f"""\
 #!/bin/sh
 # Installs Syncline {VERSION} for the role {role} from this folder, without a network.
-# Usage: sh install.sh [TARGET]      default /opt/syncline; PYTHON=python3 chooses the interpreter.
+# Usage: sh install.sh [TARGET]      default /opt/syncline; SYNCLINE_PYTHON=python3 chooses the interpreter.
 # Once more with a newer bundle updates it; then restart the agents.
 set -eu
 here=$(CDPATH= cd -- "$(dirname -- "$0")" && pwd)
 target=${{1:-/opt/syncline}}
-python=${{PYTHON:-python3}}
+python=${{SYNCLINE_PYTHON:-python3}}
 "$python" - <<'CHECK'
 import platform, sys
 found = (platform.machine(), "%d.%d" % sys.version_info[:2])

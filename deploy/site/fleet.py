@@ -137,8 +137,10 @@ class Fleet:
     def _handle_calibration(self, hub: str, message: object) -> None:
         assert isinstance(message, pb.Calibration)
         solved = message.status == "solved"
+        progress = [f"{one.camera} {one.shared_motion_s:.0f} s" for one in message.progress[:16]]
+        shared = f"; motion shared with another camera: {', '.join(progress)}" if progress else ""
         self.calibrations[hub] = (
-            f"{len(message.cameras)} cameras calibrated" if solved else f"{message.status}: {message.reason}"
+            f"{len(message.cameras)} cameras calibrated" if solved else f"{message.status}: {message.reason}{shared}"
         )
 
     def _start(self, agent: Agent) -> None:

@@ -55,7 +55,7 @@ class Issued:
 def make_site(folder: Path, site: str) -> None:
     """Create the authority of a new site. Raises InputError if the folder already has one."""
     check_identifier(site, "site")
-    _need_cryptography()
+    need_cryptography()
     if (folder / SITE_FILE).exists() or (folder / CA_KEY_FILE).exists():
         raise InputError(
             "there is an authority here already", file=folder, remedy="take another folder; a new one voids the old"
@@ -74,7 +74,7 @@ def make_site(folder: Path, site: str) -> None:
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(usage, critical=True)
     )
-    _write_key(folder / CA_KEY_FILE, key)
+    write_key(folder / CA_KEY_FILE, key)
     write_atomically(folder / CA_FILE, _pem(certificate, key))
     _write_site(folder, site, {})
 
@@ -94,11 +94,39 @@ def issue(
     connect: endpoints of the site's routers, stored with the agent. listen, hosts: for a router: its endpoints, and
     the host names and addresses in its certificate. Raises InputError.
     """
-    name = certificate_name(role, agent)
+    return issue_all(folder, [Order(role, agent, tuple(connect), tuple(listen), tuple(hosts))], days)[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """A certificate to issue; fields as for ``issue``. request: PEM of a signing request with the agent's public key.
+
+    Without a request a key is made here.
+    """
+
+    role: str
+    agent: str
+    connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = ()
+    hosts: tuple[str, ...] = ()
+    request: str = ""
+
+
+def issue_all(folder: Path, orders: Sequence[Order], days: float = 30.0) -> list[Issued]:
+    """Issue or renew certificates, and rewrite the routers' rules once. Raises InputError."""
     if not 0.0 < days <= 825.0:
         raise InputError(f"{days:g} days is no lifetime for a certificate", remedy="use 1 to 825 days")
-    _need_cryptography()
+    need_cryptography()
     site, agents = read_site(folder)
+    issued = [_issue(folder, agents, order, days) for order in orders]
+    _write_site(folder, site, agents)
+    _write_configurations(folder, site, agents)
+    return issued
+
+
+def _issue(folder: Path, agents: dict[str, dict[str, Any]], order: Order, days: float) -> Issued:
+    role, agent, connect, listen, hosts = order.role, order.agent, order.connect, order.listen, order.hosts
+    name = certificate_name(role, agent)
     entry = dict(agents.get(name, {"role": role, "id": agent}))
     if role == "router":
         entry["listen"] = list(listen) or entry.get("listen") or ["tls/127.0.0.1:7447"]
@@ -115,11 +143,9 @@ def issue(
     own = folder / f"{role}-{agent}"
     own.mkdir(exist_ok=True)
     own.chmod(0o700)
-    sign(folder, own, common, now - _BACKDATE, until, entry.get("hosts", []))
+    sign(folder, own, common, now - _BACKDATE, until, entry.get("hosts", []), order.request)
     entry["until"] = until.isoformat(timespec="seconds")
     agents[name] = entry
-    _write_site(folder, site, agents)
-    _write_configurations(folder, site, agents)
     return Issued(role, agent, own, until)
 
 
@@ -197,13 +223,19 @@ def _write_configurations(folder: Path, site: str, agents: dict[str, dict[str, A
         if entry["role"] == "router":
             bus = {"mode": "router", "listen": entry["listen"], "connect": entry["connect"], "access": ZENOH_FILE}
             table = {"id": entry["id"], "site": site, "bus": {**bus, "tls": files}}
-            write_atomically(own / ROUTER_FILE, tomli_w.dumps(table))
-            write_atomically(own / ZENOH_FILE, _zenoh_file(entry, rules))
+            _write_changed(own / ROUTER_FILE, tomli_w.dumps(table))
+            _write_changed(own / ZENOH_FILE, _zenoh_file(entry, rules))
         else:
             table = {"id": entry["id"], "site": site}
             connect = entry["connect"] or listening
             bus = {"mode": "client", "connect": connect}
-            write_atomically(own / BUS_FILE, tomli_w.dumps({**table, "bus": {**bus, "tls": files}}))
+            _write_changed(own / BUS_FILE, tomli_w.dumps({**table, "bus": {**bus, "tls": files}}))
+
+
+def _write_changed(file: Path, text: str) -> None:
+    """Write a file that differs: of fifty boards one certificate changes the files of a few."""
+    if not (file.is_file() and file.read_text(encoding="utf-8") == text):
+        write_atomically(file, text)
 
 
 def _zenoh_file(entry: dict[str, Any], rules: dict[str, Any]) -> str:
@@ -245,10 +277,13 @@ def _hosts_of(endpoints: Sequence[str]) -> set[str]:
     return (hosts - {"0.0.0.0", "::"}) | {"localhost", "127.0.0.1"}
 
 
-def sign(folder: Path, own: Path, name: str, begin: datetime, end: datetime, hosts: Sequence[str]) -> None:
+def sign(
+    folder: Path, own: Path, name: str, begin: datetime, end: datetime, hosts: Sequence[str], request: str = ""
+) -> None:
     """Create a key and a certificate for ``name``, signed by the authority in ``folder``, in the folder ``own``.
 
-    hosts: host names and addresses of a server certificate; empty for a client. Raises InputError.
+    hosts: host names and addresses of a server certificate; empty for a client. request: a signing request, of which
+    the public key is taken and nothing else: its key stays where it was made. Raises InputError.
     """
     from cryptography import x509
     from cryptography.hazmat.primitives import serialization
@@ -262,19 +297,47 @@ def sign(folder: Path, own: Path, name: str, begin: datetime, end: datetime, hos
         raise InputError(f"the authority cannot be read: {error}", file=folder, remedy="restore its files") from None
     if not isinstance(signer, ec.EllipticCurvePrivateKey):
         raise InputError("the authority's key is of another kind", file=folder / CA_KEY_FILE, remedy="restore it")
-    key = ec.generate_private_key(ec.SECP256R1())
+    key = None if request else ec.generate_private_key(ec.SECP256R1())
+    public = _public_key(request) if key is None else key.public_key()
     names: list[x509.GeneralName] = [_general_name(host) for host in hosts]
     usage = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
     builder = (
-        _builder(_name(name), authority.subject, key.public_key(), begin, end)
+        _builder(_name(name), authority.subject, public, begin, end)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage(usage), critical=False)
     )
     # rustls requires a subject alternative name in every certificate.
     builder = builder.add_extension(x509.SubjectAlternativeName(names or [x509.DNSName(name)]), critical=False)
-    _write_key(own / KEY_FILE, key)
+    if key is None:
+        (own / KEY_FILE).unlink(missing_ok=True)  # of an earlier certificate that was made here
+    else:
+        write_key(own / KEY_FILE, key)
     write_atomically(own / CERTIFICATE_FILE, _pem(builder, signer))
     write_atomically(own / CA_FILE, (folder / CA_FILE).read_text(encoding="ascii"))
+
+
+def _public_key(request: str) -> ec.EllipticCurvePublicKey:
+    """The public key of a signing request. Raises InputError."""
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    try:
+        found = x509.load_pem_x509_csr(request.encode("ascii"))
+        public = found.public_key()
+        if not found.is_signature_valid or not isinstance(public, ec.EllipticCurvePublicKey):
+            raise ValueError("it is not signed by its own key, or of another kind")
+    except ValueError as error:
+        raise InputError(f"no signing request: {error}", remedy="make it with `syncline site request`") from None
+    return public
+
+
+def signing_request(key: ec.EllipticCurvePrivateKey, name: str) -> str:
+    """A signing request (PEM) for a key."""
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+
+    made = x509.CertificateSigningRequestBuilder().subject_name(_name(name)).sign(key, hashes.SHA256())
+    return made.public_bytes(serialization.Encoding.PEM).decode("ascii")
 
 
 def _general_name(host: str) -> x509.GeneralName:
@@ -318,7 +381,7 @@ def _pem(builder: x509.CertificateBuilder, signer: ec.EllipticCurvePrivateKey) -
     return builder.sign(signer, hashes.SHA256()).public_bytes(serialization.Encoding.PEM).decode("ascii")
 
 
-def _write_key(file: Path, key: ec.EllipticCurvePrivateKey) -> None:
+def write_key(file: Path, key: ec.EllipticCurvePrivateKey) -> None:
     """Write a private key, which is at no time readable by others."""
     from cryptography.hazmat.primitives import serialization
 
@@ -334,8 +397,10 @@ def _write_key(file: Path, key: ec.EllipticCurvePrivateKey) -> None:
     temporary.replace(file)
 
 
-def _need_cryptography() -> None:
+def need_cryptography() -> None:
     try:
         import cryptography  # noqa: F401
     except ImportError:
-        raise InputError("this needs the package cryptography", remedy='pip install "syncline[keys]"') from None
+        raise InputError(
+            "this needs the package cryptography", remedy='pip install "syncline[keys]"; bundles have it'
+        ) from None

@@ -14,7 +14,7 @@ from google.protobuf.message import Message
 from hub.distributed.network.host import ROLE as NODES
 from hub.distributed.network.host import NodeHost
 from hub.live.fair_share import FairShare
-from hub.live.live_hub import LiveHub
+from hub.live.live_hub import SILENT_S, LiveHub
 from protocols.bus.base import Bus, Publisher, Received
 from protocols.bus.commands import CommandSubscription
 from protocols.core.version import VERSION
@@ -48,6 +48,7 @@ _STATUS_S = 1.0
 _RIG_S = 5.0
 _MAX_TEXT = 2000  # characters of a status message
 _NAMED_CAMERAS = 16  # that a status has counters of their own for
+_MEASURED_CAMERAS = 64  # that it has gauges of their own for: three each of the 256 that a message may have
 
 
 def run_hub(
@@ -151,9 +152,6 @@ def run_hub(
                 if now >= next_status or last:
                     next_status = now + _STATUS_S
                     status = status_message(hub, agent, boot, sequence, [s.counters for s in subscriptions], now)
-                    if not bus.connected():
-                        status.state = "degraded"
-                        status.message = f"no router can be reached; {status.message}"
                     needs_advice = hub.calibration is None or hub.refusal is not None or hub.calibration.refused
                     if shares.dropped:
                         status.counters["dropped_behind"] = shares.dropped.total()
@@ -228,8 +226,19 @@ def status_message(
     for kind, of_cameras in (("over_budget", hub.budgets.counts), ("fault", hub.faults)):
         for camera, count in of_cameras.most_common(_NAMED_CAMERAS):
             message.counters[f"{kind}.{camera}"[:64]] = count
-    for camera, ppm in hub.clocks.rates_ppm().items():
-        message.gauges[f"ppm.{camera}"[:64]] = ppm
+    ages = hub.frame_ages(now)
+    rates = {camera: ppm for camera, ppm in hub.clocks.rates_ppm().items() if ages.get(camera, SILENT_S) < SILENT_S}
+    for kind, values in (("ppm", rates), ("frame_age_s", ages), ("offset_std_s", hub.offset_stds())):
+        for camera, value in list(values.items())[:_MEASURED_CAMERAS]:
+            message.gauges[f"{kind}.{camera}"[:64]] = value
+    if state in ("collecting", "searching"):
+        # What is waited for, per camera: the search needs motion that two cameras see at the same time.
+        shared = [f"{one.camera} {one.shared_motion_s:.0f} s" for one in hub.progress()[:_NAMED_CAMERAS]]
+        message.message += f"; motion shared with another camera: {', '.join(shared)}" if shared else ""
+    if hub.calibration is not None:
+        message.gauges["calibrated_cameras"] = len(hub.calibration.cameras)
+        message.gauges["calibration_age_s"] = max(now - hub.calibrated_at, 0.0)
+        message.gauges["calibration_verified"] = float(not hub.unverified)
     alarms = [*hub.clocks.alarms.values(), *hub.clock_contradictions()]
     if alarms:
         message.message = "; ".join([*alarms, message.message])[:1000]

@@ -15,7 +15,7 @@ import numpy as np
 from google.protobuf.message import Message
 
 from hub.calibration.coverage import CoverageMonitor
-from hub.clocks.arrival_prior import ArrivalPriors
+from hub.clocks.arrival_prior import ERROR_BOUND_S, ArrivalPriors
 from hub.clocks.external_prior import ExternalClockPriors
 from hub.clocks.rate_change import RateChanges
 from hub.clocks.segments import SEGMENT_MIN_ROWS, ClockSegments
@@ -27,7 +27,7 @@ from hub.live.solver import InlineSolver, Solver, SolverAnswer, SolverJob
 from hub.tracking.calibration.people import PeopleTracklets
 from hub.tracking.detections import tracked_kind
 from hub.tracking.live_tracking import LiveTracking
-from protocols.core.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.core.errors import InputError, Refused
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
@@ -52,11 +52,15 @@ _FIRST_FULL_S = 60.0
 arrival it finds nothing more."""
 _BEHIND_S = 10.0
 """A job that takes longer than this degrades a calibrated hub: warm ones take about a second."""
-_SILENT_S = 3.0
-"""A calibrated camera without a frame for longer than this degrades the hub."""
+SILENT_S = 3.0
+"""A camera without a frame for longer than this degrades the hub."""
+_FORGOTTEN_S = 600.0
+"""A camera that is not calibrated is not waited for after this time without a frame."""
 _VERIFY_ROWS, _VERIFY_S = 60, 15.0
 """Detections of two cameras that a reloaded calibration is verified with, and seconds after which it is dropped."""
 _VERIFY_EVERY_S = 0.5
+_ALL_HEARD_S = 3.0
+"""How long the other cameras of a reloaded calibration are waited for, once two are heard of."""
 _SAME_CLOCK_S = 1.0
 """Largest change of a camera's delay against the hub's clock for a reloaded time map to be of the same clock."""
 _BUDGET_NOTICE_S = 10.0
@@ -127,6 +131,9 @@ class LiveHub:
         self._arrivals = ArrivalPriors()
         self.delays: dict[str, float] = {}
         """By camera, arrival of its newest frame on the hub's clock less its time on the camera's [s]."""
+        self._camera_time: dict[str, float] = {}
+        self._fresh: set[str] = set()
+        """Cameras whose frames have not all waited for this hub: their delays are those of the network."""
         self._boots: dict[str, str] = {}
         self._clock_stepped = False
         self.guidance = CoverageMonitor()
@@ -160,11 +167,15 @@ class LiveHub:
         self.session: tuple[Rig, Observations] | None = None
         self.refusal: Refused | None = None
         self.solver_failure = ""
+        self.calibrated_at = self._now
+        """When the present calibration was estimated or, of a given one, began to be used."""
         self._solved_boot_ids: dict[str, str] = {}
         self._unverified: Calibration | None = None
         self._unverified_boots: dict[str, str] = {}
         self._unverified_delays: dict[str, float] = {}
         self._unverified_since: float | None = None
+        self._unverified_arrival: float | None = None
+        self._heard_two_at = np.inf
         if self._known is not None:
             self._use_known(self._known)
 
@@ -217,8 +228,10 @@ class LiveHub:
             if arrival is not None:
                 camera_time = message.device_time_ns / NANOSECONDS
                 if not backlog:
+                    self._fresh.add(message.camera)
                     self._arrivals.handle(message.camera, message.boot_id, camera_time, arrival)
                 self.delays[message.camera] = arrival - camera_time
+                self._camera_time[message.camera] = camera_time
             self._last_frame[message.camera] = self._now
         self.guidance.handle(message)
         if self.tracking is not None:
@@ -246,13 +259,22 @@ class LiveHub:
         self.guidance.reset()
         self._begin()
 
-    def reload(self, calibration: Calibration, boot_ids: dict[str, str], delays: dict[str, float]) -> None:
+    def reload(
+        self,
+        calibration: Calibration,
+        boot_ids: dict[str, str],
+        delays: dict[str, float],
+        *,
+        arrival: float | None = None,
+    ) -> None:
         """Go on with an earlier answer, unverified until the first consistent second.
 
         boot_ids, delays: of its cameras then; cameras that were restarted since, or whose clock was set, are left out.
-        A hub that was killed tracks again at once.
+        arrival: the hub's clock at those delays [s]; where it is given, such cameras come to their new clocks by the
+        delays then and now. A hub that was killed tracks again at once.
         """
         if self._known is None and self.calibration is None:
+            self._unverified_arrival = arrival
             self._unverified, self._unverified_boots = calibration, dict(boot_ids)
             self._unverified_delays, self._unverified_since = dict(delays), None
 
@@ -343,26 +365,34 @@ class LiveHub:
             reasons = self.degradations(now)
             count = f"{len(self.calibration.cameras)} cameras calibrated"
             return ("degraded", "; ".join([*reasons, count])) if reasons else ("calibrated", count)
-        missing = self.missing()
+        missing = "; ".join([*self.degradations(now), text]) if (text := self.missing()) else ""
         if missing:
             return "collecting", missing
         if self.refusal is not None and self.refusal.permanent:
             return "refused", self.refusal.reason
         return "searching", "searching" if self.refusal is None else f"searching: {self.refusal.reason}"
 
+    def frame_ages(self, now: float) -> dict[str, float]:
+        """Seconds since the last frame of each camera that is calibrated or was heard of lately."""
+        kept = {} if self.calibration is None else self.calibration.cameras
+        ages = {name: now - last for name, last in sorted(self._last_frame.items())}
+        return {name: age for name, age in ages.items() if name in kept or age < _FORGOTTEN_S}
+
+    def offset_stds(self) -> dict[str, float]:
+        """Standard deviation [s] of each calibrated camera's time offset."""
+        cameras = {} if self.calibration is None else self.calibration.cameras
+        return {name: camera.time_offset_std for name, camera in cameras.items()}
+
     def degradations(self, now: float) -> list[str]:
         """What impairs a calibrated hub at ``now``, one line each."""
         out = []
         if self.unverified:
             out.append("the calibration was reloaded and is not verified yet")
-        if self.calibration is not None:
-            last = {name: self._last_frame.get(name) for name in self.calibration.cameras}
-            silent = [
-                f"{name} (never)" if frame is None else f"{name} ({now - frame:.0f} s)"
-                for name, frame in last.items()
-                if frame is None or now - frame > _SILENT_S
-            ]
-            out += [f"no frames from {_listed(silent)}"] if silent else []
+        ages = self.frame_ages(now)
+        never = [] if self.calibration is None else [name for name in self.calibration.cameras if name not in ages]
+        silent = [f"{name} ({age:.0f} s)" for name, age in ages.items() if age > SILENT_S]
+        silent += [f"{name} (never)" for name in never]
+        out += [f"no frames from {_listed(silent)}"] if silent else []
         exceeding = self.budgets.exceeded(now, _BUDGET_NOTICE_S)
         if exceeding:
             out.append(f"frames left out of {_listed(exceeding)}: more than a camera may send")
@@ -382,9 +412,12 @@ class LiveHub:
         shared = self._builder.shared_motions_s()
         for name in self._builder.cameras:
             reason = waiting.get(name, refused.get(name, ""))
-            state = "searching" if self._builder.rows(name) >= self.settings.least_rows else "collecting"
+            rows, least = self._builder.rows(name), self.settings.least_rows
+            state = "searching" if rows >= least else "collecting"
+            if state == "collecting" and not reason:
+                reason = f"{rows} of {least} detections"
             if name in tied:
-                silent = self._now - self._last_frame.get(name, self._now) > _SILENT_S
+                silent = self._now - self._last_frame.get(name, self._now) > SILENT_S
                 state, reason = ("degraded", "no frames") if silent else ("calibrated", "")
             out.append(
                 pb.CameraProgress(
@@ -530,7 +563,7 @@ class LiveHub:
         self._unverified = None
         self._answer_rows = np.inf if job.verify else rows  # of a reloaded answer the rows are not known
         self.session = job.rig, job.observations
-        self.calibration = found
+        self.calibration, self.calibrated_at = found, now
         self._solved_boot_ids = {name: boots[name] for name in found.cameras if name in boots}
         return [event, *self._publish_present()]
 
@@ -586,14 +619,33 @@ class LiveHub:
     def _publish_unverified(self) -> list[Message]:
         """Publish a reloaded answer as soon as two of its cameras are heard of on the clocks that it knows."""
         assert self._unverified is not None
-        boots = {name: self._builder.boot(name) for name in self._builder.cameras}
+        boots = {name: boot for name in self._builder.cameras if (boot := self._builder.boot(name))}
+        last = self._unverified
+        heard = {name: last.cameras[name] for name in boots if name in last.cameras and name in self.delays}
+        shifts = {name: self.delays[name] - self._unverified_delays.get(name, -np.inf) for name in heard}
         kept = {
             name: camera
-            for name, camera in self._unverified.cameras.items()
-            if boots.get(name, "")
-            and boots[name] == self._unverified_boots.get(name)
-            and abs(self.delays.get(name, np.inf) - self._unverified_delays.get(name, -np.inf)) < _SAME_CLOCK_S
+            for name, camera in heard.items()
+            if boots[name] == self._unverified_boots.get(name) and abs(shifts[name]) < _SAME_CLOCK_S
         }
+        if self._unverified_arrival is not None and len(kept) < len(last.cameras):
+            fresh = {
+                name: camera for name, camera in heard.items() if name in self._fresh and np.isfinite(shifts[name])
+            }
+            if len(fresh) < 2 or last.reference not in fresh:
+                return []
+            self._heard_two_at = min(self._heard_two_at, self._now)
+            if len(fresh) < len(last.cameras) and self._now < self._heard_two_at + _ALL_HEARD_S:
+                return []
+            kept = {
+                name: on_new_clock(
+                    camera,
+                    shifts[name] - shifts[last.reference],
+                    self._unverified_arrival - self._unverified_delays[name] - self._camera_time[name],
+                )
+                for name, camera in fresh.items()
+            }
+            last = self._unverified = replace(last, cameras=kept)
         if len(kept) < 2:
             return []  # not heard of yet, a backlog, or clocks that it does not know
         self._unverified_since = self._now
@@ -697,6 +749,19 @@ class LiveHub:
         source = self._source()
         boots = {name: self._solved_boot_ids.get(name) or source.boot(name) for name in calibration.cameras}
         return self.clocks.to_present(calibration, boots)
+
+
+def on_new_clock(camera: CameraCalibration, shift: float, elapsed: float) -> CameraCalibration:
+    """A calibrated camera whose clock, or whose reference camera's, began anew, by delays against the hub's clock.
+
+    A camera's delay is the hub's clock less its own. shift: its delay now less then, less the same of the reference
+    camera: what the hub's clock was set by meanwhile cancels. elapsed: its time then less now [s], over which its rate
+    counts. Both differ from the truth by the variation of the network's delays.
+    """
+    rate = camera.time_map.clock_rate
+    offset = camera.time_map.time_offset + shift + (rate - 1.0) * elapsed
+    std = float(np.hypot(camera.time_offset_std, ERROR_BOUND_S))
+    return replace(camera, time_map=TimeMap(rate, offset), time_offset_std=std)
 
 
 def _listed(names: Iterable[str], most: int = 16) -> str:

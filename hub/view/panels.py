@@ -52,6 +52,7 @@ def overview(state: ViewState, now: float) -> str:
     if problems := state.problems(now):
         lines.append(f"<br><b data-syncline='health'>▲ degraded: {html.escape('; '.join(problems))}</b>")
     lines.append("</p>")
+    lines.append(waiting_html(state))
     if needs_guidance(state):
         lines += [f"<p data-syncline='guide'>☞ {html.escape(step)}</p>" for step in state.next_steps()]
     for path in list(state.paths.values())[: -_MAX_TRACKS - 1 : -1]:
@@ -64,6 +65,24 @@ def overview(state: ViewState, now: float) -> str:
             result = agent.status.message.rpartition("; ")[2]
             lines.append(f"<p>{html.escape(f'{agent.status.agent}: {result}')}</p>")
     return f"{_STYLE}<div class='sl'>{''.join(lines)}</div>"
+
+
+def waiting_html(state: ViewState) -> str:
+    """While nothing is solved: what each camera is waited for, with how far it is; "" once something is."""
+    if state.solved is not None:
+        return ""
+    rows = []
+    for camera in state.cameras.values():
+        progress, share = camera.progress, state.guidance.coverage(camera.name)
+        parts = [camera.reason[:120]] if camera.reason else []
+        if progress is not None:
+            parts.append(f"{progress.shared_motion_s:.0f} s of motion shared with another camera")
+        parts.append(f"marker seen in {100 * share:.0f} % of its view, {100 * MIN_COVERAGE:.0f} % wanted")
+        name = html.escape(camera.name, quote=True)
+        bar = f"<progress max='1' value='{min(share / MIN_COVERAGE, 1.0):.2f}'></progress>"
+        words = html.escape(f"{camera.verdict}: {' · '.join(parts)}")
+        rows.append(f"<p data-waiting='{name}'>{SIGNS[camera.verdict]} {name} {bar}<br>{words}</p>")
+    return "".join(rows)
 
 
 def track_text(path: PathView, now: float) -> str:

@@ -44,6 +44,7 @@ _IDLE_TICK_S = 0.1
 _MIN_REST_S = 0.01
 _DRAW_S = 0.2
 _PANEL_S = 0.5
+_CONNECTION_S = 1.0  # between two looks whether the router is there
 _UNWATCHED_S = 1.0  # redraw interval without an open browser
 _ROLE_OF_ACTION = {"start_recording": "record", "stop_recording": "record", "recalibrate": "hub", "export": "hub"}
 
@@ -114,10 +115,14 @@ def run_view(
     pictures: Subscription | None = None
     sequence = 0
     redraw, cycle = _RedrawTimer(), _Cycle()
+    next_look = 0.0
     try:
         with bus.announce(ROLE, name, boot):
             while not stop.wait(cycle.rest(view.watched)):
                 now, wall = time.monotonic(), time.time_ns()
+                if now >= next_look:
+                    next_look = now + _CONNECTION_S
+                    state.lost_at = None if bus.connected() else state.lost_at or now
                 for event in watch.drain():
                     state.presence(event.role, event.agent, event.alive, event.boot_id)
                 # Images are subscribed to only while a browser is open.

@@ -177,6 +177,8 @@ class ViewState:
         self.solved: pb.Calibration | None = None
         self.guidance = CoverageMonitor()
         self.revision = 0
+        self.lost_at: float | None = None
+        """Since when this view reaches nobody, as when its router has ended."""
 
     def handle(self, message: Message, now: float) -> None:
         """Process one message from the bus or a log."""
@@ -252,7 +254,8 @@ class ViewState:
 
     def problems(self, now: float) -> list[str]:
         """What is wrong with the agents of the site, by name; empty while all are well."""
-        out = [] if self._is_static else [text for camera in self.cameras.values() if (text := _absence(camera, now))]
+        out = [] if self.lost_at is None else [f"this view reaches no router for {now - self.lost_at:.0f} s"]
+        out += [] if self._is_static else [text for camera in self.cameras.values() if (text := _absence(camera, now))]
         for name, agent in sorted(self.agents.items()):
             role, status = agent.status.role, agent.status
             if not agent.alive:

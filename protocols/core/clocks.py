@@ -7,6 +7,7 @@ Unix time or 0; only differences on one camera mean anything.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import NewType
 
 CameraTime = NewType("CameraTime", float)
@@ -17,6 +18,13 @@ BusTime = NewType("BusTime", int)
 """Nanoseconds on the recorder's clock (log time); never used as a capture time."""
 
 NANOSECONDS = 1_000_000_000
+UNSET_CLOCK_UNIX_S = 1_735_689_600.0
+"""2025: a machine whose Unix time is before that has a clock that was never set."""
+
+
+def utc_text(unix_s: float) -> str:
+    """A Unix time for a person: 2026-11-24 06:40:00 UTC."""
+    return f"{datetime.fromtimestamp(unix_s, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 @dataclass(frozen=True, slots=True)

@@ -62,6 +62,11 @@ def read_text(file: Path, what: str = "file", most: int = MAX_TEXT) -> str:
 def read_toml(file: Path, what: str = "file") -> tuple[dict[str, Any], str]:
     """The parsed TOML file and its text. Raises InputError with file, line and remedy."""
     text = read_text(file, what, MAX_TOML)
+    return parse_toml(text, file), text
+
+
+def parse_toml(text: str, file: Path) -> dict[str, Any]:
+    """A TOML text, parsed; file: what errors name."""
     for key in _KEY.finditer(text):
         if key[0].count(".") > _MAX_PARTS and len(re.findall(_PART, key[0])) > _MAX_PARTS:
             line = text.count("\n", 0, key.start()) + 1
@@ -70,7 +75,7 @@ def read_toml(file: Path, what: str = "file") -> tuple[dict[str, Any], str]:
     try:
         values = tomllib.loads(text)
         _check_integers(values)
-        return values, text
+        return values
     except (RecursionError, OverflowError):
         raise InputError(
             "nested too deeply or a number too large", file=file, remedy="write a plain TOML file"

@@ -7,14 +7,24 @@ from __future__ import annotations
 
 import os
 import platform
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 from deploy.site.bundle import BUDGET_MB, Bundle, Target, folder_size_mb, make_bundle
+from protocols.bus.settings import BusConfig
+from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.core.errors import InputError
+from protocols.topics import STATUS
+from tests.faults.processes import ROOT, wait_until
+from tests.support import image_builds
 
 HERE = f"{sys.version_info.major}.{sys.version_info.minor}"
 CONFIG = {
@@ -36,9 +46,24 @@ def made(role: str, target: Target, out: Path) -> Bundle:
         raise
 
 
+@pytest.fixture(scope="module")
+def own_bundle(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Bundle]:
+    """The bundle of a role for this machine, made once."""
+    bundles: dict[str, Bundle] = {}
+
+    def get(role: str) -> Bundle:
+        if role not in bundles:
+            bundles[role] = made(role, Target(platform.machine(), HERE), tmp_path_factory.mktemp(role) / "bundle")
+        return bundles[role]
+
+    return get
+
+
 @pytest.mark.parametrize("role", sorted(CONFIG))
-def test_a_bundle_installs_without_an_index_and_its_agent_runs(role: str, tmp_path: Path) -> None:
-    bundle = made(role, Target(platform.machine(), HERE), tmp_path / "bundle")
+def test_a_bundle_installs_without_an_index_and_its_agent_runs(
+    role: str, tmp_path: Path, own_bundle: Callable[[str], Bundle]
+) -> None:
+    bundle = own_bundle(role)
     board = tmp_path / "board"
     for _ in range(2):  # twice: a newer bundle is installed over an older one the same way
         ended = subprocess.run(
@@ -47,7 +72,7 @@ def test_a_bundle_installs_without_an_index_and_its_agent_runs(role: str, tmp_pa
             text=True,
             timeout=300,
             check=False,
-            env={**OFFLINE, "PYTHON": sys.executable},
+            env={**OFFLINE, "SYNCLINE_PYTHON": sys.executable, "PYTHON": "3.11"},
         )
         assert ended.returncode == 0, ended.stderr
     if role in BUDGET_MB:
@@ -93,3 +118,65 @@ def test_a_board_of_another_architecture_stays_within_its_budget(role: str, tmp_
     assert any("aarch64" in name for name in wheels)
     assert not any("x86_64" in name for name in wheels)
     assert len((bundle.out / "requirements.txt").read_text().splitlines()) == len(wheels) - 1, "all but pip"
+
+
+CONTAINERS = ROOT / "deploy" / "site" / "containers"
+DEBIAN_PYTHON = Path("/usr/bin/python3")
+
+
+@pytest.fixture(scope="module")
+def images(
+    tmp_path_factory: pytest.TempPathFactory, own_bundle: Callable[[str], Bundle]
+) -> Iterator[dict[str, image_builds.Image]]:
+    """The images of a site, built from the Containerfile in clean roots without a network."""
+    if not image_builds.permitted():
+        pytest.skip("NOT TRIED: mounts and namespaces are not permitted here")
+    version = subprocess.run([str(DEBIAN_PYTHON), "--version"], capture_output=True, text=True, check=False).stdout
+    if not version.startswith(f"Python {HERE}."):
+        pytest.skip(f"NOT TRIED: the system's Python is not {HERE}: IMAGES ARE NOT BUILT")
+    context = tmp_path_factory.mktemp("context")
+    shutil.copy(CONTAINERS / "Containerfile", context)
+    built = {}
+    for role in ("router", "hub", "recorder", "camera"):
+        shutil.copytree(own_bundle(role).out, context / "bundles" / role)
+        place = tmp_path_factory.mktemp(f"image-{role}")
+        # As an engine has it: the names of ARG and ENV are the environment of RUN.
+        built[role] = image_builds.build(context / "Containerfile", role, place, {"PYTHON_VERSION": HERE})
+    return built
+
+
+def test_the_site_of_the_compose_file_runs_from_images_built_without_a_network(
+    images: dict[str, image_builds.Image], tmp_path: Path
+) -> None:
+    services: dict[str, Any] = yaml.safe_load((CONTAINERS / "compose.yaml").read_text(encoding="utf-8"))["services"]
+    with ExitStack() as stack:
+        for name, service in services.items():
+            image = images[service["image"].removeprefix("syncline-")]
+            given, _, place = service["volumes"][0].partition(":")
+            config = tmp_path / f"{name}.toml"
+            text = (CONTAINERS / given).read_text(encoding="utf-8").replace('driver = "video"', 'driver = "simulated"')
+            config.write_text(text, encoding="utf-8")
+            state = tmp_path / f"{name}-state"
+            state.mkdir()
+            os.chown(state, 10001, 10001)
+            binds = {config: place.partition(":")[0], state: "/var/lib/syncline"}
+            words = image.words((*image.entrypoint, *image.command), network=True, binds=binds, sealed=True)
+            log = stack.enter_context((tmp_path / f"{name}.txt").open("wb"))
+            process = subprocess.Popen(words, stdout=log, stderr=subprocess.STDOUT)
+            stack.callback(process.wait)
+            stack.callback(process.terminate)
+        states: dict[str, str] = {}
+        with open_bus("room", BusConfig(mode="client"), timeout_s=30.0) as bus:
+            statuses = bus.subscribe(STATUS)
+
+            def all_run() -> bool:
+                for one in statuses.drain():
+                    states[one.message.agent] = one.message.state  # type: ignore[attr-defined]
+                return all(states.get(name) == "running" for name in services)
+
+            try:
+                wait_until(all_run, 60.0)
+            except AssertionError:
+                logs = {name: (tmp_path / f"{name}.txt").read_text(encoding="utf-8") for name in services}
+                raise AssertionError(f"{states} {logs}") from None
+        assert list((tmp_path / "recorder-state").glob("*.mcap"))

@@ -190,6 +190,6 @@ def _make_view_server(port: int) -> ViewServer:
     try:
         from hub.view.server import ViewServer
     except ImportError:
-        remedy = 'install it: pip install "syncline[view]", or give --headless'
+        remedy = 'pip install "syncline[view]" (without a network: the bundle of a hub), or give --headless'
         raise InputError("the page needs viser", remedy=remedy) from None
     return ViewServer(port=port, actions=("recalibrate",))

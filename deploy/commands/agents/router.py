@@ -16,6 +16,7 @@ from protocols.core.errors import EXIT_BUG, EXIT_DONE
 
 if TYPE_CHECKING:
     from deploy.agents.systemd_notify import Notifier
+    from protocols.messages.syncline_pb2 import AgentStatus
 
 _RESTARTS = "SYNCLINE_ROUTER_RESTARTS"
 """Environment variable that carries the restart count over an exec; informational only."""
@@ -41,6 +42,7 @@ def router(config: Path, /, *, print_config: Annotated[bool, Parameter(negative=
     if print_config:
         print(effective_toml(settings), end="")
         return EXIT_DONE
+    from deploy.agents.conditions import Conditions
     from deploy.agents.health import Health
     from deploy.agents.startup_checks import check_startup, serve_health
     from protocols.bus.base import BusDead
@@ -57,7 +59,13 @@ def router(config: Path, /, *, print_config: Annotated[bool, Parameter(negative=
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
     stop = stop_on_signals()
-    health = Health()
+    conditions = Conditions(settings, lambda: True)
+
+    def seen(status: AgentStatus) -> None:
+        conditions.amend(status)
+        health.seen(status)
+
+    health = Health(site=settings.site, role="router", agent=settings.id)
     try:
         with serve_health(settings, health):
             run_router(
@@ -69,7 +77,7 @@ def router(config: Path, /, *, print_config: Annotated[bool, Parameter(negative=
                 restarts=restarts,
                 ready=lambda listen: print(f"relays at {', '.join(listen)}", flush=True),
                 beat=(lambda: None) if notifier is None else notifier.beat,
-                seen=health.seen,
+                seen=seen,
             )
     except RulesChanged:
         time.sleep(0.2)  # the file was renamed into place, but more files of the same `keys issue` may follow

@@ -15,11 +15,12 @@ from cyclopts import Parameter
 from deploy.agents.signals import stop_on_signals
 from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig, effective_toml, load
 from protocols.bus.settings import BusConfig
-from protocols.core.errors import EXIT_BUG, EXIT_DONE, EXIT_INPUT
+from protocols.core.errors import EXIT_BUG, EXIT_DONE
 
 if TYPE_CHECKING:
     from deploy.agents.systemd_notify import Notifier
 
+_PROGRESS_S = 5.0
 PrintConfig = Annotated[bool, Parameter(negative="")]
 
 
@@ -109,7 +110,7 @@ def record(config: Path, /, *, print_config: PrintConfig = False) -> int:
     ----------
     config
         TOML file: id, site, [bus], out (a .mcap file, or a folder for files named by start time), part_s, part_mb,
-        min_free_mb, foxglove.
+        keep_days, keep_mb, keep_free_mb, min_free_mb, foxglove.
     print_config
         Show the configuration with all defaults filled in, and stop.
     """
@@ -122,9 +123,6 @@ def record(config: Path, /, *, print_config: PrintConfig = False) -> int:
     def start(bus: Any, stop: Any, beat: Any) -> int:
         result = record_on_command(settings, bus, stop, beat=beat, report=lambda line: print(line, flush=True))
         print(f"recorded {result.messages} messages to {result.path}" + _more_parts(result.parts))
-        if result.stopped:
-            print(f"syncline: recording ended: {result.stopped}; the log is complete; free disk space", file=sys.stderr)
-            return EXIT_INPUT
         return EXIT_DONE
 
     return _with_bus(settings, start)
@@ -139,9 +137,10 @@ def _with_bus(settings: Any, start: Any) -> int:
 
     If the bus fails, the process ends with one line and status 1, so that its supervisor restarts it.
     """
+    from deploy.agents.conditions import Conditions
     from deploy.agents.health import Health
     from deploy.agents.malloc_tuning import limit_heap_growth
-    from deploy.agents.startup_checks import check_startup, serve_health
+    from deploy.agents.startup_checks import check_startup, role_of, serve_health
     from deploy.agents.systemd_notify import Notifier
     from protocols.bus.base import BusDead, BusStopped
     from protocols.bus.security.sender_identity import SenderCheckedBus
@@ -151,13 +150,15 @@ def _with_bus(settings: Any, start: Any) -> int:
     check_startup(settings)
     stop = stop_on_signals()
     notifier = Notifier.from_environment()
-    health = Health()
+    health = Health(site=settings.site, role=role_of(settings), agent=settings.id)
     try:
         with (
             serve_health(settings, health),
             open_bus(settings.site, settings.bus, stop=_stop_condition(stop, settings.bus, notifier)) as bus,
         ):
-            guarded = SenderCheckedBus(bus, time.monotonic, seen=health.seen, refused=health.refused)
+            amend = Conditions(settings, bus.connected).amend
+            show = _progress_lines(health.seen)
+            guarded = SenderCheckedBus(bus, time.monotonic, amend=amend, seen=show, refused=health.refused)
             try:
                 return int(start(guarded, stop, lambda: notifier.beat(ending=stop.is_set())))
             except BusDead as error:
@@ -167,6 +168,21 @@ def _with_bus(settings: Any, start: Any) -> int:
         return EXIT_DONE
     finally:
         notifier.stopping()
+
+
+def _progress_lines(seen: Callable[[Any], None]) -> Callable[[Any], None]:
+    """Passes statuses on; of an agent that is starting, prints every few seconds what it waits for."""
+    printed, text = -_PROGRESS_S, ""
+
+    def show(status: Any) -> None:
+        nonlocal printed, text
+        seen(status)
+        now = time.monotonic()
+        if status.state == "starting" and status.message != text and now - printed >= _PROGRESS_S:
+            printed, text = now, status.message
+            print(text, flush=True)
+
+    return show
 
 
 def _stop_condition(stop: threading.Event, bus: BusConfig, notifier: Notifier) -> Callable[[], bool]:

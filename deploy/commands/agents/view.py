@@ -165,7 +165,10 @@ def _server(listen: str, port: int, token: str, look_only: bool) -> Callable[[An
     try:
         from hub.view.server import ViewServer
     except ImportError:
-        raise InputError("the view needs viser", remedy='install it: pip install "syncline[view]"') from None
+        raise InputError(
+            "the view needs viser",
+            remedy='pip install "syncline[view]"; without a network: the bundle of a hub, or --extra view of another',
+        ) from None
     return lambda player: ViewServer(listen, port, token=token, look_only=look_only, player=player)
 
 

@@ -98,7 +98,7 @@ def replay(
     rate: str = "1",
     start: float = 0.0,
     loop: Annotated[bool, Parameter(negative="")] = False,
-    topics: list[str] | None = None,
+    topics: Annotated[list[str] | None, Parameter(consume_multiple=True, negative="")] = None,
     compare: Path | None = None,
     tolerance: list[str] | None = None,
     through: Literal["hub", "uav"] | None = None,
@@ -127,7 +127,7 @@ def replay(
     loop
         Start again at the end, until stopped; every round has new boot ids, as if the agents had been restarted.
     topics
-        Only these topics of the catalogue; default: all.
+        Only these topics of the catalogue, one or several; default: all.
     compare
         Publish nothing; compare with this log instead.
     tolerance

@@ -172,6 +172,6 @@ def _lines(quiet: bool) -> Callable[[Fleet], None]:
         active = sum(bool(seen.counters.get("frames")) for seen in cameras)
         frames = sum(seen.counters.get("frames", 0) for seen in cameras)
         hubs = "; ".join(f"{hub} {text}" for hub, text in fleet.calibrations.items())
-        print(f"{fleet.elapsed:6.1f} s  {active}/{len(cameras)} cameras, {frames} frames  {hubs[:160]}", flush=True)
+        print(f"{fleet.elapsed:6.1f} s  {active}/{len(cameras)} cameras, {frames} frames  {hubs[:300]}", flush=True)
 
     return show

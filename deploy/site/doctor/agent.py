@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from deploy.site.doctor import network
 from deploy.site.doctor.check_result import CheckResult, misconfigured, ok, skip, unavailable, warn
 from edge.devices.base import Device
 from protocols.bus.settings import BusConfig, is_loopback, unprotected_listeners
@@ -110,12 +111,23 @@ def bus_path(bus: BusConfig, site: str, role: str, agent: str, patience_s: float
             return unavailable(
                 "bus",
                 f"{where} accepts the connection, but relays no messages",
-                "restart the router (`systemctl restart syncline-router-…`); with certificates, issue them again",
+                "restart the router (`systemctl restart syncline-router-…`)"
+                + (
+                    ""
+                    if bus.tls is None
+                    else "; its rules may lack this agent: issue again, and copy zenoh.json5 to it"
+                ),
             )
         large = round_trip(config, prefix, _LARGE, timeout_s=patience_s)
     except (InputError, BusDead) as error:
-        remedy = getattr(error, "remedy", "") or "restart the router"
-        return unavailable("bus", getattr(error, "what", str(error)), remedy)
+        what, remedy = getattr(error, "what", str(error)), getattr(error, "remedy", "") or "restart the router"
+        if "no router answers" in what:
+            for endpoint in config.connect:
+                if (unreachable := network.reach(endpoint)) is not None:
+                    return unreachable
+            what = f"{where} accepts connections, but does not speak as a router: it hangs, or is another program"
+            remedy = "restart the router; `ss -ltnp` there says what listens"
+        return unavailable("bus", what, remedy)
     if large is None:
         return unavailable(
             "bus",

@@ -6,9 +6,11 @@ All inputs are files below ``root`` or arguments, so that tests can simulate eve
 from __future__ import annotations
 
 import ctypes
+import json
 import os
 import platform
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -18,6 +20,7 @@ from pathlib import Path
 
 from deploy.site.doctor.check_result import CheckResult, misconfigured, ok, skip, warn
 from edge.agents.clock_quality import kernel_clock
+from protocols.core.clocks import UNSET_CLOCK_UNIX_S, utc_text
 
 PACKAGES: dict[str, tuple[str, ...]] = {
     "": ("numpy", "zenoh", "msgspec", "google.protobuf"),
@@ -34,7 +37,6 @@ _RECOMMENDED = {"usb": (("linuxpy", "frames are stamped on arrival, and lost one
 _EXTRAS = {"pymavlink": "uav", "serial": "uav", "depthai": "oak", "linuxpy": "v4l2", "av": "video"}
 _MAX_TEMPERATURE_C = 80.0  # boards throttle above about this
 _LOW_DISK_MB = 2000.0  # about two hours of four cameras
-_MIN_UNIX_S = 1_735_689_600.0  # 2025: before that a clock was never set
 Run = Callable[[Sequence[str]], tuple[int, str]]
 
 
@@ -61,7 +63,11 @@ def packages(
     if not gone:
         worse = [one for kind in kinds for one in _RECOMMENDED.get(kind, ()) if not _is_installed(one[0], there)]
         for name, what in worse:
-            return warn("packages", f"{name} missing: {what}", f'pip install "syncline[{_EXTRAS[name]}]"')
+            return warn(
+                "packages",
+                f"{name} missing: {what}",
+                f'pip install "syncline[{_EXTRAS[name]}]"; without a network: bundle --extra {_EXTRAS[name]}',
+            )
         return ok("packages", f"{len(wanted)} of {len(wanted)} are installed")
     extras = sorted({_EXTRAS[name] for name in gone if name in _EXTRAS})
     how = f'pip install "syncline[{",".join(extras)}]"' if extras else "pip install --force-reinstall syncline"
@@ -112,7 +118,9 @@ def _celsius(file: Path) -> float:
 
 def disk(folder: Path, least_mb: float = 0.0, free: Callable[[Path], int] | None = None) -> CheckResult:
     """Check free space and permissions of an agent's output folder. least_mb: a recorder's min_free_mb."""
-    place = next(parent for parent in (folder, *folder.absolute().parents) if parent.is_dir())
+    place = next(parent for parent in (folder, *folder.absolute().parents) if os.path.isdir(parent))  # noqa: PTH112
+    if not os.access(place, os.X_OK):  # Path.is_dir raises below such a folder
+        return misconfigured("disk", f"{place} may not be entered by this user", "give rights there, or ask as root")
     left = (free(place) if free else shutil.disk_usage(place).free) / 1e6
     text = f"{left / 1000.0:.1f} GB free at {place}"
     if left < max(least_mb, 50.0):
@@ -206,21 +214,39 @@ def _text(file: Path) -> str:
 
 
 def clock(
-    certificates: bool, state: Callable[[], tuple[bool, float]] = kernel_clock, now: Callable[[], float] = time.time
+    certificates: bool,
+    state: Callable[[], tuple[bool, float]] = kernel_clock,
+    now: Callable[[], float] = time.time,
+    ask: Run | None = None,
 ) -> CheckResult:
-    """Check the machine's Unix time. Certificates and log names need it; timing between cameras does not."""
-    if now() < _MIN_UNIX_S:
+    """Check the machine's Unix time and name its source. Certificates and log names need it; camera timing does not."""
+    source = time_source(ask or run)
+    if now() < UNSET_CLOCK_UNIX_S:
         remedy = "set it: `sudo timedatectl set-ntp true` with a network, `sudo date -s …` without one"
-        text = f"the clock is at {time.strftime('%Y-%m-%d', time.gmtime(now()))}: it was never set"
+        text = f"the clock is at {utc_text(now())}: it was never set; time source: {source}"
         return misconfigured("clock", text, remedy) if certificates else warn("clock", text, remedy)
     synchronised, error = state()
     if not synchronised:
         return warn(
             "clock",
-            "not synchronised",
+            f"not synchronised; time source: {source}",
             "install chrony (or `sudo timedatectl set-ntp true`): names of logs need it, timing of cameras does not",
         )
-    return ok("clock", f"synchronised, within {1e3 * error:.0f} ms")
+    return ok("clock", f"synchronised, within {1e3 * error:.0f} ms; time source: {source}")
+
+
+def time_source(ask: Run) -> str:
+    """Where this machine takes its time from, as chrony or systemd-timesyncd says."""
+    status, text = ask(("chronyc", "-c", "tracking"))
+    fields = text.strip().split(",")
+    if status == 0 and len(fields) > 3:
+        name = fields[1] or fields[0]
+        return "chrony, without a source yet" if name in ("", "0.0.0.0", "00000000") else f"{name}, by chrony"
+    status, text = ask(("timedatectl", "show-timesync", "--property=ServerName", "--property=ServerAddress"))
+    values = dict(line.partition("=")[::2] for line in text.splitlines())
+    if status == 0 and values.get("ServerName"):
+        return f"{values['ServerName']} ({values.get('ServerAddress') or 'no answer yet'}), by systemd-timesyncd"
+    return "none known"
 
 
 def run(command: Sequence[str]) -> tuple[int, str]:
@@ -237,13 +263,22 @@ _CRASHES = {
     "oom-kill": "the memory was full: fewer or smaller cameras on this board, or window_s of a hub shorter",
     "core-dump": "it crashed in a driver or library: update Syncline, and report `coredumpctl info {unit}`",
     "signal": "somebody or something killed it: `journalctl -u {unit}`",
-    "exit-code": "it refused to run: `journalctl -u {unit} -n 20` shows the reason",
+    "exit-code": "it ended by itself: `journalctl -u {unit} -n 20` shows the reason",
     "timeout": "it did not start in time: is the router up? `journalctl -u {unit}`",
+    "": "the journal does not say why (ask as root): `journalctl -u {unit} -n 50`",
 }
+_ENDS = {
+    "98e322203f7a4ed290d09fe03c09fe15": ("EXIT_CODE", "EXIT_STATUS"),
+    "d9b373ed55a64feb8242e02dbe79a49c": ("UNIT_RESULT", ""),
+}
+"""systemd's journal messages of a process that ended and of a unit that failed (sd-messages.h), and their fields."""
 
 
 def crash(unit: str, run: Run = run) -> CheckResult:
-    """Check how a service last ended, and how often it was restarted. unit: its name; patterns are allowed."""
+    """Check how a service last ended, and how often it was restarted. unit: its name; patterns are allowed.
+
+    A service that was restarted is well again, and systemd has forgotten why: the journal has not.
+    """
     status, text = run(["systemctl", "show", unit, "--property=Id,Result,NRestarts,ActiveState,ExecMainStatus"])
     if status == 127:
         return skip("last crash", "no systemd here")
@@ -257,9 +292,40 @@ def crash(unit: str, run: Run = run) -> CheckResult:
             continue
         count += 1
         if result != "success" or restarts not in ("0", ""):
-            why = result if result != "success" else "exit-code"
+            why, how = _last_end(name, run)
+            why = result if result != "success" else why
             remedy = _CRASHES.get(why, "`journalctl -u {unit}`").format(unit=name)
-            worst = warn("last crash", f"{name}: {result}, restarted {restarts or 0} times", remedy)
+            said = f"{why or 'ended'}{how}, restarted {restarts or 0} times"
+            worst = warn("last crash", f"{name}: {said}", remedy)
     return worst or (
         ok("last crash", f"none of {count} service(s)") if count else skip("last crash", "not installed as a service")
     )
+
+
+def _last_end(unit: str, run: Run) -> tuple[str, str]:
+    """(systemd's result, how the process ended) of a unit's last failure, by the journal; "" for what it lacks."""
+    command = ["journalctl", f"--unit={unit}", "--output=json", "--reverse", "--lines=20", "--no-pager"]
+    status, text = run([*command, *(f"MESSAGE_ID={number}" for number in _ENDS)])
+    result = how = ""
+    for line in text.splitlines() if status == 0 else ():
+        try:
+            entry = json.loads(line)
+            first, second = (str(entry.get(field, "")) for field in _ENDS[entry["MESSAGE_ID"]])
+        except (ValueError, KeyError, AttributeError, TypeError):
+            continue
+        if second and not how:
+            how = f" by {signal_name(second)}" if first != "exited" else f" with status {second}"
+            result = result or {"exited": "exit-code", "dumped": "core-dump"}.get(first, "signal")
+        elif not second and not how:
+            result = first
+        if how:
+            break
+    return result, f" ({how.strip()})" if how else ""
+
+
+def signal_name(text: str) -> str:
+    """SIGKILL for KILL and 9."""
+    try:
+        return signal.Signals(int(text)).name
+    except ValueError:
+        return text if text.startswith("SIG") else f"SIG{text}"

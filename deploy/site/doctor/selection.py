@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from deploy.site.doctor import agent as agents
-from deploy.site.doctor import autopilot, machine
+from deploy.site.doctor import autopilot, machine, network
 from deploy.site.doctor.check_result import CheckResult, skip, unavailable
 from deploy.site.install import units
 from deploy.site.rig_folder import role_of
@@ -15,14 +15,17 @@ from protocols.core.errors import InputError
 
 
 def run_checks(file: Path | None, role: str | None = None) -> Iterator[CheckResult]:
-    """Yield the result of each check as soon as it is known. file: an agent's configuration; None = machine only."""
+    """Yield the result of each check as soon as it is known. file: an agent's configuration; None = machine only.
+
+    A check that cannot be made, as of a folder that this user may not read, is one failed line, and the others go on.
+    """
     yield machine.python()
-    yield machine.cpu()
+    yield from _one("cpu", machine.cpu)
     if file is None:
         yield machine.packages(())
-        yield machine.disk(Path.cwd())
+        yield from _one("disk", lambda: machine.disk(Path.cwd()))
         yield machine.clock(certificates=False)
-        yield machine.crash("syncline-*")
+        yield from _one("last crash", lambda: machine.crash("syncline-*"))
         return
     kind = role or role_from_path(file)
     found, config = agents.configuration(file, kind)
@@ -31,15 +34,28 @@ def run_checks(file: Path | None, role: str | None = None) -> Iterator[CheckResu
         return
     driver = getattr(config, "driver", "")
     yield machine.packages((kind, driver))
-    yield machine.disk(getattr(config, "out", None) or Path.cwd(), getattr(config, "min_free_mb", 0.0))
+    out, least_mb = getattr(config, "out", None) or Path.cwd(), getattr(config, "min_free_mb", 0.0)
+    yield from _one("disk", lambda: machine.disk(out, least_mb))
     yield machine.clock(certificates=config.bus.tls is not None)
-    yield from _check_camera(config, driver)
-    yield agents.certificates(config.bus, kind, config.id)
-    yield agents.bus_path(config.bus, config.site, kind, config.id)
-    yield agents.access_rights(config.bus, config.site, kind, config.id)
+    yield from _all("camera", lambda: _check_camera(config, driver))
+    yield from _one("certificates", lambda: agents.certificates(config.bus, kind, config.id))
+    yield from _one("bus", lambda: agents.bus_path(config.bus, config.site, kind, config.id))
+    yield from _one("access rules", lambda: agents.access_rights(config.bus, config.site, kind, config.id))
     if kind == "uav":
-        yield from autopilot.check(config)
-    yield machine.crash(f"syncline-{kind}-{config.id}.service")
+        yield from _all("mavlink", lambda: autopilot.check(config))
+    yield from _one("health", lambda: network.running_agent(config))
+    yield from _one("last crash", lambda: machine.crash(f"syncline-{kind}-{config.id}.service"))
+
+
+def _one(name: str, check: Callable[[], CheckResult]) -> Iterator[CheckResult]:
+    return _all(name, lambda: iter((check(),)))
+
+
+def _all(name: str, checks: Callable[[], Iterator[CheckResult]]) -> Iterator[CheckResult]:
+    try:
+        yield from checks()
+    except (OSError, InputError) as error:
+        yield network.guarded(name, error)
 
 
 def role_from_path(file: Path) -> str:

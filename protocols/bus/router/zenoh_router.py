@@ -77,9 +77,9 @@ def run_router(
     """Relay until ``stop`` is set, monitor the data path with a canary, and publish the router's status.
 
     restarts: number of restarts so far, for the status. ready: called with the endpoints once messages pass; beat:
-    called in every round from then on; seen: called with every status. died: called when no message has passed for
-    DEAD_AFTER_S although the process is alive; it must replace the process and not return, because closing a router in
-    that state may hang. Raises RulesChanged where the router must be reopened.
+    called in every round from then on; seen: called with every status before it is published; may add to it. died:
+    called when no message has passed for DEAD_AFTER_S although the process is alive; it must replace the process and
+    not return, because closing a router in that state may hang. Raises RulesChanged where the router must be reopened.
     """
     boot = uuid.uuid4().hex
     config = msgspec.structs.replace(config, listen=tuple(map(_with_port, config.endpoints()[1])))
@@ -115,8 +115,8 @@ def run_router(
                     gauges={"canary_s": canary.delay_s, "sessions": router.sessions()},
                     version=VERSION,
                 )
-                publisher.put(status)
                 seen(status)
+                publisher.put(status)
         publisher.close()
     canary.close()
     router.close()

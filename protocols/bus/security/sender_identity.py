@@ -168,8 +168,9 @@ class _StatusPublisher:
 class SenderCheckedBus:
     """A bus whose subscriptions accept only messages of verified senders. See ``protocols.bus.base.Bus``.
 
-    now: a monotonic clock [s]. seen: called with every status that this process publishes. refused: called with every
-    rejection that is reported (their number is bounded).
+    now: a monotonic clock [s]. amend: called with every status before it is published; may add to it. seen: called with
+    every status that this process publishes. refused: called with every rejection that is reported (their number is
+    bounded).
     """
 
     def __init__(
@@ -177,12 +178,13 @@ class SenderCheckedBus:
         bus: Bus,
         now: Callable[[], float],
         *,
+        amend: Callable[[pb.AgentStatus], None] = lambda status: None,
         seen: Callable[[pb.AgentStatus], None] = lambda status: None,
         refused: Callable[[Refusal], None] = lambda refusal: None,
     ) -> None:
         self._bus = bus
         self.now = now
-        self._seen, self._refused = seen, refused
+        self._amend, self._seen, self._refused = amend, seen, refused
         self.guard = SenderValidator()
         self._watch: AgentWatch | None = None
         self._by_source: Counter[tuple[str, str]] = Counter()
@@ -261,5 +263,6 @@ class SenderCheckedBus:
             whole.message = "; ".join([*alarms, whole.message])[:1000]
             if whole.state == "running":
                 whole.state = "degraded"
+        self._amend(whole)
         self._seen(whole)
         return whole

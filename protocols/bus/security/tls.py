@@ -11,12 +11,12 @@ import socket
 import ssl
 import stat
 import time
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from protocols.bus.security.access import certificate_owner
 from protocols.bus.settings import TlsConfig, split_endpoint
+from protocols.core.clocks import utc_text
 from protocols.core.errors import InputError
 from protocols.core.names import key_segment
 
@@ -47,12 +47,15 @@ def check_files(tls: TlsConfig) -> None:
             file=tls.certificate,
             remedy="issue them again with `syncline keys issue`",
         ) from None
-    left = days_left(tls.certificate)
-    if left <= 0.0:
+    problem = validity_problem(period := validity(tls.certificate), time.time())
+    if problem:
+        behind = time.time() < period[0]
         raise InputError(
-            f"bus.tls: the certificate expired {-left:.1f} days ago",
+            f"bus.tls: {problem}",
             file=tls.certificate,
-            remedy="renew it with `syncline keys issue`",
+            remedy="set this machine's clock (`syncline doctor` says where it takes the time from)"
+            if behind
+            else "renew it: `syncline site renew`, or `syncline keys issue`",
         )
 
 
@@ -62,12 +65,39 @@ def _decoded(certificate: Path) -> dict[str, Any]:
     return dict(decode(str(certificate)))
 
 
+def validity(certificate: Path) -> tuple[float, float]:
+    """(begin, end) of a PEM certificate's validity, Unix [s]. Raises InputError where it cannot be read."""
+    try:
+        fields = _decoded(certificate)
+    except (OSError, ssl.SSLError) as error:
+        raise InputError(
+            f"bus.tls: the certificate cannot be read: {_message_of(error)}",
+            file=certificate,
+            remedy="see `syncline keys issue`",
+        ) from None
+    begin, end = (float(ssl.cert_time_to_seconds(fields[name])) for name in ("notBefore", "notAfter"))
+    return begin, end
+
+
+def validity_problem(period: tuple[float, float], now: float) -> str:
+    """Why a certificate with this validity is not valid at ``now`` [Unix, s]; "" if it is.
+
+    A certificate that is not valid yet is a clock that is behind, as that of a board without a battery after a start.
+    """
+    begin, end = period
+    if now < begin:
+        return (
+            f"the certificate is not valid yet: it begins at {utc_text(begin)}, "
+            f"and this machine's clock says {utc_text(now)}: the clock is behind"
+        )
+    if now > end:
+        return f"the certificate expired {(now - end) / 86_400.0:.1f} days ago, at {utc_text(end)}"
+    return ""
+
+
 def days_left(certificate: Path) -> float:
-    """Days until a PEM certificate expires; negative if it has expired or is not valid yet."""
-    fields = _decoded(certificate)
-    now = datetime.now(UTC).timestamp()
-    begins, ends = (ssl.cert_time_to_seconds(fields[name]) for name in ("notBefore", "notAfter"))
-    return min(ends - now, now - begins if now < begins else float("inf")) / 86_400.0
+    """Days until a PEM certificate expires; negative if it has."""
+    return (validity(certificate)[1] - time.time()) / 86_400.0
 
 
 def common_name(certificate: Path) -> str:
@@ -109,7 +139,8 @@ def refusal_reason(endpoint: str, tls: TlsConfig | None, timeout_s: float = _TIM
                 secure.settimeout(max(0.05, min(0.3, deadline - time.monotonic())))
                 secure.recv(1)
     except ssl.SSLCertVerificationError as error:
-        return f"the router's certificate is refused here: {error.verify_message}"
+        clock = f"; this machine's clock says {utc_text(time.time())}" if "valid" in error.verify_message else ""
+        return f"the router's certificate is refused here: {error.verify_message}{clock}"
     except ssl.SSLError as error:
         return _alert(error)
     except (OSError, ValueError):
@@ -136,7 +167,9 @@ def _alert(error: ssl.SSLError) -> str:
     reason = str(error.reason or "")
     reasons = {
         "CERTIFICATE_REQUIRED": "it wants a certificate",
-        "CERTIFICATE_EXPIRED": "it says that this certificate has expired",
+        # rustls says so of one that is not valid yet, too.
+        "CERTIFICATE_EXPIRED": "it says that this certificate has expired or is not valid yet; "
+        f"this machine's clock says {utc_text(time.time())}",
         "UNKNOWN_CA": "it does not know who signed this certificate",
         "BAD_CERTIFICATE": "it does not accept this certificate",
         "CERTIFICATE_UNKNOWN": "it does not accept this certificate",

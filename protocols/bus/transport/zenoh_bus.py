@@ -279,6 +279,7 @@ class ZenohBus:
     ) -> None:
         self._session = session
         self._needs_router = needs_router
+        self._had_others = self._has_lost_others = False
         self._site = check_identifier(site, "site")
         self._clock_ns = clock_ns
         self._outage_s = outage_s
@@ -323,10 +324,16 @@ class ZenohBus:
         return watch
 
     def connected(self) -> bool:
-        """Whether this process can reach others: a client that lost its router cannot."""
+        """Whether this process can reach others: a client without its router cannot, nor a peer that lost all others.
+
+        A peer that has met nobody yet may be the first.
+        """
         with zenoh_call("routers"):
             info = self._session.info
-            return not self._needs_router or bool(info.routers_zid())
+            others = bool(info.routers_zid() or info.peers_zid())
+        self._has_lost_others = not others and (self._has_lost_others or self._had_others)
+        self._had_others = others
+        return others or not (self._needs_router or self._has_lost_others)
 
     def close(self) -> None:
         """Undeclare everything and close the session."""

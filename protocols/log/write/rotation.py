@@ -60,6 +60,11 @@ class RotatingWriter:
         """How many files there are."""
         return self._number + 1
 
+    @property
+    def current(self) -> Path:
+        """The file that is being written."""
+        return self._writer.path
+
     def write(self, topic: Topic, agent: str, site: str, message: Message, log_time_ns: int) -> bool:
         """As LogWriter.write; begins a new part first where one is due."""
         if self._first_ns is None:

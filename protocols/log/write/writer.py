@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, NoReturn, Self, cast
@@ -81,6 +82,11 @@ class LogWriter:
             self._writer.add_metadata(FORMAT_RECORD, _format(part, schema))
             for name, values in (metadata or {}).items():
                 self._writer.add_metadata(name, dict(values))
+
+    @property
+    def current(self) -> Path:
+        """The file that is being written."""
+        return self.path
 
     @property
     def size(self) -> int:
@@ -223,6 +229,8 @@ class _DirectFile:
 
     def __init__(self, path: Path) -> None:
         self._raw = path.open("xb", buffering=0)
+        with suppress(OSError):  # not every file system has locks; one tells others that this file is being written
+            fcntl.flock(self._raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._position = 0
 
     def write(self, data: bytes) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from deploy.agents.answer_store import HISTORY, LAST, AnswerStore
 from hub.live.live_hub import LiveHub, LiveSettings
-from protocols.core.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
 from tests.integration.live.test_live_hub import messages
@@ -118,3 +119,56 @@ def test_a_disk_that_cannot_be_written_is_told(session: Session, kept: Path, tmp
     (kept / "broken").mkdir(exist_ok=True)
     (kept / "broken" / LAST).write_text("[cam0\n", encoding="utf-8")
     assert AnswerStore(kept / "broken").load() is None
+
+
+def test_after_a_power_cut_the_last_answer_holds_on_new_clocks_if_it_is_configured(
+    session: Session, kept: Path
+) -> None:
+    """Every camera's clock has begun anew, and the hub's own was never set."""
+    hub, last = LiveHub(SETTINGS), AnswerStore(kept).load(of_any_age=True)
+    assert last is not None
+    calibration, boots, delays = last
+    hub_clock = 1e9 + 18.0 + 0.05
+    shift = {"cam0": 500.0, "cam1": -300.0, "cam2": 40.0}
+    before = {}
+    for name, camera in calibration.cameras.items():  # as if the clocks had shown so much more before the cut
+        rate, offset = camera.time_map.clock_rate, camera.time_map.time_offset
+        moved = TimeMap(rate, offset + shift[calibration.reference] - rate * shift[name])
+        before[name] = dataclasses.replace(camera, time_map=moved)
+    wrong_by = 1.7e9
+    hub.reload(
+        dataclasses.replace(calibration, cameras=before),
+        dict.fromkeys(boots, "another"),
+        {name: delay - shift[name] - wrong_by for name, delay in delays.items()},
+        arrival=hub_clock - wrong_by,
+    )
+    first = next(one for one in play(hub, session, 18.0, 18.5) if one.status == "solved")
+    assert {camera.camera for camera in first.cameras} == set(before)
+    assert first.state == "degraded"
+    assert "not verified" in hub.state(18.5)[1]
+    play(hub, session, 18.5, 22.0)
+    assert hub.counters["verified"] == 1
+    assert hub.state(22.0)[0] == "calibrated"
+    assert hub.calibration is not None
+    for name, camera in hub.calibration.cameras.items():
+        assert abs(session.clock_error(name, hub.calibration.reference, camera.time_map)) < 2e-3
+
+
+def test_the_history_is_in_order_and_bounded_though_the_clock_was_set_back(
+    session: Session, kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    last = AnswerStore(kept).load()
+    assert last is not None
+    store = AnswerStore(tmp_path / "state", history=3, copy=tmp_path / "calibration.toml")
+    for year in (2026, 1970, 1970, 2027, 1970):
+        moment = time.struct_time((year, 1, 1, 0, 0, 0, 0, 1, 0))
+        monkeypatch.setattr("deploy.agents.answer_store.time.gmtime", lambda moment=moment: moment)
+        store.keep(last[0], session.rig, last[1], last[2])
+        assert store._pending is not None
+        store._pending.result()
+    store.close()
+    names = sorted(path.name for path in (tmp_path / "state" / HISTORY).iterdir())
+    assert names == [f"00000{number}-{year}0101T000000Z.toml" for number, year in ((3, 1970), (4, 2027), (5, 1970))]
+    current = tmp_path / "state" / LAST
+    assert (current.is_symlink(), current.resolve().name) == (True, names[-1])
+    assert (tmp_path / "calibration.toml").read_bytes() == current.read_bytes()

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+from datetime import datetime
 from pathlib import Path
 
 import pytest
 
-from deploy.agents.recorder import free_bytes, run_recorder
+from deploy.agents.recorder import run_recorder
+from deploy.agents.recorder_commands import record_on_command
+from deploy.agents.retention import Retention, Space, free_bytes, unused_log_path
 from deploy.cli import run
 from deploy.commands.agents import run as agents
 from deploy.config.agents import RecorderConfig
@@ -22,6 +26,7 @@ from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.core.errors import InputError
 from protocols.log.read.reader import LogReader
 from protocols.log.read.recovery import recover
+from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import OBSERVATION, STATUS
 from tests.integration.logs.test_record_replay import RECORDER
@@ -60,6 +65,110 @@ def test_a_recording_does_not_start_on_a_full_disk(tmp_path: Path) -> None:
         run_recorder(RecorderConfig(out=tmp_path / "a.mcap"), bus, threading.Event(), free=lambda folder: 5_000_000)
     assert list(tmp_path.iterdir()) == []
     assert free_bytes(tmp_path / "not" / "there" / "yet") == pytest.approx(free_bytes(tmp_path), rel=0.01)
+
+
+def test_a_recorder_waits_for_space_and_goes_on_in_a_new_log(tmp_path: Path) -> None:
+    hub, stop = MemoryHub(), threading.Event()
+    room = [500_000_000]
+    with MemoryBus(hub) as sending, MemoryBus(hub) as bus:
+        statuses = sending.subscribe(STATUS, "recorder")
+        camera = sending.publisher(OBSERVATION, "cam0")
+
+        def reported(state: str, text: str) -> bool:
+            last = [one.message for one in statuses.drain()][-1:]
+            return bool(last) and last[0].state == state and text in last[0].message  # type: ignore[attr-defined]
+
+        config = RecorderConfig(out=tmp_path / "logs")
+        recorder = threading.Thread(
+            target=record_on_command, args=(config, bus, stop), kwargs={"free": lambda _: room[0]}
+        )
+        recorder.start()
+        try:
+            assert eventually(lambda: reported("running", "messages"))
+            room[0] = 150_000_000
+            assert eventually(lambda: reported("degraded", "not recording: 150 MB are free"))
+            room[0] = 210_000_000
+            time.sleep(0.3)
+            assert eventually(lambda: reported("degraded", "not recording")), "a little more is no reason to begin"
+            room[0] = 400_000_000
+            assert eventually(lambda: reported("running", "messages"))
+            camera.put(observation("cam0", 7))
+            assert eventually(lambda: reported("running", "messages"))
+            assert eventually(lambda: reported("running", "messages")), "the status after it, so that it is on the disk"
+        finally:
+            stop.set()
+            recorder.join(10.0)
+    first, second = sorted((tmp_path / "logs").glob("*.mcap"))
+    assert [one.message.sequence for one in LogReader(second).messages([OBSERVATION])] == [7]  # type: ignore[attr-defined]
+    assert LogReader(first).damage == LogReader(second).damage == ""
+
+
+def part(folder: Path, name: str, megabytes: float = 1.0, age_days: float = 0.0) -> Path:
+    path = folder / name
+    path.write_bytes(bytes(round(megabytes * 1e6)))
+    written = time.time() - 86_400.0 * age_days
+    os.utime(path, (written, written))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("keep", "left"),
+    [
+        ({"keep_mb": 2.5}, ["000002Z-001", "000002Z-002"]),
+        ({"keep_days": 3.0}, ["000002Z-000", "000002Z-001", "000002Z-002"]),
+        ({"keep_free_mb": 12.0}, ["000002Z-000", "000002Z-001", "000002Z-002"]),
+        ({"keep_free_mb": 1000.0}, ["000002Z-002"]),
+        ({}, ["000001Z-000", "000001Z-001", "000002Z-000", "000002Z-001", "000002Z-002"]),
+    ],
+)
+def test_the_oldest_closed_files_go_first_and_the_present_one_never(
+    tmp_path: Path, keep: dict[str, float], left: list[str]
+) -> None:
+    for number, name in enumerate(("000001Z-000", "000001Z-001", "000002Z-000", "000002Z-001", "000002Z-002")):
+        part(tmp_path, f"syncline-20260101T{name}.mcap", age_days=4.0 if number < 2 else 1.0)
+    other = part(tmp_path, "somebody-elses.mcap", age_days=1000.0)
+    config = RecorderConfig(out=tmp_path, part_mb=1.0, min_free_mb=0.0, **keep)  # type: ignore[arg-type]
+
+    def free(folder: Path) -> int:
+        return 15_000_000 - sum(path.stat().st_size for path in folder.glob("syncline-*.mcap"))
+
+    Retention(config, Space(config, free)).clean(tmp_path / "syncline-20260101T000002Z-002.mcap")
+    assert [path.stem.partition("T")[2] for path in sorted(tmp_path.glob("syncline-*.mcap"))] == left
+    assert other.exists()
+
+
+def test_a_file_of_a_clock_that_was_never_set_has_no_age(tmp_path: Path) -> None:
+    unset = part(tmp_path, "syncline-19700101T000010Z-000.mcap", age_days=20_000.0)
+    part(tmp_path, "syncline-19700101T000010Z-001.mcap")
+    config = RecorderConfig(out=tmp_path, part_mb=1.0, keep_days=1.0)
+    Retention(config, Space(config)).clean(None)
+    assert unset.exists()
+
+
+def test_what_another_process_writes_is_not_deleted(tmp_path: Path) -> None:
+    path = tmp_path / "syncline-20260101T000001Z-000.mcap"
+    config = RecorderConfig(out=tmp_path, part_mb=1.0, keep_free_mb=1e9)
+    with LogWriter(path):
+        Retention(config, Space(config)).clean(None)
+        assert path.exists()
+    Retention(config, Space(config)).clean(None)
+    assert not path.exists()
+
+
+def test_names_are_unique_and_in_order_without_a_clock(tmp_path: Path) -> None:
+    names = []
+    for moment in ("1970-01-01T00:00:10", "1970-01-01T00:00:10", "2026-05-01T12:00:00", "1970-01-01T00:00:10") * 2:
+        path = unused_log_path(tmp_path, datetime.fromisoformat(f"{moment}+00:00"))
+        assert not path.exists()
+        path.touch()
+        names.append(path.stem)
+    assert names == [
+        "syncline-19700101T000010Z",
+        "syncline-19700101T000010Z-after0001",
+        "syncline-20260501T120000Z",
+        *(f"syncline-20260501T120000Z-after{number:04d}" for number in range(1, 6)),
+    ]
+    assert names == sorted(names)
 
 
 def test_a_recorder_writes_parts_that_form_one_session(tmp_path: Path) -> None:

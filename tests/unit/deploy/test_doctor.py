@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import socket
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
+from deploy.agents.health import Health, HealthServer
 from deploy.cli import run
-from deploy.site.doctor import agent, autopilot, machine, selection
+from deploy.config.agents import HealthConfig, HubConfig
+from deploy.site.doctor import agent, autopilot, machine, network, selection
 from deploy.site.doctor.check_result import CheckResult, exit_status, misconfigured, ok, unavailable, warn
 from edge.agents.clock_quality import kernel_clock
 from edge.devices.base import DeviceInfo, Frame
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import InputError
+from protocols.messages import syncline_pb2 as pb
 
 ONE_LINE = 400
 
@@ -168,6 +174,111 @@ def test_no_crash_and_no_systemd() -> None:
     check(machine.crash("syncline-*", lambda command: (0, restarted)), "warn", "journalctl")
     check(machine.crash("syncline-*", lambda command: (127, "")), "skip")
     check(machine.crash("x", lambda command: (0, calm.replace("=active", "=inactive"))), "skip")
+
+
+JOURNAL_EXIT, JOURNAL_FAILED = "98e322203f7a4ed290d09fe03c09fe15", "d9b373ed55a64feb8242e02dbe79a49c"
+
+
+@pytest.mark.parametrize(
+    ("exit_code", "exit_status", "unit_result", "text", "remedy"),
+    [
+        ("killed", "ABRT", "watchdog", "watchdog (by SIGABRT), restarted 3 times", "no data flowed"),
+        ("killed", "KILL", "signal", "signal (by SIGKILL)", "killed it"),
+        ("killed", "9", "oom-kill", "oom-kill (by SIGKILL)", "memory was full"),
+        ("exited", "2", "exit-code", "exit-code (with status 2)", "shows the reason"),
+        ("", "", "", "ended, restarted 3 times", "ask as root"),
+    ],
+)
+def test_what_ended_a_service_that_runs_again_is_in_the_journal(
+    exit_code: str, exit_status: str, unit_result: str, text: str, remedy: str
+) -> None:
+    entries = [
+        {"MESSAGE_ID": JOURNAL_FAILED, "UNIT_RESULT": unit_result},
+        {"MESSAGE_ID": JOURNAL_EXIT, "EXIT_CODE": exit_code, "EXIT_STATUS": exit_status},
+        {"MESSAGE_ID": JOURNAL_FAILED, "UNIT_RESULT": "an older one"},
+    ]
+    journal = "\n".join(json.dumps(entry) for entry in entries) if unit_result else "No entries"
+
+    def ask(command: Sequence[str]) -> tuple[int, str]:
+        shown = "Id=syncline-hub-a.service\nResult=success\nNRestarts=3\nActiveState=active\nExecMainStatus=0\n"
+        return 0, journal if command[0] == "journalctl" else shown
+
+    found = machine.crash("syncline-hub-a.service", ask)
+    check(found, "warn", remedy)
+    assert text in found.text
+    assert "refused" not in found.text + found.remedy
+
+
+@pytest.mark.parametrize(
+    ("answers", "source"),
+    [
+        ({"chronyc": "C0A80105,192.168.1.5,4,1.0,0,0,0,0,0,0,0,0,0,Normal"}, "192.168.1.5, by chrony"),
+        ({"chronyc": "00000000,,0,0,0,0,0,0,0,0,0,0,0,Not synchronised"}, "chrony, without a source yet"),
+        (
+            {"timedatectl": "ServerName=hub.local\nServerAddress=192.168.1.5"},
+            "hub.local (192.168.1.5), by systemd-timesyncd",
+        ),
+        ({}, "none known"),
+    ],
+)
+def test_the_clocks_source_is_named(answers: dict[str, str], source: str) -> None:
+    def ask(command: Sequence[str]) -> tuple[int, str]:
+        return (0, answers[command[0]]) if command[0] in answers else (127, "")
+
+    found = machine.clock(False, lambda: (True, 0.01), lambda: 1.8e9, ask)
+    assert found.text == f"synchronised, within 10 ms; time source: {source}"
+
+
+def test_two_network_troubles_read_differently(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails_with(error: OSError) -> Callable[..., None]:
+        def connect(place: tuple[str, int], timeout: float) -> None:
+            raise error
+
+        return connect
+
+    texts = []
+    for error, remedy in (
+        (ConnectionRefusedError(errno.ECONNREFUSED, "refused"), "start one there"),
+        (TimeoutError(), "firewall"),
+        (OSError(errno.EHOSTUNREACH, "no route"), "cable in"),
+        (OSError(errno.ENETUNREACH, "no network"), "DHCP"),
+        (socket.gaierror(-2, "Name or service not known"), "/etc/hosts"),
+    ):
+        monkeypatch.setattr("deploy.site.doctor.network.socket.create_connection", fails_with(error))
+        found = network.reach("tcp/router.site:7447")
+        assert found is not None
+        check(found, "fail", remedy)
+        texts.append(found.text)
+    assert len(set(texts)) == len(texts)
+
+
+def test_a_check_that_cannot_be_made_does_not_end_the_table(
+    quiet_machine: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def unreadable(*_: object) -> CheckResult:
+        raise PermissionError(errno.EACCES, "Permission denied", "/srv/recordings")
+
+    monkeypatch.setattr(machine, "disk", unreadable)
+    (tmp_path / "router.toml").write_text('id = "router"\n')
+    assert run(["doctor", str(tmp_path / "router.toml")]) == 2
+    lines = capsys.readouterr().out.splitlines()
+    assert "fail disk: /srv/recordings may not be read by this user; run doctor as root (sudo), or give rights" in lines
+    assert any(line.startswith("ok   crash") for line in lines), "the last check is made too"
+
+
+def test_a_running_agent_is_asked_for_its_health() -> None:
+    health = Health(site="local", role="hub", agent="hub")
+    with HealthServer(HealthConfig(listen="127.0.0.1:0"), health) as server:
+        config = HubConfig(health=HealthConfig(listen=server.address))
+        health.seen(pb.AgentStatus(agent="hub", role="hub", state="degraded", message="no router at x for 3 s"))
+        found = network.running_agent(config)
+        check(found, "warn", "names")
+        assert found.text == "degraded: no router at x for 3 s"
+        health.seen(pb.AgentStatus(agent="hub", role="hub", state="running", message="3 cameras calibrated"))
+        check(network.running_agent(config), "ok")
+        check(network.running_agent(msgspec.structs.replace(config, id="hub2")), "fail", "port of its own")
+    check(network.running_agent(config), "fail", "start it")
+    check(network.running_agent(HubConfig()), "skip")
 
 
 class Device:

@@ -14,7 +14,7 @@ import pytest
 
 from deploy.cli import run
 from deploy.site.install import units
-from deploy.site.install.plan import _commands, plan_install
+from deploy.site.install.plan import _commands, _run, plan_install
 
 NEEDS_SYSTEMD = pytest.mark.skipif(
     shutil.which("systemd-analyze") is None, reason="systemd-analyze is not here: UNIT FILES ARE NOT CHECKED"
@@ -339,3 +339,23 @@ def test_udev_rules_are_valid() -> None:
     assert '"03e7"' in text
     assert 'SYMLINK+="syncline/port-$env{ID_PATH}"' in text
     assert text.count('GOTO="syncline_end"') == text.count('LABEL="syncline_end"') == 1
+
+
+def test_without_udev_the_installation_goes_on_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    for name, script in (("udevadm", "echo no socket >&2; exit 1"), ("systemctl", f"echo $1 >> {tmp_path}/done")):
+        (tools / name).write_text(f"#!/bin/sh\n{script}\n")
+        (tools / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tools), prepend=":")
+    changes: list[str] = []
+    _run([["udevadm", "control", "--reload"], ["systemctl", "daemon-reload"], ["systemctl", "restart", "x"]], changes)
+    assert changes[0] == "left out: udevadm control --reload (no socket)"
+    assert (tmp_path / "done").read_text().split() == ["daemon-reload", "restart"]
+
+
+def test_a_hub_that_goes_on_from_its_last_answer_can_be_installed(files: Path) -> None:
+    (files / "hub.toml").write_text('id = "main"\nknown = "last"\n')
+    assert install(files, "hub") == 0
+    written = tomllib.loads((files / "image/etc/syncline/hub-main/config.toml").read_text())
+    assert written["known"] == "last"

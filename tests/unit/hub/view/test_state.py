@@ -104,6 +104,30 @@ def test_guidance_is_shown_while_something_is_missing() -> None:
     assert "of its view: wave it" in overview(state, 2.0)
 
 
+def test_while_nothing_is_solved_the_page_says_what_each_camera_is_waited_for() -> None:
+    state = ViewState()
+    filming(state)
+    waiting = pb.Calibration(schema_version=1, status="collecting", state="collecting", reason="too few detections yet")
+    waiting.progress.append(
+        pb.CameraProgress(camera="cam0", state="collecting", shared_motion_s=4.0, reason="50 of 90 detections")
+    )
+    state.handle(waiting, 2.0)
+    text = overview(state, 2.0)
+    assert "<p data-waiting='cam0'>… cam0 <progress" in text
+    assert "collecting: 50 of 90 detections · 4 s of motion shared with another camera · marker seen in" in text
+    assert "class='bad'" not in text + camera_table(state, 2.0), "nobody has to act yet"
+    state.handle(pb.Calibration(schema_version=1, status="solved", state="calibrated"), 3.0)
+    assert "data-waiting" not in overview(state, 3.0)
+
+
+def test_a_view_without_its_router_says_so_first() -> None:
+    state = ViewState()
+    filming(state)
+    state.lost_at = 4.0
+    assert state.problems(7.2)[0] == "this view reaches no router for 3 s"
+    assert "▲ degraded: this view reaches no router" in overview(state, 7.2)
+
+
 def test_the_path_not_updated_for_longest_is_dropped() -> None:
     state = ViewState()
     for index in range(100):

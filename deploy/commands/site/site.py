@@ -1,0 +1,465 @@
+"""`syncline site`: all boards of a site from one file."""
+
+from __future__ import annotations
+
+import json as json_module
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import App, Parameter
+
+from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
+
+if TYPE_CHECKING:
+    from deploy.site.boards.operations import Boards
+    from deploy.site.boards.site_file import Site
+
+Flag = Annotated[bool, Parameter(negative="")]
+Role = Literal["router", "recorder", "hub", "camera", "uav"]
+Names = Annotated[list[str] | None, Parameter(negative="")]
+
+SITE = App(
+    name="site",
+    help="All boards of a site from one file, site.toml: enrolment, renewal, updates, state.\n\n"
+    "Example: syncline site init site.toml --site yard --cameras 50\n\n"
+    "Example: syncline site enrol site.toml\n\n"
+    "Example: syncline site rollout site.toml --bundle camera-bundle --role camera\n\n"
+    "Example: syncline site renew site.toml\n\n"
+    "Example: syncline site status site.toml\n\n"
+    "On a board: request, accept, update, ready, restore.",
+    help_format="plaintext",
+)
+
+
+@SITE.command
+def init(file: Path, /, *, site: str = "", cameras: int = 4, json: Flag = False) -> int:
+    """Write a site.toml to begin with, unless it is there, and make the site's certificate authority beside it.
+
+    Example: syncline site init site.toml --site yard --cameras 50
+
+    Parameters
+    ----------
+    file
+        The site.toml; one that exists is read and not changed.
+    site
+        Name of the site, for a new file.
+    cameras
+        Number of cameras in a new file.
+    json
+        Print JSON.
+    """
+    from deploy.site import keys
+    from deploy.site.boards.site_file import read_site_file, template
+    from protocols.core.files import write_atomically
+
+    written = not file.exists()
+    if written:
+        if not site or not 2 <= cameras <= 150:
+            raise InputError("a new site needs --site NAME, and 2 to 150 --cameras", file=file)
+        write_atomically(file, template(site, cameras))
+    found = read_site_file(file)
+    made = not (found.keys / keys.SITE_FILE).exists()
+    if made:
+        keys.make_site(found.keys, found.settings.site)
+    if json:
+        print(json_module.dumps({"file": str(file), "keys": str(found.keys), "agents": len(found.agents)}))
+        return EXIT_DONE
+    print(f"{file}: {len(found.agents)} agents" + ("; correct hosts and configuration" if written else ""))
+    print(f"authority in {found.keys}" + ("; keep ca-key.pem on this machine only, and a copy of it" if made else ""))
+    return EXIT_DONE
+
+
+@SITE.command
+def enrol(file: Path, names: Names = None, /, *, stick: Path | None = None, again: Flag = False) -> int:
+    """Enrol boards: each makes its own key, and gets a certificate, its configuration, and its agent installed.
+
+    A private key never leaves its board. Boards that do not answer are named, and enrolled by the next run. Exit status
+    3 if any failed.
+
+    Example: syncline site enrol site.toml
+
+    Parameters
+    ----------
+    file
+        The site.toml.
+    names
+        Only these agents, by id or ROLE-ID; default: all that are not enrolled.
+    stick
+        USB stick for boards without a network: takes the requests in STICK/requests, writes what is for the boards to
+        STICK/boards.
+    again
+        Also those that are enrolled, with new keys.
+    """
+    from deploy.site.boards import operations
+
+    site = _site(file)
+    agents = operations.selected(site, names or ())
+    new = {state.agent.name for state in operations.states(site) if state.until is None}
+    wanted = [agent for agent in agents if again or names or agent.name in new]
+    if stick is not None:
+        wanted = [agent for agent in wanted if (stick / "requests" / f"{agent.name}.csr").is_file()]
+    elif not names:
+        wanted = [agent for agent in wanted if agent.host != "stick"]
+    failed = operations.enrol(site, wanted, _boards(site, stick), _report)
+    print(f"{len(wanted) - len(failed)} of {len(wanted)} enrolled")
+    return EXIT_REFUSED if failed else EXIT_DONE
+
+
+@SITE.command
+def rollout(
+    file: Path,
+    names: Names = None,
+    /,
+    *,
+    role: Role | None = None,
+    bundle: Path | None = None,
+    batch: Annotated[int, Parameter(name="--batch")] = 10,
+) -> int:
+    """Bring site.toml's configuration, or a new version, to the boards in stages, and back where one is not ready.
+
+    First one board of each role, then --batch at a time. A board that is not ready within 60 s returns to what it had,
+    by itself for a version; no further board is touched then, and the exit status is 3.
+
+    Example: syncline site rollout site.toml --role camera --bundle camera-bundle
+
+    Parameters
+    ----------
+    file
+        The site.toml.
+    names
+        Only these agents, by id or ROLE-ID.
+    role
+        Only agents of this role.
+    bundle
+        Folder that `syncline bundle` has made for these boards; without it, their configuration.
+    batch
+        Boards in a stage after the first.
+    """
+    from deploy.site.boards import operations
+
+    site = _site(file)
+    enrolled = {state.agent.name for state in operations.states(site) if state.until is not None}
+    agents = [one for one in operations.selected(site, names or ()) if role in (None, one.role)]
+    if bundle is not None and not (bundle / "install.sh").is_file():
+        raise InputError("is no bundle", file=bundle, remedy="make one with `syncline bundle`")
+    if not 1 <= batch <= 1000:
+        raise InputError(f"--batch {batch} is out of range", remedy="give 1 to 1000")
+    agents = [agent for agent in agents if agent.name in enrolled or bundle is not None]
+    done, problem = operations.rollout(site, agents, _boards(site), _report, bundle=bundle, batch=batch)
+    print(f"{len(done)} of {len(agents)} done")
+    if problem:
+        print(f"syncline: rollout stopped: {problem}", file=sys.stderr)
+        return EXIT_REFUSED
+    return EXIT_DONE
+
+
+@SITE.command
+def renew(
+    file: Path, names: Names = None, /, *, every: Annotated[bool, Parameter(name="--all", negative="")] = False
+) -> int:
+    """Renew the certificates that end within renew_days, each with a new key that its board makes.
+
+    Run it daily; it does nothing where nothing is due. One board after another restarts its agent; one that is not
+    ready afterwards gets the old certificate back, and the exit status is 3.
+
+    Example: syncline site renew site.toml
+
+    Parameters
+    ----------
+    file
+        The site.toml.
+    names
+        Only these agents, by id or ROLE-ID.
+    every
+        Also those that are not due.
+    """
+    from deploy.site.boards import operations
+
+    site = _site(file)
+    agents = operations.selected(site, names or ())
+    done, failed = operations.renew(site, agents, _boards(site), _report, every=every)
+    print(f"{len(done)} renewed" + (f", {failed[0]} failed" if failed else ""))
+    return EXIT_REFUSED if failed else EXIT_DONE
+
+
+@SITE.command
+def revoke(file: Path, name: str, /) -> int:
+    """Revoke an agent's certificates, and bring the new rules to the routers. `enrol NAME` takes it in again.
+
+    Example: syncline site revoke site.toml cam07
+
+    Parameters
+    ----------
+    file
+        The site.toml.
+    name
+        The agent, by id or ROLE-ID.
+    """
+    from deploy.site.boards import operations
+
+    site = _site(file)
+    failed: list[str] = []
+    for agent in operations.selected(site, [name]):
+        failed += operations.revoke(site, agent, _boards(site), _report)
+    return EXIT_REFUSED if failed else EXIT_DONE
+
+
+@SITE.command
+def status(file: Path, names: Names = None, /, *, offline: Flag = False, json: Flag = False) -> int:
+    """Show every agent: certificate, ready or not, and what it says of itself. Exit status 3 if any is not ready.
+
+    Example: syncline site status site.toml
+
+    Parameters
+    ----------
+    file
+        The site.toml.
+    names
+        Only these agents, by id or ROLE-ID.
+    offline
+        Do not ask the boards: only what is known here.
+    json
+        Print JSON.
+    """
+    from datetime import UTC, datetime
+
+    from deploy.site.boards import operations
+
+    site = _site(file)
+    agents = operations.selected(site, names or ())
+    now = datetime.now(UTC)
+    wanted = {agent.name for agent in agents}
+    found = [
+        state
+        for state in (operations.states(site) if offline else operations.status(site, agents, _boards(site)))
+        if state.agent.name in wanted
+    ]
+    rows = [
+        {
+            "agent": state.agent.name,
+            "host": state.agent.host,
+            "certificate": "revoked" if state.revoked else "none" if state.until is None else state.until.isoformat(),
+            "days": None if state.until is None else round(state.days(now), 2),
+            "ready": state.ready,
+            "text": state.text,
+        }
+        for state in found
+    ]
+    if json:
+        print(json_module.dumps(rows))
+    else:
+        for row in rows:
+            days = f"{row['days']} days" if row["days"] is not None else str(row["certificate"])
+            ready = "-" if row["ready"] is None else "ready" if row["ready"] else "NOT READY"
+            print(f"{row['agent']!s:<24}{days:<16}{ready:<10} {row['text']}".rstrip())
+    bad = [state for state in found if state.ready is False or (state.until is not None and state.days(now) <= 0.0)]
+    return EXIT_REFUSED if bad else EXIT_DONE
+
+
+@SITE.command
+def monitoring(file: Path, /, *, out: Path) -> int:
+    """Write a Prometheus configuration with a target for each agent, the alert rules, and the Grafana dashboard.
+
+    Example: syncline site monitoring site.toml --out monitoring
+
+    Parameters
+    ----------
+    file
+        The site.toml. An agent whose [health] stays on loopback is scraped on its own machine only.
+    out
+        Folder to write.
+    """
+    from deploy.site.boards.monitoring import write_monitoring
+
+    for line in write_monitoring(_site(file), out):
+        print(line)
+    return EXIT_DONE
+
+
+@SITE.command
+def image(root: Path, /, *, bundle: Path) -> int:
+    """Put a bundle into a mounted system image; the board installs it when it first starts, without a network.
+
+    Example: sudo syncline site image /mnt/pi --bundle camera-bundle
+
+    Parameters
+    ----------
+    root
+        Folder in which the image's root is mounted.
+    bundle
+        Folder that `syncline bundle` has made for the board.
+    """
+    from deploy.site.boards.image import prepare_image
+
+    for line in prepare_image(root, bundle):
+        print(f"wrote {line}")
+    return EXIT_DONE
+
+
+@SITE.command
+def request(*, role: Role, id: str, out: Path | None = None, root: Path = Path("/")) -> int:
+    """On a board: make a new key, which stays here, and print a signing request for it.
+
+    Example: syncline site request --role camera --id cam07 --out /media/stick/requests
+
+    Parameters
+    ----------
+    role
+        The agent's role.
+    id
+        The agent's id.
+    out
+        Folder, as on a USB stick, for ROLE-ID.csr instead of printing.
+    root
+        Root folder of a system image.
+    """
+    from deploy.site.boards import board
+    from protocols.core.files import write_atomically
+
+    text = board.request(role, id, root)
+    if out is None:
+        print(text, end="")
+    else:
+        write_atomically(out / f"{role}-{id}.csr", text)
+        print(f"{out / f'{role}-{id}.csr'}; sign it with: syncline site enrol site.toml --stick FOLDER")
+    return EXIT_DONE
+
+
+@SITE.command
+def accept(
+    source: Path | None = None,
+    /,
+    *,
+    role: Role | None = None,
+    id: str = "",
+    time_server: tuple[str, ...] = (),
+    root: Path = Path("/"),
+) -> int:
+    """On a board: take the certificate and configuration that `site enrol` made, and install the agent.
+
+    Example: sudo syncline site accept /media/stick/boards/camera-cam07.tar
+
+    Parameters
+    ----------
+    source
+        The .tar file; default: standard input.
+    role
+        The agent's role; default: by the file's name.
+    id
+        The agent's id; default: by the file's name.
+    time_server
+        NTP servers that this board is to ask.
+    root
+        Root folder of a system image.
+    """
+    from deploy.site.boards import board
+    from deploy.site.boards.transport import unpack
+    from deploy.site.install.units import ROLES
+
+    named = ("", "", "") if source is None else source.stem.partition("-")
+    try:
+        content = sys.stdin.buffer.read() if source is None else source.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", file=source, remedy="check the path") from None
+    if not (role or named[0] in ROLES) or not (id or named[2]):
+        raise InputError("whose files these are is not known", remedy="give --role and --id")
+    for line in board.accept(role or named[0], id or named[2], unpack(content), root, time_server):
+        print(line)
+    return EXIT_DONE
+
+
+@SITE.command
+def restore(*, role: Role, id: str, root: Path = Path("/")) -> int:
+    """On a board: return to certificate and configuration before the last `accept`.
+
+    Example: sudo syncline site restore --role camera --id cam07
+
+    Parameters
+    ----------
+    role
+        The agent's role.
+    id
+        The agent's id.
+    root
+        Root folder of a system image.
+    """
+    from deploy.site.boards import board
+
+    for line in board.restore(role, id, root):
+        print(line)
+    return EXIT_DONE
+
+
+@SITE.command
+def update(bundle: Path, /, *, role: Role, id: str, patience: float = 60.0, home: Path = Path("/opt/syncline")) -> int:
+    """On a board: install a bundle beside the present version, switch to it, and back if the agent is not ready.
+
+    The versions are in HOME/a and HOME/b; the link HOME/current is the one that runs. Exit status 3 after a return.
+
+    Example: sudo syncline site update camera-bundle --role camera --id cam07
+
+    Parameters
+    ----------
+    bundle
+        Folder that `syncline bundle` has made.
+    role
+        The agent that has to become ready.
+    id
+        Its id.
+    patience
+        Seconds that it may take.
+    home
+        Folder of the versions.
+    """
+    from deploy.site.boards import board
+
+    def is_ready() -> tuple[bool, str]:
+        if not board.folder_of(role, id).is_dir():
+            return True, "not enrolled yet"
+        return board.ready(role, id, patience)
+
+    print(f"updated: {board.update(bundle, home, board.restart_units, is_ready)}")
+    return EXIT_DONE
+
+
+@SITE.command
+def ready(*, role: Role, id: str, patience: float = 0.0, root: Path = Path("/"), json: Flag = False) -> int:
+    """On a board: wait until the agent is ready, and print what it says. Exit status 3 if it is not.
+
+    Example: syncline site ready --role camera --id cam07 --patience 60
+
+    Parameters
+    ----------
+    role
+        The agent's role.
+    id
+        The agent's id.
+    patience
+        Seconds to wait.
+    root
+        Root folder of the agent's configuration.
+    json
+        Print JSON.
+    """
+    from deploy.site.boards import board
+
+    good, text = board.ready(role, id, patience, root)
+    print(json_module.dumps({"ready": good, "text": text}) if json else text)
+    return EXIT_DONE if good else EXIT_REFUSED
+
+
+def _site(file: Path) -> Site:
+    from deploy.site.boards.site_file import read_site_file
+
+    return read_site_file(file)
+
+
+def _boards(site: Site, stick: Path | None = None) -> Boards:
+    from deploy.site.boards.transport import board_of
+
+    return lambda agent: board_of(site, agent, stick)
+
+
+def _report(line: str) -> None:
+    print(line, flush=True)
