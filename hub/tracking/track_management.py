@@ -20,6 +20,8 @@ from protocols.geometry.types import Bools, Floats
 _INITIATION_WINDOW_NS = 250_000_000
 """Detections older than the frame by more than this are not used for track initiation with it."""
 _MAX_ANCHORS = 4
+_ARRIVALS = 0.1
+"""People expected to appear in a frame."""
 _MAX_TENTATIVE = 64
 MAX_EXISTENCE = 0.99
 """Certainty is limited, so that a target that has left is given up: after two looks that miss it at 0.85."""
@@ -66,7 +68,9 @@ def initiate_tracks(
     state = _with_views(state, upright, name, cameras, parameters)
     if state.floor is not None and state.floor.known and upright:
         clutter = state.statistics[name].clutter
-        born = [candidate_on(state.floor, one, parameters.scale, clutter) for one in upright]
+        # More than false detections would explain (3 sigma, Poisson) are people: a hall may be full at the first frame.
+        arrivals = max(_ARRIVALS, len(upright) - clutter - 3.0 * np.sqrt(clutter))
+        born = [candidate_on(state.floor, one, parameters.scale, arrivals / clutter) for one in upright]
         state = _with_candidates(state, [one for one in born if one is not None], parameters)
         own = tuple(one for one in own if not _UPRIGHT[one.kind])
         state = replace(state, unassociated={**state.unassociated, name: own})

@@ -11,6 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -73,12 +74,14 @@ def read_objects(file: Path, sizes: Mapping[str, tuple[int, int]]) -> DetectionR
     limit = np.array([sizes[name] for name in names], dtype=np.float64)
     for what, point in (("u, v", rows.pixels), ("the head", rows.head), ("the foot", rows.foot)):
         # The end of somebody whom the border cuts may be estimated beyond it.
-        outside = ((point < -limit) | (point > 2.0 * limit)).any(axis=1)
-        table.refuse(
-            outside, lambda row, what=what: f"{what} lies outside the {limit[row, 0]:g}x{limit[row, 1]:g} picture"
-        )
+        outside = np.asarray(((point < -limit) | (point > 2.0 * limit)).any(axis=1))
+        table.refuse(outside, partial(_outside, what, limit))
     _check_pairs(rows, file)
     return rows
+
+
+def _outside(what: str, limit: Floats, row: int) -> str:
+    return f"{what} lies outside the {limit[row, 0]:g}x{limit[row, 1]:g} picture"
 
 
 def _box_rows(table: CsvTable, sizes: Mapping[str, tuple[int, int]]) -> DetectionRows:
@@ -90,7 +93,7 @@ def _box_rows(table: CsvTable, sizes: Mapping[str, tuple[int, int]]) -> Detectio
     outside = ((box[:, :2] >= limit + box[:, 2:]) | (box[:, :2] + 2.0 * box[:, 2:] <= 0.0)).any(axis=1)
     table.refuse(
         np.asarray(outside),
-        lambda row: f"the box lies outside the {limit[row, 0]:g}x{limit[row, 1]:g} picture",
+        partial(_outside, "the box", limit),
         "correct or remove the row, or take the calibration of this picture size",
     )
     count = len(table)

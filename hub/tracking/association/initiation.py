@@ -35,8 +35,6 @@ _GAUSS_NEWTON_STEPS = 3
 _GATE_SIGMAS = 3.5
 _MAX_FLOOR_DISTANCE = 40.0
 """Of a person on the floor, in heights: further away, a pixel of the foot is metres on the floor."""
-_ARRIVALS = 0.1
-"""People expected to appear in a frame, against the false detections of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,11 +174,11 @@ def _fit_with_rejection(
 
 
 def candidate_on(
-    floor: Floor, detection: UnassociatedDetection, scale: LengthScale, clutter: float
+    floor: Floor, detection: UnassociatedDetection, scale: LengthScale, prior_odds: float
 ) -> TrackCandidate | None:
     """A person at one detection, who stands on the floor; None if nobody of a person's height could.
 
-    clutter: expected number of false detections in a frame.
+    prior_odds: of a new person against a false detection, wherever it is.
     """
     camera, model = detection.camera, TARGET_MODELS[detection.kind]
     height, rotation = floor.height, camera.pose.rotation
@@ -218,7 +216,7 @@ def candidate_on(
     if not misfit < chi2_limit(dof):
         return None
     means, covariances = kalman.update(means, covariances, innovation, predicted.jacobian, noise, used)
-    odds = _ARRIVALS / clutter * np.exp(-0.5 * max(misfit - dof, 0.0))
+    odds = prior_odds * np.exp(-0.5 * max(misfit - dof, 0.0))
     return TrackCandidate(means[0], covariances[0], (detection,), misfit / dof, float(odds / (1.0 + odds)))
 
 

@@ -138,6 +138,16 @@ def test_who_walks_up_to_somebody_and_stops_is_not_exchanged_with_him(seed: int)
     assert scores(result, place).idf1 > 0.95
 
 
+def test_a_hall_that_is_full_at_the_first_frame() -> None:
+    """Eighty people at once are not taken for eighty false detections."""
+    rng = np.random.default_rng(1)
+    grid = np.stack(np.meshgrid(np.linspace(-5.0, 5.0, 8), np.linspace(-5.0, 5.0, 10)), axis=-1).reshape(-1, 2)
+    place = np.tile(grid, (4, 1, 1)) + rng.normal(0.0, 0.02, (4, 80, 2))
+    messages, calibration = boxes(rng, place, cameras=5, height=7.0)
+    result = follow(messages, calibration, [round(frame / FPS * NANOSECONDS) for frame in range(4)])
+    assert scores(result, place).mota > 0.8
+
+
 def boxes(
     rng: np.random.Generator, place: Floats, cameras: int, height: float
 ) -> tuple[list[pb.Observation], Calibration]:
