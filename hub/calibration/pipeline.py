@@ -30,6 +30,8 @@ from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.bundle.timestamp_jitter import estimate_frame_times
 from hub.calibration.pair_network import Progress, describe_timing, frame_rate_warnings, solve_pairs
 from hub.calibration.result import assemble_calibration, focal_stds, isolated_pair_report
+from hub.calibration.rigid_body.solve import calibrate_bodies
+from hub.calibration.rigid_body.views import body_labels
 from hub.calibration.self_calibration import MAX_FOCAL_STD, initial_self_calibration, with_updated_lenses
 from hub.calibration.solution import Solution
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate, connected_components, synchronise_clocks
@@ -85,6 +87,8 @@ def calibrate(
     report = progress or (lambda text, share: None)
     if known is not None:
         rig = with_known_intrinsics(rig, known)
+    if rig.bodies and solver == "joint" and not online and body_labels(observations, rig.bodies):
+        return calibrate_bodies(rig, observations, report, known)
     prepared = prepare(rig, observations)
     has_sizes = False
     if solver == "paper" and known is None:
