@@ -26,7 +26,7 @@ def calibrate(
     solver: Literal["joint", "distributed", "paper"] = "joint",
     from_known: Path | None = None,
     marker: Path | None = None,
-    detector: str = "marker",
+    detector: str | None = None,
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
@@ -35,13 +35,16 @@ def calibrate(
     Writes calibration.toml, trajectory.csv, result.json and report.html to --out. Exit status 0 if at least
     two cameras are solved, 3 if the data allow no reliable result (then only result.json and report.html).
 
-    In a folder of videos, one per camera and named after it, the marker is first detected in each video. The resulting
+    In a folder of videos, one per camera and named after it, what moves is first detected in each video. The resulting
     session is stored in --out as session/, and the detections of unchanged videos are reused. A rig.toml in the folder
-    gives the cameras' intrinsics (`syncline intrinsics`).
+    gives the cameras' intrinsics (`syncline intrinsics`); a board.toml describes a board, which gives the scale and
+    unknown intrinsics too.
 
     Example: syncline calibrate my-session --out out
 
     Example: syncline calibrate my-videos --out out
+
+    Example: syncline calibrate my-videos --detector charuco --out out
 
     Parameters
     ----------
@@ -60,8 +63,10 @@ def calibrate(
         For videos: appearance of the marker, as written by `syncline detect --teach`. Default: marker.toml in the
         folder of videos, otherwise the orange ball of the demo.
     detector
-        For videos: what moves in them. person, vehicle: only one at a time in view, with fixed cameras. Or the .toml
-        file of an ONNX network, or a detector that another package registers: only one target at a time in view.
+        For videos: what moves in them. charuco, chessboard: the board that board.toml describes. tag: ArUco or AprilTag
+        tags. bright: a point of light. marker: a coloured ball. person, vehicle: only one at a time in view, with fixed
+        cameras. auto (default): looks at some frames with all of them. Or the .toml file of an ONNX network, or a
+        detector that another package registers: only one target at a time in view.
     json
         Print the result as JSON on standard output.
     seed
@@ -92,7 +97,7 @@ def _load(
     observations: Path | None,
     out: Path,
     marker: Path | None,
-    detector: str,
+    detector: str | None,
     quiet: bool,
 ) -> Session:
     """Read a session, or make one from a folder of videos. Raises InputError."""
@@ -100,10 +105,11 @@ def _load(
         from deploy.offline.video_folder import SESSION, is_video_folder, session_from_videos
 
         if is_video_folder(session):
-            if marker is not None and detector != "marker":
+            if marker is not None and detector not in (None, "marker"):
                 raise InputError(f"--marker cannot be used with --detector {detector}", remedy="leave one of them out")
-            with progress_bar(f"looking for the {detector}", quiet=quiet) as progress:
-                gathered = session_from_videos(session, out / SESSION, progress, marker, detector)
+            wanted = detector or ("auto" if marker is None else "marker")
+            with progress_bar(f"looking for what moves in {session.name}", quiet=quiet) as progress:
+                gathered = session_from_videos(session, out / SESSION, progress, marker, wanted)
             for line in () if quiet else gathered.summaries:
                 print(line)
             return gathered
@@ -112,6 +118,6 @@ def _load(
             raise InputError("this folder holds neither videos nor a session", file=session, remedy=remedy)
     if marker is not None:
         raise InputError("--marker goes with a folder of videos", remedy="leave it out for a session")
-    if detector != "marker":
+    if detector is not None:
         raise InputError("--detector goes with a folder of videos", remedy="leave it out for a session")
     return load_session(session, observations)

@@ -7,6 +7,7 @@ sum of their quaternions' outer products (Markley et al., "Averaging Quaternions
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -200,7 +201,7 @@ def rotations(turn: Floats) -> Floats:
 def aligned(turn: Floats, order: Ints) -> Floats:
     """The quaternions (n, 4) with signs such that each is near its predecessor in ``order``."""
     out = turn.copy()
-    for before, after in zip(order[:-1], order[1:], strict=True):
+    for before, after in itertools.pairwise(order):
         if out[before] @ out[after] < 0.0:
             out[after] = -out[after]
     return out

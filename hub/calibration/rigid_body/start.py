@@ -21,7 +21,7 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 
-_LENS_VIEWS, _LENS_POINTS = 30, 6  # most views, least points of one
+_LENS_VIEWS, _LENS_POINTS = 30, 4  # most views, least points of one
 _MIN_KNOT, _MAX_GAP = 0.05, 3.2  # s; knot intervals without any view, over which no path is defined
 _FIELDS_OF_VIEW = (90.0, 65.0, 40.0, 25.0)  # degrees: starts of a lens
 
