@@ -28,7 +28,7 @@ from edge.detectors.plugins import detector_revision, load_detector
 from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader, has_pyav
 from edge.offline.detections import HEADER, VideoDetections, observations_csv, run_detector
 from edge.offline.video import MARKER_FILE, read_marker_model
-from protocols.core.errors import InputError
+from protocols.core.errors import InputError, Refused
 from protocols.core.files import write_together
 from protocols.core.names import name_from_file
 from protocols.core.version import VERSION
@@ -42,6 +42,7 @@ Progress = Callable[[str, float], None]
 
 SESSION = "session"
 _DETECTIONS, _STATE = "detections", "videos.json"
+_NOTHING = "nothing"  # what is searched where nothing was recognised
 _LEAST_ROWS = 3  # of a tag's corner in a video
 _SAME_TIME_S = 1e-3  # s: containers round time stamps to milliseconds
 _LENS = ("matrix", "distortions", "fisheye", "focal_std")
@@ -59,9 +60,10 @@ class VideoFile:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VideoSession(Session):
-    """A session made of videos. summaries: one line a video."""
+    """A session made of videos. summaries: one line a video. refusal: nothing that moves was found in them."""
 
     summaries: tuple[str, ...] = ()
+    refusal: Refused | None = None
 
 
 def is_video_folder(folder: Path) -> bool:
@@ -109,7 +111,8 @@ def session_from_videos(
     reused if the video has not changed. marker: a marker.toml; default: the one in the folder, or the demo's orange
     ball. detector: one of ``recognition.DETECTORS``, a network's .toml file, or another package's detector. Persons,
     vehicles and those of networks and packages: one target at a time, because they are not associated between videos.
-    Raises InputError if fewer than two videos can be read, and Refused if auto finds nothing in them.
+    Raises InputError if fewer than two videos can be read. Where auto finds nothing in them, the session is empty and
+    carries the refusal.
     """
     if detector not in DETECTORS:
         load_detector(detector)  # one that is not usable fails once, not for every video
@@ -122,7 +125,11 @@ def session_from_videos(
     own_marker = marker or (folder / MARKER_FILE if (folder / MARKER_FILE).exists() else None)
     model = MarkerModel.default() if own_marker is None else read_marker_model(own_marker)
     paths = [video.path for video in videos]
-    target = find_target(folder, paths, detector, model, progress) if detector in DETECTORS else Target(detector)
+    refusal: Refused | None = None
+    try:
+        target = find_target(folder, paths, detector, model, progress) if detector in DETECTORS else Target(detector)
+    except Refused as refused:
+        refusal, target = refused, Target(_NOTHING)
     detector, what = target.kind, target.text if detector in DETECTORS else "target"
     found, failed = _detect_all(videos, session, model, given, progress, target)
     warnings += failed
@@ -143,9 +150,10 @@ def session_from_videos(
             one = replace(one, rows=())
         rows += one.rows
         again = " (kept from before)" if kept else ""
-        lines.append(f"{video.path.name}: {what} in {one.frames_with_detection} of {one.frames} frames{again}")
+        if refusal is None:
+            lines.append(f"{video.path.name}: {what} in {one.frames_with_detection} of {one.frames} frames{again}")
         warnings += [f"{video.path.name}: {warning}" for warning in one.warnings]
-        if not one.rows and not several:
+        if not one.rows and not several and refusal is None:
             warnings.append(f"{video.path.name}: no {what} in any of its frames")
         table = _camera_table(video, one, tables.get(video.camera, {}), warnings)
         lens = _measured_lens(given, video.camera)
@@ -164,7 +172,10 @@ def session_from_videos(
     rig_text = tomli_w.dumps({"metadata": metadata, **tables} if metadata else tables)
     write_together({session / RIG_FILE: rig_text, session / OBSERVATIONS_FILE: observations_csv(rows)})
     if not rows:
-        return VideoSession(read_rig(session / RIG_FILE), Observations({}), tuple(warnings), folder.name, tuple(lines))
+        rig = read_rig(session / RIG_FILE)
+        if refusal is not None:
+            refusal.warnings = tuple(warnings)
+        return VideoSession(rig, Observations({}), tuple(warnings), folder.name, tuple(lines), refusal)
     rig, observations = read_folder(session)
     return VideoSession(rig, observations, (*warnings, *observations.warnings), folder.name, tuple(lines))
 
@@ -255,7 +266,9 @@ def _detect_all(
         try:
             film = VideoReader(video.path)
             total = max(film.info.frames, 1)
-            if kind == "marker" or kind == "bright" or target.board is not None:
+            if kind == _NOTHING:
+                one = VideoDetections((), film.info.frames, 0, 0, 0, film.info.size, film.info.fps, (0.0, 0.0))
+            elif kind == "marker" or kind == "bright" or target.board is not None:
                 detector = _point_detector(target, model, lens, film.info.size)
                 one = run_detector(
                     film,
@@ -343,7 +356,7 @@ def _cache_key(video: VideoFile, model: MarkerModel | None, lens: Any, target: T
     """Cache key: a hash of everything that affects a video's detections."""
     table = None if model is None else {"revision": REVISION, **model.to_table()}
     kind = target.kind
-    revision = f"{kind} {target.board}" if kind in DETECTORS else detector_revision(kind)
+    revision = f"{kind} {target.board}" if kind in (*DETECTORS, _NOTHING) else detector_revision(kind)
     about = [VERSION, has_pyav(), video.path.name, video.size, video.mtime_ns, table, lens, revision]
     return hashlib.sha256(json.dumps(about).encode()).hexdigest()
 

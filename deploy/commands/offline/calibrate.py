@@ -83,6 +83,9 @@ def calibrate(
     from deploy.offline.outputs import report_refusal, report_result
 
     try:
+        refusal = getattr(read, "refusal", None)
+        if refusal is not None:
+            raise refusal
         with progress_bar(f"calibrating {session.name}", quiet=json) as progress:
             result = solve(read, options, progress)
     except Refused as refusal:

@@ -511,7 +511,7 @@ def _noise(problem: BodyProblem, state: BodyState) -> Floats:
 
 
 def _jitters(problem: BodyProblem, state: BodyState) -> Floats:
-    """Stds (cameras,) of the views' time errors: their mean square with the variance that remains (EM's step)."""
+    """Stds (cameras,) of the views' time errors: their squares over the number of them that the data determine (MacKay, 1992)."""
     out = state.jitter.copy()
     for camera in range(len(problem.views)):
         if out[camera] <= 0.0:
@@ -524,7 +524,7 @@ def _jitters(problem: BodyProblem, state: BodyState) -> Floats:
         seen = information > 0
         if not seen.any():
             continue
-        left = 1.0 / (information[seen] + 1.0 / out[camera] ** 2)
-        value = float(np.sqrt(np.mean(state.shift[camera][seen] ** 2 + left)))
+        known = information[seen] / (information[seen] + 1.0 / out[camera] ** 2)
+        value = float(np.sqrt((state.shift[camera][seen] ** 2).sum() / max(float(known.sum()), 1.0)))
         out[camera] = value if value > _MIN_JITTER else 0.0
     return out

@@ -160,7 +160,9 @@ def test_no_marker_in_any_video_is_refused_with_a_result(tmp_path: Path, capsys:
             tmp_path / "videos" / f"{name}.mp4", [numbered_image(i + 9 * k) for i in range(10)], np.arange(10) / 20
         )
     assert run(["calibrate", str(tmp_path / "videos"), "--out", str(tmp_path / "out")]) == 3
-    assert "no observations" in capsys.readouterr().err
+    message = capsys.readouterr().err
+    assert "tried: ArUco and AprilTag tags of all dictionaries" in message
+    assert all(name in message for name in ("chessboards", "ball", "light", "person", "vehicle"))
     assert json.loads((tmp_path / "out" / "result.json").read_text())["status"] == "refused"
 
 
