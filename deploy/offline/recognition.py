@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.detectors.board.description import BOARD_FILE, Board, load_dictionary, read_board
+from edge.detectors.board.description import BOARD_FILE, Board, BoardKind, load_dictionary, read_board
 from edge.detectors.board.detector import SEARCH_PX, BoardDetector
 from edge.detectors.marker.ball import MarkerModel
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
@@ -54,9 +55,7 @@ class Target:
         return "tag" if self.board.tags and self.board.squares is None else "board"
 
 
-def find_target(
-    folder: Path, videos: Sequence[Path], detector: str, model: MarkerModel, progress: Progress
-) -> Target:
+def find_target(folder: Path, videos: Sequence[Path], detector: str, model: MarkerModel, progress: Progress) -> Target:
     """The target of a folder of videos.
 
     detector: a name of DETECTORS; ``auto`` looks at some frames with all of them. Raises InputError for a board that
@@ -87,8 +86,8 @@ def _look(looks: _Looks, board: Board | None, model: MarkerModel) -> Target:
     if board is not None:
         described, videos = looks.print_of(board)
         if videos >= _LEAST_VIDEOS:
-            kind = "tag" if board.tags else board.kind
-            return Target(kind, described, (f"auto: the board of {BOARD_FILE} is in the videos ({described.text})",))
+            name = "tag" if board.tags else board.kind
+            return Target(name, described, (f"auto: the board of {BOARD_FILE} is in the videos ({described.text})",))
         tried.append(f"the board of {BOARD_FILE} ({board.text}, in every print)")
     tags = looks.tags(_DICTIONARIES)
     if tags is not None:
@@ -142,6 +141,9 @@ class _Looks:
                 self._samples[path] = []
         return self._samples[path]
 
+    def _show(self, path: Path, text: str, share: float) -> None:
+        self._progress(f"{path.name} {text}", share)
+
     def print_of(self, board: Board) -> tuple[Board, int]:
         """The print of a board in which most corners are found, and the number of videos with it."""
         best, most, seen = next(iter(board.prints())), 0, 0
@@ -160,7 +162,9 @@ class _Looks:
         """Single tags of the dictionary of which most are seen again and again, and how many there are."""
         best: tuple[int, str, bool, set[int]] | None = None
         for inverted in (False, True):
-            images = [[_small(_grey(image), inverted) for image in self.images(path)] for path in self._paths[:_LOOK_AT]]
+            images = [
+                [_small(_grey(image), inverted) for image in self.images(path)] for path in self._paths[:_LOOK_AT]
+            ]
             for name in dictionaries:
                 detector = cv2.aruco.ArucoDetector(load_dictionary(name))
                 seen: Counter[int] = Counter()
@@ -168,7 +172,7 @@ class _Looks:
                     mine: Counter[int] = Counter()
                     for image in video:
                         ids = detector.detectMarkers(image)[1]
-                        mine.update(set() if ids is None else set(np.ravel(ids).tolist()))
+                        mine.update(set() if ids is None else {int(number) for number in np.ravel(ids)})
                     seen.update({number for number, count in mine.items() if count >= _LEAST_FRAMES})
                 steady = {number for number, count in seen.items() if count >= _LEAST_VIDEOS}
                 if steady and (best is None or len(steady) > best[0]):
@@ -176,7 +180,7 @@ class _Looks:
         if best is None:
             return None
         count, name, inverted, steady = best
-        kind = "apriltag" if name.startswith("APRILTAG") else "aruco"
+        kind: BoardKind = "apriltag" if name.startswith("APRILTAG") else "aruco"
         board = Board("aruco", None, _smallest(name, max(steady)), inverted=inverted, mirrored=False, legacy=False)
         return replace(board, kind=kind), count
 
@@ -220,8 +224,9 @@ class _Looks:
                 reader = VideoReader(path)
             except InputError:
                 continue
+            show = partial(self._show, path)
             detector = moving_detector("person" if kind == "person" else "vehicle", "mog2", reader.info.fps)
-            found = detect_moving(reader, "look", detector, lambda text, share: self._progress(f"{path.name} {text}", share))
+            found = detect_moving(reader, "look", detector, show)
             videos += bool(found.rows)
             if videos >= _LEAST_VIDEOS:
                 break

@@ -65,7 +65,9 @@ class BoardWorld:
                 pixels = camera.lens.project(camera.pose.camera_from_world(centred @ turn.T + place))
                 yield name, frame, time, pixels
 
-    def observations(self, seconds: float = 10.0, noise: float = 0.15, seed: int = 0, jitter: float = 0.0) -> Observations:
+    def observations(
+        self, seconds: float = 10.0, noise: float = 0.15, seed: int = 0, jitter: float = 0.0
+    ) -> Observations:
         """The corners inside the images, with noise [px]."""
         rng = np.random.default_rng(seed + 1000)
         cameras, labels, frames, times, seen = [], [], [], [], []
@@ -86,7 +88,11 @@ class BoardWorld:
 
 
 def board_world(
-    seed: int, fps: tuple[float, ...] = (6.0, 6.0, 6.0, 6.0), lag: float = 3.0, squares: tuple[int, int] = (5, 4), size: float = 0.05
+    seed: int,
+    fps: tuple[float, ...] = (6.0, 6.0, 6.0, 6.0),
+    lag: float = 3.0,
+    squares: tuple[int, int] = (5, 4),
+    size: float = 0.05,
 ) -> BoardWorld:
     """A world with a camera for each rate of ``fps``, whose clocks differ by up to ``lag`` [s]."""
     rng = np.random.default_rng(seed)

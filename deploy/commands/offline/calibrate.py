@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -27,6 +29,8 @@ def calibrate(
     from_known: Path | None = None,
     marker: Path | None = None,
     detector: str | None = None,
+    height: float | None = None,
+    limb: str | None = None,
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
@@ -67,6 +71,10 @@ def calibrate(
         tags. bright: a point of light. marker: a coloured ball. person, vehicle: only one at a time in view, with fixed
         cameras. auto (default): looks at some frames with all of them. Or the .toml file of an ONNX network, or a
         detector that another package registers: only one target at a time in view.
+    height
+        For keypoints of a person: the height [rig units], which gives the scale by thighs and shanks (about 3 %).
+    limb
+        The distance between two labels, as left_knee-left_ankle=0.41 [rig units]: gives the scale.
     json
         Print the result as JSON on standard output.
     seed
@@ -78,6 +86,7 @@ def calibrate(
     check_folder(out)
     options = CalibrationOptions(solver, from_known, seed=seed)
     read = _load(session, observations, out, marker, detector, json)
+    read = _with_scale(read, height, limb)
     command = shlex.join(["syncline", *sys.argv[1:]])
     retain_freed_memory()
     from deploy.offline.outputs import report_refusal, report_result
@@ -124,3 +133,25 @@ def _load(
     if detector is not None:
         raise InputError("--detector goes with a folder of videos", remedy="leave it out for a session")
     return load_session(session, observations)
+
+
+def _with_scale(read: Session, height: float | None, limb: str | None) -> Session:
+    """The session with scale bars of a person's height, or of one limb. Raises InputError."""
+    from protocols.formats.keypoints import limbs_of_height
+
+    labels, bars = read.observations.labels, list(read.rig.scale_bars)
+    if limb is not None:
+        found = re.fullmatch(r"\s*(.+?)\s*[-–]\s*(.+?)\s*=\s*([0-9.eE+]+)\s*", limb)
+        if found is None or not {found[1], found[2]} <= set(labels):
+            known = ", ".join(labels[:12])
+            raise InputError(f"--limb {limb}: no two labels and a length", remedy=f"give a-b=0.4; labels are {known}")
+        bars.append((found[1], found[2], float(found[3])))
+    if height is not None:
+        if not 0.0 < height < 1e6:
+            raise InputError(f"--height {height:g} is out of range", remedy="give the person's height in rig units")
+        limbs = limbs_of_height(height, labels)
+        if not limbs:
+            remedy = "it needs joints named left_hip, left_knee, left_ankle; or give --limb a-b=LENGTH"
+            raise InputError("--height: no thigh or shank among the labels", remedy=remedy)
+        bars += limbs
+    return read if bars == list(read.rig.scale_bars) else replace(read, rig=replace(read.rig, scale_bars=tuple(bars)))

@@ -35,7 +35,7 @@ class Finder:
         """The corners in an image (H, W) uint8. thorough: search a chessboard by every method."""
         if min(grey.shape) < 24:
             return _NOTHING
-        print_ = cv2.bitwise_not(grey) if self.board.inverted else grey
+        print_ = np.asarray(255 - grey if self.board.inverted else grey, dtype=np.uint8)
         if self.board.mirrored:
             print_ = np.ascontiguousarray(print_[:, ::-1])
         if self._charuco is not None:

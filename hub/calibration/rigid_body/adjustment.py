@@ -396,18 +396,18 @@ def _moments(full: Floats, weight: Floats, view: Ints, count: int) -> Floats:
     width = full.shape[2]
     padded = np.zeros((count, int(each.max(initial=1)), 2, width))
     padded[view, place] = full * np.sqrt(weight)[:, None, None]
-    padded = padded.reshape(count, -1, width)
-    return np.matmul(padded.transpose(0, 2, 1), padded)
+    flat = padded.reshape(count, -1, width)
+    return np.asarray(np.matmul(flat.transpose(0, 2, 1), flat))
 
 
 def _add_priors(
     system: ReducedSystem, problem: BodyProblem, state: BodyState, columns: list[list[int]], starts: Ints
 ) -> None:
-    for camera, column, value, std in _camera_priors(problem, state):
+    for camera, column, difference, std in _camera_priors(problem, state):
         if column in columns[camera]:
-            at = int(starts[camera]) + columns[camera].index(column)
-            system.corner[at, at] += 1.0 / std**2
-            system.gradient_cameras[at] += value / std**2
+            place = int(starts[camera]) + columns[camera].index(column)
+            system.corner[place, place] += 1.0 / std**2
+            system.gradient_cameras[place] += difference / std**2
     third = np.array([-1.0, 3.0, -3.0, 1.0])
     first = 0
     for body, scatter in zip(state.bodies, state.scatter, strict=True):
@@ -511,7 +511,10 @@ def _noise(problem: BodyProblem, state: BodyState) -> Floats:
 
 
 def _jitters(problem: BodyProblem, state: BodyState) -> Floats:
-    """Stds (cameras,) of the views' time errors: their squares over the number of them that the data determine (MacKay, 1992)."""
+    """Stds (cameras,) of the views' time errors: their squares over the number of them that the data determine.
+
+    MacKay, "Bayesian interpolation", 1992, equation 4.8.
+    """
     out = state.jitter.copy()
     for camera in range(len(problem.views)):
         if out[camera] <= 0.0:

@@ -188,13 +188,15 @@ def quaternions(rotation: Floats) -> Floats:
 def rotations(turn: Floats) -> Floats:
     """Rotations (n, 3, 3) of quaternions w, x, y, z (n, 4) of any norm."""
     w, x, y, z = (turn / np.linalg.norm(turn, axis=-1, keepdims=True)).T
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
-        ],
-        axis=-2,
+    return np.asarray(
+        np.stack(
+            [
+                np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
+                np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
+                np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
+            ],
+            axis=-2,
+        )
     )
 
 
@@ -208,7 +210,7 @@ def aligned(turn: Floats, order: Ints) -> Floats:
 
 
 def _conjugate(turn: Floats) -> Floats:
-    return turn * np.array([1.0, -1.0, -1.0, -1.0])
+    return np.asarray(turn * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
 def _multiply(p: Floats, q: Floats) -> Floats:

@@ -85,7 +85,7 @@ def gather_views(
     pixels = np.concatenate([track.pixels for track in used])
     label = np.concatenate([np.full(len(track), labels.index(track.label)) for track in used])
     order = np.lexsort((label, time, body))
-    time, body, points, pixels, label = (values[order] for values in (time, body, points, pixels, label))
+    time, body, points, pixels, label = time[order], body[order], points[order], pixels[order], label[order]
     new = np.r_[True, (np.diff(time) > 0) | (np.diff(body) > 0)]
     return CameraViews(name, origin, time[new], body[new], np.cumsum(new) - 1, points, pixels, label)
 
