@@ -168,6 +168,8 @@ def session_from_videos(
         metadata |= _body_metadata(target.board, rows)
         if "clock" not in metadata and _same_stamps([one for one, _ in found.values()]):
             metadata["in_step"] = True
+    if refusal is None and target.kind in DETECTORS and target.kind != "marker":
+        metadata["target"] = target.text
     # [metadata] goes first, so that its keys do not end up in the last camera's table.
     rig_text = tomli_w.dumps({"metadata": metadata, **tables} if metadata else tables)
     write_together({session / RIG_FILE: rig_text, session / OBSERVATIONS_FILE: observations_csv(rows)})

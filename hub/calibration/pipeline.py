@@ -570,7 +570,7 @@ def _no_pair_reason(prepared: PreparedSession, pairs: list[PairSolution], refuse
         remedy = (
             "; give their intrinsics: `syncline intrinsics` with a board, --model or --field-of-view"
             if prepared.uncalibrated
-            else "; film the marker with two cameras or more at the same time"
+            else "; film what moves with two cameras or more at the same time"
         )
         return (
             f"fewer than two cameras can be placed ({listed}){remedy}"

@@ -19,8 +19,25 @@ from protocols.session.observations import read_observations
 from tests.support.board_session import BoardWorld, board_world
 
 Capture = pytest.CaptureFixture[str]
-JOINTS = ("nose left_eye right_eye left_ear right_ear left_shoulder right_shoulder left_elbow right_elbow left_wrist "
-          "right_wrist left_hip right_hip left_knee right_knee left_ankle right_ankle").split()  # fmt: skip
+JOINTS = [
+    "nose",
+    "left_eye",
+    "right_eye",
+    "left_ear",
+    "right_ear",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "right_elbow",
+    "left_wrist",
+    "right_wrist",
+    "left_hip",
+    "right_hip",
+    "left_knee",
+    "right_knee",
+    "left_ankle",
+    "right_ankle",
+]
 FRAMES = 6
 
 
