@@ -25,6 +25,7 @@ _REPLACED_METADATA = (
     "bodies",
     "bodies_scale",
     "in_step",
+    "target",
     "refused",
     "scale",
     "solver",

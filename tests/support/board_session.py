@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations, gather_tracks
 from protocols.session.rig import Rig, RigCamera
+from tests.support import boards
+from tests.support.videos import write_video
 
 
 @dataclass(frozen=True)
@@ -122,6 +125,31 @@ def board_world(
         for column in range(squares[0] - 1)
     }
     return BoardWorld(cameras, points, (amplitude, frequency, rng.uniform(0, 2 * np.pi, (6, 3))), facing)
+
+
+def render_videos(
+    world: BoardWorld, folder: Path, seconds: float, *, inverted: bool = False, scale: float = 0.5
+) -> None:
+    """Write a video a camera of the ChArUco board of ``tests.support.boards``, at a share of the lens's resolution."""
+    drawing = boards.charuco_image()
+    square = float(np.diff([point[0] for point in list(world.points.values())[:2]])[0])
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, camera in world.cameras.items():
+        lens = camera.lens
+        matrix = np.diag([scale, scale, 1.0]) @ lens.matrix
+        matrix[:2, 2] += 0.5 * (scale - 1.0)
+        size = round(lens.width * scale), round(lens.height * scale)
+        renderer = boards.BoardRenderer(Intrinsics(*size, matrix, lens.distortions), seed=len(name))
+        times = np.arange(int(seconds * camera.fps)) / camera.fps
+        images = []
+        for time in times:
+            turn, place = world.board(float(time) * camera.rate + camera.offset)
+            rotation = camera.pose.rotation @ turn
+            centre = camera.pose.camera_from_world(place[None])[0] / square
+            faces = rotation[:, 2] @ centre > 0.3 * np.linalg.norm(centre)
+            image = renderer.draw(drawing, rotation, centre) if faces else renderer.draw(drawing, rotation, 50 * centre)
+            images.append(255 - image if inverted else image)
+        write_video(folder / f"{name}.mp4", images, times)
 
 
 def looking_at(place: Floats, target: Floats) -> Pose:
