@@ -6,11 +6,12 @@ from pathlib import Path
 
 from protocols.core.errors import InputError
 from protocols.core.files import file_in
-from protocols.formats import colmap, toml_rigs, trc, yaml_rigs
+from protocols.formats import colmap, opensfm, ros, toml_rigs, trc, yaml_rigs
+from protocols.formats.c3d import write_c3d
 from protocols.formats.cameras import ExportedFiles, convert_units
 from protocols.session.calibration import read_calibration
 
-IN_FOLDERS = ("opencv", "colmap")
+IN_FOLDERS = ("opencv", "ros", "colmap")
 """Formats with several files, for which --out is a folder."""
 
 
@@ -29,6 +30,10 @@ def calibration_files(source: Path, to: str, out: Path) -> tuple[dict[Path, str]
         written = ExportedFiles(written.files, warnings + written.warnings)
     elif to == "opencv":
         written = yaml_rigs.write_opencv(cameras, rig.units)
+    elif to == "ros":
+        written = ros.write(cameras)
+    elif to == "opensfm":
+        written = opensfm.write(cameras, out.name)
     else:
         written = colmap.write(cameras)
     folder = out if to in IN_FOLDERS else out.parent
@@ -53,3 +58,6 @@ def export_log(log: Path, out: Path) -> tuple[int, int, tuple[str, ...]]:
     write_rig(out / RIG_FILE, rig_tables_of_log(rig))
     write_observations(out / OBSERVATIONS_FILE, observations)
     return len(rig.cameras), len(observations), warnings
+
+
+__all__ = ["IN_FOLDERS", "calibration_files", "export_log", "trajectory_files", "write_c3d"]

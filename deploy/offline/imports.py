@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,13 +17,13 @@ from deploy.offline.follow.objects import BOXES_FILE, complete_detections, is_bo
 from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.core.errors import InputError
 from protocols.core.files import read_text, read_toml
-from protocols.formats import colmap, points, toml_rigs, yaml_rigs
+from protocols.formats import colmap, keypoints, opensfm, points, toml_rigs, xml_rigs, yaml_rigs
 from protocols.formats.cameras import ForeignRig, rig_tables
 from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration, read_calibration
-from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
-from protocols.session.observations import Observations
+from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_rig
+from protocols.session.observations import Observations, gather_tracks
 from protocols.session.rig import Rig, parse_camera_table, read_rig
 
 if TYPE_CHECKING:
@@ -30,11 +31,28 @@ if TYPE_CHECKING:
 
     from protocols.topics import Topic
 
-CALIBRATIONS = ("aniposelib", "caliscope", "pose2sim", "freemocap", "opencv", "kalibr", "colmap")
-POINTS = ("caliscope-points", "deeplabcut", "mvus")
+CALIBRATIONS = (
+    "aniposelib",
+    "caliscope",
+    "pose2sim",
+    "freemocap",
+    "opencv",
+    "kalibr",
+    "colmap",
+    "opensfm",
+    "qualisys",
+    "vicon",
+)
+POINTS = ("caliscope-points", "deeplabcut", "mvus", *keypoints.FORMATS)
 FORMATS = (*CALIBRATIONS, *POINTS, "session")
+_CROWDED_SHARE = 0.1  # of the frames with more than one person: above it, they are different labels
 _YAML = (".yml", ".yaml")
+_KEYPOINTS = (".json", ".h5", ".hdf5", ".slp", ".npy")
 _REMEDY = f"give the format with --format: {', '.join(FORMATS)}"
+
+
+CameraTables = Callable[[str], dict[str, Any] | None]
+"""Camera → its table of rig.toml, as far as it is known without a lens; None = not at all."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,10 +95,17 @@ def detect_source(sources: list[Path], wanted: str | None) -> ImportSource:
             return ImportSource("session", [folder])
         if wanted == "colmap" or (wanted is None and (folder / colmap.IMAGES).exists()):
             return ImportSource("colmap", [folder])
-        kinds = (".csv", ".txt", *_YAML, ".toml")
+        volume = folder / "camera_array.toml"
+        if wanted in (None, "caliscope") and volume.exists() and (folder / "image_points.csv").exists():
+            return ImportSource("caliscope", [volume])  # a capture volume
+        if wanted in (None, "openpose") and keypoints.detect_format(folder) == "openpose":
+            return ImportSource("openpose", [folder])
+        kinds = (".csv", ".txt", *_YAML, ".toml", *_KEYPOINTS)
         files = sorted(path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in kinds)
         if not files:
             raise InputError("nothing in this folder can be imported", file=folder, remedy=_REMEDY)
+    if all(path.is_dir() and keypoints.detect_format(path) == "openpose" for path in files):
+        return ImportSource("openpose", files)
     if any(path.is_dir() for path in files):
         raise InputError("a folder among files", file=next(p for p in files if p.is_dir()), remedy="give one folder")
     if wanted in ("session", "colmap"):
@@ -90,7 +115,8 @@ def detect_source(sources: list[Path], wanted: str | None) -> ImportSource:
     found = {path: _kind_of(path) for path in files}
     unknown = next((path for path, kind in found.items() if kind is None), None)
     if unknown is not None:
-        raise InputError("unknown format", file=unknown, line=1, remedy=_REMEDY)
+        nearest = points.nearest_layout(_beginning(unknown)) if unknown.suffix.lower() in (".csv", ".txt") else ""
+        raise InputError(f"unknown format{f': {nearest}' if nearest else ''}", file=unknown, line=1, remedy=_REMEDY)
     kinds_found = sorted({str(kind) for kind in found.values()})
     if len(kinds_found) > 1:
         raise InputError(f"files of different kinds ({', '.join(kinds_found)})", remedy="import each kind by itself")
@@ -108,6 +134,10 @@ def read_foreign_calibration(source: ImportSource) -> ForeignRig:
         return colmap.read(file)
     if source.kind == "kalibr":
         return yaml_rigs.read_kalibr(file)
+    if source.kind in ("qualisys", "vicon"):
+        return xml_rigs.read(file, source.kind)
+    if source.kind == "opensfm":
+        return opensfm.read(file)
     return toml_rigs.read(file, source.kind)
 
 
@@ -142,11 +172,94 @@ def frame_clock(fps: float | None, videos: Path | None) -> points.Times:
     return times
 
 
-def read_points(source: ImportSource, times: points.Times, likelihood: float, camera: str | None) -> Observations:
-    """Read the observations of another tracker. Raises InputError."""
+def read_points(
+    source: ImportSource,
+    times: points.Times,
+    likelihood: float,
+    camera: str | None,
+    tables: CameraTables | None = None,
+) -> Observations:
+    """Read the observations of another tracker. tables: what is known of each camera. Raises InputError."""
     if camera is not None and (len(source.files) > 1 or source.kind == "caliscope-points"):
         raise InputError("--camera names the camera of one file", remedy="leave it out: files are named after cameras")
+    if source.kind in keypoints.FORMATS:
+        return _keypoint_observations(keypoints.read(source.kind, source.files, camera), times, likelihood, tables)
     return points.read(source.kind, source.files, times, likelihood, camera)
+
+
+def _keypoint_observations(
+    found: list[keypoints.CameraKeypoints],
+    times: points.Times,
+    likelihood: float,
+    tables: CameraTables | None,
+) -> Observations:
+    """Observations of keypoints: joints are labels, of several people with the person's name before them."""
+    several = any(_several_people(one.rows) for one in found)
+    columns: list[tuple[str, str, int, float, float]] = []
+    stamps: list[float] = []
+    for one in found:
+        table = tables(one.camera) if one.normalised and tables is not None else None
+        size = table["size"] if table is not None else (1, 1)
+        if one.normalised and table is None:
+            what = f"its points are shares of the image, and the size of {one.camera}'s is not known"
+            raise InputError(what, file=one.file, remedy="give --videos FOLDER or --size 1920x1080")
+        rows = [row for row in one.rows if row.score >= likelihood]
+        if not several:
+            # A second person in a few frames is a false detection: the better one of each frame is kept.
+            best = _best_person(rows)
+            rows = [row for row in rows if best[row.frame] == row.person]
+        shift = 0.5 if one.normalised else 0.0
+        for row in rows:
+            label = f"{row.person}.{row.joint}" if several else row.joint
+            columns.append((one.camera, label, row.frame, row.u * size[0] - shift, row.v * size[1] - shift))
+        stamps += times(one.camera, np.array([row.frame for row in rows], dtype=np.int64), one.file).tolist()
+    if not columns:
+        raise InputError("no keypoint is above --likelihood", file=found[0].file, remedy="give a lower one")
+    cameras, labels, frames, across, down = (list(column) for column in zip(*columns, strict=True))
+    nothing = np.full(len(columns), np.nan)
+    pixels = np.column_stack([np.array(across, dtype=np.float64), np.array(down, dtype=np.float64)])
+    return gather_tracks(cameras, labels, np.array(frames, dtype=np.int64), np.array(stamps), pixels, nothing)
+
+
+def _several_people(rows: list[keypoints.Keypoint]) -> bool:
+    """Whether a sizeable part of the frames shows more than one person."""
+    people: dict[int, set[str]] = {}
+    for row in rows:
+        people.setdefault(row.frame, set()).add(row.person)
+    return sum(len(one) > 1 for one in people.values()) > _CROWDED_SHARE * len(people)
+
+
+def _best_person(rows: list[keypoints.Keypoint]) -> dict[int, str]:
+    """The person with the largest sum of scores in each frame."""
+    total: dict[int, Counter[str]] = {}
+    for row in rows:
+        total.setdefault(row.frame, Counter())[row.person] += row.score  # type: ignore[assignment]
+    return {frame: max(sorted(scores), key=scores.__getitem__) for frame, scores in total.items()}
+
+
+def camera_tables(videos: Path | None, size: tuple[int, int] | None, fps: float | None) -> CameraTables:
+    """A function that gives what is known of a camera: image size and frame rate, of its video or as given."""
+
+    def table(camera: str) -> dict[str, Any] | None:
+        if videos is None:
+            rate = {} if fps is None else {"fps": fps}
+            return None if size is None else {"name": camera, "size": list(size), **rate}
+        from edge.devices.playback.video_reader import VideoReader
+
+        info = VideoReader(_video_of(camera, videos)).info
+        return {"name": camera, "size": list(info.size), "fps": info.fps}
+
+    return table
+
+
+def write_missing_rig(folder: Path, cameras: Sequence[str], tables: CameraTables) -> Path | None:
+    """Write a rig.toml without lenses beside observations, where there is none and all sizes are known."""
+    file = folder / RIG_FILE
+    found = {name: tables(name) for name in cameras}
+    if file.exists() or any(table is None for table in found.values()):
+        return None
+    write_rig(file, {"metadata": {"units": "m"}, **found})
+    return file
 
 
 def session_to_log(rig: Rig, observations: Observations, out: Path, arrivals: Arrivals | None = None) -> int:
@@ -278,16 +391,34 @@ def rig_tables_of_log(rig: Rig) -> dict[str, Any]:
 
 def _kind_of(file: Path) -> str | None:
     suffix = file.suffix.lower()
+    if suffix == ".json" and opensfm.is_file(file):
+        return "opensfm"
+    if suffix in _KEYPOINTS:
+        return keypoints.detect_format(file)
     if suffix == ".toml":
         return toml_rigs.detect_format(read_toml(file, "calibration")[0])
     if suffix in _YAML:
         return yaml_rigs.detect_format(yaml_rigs.load(file)[0])
-    return points.detect_format(read_text(file)[: 1 << 16])
+    begin = _beginning(file)
+    if suffix in (".xml", ".xcp") or begin.lstrip().startswith("<"):
+        return xml_rigs.detect_format(file)
+    return points.detect_format(begin)
+
+
+def _beginning(file: Path) -> str:
+    """The first 64 Ki characters of a text. Raises InputError."""
+    return read_text(file)[: 1 << 16]
 
 
 def _stamps_of(camera: str, videos: Path) -> Floats:
     """Times (n,) [s] of the frames of a camera's video, in presentation order."""
-    from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader
+    from edge.devices.playback.video_reader import VideoReader
+
+    return np.array([shot.time for shot in VideoReader(_video_of(camera, videos))])
+
+
+def _video_of(camera: str, videos: Path) -> Path:
+    from edge.devices.playback.video_reader import VIDEO_SUFFIXES
 
     found = sorted(
         path
@@ -296,7 +427,7 @@ def _stamps_of(camera: str, videos: Path) -> Floats:
     )
     if not found:
         raise InputError(f"no video of camera {camera!r}", file=videos, remedy=f"name it {camera}.mp4, or give --fps")
-    return np.array([shot.time for shot in VideoReader(found[0])])
+    return found[0]
 
 
 def camera_info(rig: Rig, name: str) -> pb.CameraInfo:

@@ -55,6 +55,11 @@ def report_refusal(
         return
     for warning in refusal.warnings:
         print(f"warning: {warning}")
+    lags = [pair for pair in refusal.pairs if pair.lag_s is not None]
+    for pair in lags:
+        print(f"timing of {pair.cameras[0]}–{pair.cameras[1]}: lag {pair.lag_s:+.4f} s")
+    if lags:
+        print(f"the lags are usable without poses: syncline sync VIDEOS --calibration {out / RESULT} --out DIR")
     print_advice(session.rig, session.observations)
 
 

@@ -6,8 +6,9 @@ source frame nearest to that time; a table lists which one it is.
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -20,7 +21,9 @@ from edge.devices.base import Image
 from edge.devices.playback.video_reader import VideoReader
 from protocols.core.clocks import CameraTime, TimeMap
 from protocols.core.errors import InputError, Refused
+from protocols.core.files import read_text
 from protocols.geometry.types import Floats
+from protocols.session.calibration import read_calibration
 
 if TYPE_CHECKING:
     from av.container import OutputContainer
@@ -50,6 +53,62 @@ class SynchronisedVideo:
     reference: Floats
     source_frames: list[int]
     error: Floats
+
+
+def read_time_maps(file: Path, films: Mapping[str, VideoReader]) -> tuple[str, dict[str, TimeMap], dict[str, float]]:
+    """Reference camera, time maps and stds [s] of a calibration.toml, or from the pairs of a result.json.
+
+    A result.json has lags also where no camera could be placed. Raises InputError, and Refused where it has none.
+    """
+    if file.suffix.lower() != ".json":
+        rig, cameras = read_calibration(file)
+        stds = {name: camera.time_offset_std for name, camera in cameras.items()}
+        reference = str(rig.metadata.get("reference", next(iter(rig.cameras))))
+        return reference, {name: camera.time_map for name, camera in cameras.items()}, stds
+    try:
+        document = json.loads(read_text(file))
+        pairs = [
+            (str(a), str(b), float(pair["lag_s"]), float(pair.get("clock_rate") or 1.0))
+            for pair in document["pairs"]
+            if pair.get("lag_s") is not None
+            for a, b in (pair["cameras"],)
+        ]
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        remedy = "give the result.json or the calibration.toml of `calibrate`"
+        raise InputError("this is no result of `calibrate`", file=file, remedy=remedy) from None
+    return time_maps_of_pairs(pairs, films)
+
+
+def time_maps_of_pairs(
+    pairs: Sequence[tuple[str, str, float, float]], films: Mapping[str, VideoReader]
+) -> tuple[str, dict[str, TimeMap], dict[str, float]]:
+    """Time maps from the lags of pairs (a, b, t_a - t_b in the middle of their overlap [s], rate of a's clock by b's).
+
+    Raises Refused where the lag of no pair is known.
+    """
+    usable = [pair for pair in pairs if {pair[0], pair[1]} <= set(films) and all(map(math.isfinite, pair[2:]))]
+    if not usable:
+        raise Refused("the lag of no pair of these videos is known: film something that moves in front of both")
+    reference = next(name for name in films if any(name in pair[:2] for pair in usable))
+    maps = {reference: TimeMap(1.0, 0.0)}
+    spans = {name: reference_span(film, TimeMap(1.0, 0.0)) for name, film in films.items()}
+    grown = True
+    while grown:
+        grown = False
+        for a, b, lag, rate in usable:
+            first, last = max(spans[a].first, spans[b].first + lag), min(spans[a].last, spans[b].last + lag)
+            middle = 0.5 * (first + last)
+            a_from_b = TimeMap(rate, middle - rate * (middle - lag))
+            if a in maps and b not in maps:
+                maps[b], grown = _chained(maps[a], a_from_b), True
+            elif b in maps and a not in maps:
+                maps[a], grown = _chained(maps[b], TimeMap(1.0 / rate, -a_from_b.time_offset / rate)), True
+    return reference, maps, dict.fromkeys(maps, 0.0)
+
+
+def _chained(outer: TimeMap, inner: TimeMap) -> TimeMap:
+    """The map that applies ``inner`` first."""
+    return TimeMap(outer.clock_rate * inner.clock_rate, outer.clock_rate * inner.time_offset + outer.time_offset)
 
 
 def reference_span(film: VideoReader, time_map: TimeMap) -> Span:

@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import threading
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -14,16 +15,20 @@ from pathlib import Path
 from typing import Any, get_args
 
 import cv2
+import numpy as np
 import tomli_w
 
-from edge.detectors.base import Kind
+from deploy.offline.recognition import DETECTORS, Target, find_target
+from edge.detectors.base import Detector, Kind
+from edge.detectors.board.description import Board
+from edge.detectors.board.detector import BoardDetector
 from edge.detectors.marker.ball import REVISION, MarkerModel
-from edge.detectors.marker.factory import ball_detector
+from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
 from edge.detectors.plugins import detector_revision, load_detector
 from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader, has_pyav
 from edge.offline.detections import HEADER, VideoDetections, observations_csv, run_detector
 from edge.offline.video import MARKER_FILE, read_marker_model
-from protocols.core.errors import InputError
+from protocols.core.errors import InputError, Refused
 from protocols.core.files import read_toml, write_together
 from protocols.core.names import name_from_file
 from protocols.core.version import VERSION
@@ -37,6 +42,9 @@ Progress = Callable[[str, float], None]
 
 SESSION = "session"
 _DETECTIONS, _STATE = "detections", "videos.json"
+_NOTHING = "nothing"  # what is searched where nothing was recognised
+_LEAST_ROWS = 3  # of a tag's corner in a video
+_SAME_TIME_S = 1e-3  # s: containers round time stamps to milliseconds
 _LENS = ("matrix", "distortions", "fisheye", "focal_std")
 
 
@@ -52,9 +60,10 @@ class VideoFile:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VideoSession(Session):
-    """A session made of videos. summaries: one line a video."""
+    """A session made of videos. summaries: one line a video. refusal: nothing that moves was found in them."""
 
     summaries: tuple[str, ...] = ()
+    refusal: Refused | None = None
 
 
 def is_video_folder(folder: Path) -> bool:
@@ -100,14 +109,13 @@ def session_from_videos(
 
     session: folder that is created or updated: rig.toml, observations.csv and the detections of each video, which are
     reused if the video has not changed. marker: a marker.toml; default: the one in the folder, or the demo's orange
-    ball. detector: marker, person, vehicle, a network's .toml file, or another package's detector; all but marker
-    require videos with one target at a time, because targets are not associated between videos. Raises InputError if
-    fewer than two videos can be read.
+    ball. detector: one of ``recognition.DETECTORS``, a network's .toml file, or another package's detector. Persons,
+    vehicles and those of networks and packages: one target at a time, because they are not associated between videos.
+    Raises InputError if fewer than two videos can be read. Where auto finds nothing in them, the session is empty and
+    carries the refusal.
     """
-    what = detector
-    if detector not in ("marker", *get_args(Kind)):
+    if detector not in DETECTORS:
         load_detector(detector)  # one that is not usable fails once, not for every video
-        what = "target"
     folder, session = Path(folder), Path(session)
     videos, warnings = list_videos(folder)
     if len(videos) < 2:
@@ -116,18 +124,25 @@ def session_from_videos(
     given, tables = _given_rig(folder)
     own_marker = marker or (folder / MARKER_FILE if (folder / MARKER_FILE).exists() else None)
     model = MarkerModel.default() if own_marker is None else read_marker_model(own_marker)
-    found, failed = _detect_all(videos, session, model, given, progress, detector)
+    paths = [video.path for video in videos]
+    refusal: Refused | None = None
+    try:
+        target = find_target(folder, paths, detector, model, progress) if detector in DETECTORS else Target(detector)
+    except Refused as refused:
+        refusal, target = refused, Target(_NOTHING)
+    detector, what = target.kind, target.text if detector in DETECTORS else "target"
+    found, failed = _detect_all(videos, session, model, given, progress, target)
     warnings += failed
     if len(found) < 2:
         listed = "; ".join(warnings)
         raise InputError(f"fewer than two videos can be used ({listed})", file=folder, remedy="add or replace videos")
-    lines: list[str] = []
+    lines: list[str] = list(target.notes)
     rows: list[str] = []
     for video in videos:
         if video.camera not in found:
             continue
         one, kept = found[video.camera]
-        several = _label_count_if_many(one)
+        several = 0 if target.board is not None else _label_count_if_many(one)
         if several:
             warnings.append(
                 f"{video.path.name}: {several} {what}s in it, and who is who in two videos is not known; left out"
@@ -135,9 +150,10 @@ def session_from_videos(
             one = replace(one, rows=())
         rows += one.rows
         again = " (kept from before)" if kept else ""
-        lines.append(f"{video.path.name}: {what} in {one.frames_with_detection} of {one.frames} frames{again}")
+        if refusal is None:
+            lines.append(f"{video.path.name}: {what} in {one.frames_with_detection} of {one.frames} frames{again}")
         warnings += [f"{video.path.name}: {warning}" for warning in one.warnings]
-        if not one.rows and not several:
+        if not one.rows and not several and refusal is None:
             warnings.append(f"{video.path.name}: no {what} in any of its frames")
         table = _camera_table(video, one, tables.get(video.camera, {}), warnings)
         lens = _measured_lens(given, video.camera)
@@ -148,11 +164,20 @@ def session_from_videos(
             table["ball_outline"] = True
         tables[video.camera] = table
     metadata = tables.pop("metadata", {})
+    if target.board is not None:
+        metadata |= _body_metadata(target.board, rows)
+        if "clock" not in metadata and _same_stamps([one for one, _ in found.values()]):
+            metadata["in_step"] = True
+    if refusal is None and target.kind in DETECTORS and target.kind != "marker":
+        metadata["target"] = target.text
     # [metadata] goes first, so that its keys do not end up in the last camera's table.
     rig_text = tomli_w.dumps({"metadata": metadata, **tables} if metadata else tables)
     write_together({session / RIG_FILE: rig_text, session / OBSERVATIONS_FILE: observations_csv(rows)})
     if not rows:
-        return VideoSession(read_rig(session / RIG_FILE), Observations({}), tuple(warnings), folder.name, tuple(lines))
+        rig = read_rig(session / RIG_FILE)
+        if refusal is not None:
+            refusal.warnings = tuple(warnings)
+        return VideoSession(rig, Observations({}), tuple(warnings), folder.name, tuple(lines), refusal)
     rig, observations = read_folder(session)
     return VideoSession(rig, observations, (*warnings, *observations.warnings), folder.name, tuple(lines))
 
@@ -216,9 +241,10 @@ def _detect_all(
     model: MarkerModel,
     given: Rig | None,
     progress: Progress,
-    kind: str,
+    target: Target,
 ) -> tuple[dict[str, tuple[VideoDetections, bool]], list[str]]:
     """Detections of each video with whether they come from the cache, and reasons why some could not be read."""
+    kind = target.kind
     state = _read_state(session)
     found: dict[str, tuple[VideoDetections, bool]] = {}
     failed: dict[str, str] = {}
@@ -233,7 +259,7 @@ def _detect_all(
     def look(video: VideoFile) -> None:
         lens = _measured_lens(given, video.camera)
         given_lens = None if lens is None else [lens.matrix.tolist(), lens.distortions.tolist()]
-        key = _cache_key(video, model if kind == "marker" else None, given_lens, kind)
+        key = _cache_key(video, model if kind == "marker" else None, given_lens, target)
         before = _cached_detections(session, video.camera, state.get(video.camera), key)
         if before is not None:
             found[video.camera] = before, True
@@ -242,8 +268,10 @@ def _detect_all(
         try:
             film = VideoReader(video.path)
             total = max(film.info.frames, 1)
-            if kind == "marker":
-                detector = ball_detector(model, lens, film.info.size)
+            if kind == _NOTHING:
+                one = VideoDetections((), film.info.frames, 0, 0, 0, film.info.size, film.info.fps, (0.0, 0.0))
+            elif kind == "marker" or kind == "bright" or target.board is not None:
+                detector = _point_detector(target, model, lens, film.info.size)
                 one = run_detector(
                     film,
                     video.camera,
@@ -283,6 +311,31 @@ def _detect_all(
     return found, [failed[video.camera] for video in videos if video.camera in failed]
 
 
+def _point_detector(target: Target, model: MarkerModel, lens: Intrinsics | None, size: tuple[int, int]) -> Detector:
+    if target.board is not None:
+        return BoardDetector(target.board)
+    return ball_detector(model, lens, size) if target.kind == "marker" else bright_or_tag_detector("bright")
+
+
+def _body_metadata(board: Board, rows: list[str]) -> dict[str, Any]:
+    """What rig.toml says of a board: the points of its labels. Single tags count from a few frames in two videos on."""
+    cells = list(csv.reader(rows))
+    camera, label = (HEADER.split(",").index(name) for name in ("camera", "label"))
+    seen = Counter((row[camera], row[label]) for row in cells)
+    videos = Counter(name for (_, name), count in seen.items() if count >= _LEAST_ROWS)
+    bodies = board.bodies([name for name, count in videos.items() if count >= 2])
+    plain = {name: {label: point.tolist() for label, point in body.items()} for name, body in bodies.items()}
+    return {"bodies": plain, "bodies_scale": "arbitrary" if board.size is None else "metric"}
+
+
+def _same_stamps(found: list[VideoDetections]) -> bool:
+    """Whether all videos have the same number of frames at the same times, as those of one recorder have."""
+    first = found[0]
+    return all(
+        one.frames == first.frames and np.allclose(one.span, first.span, rtol=0.0, atol=_SAME_TIME_S) for one in found
+    )
+
+
 def _detect_people_or_vehicles(film: VideoReader, camera: str, kind: str, progress: Progress) -> VideoDetections:
     """Detect people or vehicles in a video, by the shipped detectors or by another one."""
     if kind not in get_args(Kind):
@@ -301,10 +354,11 @@ def _label_count_if_many(found: VideoDetections) -> int:
     return len(labels) if len(labels) > 1 else 0
 
 
-def _cache_key(video: VideoFile, model: MarkerModel | None, lens: Any, kind: str) -> str:
+def _cache_key(video: VideoFile, model: MarkerModel | None, lens: Any, target: Target) -> str:
     """Cache key: a hash of everything that affects a video's detections."""
     table = None if model is None else {"revision": REVISION, **model.to_table()}
-    revision = kind if kind in ("marker", *get_args(Kind)) else detector_revision(kind)
+    kind = target.kind
+    revision = f"{kind} {target.board}" if kind in (*DETECTORS, _NOTHING) else detector_revision(kind)
     about = [VERSION, has_pyav(), video.path.name, video.size, video.mtime_ns, table, lens, revision]
     return hashlib.sha256(json.dumps(about).encode()).hexdigest()
 

@@ -33,7 +33,7 @@ class Detection:
     label: str = "marker"
     colour: tuple[int, int, int] | None = None
     covariance: tuple[float, float, float] | None = None
-    kind: Literal["", "marker", "person", "vehicle"] = ""
+    kind: Literal["", "marker", "person", "vehicle", "corner"] = ""
     head: tuple[float, float] | None = None
     foot: tuple[float, float] | None = None
     box: tuple[float, float, float, float] | None = None

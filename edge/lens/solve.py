@@ -20,10 +20,14 @@ from protocols.geometry.types import Floats, Ints
 COVERAGE_GRID = (8, 6)
 """Columns and rows of the grid over the image on which coverage is counted."""
 MIN_VIEWS = 8
+"""From so many views on a lens counts as measured; fewer give one with a wide std, if they fix it at all."""
+_LEAST_VIEWS, _FEW_FOCAL_STD = 3, 0.05
 _MAX_VIEWS = 40
 _MIN_COVERAGE = 0.5
 _MAX_RMS = 1.0  # px, at a width of up to 1280
 _MAX_FOCAL_STD = 0.004  # relative
+_PRINCIPAL_POINT_STD = 0.012  # of the larger image side, of usual cameras about the middle
+_FEW_FLAGS = cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
 _OUTLIER_RATIO = 2.5  # times the median view's rms
 
 
@@ -50,24 +54,25 @@ def calibrate_lens(views: list[BoardView], size: tuple[int, int], fisheye: bool 
     """
     if not views:
         raise Refused("the board is in no frame: check its kind, squares and dictionary, and that it is sharp and lit")
-    if len(views) < MIN_VIEWS:
+    few = len(views) < MIN_VIEWS
+    if len(views) < _LEAST_VIEWS:
         raise Refused(f"the board is seen in {len(views)} different views, {MIN_VIEWS} are needed: film it longer")
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _MAX_VIEWS)).round().astype(int))
     accepted = [views[i] for i in chosen]
     cells = _corner_counts(accepted, size)
     coverage = float((cells > 0).mean())
-    if coverage < _MIN_COVERAGE:
+    if coverage < _MIN_COVERAGE and not few:
         empty = _uncovered_sides(cells)
         raise Refused(
             f"the board covers {100 * coverage:.0f} % of the picture, {100 * _MIN_COVERAGE:.0f} % are needed: "
             f"move it into {empty} too"
         )
     try:
-        fit = _calibrate(accepted, size, fisheye)
+        fit = _calibrate(accepted, size, fisheye, few)
         outlier = fit[2] > _OUTLIER_RATIO * float(np.median(fit[2]))
         if outlier.any() and (~outlier).sum() >= MIN_VIEWS:  # blurred, or with mismatched corners
             accepted = [view for view, out in zip(accepted, outlier, strict=True) if not out]
-            fit = _calibrate(accepted, size, fisheye)
+            fit = _calibrate(accepted, size, fisheye, few)
     except cv2.error as error:
         reason = " ".join(str(error.err).split())
         raise Refused(f"no camera model fits these views ({reason}): tilt the board in different directions") from None
@@ -80,9 +85,10 @@ def calibrate_lens(views: list[BoardView], size: tuple[int, int], fisheye: bool 
             f"the reprojection error is {rms:.2f} px, {limit:.2f} px are allowed: is the board flat, are its "
             f"squares the ones given, is the picture sharp and the zoom fixed? Or try {other} --fisheye"
         )
-    if not std < _MAX_FOCAL_STD:
+    limit_std = _FEW_FOCAL_STD if few else _MAX_FOCAL_STD
+    if not std < limit_std:
         raise Refused(
-            f"the focal length is known only to {100 * std:.2g} % (std), {100 * _MAX_FOCAL_STD:.1f} % are needed: "
+            f"the focal length is known only to {100 * std:.2g} % (std), {100 * limit_std:.1f} % are needed: "
             "tilt the board by 20 to 45 degrees in different directions, near and far"
         )
     return LensCalibration(intrinsics, rms, std, len(accepted), _corner_counts(accepted, size), coverage)
@@ -101,21 +107,26 @@ def coverage_map(cells: Ints) -> list[str]:
     return ["".join(f"{value:5d}" if value else "    ." for value in row) for row in cells.tolist()]
 
 
-def _calibrate(views: list[BoardView], size: tuple[int, int], fisheye: bool) -> tuple[Intrinsics, float, Floats]:
+def _calibrate(
+    views: list[BoardView], size: tuple[int, int], fisheye: bool, few: bool
+) -> tuple[Intrinsics, float, Floats]:
     """The intrinsics, the relative std of the focal length, and the rms [px] of each view."""
-    return _fisheye(views, size) if fisheye else _pinhole(views, size)
+    return _fisheye(views, size) if fisheye else _pinhole(views, size, few)
 
 
-def _pinhole(views: list[BoardView], size: tuple[int, int]) -> tuple[Intrinsics, float, Floats]:
+def _pinhole(views: list[BoardView], size: tuple[int, int], few: bool) -> tuple[Intrinsics, float, Floats]:
+    """few: only what a few views determine is estimated, focal length, k1 and k2; the rest as of usual lenses."""
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32)[:, None] for view in views]
     start = intrinsics_from_field_of_view(size, 65.0, False).matrix
     _, matrix, distortions, _, _, stds, _, view_rms = cv2.calibrateCameraExtended(
-        points, pixels, size, start, np.zeros(5), flags=cv2.CALIB_USE_INTRINSIC_GUESS
+        points, pixels, size, start, np.zeros(5), flags=cv2.CALIB_USE_INTRINSIC_GUESS | (_FEW_FLAGS if few else 0)
     )
     found: Floats = np.asarray(matrix, dtype=np.float64)
     intrinsics = Intrinsics(size[0], size[1], found, np.asarray(distortions, dtype=np.float64).ravel()[:5])
     std = float(np.asarray(stds).ravel()[:2].max() / intrinsics.focal)
+    if few:  # what was assumed of the principal point is uncertain too, and goes into the focal length
+        std = float(np.hypot(std, _PRINCIPAL_POINT_STD))
     return intrinsics, std, np.asarray(view_rms, dtype=np.float64).ravel()
 
 

@@ -170,7 +170,7 @@ def apply_step(problem: Problem, state: AdjustmentState, path_step: Floats, came
     full = np.zeros(len(state.cameras) * CAMERA_PARAMETERS)
     full[problem.free_columns()] = camera_step
     cameras = tuple(
-        _apply_camera_step(camera, full[i * CAMERA_PARAMETERS : (i + 1) * CAMERA_PARAMETERS])
+        apply_camera_step(camera, full[i * CAMERA_PARAMETERS : (i + 1) * CAMERA_PARAMETERS])
         for i, camera in enumerate(state.cameras)
     )
     paths, at = [], 0
@@ -181,7 +181,8 @@ def apply_step(problem: Problem, state: AdjustmentState, path_step: Floats, came
     return replace(state, cameras=cameras, trajectories=tuple(paths))
 
 
-def _apply_camera_step(camera: CameraState, step: Floats) -> CameraState:
+def apply_camera_step(camera: CameraState, step: Floats) -> CameraState:
+    """The camera after a step (18,) of its parameters."""
     pose = Pose(so3.exp(step[:3]) @ camera.pose.rotation, camera.pose.position + step[3:6])
     lens = camera.intrinsics
     if np.any(step[FOCAL:]):

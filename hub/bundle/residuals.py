@@ -77,6 +77,16 @@ class ResidualEvaluation:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SplineSupport:
+    """Of n rows: control points (size, 3), the first of four (n,), their weights and those of the velocity (n, 4)."""
+
+    control: Floats
+    index: Ints
+    weights: Floats
+    slope_weights: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class StackedTrajectories:
     """The paths of all labels, concatenated. offsets: index of each label's first point in ``control`` (size, 3)."""
 
@@ -128,9 +138,17 @@ def evaluate_labels(
     )
     weights, slope_weights = (np.concatenate([support[i] for support in supports]) for i in (1, 2))
     inside = np.concatenate([support[3] for support in supports])
-    camera_points = camera.pose.rotation @ (
-        weighted_sums(paths.control, index, weights).T - camera.pose.position[:, None]
+    points = weighted_sums(paths.control, index, weights)
+    return evaluate_points(
+        camera, points, inside, time, pixels, SplineSupport(paths.control, index, weights, slope_weights)
     )
+
+
+def evaluate_points(
+    camera: CameraState, points: Floats, inside: Bools, time: Floats, pixels: Floats, support: SplineSupport
+) -> ResidualEvaluation:
+    """Residuals of pixels (n, 2) of world points (n, 3), which are defined where ``inside`` (n,)."""
+    camera_points = camera.pose.rotation @ (points.T - camera.pose.position[:, None])
     z = camera_points[2]
     valid = inside & (z > 1e-9)
     normalised = np.where(valid, camera_points[:2] / np.where(valid, z, 1.0), 0.0)
@@ -154,10 +172,10 @@ def evaluate_labels(
         valid,
         time,
         pixels,
-        paths.control,
-        index,
-        weights,
-        slope_weights,
+        support.control,
+        support.index,
+        support.weights,
+        support.slope_weights,
         camera_points,
         normalised,
         distortion_jacobian,

@@ -23,6 +23,15 @@ MIN_COVERAGE = 0.35
 """Share of the image cells in which the marker should have been seen."""
 MIN_DETECTIONS = 90
 """Detections below which a camera can hardly be calibrated with another."""
+_VERBS = {
+    "marker": "wave it",
+    "board": "show it",
+    "tag": "show it",
+    "light": "move it",
+    "person": "walk",
+    "vehicle": "drive",
+}
+"""What the user does with the target, by its name."""
 _MAX_ADVICE = 2  # pieces of advice at a time: people do not follow more
 _MAX_ADVISED = 64  # cameras that are considered: of a thousand it would take a second
 
@@ -93,22 +102,34 @@ class CoverageMonitor:
         return _most_urgent([advice for advice in found if advice is not None], max_advice)
 
 
-def camera_advice(camera: str, frames: int, rows: int, covered: Bools) -> CoverageAdvice | None:
-    """Advice on one camera, None if none is needed. frames: received from it; rows: those with a detection."""
+def target_of(rig: Rig, labels: list[str]) -> str:
+    """What the user moves, in one word: as the session says, a board where there are bodies, a person with joints."""
+    given = rig.metadata.get("target")
+    if isinstance(given, str) and given in _VERBS:
+        return given
+    if rig.bodies:
+        return "board" if max(len(body) for body in rig.bodies.values()) > 4 else "tag"
+    return "person" if any(label.endswith(("hip", "knee", "shoulder")) for label in labels) else "marker"
+
+
+def camera_advice(camera: str, frames: int, rows: int, covered: Bools, target: str = "marker") -> CoverageAdvice | None:
+    """Advice on one camera, None if none is needed. frames: received from it; rows: those with a detection.
+
+    target: what the user moves, see `target_of`.
+    """
+    do = _VERBS.get(target, "move it")
     share = float(covered.mean())
     regions = uncovered_regions(covered)
     if frames == 0:
         return CoverageAdvice(camera, "silent", 0.0, (), f"{camera} sends no frames: check that it runs")
     if rows == 0:
-        return CoverageAdvice(
-            camera, "unseen", 0.0, (), f"{camera} has not seen the marker yet: wave it in front of it"
-        )
-    percent = f"{camera} has seen the marker in {100 * share:.0f} % of its view"
+        return CoverageAdvice(camera, "unseen", 0.0, (), f"{camera} has not seen the {target} yet: {do} in front of it")
+    percent = f"{camera} has seen the {target} in {100 * share:.0f} % of its view"
     if share < MIN_COVERAGE:
         aim = f" at the {_listed(regions[:2])} of its picture" if regions else ""
-        return CoverageAdvice(camera, "narrow", share, regions, f"{percent}: wave it{aim}")
+        return CoverageAdvice(camera, "narrow", share, regions, f"{percent}: {do}{aim}")
     if rows < MIN_DETECTIONS:
-        text = f"{camera} has seen the marker in {rows} frames only: wave it there for longer"
+        text = f"{camera} has seen the {target} in {rows} frames only: {do} there for longer"
         return CoverageAdvice(camera, "few", share, regions, text)
     return None
 
@@ -118,13 +139,14 @@ def session_advice(
 ) -> list[CoverageAdvice]:
     """Advice on a recorded session. cameras: only these are considered, e.g. the refused ones; None = all."""
     found = []
+    target = target_of(rig, observations.labels)
     for name, camera in rig.cameras.items():
         if cameras is not None and name not in cameras:
             continue
         pixels = [track.pixels for track in observations.of_camera(name)]
         rows = np.concatenate(pixels) if pixels else np.zeros((0, 2))
         covered = covered_cells(rows, camera.size) if len(rows) else np.zeros((ROWS, COLUMNS), dtype=np.bool_)
-        advice = camera_advice(name, max(len(rows), 1), len(rows), covered)
+        advice = camera_advice(name, max(len(rows), 1), len(rows), covered, target)
         if advice is not None:
             found.append(advice)
     return _most_urgent(found, _MAX_ADVICE)

@@ -30,6 +30,8 @@ from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.bundle.timestamp_jitter import estimate_frame_times
 from hub.calibration.pair_network import Progress, describe_timing, frame_rate_warnings, solve_pairs
 from hub.calibration.result import assemble_calibration, focal_stds, isolated_pair_report
+from hub.calibration.rigid_body.solve import calibrate_bodies
+from hub.calibration.rigid_body.views import body_labels
 from hub.calibration.self_calibration import MAX_FOCAL_STD, initial_self_calibration, with_updated_lenses
 from hub.calibration.solution import Solution
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate, connected_components, synchronise_clocks
@@ -53,6 +55,7 @@ _MAX_CLOCK_STD = 10e-3  # s: a frame is more than three of them
 _MAX_LAG_CHANGE = 20e-3  # s
 _LAG_CONFLICT = "the trajectory puts its clock"
 _LENS_ITERATIONS = 3
+_SMALL_BODY = 4  # points of a single tag
 _ONLINE_MIN_INFLATION = 2.0  # rows per effective row from which the noise of a recording that goes on is correlated
 _MAX_ONLINE_ROW_RATE = 120.0  # rows a second, of all cameras
 
@@ -85,6 +88,14 @@ def calibrate(
     report = progress or (lambda text, share: None)
     if known is not None:
         rig = with_known_intrinsics(rig, known)
+    if rig.bodies and solver == "joint" and not online and body_labels(observations, rig.bodies):
+        try:
+            return calibrate_bodies(rig, observations, report, known)
+        except Refused:
+            # The pose of a small tag is too coarse to connect cameras: its corners are points that move.
+            if max(len(body) for body in rig.bodies.values()) > _SMALL_BODY:
+                raise
+            rig = replace(rig, bodies={}, scale_bars=rig.scale_bars + _diagonals(rig))
     prepared = prepare(rig, observations)
     has_sizes = False
     if solver == "paper" and known is None:
@@ -125,6 +136,14 @@ def calibrate(
         refusal.pairs = tuple(isolated_pair_report(pair, prepared) for pair in rejected)
         refusal.warnings = prepared.warnings
         raise
+
+
+def _diagonals(rig: Rig) -> tuple[tuple[str, str, float], ...]:
+    """The diagonals of single tags as scale bars, where their size is known."""
+    if not rig.bodies_metric:
+        return ()
+    corners = [list(body.items()) for body in rig.bodies.values()]
+    return tuple((a, c, float(np.linalg.norm(at_a - at_c))) for (a, at_a), _, (c, at_c), _ in corners)
 
 
 def with_known_intrinsics(rig: Rig, known: FixedCalibration) -> Rig:
@@ -551,7 +570,7 @@ def _no_pair_reason(prepared: PreparedSession, pairs: list[PairSolution], refuse
         remedy = (
             "; give their intrinsics: `syncline intrinsics` with a board, --model or --field-of-view"
             if prepared.uncalibrated
-            else "; film the marker with two cameras or more at the same time"
+            else "; film what moves with two cameras or more at the same time"
         )
         return (
             f"fewer than two cameras can be placed ({listed}){remedy}"

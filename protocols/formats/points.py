@@ -24,7 +24,16 @@ from protocols.session.observations import Observations, gather_tracks
 Times = Callable[[str, Ints, Path], Floats]
 """Camera, its frames (n,), the file → seconds (n,). May raise InputError."""
 _FARTHEST = 1e6  # px
-_CALISCOPE = ("sync_index", "point_id", "img_loc_x", "img_loc_y")
+_CALISCOPE = ("sync_index", "img_loc_x", "img_loc_y")
+_CALISCOPE_POINTS, _CALISCOPE_CAMERAS = ("keypoint_id", "point_id"), ("cam_id", "port")  # today's names first
+_LAYOUTS = {
+    "caliscope's xy.csv of 2025": "sync_index cam_id frame_index frame_time object_id keypoint_id img_loc_x img_loc_y",
+    "caliscope's older xy.csv": "sync_index port frame_index frame_time point_id img_loc_x img_loc_y",
+    "Syncline's observations.csv": "camera frame time u v",
+    "Syncline's boxes.csv": "camera frame time x y width height",
+    "DeepLabCut's CSV": "scorer bodyparts coords",
+}
+"""Columns of tables by name, for what is nearly one of them."""
 
 
 @dataclass(slots=True)
@@ -45,7 +54,7 @@ def detect_format(text: str) -> str | None:
     if not lines:
         return None
     header = [cell.strip() for cell in lines[0].split(",")]
-    if all(name in header for name in _CALISCOPE):
+    if all(name in header for name in _CALISCOPE) and any(name in header for name in _CALISCOPE_POINTS):
         return "caliscope-points"
     if header[0] == "scorer" and any(line.startswith("bodyparts,") for line in lines):
         return "deeplabcut"
@@ -54,6 +63,20 @@ def detect_format(text: str) -> str | None:
     except ValueError:
         return None
     return "mvus" if len(first) >= 3 and first[2] == round(first[2]) and first[2] >= 0 else None
+
+
+def nearest_layout(text: str) -> str:
+    """Which known table the beginning of a text is nearest to, and what it lacks; "" where it resembles none."""
+    header = [cell.strip().lower() for cell in (text.splitlines() or [""])[0].split(",")]
+    found = []
+    for name, columns in _LAYOUTS.items():
+        wanted = columns.split()
+        missing = [column for column in wanted if column not in header]
+        found.append((len(missing) / len(wanted), name, missing))
+    share, name, missing = min(found)
+    if share > 0.5 or not missing:
+        return ""
+    return f"looks like {name}, but column {', '.join(missing)} is missing"
 
 
 def read(kind: str, files: list[Path], times: Times, likelihood: float, camera: str | None) -> Observations:
@@ -98,12 +121,19 @@ def _caliscope(file: Path, rows: _Rows, times: Times) -> None:
     table = _table(file)
     header = [cell.strip() for cell in table[0][1]] if table else []
     place = {name: number for number, name in reversed(list(enumerate(header)))}
-    ids = next((name for name in ("cam_id", "port") if name in place), None)
-    missing = [name for name in _CALISCOPE if name not in place] + ([] if ids else ["port"])
-    if missing or ids is None:
+    ids = next((name for name in _CALISCOPE_CAMERAS if name in place), None)
+    of_point = next((name for name in _CALISCOPE_POINTS if name in place), None)
+    missing = [name for name in _CALISCOPE if name not in place]
+    missing += ([] if ids else ["cam_id"]) + ([] if of_point else ["keypoint_id"])
+    if missing or ids is None or of_point is None:
         remedy = "give caliscope's xy_….csv or image_points.csv"
         raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)
     timed = "frame_time" in place
+    objects = (
+        len({cells[place["object_id"]] for _, cells in table[1:] if len(cells) == len(header)})
+        if "object_id" in place
+        else 1
+    )
     begin = len(rows.camera)
     counted = "frame_index" if "frame_index" in place else "sync_index"
     for line, cells in table[1:]:
@@ -114,7 +144,10 @@ def _caliscope(file: Path, rows: _Rows, times: Times) -> None:
         port = _whole(cells[place[ids]], ids, file, line)
         u, v = (_pixel(cells[place[name]], name, file, line) for name in ("img_loc_x", "img_loc_y"))
         rows.camera.append(f"cam_{port}")
-        rows.label.append(str(_whole(cells[place["point_id"]], "point_id", file, line)))
+        label = str(_whole(cells[place[of_point]], of_point, file, line))
+        if objects > 1:
+            label = f"{_whole(cells[place['object_id']], 'object_id', file, line)}.{label}"
+        rows.label.append(label)
         rows.frame.append(_whole(cells[place[counted]], counted, file, line))
         rows.pixels.append((u, v))
         rows.line.append(line)

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,20 +17,37 @@ from protocols.geometry.types import Floats, Ints
 from protocols.session.rig import METRES_PER_UNIT
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class TrajectoryGrid:
+    """Trajectories on one grid of constant rate [Hz]. cells: (n, 3 labels) x, y, z of each label; NaN = a gap."""
+
+    labels: tuple[str, ...]
+    rate: float
+    cells: Floats
+
+
+def read_grid(file: Path, units: str, wanted: str) -> TrajectoryGrid:
+    """A trajectory.csv or track.csv in ``wanted`` units on a grid. Raises InputError: file, line, what, remedy."""
+    paths = _read_paths(file)
+    times, frames = _frames(paths)
+    count = int(frames[-1]) + 1
+    rate = (count - 1) / float(times[-1] - times[0]) if count > 1 else 1.0
+    scale = METRES_PER_UNIT[units] / METRES_PER_UNIT[wanted]
+    cells = np.full((count, 3 * len(paths)), math.nan)
+    for column, path in enumerate(paths.values()):
+        at = frames[np.clip(np.searchsorted(times, path[:, 0] - 1e-6), 0, len(times) - 1)]
+        cells[at, 3 * column : 3 * column + 3] = scale * path[:, 1:4]
+    return TrajectoryGrid(tuple(paths), rate, cells)
+
+
 def trc_text(file: Path, name: str, units: str) -> str:
     """A trajectory.csv or track.csv as TRC (OpenSim): constant rate, empty where a label has no position, m or mm.
 
     Time 0 is the first row. Raises InputError: file, line, what, remedy.
     """
-    paths = _read_paths(file)
-    times, frames = _frames(paths)
-    count = int(frames[-1]) + 1
-    rate = (count - 1) / float(times[-1] - times[0]) if count > 1 else 1.0
-    scale, written_units = (METRES_PER_UNIT[units], "m") if units == "cm" else (1.0, units)
-    cells = np.full((count, 3 * len(paths)), math.nan)
-    for column, path in enumerate(paths.values()):
-        at = frames[np.clip(np.searchsorted(times, path[:, 0] - 1e-6), 0, len(times) - 1)]
-        cells[at, 3 * column : 3 * column + 3] = scale * path[:, 1:4]
+    written_units = "m" if units == "cm" else units
+    grid = read_grid(file, units, written_units)
+    paths, rate, cells, count = grid.labels, grid.rate, grid.cells, len(grid.cells)
     keys = "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames"
     axes = "\t".join(f"{axis}{i}" for i in range(1, len(paths) + 1) for axis in "XYZ")
     lines = [

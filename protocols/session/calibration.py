@@ -19,7 +19,19 @@ from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.rig import Rig, read_rig
 
-_REPLACED_METADATA = ("distances", "wand", "refused", "scale", "solver", "version", "reference")
+_REPLACED_METADATA = (
+    "distances",
+    "wand",
+    "bodies",
+    "bodies_scale",
+    "in_step",
+    "target",
+    "refused",
+    "scale",
+    "solver",
+    "version",
+    "reference",
+)
 """Metadata keys of rig.toml that the result replaces."""
 
 

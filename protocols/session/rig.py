@@ -32,6 +32,7 @@ MEASURED_FOCAL_STD = 0.02
 """A focal length of at most this relative std counts as measured."""
 MAX_READOUT_S = 0.06
 """Upper bound [s] of a rolling shutter's readout, from an image's first row to its last."""
+_MAX_POINTS = 20_000  # of all rigid bodies
 _POSITION_TOLERANCE = 1e-3  # relative: position and translation may differ by rounding, not by more
 
 
@@ -83,6 +84,13 @@ class Rig:
     metadata: dict[str, Any] = field(default_factory=dict)
     file: Path | None = None
     scale_bars: tuple[tuple[str, str, float], ...] = ()
+    bodies: dict[str, dict[str, Floats]] = field(default_factory=dict)
+    """Rigid bodies (boards, tags): by name, the points (3,) of their labels on the body [rig units]."""
+
+    @property
+    def bodies_metric(self) -> bool:
+        """Whether the bodies' points are in rig units, rather than in squares of an unknown size."""
+        return bool(self.bodies) and self.metadata.get("bodies_scale", "metric") == "metric"
 
     @property
     def shared_clock(self) -> bool:
@@ -194,7 +202,28 @@ def parse_rig(values: dict[str, Any], file: Path, text: str) -> Rig:
     if reference is not None and (not isinstance(reference, str) or reference not in cameras):
         raise meta.fail("reference", f"reference = {reference!r} is no camera", "use a camera of this file")
     distances, up = _read_distances(meta, cameras), _read_up(meta, cameras)
-    return Rig(cameras, units, clock, distances, up, dict(metadata), file, _read_scale_bars(meta))
+    return Rig(cameras, units, clock, distances, up, dict(metadata), file, _read_scale_bars(meta), _read_bodies(meta))
+
+
+def _read_bodies(meta: _Table) -> dict[str, dict[str, Floats]]:
+    remedy = 'give [metadata.bodies.board] and its points below it: "0" = [0.03, 0.03, 0.0]'
+    bodies = meta.values.get("bodies", {})
+    if not isinstance(bodies, dict) or not all(isinstance(body, dict) for body in bodies.values()):
+        raise meta.fail("bodies", "bodies is not a table of tables", remedy)
+    if sum(len(body) for body in bodies.values()) > _MAX_POINTS:
+        raise meta.fail("bodies", f"more than {_MAX_POINTS} points", "keep the points that are seen")
+    owner: dict[str, str] = {}
+    for name, body in bodies.items():
+        for label in body:
+            if label in owner:
+                raise meta.fail("bodies", f"point {label!r} is on {owner[label]} and on {name}", "keep one")
+            owner[label] = name
+    points = {}
+    for name, body in bodies.items():
+        table = _Table(body, "metadata", meta.file, meta.text)
+        read = {label: table.numbers(label, 3, "[x, y, z]") for label in body}
+        points[name] = {label: point for label, point in read.items() if point is not None}
+    return points
 
 
 def _read_scale_bars(meta: _Table) -> tuple[tuple[str, str, float], ...]:

@@ -14,7 +14,20 @@ def export(
     source: Path,
     /,
     *,
-    to: Literal["aniposelib", "caliscope", "pose2sim", "freemocap", "opencv", "kalibr", "colmap", "trc", "session"]
+    to: Literal[
+        "aniposelib",
+        "caliscope",
+        "pose2sim",
+        "freemocap",
+        "opencv",
+        "kalibr",
+        "colmap",
+        "ros",
+        "opensfm",
+        "trc",
+        "c3d",
+        "session",
+    ]
     | None = None,
     out: Path,
     units: Literal["m", "cm", "mm"] = "m",
@@ -25,7 +38,9 @@ def export(
 
     aniposelib, caliscope, pose2sim, freemocap: one TOML file in the units that the tool expects. kalibr: a camchain
     YAML with timeshift_cam_imu. opencv: one CAMERA.yml per camera for cv2.FileStorage. colmap: cameras.txt, images.txt,
-    points3D.txt. trc: a trajectory for OpenSim, in the world frame. session: rig.toml and observations.csv of a log.
+    points3D.txt. ros: one camera_info CAMERA.yaml per camera. opensfm: one reconstruction.json. trc, c3d: a trajectory
+    for OpenSim and motion capture, in the world frame, with gaps marked. session: rig.toml and observations.csv of
+    a log.
     Information that a format cannot represent is listed in a warning.
 
     Example: syncline export out/calibration.toml --to caliscope --out camera_array.toml
@@ -37,13 +52,13 @@ def export(
     Parameters
     ----------
     source
-        calibration.toml; trajectory.csv or track.csv for trc; a .mcap log for session.
+        calibration.toml; trajectory.csv or track.csv for trc and c3d; a .mcap log for session.
     to
         The format; for a .mcap log always session.
     out
-        The folder for opencv, colmap and session; the file for all others.
+        The folder for opencv, ros, colmap and session; the file for all others.
     units
-        Length unit of a trajectory, for trc.
+        Length unit of a trajectory, for trc and c3d.
     json
         Print a summary as JSON.
     seed
@@ -55,7 +70,9 @@ def export(
 
     log = is_log(source)
     if to is None and not log:
-        remedy = "give --to aniposelib, caliscope, pose2sim, freemocap, opencv, kalibr, colmap or trc"
+        remedy = (
+            "give --to aniposelib, caliscope, pose2sim, freemocap, opencv, kalibr, colmap, ros, opensfm, trc or c3d"
+        )
         raise InputError("--to is missing", file=source, remedy=remedy)
     if log and to not in (None, "session"):
         remedy = "calibrate it first, then export its calibration.toml"
@@ -74,12 +91,15 @@ def export(
             check_folder(out)
         elif out.is_dir():
             raise InputError("this is a folder, but a file is needed", file=out, remedy="give --out the name of a file")
-        if to == "trc":
+        texts: dict[Path, str] = {}
+        if to == "c3d":
+            exports.write_c3d(source, out, units)
+        elif to == "trc":
             texts = exports.trajectory_files(source, out, units)
         else:
             texts, warnings = exports.calibration_files(source, to, out)
         write_together(texts)
-        files, summary = list(texts), ""
+        files, summary = list(texts) or [out], ""
     if json:
         import json as json_module
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from protocols.core.errors import EXIT_DONE, InputError
+from protocols.core.ranges import MAX_IMAGE_SIDE
 
 
 def import_(
@@ -21,15 +23,26 @@ def import_(
         "opencv",
         "kalibr",
         "colmap",
+        "opensfm",
+        "qualisys",
+        "vicon",
         "caliscope-points",
         "deeplabcut",
         "mvus",
+        "openpose",
+        "mmpose",
+        "coco",
+        "mediapipe",
+        "sleap",
+        "deeplabcut-h5",
+        "freemocap-points",
         "session",
     ]
     | None = None,
     units: Literal["m", "cm", "mm"] | None = None,
     fps: float | None = None,
     videos: Path | None = None,
+    size: str | None = None,
     likelihood: float = 0.6,
     camera: str | None = None,
     calibration: Path | None = None,
@@ -40,15 +53,20 @@ def import_(
 ) -> int:
     """Convert another tool's calibration or 2-D tracks, or a session folder.
 
-    Calibrations (aniposelib, caliscope, Pose2Sim, FreeMoCap, OpenCV YAML, Kalibr camchain, COLMAP text) become a
-    rig.toml, which also serves as a calibration.toml if it has all poses. Tracks (caliscope CSV, DeepLabCut CSV, mvus
-    text) become an observations.csv, and a session folder becomes a .mcap log. The format is detected from the content.
+    Calibrations (aniposelib, caliscope, Pose2Sim, FreeMoCap, OpenCV YAML, Kalibr camchain, ROS camera_info, COLMAP
+    text, OpenSfM, Qualisys and Vicon XML) become a rig.toml, which also serves as a calibration.toml if it has all
+    poses.
+    Tracks (caliscope CSV, DeepLabCut CSV, mvus text) and keypoints of people or animals (OpenPose, RTMPose, MMPose and
+    Pose2Sim JSON folders, DeepLabCut and SLEAP HDF5, FreeMoCap npy, COCO and MediaPipe JSON) become an observations.csv
+    with a label a joint, and a session folder becomes a .mcap log. The format is detected from the content.
     A folder with detections of people (boxes.csv, or observations.csv as `detect person` writes it) needs no rig.toml
     where --calibration gives the cameras.
 
     Example: syncline import camchain.yaml --out rig.toml
 
     Example: syncline import cam0DLC_resnet50.csv cam1DLC_resnet50.csv --videos my-videos --out observations.csv
+
+    Example: syncline import my-project/pose --videos my-project/videos --out my-session/observations.csv
 
     Example: syncline import my-session --out my-session.mcap
 
@@ -68,9 +86,11 @@ def import_(
         Frame rate in Hz, for tracks with frame numbers only.
     videos
         Folder of the tracked videos, each named after its camera: frame times are read from them (variable frame
-        rates).
+        rates), and image sizes: a rig.toml is written beside the observations where there is none.
+    size
+        Image size of all cameras, as 1920x1080, where there are no videos.
     likelihood
-        DeepLabCut points with a smaller likelihood are discarded.
+        Points with a smaller likelihood (confidence, score) are discarded.
     camera
         The camera's name, for tracks in one file; default: the file's name.
     calibration
@@ -131,8 +151,10 @@ def import_(
         summary = f"{len(rig.cameras)} cameras, {len(seen)} observations, {count} messages"
         cameras = list(rig.cameras)
     elif source.kind in imports.POINTS:
-        seen = imports.read_points(source, imports.frame_clock(fps, videos), likelihood, camera)
+        tables = imports.camera_tables(videos, _parsed_size(size), fps)
+        seen = imports.read_points(source, imports.frame_clock(fps, videos), likelihood, camera, tables)
         write_observations(out, seen)
+        imports.write_missing_rig(out.parent, seen.cameras, tables)
         warnings = seen.warnings
         summary = f"{len(seen)} observations of {len(seen.labels)} points by {', '.join(seen.cameras)}"
         cameras = seen.cameras
@@ -161,8 +183,19 @@ def import_(
     return EXIT_DONE
 
 
+def _parsed_size(size: str | None) -> tuple[int, int] | None:
+    if size is None:
+        return None
+    found = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", size.strip())
+    if found is None or not all(1 <= int(side) <= MAX_IMAGE_SIDE for side in found.groups()):
+        raise InputError(f"--size {size} is no image size", remedy="give width x height in pixels: 1920x1080")
+    return int(found[1]), int(found[2])
+
+
 def _check_suffix(kind: str, out: Path) -> None:
     """Raise InputError if the suffix of ``out`` does not fit its content: it could not be read back."""
-    wanted = {"session": ".mcap", "caliscope-points": ".csv", "deeplabcut": ".csv", "mvus": ".csv"}.get(kind, ".toml")
+    from deploy.offline.imports import POINTS
+
+    wanted = ".mcap" if kind == "session" else ".csv" if kind in POINTS else ".toml"
     if out.suffix.lower() != wanted:
         raise InputError(f"{kind} becomes a {wanted} file", file=out, remedy=f"give --out a name that ends in {wanted}")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -26,7 +28,9 @@ def calibrate(
     solver: Literal["joint", "distributed", "paper"] = "joint",
     from_known: Path | None = None,
     marker: Path | None = None,
-    detector: str = "marker",
+    detector: str | None = None,
+    height: float | None = None,
+    limb: str | None = None,
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
@@ -35,13 +39,16 @@ def calibrate(
     Writes calibration.toml, trajectory.csv, result.json and report.html to --out. Exit status 0 if at least
     two cameras are solved, 3 if the data allow no reliable result (then only result.json and report.html).
 
-    In a folder of videos, one per camera and named after it, the marker is first detected in each video. The resulting
+    In a folder of videos, one per camera and named after it, what moves is first detected in each video. The resulting
     session is stored in --out as session/, and the detections of unchanged videos are reused. A rig.toml in the folder
-    gives the cameras' intrinsics (`syncline intrinsics`).
+    gives the cameras' intrinsics (`syncline intrinsics`); a board.toml describes a board, which gives the scale and
+    unknown intrinsics too.
 
     Example: syncline calibrate my-session --out out
 
     Example: syncline calibrate my-videos --out out
+
+    Example: syncline calibrate my-videos --detector charuco --out out
 
     Parameters
     ----------
@@ -60,8 +67,14 @@ def calibrate(
         For videos: appearance of the marker, as written by `syncline detect --teach`. Default: marker.toml in the
         folder of videos, otherwise the orange ball of the demo.
     detector
-        For videos: what moves in them. person, vehicle: only one at a time in view, with fixed cameras. Or the .toml
-        file of an ONNX network, or a detector that another package registers: only one target at a time in view.
+        For videos: what moves in them. charuco, chessboard: the board that board.toml describes. tag: ArUco or AprilTag
+        tags. bright: a point of light. marker: a coloured ball. person, vehicle: only one at a time in view, with fixed
+        cameras. auto (default): looks at some frames with all of them. Or the .toml file of an ONNX network, or a
+        detector that another package registers: only one target at a time in view.
+    height
+        For keypoints of a person: the height [rig units], which gives the scale by thighs and shanks (about 3 %).
+    limb
+        The distance between two labels, as left_knee-left_ankle=0.41 [rig units]: gives the scale.
     json
         Print the result as JSON on standard output.
     seed
@@ -73,11 +86,15 @@ def calibrate(
     check_folder(out)
     options = CalibrationOptions(solver, from_known, seed=seed)
     read = _load(session, observations, out, marker, detector, json)
+    read = _with_scale(read, height, limb)
     command = shlex.join(["syncline", *sys.argv[1:]])
     retain_freed_memory()
     from deploy.offline.outputs import report_refusal, report_result
 
     try:
+        refusal = getattr(read, "refusal", None)
+        if refusal is not None:
+            raise refusal
         with progress_bar(f"calibrating {session.name}", quiet=json) as progress:
             result = solve(read, options, progress)
     except Refused as refusal:
@@ -92,7 +109,7 @@ def _load(
     observations: Path | None,
     out: Path,
     marker: Path | None,
-    detector: str,
+    detector: str | None,
     quiet: bool,
 ) -> Session:
     """Read a session, or make one from a folder of videos. Raises InputError."""
@@ -100,10 +117,11 @@ def _load(
         from deploy.offline.video_folder import SESSION, is_video_folder, session_from_videos
 
         if is_video_folder(session):
-            if marker is not None and detector != "marker":
+            if marker is not None and detector not in (None, "marker"):
                 raise InputError(f"--marker cannot be used with --detector {detector}", remedy="leave one of them out")
-            with progress_bar(f"looking for the {detector}", quiet=quiet) as progress:
-                gathered = session_from_videos(session, out / SESSION, progress, marker, detector)
+            wanted = detector or ("auto" if marker is None else "marker")
+            with progress_bar(f"looking for what moves in {session.name}", quiet=quiet) as progress:
+                gathered = session_from_videos(session, out / SESSION, progress, marker, wanted)
             for line in () if quiet else gathered.summaries:
                 print(line)
             return gathered
@@ -112,6 +130,28 @@ def _load(
             raise InputError("this folder holds neither videos nor a session", file=session, remedy=remedy)
     if marker is not None:
         raise InputError("--marker goes with a folder of videos", remedy="leave it out for a session")
-    if detector != "marker":
+    if detector is not None:
         raise InputError("--detector goes with a folder of videos", remedy="leave it out for a session")
     return load_session(session, observations)
+
+
+def _with_scale(read: Session, height: float | None, limb: str | None) -> Session:
+    """The session with scale bars of a person's height, or of one limb. Raises InputError."""
+    from protocols.formats.keypoints import limbs_of_height
+
+    labels, bars = read.observations.labels, list(read.rig.scale_bars)
+    if limb is not None:
+        found = re.fullmatch(r"\s*(.+?)\s*[-–]\s*(.+?)\s*=\s*([0-9.eE+]+)\s*", limb)
+        if found is None or not {found[1], found[2]} <= set(labels):
+            known = ", ".join(labels[:12])
+            raise InputError(f"--limb {limb}: no two labels and a length", remedy=f"give a-b=0.4; labels are {known}")
+        bars.append((found[1], found[2], float(found[3])))
+    if height is not None:
+        if not 0.0 < height < 1e6:
+            raise InputError(f"--height {height:g} is out of range", remedy="give the person's height in rig units")
+        limbs = limbs_of_height(height, labels)
+        if not limbs:
+            remedy = "it needs joints named left_hip, left_knee, left_ankle; or give --limb a-b=LENGTH"
+            raise InputError("--height: no thigh or shank among the labels", remedy=remedy)
+        bars += limbs
+    return read if bars == list(read.rig.scale_bars) else replace(read, rig=replace(read.rig, scale_bars=tuple(bars)))

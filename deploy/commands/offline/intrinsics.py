@@ -87,10 +87,11 @@ def intrinsics(
         raise InputError(what, remedy=f"give 5 to {widest:g} degrees")
     if model is not None and field_of_view is not None:
         raise InputError("--model and --field-of-view each give the field of view", remedy="keep one")
+    from edge.detectors.board.description import Board, check_board
     from edge.devices.playback.video_reader import VideoReader
-    from edge.lens.board import BoardView, CharucoBoard, Chessboard, board_views
+    from edge.lens.board import BoardView, board_views
     from edge.lens.models import FIELD_OF_VIEW_STD, find_lens_model, horizontal_field_of_view
-    from edge.lens.solve import LensCalibration, calibrate_lens, coverage_map, intrinsics_from_field_of_view
+    from edge.lens.solve import MIN_VIEWS, LensCalibration, calibrate_lens, coverage_map, intrinsics_from_field_of_view
     from protocols.core.files import write_atomically
 
     name = name_from_file(video.stem, video) if camera is None else check_name(camera, "--camera")
@@ -107,17 +108,20 @@ def intrinsics(
         lens, guess_std = intrinsics_from_field_of_view(reader.info.size, field_of_view, fisheye), FIELD_OF_VIEW_STD
     else:
         grid = int(numbers[1]), int(numbers[2])
-        finder = Chessboard(grid) if board == "chessboard" else CharucoBoard(grid, dictionary, ratio)
+        described = Board(board, grid, dictionary, ratio)
+        check_board(described)
         total = reader.info.frames
         step = max(1, round(reader.info.fps / _MAX_RATE_HZ), -(-total // _MAX_FRAMES))
         step = 1 if video.is_dir() else step
         views: list[BoardView] = []
         with progress_bar(f"looking for the board in {video.name}", quiet=json) as progress:
-            for view in board_views(finder, reader, step, reader.info.size[0]):
+            for view in board_views(described, reader, step, reader.info.size[0]):
                 views.append(view)
                 progress(f"{len(views)} views, frame {view.frame}", min(view.frame / total, 1.0) if total else 0.0)
         fit = calibrate_lens(views, reader.info.size, fisheye)
         lens = fit.intrinsics
+        if fit.views < MIN_VIEWS:
+            guess_std = fit.focal_std
     table: dict[str, Any] = {
         "name": name,
         "size": [lens.width, lens.height],
@@ -149,6 +153,8 @@ def intrinsics(
         print("approximate: `syncline calibrate` refines it from the marker's motion; a board is more precise")
     else:
         print(f"{name}: {model}, focal length {lens.focal:.2f} px ± {100 * fit.focal_std:.2g} %, {fit.views} views")
+        if guess_std:
+            print(f"approximate: fewer than {MIN_VIEWS} different views; `syncline calibrate` refines it")
         print(f"corners fit to {fit.rms_px:.3f} px; corners in each part of the image ({100 * fit.coverage:.0f} %):")
         for row in coverage_map(fit.cells):
             print(row)

@@ -15,7 +15,7 @@ def sync(
     folder: Path,
     /,
     *,
-    calibration: Path,
+    calibration: Path | None = None,
     out: Path,
     videos: Literal["retime", "trim", "none"] = "retime",
     fps: float | None = None,
@@ -29,6 +29,11 @@ def sync(
     synchronised.csv lists the source frames. trim: every source frame once, stamped with its reference time. Audio is
     dropped. Needs the extra "video" (PyAV). Exit status 3 if the videos do not overlap in time.
 
+    Lags need no lenses and no poses: without --calibration, or with the result.json of a calibration that was refused,
+    the videos are aligned by timing alone.
+
+    Example: syncline sync my-videos --out synchronised
+
     Example: syncline sync my-videos --calibration out/calibration.toml --out synchronised
 
     Parameters
@@ -36,7 +41,8 @@ def sync(
     folder
         The videos that were calibrated, each named after its camera.
     calibration
-        The calibration.toml of these videos.
+        The calibration.toml, or result.json, of these videos. Default: what moves in them is detected, and the lags are
+        estimated, as by `syncline calibrate`, into timing/ in --out.
     out
         Folder for the results.
     videos
@@ -60,19 +66,22 @@ def sync(
     from deploy.offline import sync as syncing
     from deploy.offline.video_folder import list_videos
     from edge.devices.playback.video_reader import VideoReader, has_pyav
-    from protocols.session.calibration import csv_cell, read_calibration
+    from protocols.session.calibration import csv_cell
 
     if not has_pyav():
         raise InputError("`sync` needs PyAV, which is not installed", remedy="pip install 'syncline[video]'")
-    rig, known = read_calibration(calibration)
     listed, warnings = list_videos(folder)
+    found = {video.camera: VideoReader(video.path) for video in listed if _readable(video.path)}
+    if calibration is None:
+        calibration = _estimate(folder, out / "timing", json)
+    reference, known, stds = syncing.read_time_maps(calibration, found)
     warnings += [f"{v.path.name}: {v.camera} is not in the calibration" for v in listed if v.camera not in known]
-    used = [video for video in listed if video.camera in known]
+    used = [video for video in listed if video.camera in known and video.camera in found]
     if not used:
         names = ", ".join(known)
         raise InputError(f"no video is named after a camera ({names})", file=folder, remedy="rename the videos")
-    films = {video.camera: VideoReader(video.path) for video in used}
-    maps = {name: known[name].time_map for name in films}
+    films = {video.camera: found[video.camera] for video in used}
+    maps = {name: known[name] for name in films}
     spans = {name: syncing.reference_span(film, maps[name]) for name, film in films.items()}
     rate = fps or max(film.info.fps for film in films.values())
     grid = syncing.common_time_grid(spans, rate)
@@ -107,20 +116,23 @@ def sync(
         document = {
             "out": str(out),
             "files": written,
-            "reference": str(rig.metadata.get("reference", next(iter(rig.cameras)))),
+            "reference": reference,
             "fps": rate,
             "begin": float(grid[0]),
             "end": float(grid[-1]),
             "frames": {name: len(video.source_frames) for name, video in done.items()},
             "largest_error_s": {name: float(abs(video.error).max(initial=0.0)) for name, video in done.items()},
-            "time_offset_std": {name: known[name].time_offset_std for name in done},
+            "time_offset_std": {name: stds[name] for name in done},
             "warnings": warnings,
         }
         print(json_module.dumps(document, allow_nan=False))
         return EXIT_DONE
     print(f"common span: {grid[0]:.3f} to {grid[-1]:.3f} s of the reference clock, {grid[-1] - grid[0]:.3f} s")
     for name, video in done.items():
-        text = f"{name}: {len(video.time)} frames, clock ± {1e3 * known[name].time_offset_std:.3f} ms"
+        at = 0.5 * (video.time[0] + video.time[-1])
+        lag = known[name].clock_rate * at + known[name].time_offset - at
+        std = f" ± {1e3 * stds[name]:.3f} ms" if stds[name] > 0.0 else ""
+        text = f"{name}: {len(video.time)} frames, clock {lag:+.4f} s{std} against {reference}"
         if videos == "retime":
             middle = 1e3 * float(abs(video.error).mean())
             worst = 1e3 * float(abs(video.error).max())
@@ -130,6 +142,39 @@ def sync(
         print(f"warning: {warning}")
     print(f"written: {', '.join(written)}")
     return EXIT_DONE
+
+
+def _readable(path: Path) -> bool:
+    from edge.devices.playback.video_reader import VideoReader
+
+    try:
+        VideoReader(path)
+    except InputError:
+        return False
+    return True
+
+
+def _estimate(folder: Path, out: Path, quiet: bool) -> Path:
+    """Calibrate the videos as far as they allow; the file with their clocks. Raises Refused where there are none."""
+    from deploy.offline.video_folder import SESSION, session_from_videos
+    from hub.api import CALIBRATION, RESULT, calibrate, save_refusal
+    from protocols.core.errors import Refused
+
+    with progress_bar(f"looking for what moves in {folder.name}", quiet=quiet) as progress:
+        session = session_from_videos(folder, out / SESSION, progress, detector="auto")
+    for line in () if quiet else session.summaries:
+        print(line)
+    try:
+        if session.refusal is not None:
+            raise session.refusal
+        with progress_bar("estimating the lags", quiet=quiet) as progress:
+            calibrate(session, progress=progress).save(out)
+    except Refused as refusal:
+        save_refusal(out, refusal, session)
+        if not any(pair.lag_s is not None for pair in refusal.pairs):
+            raise
+        return out / RESULT
+    return out / CALIBRATION
 
 
 def _reader_warnings(film: object) -> list[str]:

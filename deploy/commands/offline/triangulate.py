@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from deploy.offline.progress import progress_bar
 from protocols.core.errors import EXIT_DONE, InputError
+
+if TYPE_CHECKING:
+    from hub.api import TriangulationResult
 
 
 def triangulate(
@@ -29,6 +32,8 @@ def triangulate(
 
     Example: syncline triangulate my-session --calibration out/calibration.toml --out track.csv
 
+    Example: syncline triangulate my-session --calibration out/calibration.toml --out track.c3d
+
     Parameters
     ----------
     session
@@ -36,7 +41,8 @@ def triangulate(
     calibration
         The calibration.toml that `syncline calibrate` wrote.
     out
-        The CSV file to write.
+        The file to write: .csv, or .trc (OpenSim) or .c3d (motion capture), which have gaps where a label has no
+        position.
     observations
         Another observations file to use instead of the session's own.
     json
@@ -50,7 +56,7 @@ def triangulate(
 
     with progress_bar(f"triangulating {session.name}", quiet=json) as progress:
         result = solve(session, calibration, progress, observations=observations)
-    result.save(out)
+    _save(result, out)
     rig, warnings = result.rig, result.warnings
     scale = str(rig.metadata.get("scale", "metric"))
     unit = rig.units if scale == "metric" else "baselines"
@@ -83,3 +89,23 @@ def triangulate(
         print(f"warning: {warning}")
     print(f"written: {out}")
     return EXIT_DONE
+
+
+def _save(result: TriangulationResult, out: Path) -> None:
+    """Write the trajectories in the format that the file's suffix names. Raises InputError."""
+    from tempfile import TemporaryDirectory
+
+    from deploy.offline.exports import trajectory_files, write_c3d
+    from protocols.core.files import write_together
+
+    suffix = out.suffix.lower()
+    if suffix not in (".trc", ".c3d"):
+        result.save(out)
+        return
+    with TemporaryDirectory() as folder:
+        table = Path(folder) / "track.csv"
+        result.save(table)
+        if suffix == ".c3d":
+            write_c3d(table, out, result.rig.units)
+        else:
+            write_together(trajectory_files(table, out, result.rig.units))

@@ -105,10 +105,28 @@ def test_a_board_only_at_the_image_centre_is_refused(tmp_path: Path, capsys: Cap
     assert "covers" in capsys.readouterr().err
 
 
+def test_a_few_views_give_a_lens_with_its_std(tmp_path: Path, capsys: Capture) -> None:
+    video = render_board(tmp_path / "some", "charuco", False, count=5)
+    assert run(command(video, tmp_path / "rig.toml", "charuco")) == 0
+    report = json.loads(capsys.readouterr().out)
+    table = tomllib.loads((tmp_path / "rig.toml").read_text())["some"]
+    assert 0.005 < table["focal_std"] < 0.05
+    assert abs(table["matrix"][0][0] / PINHOLE.focal - 1) < 3 * table["focal_std"]
+    assert report["views"] == 5
+
+
+def test_an_inverted_board_is_found_without_a_setting(tmp_path: Path, capsys: Capture) -> None:
+    video = render_board(tmp_path / "cam7", "charuco", False, reach=0.55)
+    for file in video.glob("*.bmp"):
+        cv2.imwrite(str(file), 255 - cv2.imread(str(file)))
+    assert run(command(video, tmp_path / "rig.toml", "charuco")) == 0
+    assert json.loads(capsys.readouterr().out)["views"] >= 15
+
+
 def test_few_views_or_none_are_refused(tmp_path: Path, capsys: Capture) -> None:
-    video = render_board(tmp_path / "few", "charuco", False, count=5)
+    video = render_board(tmp_path / "few", "charuco", False, count=2)
     assert run(command(video, tmp_path / "rig.toml", "charuco")) == 3
-    assert "5 different views" in capsys.readouterr().err
+    assert "2 different views" in capsys.readouterr().err
     assert run([*command(video, tmp_path / "rig.toml", "charuco"), "--dictionary", "6X6_50"]) == 3
     assert "in no frame" in capsys.readouterr().err
 

@@ -160,7 +160,9 @@ def test_no_marker_in_any_video_is_refused_with_a_result(tmp_path: Path, capsys:
             tmp_path / "videos" / f"{name}.mp4", [numbered_image(i + 9 * k) for i in range(10)], np.arange(10) / 20
         )
     assert run(["calibrate", str(tmp_path / "videos"), "--out", str(tmp_path / "out")]) == 3
-    assert "no observations" in capsys.readouterr().err
+    message = capsys.readouterr().err
+    assert "tried: ArUco and AprilTag tags of all dictionaries" in message
+    assert all(name in message for name in ("chessboards", "ball", "light", "person", "vehicle"))
     assert json.loads((tmp_path / "out" / "result.json").read_text())["status"] == "refused"
 
 
@@ -327,3 +329,24 @@ def test_videos_are_synchronised_triangulated_and_exported_to_every_format(
             np.testing.assert_allclose(back[camera]["matrix"], matrix, rtol=1e-12, atol=1e-9)
     assert run(["export", str(track), "--to", "trc", "--out", str(tmp_path / "track.trc")]) == 0
     assert len((tmp_path / "track.trc").read_text().splitlines()) > len(again)
+
+
+def test_two_cameras_without_lenses_are_synchronised_by_timing_alone(
+    recorded: RecordedVideos, tmp_path: Path, capsys: Capture
+) -> None:
+    folder = tmp_path / "videos"
+    folder.mkdir()
+    for name in ("cam0", "cam1"):
+        shutil.copy(recorded.folder / f"{name}.mp4", folder)
+    assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 3
+    assert "timing of cam0–cam1: lag" in capsys.readouterr().out
+    result = tmp_path / "out" / "result.json"
+    arguments = ["sync", str(folder), "--videos", "none", "--json"]
+    assert run([*arguments, "--calibration", str(result), "--out", str(tmp_path / "sync")]) == 0
+    assert json.loads(capsys.readouterr().out)["reference"] == "cam0"
+    assert run([*arguments, "--out", str(tmp_path / "again")]) == 0  # without a calibration: it is made
+    with_poses = toml(recorded.out / "calibration.toml")["cam1"]
+    for made in ("sync", "again"):
+        for row in rows(tmp_path / made / "cam1.csv"):
+            expected = with_poses["clock_rate"] * float(row["time"]) + with_poses["time_offset"]
+            assert abs(float(row["reference_time"]) - expected) < 0.005

@@ -1,0 +1,251 @@
+"""What moves in a folder of videos: the detector that a name, board.toml or a look at some frames gives."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from edge.detectors.board.description import BOARD_FILE, Board, BoardKind, load_dictionary, read_board
+from edge.detectors.board.detector import SEARCH_PX, BoardDetector
+from edge.detectors.marker.ball import MarkerModel
+from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
+from edge.devices.base import Image
+from edge.devices.playback.video_reader import VideoReader
+from edge.offline.sampling import sample_images
+from protocols.core.errors import InputError, Refused
+
+BOARDS = ("charuco", "chessboard", "tag")
+DETECTORS = ("charuco", "chessboard", "tag", "bright", "marker", "person", "vehicle", "auto")
+"""What ``calibrate VIDEOS --detector`` names, besides networks and other packages' detectors."""
+_SAMPLES, _LOOK_AT = 8, 4  # frames of a video; videos in which tags of any kind are searched
+_LEAST_FRAMES, _LEAST_VIDEOS = 2, 2  # sampled frames of a video, and videos, in which it must be found
+_BALL_SHARE = 0.3  # of the sampled frames
+# Dictionaries of one size are prefixes of their largest: these stand for all.
+_DICTIONARIES = (
+    "4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000",
+    "APRILTAG_36H11", "APRILTAG_25H9", "APRILTAG_16H5", "APRILTAG_36H10", "ARUCO_MIP_36H12", "ARUCO_ORIGINAL",
+)  # fmt: skip
+_EXAMPLE = 'board = "charuco", squares = "8x5", square_size = 0.03 [m]'
+
+Grey = npt.NDArray[np.uint8]
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """What is searched in the videos. kind: the detector's name. board: of charuco, chessboard, tag; its print is
+    known. notes: sentences for the user."""
+
+    kind: str
+    board: Board | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """The target in words."""
+        if self.board is None:
+            return {"marker": "marker", "bright": "light"}.get(self.kind, self.kind)
+        return "tag" if self.board.tags and self.board.squares is None else "board"
+
+
+def find_target(folder: Path, videos: Sequence[Path], detector: str, model: MarkerModel, progress: Progress) -> Target:
+    """The target of a folder of videos.
+
+    detector: a name of DETECTORS; ``auto`` looks at some frames with all of them. Raises InputError for a board that
+    is not described, and Refused, with the list of what was tried, where auto finds nothing.
+    """
+    file = folder / BOARD_FILE
+    board = read_board(file) if file.exists() else None
+    if detector in ("charuco", "chessboard") and (board is None or board.kind != detector):
+        found = "there is no board.toml in this folder" if board is None else f"board.toml describes a {board.kind}"
+        remedy = f"write board.toml: {_EXAMPLE}" if board is None else f"use --detector auto, or correct {BOARD_FILE}"
+        raise InputError(f"--detector {detector}: {found}", file=folder, remedy=remedy)
+    if detector not in (*BOARDS, "auto"):
+        return Target(detector)
+    looks = _Looks(videos, progress)
+    if detector != "auto":
+        if board is None:
+            tags = looks.tags(("APRILTAG_36H11", *(name for name in _DICTIONARIES if name != "APRILTAG_36H11")))
+            return Target("tag", tags[0] if tags else Board("apriltag", None, "APRILTAG_36H11"))
+        if detector == "tag" and not board.tags:
+            what = f"--detector tag, and board.toml describes a {board.kind}"
+            raise InputError(what, file=file, remedy=f"use --detector {board.kind}")
+        return Target("tag" if board.tags else board.kind, looks.print_of(board)[0])
+    return _look(looks, board, model)
+
+
+def _look(looks: _Looks, board: Board | None, model: MarkerModel) -> Target:
+    tried = []
+    if board is not None:
+        described, videos = looks.print_of(board)
+        if videos >= _LEAST_VIDEOS:
+            name = "tag" if board.tags else board.kind
+            return Target(name, described, (f"auto: the board of {BOARD_FILE} is in the videos ({described.text})",))
+        tried.append(f"the board of {BOARD_FILE} ({board.text}, in every print)")
+    tags = looks.tags(_DICTIONARIES)
+    if tags is not None:
+        found, numbers = tags
+        hint = (
+            f"; if they are on a ChArUco board, {BOARD_FILE} with it finds more and gives the scale ({_EXAMPLE})"
+            if numbers >= 4
+            else f"; {BOARD_FILE} with tag_size gives the scale"
+        )
+        notes = (f"auto: {numbers} tags of {found.dictionary}{', white on black' if found.inverted else ''}{hint}",)
+        return Target("tag", found, notes)
+    tried.append("ArUco and AprilTag tags of all dictionaries, black or white")
+    squares = looks.chessboard()
+    if squares is not None:
+        board = Board("chessboard", squares)
+        size = f"{squares[0]}x{squares[1]}"
+        notes = (f"auto: a chessboard of {size} squares; {BOARD_FILE} with square_size gives the scale",)
+        return Target("chessboard", board, notes)
+    tried.append("chessboards")
+    if looks.single(lambda size: ball_detector(model, None, size), _BALL_SHARE) >= _LEAST_VIDEOS:
+        return Target("marker", None, ("auto: a coloured ball",))
+    tried.append("a coloured ball (marker.toml, else orange)")
+    if looks.single(lambda size: bright_or_tag_detector("bright"), _BALL_SHARE) >= _LEAST_VIDEOS:
+        return Target("bright", None, ("auto: a point of light",))
+    tried.append("a point of light")
+    for kind in ("person", "vehicle"):
+        if looks.moving(kind) >= _LEAST_VIDEOS:
+            return Target(kind, None, (f"auto: a moving {kind}",))
+        tried.append(f"one moving {kind}")
+    raise Refused(
+        f"nothing that moves was found in at least {_LEAST_VIDEOS} videos; tried: {', '.join(tried)}; name it with "
+        "--detector, describe a board in board.toml, or teach a marker with `syncline detect marker --teach`"
+    )
+
+
+class _Looks:
+    """A few frames of every video, decoded when they are first needed."""
+
+    def __init__(self, videos: Sequence[Path], progress: Progress) -> None:
+        self._paths, self._progress = videos, progress
+        self._samples: dict[Path, list[Image]] = {}
+        cv2.setNumThreads(1)
+
+    def images(self, path: Path) -> list[Image]:
+        """Sampled images of a video; none where it cannot be read."""
+        if path not in self._samples:
+            self._progress(f"looking at {path.name}", len(self._samples) / len(self._paths))
+            try:
+                self._samples[path] = list(sample_images(VideoReader(path), _SAMPLES))
+            except InputError:
+                self._samples[path] = []
+        return self._samples[path]
+
+    def _show(self, path: Path, text: str, share: float) -> None:
+        self._progress(f"{path.name} {text}", share)
+
+    def print_of(self, board: Board) -> tuple[Board, int]:
+        """The print of a board in which most corners are found, and the number of videos with it."""
+        best, most, seen = next(iter(board.prints())), 0, 0
+        for print_ in board.prints():
+            counts = []
+            for path in self._paths:
+                detector = BoardDetector(print_)
+                found = [len(detector.find(_grey(image))[0]) for image in self.images(path)]
+                counts.append((sum(found), sum(count >= 4 for count in found)))
+            total = sum(count for count, _ in counts)
+            if total > most:
+                best, most, seen = print_, total, sum(frames >= _LEAST_FRAMES for _, frames in counts)
+        return best, seen
+
+    def tags(self, dictionaries: Sequence[str]) -> tuple[Board, int] | None:
+        """Single tags of the dictionary of which most are seen again and again, and how many there are."""
+        best: tuple[int, str, bool, set[int]] | None = None
+        for inverted in (False, True):
+            images = [
+                [_small(_grey(image), inverted) for image in self.images(path)] for path in self._paths[:_LOOK_AT]
+            ]
+            for name in dictionaries:
+                detector = cv2.aruco.ArucoDetector(load_dictionary(name))
+                seen: Counter[int] = Counter()
+                for video in images:
+                    mine: Counter[int] = Counter()
+                    for image in video:
+                        ids = detector.detectMarkers(image)[1]
+                        mine.update(set() if ids is None else {int(number) for number in np.ravel(ids)})
+                    seen.update({number for number, count in mine.items() if count >= _LEAST_FRAMES})
+                steady = {number for number, count in seen.items() if count >= _LEAST_VIDEOS}
+                if steady and (best is None or len(steady) > best[0]):
+                    best = len(steady), name, inverted, steady
+        if best is None:
+            return None
+        count, name, inverted, steady = best
+        kind: BoardKind = "apriltag" if name.startswith("APRILTAG") else "aruco"
+        board = Board("aruco", None, _smallest(name, max(steady)), inverted=inverted, mirrored=False, legacy=False)
+        return replace(board, kind=kind), count
+
+    def chessboard(self) -> tuple[int, int] | None:
+        """Squares of the chessboard that most frames show; None where there is none."""
+        sizes: Counter[tuple[int, int]] = Counter()
+        for path in self._paths[:_LOOK_AT]:
+            for image in self.images(path):
+                flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
+                found, corners, meta = cv2.findChessboardCornersSBWithMeta(_small(_grey(image), False), (4, 4), flags)
+                if found and meta is not None and corners is not None:
+                    rows, columns = np.asarray(meta).shape[:2]
+                    sizes[max(rows, columns) + 1, min(rows, columns) + 1] += 1
+        if not sizes:
+            return None
+        size, count = sizes.most_common(1)[0]
+        return size if count >= _LEAST_FRAMES * _LEAST_VIDEOS else None
+
+    def single(self, make: Callable[[tuple[int, int]], object], share: float) -> int:
+        """Number of videos in which a detector of single points finds something in a share of the frames, moving."""
+        videos = 0
+        for path in self._paths:
+            images = self.images(path)
+            places = []
+            for image in images:
+                size = image.shape[1], image.shape[0]
+                found = make(size).detect(image)  # type: ignore[attr-defined]
+                if len(found) == 1:
+                    places.append((found[0].u / size[0], found[0].v / size[0]))
+            moved = len(places) >= 2 and float(np.ptp(places, axis=0).max()) > 0.02
+            videos += len(places) >= max(share * len(images), _LEAST_FRAMES) and moved
+        return videos
+
+    def moving(self, kind: str) -> int:
+        """Number of videos in which a detector of moving objects confirms one."""
+        from edge.offline.moving import detect_moving, moving_detector
+
+        videos = 0
+        for path in self._paths:
+            try:
+                reader = VideoReader(path)
+            except InputError:
+                continue
+            show = partial(self._show, path)
+            detector = moving_detector("person" if kind == "person" else "vehicle", "mog2", reader.info.fps)
+            found = detect_moving(reader, "look", detector, show)
+            videos += bool(found.rows)
+            if videos >= _LEAST_VIDEOS:
+                break
+        return videos
+
+
+def _smallest(name: str, largest: int) -> str:
+    """The smallest dictionary with this number of those that begin as ``name`` does: fewer are mistaken."""
+    if not name.endswith("_1000"):
+        return name
+    return next(f"{name[:3]}_{size}" for size in (50, 100, 250, 1000) if largest < size)
+
+
+def _grey(image: Image) -> Grey:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+
+
+def _small(grey: Grey, inverted: bool) -> Grey:
+    scale = min(1.0, SEARCH_PX / max(grey.shape))
+    size = max(round(grey.shape[1] * scale), 1), max(round(grey.shape[0] * scale), 1)
+    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if scale < 1.0 else grey
+    return np.asarray(cv2.bitwise_not(small) if inverted else small, dtype=np.uint8)

@@ -1,0 +1,96 @@
+"""Detector of a board's corners in the images of one camera: an image pyramid, and tracking between full searches.
+
+The board is searched in an image of at most ``SEARCH_PX``; where it was a moment ago, only its surroundings are
+searched, at the resolution at which it is large enough. Corners are then refined in the full image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from edge.detectors.base import Detection, Prediction
+from edge.detectors.board.description import Board
+from edge.detectors.board.finder import Corners, Finder, Grey
+from protocols.geometry.types import Floats
+
+SEARCH_PX = 1280
+"""Longer side [px] of the image in which the whole frame is searched."""
+_TRACK_PX = 960  # … in which the surroundings of the last place are searched
+_MARGIN = 1.0  # of the board's extent around its last place
+_KEPT_SHARE = 0.8  # fewer of the corners of the last frame: the whole frame is searched
+_FULL_EVERY = 8  # frames without a board between searches at full resolution, or by every method
+
+
+class BoardDetector:
+    """Detects the corners of a board whose print is known; labels are those of ``Board.points``."""
+
+    def __init__(self, board: Board) -> None:
+        self._board = next(iter(board.prints()))
+        self._finder = Finder(self._board)
+        self._last: Floats | None = None
+        self._missed = 0
+
+    @property
+    def board(self) -> Board:
+        """The board in the print that is searched."""
+        return self._board
+
+    def detect(
+        self, image: npt.NDArray[np.uint8], time_s: float | None = None, predictions: Sequence[Prediction] = ()
+    ) -> list[Detection]:
+        """The corners in an image (H, W, 3) uint8 BGR."""
+        grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+        numbers, pixels = self.find(grey)
+        height, width = grey.shape
+        labels = self._finder.labels
+        return [
+            Detection(u=float(u), v=float(v), label=labels[number], kind="corner")
+            for number, (u, v) in zip(numbers.tolist(), pixels, strict=True)
+            if -0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5
+        ]
+
+    def find(self, grey: Grey) -> Corners:
+        """Numbers and pixels of the corners in the next image (H, W) of this camera."""
+        corners = self._search_nearby(grey)
+        if corners is None:
+            thorough = self._missed % _FULL_EVERY == 0
+            corners = self._search(grey, (0, 0, grey.shape[1], grey.shape[0]), SEARCH_PX, thorough)
+            if not len(corners[0]) and thorough and max(grey.shape) > SEARCH_PX:
+                corners = self._finder.find(grey)
+        found = len(corners[0]) > 0
+        self._last = corners[1] if found else None
+        self._missed = 0 if found else self._missed + 1
+        return corners
+
+    def _search_nearby(self, grey: Grey) -> Corners | None:
+        """The corners around the last place; None if that is not known, or too few are there."""
+        if self._last is None:
+            return None
+        low, high = self._last.min(axis=0), self._last.max(axis=0)
+        reach = _MARGIN * max(float((high - low).max()), 60.0)
+        x, y = np.maximum(np.floor(low - reach), 0).astype(int).tolist()
+        right, bottom = np.minimum(np.ceil(high + reach), [grey.shape[1], grey.shape[0]]).astype(int).tolist()
+        corners = self._search(grey, (x, y, right, bottom), _TRACK_PX, False)
+        return corners if len(corners[0]) >= max(_KEPT_SHARE * len(self._last), 1.0) else None
+
+    def _search(self, grey: Grey, box: tuple[int, int, int, int], most: int, thorough: bool) -> Corners:
+        """The corners in a part x, y, right, bottom of the image, reduced to ``most`` pixels."""
+        x, y, right, bottom = box
+        part = np.ascontiguousarray(grey[y:bottom, x:right])
+        if min(part.shape) < 24:
+            return self._finder.find(part)
+        scale = min(1.0, most / max(part.shape))
+        if scale == 1.0:
+            numbers, pixels = self._finder.find(part, thorough=thorough)
+            return numbers, pixels + [x, y]
+        size = max(round(part.shape[1] * scale), 1), max(round(part.shape[0] * scale), 1)
+        small = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        numbers, pixels = self._finder.find(small, thorough=thorough)
+        factor = np.array([part.shape[1] / size[0], part.shape[0] / size[1]])
+        full = (pixels + 0.5) * factor - 0.5
+        numbers, full = self._finder.refine(part, (numbers, full))
+        return numbers, full + [x, y]

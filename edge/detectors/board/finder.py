@@ -1,0 +1,171 @@
+"""Corners of a known board in one grey image, by OpenCV: ChArUco boards, chessboards, square tags."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from edge.detectors.board.description import Board, load_dictionary
+from protocols.geometry.types import Floats, Ints
+
+Grey = npt.NDArray[np.uint8]
+Corners = tuple[Ints, Floats]
+"""Numbers (n,) of the corners, and their pixels (n, 2). A corner's number is its place in ``Finder.labels``."""
+_NOTHING: Corners = (np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+_SUBPIX_SHARE, _SUBPIX_LEAST, _SUBPIX_MOST = 0.12, 2, 9  # half window, over the distance of neighbouring corners; px
+
+
+class Finder:
+    """Finds the corners of one print of a board; keeps no state."""
+
+    def __init__(self, board: Board) -> None:
+        self.board = board
+        self._numbers: dict[str, int] = {}
+        self.labels: list[str] = []
+        """Labels of the corners by number; single tags are added as they are seen."""
+        for label in board.points() if board.squares is not None else ():
+            self._number(label)
+        self._charuco = _charuco_detector(board) if board.kind == "charuco" else None
+        self._tags = _tag_detector(board) if board.tags else None
+
+    def find(self, grey: Grey, *, thorough: bool = False) -> Corners:
+        """The corners in an image (H, W) uint8. thorough: search a chessboard by every method."""
+        if min(grey.shape) < 24:
+            return _NOTHING
+        print_ = np.asarray(255 - grey if self.board.inverted else grey, dtype=np.uint8)
+        if self.board.mirrored:
+            print_ = np.ascontiguousarray(print_[:, ::-1])
+        if self._charuco is not None:
+            numbers, pixels = self._find_charuco(print_)
+        elif self._tags is not None:
+            numbers, pixels = self._find_tags(print_)
+        else:
+            numbers, pixels = self._find_chessboard(print_, thorough)
+        if self.board.mirrored:
+            pixels = np.column_stack([grey.shape[1] - 1.0 - pixels[:, 0], pixels[:, 1]])
+            numbers = self._mirrored(numbers)
+        return numbers, pixels
+
+    def refine(self, grey: Grey, corners: Corners) -> Corners:
+        """The corners again in a larger image, at most half a window from ``corners``, which are in its pixels."""
+        numbers, pixels = corners
+        if not len(numbers):
+            return corners
+        half = int(np.clip(_SUBPIX_SHARE * self.pitch(corners), _SUBPIX_LEAST, _SUBPIX_MOST))
+        criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
+        found = cv2.cornerSubPix(
+            grey, pixels.astype(np.float32).reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria
+        )
+        refined = np.asarray(found, dtype=np.float64).reshape(-1, 2)
+        moved = np.linalg.norm(refined - pixels, axis=1) < 1.5 * half
+        return numbers, np.where(moved[:, None], refined, pixels)
+
+    def pitch(self, corners: Corners) -> float:
+        """Median distance of a corner from the nearest other one [px]."""
+        _, pixels = corners
+        if len(pixels) < 2:
+            return 30.0
+        distance = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
+        np.fill_diagonal(distance, np.inf)
+        return float(np.median(distance.min(axis=1)))
+
+    def _number(self, label: str) -> int:
+        if label not in self._numbers:
+            self._numbers[label] = len(self.labels)
+            self.labels.append(label)
+        return self._numbers[label]
+
+    def _find_charuco(self, grey: Grey) -> Corners:
+        assert self._charuco is not None
+        corners, ids, _, _ = self._charuco.detectBoard(grey)
+        if ids is None or not len(ids):
+            return _NOTHING
+        return np.asarray(ids, dtype=np.int64).ravel(), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+
+    def _find_tags(self, grey: Grey) -> Corners:
+        assert self._tags is not None
+        quads, ids, _ = self._tags.detectMarkers(grey)
+        numbers, pixels = [], []
+        for quad, tag in zip(quads, () if ids is None else np.ravel(ids).tolist(), strict=True):
+            labels = [f"{tag}.{k}" for k in range(4)]
+            if self.board.squares is not None and labels[0] not in self._numbers:
+                continue  # not of this grid
+            numbers += [self._number(label) for label in labels]
+            pixels.append(np.asarray(quad, dtype=np.float64).reshape(4, 2))
+        return (np.array(numbers, dtype=np.int64), np.concatenate(pixels)) if numbers else _NOTHING
+
+    def _find_chessboard(self, grey: Grey, thorough: bool) -> Corners:
+        assert self.board.squares is not None
+        inner = self.board.squares[0] - 1, self.board.squares[1] - 1
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, corners = cv2.findChessboardCornersSB(grey, inner, flags=flags)
+        if not found:  # the classic finder likes small boards and blur better
+            fast = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+            found, corners = cv2.findChessboardCorners(grey, inner, flags=fast | cv2.CALIB_CB_FAST_CHECK)
+            if found and corners is not None:
+                numbers = np.arange(len(corners), dtype=np.int64)
+                _, refined = self.refine(grey, (numbers, np.asarray(corners, dtype=np.float64).reshape(-1, 2)))
+                corners = refined
+        if not found and thorough:
+            exhaustive = flags | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+            found, corners = cv2.findChessboardCornersSB(grey, inner, flags=exhaustive)
+        if not found or corners is None:
+            return _NOTHING
+        pixels = np.asarray(corners, dtype=np.float64).reshape(inner[1], inner[0], 2)
+        return np.arange(inner[0] * inner[1], dtype=np.int64), _ordered(grey, pixels).reshape(-1, 2)
+
+    def _mirrored(self, numbers: Ints) -> Ints:
+        """The places on the sheet of a mirrored print's corners: its columns are exchanged."""
+        if self.board.squares is None or not len(numbers):
+            return numbers
+        columns = self.board.squares[0]
+        if self.board.tags:
+            tag, corner = np.divmod(numbers, 4)
+            row, column = np.divmod(tag, columns)
+            return np.asarray(4 * (row * columns + columns - 1 - column) + np.array([1, 0, 3, 2])[corner])
+        row, column = np.divmod(numbers, columns - 1)
+        return np.asarray(row * (columns - 1) + columns - 2 - column)
+
+
+def _ordered(grey: Grey, corners: Floats) -> Floats:
+    """Corners (rows, columns, 2) of a chessboard in the one order that the same physical corner always has.
+
+    A board with an odd and an even number of squares looks different upside down: its first square is dark.
+    Other boards do not: the first corner is then the one further up and left in the image.
+    """
+    rows, columns = corners.shape[:2]
+    # The pattern may be found in a mirrored order: rows x columns must form a right-handed frame in the image.
+    across, down = corners[0, -1] - corners[0, 0], corners[-1, 0] - corners[0, 0]
+    if across[0] * down[1] - across[1] * down[0] < 0.0:
+        corners = corners[:, ::-1]
+    if (rows + columns) % 2:
+        first, other = _diagonal_levels(grey, corners)
+        return corners if first <= other else corners[::-1, ::-1]
+    middle = corners.mean(axis=(0, 1))
+    return corners if (corners[0, 0] - middle).sum() <= (corners[-1, -1] - middle).sum() else corners[::-1, ::-1]
+
+
+def _diagonal_levels(grey: Grey, corners: Floats) -> tuple[float, float]:
+    """Mean grey level of the inner squares of the first one's colour, and of the others."""
+    middles = 0.25 * (corners[:-1, :-1] + corners[1:, :-1] + corners[:-1, 1:] + corners[1:, 1:])
+    row, column = np.mgrid[: middles.shape[0], : middles.shape[1]]
+    places = np.clip(np.rint(middles), 0, [grey.shape[1] - 1, grey.shape[0] - 1]).astype(int)
+    levels = grey[places[..., 1], places[..., 0]].astype(np.float64)
+    even = (row + column) % 2 == 0
+    return float(levels[even].mean()), float(levels[~even].mean()) if (~even).any() else 255.0
+
+
+def _charuco_detector(board: Board) -> Any:
+    assert board.squares is not None
+    pattern = cv2.aruco.CharucoBoard(board.squares, 1.0, board.ratio, load_dictionary(board.dictionary))
+    pattern.setLegacyPattern(bool(board.legacy))
+    return cv2.aruco.CharucoDetector(pattern)
+
+
+def _tag_detector(board: Board) -> Any:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    return cv2.aruco.ArucoDetector(load_dictionary(board.dictionary), parameters)

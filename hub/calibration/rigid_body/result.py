@@ -1,0 +1,256 @@
+"""The published calibration of an adjusted rigid-body problem: world, clocks, stds, trajectories of the corners."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hub.bundle.datum.gauge import fix_gauge
+from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, OFFSET, RATE
+from hub.calibration.rigid_body.adjustment import BodyProblem, BodyState, frame_interval, residuals
+from hub.calibration.rigid_body.lag import BodyPair
+from hub.calibration.rigid_body.uncertainty import BodyCovariance, body_covariance, path_covariance
+from hub.trajectory.discrete import INSTANT_TOLERANCE_S, PointBasis
+from hub.two_view.relative_pose import fundamental_from, relative_pose_between
+from protocols.core.clocks import TimeMap
+from protocols.core.pair_report import PairReport
+from protocols.core.version import VERSION
+from protocols.geometry.pose import Similarity
+from protocols.geometry.types import Floats, Ints
+from protocols.session.calibration import Calibration, CameraCalibration, FixedCalibration, TrajectoryTable
+from protocols.session.rig import Rig
+
+_SEEN_WITHIN = 0.2  # s: a camera sees a point at a time if it has an observation this near
+_MAX_SAMPLES = 1_000_000  # of one path
+_SCALE_CONFLICT = 0.02  # relative difference of the board's scale from the control points' that is reported
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodySolution:
+    """An adjusted problem. names: its cameras, in order. lens_stds: relative stds of focal lengths that an earlier
+    adjustment of the same views estimated."""
+
+    rig: Rig
+    labels: list[str]
+    names: list[str]
+    problem: BodyProblem
+    state: BodyState
+    pairs: Mapping[tuple[str, str], BodyPair]
+    refused: dict[str, str]
+    known: FixedCalibration | None = None
+    warnings: tuple[str, ...] = ()
+    lens_stds: dict[str, float] = field(default_factory=dict)
+
+    def focal_stds(self) -> dict[str, float]:
+        """Relative std of each estimated focal length; 0 where the lens was given."""
+        covariance = body_covariance(self.problem, self.state)
+        return {
+            name: covariance.std(i, FOCAL) if self.problem.free_lens[i] else self.lens_stds.get(name, 0.0)
+            for i, name in enumerate(self.names)
+        }
+
+
+def publish(rig: Rig, solution: BodySolution) -> Calibration:
+    """The calibration in the rig's world and units, on the reference camera's clock."""
+    problem, state, names = solution.problem, solution.state, solution.names
+    covariance = body_covariance(problem, state)
+    world, scale, warnings = _world(rig, solution)
+    requested = rig.metadata.get("reference")
+    reference = names.index(requested) if requested in names else 0
+    stds = solution.focal_stds()
+    maps = [_time_map(problem, state, i, reference) for i in range(len(names))]
+    cameras = {
+        name: CameraCalibration(
+            name=name,
+            intrinsics=state.cameras[i].intrinsics,
+            pose=world.pose(state.cameras[i].pose),
+            time_map=maps[i],
+            time_offset_std=_relative_std(covariance, i, reference, OFFSET),
+            position_std=_position_std(covariance, i, world)
+            if solution.known is None
+            else solution.known.cameras[name].position_std,
+            rms_px=_rms(problem, state, i),
+            focal_std=stds[name],
+            readout=state.cameras[i].readout,
+            lag_time=state.cameras[i].centre + problem.views[i].time_origin,
+            clock_rate_std=_relative_std(covariance, i, reference, RATE),
+        )
+        for i, name in enumerate(names)
+    }
+    return Calibration(
+        cameras=cameras,
+        reference=names[reference],
+        scale=scale,
+        units=rig.units,
+        solver="joint",
+        version=VERSION,
+        refused={name: solution.refused[name] for name in rig.cameras if name in solution.refused},
+        trajectories=_trajectories(rig, solution, covariance, world, reference),
+        pairs=tuple(_pair(solution, cameras, pair, found) for pair, found in solution.pairs.items()),
+        warnings=(*solution.warnings, *warnings, *_notes(solution, cameras)),
+        residuals={name: _residual_rows(problem, state, i) for i, name in enumerate(names)},
+        convergence=state.steps,
+    )
+
+
+def _world(rig: Rig, solution: BodySolution) -> tuple[Similarity, str, tuple[str, ...]]:
+    """The similarity to the published world, its scale, and warnings.
+
+    The bodies' size gives the scale, unless it is not known, or positions or distances in the rig do.
+    """
+    if solution.known is not None:
+        return Similarity(1.0, np.eye(3), np.zeros(3)), solution.known.scale, ()
+    poses = [camera.pose for camera in solution.state.cameras]
+    gauge = fix_gauge(rig, solution.names, poses)
+    s = gauge.similarity
+    if gauge.scale == "metric":
+        warnings = gauge.warnings
+        if rig.bodies_metric and abs(s.scale - 1.0) > _SCALE_CONFLICT:
+            off = f"{100 * abs(s.scale - 1.0):.1f} % {'larger' if s.scale > 1.0 else 'smaller'}"
+            warnings += (f"the control points make the board {off} than board.toml: is square_size right?",)
+        return s, "metric", warnings
+    if not rig.bodies_metric:
+        return s, "arbitrary", gauge.warnings
+    # Only the size of the default world, whose first baseline is 1, is replaced.
+    return (
+        Similarity(1.0, s.rotation, s.shift / s.scale),
+        "metric",
+        tuple(text for text in gauge.warnings if "fix no scale" not in text),
+    )
+
+
+def _time_map(problem: BodyProblem, state: BodyState, camera: int, reference: int) -> TimeMap:
+    if camera == reference or not problem.clock:
+        return TimeMap(1.0, 0.0)
+    now, base = state.cameras[camera], state.cameras[reference]
+    rate = now.rate / base.rate
+    at_centre = (now.offset - base.offset) / base.rate + base.centre + problem.views[reference].time_origin
+    return TimeMap(rate, at_centre - rate * (now.centre + problem.views[camera].time_origin))
+
+
+def _relative_std(covariance: BodyCovariance, camera: int, reference: int, column: int) -> float:
+    """Std of a clock parameter against the reference camera's."""
+    if camera == reference:
+        return 0.0
+    both = [camera * CAMERA_PARAMETERS + column, reference * CAMERA_PARAMETERS + column]
+    block = covariance.cameras[np.ix_(both, both)]
+    return float(np.sqrt(max(block[0, 0] + block[1, 1] - 2.0 * block[0, 1], 0.0)))
+
+
+def _position_std(covariance: BodyCovariance, camera: int, world: Similarity) -> Floats:
+    block = covariance.block(camera)[3:6, 3:6]
+    return np.asarray(world.scale * np.sqrt(np.maximum(np.diag(world.rotation @ block @ world.rotation.T), 0.0)))
+
+
+def _rms(problem: BodyProblem, state: BodyState, camera: int) -> float:
+    values, good = residuals(problem, state, camera)
+    return float(np.sqrt((values[good] ** 2).sum(axis=1).mean())) if good.any() else 0.0
+
+
+def _residual_rows(problem: BodyProblem, state: BodyState, camera: int) -> Floats:
+    values, good = residuals(problem, state, camera)
+    views = problem.views[camera]
+    stamps = views.time[views.view] + views.time_origin
+    return np.column_stack([stamps, views.pixels, -values])[good]
+
+
+def _notes(solution: BodySolution, cameras: Mapping[str, CameraCalibration]) -> tuple[str, ...]:
+    lenses = tuple(
+        f"{name}: its lens was estimated from the board: focal length {camera.intrinsics.focal:.1f} px ± "
+        f"{100 * camera.focal_std:.2g} % (std)"
+        for name, camera in cameras.items()
+        if camera.focal_std > 0.0
+    )
+    jitter = tuple(
+        f"{name}: its stamps jitter by {1e3 * std:.2g} ms (std): each frame's time was estimated from the board"
+        for name, std in zip(solution.names, solution.state.jitter.tolist(), strict=True)
+        if std > 0.0
+    )
+    return lenses + jitter
+
+
+def _trajectories(
+    rig: Rig, solution: BodySolution, covariance: BodyCovariance, world: Similarity, reference: int
+) -> tuple[TrajectoryTable, ...]:
+    problem, state = solution.problem, solution.state
+    base, origin = state.cameras[reference], problem.views[reference].time_origin
+    fastest = min(frame_interval(views) for views in problem.views)
+    rate = max([1.0 / fastest, *(rig.cameras[name].fps for name in solution.names)])
+    out = []
+    owner = {label: (number, point) for number, body in enumerate(rig.bodies.values()) for label, point in body.items()}
+    order = {number: i for i, number in enumerate(_moving_bodies(solution))}
+    for number, place in order.items():
+        motion = state.bodies[place]
+        instants = isinstance(motion.basis, PointBasis)
+        if isinstance(motion.basis, PointBasis):
+            ticks = base.camera_time(motion.basis.instants) + origin
+        else:
+            first, last = base.camera_time(np.array([motion.basis.begin, motion.basis.end])) + origin
+            step = max(1.0 / rate, (last - first) / _MAX_SAMPLES)
+            ticks = np.arange(np.ceil(first / step), np.floor(last / step) + 1) * step
+        internal = base.reference_time(ticks - origin)
+        path = path_covariance(state, covariance, place, internal)
+        for index, label in enumerate(solution.labels):
+            if owner[label][0] != number:
+                continue
+            good = _observing(problem, state, index, internal, instants) >= 2
+            position = motion.points(internal[good], owner[label][1])
+            finite = np.isfinite(position).all(axis=1)
+            time, inside = ticks[good][finite], internal[good][finite]
+            if len(time):
+                std = world.scale * path.point_stds(owner[label][1], inside)
+                out.append(TrajectoryTable(label, time, world.points(position[finite]), std))
+    return tuple(out)
+
+
+def _moving_bodies(solution: BodySolution) -> list[int]:
+    """Numbers of the bodies that have a motion: those that were seen."""
+    return sorted({int(number) for views in solution.problem.views for number in np.unique(views.body)})
+
+
+def _observing(problem: BodyProblem, state: BodyState, label: int, time: Floats, instants: bool) -> Ints:
+    """Number of cameras (n,) that saw a label at internal times (n,)."""
+    within = INSTANT_TOLERANCE_S if instants else _SEEN_WITHIN
+    count = np.zeros(len(time), dtype=np.int64)
+    for views, use, camera in zip(problem.views, problem.use, state.cameras, strict=True):
+        seen = np.unique(views.view[use & (views.label == label)])
+        if not len(seen):
+            continue
+        stamps = np.sort(camera.reference_time(views.time[seen]))
+        after = np.clip(np.searchsorted(stamps, time), 0, len(stamps) - 1)
+        before = np.maximum(after - 1, 0)
+        count += np.minimum(np.abs(stamps[after] - time), np.abs(stamps[before] - time)) <= within
+    return count
+
+
+def _pair(
+    solution: BodySolution, cameras: Mapping[str, CameraCalibration], pair: tuple[str, str], found: BodyPair
+) -> PairReport:
+    """A pair's report, from the joint solution where both cameras are in it."""
+    if not all(name in cameras for name in pair):
+        return PairReport(pair, found.reason or "ok", None if found.reason else -found.lag)
+    a, b = (cameras[name] for name in pair)
+    views = [solution.problem.views[solution.names.index(name)] for name in pair]
+    spans = [
+        [
+            camera.time_map.clock_rate * (t + v.time_origin) + camera.time_map.time_offset
+            for t in (v.time.min(), v.time.max())
+        ]
+        for camera, v in zip((a, b), views, strict=True)
+    ]
+    middle = 0.5 * (max(spans[0][0], spans[1][0]) + min(spans[0][1], spans[1][1]))
+    on_a, on_b = ((middle - camera.time_map.time_offset) / camera.time_map.clock_rate for camera in (a, b))
+    try:
+        matrix = fundamental_from(relative_pose_between(a.pose, b.pose), a.intrinsics.matrix, b.intrinsics.matrix)
+    except ValueError:  # coincident centres
+        matrix = None
+    return PairReport(
+        pair,
+        found.reason or "ok",
+        on_a - on_b,
+        b.time_map.clock_rate / a.time_map.clock_rate,
+        matrix,
+        found.share or None,
+    )

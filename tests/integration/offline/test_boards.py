@@ -1,0 +1,176 @@
+"""`syncline calibrate VIDEOS` with boards: rendered clips of an inverted ChArUco board, names, and bad descriptions."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tomllib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from deploy.cli import run
+from edge.detectors.board.description import Board, parse_board
+from edge.detectors.board.detector import BoardDetector
+from edge.detectors.board.finder import Finder
+from protocols.core.errors import InputError
+from protocols.geometry.camera import Intrinsics
+from protocols.session.calibration import read_calibration
+from tests.support import boards
+from tests.support.board_session import BoardWorld, board_world, render_videos
+
+Capture = pytest.CaptureFixture[str]
+BOARD = 'board = "charuco"\nsquares = "8x6"\nsquare_size = 0.1\n'
+NAMES = ("CVLab1", "GoPro 2")
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BoardWorld]:
+    """Two clips of an inverted board, named as users name cameras, with board.toml and no lenses."""
+    folder = tmp_path_factory.mktemp("board") / "videos"
+    world = board_world(5, (10.0, 12.0), lag=1.5, squares=(8, 6), size=0.1)
+    render_videos(world, folder, 6.0, inverted=True, scale=0.6)
+    for old, new in zip(world.cameras, NAMES, strict=True):
+        (folder / f"{old}.mp4").rename(folder / f"{new}.mp4")
+    (folder / "board.toml").write_text(BOARD)
+    return folder, world
+
+
+def test_two_clips_of_a_board_give_clocks_poses_lenses_and_metres(
+    recorded: tuple[Path, BoardWorld], tmp_path: Path, capsys: Capture
+) -> None:
+    folder, world = recorded
+    out = tmp_path / "out"
+    assert run(["calibrate", str(folder), "--detector", "charuco", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "board in" in printed
+    assert "marker" not in printed
+    rig, cameras = read_calibration(out / "calibration.toml")
+    assert list(cameras) == list(NAMES)
+    assert rig.metadata["scale"] == "metric"
+    first, second = world.cameras.values()
+    true = first.pose.camera_from_world(second.pose.position[None])[0]
+    found = cameras["CVLab1"].pose.camera_from_world(cameras["GoPro 2"].pose.position[None])[0]
+    assert np.linalg.norm(found - true) < 0.03
+    document = json.loads((out / "result.json").read_text())
+    lag = document["cameras"]["GoPro 2"]
+    at = lag["lag_time_s"]
+    clock = cameras["GoPro 2"].time_map
+    expected = second.rate * at + second.offset
+    assert abs(clock.clock_rate * at + clock.time_offset - expected) < 0.005
+    session = tomllib.loads((out / "session" / "rig.toml").read_text())
+    assert len(session["metadata"]["bodies"]["board"]) == 35
+
+
+def test_auto_takes_the_board_that_is_there_and_says_so(recorded: tuple[Path, BoardWorld], tmp_path: Path) -> None:
+    from deploy.offline.recognition import find_target
+    from edge.detectors.marker.ball import MarkerModel
+
+    folder, _ = recorded
+    paths = sorted(folder.glob("*.mp4"))
+    target = find_target(folder, paths, "auto", MarkerModel.default(), lambda text, share: None)
+    assert target.board is not None
+    assert (target.kind, target.board.inverted) == ("charuco", True)
+    assert "inverted" in target.notes[0]
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for path in paths:
+        shutil.copy(path, bare)
+    target = find_target(bare, sorted(bare.glob("*.mp4")), "auto", MarkerModel.default(), lambda text, share: None)
+    assert target.kind == "tag"
+    assert target.board is not None
+    assert (target.board.dictionary, target.board.inverted) == ("4X4_50", True)
+    assert "board.toml" in target.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ('board = "charuco"\n', "needs its squares"),
+        ('board = "charuco"\nsquares = "8by5"\n', "squares = '8by5'"),
+        ('board = "circles"\nsquares = "8x5"\n', "board = 'circles'"),
+        ('board = "charuco"\nsquares = "8x5"\nsquare_sise = 0.03\n', "did you mean square_size"),
+        ('board = "charuco"\nsquares = "8x5"\ndictionary = "4X4_51"\n', "did you mean"),
+        ('board = "charuco"\nsquares = "20x20"\ndictionary = "4X4_50"\n', "more markers"),
+        ('board = "charuco"\nsquares = "8x5"\ninverted = 1\n', "inverted = 1"),
+    ],
+)
+def test_a_wrong_board_toml_is_bad_input_in_one_line(
+    recorded: tuple[Path, BoardWorld], tmp_path: Path, capsys: Capture, text: str, problem: str
+) -> None:
+    for path in recorded[0].glob("*.mp4"):
+        shutil.copy(path, tmp_path)
+    (tmp_path / "board.toml").write_text(text)
+    assert run(["calibrate", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert problem in error
+    assert error.count("\n") == 1
+
+
+def test_a_board_detector_without_board_toml_names_the_file(
+    recorded: tuple[Path, BoardWorld], tmp_path: Path, capsys: Capture
+) -> None:
+    for path in recorded[0].glob("*.mp4"):
+        shutil.copy(path, tmp_path)
+    assert run(["calibrate", str(tmp_path), "--detector", "charuco", "--out", str(tmp_path / "out")]) == 2
+    assert "write board.toml" in capsys.readouterr().err
+
+
+def _drawn(name: str, columns: int, rows: int, legacy: bool) -> np.ndarray:
+    book = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
+    board = cv2.aruco.CharucoBoard((columns, rows), 1.0, 0.7, book)
+    board.setLegacyPattern(legacy)
+    return np.asarray(board.generateImage((columns * 60 + 120, rows * 60 + 120), marginSize=60), dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("dictionary", "legacy", "inverted", "mirrored"),
+    [("5X5_100", True, False, False), ("6X6_250", False, True, True), ("APRILTAG_36H11", False, False, True)],
+)
+def test_every_print_is_recognised_and_gives_the_same_corners(
+    dictionary: str, legacy: bool, inverted: bool, mirrored: bool
+) -> None:
+    image = _drawn(dictionary, 6, 4, legacy)
+    image = image[:, ::-1].copy() if mirrored else image
+    image = 255 - image if inverted else image
+    board = Board("charuco", (6, 4), dictionary, 0.7)
+    counts = {print_: len(Finder(print_).find(image)[0]) for print_ in board.prints()}
+    best = max(counts, key=counts.__getitem__)
+    assert (best.legacy, best.inverted, best.mirrored) == (legacy, inverted, mirrored)
+    finder = Finder(best)
+    numbers, pixels = finder.find(image)
+    assert len(numbers) == 15
+    points = np.array([board.points()[finder.labels[number]][:2] for number in numbers])
+    assert np.abs(60 * points + 59.5 - pixels).max() < 1.0
+
+
+def test_a_chessboard_has_one_order_of_its_corners_also_upside_down() -> None:
+    board = next(iter(Board("chessboard", (8, 5)).prints()))
+    squares = (np.indices((5, 8)).sum(axis=0) % 2 * 255).astype(np.uint8)
+    image = np.pad(np.kron(squares, np.ones((40, 40), np.uint8)), 60, constant_values=255)
+    upright = dict(zip(*map(list, Finder(board).find(image)), strict=True))
+    turned = dict(zip(*map(list, Finder(board).find(np.ascontiguousarray(image[::-1, ::-1]))), strict=True))
+    size = np.array(image.shape[::-1]) - 1.0
+    assert len(upright) == 28
+    for number, pixel in upright.items():
+        assert np.abs(size - turned[number] - pixel).max() < 1.0
+
+
+def test_a_large_image_gives_the_corners_of_full_resolution() -> None:
+    lens = Intrinsics(1920, 1080, np.array([[1600.0, 0, 960], [0, 1600.0, 540], [0, 0, 1]]))
+    image = boards.BoardRenderer(lens, 1).draw(boards.charuco_image(), np.eye(3), np.array([0.5, 0.2, 12.0]))
+    grey = image[..., 0].copy()
+    detector = BoardDetector(parse_board({"board": "charuco", "squares": "8x6", "inverted": False, "mirrored": False}))
+    detector.find(grey)
+    numbers, pixels = detector.find(grey)  # tracked
+    full_numbers, full = Finder(detector.board).find(grey)
+    common, a, b = np.intersect1d(numbers, full_numbers, return_indices=True)
+    assert len(common) == 35
+    assert np.abs(pixels[a] - full[b]).max() < 0.25
+
+
+def test_a_board_too_small_is_bad_input() -> None:
+    with pytest.raises(InputError, match="too small"):
+        parse_board({"board": "chessboard", "squares": "3x3"})

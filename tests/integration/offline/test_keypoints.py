@@ -1,0 +1,221 @@
+"""Keypoints of other trackers: each format is read, a person calibrates cameras in metres, C3D and TRC mark gaps."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deploy.cli import run
+from protocols.formats import keypoints
+from protocols.geometry.types import Floats
+from protocols.session.calibration import read_calibration
+from protocols.session.folder import write_observations
+from protocols.session.observations import read_observations
+from tests.support.board_session import BoardWorld, board_world
+
+Capture = pytest.CaptureFixture[str]
+JOINTS = [
+    "nose",
+    "left_eye",
+    "right_eye",
+    "left_ear",
+    "right_ear",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "right_elbow",
+    "left_wrist",
+    "right_wrist",
+    "left_hip",
+    "right_hip",
+    "left_knee",
+    "right_knee",
+    "left_ankle",
+    "right_ankle",
+]
+FRAMES = 6
+
+
+def places() -> Floats:
+    """(frames, 17, 3) u, v, score; joint 3 of frame 2 is not seen."""
+    rng = np.random.default_rng(1)
+    points = np.concatenate([rng.uniform(10, 600, (FRAMES, 17, 2)), rng.uniform(0.7, 1.0, (FRAMES, 17, 1))], axis=2)
+    points[2, 3] = 0.0
+    return points
+
+
+def openpose(folder: Path) -> Path:
+    target = folder / "pose" / "cam1_json"
+    target.mkdir(parents=True)
+    for frame, points in enumerate(places()):
+        person = {"person_id": [-1], "pose_keypoints_2d": points.ravel().tolist()}
+        (target / f"cam1_{frame:012d}_keypoints.json").write_text(json.dumps({"version": 1.3, "people": [person]}))
+    return folder
+
+
+def mmpose(folder: Path) -> Path:
+    frames = [
+        {"frame_id": k + 1, "instances": [{"keypoints": p[:, :2].tolist(), "keypoint_scores": p[:, 2].tolist()}]}
+        for k, p in enumerate(places())
+    ]
+    return written(folder / "cam1.json", frames)
+
+
+def coco(folder: Path) -> Path:
+    images = [{"id": 100 + k, "file_name": f"{k:05d}.png"} for k in range(FRAMES)]
+    found = [
+        {"image_id": 100 + k, "category_id": 1, "keypoints": np.c_[p[:, :2], 2.0 * (p[:, 2] > 0)].ravel().tolist()}
+        for k, p in enumerate(places())
+    ]
+    document = {"images": images, "annotations": found, "categories": [{"id": 1, "keypoints": JOINTS}]}
+    return written(folder / "cam1.json", document)
+
+
+def sleap(folder: Path) -> Path:
+    import h5py
+
+    points = places()
+    points[2, 3] = np.nan
+    file = folder / "cam1.analysis.h5"
+    with h5py.File(file, "w") as data:
+        data["tracks"] = points[None, :, :, :2].transpose(0, 3, 2, 1)
+        data["node_names"] = [name.encode() for name in JOINTS]
+        data["point_scores"] = points[None, :, :, 2].transpose(0, 2, 1)
+    return file
+
+
+def freemocap(folder: Path) -> Path:
+    points = places()[None]
+    points[0, 2, 3] = np.nan
+    file = folder / "mediapipe2dData_numCams_numFrames_numTrackedPoints_pixelXY.npy"
+    np.save(file, points)
+    return file
+
+
+def written(file: Path, document: object) -> Path:
+    file.write_text(json.dumps(document))
+    return file
+
+
+@pytest.mark.parametrize(
+    ("make", "kind"),
+    [(openpose, "openpose"), (mmpose, "mmpose"), (coco, "coco"), (sleap, "sleap"), (freemocap, "freemocap-points")],
+)
+def test_every_format_is_recognised_and_gives_the_same_points(
+    tmp_path: Path, capsys: Capture, make: Callable[[Path], Path], kind: str
+) -> None:
+    source = make(tmp_path)
+    out = tmp_path / "session" / "observations.csv"
+    out.parent.mkdir()
+    arguments = ["import", str(source), "--fps", "20", "--size", "640x480", "--out", str(out), "--json"]
+    assert run(arguments) == 0
+    assert json.loads(capsys.readouterr().out)["format"] == kind
+    camera = "cam_0" if make is freemocap else "cam1"
+    seen = read_observations(out, [camera])
+    assert len(seen) == 17 * FRAMES - 1
+    truth = places()
+    label = "point5" if make is freemocap else "left_shoulder"
+    track = seen.tracks[camera, label]
+    assert track.time == pytest.approx(np.arange(FRAMES) / 20)
+    assert track.pixels == pytest.approx(truth[:, 5, :2])
+    assert 2 not in seen.tracks[camera, "point3" if make is freemocap else "left_ear"].frame
+    assert "size = [\n    640,\n    480,\n]" in (out.parent / "rig.toml").read_text()
+
+
+def test_deeplabcuts_hdf5_is_read_as_pandas_wrote_it(tmp_path: Path) -> None:
+    import h5py
+
+    columns = [("DLC", joint, axis) for joint in ("nose", "tail") for axis in ("x", "y", "likelihood")]
+    values = np.random.default_rng(0).uniform(1, 100, (4, 6))
+    values[:, [2, 5]] = 0.9
+    file = tmp_path / "cam1DLC_resnet50.h5"
+    with h5py.File(file, "w") as data:
+        group = data.create_group("df_with_missing")
+        for level in range(3):
+            names = list(dict.fromkeys(column[level] for column in columns))
+            group[f"axis0_level{level}"] = [name.encode() for name in names]
+            group[f"axis0_label{level}"] = [names.index(column[level]) for column in columns]
+        group["axis1"] = np.arange(4)
+        group["block0_values"] = values
+    assert keypoints.detect_format(file) == "deeplabcut-h5"
+    (found,) = keypoints.read("deeplabcut-h5", [file], None)
+    assert found.camera == "cam1"
+    assert [row.joint for row in found.rows[::4]] == ["nose", "tail"]
+    assert found.rows[5].u == pytest.approx(values[1, 3])
+
+
+def test_mediapipes_shares_of_the_image_become_pixels(tmp_path: Path) -> None:
+    frames = [{"frame": k, "landmarks": [{"x": 0.5, "y": 0.25, "visibility": 0.9}] * 33} for k in range(3)]
+    file = written(tmp_path / "cam1.json", frames)
+    out = tmp_path / "observations.csv"
+    assert run(["import", str(file), "--fps", "30", "--out", str(out)]) == 2  # without a size
+    assert run(["import", str(file), "--fps", "30", "--size", "640x480", "--out", str(out)]) == 0
+    assert read_observations(out, ["cam1"]).tracks["cam1", "nose"].pixels[0] == pytest.approx([319.5, 119.5])
+
+
+def test_unknown_json_and_pickles_in_foreign_files_are_bad_input(tmp_path: Path, capsys: Capture) -> None:
+    import pickle
+
+    file = written(tmp_path / "cam1.json", {"what": 1})
+    assert run(["import", str(file), "--out", str(tmp_path / "observations.csv")]) == 2
+    assert "unknown format" in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r"posix\.system|builtins|os"):
+        keypoints._plain_pickle(pickle.dumps(print))
+
+
+def skeleton_world() -> tuple[BoardWorld, dict[str, Floats]]:
+    """A world whose moving body is a person of 1.75 m, by joints."""
+    world = board_world(21, (25.0, 30.0, 25.0))
+    height = 1.75
+    joints = {
+        "left_hip": [-0.1, 0.0, 0.0],
+        "right_hip": [0.1, 0.0, 0.0],
+        "left_knee": [-0.1, 0.245 * height, 0.0],
+        "right_knee": [0.1, 0.245 * height, 0.0],
+        "left_ankle": [-0.1, (0.245 + 0.246) * height, 0.02],
+        "right_ankle": [0.1, (0.245 + 0.246) * height, -0.02],
+        "nose": [0.0, -0.3 * height, 0.1],
+    }
+    return world, {name: 0.4 * np.array(place) for name, place in joints.items()}
+
+
+def test_a_person_calibrates_the_cameras_in_metres_by_the_given_height(tmp_path: Path, capsys: Capture) -> None:
+    world, joints = skeleton_world()
+    world = replace(world, points=joints)
+    seen = world.observations(12.0, noise=1.0)
+    session = tmp_path / "session"
+    session.mkdir()
+    write_observations(session / "observations.csv", seen)
+    (session / "rig.toml").write_text(
+        "\n".join(
+            f'[{name}]\nname = "{name}"\nsize = [1280, 720]\nfps = {one.fps}\nmatrix = {one.lens.matrix.tolist()}\n'
+            f"distortions = {one.lens.distortions.tolist()}"
+            for name, one in world.cameras.items()
+        )
+    )
+    out = tmp_path / "out"
+    assert run(["calibrate", str(session), "--limb", "left_hip-tail=1", "--out", str(out)]) == 2
+    assert "labels are left_ankle" in capsys.readouterr().err
+    assert run(["calibrate", str(session), "--height", "0.7", "--out", str(out)]) == 0  # 0.4 of 1.75 m
+    capsys.readouterr()
+    rig, cameras = read_calibration(out / "calibration.toml")
+    assert rig.metadata["scale"] == "metric"
+    length = float(np.linalg.norm(cameras["cam0"].pose.position - cameras["cam1"].pose.position))
+    true = float(np.linalg.norm(world.cameras["cam0"].pose.position - world.cameras["cam1"].pose.position))
+    assert length == pytest.approx(true, rel=0.02)
+    for suffix in ("trc", "c3d"):
+        target = tmp_path / f"track.{suffix}"
+        calibration = str(out / "calibration.toml")
+        assert run(["triangulate", str(session), "--calibration", calibration, "--out", str(target)]) == 0
+    import ezc3d
+
+    file = ezc3d.c3d(str(tmp_path / "track.c3d"))
+    assert set(file["parameters"]["POINT"]["LABELS"]["value"]) == set(joints)
+    assert file["parameters"]["POINT"]["UNITS"]["value"] == ["mm"]
+    missing = np.isnan(file["data"]["points"][0])
+    assert (file["data"]["meta_points"]["residuals"][0] < 0).tolist() == missing.tolist()
