@@ -34,6 +34,7 @@ from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
 
 _MIN_PARALLAX = 0.02  # rad between rays; less does not triangulate
+_MIN_POINT_PARALLAX = 2e-3  # rad: the same for separate points, no part of a path; two pixels of a bearing
 _MIN_BEARING_ANGLE = 0.05  # rad between two directions that intersect
 _MAX_PNP_POINTS = 400
 _PNP_THRESHOLD_PX = 8.0
@@ -277,7 +278,7 @@ def triangulate_label(
 def _triangulate_instants(seeing: list[tuple[CameraState, ImageTrack]]) -> Trajectory | None:
     """The trajectory of a shared clock: one point for every instant that two cameras triangulate."""
     instants = merged_instants([state.reference_time(track.time) for state, track in seeing])
-    points, good = linear_triangulation(seeing, instants)
+    points, good = linear_triangulation(seeing, instants, _MIN_POINT_PARALLAX)
     if good.sum() < _MIN_PNP_POINTS:
         return None
     basis = PointBasis(instants[good])
@@ -286,7 +287,9 @@ def _triangulate_instants(seeing: list[tuple[CameraState, ImageTrack]]) -> Traje
     )
 
 
-def linear_triangulation(seeing: list[tuple[CameraState, ImageTrack]], time: Floats) -> tuple[Floats, Bools]:
+def linear_triangulation(
+    seeing: list[tuple[CameraState, ImageTrack]], time: Floats, min_parallax: float = _MIN_PARALLAX
+) -> tuple[Floats, Bools]:
     """Points (n, 3) at reference times, and which of them are triangulated in front of all their cameras.
 
     Least squares over the distances to the rays, which needs no initial values.
@@ -309,7 +312,7 @@ def linear_triangulation(seeing: list[tuple[CameraState, ImageTrack]], time: Flo
     matrix, right = np.ascontiguousarray(sums.transpose(2, 0, 1)), target.T
     eigenvalues = np.linalg.eigvalsh(matrix)
     # Smallest eigenvalue of two rays at angle t: 1 - cos t.
-    good = (count >= 2) & (eigenvalues[:, 0] > 1.0 - np.cos(_MIN_PARALLAX))
+    good = (count >= 2) & (eigenvalues[:, 0] > 1.0 - np.cos(min_parallax))
     points = np.zeros((len(time), 3))
     points[good] = np.linalg.solve(matrix[good], right[good][:, :, None])[:, :, 0]
     for position, ray in rays:  # a ray of length 0 marks a camera that does not see the point

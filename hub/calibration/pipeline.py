@@ -14,7 +14,7 @@ import numpy as np
 
 from hub.baselines.session_lags import solve_pair_by_paper
 from hub.bundle import covariance as cov
-from hub.bundle import rolling_shutter
+from hub.bundle import model_comparison
 from hub.bundle.adjustment import adjust, estimate_noise, residual_norms
 from hub.bundle.correlated_noise import refit_with_correlated_noise
 from hub.bundle.initialisation import (
@@ -69,6 +69,7 @@ def calibrate(
     clock_priors: Mapping[str, ExternalClockPrior] | None = None,
     arrivals: Mapping[str, ExternalClockPrior] | None = None,
     online: bool = False,
+    refine_lenses: bool = False,
 ) -> Calibration:
     """Timing and poses of all cameras from their observations, without initial values.
 
@@ -78,7 +79,7 @@ def calibrate(
     search over clock rates that a wrong nominal frame rate causes (times made from frame numbers, which a live
     camera's are not) and over interrupted tracks. seed: of the random samples of the pose nodes; the other solvers are
     deterministic. clock_priors: external clock priors by camera, used only where the images leave lags ambiguous.
-    arrivals: the same by times of arrival at a hub; lags far from them are not searched. online: see
+    arrivals: the same by times of arrival at a hub; lags far from them are not searched. online, refine_lenses: see
     `final_adjustment`. Raises Refused, with a reason for every camera and the pair reports, where fewer than two
     cameras can be placed.
     """
@@ -116,7 +117,9 @@ def calibrate(
                 prepared, pairs, report, DistributedPoseSolver(rig, prepared, observations, report, seed)
             )
         else:
-            solution = solve_with_unknown_lenses(rig, prepared, pairs, report, online=online)
+            solution = solve_with_unknown_lenses(
+                rig, prepared, pairs, report, online=online, refine_lenses=refine_lenses
+            )
         report("covariances", 0.95)
         return assemble_calibration(rig, solution)
     except Refused as refusal:
@@ -164,7 +167,13 @@ def paper_pairs(prepared: PreparedSession, observations: Observations, report: P
 
 
 def solve_with_unknown_lenses(
-    rig: Rig, prepared: PreparedSession, pairs: list[PairSolution], report: Progress, *, online: bool = False
+    rig: Rig,
+    prepared: PreparedSession,
+    pairs: list[PairSolution],
+    report: Progress,
+    *,
+    online: bool = False,
+    refine_lenses: bool = False,
 ) -> Solution:
     """The network with cameras of unknown intrinsics, where the common trajectory determines their focal lengths.
 
@@ -172,11 +181,11 @@ def solve_with_unknown_lenses(
     """
     trial, trial_pairs = initial_self_calibration(rig, prepared, pairs)
     if trial is prepared:
-        return solve_network(prepared, pairs, report, online=online)
+        return solve_network(prepared, pairs, report, online=online, refine_lenses=refine_lenses)
     report("focal lengths", 0.58)
     try:
         for _ in range(_LENS_ITERATIONS):
-            solution = solve_network(trial, trial_pairs, report, online=online)
+            solution = solve_network(trial, trial_pairs, report, online=online, refine_lenses=refine_lenses)
             found = dict(zip(solution.reconstruction.names, solution.reconstruction.state.cameras, strict=True))
             lenses = {name: camera.intrinsics for name, camera in found.items()}
             trial, trial_pairs, changed = with_updated_lenses(trial, trial_pairs, lenses)
@@ -187,7 +196,7 @@ def solve_with_unknown_lenses(
             name: refusal.cameras.get(name, "") for name in trial.cameras if trial.cameras[name].lens_prior is not None
         }
         without = replace(prepared, refused=_with_lens_failure(prepared, reasons))
-        return solve_network(without, pairs, report, online=online)
+        return solve_network(without, pairs, report, online=online, refine_lenses=refine_lenses)
     uncalibrated = [name for name in trial.cameras if trial.cameras[name].lens_prior is not None]
     left = {name: solution.refused[name] for name in uncalibrated if name in solution.refused}
     refused = solution.refused | {
@@ -223,6 +232,7 @@ def solve_network(
     distributed_solver: DistributedPoseSolver | None = None,
     *,
     online: bool = False,
+    refine_lenses: bool = False,
 ) -> Solution:
     """One adjusted network from the pairs; cameras that do not fit are refused with a reason.
 
@@ -239,7 +249,7 @@ def solve_network(
             reconstruction, unplaced = reconstruct_incrementally(
                 prepared.cameras, graph, prepared.rows, prepared.labels, lambda text: report(text, 0.6), with_rate_prior
             )
-            reconstruction = final_adjustment(reconstruction, report, online=online)
+            reconstruction = final_adjustment(reconstruction, report, online=online, refine_lenses=refine_lenses)
             # The narrow rate prior only stabilises the estimate; stds are computed with the usual one.
             usual = replace(reconstruction.problem.free_parameters, rate_std=free_parameters.rate_std)
             reconstruction.problem = replace(reconstruction.problem, free_parameters=usual)
@@ -444,14 +454,19 @@ def fits_trajectory(reconstruction: Reconstruction, name: str) -> bool:
 
 
 def final_adjustment(
-    reconstruction: Reconstruction, report: Progress, *, warm: bool = False, online: bool = False
+    reconstruction: Reconstruction,
+    report: Progress,
+    *,
+    warm: bool = False,
+    online: bool = False,
+    refine_lenses: bool = False,
 ) -> Reconstruction:
-    """The final adjustment, with lenses and readouts estimated where the data clearly support it.
+    """The final adjustment, with readouts estimated where the data clearly support it.
 
-    warm: the state is near the solution, and which lenses to estimate is not decided again. online: a part of a
-    recording that goes on. Then readouts are not estimated: on the first 70 to 110 s of a real rig they came out at
-    -34 and +42 ms with stds of 10 ms, after 130 s not at all. And the re-fit with correlated noise, whose lens
-    tolerances make early stds honest, waits for less correlation.
+    refine_lenses: measured lenses may change within their tolerance where the data clearly support it; else they are
+    kept exactly. warm: the state is near the solution. online: a part of a recording that goes on. Then readouts are
+    not estimated: on the first 70 to 110 s of a real rig they came out at -34 and +42 ms with stds of 10 ms, after
+    130 s not at all. And the re-fit with correlated noise, which makes early stds honest, waits for less correlation.
     """
     report("adjusting", 0.75)
     problem, state = reconstruction.problem, reconstruction.state
@@ -463,7 +478,7 @@ def final_adjustment(
             return _with_state(reconstruction, *refitted)
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
     problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
-    if not warm:
+    if refine_lenses and not warm:
         report("adjusting the lenses", 0.85)
         freed = replace(problem, free_parameters=replace(problem.free_parameters, lens=True))
         freed_problem, freed_state, _ = adjust(freed, state, rounds=2, progress=lambda text: report(text, 0.85))
@@ -472,17 +487,17 @@ def final_adjustment(
     if (
         not online
         and problem.free_parameters.clock
-        and rolling_shutter.are_readouts_observable(problem, state, estimate_smoothness(problem, state))
+        and model_comparison.are_readouts_observable(problem, state, estimate_smoothness(problem, state))
     ):
         report("adjusting the readouts", 0.9)
-        read_problem, read_state, _ = adjust(rolling_shutter.with_free_readouts(problem), state, rounds=2)
-        if rolling_shutter.are_readouts_plausible(read_state) and _bic_prefers(
+        read_problem, read_state, _ = adjust(model_comparison.with_free_readouts(problem), state, rounds=2)
+        if model_comparison.are_readouts_plausible(read_state) and _bic_prefers(
             read_problem, read_state, problem, state, 1
         ):
             problem, state = read_problem, read_state
     report("correlated noise", 0.92)
-    refit = _refit_online if online else refit_with_correlated_noise
-    return _with_state(reconstruction, *refit(problem, state))
+    refitted = _refit_online(problem, state) if online else refit_with_correlated_noise(problem, state, refine_lenses)
+    return _with_state(reconstruction, *refitted)
 
 
 def _refit_online(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
@@ -510,7 +525,7 @@ def _refit_online(problem: Problem, state: AdjustmentState) -> tuple[Problem, Ad
                 for rows in problem.rows
             ),
         )
-    refitted = refit_with_correlated_noise(thinned, state, _ONLINE_MIN_INFLATION)
+    refitted = refit_with_correlated_noise(thinned, state, min_inflation=_ONLINE_MIN_INFLATION)
     return (problem, state) if refitted[1] is state else refitted
 
 

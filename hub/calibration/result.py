@@ -11,12 +11,13 @@ from hub.bundle import covariance as cov
 from hub.bundle.adjustment import predict, residual_norms
 from hub.bundle.datum.control_outliers import reject_outliers
 from hub.bundle.datum.control_point_adjustment import adjust_to_control_points
-from hub.bundle.datum.gauge import fix_gauge, identity_gauge, is_overdetermined, transform_state
+from hub.bundle.datum.gauge import fix_gauge, identity_gauge, is_overdetermined, transform_state, with_exact_poses
 from hub.bundle.initialisation import Reconstruction
 from hub.bundle.noise_scale import rescale_noise
 from hub.bundle.preprocessing import PreparedSession
 from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, READOUT, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
+from hub.calibration.given_values import refuted_lens_warnings
 from hub.calibration.held_gauge import similarity_to_published
 from hub.calibration.pair_network import pair_lag
 from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
@@ -71,10 +72,14 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
             prior = estimate_smoothness(problem, state)
             fitted = adjust_to_control_points(rig, names, problem, rescale_noise(problem, state, prior), prior)
             state = replace(fitted, sigma=state.sigma)
+        if gauge.scale == "metric":
+            state = with_exact_poses(rig, names, state)
     else:
         gauge = identity_gauge(len(names), solution.known.scale)
     prior = estimate_smoothness(problem, state)
-    covariance = cov.covariance(problem, rescale_noise(problem, state, prior), prior, gauge.information, datum_points)
+    covariance = cov.covariance(
+        problem, rescale_noise(problem, state, prior), prior, gauge.information, datum_points, gauge.exact
+    )
     lens_stds = focal_stds(problem, state, covariance)
     readout_stds = np.sqrt(np.maximum(np.diag(covariance.cameras)[READOUT::CAMERA_PARAMETERS], 0.0))
     time_origins = [solution.prepared.time_origins[name] for name in names]
@@ -139,6 +144,7 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         + gauge.warnings
         + _estimated_lenses(cameras)
         + _refined_lenses(names, problem, state)
+        + (refuted_lens_warnings(names, problem, state) if published is None else ())
         + _estimated_readouts(cameras)
         + _estimated_jitter(names, state, time_scales),
         residuals={
