@@ -109,7 +109,7 @@ def calibrate(
         if known is not None:
             solution = solve_with_known_poses(prepared, pairs, known, report)
         elif solver == "paper":
-            solution = solve_paper(prepared, pairs, report, observations if has_sizes else None)
+            solution = solve_paper(rig, prepared, pairs, report, observations if has_sizes else None)
         elif solver == "distributed":
             from hub.distributed.solver import DistributedPoseSolver
 
@@ -355,7 +355,11 @@ def _conflicts_with_pair(reconstruction: Reconstruction, graph: ClockGraph) -> t
 
 
 def solve_paper(
-    prepared: PreparedSession, pairs: list[PairSolution], report: Progress, sized: Observations | None = None
+    rig: Rig,
+    prepared: PreparedSession,
+    pairs: list[PairSolution],
+    report: Progress,
+    sized: Observations | None = None,
 ) -> Solution:
     """Network from the pairs of the paper's method: averaged clocks, no adjustment.
 
@@ -374,7 +378,7 @@ def solve_paper(
     else:
         from hub.baselines.session_poses import reconstruct_by_paper
 
-        reconstruction, unplaced = reconstruct_by_paper(prepared, sized, graph)
+        reconstruction, unplaced = reconstruct_by_paper(rig, prepared, sized, graph)
     if prepared.shared_clock:
         free_parameters = replace(reconstruction.problem.free_parameters, clock=False)
         reconstruction.problem = replace(reconstruction.problem, free_parameters=free_parameters)

@@ -68,7 +68,8 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
             )
             gauge = replace(gauge, similarity=held)
         state = transform_state(state, gauge.similarity)
-        if gauge.scale == "metric" and problem.free_parameters.pose and is_overdetermined(rig, names):
+        adjustable = problem.free_parameters.pose and solution.solver != "paper"  # its method has no adjustment
+        if gauge.scale == "metric" and adjustable and is_overdetermined(rig, names):
             prior = estimate_smoothness(problem, state)
             fitted = adjust_to_control_points(rig, names, problem, rescale_noise(problem, state, prior), prior)
             state = replace(fitted, sigma=state.sigma)
