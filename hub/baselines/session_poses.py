@@ -122,7 +122,7 @@ def _initial_poses(cameras: int, pairs: list[SharedPair]) -> dict[int, Pose]:
 
 def _in_the_rigs_world(rig: Rig, names: list[str], initial: dict[int, Pose]) -> dict[int, Pose]:
     """The initial poses moved into the rig's world, known parts at their given values, in the constants' unit."""
-    found, _ = fit_to_control_points(rig, names, list(initial[i] for i in sorted(initial)))
+    found, _ = fit_to_control_points(rig, names, [initial[i] for i in sorted(initial)])
     out = {}
     for i, name in zip(sorted(initial), names, strict=True):
         pose, camera = found.pose(initial[i]), rig.cameras[name]

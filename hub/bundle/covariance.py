@@ -196,11 +196,10 @@ def relative_clock_stds(cov: Covariance, problem: Problem, state: AdjustmentStat
     That is where their lag is used; away from it the uncertain rates increase the std. For cameras without a common
     span: in the middle of the gap. Diagonal 0.
     """
-    spans = _observed_spans(problem, state)
     count = len(state.cameras)
     out = np.zeros((count, count))
     for i, j in itertools.combinations(range(count), 2):
-        middle = 0.5 * (max(spans[i, 0], spans[j, 0]) + min(spans[i, 1], spans[j, 1]))
+        middle = float(middle_of_overlap(problem, state, i, j)[0])
         row = np.zeros(len(cov.cameras))
         for camera, sign in ((i, 1.0), (j, -1.0)):
             now = state.cameras[camera]
@@ -208,6 +207,12 @@ def relative_clock_stds(cov: Covariance, problem: Problem, state: AdjustmentStat
             row[camera * CAMERA_PARAMETERS + RATE] = sign * (middle - now.offset) / now.rate
         out[i, j] = out[j, i] = np.sqrt(max(float(row @ cov.cameras @ row), 0.0))
     return out
+
+
+def middle_of_overlap(problem: Problem, state: AdjustmentState, first: int, second: int) -> Floats:
+    """Internal reference time (1,) in the middle of the common span of two cameras, or of the gap between them."""
+    spans = _observed_spans(problem, state)
+    return np.array([0.5 * (spans[[first, second], 0].max() + spans[[first, second], 1].min())])
 
 
 def _observed_spans(problem: Problem, state: AdjustmentState) -> Floats:

@@ -329,7 +329,7 @@ def _resection_points(camera: CameraInput, clock: CameraState, reconstruction: R
             continue
         time = clock.reference_time(track.time)
         where = path.at(time)
-        both = np.isfinite(where).all(axis=1) & _seen_by_two(reconstruction, number, time)
+        both = np.isfinite(where).all(axis=1) & seen_by_two(reconstruction, number, time)
         positions.append(where[both])
         seen.append(track.points[both])
     if not positions:
@@ -337,7 +337,7 @@ def _resection_points(camera: CameraInput, clock: CameraState, reconstruction: R
     return np.concatenate(positions), np.concatenate(seen)
 
 
-def _seen_by_two(reconstruction: Reconstruction, number: int, time: Floats) -> Bools:
+def seen_by_two(reconstruction: Reconstruction, number: int, time: Floats) -> Bools:
     """Times (n,) within 0.2 s of observations of at least two placed cameras."""
     count = np.zeros(len(time), dtype=np.int64)
     for camera, state in enumerate(reconstruction.state.cameras):

@@ -20,13 +20,15 @@ from hub.bundle.adjustment import gauge_tangent
 from hub.bundle.bordered_system import cho_solve_path, eliminate
 from hub.bundle.noise_scale import correlation_inflation, modelled_inflation
 from hub.bundle.normal_equations import build_system
-from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, K1, READOUT, AdjustmentState, Problem
+from hub.bundle.problem import CAMERA_PARAMETERS, CRYSTAL_RATE_STD, FOCAL, K1, RATE, READOUT, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.session.rig import MAX_READOUT_S
 
 _FALSE_ALARM_PROBABILITY = 1e-4
 """Probability that one of the lenses of a correct rig is refuted."""
+_REFUTED_SIGMA = 4.0
+"""Stds from which a rate is no crystal's: of a hundred cameras with crystals one in 160 is refuted."""
 _WIDE_FOCAL_STD, _WIDE_K1_STD = 0.5, 0.2
 """Prior stds of a lens in the test: so wide that only the observations count."""
 
@@ -84,6 +86,28 @@ def refuted_lenses(problem: Problem, state: AdjustmentState) -> list[LensTest]:
         step, covariance = gains[camera][1:]
         out.append(LensTest(camera, float(step[focal]), float(np.sqrt(covariance[focal, focal])), statistic, limit))
     return out
+
+
+def with_crystal_rates(problem: Problem, state: AdjustmentState) -> Problem:
+    """The problem with rates held by the prior of crystals, but for those that the observations refute.
+
+    problem, state: adjusted under the wide prior of rates. A rate is refuted where it differs from 1 by more than
+    `_REFUTED_SIGMA` times the std of both the estimate and the prior: then the frame rate is another one.
+    """
+    if not problem.free_parameters.clock:
+        return problem
+    wide = replace(problem, crystal_rates=())
+    inflation = [correlation_inflation(problem, state, camera) for camera in range(len(state.cameras))]
+    noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
+    columns, normal, gradient = _reduced_system(wide, noisy, estimate_smoothness(problem, state))
+    covariance = _reduction(normal, gradient, gauge_tangent(wide, state), np.arange(len(columns)))[2]
+    variance = dict(zip(columns.tolist(), np.diag(covariance).tolist(), strict=True))
+    crystal = tuple(
+        (camera.rate - 1.0) ** 2
+        < _REFUTED_SIGMA**2 * (CRYSTAL_RATE_STD**2 + variance.get(i * CAMERA_PARAMETERS + RATE, 0.0))
+        for i, camera in enumerate(state.cameras)
+    )
+    return replace(problem, crystal_rates=crystal)
 
 
 def with_free_readouts(problem: Problem) -> Problem:

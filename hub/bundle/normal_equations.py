@@ -129,7 +129,7 @@ def camera_priors(problem: Problem, state: AdjustmentState) -> list[tuple[int, f
     free_parameters, out = problem.free_parameters, list[tuple[int, float, float]]()
     for camera, (current, nominal) in enumerate(zip(state.cameras, problem.nominal, strict=True)):
         base = camera * CAMERA_PARAMETERS
-        terms = [(RATE, current.rate - 1.0, free_parameters.rate_std)]
+        terms = [(RATE, current.rate - 1.0, problem.rate_std(camera))]
         if free_parameters.readout:
             terms.append((READOUT, current.readout, free_parameters.readout_std))
         lens_prior = problem.lens_prior(camera)

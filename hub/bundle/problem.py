@@ -18,6 +18,8 @@ CAMERA_PARAMETERS = 18
 a lens that was not measured also the principal point 11, 12, k2 13, k3 14, log fy/fx 15 and, for a pinhole lens, p1, p2
 16, 17."""
 OFFSET, RATE, FOCAL, K1, READOUT, CENTRE, K2, K3, ASPECT, P1 = 6, 7, 8, 9, 10, 11, 13, 14, 15, 16
+CRYSTAL_RATE_STD = 1.4e-4
+"""Prior std of one crystal's rate against another's: each is within 100 ppm."""
 GIVEN_PARAMETERS = 11
 """Columns of a camera with given intrinsics; the others are never free."""
 
@@ -156,7 +158,7 @@ class FreeParameters:
 
     pose, clock, lens: whether poses, time maps, and focal length with k1 are estimated.
     readout: whether rolling-shutter readouts are. focal_std: prior std of log focal length. k1_std: prior std of k1.
-    rate_std: prior std of a rate about 1: crystals err by 50 ppm, nominal frame rates by 1000.
+    rate_std: prior std of a rate about 1 while it is not known whether the frame rate is the nominal one.
     readout_std: prior std [s] of a readout about 0.
     """
 
@@ -178,7 +180,8 @@ class Problem:
     whose clock is the internal time. anchors: the two cameras whose pose and distance fix the gauge. lens_priors: by
     camera, priors of lenses that were not measured, None = given; () = all are given. readout_given: by camera, whether
     its readout was given, so that the rows' times are already corrected; () = none was. lens_tolerances: by camera,
-    priors for given lenses that are estimated all the same; () = they are fixed.
+    priors for given lenses that are estimated all the same; () = they are fixed. crystal_rates: by camera, whether its
+    rate differs from the reference's only as two crystals do (`CRYSTAL_RATE_STD`); () = not decided.
     """
 
     rows: tuple[TrackObservations, ...]
@@ -189,6 +192,12 @@ class Problem:
     lens_priors: tuple[LensPrior | None, ...] = ()
     readout_given: tuple[bool, ...] = ()
     lens_tolerances: tuple[LensPrior, ...] = ()
+    crystal_rates: tuple[bool, ...] = ()
+
+    def rate_std(self, camera: int) -> float:
+        """Prior std of a camera's rate about 1."""
+        crystal = bool(self.crystal_rates) and self.crystal_rates[camera]
+        return min(self.free_parameters.rate_std, CRYSTAL_RATE_STD) if crystal else self.free_parameters.rate_std
 
     def lens_prior(self, camera: int) -> LensPrior | None:
         """The prior of a lens whose parameters are all estimated; None = at most focal length and k1 are."""

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -48,14 +49,15 @@ def solve_pairs(
     prepared: PreparedSession,
     report: Progress,
     *,
-    thorough: bool = False,
+    thorough: bool | Literal["first pair"] = False,
     known: FixedCalibration | None = None,
     clock_priors: Mapping[str, ExternalClockPrior] | None = None,
     arrivals: Mapping[str, ExternalClockPrior] | None = None,
 ) -> tuple[PreparedSession, list[PairSolution]]:
     """All pairs of cameras, uncalibrated ones included, and the session with the time scales that were found.
 
-    thorough: whether to try rates that a wrong nominal frame rate causes, for unconnected cameras. known: given poses;
+    thorough: whether to try rates that a wrong nominal frame rate causes, for unconnected cameras. "first pair": only
+    until a pair is solved; and a camera whose best pair with three connected ones fails is left to resection. known: given poses;
     pairs of two such cameras then estimate lag and rate only. clock_priors: external clock priors by camera; they
     select a lag only where the images leave it ambiguous, which a warning reports. arrivals: the same by times of
     arrival; pairs that have no solution near them are not searched further.
@@ -77,6 +79,9 @@ def solve_pairs(
                 pairs[a, b] = solution
                 continue
         predicted_lag = None if prepared.shared_clock else synchronised.lag(prepared, a, b)
+        if thorough == "first pair" and predicted_lag is None and synchronised.leaves(a, b, pairs.values()):
+            pairs[a, b] = PairSolution(a, b, "not searched: the most promising pair of the same camera had failed")
+            continue
         solution = _solve(prepared, (a, b), known, predicted_lag=predicted_lag, cache=cache)
         # If the predicted lag is right, a pair with a long overlap must agree with it; else it is solved over all lags.
         if predicted_lag is not None and not solution.solved and (not is_large or _has_long_overlap(solution)):
@@ -96,7 +101,7 @@ def solve_pairs(
             report(f"pair {both[0]}–{both[1]} by itself", 0.56)
             pairs[both] = unguided[both] = _solve(prepared, both, known, standalone=True, cache=cache)
     if thorough and not prepared.shared_clock:
-        prepared = _connect_at_other_rates(prepared, pairs, unguided, known, report)
+        prepared = _connect_at_other_rates(prepared, pairs, unguided, known, report, thorough == "first pair")
     return prepared, list(pairs.values())
 
 
@@ -219,6 +224,18 @@ class _SynchronisedGroups:
             if group == group_b:
                 self._maps[name] = (group_a, rate * r, rate * o + offset)
 
+    def leaves(self, a: str, b: str, pairs: Iterable[PairSolution]) -> bool:
+        """Whether one of two cameras is in a group of three or more, and the best pair of the other with it has failed."""
+        groups = Counter(group for group, _, _ in self._maps.values())
+        for new, old in ((a, b), (b, a)):
+            group = self._maps.get(old, ("", 1.0, 0.0))[0]
+            if new in self._maps or groups[group] < _MIN_REDUNDANT:
+                continue
+            tried = [pair.b if pair.a == new else pair.a for pair in pairs if new in (pair.a, pair.b)]
+            if any(self._maps.get(other, ("", 1.0, 0.0))[0] == group for other in tried):
+                return True
+        return False
+
     def lag(self, prepared: PreparedSession, a: str, b: str) -> float | None:
         """``t_a - t_b`` [s] in the middle of the common recording time; None if they are not connected."""
         if a not in self._maps or b not in self._maps or self._maps[a][0] != self._maps[b][0]:
@@ -272,6 +289,7 @@ def _connect_at_other_rates(
     unguided: dict[tuple[str, str], PairSolution],
     known: FixedCalibration | None,
     report: Progress,
+    first_pair_only: bool,
 ) -> PreparedSession:
     """Connect cameras outside the largest group at rates far from 1; ``pairs`` are replaced in place.
 
@@ -282,6 +300,8 @@ def _connect_at_other_rates(
     while True:
         groups = connected_components(names, [pair for pair in pairs.values() if pair.solved])
         largest = groups[0] if groups else []
+        if len(largest) > 1 and first_pair_only:
+            return prepared
         found = None
         for a, b in pairs:
             across = (a in largest) != (b in largest) if len(largest) > 1 else not pairs[a, b].solved

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from hub.calibration.pair_network import Progress, describe_timing, frame_rate_w
 from hub.calibration.result import assemble_calibration, focal_stds, isolated_pair_report
 from hub.calibration.self_calibration import MAX_FOCAL_STD, initial_self_calibration, with_updated_lenses
 from hub.calibration.solution import Solution
+from hub.calibration.unconnected import connect_by_resection
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate, connected_components, synchronise_clocks
 from hub.clocks.external_prior import ExternalClockPrior
 from hub.sync.hypothesis import PairSolution
@@ -97,8 +98,12 @@ def calibrate(
     elif solver == "paper" and known is None:
         pairs = paper_pairs(prepared, observations, report)
     else:
+        # With a solved path, resection finds the other cameras, at a fraction of the cost of further pairs.
+        extent: bool | Literal["first pair"] = (
+            "first pair" if thorough and solver == "joint" and known is None else thorough
+        )
         prepared, pairs = solve_pairs(
-            prepared, report, thorough=thorough, known=known, clock_priors=clock_priors, arrivals=arrivals
+            prepared, report, thorough=extent, known=known, clock_priors=clock_priors, arrivals=arrivals
         )
         prepared = replace(
             prepared,
@@ -118,7 +123,7 @@ def calibrate(
             )
         else:
             solution = solve_with_unknown_lenses(
-                rig, prepared, pairs, report, online=online, refine_lenses=refine_lenses
+                rig, prepared, pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough
             )
         report("covariances", 0.95)
         return assemble_calibration(rig, solution)
@@ -174,6 +179,7 @@ def solve_with_unknown_lenses(
     *,
     online: bool = False,
     refine_lenses: bool = False,
+    thorough: bool = False,
 ) -> Solution:
     """The network with cameras of unknown intrinsics, where the common trajectory determines their focal lengths.
 
@@ -181,11 +187,13 @@ def solve_with_unknown_lenses(
     """
     trial, trial_pairs = initial_self_calibration(rig, prepared, pairs)
     if trial is prepared:
-        return solve_network(prepared, pairs, report, online=online, refine_lenses=refine_lenses)
+        return solve_network(prepared, pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough)
     report("focal lengths", 0.58)
     try:
         for _ in range(_LENS_ITERATIONS):
-            solution = solve_network(trial, trial_pairs, report, online=online, refine_lenses=refine_lenses)
+            solution = solve_network(
+                trial, trial_pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough
+            )
             found = dict(zip(solution.reconstruction.names, solution.reconstruction.state.cameras, strict=True))
             lenses = {name: camera.intrinsics for name, camera in found.items()}
             trial, trial_pairs, changed = with_updated_lenses(trial, trial_pairs, lenses)
@@ -196,7 +204,7 @@ def solve_with_unknown_lenses(
             name: refusal.cameras.get(name, "") for name in trial.cameras if trial.cameras[name].lens_prior is not None
         }
         without = replace(prepared, refused=_with_lens_failure(prepared, reasons))
-        return solve_network(without, pairs, report, online=online, refine_lenses=refine_lenses)
+        return solve_network(without, pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough)
     uncalibrated = [name for name in trial.cameras if trial.cameras[name].lens_prior is not None]
     left = {name: solution.refused[name] for name in uncalibrated if name in solution.refused}
     refused = solution.refused | {
@@ -233,6 +241,7 @@ def solve_network(
     *,
     online: bool = False,
     refine_lenses: bool = False,
+    thorough: bool = False,
 ) -> Solution:
     """One adjusted network from the pairs; cameras that do not fit are refused with a reason.
 
@@ -241,6 +250,7 @@ def solve_network(
     refused = dict(prepared.refused)
     free_parameters = FreeParameters(clock=not prepared.shared_clock)
     graph = _largest_component(prepared, list(prepared.cameras), pairs, refused)
+    unfit: set[str] = set()
     with_rate_prior = replace(free_parameters, rate_std=_rate_prior_std(graph, free_parameters.rate_std))
     while True:
         if distributed_solver is not None:
@@ -273,10 +283,28 @@ def solve_network(
             if not reason:
                 break
             refused[worst] = reason
+        unfit.add(worst)
         remaining = [name for name in reconstruction.names if name != worst]
         if len(remaining) < 2:
             raise Refused(f"no two cameras can be placed ({worst}: {refused[worst]})", refused)
         graph = _largest_component(prepared, remaining, list(graph.inlier_pairs), refused)
+    unconnected = [name for name in prepared.cameras if name in refused and name not in unfit]
+    if thorough and unconnected and not prepared.shared_clock:
+        report("resection of further cameras", 0.93)
+        prepared, reconstruction, more, reasons = connect_by_resection(
+            prepared,
+            reconstruction,
+            unconnected,
+            free_parameters,
+            lambda trial: final_adjustment(trial, report, online=online, refine_lenses=refine_lenses),
+            _misfit,
+        )
+        if more:
+            replaced = {frozenset((pair.a, pair.b)) for pair in more}
+            pairs = [pair for pair in pairs if frozenset((pair.a, pair.b)) not in replaced] + more
+            prepared = replace(prepared, warnings=prepared.warnings + frame_rate_warnings(prepared, pairs))
+        refused = {name: reason for name, reason in refused.items() if name not in reconstruction.names}
+        refused |= {name: f"{reason}; {refused[name]}" for name, reason in reasons.items()}
     warnings = tuple(
         f"pair {pair.a}–{pair.b} contradicts the other pairs and was rejected" for pair in graph.outlier_pairs
     )
@@ -284,6 +312,15 @@ def solve_network(
     if distributed_solver is not None:
         solver, warnings = "distributed", warnings + distributed_solver.warnings
     return Solution(reconstruction, tuple(pairs), in_rig_order(refused, prepared), prepared, solver, warnings)
+
+
+def _misfit(reconstruction: Reconstruction, name: str) -> str:
+    """Why a camera does not fit the others; "" if it does."""
+    if not fits_trajectory(reconstruction, name):
+        share, count = inlier_share(reconstruction, name)
+        return f"only {100 * share:.0f} % of its {count} observations fit the trajectory seen by the other cameras"
+    worst, reason = least_certain_camera(reconstruction)
+    return reason if worst == name else ""
 
 
 def _rate_prior_std(graph: ClockGraph, usual: float) -> float:
@@ -477,11 +514,13 @@ def final_adjustment(
     if warm and online and state.jitter is None:
         # Near the solution the re-fit alone converges; where it does not apply, the adjustment does.
         problem, state = estimate_frame_times(problem, state)
+        problem = model_comparison.with_crystal_rates(problem, state)
         refitted = _refit_online(problem, state)
         if refitted[1] is not state:
             return _with_state(reconstruction, *refitted)
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
     problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
+    problem = model_comparison.with_crystal_rates(problem, state)
     if refine_lenses and not warm:
         report("adjusting the lenses", 0.85)
         freed = replace(problem, free_parameters=replace(problem.free_parameters, lens=True))
@@ -501,6 +540,8 @@ def final_adjustment(
             problem, state = read_problem, read_state
     report("correlated noise", 0.92)
     refitted = _refit_online(problem, state) if online else refit_with_correlated_noise(problem, state, refine_lenses)
+    if refitted[1] is state and any(problem.crystal_rates):
+        refitted = adjust(problem, state, rounds=1, iterations=9)[:2]  # the re-fit would have applied the rates' prior
     return _with_state(reconstruction, *refitted)
 
 

@@ -94,6 +94,10 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         time_at_centre = float(reference_at_centre / time_scales[reference] + time_origins[reference])
         maps.append(TimeMap(rate, time_at_centre - rate * (camera.centre / time_scale + time_origin)))
     maps[reference] = TimeMap(1.0, 0.0)
+    lag_times = [
+        float(camera.camera_time(cov.middle_of_overlap(problem, state, i, reference))[0])
+        for i, camera in enumerate(state.cameras)
+    ]
     cameras = {
         name: CameraCalibration(
             name=name,
@@ -108,7 +112,8 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
             focal_std=float(lens_stds[i]),
             readout=_readout(rig, name, state.cameras[i].readout / time_scales[i]),
             readout_std=float(readout_stds[i]) / time_scales[i],
-            lag_time=state.cameras[i].centre / time_scales[i] + time_origins[i],
+            lag_time=float(lag_times[i]) / time_scales[i] + time_origins[i],
+            lag_std=_lag_std(problem, state, covariance, i, reference) / time_scales[reference],
             clock_rate_std=cov.clock_rate_std(covariance, state, i, reference)
             if problem.free_parameters.clock
             else 0.0,
@@ -146,6 +151,7 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         + _estimated_lenses(cameras)
         + _refined_lenses(names, problem, state)
         + (refuted_lens_warnings(names, problem, state) if published is None else ())
+        + _other_frame_rates(rig, cameras, names[reference], problem)
         + _estimated_readouts(cameras)
         + _estimated_jitter(names, state, time_scales),
         residuals={
@@ -202,6 +208,7 @@ def _reordered(problem: Problem, state: AdjustmentState, order: list[int]) -> tu
         lens_priors=tuple(problem.lens_priors[i] for i in order) if problem.lens_priors else (),
         readout_given=tuple(problem.readout_given[i] for i in order) if problem.readout_given else (),
         lens_tolerances=tuple(problem.lens_tolerances[i] for i in order) if problem.lens_tolerances else (),
+        crystal_rates=tuple(problem.crystal_rates[i] for i in order) if problem.crystal_rates else (),
     )
     return reordered, replace(
         state,
@@ -243,6 +250,22 @@ def _refined_lenses(names: list[str], problem: Problem, state: AdjustmentState) 
     return (f"given lenses were refined within their tolerance: change of focal lengths {changes} (tolerance 1 %)",)
 
 
+def _other_frame_rates(
+    rig: Rig, cameras: dict[str, CameraCalibration], reference: str, problem: Problem
+) -> tuple[str, ...]:
+    """One sentence for each camera whose clock rate no crystal explains."""
+    out = []
+    for (name, camera), crystal in zip(cameras.items(), problem.crystal_rates, strict=bool(problem.crystal_rates)):
+        rate = camera.time_map.clock_rate
+        if not crystal and name != reference:
+            out.append(
+                f"{name}: its times run {1e6 * (rate - 1.0):+.0f} ± {1e6 * camera.clock_rate_std:.0f} ppm against "
+                f"{reference}'s, more than the 100 ppm of crystals: a different frame rate, "
+                f"{rig.cameras[name].fps / rate:.5g} fps for {rig.cameras[name].fps:.5g}, or that of {reference}"
+            )
+    return tuple(out)
+
+
 def _readout(rig: Rig, name: str, found: float) -> float:
     """Readout time [s] from the first row to the last: as given, else as estimated; 0 if neither."""
     given = rig.cameras[name].readout
@@ -274,7 +297,21 @@ def _time_map_std(
 ) -> float:
     if not problem.free_parameters.clock or camera == reference:
         return 0.0
-    variance = cov.time_map_std(covariance, state, camera, reference) ** 2
+    return _with_jitter(cov.time_map_std(covariance, state, camera, reference), problem, state, camera, reference)
+
+
+def _lag_std(
+    problem: Problem, state: AdjustmentState, covariance: cov.Covariance, camera: int, reference: int
+) -> float:
+    """Std [s] of the map onto the reference camera's clock in the middle of their common span."""
+    if not problem.free_parameters.clock or camera == reference:
+        return 0.0
+    std = float(cov.relative_clock_stds(covariance, problem, state)[camera, reference])
+    return _with_jitter(std / state.cameras[reference].rate, problem, state, camera, reference)
+
+
+def _with_jitter(std: float, problem: Problem, state: AdjustmentState, camera: int, reference: int) -> float:
+    variance = std**2
     if state.jitter is not None:
         # The map refers to the mean time stamp: its variance includes that of the mean of so many jittered stamps.
         for one in (camera, reference):
