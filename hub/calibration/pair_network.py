@@ -57,8 +57,8 @@ def solve_pairs(
     """All pairs of cameras, uncalibrated ones included, and the session with the time scales that were found.
 
     thorough: whether to try rates that a wrong nominal frame rate causes, for unconnected cameras. "first pair": only
-    until a pair is solved; and a camera whose best pair with three connected ones fails is left to resection. known: given poses;
-    pairs of two such cameras then estimate lag and rate only. clock_priors: external clock priors by camera; they
+    until a pair is solved; and a camera whose best pair with three connected ones fails is left to resection. known:
+    given poses; pairs of two such cameras then estimate lag and rate only. clock_priors: external clock priors by camera; they
     select a lag only where the images leave it ambiguous, which a warning reports. arrivals: the same by times of
     arrival; pairs that have no solution near them are not searched further.
     """
@@ -67,7 +67,7 @@ def solve_pairs(
     is_large = len(names) > _SMALL_NETWORK and not prepared.shared_clock
     pairs: dict[tuple[str, str], PairSolution] = {}
     unguided: dict[tuple[str, str], PairSolution] = {}
-    synchronised, cache = _SynchronisedGroups(), TrackCache()
+    synchronised, cache, searched_again = _SynchronisedGroups(), TrackCache(), set[str]()
     is_ranked = len(todo) > 1 and not prepared.shared_clock
     for done, (a, b) in enumerate(_ranked(prepared, todo, report, cache) if is_ranked else todo):
         report(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
@@ -84,7 +84,11 @@ def solve_pairs(
             continue
         solution = _solve(prepared, (a, b), known, predicted_lag=predicted_lag, cache=cache)
         # If the predicted lag is right, a pair with a long overlap must agree with it; else it is solved over all lags.
-        if predicted_lag is not None and not solution.solved and (not is_large or _has_long_overlap(solution)):
+        again = predicted_lag is not None and not solution.solved and (not is_large or _has_long_overlap(solution))
+        if again and thorough == "first pair" and synchronised.size(a) > _MIN_REDUNDANT:
+            again = not {a, b} & searched_again  # resection corrects a camera that a wrong pair has connected
+            searched_again |= {a, b}
+        if again:
             solution, predicted_lag = _solve(prepared, (a, b), known, cache=cache), None
         if predicted_lag is None:
             unguided[a, b] = solution
@@ -224,8 +228,13 @@ class _SynchronisedGroups:
             if group == group_b:
                 self._maps[name] = (group_a, rate * r, rate * o + offset)
 
+    def size(self, name: str) -> int:
+        """Number of cameras in the group of a camera."""
+        group = self._maps[name][0]
+        return sum(other == group for other, _, _ in self._maps.values())
+
     def leaves(self, a: str, b: str, pairs: Iterable[PairSolution]) -> bool:
-        """Whether one of two cameras is in a group of three or more, and the best pair of the other with it has failed."""
+        """Whether one of two cameras is in a group of three or more, and the other's best pair with it has failed."""
         groups = Counter(group for group, _, _ in self._maps.values())
         for new, old in ((a, b), (b, a)):
             group = self._maps.get(old, ("", 1.0, 0.0))[0]

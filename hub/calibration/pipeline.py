@@ -16,7 +16,7 @@ from hub.baselines.session_lags import solve_pair_by_paper
 from hub.bundle import covariance as cov
 from hub.bundle import model_comparison
 from hub.bundle.adjustment import adjust, estimate_noise, residual_norms
-from hub.bundle.correlated_noise import refit_with_correlated_noise
+from hub.bundle.correlated_noise import MIN_INFLATION, refit_with_correlated_noise
 from hub.bundle.initialisation import (
     Reconstruction,
     inlier_share,
@@ -28,6 +28,7 @@ from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
 from hub.bundle.problem import AdjustmentState, FreeParameters, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.bundle.timestamp_jitter import estimate_frame_times
+from hub.calibration.given_values import refuted_lens
 from hub.calibration.pair_network import Progress, describe_timing, frame_rate_warnings, solve_pairs
 from hub.calibration.result import assemble_calibration, focal_stds, isolated_pair_report
 from hub.calibration.self_calibration import MAX_FOCAL_STD, initial_self_calibration, with_updated_lenses
@@ -54,6 +55,8 @@ _MAX_CLOCK_STD = 10e-3  # s: a frame is more than three of them
 _MAX_LAG_CHANGE = 20e-3  # s
 _LAG_CONFLICT = "the trajectory puts its clock"
 _LENS_ITERATIONS = 3
+_WRONG_LENS = 0.05  # relative error of a focal length that no zoom, crop or temperature explains: another lens
+_MIN_TO_BLAME_A_LENS = 4  # cameras: of three, another camera's pose absorbs too much of a wrong lens
 _ONLINE_MIN_INFLATION = 2.0  # rows per effective row from which the noise of a recording that goes on is correlated
 _MAX_ONLINE_ROW_RATE = 120.0  # rows a second, of all cameras
 
@@ -264,7 +267,7 @@ def solve_network(
             usual = replace(reconstruction.problem.free_parameters, rate_std=free_parameters.rate_std)
             reconstruction.problem = replace(reconstruction.problem, free_parameters=usual)
         refused |= unplaced
-        inconsistent = [name for name in reconstruction.names if not fits_trajectory(reconstruction, name)]
+        inconsistent = misfits(reconstruction)
         # A wrong lens of an uncalibrated camera may be the cause of all the others' misfit: it goes first.
         inconsistent = [name for name in inconsistent if prepared.cameras[name].lens_prior is not None] or inconsistent
         if inconsistent:
@@ -275,7 +278,9 @@ def solve_network(
                 f"only {100 * share:.0f} % of its {count} observations fit the trajectory seen by the other cameras"
             )
         else:
-            worst, reason = _least_certain_lens(reconstruction)
+            worst, reason = _wrong_lens(reconstruction)
+            if not reason:
+                worst, reason = _least_certain_lens(reconstruction)
             if not reason:
                 worst, reason = least_certain_camera(reconstruction)
             if not reason:
@@ -283,7 +288,8 @@ def solve_network(
             if not reason:
                 break
             refused[worst] = reason
-        unfit.add(worst)
+        if not inconsistent:
+            unfit.add(worst)  # resection would place it alike
         remaining = [name for name in reconstruction.names if name != worst]
         if len(remaining) < 2:
             raise Refused(f"no two cameras can be placed ({worst}: {refused[worst]})", refused)
@@ -494,6 +500,27 @@ def fits_trajectory(reconstruction: Reconstruction, name: str) -> bool:
     return share >= _MIN_INLIER_SHARE and count >= _MIN_ROWS
 
 
+def misfits(reconstruction: Reconstruction) -> list[str]:
+    """Cameras that do not fit the trajectory that the others give."""
+    return [name for name in reconstruction.names if not fits_trajectory(reconstruction, name)]
+
+
+def _wrong_lens(reconstruction: Reconstruction) -> tuple[str, str]:
+    """The camera whose measured lens is refuted most, by far more than any lens changes in the field, and the reason.
+
+    Without correlated residuals there is none: a wrong lens displaces successive rows alike.
+    """
+    problem, state, names = reconstruction.problem, reconstruction.state, reconstruction.names
+    if state.correlated_noise is not None or not problem.free_parameters.clock or len(names) < _MIN_TO_BLAME_A_LENS:
+        return "", ""
+    if max(correlation_inflation(problem, state, camera) for camera in range(len(names))) < MIN_INFLATION:
+        return "", ""
+    for one in model_comparison.refuted_lenses(problem, state)[:1]:
+        if abs(one.focal_change) - 3.0 * one.focal_std > _WRONG_LENS:
+            return names[one.camera], refuted_lens(one)
+    return "", ""
+
+
 def final_adjustment(
     reconstruction: Reconstruction,
     report: Progress,
@@ -538,6 +565,9 @@ def final_adjustment(
             read_problem, read_state, problem, state, 1
         ):
             problem, state = read_problem, read_state
+    adjusted = _with_state(reconstruction, problem, state)
+    if not online and (misfits(adjusted) or _wrong_lens(adjusted)[0]):
+        return adjusted  # a camera that will be left out: its errors are no noise
     report("correlated noise", 0.92)
     refitted = _refit_online(problem, state) if online else refit_with_correlated_noise(problem, state, refine_lenses)
     if refitted[1] is state and any(problem.crystal_rates):

@@ -274,7 +274,7 @@ def _verify(
 
 
 def _resected_residuals(positions: Floats, seen: Floats, others: Floats, others_seen: Floats, focal: float) -> Floats:
-    """Residuals [px] of ``others`` under the pose that fits ``positions`` best; inf behind the camera or without one."""
+    """Residuals [px] of ``others`` under the pose that fits ``positions`` best; inf behind the camera."""
     try:
         found, rotation, shift = cv2.solvePnP(positions, seen, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_SQPNP)
     except cv2.error:  # all points in one place

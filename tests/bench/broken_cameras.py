@@ -142,7 +142,10 @@ def main() -> None:
             if not (named and moved < 1.0 and cpu < 2.0 * base):
                 bad.append(f"{seed} {kind}")
             reason = found.refused.get(name) or next((t for t in found.warnings if t.startswith(f"{name}:")), "")
-            print(f"  {kind}: {cpu:.1f} s ({cpu / base:.2f}), change {moved:.2f} std, {reason[:110] or 'NOT NAMED'}", flush=True)
+            print(
+                f"  {kind}: {cpu:.1f} s ({cpu / base:.2f}), change {moved:.2f} std, {reason[:110] or 'NOT NAMED'}",
+                flush=True,
+            )
     print(f"CPU ratio: median {np.median(ratios):.2f}, worst {max(ratios):.2f}; {len(bad)} not met: {', '.join(bad)}")
 
 
