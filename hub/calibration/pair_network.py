@@ -29,6 +29,7 @@ from hub.sync.settings import PairSettings
 from hub.sync.track_cache import TrackCache
 from hub.trajectory.image_tracks import smooth_only
 from hub.two_view.relative_pose import relative_pose_between
+from protocols.geometry.types import Floats
 from protocols.session.calibration import FixedCalibration
 
 Progress = Callable[[str, float], None]
@@ -58,9 +59,9 @@ def solve_pairs(
 
     thorough: whether to try rates that a wrong nominal frame rate causes, for unconnected cameras. "first pair": only
     until a pair is solved; and a camera whose best pair with three connected ones fails is left to resection. known:
-    given poses; pairs of two such cameras then estimate lag and rate only. clock_priors: external clock priors by camera; they
-    select a lag only where the images leave it ambiguous, which a warning reports. arrivals: the same by times of
-    arrival; pairs that have no solution near them are not searched further.
+    given poses; pairs of two such cameras then estimate lag and rate only. clock_priors: external clock priors by
+    camera; they select a lag only where the images leave it ambiguous, which a warning reports. arrivals: the same by
+    times of arrival; pairs that have no solution near them are not searched further.
     """
     names = prepared.names
     todo = list(itertools.combinations(names, 2))
@@ -274,7 +275,10 @@ def _solve(
         return solve_common_clock_pair(a, b, names)
     given = None
     if known is not None and all(name in known.cameras for name in names):
-        given = relative_pose_between(known.cameras[names[0]].pose, known.cameras[names[1]].pose)
+        poses = [known.cameras[name].pose for name in names]
+        if coincide(*(pose.position for pose in poses)):
+            return PairSolution(*names, "both cameras are known to be in one place: no motion tells their lag")
+        given = relative_pose_between(*poses)
     calibrated = all(name in prepared.cameras for name in names)
     # With more cameras the adjustment estimates lenses and tests each clock: an imprecise lag suffices to start.
     settings = replace(settings or PairSettings(), standalone=standalone or len(prepared.names) < _MIN_REDUNDANT)
@@ -290,6 +294,12 @@ def _solve(
         previous_refusal=unguided,
         cache=cache,
     )
+
+
+def coincide(*positions: Floats) -> bool:
+    """Whether positions (3,) differ by no more than rounding, so that rays from them meet nowhere else."""
+    extent = np.ptp(np.array(positions), axis=0)
+    return bool(np.abs(extent).max() <= 1e-9 * max(float(np.abs(positions).max()), 1e-9))
 
 
 def _connect_at_other_rates(

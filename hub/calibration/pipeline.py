@@ -29,7 +29,7 @@ from hub.bundle.problem import AdjustmentState, FreeParameters, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.bundle.timestamp_jitter import estimate_frame_times
 from hub.calibration.given_values import refuted_lens
-from hub.calibration.pair_network import Progress, describe_timing, frame_rate_warnings, solve_pairs
+from hub.calibration.pair_network import Progress, coincide, describe_timing, frame_rate_warnings, solve_pairs
 from hub.calibration.result import assemble_calibration, focal_stds, isolated_pair_report
 from hub.calibration.self_calibration import MAX_FOCAL_STD, initial_self_calibration, with_updated_lenses
 from hub.calibration.solution import Solution
@@ -443,6 +443,8 @@ def solve_with_known_poses(
         refused[name] = "not in the known calibration"
     cameras = {name: camera for name, camera in prepared.cameras.items() if name in known.cameras}
     inside = replace(prepared, cameras=cameras)
+    if len(cameras) > 1 and coincide(*(known.cameras[name].pose.position for name in cameras)):
+        raise Refused(f"the known cameras {', '.join(cameras)} are in one place: their rays meet nowhere else", refused)
     graph = _largest_component(inside, list(cameras), pairs, refused)
     report("adjusting", 0.75)
     poses = {name: known.cameras[name].pose for name in graph.clocks}

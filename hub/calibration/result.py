@@ -362,7 +362,8 @@ def _sampling_rate(rig: Rig, problem: Problem, names: list[str], time_scales: li
 
 
 def observing_cameras(problem: Problem, state: AdjustmentState, label: int, time: Floats) -> Floats:
-    """Number of cameras with an observation of the point within SEEN_WITHIN of internal reference times (n,)."""
+    """Number of cameras that observed the point within SEEN_WITHIN of internal reference times (n,), both before and
+    after them or at them."""
     # With a shared clock a point is observed at its own instant or not at all.
     within = INSTANT_TOLERANCE_S if isinstance(state.trajectories[label].basis, PointBasis) else SEEN_WITHIN
     count = np.zeros(len(time))
@@ -373,9 +374,14 @@ def observing_cameras(problem: Problem, state: AdjustmentState, label: int, time
             continue
         observation_times = np.sort(camera.reference_time(joined))
         after = np.clip(np.searchsorted(observation_times, time), 1, len(observation_times) - 1)
-        count += (
+        near = (
             np.minimum(np.abs(observation_times[after] - time), np.abs(time - observation_times[after - 1])) <= within
         )
+        # Before its first and after its last observation of the point a camera has seen nothing of it.
+        span = (time >= observation_times[0] - INSTANT_TOLERANCE_S) & (
+            time <= observation_times[-1] + INSTANT_TOLERANCE_S
+        )
+        count += near & span
     return count
 
 
