@@ -76,7 +76,7 @@ class _NoiseBlock:
     interpolation: csr_array
     precision: Floats
     factor: Floats
-    white_information: float
+    white_information: Floats
 
 
 def solve_gls(
@@ -180,9 +180,10 @@ def _noise_block(rows: TrackObservations, count: int, noise: CorrelatedNoise) ->
     # Between two knots the process deviates from the line: mean variance of the bridge.
     width, correlated_std = float(knots[1] - knots[0]), float(noise.correlated_std[rows.camera])
     bridge_variance = correlated_std**2 * min(width / (3.0 * float(noise.time_constant[rows.camera])), 1.0)
-    white_information = 1.0 / (float(noise.white_std[rows.camera]) ** 2 + bridge_variance)
+    white_variance = float(noise.white_std[rows.camera]) ** 2 * rows.used_relative_std**2
+    white_information = 1.0 / (white_variance + bridge_variance)
     precision = GaussMarkov.sampled_at(knots, float(noise.time_constant[rows.camera])).precision() / correlated_std**2
-    both = precision + _knot_information(interval, knot_weights, np.full(len(time), white_information), count)
+    both = precision + _knot_information(interval, knot_weights, white_information, count)
     return _NoiseBlock(
         rows,
         knots,
@@ -223,9 +224,9 @@ def _cost(
         evaluation = evaluate_residuals(part.rows, state.cameras[part.rows.camera], state.trajectories[part.rows.label])
         total += _GROSS_ERROR_COST * float(np.count_nonzero(~evaluation.valid))
         residual = np.where(evaluation.valid, evaluation.residual, 0.0)
-        weighted_residual = part.white_information * (part.interpolation.T @ residual.T)
+        weighted_residual = part.interpolation.T @ (residual * part.white_information).T
         noise_estimate = cho_solve_banded((part.factor, False), weighted_residual, check_finite=False)
-        total += part.white_information * float((residual**2).sum()) - float((weighted_residual * noise_estimate).sum())
+        total += float((part.white_information * residual**2).sum()) - float((weighted_residual * noise_estimate).sum())
     return float(total)
 
 

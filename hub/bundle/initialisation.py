@@ -224,11 +224,7 @@ def _subsampled(problem: Problem, state: AdjustmentState) -> Problem:
         interval = float(np.median(np.diff(rows.time))) * state.cameras[rows.camera].rate if len(rows.time) > 1 else 1.0
         rows_per_knot = state.trajectories[rows.label].basis.spacing / interval
         every = max(1, int(min(rows_per_knot / _MIN_ROWS_PER_KNOT, share)))
-        stamp = None if rows.stamp is None else rows.stamp[::every]
-        subsampled = replace(
-            rows, time=rows.time[::every], pixels=rows.pixels[::every], use=rows.use[::every], stamp=stamp
-        )
-        out.append(subsampled)
+        out.append(rows.every(every))
     return replace(problem, rows=tuple(out))
 
 

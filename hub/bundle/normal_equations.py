@@ -60,7 +60,7 @@ def weigh_residuals(
     evaluations, weights = [], []
     for camera, parts in by_camera.items():
         residuals = evaluate_labels(parts, state.cameras[camera], paths)
-        information = 1.0 / state.sigma[camera] ** 2
+        information = residuals.relative_information / state.sigma[camera] ** 2
         squared = (residuals.residual[0] ** 2 + residuals.residual[1] ** 2) * information
         if robust:
             ratio = squared / CAUCHY_WIDTH**2

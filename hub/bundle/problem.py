@@ -65,7 +65,8 @@ class TrackObservations:
 
     camera, label: indices. time: (n,) on the camera's clock relative to its epoch [s]. pixels: (n, 2) distorted.
     use: (n,) inliers. stamp: (n,) the frames' original timestamps where ``time`` differs from them, because it is
-    corrected for a given readout or by an estimated frame time (`timestamp_jitter`).
+    corrected for a given readout or by an estimated frame time (`timestamp_jitter`). relative_std: (n,) std of each
+    row's noise relative to the camera's typical row, by the detector's covariances; None = all alike.
     """
 
     camera: int
@@ -74,11 +75,29 @@ class TrackObservations:
     pixels: Floats
     use: Bools
     stamp: Floats | None = None
+    relative_std: Floats | None = None
 
     @property
     def stamps(self) -> Floats:
         """Timestamps (n,) of the rows' frames [s]: the same for all rows of a frame."""
         return self.time if self.stamp is None else self.stamp
+
+    def every(self, step: int) -> TrackObservations:
+        """Every ``step``-th row."""
+        part = slice(None, None, step)
+        return replace(
+            self,
+            time=self.time[part],
+            pixels=self.pixels[part],
+            use=self.use[part],
+            stamp=None if self.stamp is None else self.stamp[part],
+            relative_std=None if self.relative_std is None else self.relative_std[part],
+        )
+
+    @property
+    def used_relative_std(self) -> Floats:
+        """Relative stds of the rows in use."""
+        return np.ones(int(np.count_nonzero(self.use))) if self.relative_std is None else self.relative_std[self.use]
 
     def using(self, use: Bools) -> TrackObservations:
         """The same rows with another inlier mask."""

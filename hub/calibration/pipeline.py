@@ -589,19 +589,7 @@ def _refit_online(problem: Problem, state: AdjustmentState) -> tuple[Problem, Ad
     every = max(1, int(np.ceil(rate / _MAX_ONLINE_ROW_RATE)))
     thinned = problem
     if every > 1:
-        thinned = replace(
-            problem,
-            rows=tuple(
-                replace(
-                    rows,
-                    time=rows.time[::every],
-                    pixels=rows.pixels[::every],
-                    use=rows.use[::every],
-                    stamp=None if rows.stamp is None else rows.stamp[::every],
-                )
-                for rows in problem.rows
-            ),
-        )
+        thinned = replace(problem, rows=tuple(rows.every(every) for rows in problem.rows))
     refitted = refit_with_correlated_noise(thinned, state, min_inflation=_ONLINE_MIN_INFLATION)
     return (problem, state) if refitted[1] is state else refitted
 
