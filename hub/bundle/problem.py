@@ -132,6 +132,19 @@ class CorrelatedNoise:
         return CorrelatedNoise(self.white_std[cameras], self.correlated_std[cameras], self.time_constant[cameras])
 
 
+@dataclass(frozen=True, slots=True)
+class ClockStep:
+    """A step of a camera's clock. camera: index. time: camera time [s] from which on it holds; size: [s] by which the
+    clock is set forward there, and its std. statistic: chi-squared of the size, its noise scaled to the effective
+    sample size."""
+
+    camera: int
+    time: float
+    size: float
+    std: float
+    statistic: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustmentState:
     """All parameters that the adjustment estimates.
@@ -139,6 +152,7 @@ class AdjustmentState:
     sigma: (cameras,) noise of one pixel coordinate. steps: convergence history. jitter: (cameras,) std [s] of the
     cameras' timestamps where frame times were estimated (`timestamp_jitter`); None = not estimated, or no jitter found.
     correlated_noise: noise model of the re-fit by generalised least squares (`gls`); None = independent rows.
+    clock_steps: for which the rows' times are corrected.
     """
 
     cameras: tuple[CameraState, ...]
@@ -147,6 +161,7 @@ class AdjustmentState:
     steps: tuple[AdjustmentStep, ...] = ()
     jitter: Floats | None = None
     correlated_noise: CorrelatedNoise | None = None
+    clock_steps: tuple[ClockStep, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

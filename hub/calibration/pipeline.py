@@ -55,6 +55,8 @@ _MAX_CLOCK_STD = 10e-3  # s: a frame is more than three of them
 _MAX_LAG_CHANGE = 20e-3  # s
 _LAG_CONFLICT = "the trajectory puts its clock"
 _LENS_ITERATIONS = 3
+_MAX_CLOCK_STEPS, _STEP_ITERATIONS = 2, 2
+_SAME_STEP_S = 2.0
 _WRONG_LENS = 0.05  # relative error of a focal length that no zoom, crop or temperature explains: another lens
 _MIN_TO_BLAME_A_LENS = 4  # cameras: of three, another camera's pose absorbs too much of a wrong lens
 _ONLINE_MIN_INFLATION = 2.0  # rows per effective row from which the noise of a recording that goes on is correlated
@@ -502,6 +504,25 @@ def fits_trajectory(reconstruction: Reconstruction, name: str) -> bool:
     return share >= _MIN_INLIER_SHARE and count >= _MIN_ROWS
 
 
+def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
+    """Problem and state with the rows after clock steps corrected, as far as these explain the observations better."""
+    for _ in range(_MAX_CLOCK_STEPS):
+        step = model_comparison.find_clock_step(problem, state)
+        if step is None:
+            break
+        trial, trial_state, _ = adjust(model_comparison.with_clock_step(problem, step), state, rounds=2)
+        for _ in range(_STEP_ITERATIONS):  # the size is of one Gauss-Newton step, which leaves a part of a large one
+            left = model_comparison.find_clock_step(trial, trial_state)
+            if left is None or left.camera != step.camera or abs(left.time - step.time) > _SAME_STEP_S:
+                break
+            step = replace(step, size=step.size + left.size)
+            trial, trial_state, _ = adjust(model_comparison.with_clock_step(problem, step), trial_state, rounds=2)
+        if not _bic_prefers(trial, trial_state, problem, state):
+            break
+        problem, state = trial, replace(trial_state, clock_steps=(*trial_state.clock_steps, step))
+    return problem, state
+
+
 def misfits(reconstruction: Reconstruction) -> list[str]:
     """Cameras that do not fit the trajectory that the others give."""
     return [name for name in reconstruction.names if not fits_trajectory(reconstruction, name)]
@@ -548,6 +569,8 @@ def final_adjustment(
         if refitted[1] is not state:
             return _with_state(reconstruction, *refitted)
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
+    if not online:
+        problem, state = _with_clock_steps(problem, state)
     problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
     problem = model_comparison.with_crystal_rates(problem, state)
     if refine_lenses and not warm:
@@ -563,7 +586,7 @@ def final_adjustment(
     ):
         report("adjusting the readouts", 0.9)
         read_problem, read_state, _ = adjust(model_comparison.with_free_readouts(problem), state, rounds=2)
-        if model_comparison.are_readouts_plausible(read_state) and _bic_prefers(
+        if model_comparison.are_readouts_plausible(read_problem, read_state) and _bic_prefers(
             read_problem, read_state, problem, state, 1
         ):
             problem, state = read_problem, read_state

@@ -13,9 +13,10 @@ from hub.bundle.datum.control_outliers import reject_outliers
 from hub.bundle.datum.control_point_adjustment import adjust_to_control_points
 from hub.bundle.datum.gauge import fix_gauge, identity_gauge, is_overdetermined, transform_state, with_exact_poses
 from hub.bundle.initialisation import Reconstruction
+from hub.bundle.model_comparison import REFUTED_SIGMA
 from hub.bundle.noise_scale import rescale_noise
 from hub.bundle.preprocessing import PreparedSession
-from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, READOUT, AdjustmentState, Problem
+from hub.bundle.problem import CAMERA_PARAMETERS, CRYSTAL_RATE_STD, FOCAL, READOUT, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.calibration.given_values import refuted_lens_warnings
 from hub.calibration.held_gauge import similarity_to_published
@@ -151,9 +152,16 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         + _estimated_lenses(cameras)
         + _refined_lenses(names, problem, state)
         + (refuted_lens_warnings(names, problem, state) if published is None else ())
-        + _other_frame_rates(rig, cameras, names[reference], problem)
+        + _other_frame_rates(rig, cameras, names[reference])
         + _estimated_readouts(cameras)
-        + _estimated_jitter(names, state, time_scales),
+        + _estimated_jitter(names, state, time_scales)
+        + tuple(
+            f"{names[step.camera]}: its clock steps by {1e3 * step.size / time_scales[step.camera]:+.1f} ± "
+            f"{1e3 * step.std / time_scales[step.camera]:.1g} ms at its time "
+            f"{step.time / time_scales[step.camera] + time_origins[step.camera]:.2f} s; the rows after it were "
+            "corrected, and its time map holds before it"
+            for step in state.clock_steps
+        ),
         residuals={
             name: _residual_rows(problem, state, i, time_origins[i], time_scales[i]) for i, name in enumerate(names)
         },
@@ -215,6 +223,7 @@ def _reordered(problem: Problem, state: AdjustmentState, order: list[int]) -> tu
         cameras=tuple(state.cameras[i] for i in order),
         sigma=state.sigma[order],
         jitter=None if state.jitter is None else state.jitter[order],
+        clock_steps=tuple(replace(step, camera=new_index[step.camera]) for step in state.clock_steps),
         correlated_noise=None if state.correlated_noise is None else state.correlated_noise.select(order),
     )
 
@@ -250,18 +259,16 @@ def _refined_lenses(names: list[str], problem: Problem, state: AdjustmentState) 
     return (f"given lenses were refined within their tolerance: change of focal lengths {changes} (tolerance 1 %)",)
 
 
-def _other_frame_rates(
-    rig: Rig, cameras: dict[str, CameraCalibration], reference: str, problem: Problem
-) -> tuple[str, ...]:
+def _other_frame_rates(rig: Rig, cameras: dict[str, CameraCalibration], reference: str) -> tuple[str, ...]:
     """One sentence for each camera whose clock rate no crystal explains."""
     out = []
-    for (name, camera), crystal in zip(cameras.items(), problem.crystal_rates, strict=bool(problem.crystal_rates)):
-        rate = camera.time_map.clock_rate
-        if not crystal and name != reference:
+    for name, camera in cameras.items():
+        rate, std, fps = camera.time_map.clock_rate, camera.clock_rate_std, rig.cameras[name].fps
+        if (rate - 1.0) ** 2 > REFUTED_SIGMA**2 * (CRYSTAL_RATE_STD**2 + std**2):
             out.append(
-                f"{name}: its times run {1e6 * (rate - 1.0):+.0f} ± {1e6 * camera.clock_rate_std:.0f} ppm against "
-                f"{reference}'s, more than the 100 ppm of crystals: a different frame rate, "
-                f"{rig.cameras[name].fps / rate:.5g} fps for {rig.cameras[name].fps:.5g}, or that of {reference}"
+                f"{name}: its times run {1e6 * (rate - 1.0):+.0f} ± {1e6 * std:.0f} ppm against {reference}'s, more than "
+                f"the 100 ppm of crystals: a different frame rate, {fps / rate:.5g} fps for {fps:.5g}, or that of "
+                f"{reference}"
             )
     return tuple(out)
 
