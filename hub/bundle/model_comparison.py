@@ -240,12 +240,13 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     return best if best.statistic > needed and best.statistic > readout and abs(best.size) > _MIN_STEP_S else None
 
 
-def with_clock_step(problem: Problem, step: ClockStep) -> Problem:
-    """The problem with the rows after a step at the times that the clock would have shown without it."""
+def with_clock_step(problem: Problem, step: ClockStep, middle: float) -> Problem:
+    """The problem with the rows beyond a step, seen from camera time ``middle``, at the times of an even clock."""
     rows = []
     for part in problem.rows:
         if part.camera == step.camera:
-            shifted = part.time - np.where(part.time >= step.time, step.size, 0.0)
+            beyond = (part.time >= step.time) == (step.time > middle)
+            shifted = part.time - np.where(beyond, np.copysign(1.0, step.time - middle) * step.size, 0.0)
             part = replace(part, time=shifted, stamp=part.stamps, use=np.ones_like(part.use))
         rows.append(part)
     return replace(problem, rows=tuple(rows))

@@ -510,13 +510,15 @@ def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem
         step = model_comparison.find_clock_step(problem, state)
         if step is None:
             break
-        trial, trial_state, _ = adjust(model_comparison.with_clock_step(problem, step), state, rounds=2)
+        middle = state.cameras[step.camera].centre
+        trial, trial_state, _ = adjust(model_comparison.with_clock_step(problem, step, middle), state, rounds=2)
         for _ in range(_STEP_ITERATIONS):  # the size is of one Gauss-Newton step, which leaves a part of a large one
             left = model_comparison.find_clock_step(trial, trial_state)
             if left is None or left.camera != step.camera or abs(left.time - step.time) > _SAME_STEP_S:
                 break
             step = replace(step, size=step.size + left.size)
-            trial, trial_state, _ = adjust(model_comparison.with_clock_step(problem, step), trial_state, rounds=2)
+            corrected = model_comparison.with_clock_step(problem, step, middle)
+            trial, trial_state, _ = adjust(corrected, trial_state, rounds=2)
         if not _bic_prefers(trial, trial_state, problem, state):
             break
         problem, state = trial, replace(trial_state, clock_steps=(*trial_state.clock_steps, step))

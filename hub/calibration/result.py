@@ -118,6 +118,11 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
             clock_rate_std=cov.clock_rate_std(covariance, state, i, reference)
             if problem.free_parameters.clock
             else 0.0,
+            clock_steps=tuple(
+                (step.time / time_scales[i] + time_origins[i], step.size / time_scales[i], step.std / time_scales[i])
+                for step in state.clock_steps
+                if step.camera == i
+            ),
         )
         for i, name in enumerate(names)
     }
@@ -155,13 +160,7 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         + _other_frame_rates(rig, cameras, names[reference])
         + _estimated_readouts(cameras)
         + _estimated_jitter(names, state, time_scales)
-        + tuple(
-            f"{names[step.camera]}: its clock steps by {1e3 * step.size / time_scales[step.camera]:+.1f} ± "
-            f"{1e3 * step.std / time_scales[step.camera]:.1g} ms at its time "
-            f"{step.time / time_scales[step.camera] + time_origins[step.camera]:.2f} s; the rows after it were "
-            "corrected, and its time map holds before it"
-            for step in state.clock_steps
-        ),
+        + _clock_step_warnings(cameras),
         residuals={
             name: _residual_rows(problem, state, i, time_origins[i], time_scales[i]) for i, name in enumerate(names)
         },
@@ -266,8 +265,8 @@ def _other_frame_rates(rig: Rig, cameras: dict[str, CameraCalibration], referenc
         rate, std, fps = camera.time_map.clock_rate, camera.clock_rate_std, rig.cameras[name].fps
         if (rate - 1.0) ** 2 > REFUTED_SIGMA**2 * (CRYSTAL_RATE_STD**2 + std**2):
             out.append(
-                f"{name}: its times run {1e6 * (rate - 1.0):+.0f} ± {1e6 * std:.0f} ppm against {reference}'s, more than "
-                f"the 100 ppm of crystals: a different frame rate, {fps / rate:.5g} fps for {fps:.5g}, or that of "
+                f"{name}: its times run {1e6 * (rate - 1.0):+.0f} ± {1e6 * std:.0f} ppm against {reference}'s, more "
+                f"than the 100 ppm of crystals: a different frame rate, {fps / rate:.5g} fps for {fps:.5g}, or that of "
                 f"{reference}"
             )
     return tuple(out)
@@ -296,6 +295,16 @@ def _estimated_jitter(names: list[str], state: AdjustmentState, time_scales: lis
         f"{name}: its stamps jitter by {1e3 * std:.2g} ms (std): each frame's time was estimated from its observations"
         for name, std in zip(names, stds, strict=True)
         if std > 0.0
+    )
+
+
+def _clock_step_warnings(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
+    """One sentence for each clock step."""
+    return tuple(
+        f"{name}: its clock steps by {1e3 * size:+.1f} ± {1e3 * std:.1g} ms at its time {time:.2f} s; its map holds "
+        f"{'before' if time > camera.lag_time else 'after'} the step, and the rows on the other side were corrected"
+        for name, camera in cameras.items()
+        for time, size, std in camera.clock_steps
     )
 
 

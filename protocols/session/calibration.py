@@ -32,7 +32,8 @@ class CameraCalibration:
     reference camera; lag_std: std [s] of `lag`, the map there. clock_rate_std: of its rate. position_std: (3,)
     [rig units]. rms_px: root mean square reprojection error. focal_std: relative std of a focal length estimated by
     self-calibration; 0 = the lens was given. readout: seconds from the image's first row to its last; 0 = not known.
-    readout_std: its std where it was estimated, else 0.
+    readout_std: its std where it was estimated, else 0. clock_steps: camera time, size and std [s] of each step of its
+    clock; the map holds on the side of ``lag_time``.
     """
 
     name: str
@@ -48,6 +49,7 @@ class CameraCalibration:
     lag_time: float = 0.0
     lag_std: float = 0.0
     clock_rate_std: float = 0.0
+    clock_steps: tuple[tuple[float, float, float], ...] = ()
 
     @property
     def lag(self) -> float:

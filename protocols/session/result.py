@@ -38,6 +38,9 @@ def result_document(calibration: Calibration, rig: Rig, *, command: str = "") ->
         tables[name]["lag_time_s"] = camera.lag_time
         tables[name]["clock_rate_ppm"] = 1e6 * (camera.time_map.clock_rate - 1.0)
         tables[name]["clock_rate_ppm_std"] = 1e6 * camera.clock_rate_std
+        tables[name]["clock_steps"] = [
+            {"time_s": time, "size_s": size, "size_std_s": std} for time, size, std in camera.clock_steps
+        ]
         tables[name]["rows_used"] = None if residuals is None else len(residuals)
     return _document(
         status="solved",

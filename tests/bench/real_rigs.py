@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import csv
 import itertools
+import json
 import resource
 import shutil
 import subprocess
@@ -59,13 +60,14 @@ _MS = 1e3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Run:
-    """One run of calibrate: what it wrote, and its CPU and wall seconds (whole command)."""
+    """One run of calibrate: what it wrote, its CPU and wall seconds (whole command), and times of clock steps [s]."""
 
     cameras: dict[str, CameraCalibration]
     path_time: dict[str, Floats]
     path: dict[str, Floats]
     cpu: float
     wall: float
+    steps: dict[str, list[float]]
 
 
 class CommandFailed(Exception):
@@ -81,7 +83,9 @@ def run_calibrate(session: Path, observations: str, refine_lenses: bool = False)
         cpu, wall = _cpu() - before, time.perf_counter() - began
         _, cameras = read_calibration(out / "calibration.toml")
         times, paths = _read_paths(out / "trajectory.csv")
-    return Run(cameras, times, paths, cpu, wall)
+        tables = json.loads((out / "result.json").read_text(encoding="utf-8"))["cameras"]
+        steps = {name: [step["time_s"] for step in table["clock_steps"]] for name, table in tables.items()}
+    return Run(cameras, times, paths, cpu, wall, steps)
 
 
 def _cpu() -> float:
@@ -186,8 +190,12 @@ def _lags(run: Run, seen: Observations, fit: scoring.Alignment, table: Floats) -
         start = TimeMap(fit.rate * clock.clock_rate, fit.rate * clock.time_offset + fit.offset)
         track = seen.of_camera(name)[0]
         lens = camera.intrinsics
+        whole = np.ones(len(track.time), dtype=np.bool_)
+        for step in run.steps[name]:  # the resection has one clock: that of the longer side, as the map
+            middle = 0.5 * (track.time[0] + track.time[-1])
+            whole &= (track.time < step) == (middle < step)
         try:
-            found[name] = resect(lens, track.time, track.pixels, start, table[:, 0], table[:, 1:])
+            found[name] = resect(lens, track.time[whole], track.pixels[whole], start, table[:, 0], table[:, 1:])
         except ValueError as error:
             lines.append(f"{name}: {error}")
     spans = dict(zip(run.cameras, _seen_times(run, seen), strict=True))
