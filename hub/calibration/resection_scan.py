@@ -245,7 +245,7 @@ def _verify(
     def at(offset: float) -> tuple[float, float, bool]:
         world, image, times = [], [], []
         for number, time, points in samples:
-            internal = candidate.rate * time + offset
+            internal = np.asarray(candidate.rate * time + offset, dtype=np.float64)
             where = reconstruction.state.trajectories[number].at(internal)
             good = np.isfinite(where).all(axis=1) & seen_by_two(reconstruction, number, internal)
             world.append(where[good])
