@@ -52,12 +52,14 @@ class CalibrationOptions:
     methods, for comparison). from_known: a calibration.toml whose intrinsics and poses are kept; only timing and
     trajectories are estimated then, by "joint". thorough: search clock rates of wrong nominal frame rates, and
     interrupted tracks, for cameras that a first search leaves unconnected. seed: of the distributed solver's samples.
+    refine_lenses: measured lenses may change within their tolerance ("joint"); else they are kept exactly.
     """
 
     solver: Solver = "joint"
     from_known: str | Path | None = None
     thorough: bool = True
     seed: int = 0
+    refine_lenses: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,6 +171,9 @@ def calibrate(
     options = options or CalibrationOptions()
     if options.from_known is not None and options.solver != "joint":
         raise InputError("--from-known goes with --solver joint", remedy="leave one of the two out")
+    if options.refine_lenses and (options.from_known is not None or options.solver != "joint"):
+        remedy = "leave --from-known and --solver out"
+        raise InputError("--refine-lenses goes with --solver joint and without --from-known", remedy=remedy)
     session = session if isinstance(session, Session) else load_session(session)
     known = None
     if options.from_known is not None:
@@ -184,6 +189,7 @@ def calibrate(
             known=known,
             thorough=options.thorough,
             seed=options.seed,
+            refine_lenses=options.refine_lenses,
         )
     except Refused as refused:
         refused.warnings = (*session.warnings, *refused.warnings)

@@ -29,7 +29,7 @@ def report_result(result: CalibrationResult, out: Path, command: str, echo_json:
     imprecise = {
         name: ""
         for name, camera in calibration.cameras.items()
-        if camera.time_offset_std > _ADVICE_OFFSET_STD_S or name in calibration.refused
+        if camera.lag_std > _ADVICE_OFFSET_STD_S or name in calibration.refused
     }
     print_advice(result.session.rig, result.session.observations, {**imprecise, **calibration.refused})
 
@@ -87,20 +87,23 @@ def print_summary(calibration: Calibration, out: Path) -> None:
     table = Table(
         title=f"{len(calibration.cameras)} cameras, {calibration.cpu_seconds:.1f} s of CPU", title_justify="left"
     )
-    for column in ("camera", "offset [s]", "± [ms]", "rate [ppm]", f"position [{unit}]", "±", "rms [px]"):
+    for column in ("camera", "lag [s]", "± [ms]", "rate [ppm]", "±", f"position [{unit}]", "±", "rms [px]"):
         table.add_column(column, justify="left" if column == "camera" else "right")
     for name, camera in calibration.cameras.items():
         position = " ".join(f"{value:.3f}" for value in camera.pose.position)
         table.add_row(
             name + (" (reference)" if name == calibration.reference else ""),
-            f"{camera.time_map.time_offset:.6f}",
-            f"{1e3 * camera.time_offset_std:.3f}",
+            f"{camera.lag:.6f}",
+            f"{1e3 * camera.lag_std:.3f}",
             f"{1e6 * (camera.time_map.clock_rate - 1.0):+.1f}",
+            f"{1e6 * camera.clock_rate_std:.1f}",
             position,
             f"{float(max(camera.position_std)):.2g}",
             f"{camera.rms_px:.2f}",
         )
     console.print(table)
+    if any(camera.lag_std > 0.0 for camera in calibration.cameras.values()):
+        console.print(f"lag: {calibration.reference}'s time less the camera's, in the middle of their common span")
     for name, reason in calibration.refused.items():
         console.print(f"refused {name}: {reason}", soft_wrap=True)
     for warning in calibration.warnings:

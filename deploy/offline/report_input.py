@@ -6,7 +6,7 @@ import json
 import math
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +97,7 @@ def _input_from_folder(folder: Path, session: Path | None) -> ReportInput:
         reason = str(document.get("reason") or "no reason given")
         return ReportInput(Refused(reason, refused, pairs, warnings), rig, observations, command, missing)
     known, cameras = read_calibration(folder / CALIBRATION)
+    cameras = {name: _with_lag(camera, _table(document.get("cameras"))) for name, camera in cameras.items()}
     file = folder / TRAJECTORY
     tables = read_trajectory(file) if file.exists() else ()
     calibration = Calibration(
@@ -220,6 +221,14 @@ def _pair(pair: Any) -> PairReport:
         number("inliers"),
         number("rms_px"),
     )
+
+
+def _with_lag(camera: CameraCalibration, tables: dict[str, Any]) -> CameraCalibration:
+    """The camera with the instant of its lag and the stds there, which only result.json holds."""
+    table = _table(tables.get(camera.name))
+    values = [table.get(key) for key in ("lag_time_s", "lag_std_s", "clock_rate_ppm_std")]
+    time, std, rate_std = (float(v) if isinstance(v, int | float) and math.isfinite(v) else 0.0 for v in values)
+    return replace(camera, lag_time=time, lag_std=std, clock_rate_std=1e-6 * rate_std)
 
 
 def _steps(value: Any) -> tuple[AdjustmentStep, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hub.baselines.recursive_poses import RecursivePoseNode, point_in_camera
+from hub.bundle.datum.gauge import control_points_of, fit_to_control_points
 from hub.bundle.initialisation import Reconstruction, triangulate_and_adjust
 from hub.bundle.preprocessing import PreparedSession
 from hub.bundle.problem import CameraState
@@ -16,6 +17,7 @@ from protocols.core.errors import Refused
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations
+from protocols.session.rig import Rig
 
 _UPDATE_INTERVAL = 10
 """Observations between two updates."""
@@ -38,11 +40,12 @@ def all_tracks_have_sizes(prepared: PreparedSession, observations: Observations)
 
 
 def reconstruct_by_paper(
-    prepared: PreparedSession, observations: Observations, graph: ClockGraph
+    rig: Rig, prepared: PreparedSession, observations: Observations, graph: ClockGraph
 ) -> tuple[Reconstruction, dict[str, str]]:
     """Poses of the cameras of ``graph`` and the triangulated path, unadjusted; and the refused cameras with reasons.
 
-    The first camera's pose and the second one's position are the gauge. Initial poses are chained from camera to camera
+    Positions and attitudes of the rig are known, as in the paper's section 4, where they determine the scale; else the
+    first camera's pose and the second one's position are the gauge. Initial poses are chained from camera to camera
     by eqs. (16) to (19) over the first shared observations. Raises Refused where fewer than two cameras can be placed.
     """
     names = [name for name in prepared.camera_order if name in graph.clocks]
@@ -53,7 +56,14 @@ def reconstruct_by_paper(
     }
     if len(initial) < 2:
         raise Refused("no two cameras share enough observations", prepared.refused | refused)
-    poses = _run(initial, pairs)
+    known_positions, known_attitudes = sorted(initial)[:2], sorted(initial)[:1]
+    placed_names = [names[i] for i in sorted(initial)]
+    control = control_points_of(rig, placed_names)
+    if control.extent > 0.0 and control.rotations:
+        initial = _in_the_rigs_world(rig, placed_names, initial)
+        known_positions = [sorted(initial)[i] for i, _ in control.positions]
+        known_attitudes = [sorted(initial)[i] for i, _ in control.rotations]
+    poses = _run(initial, pairs, known_positions, known_attitudes)
     placed = {}
     for i, pose in poses.items():
         clock = graph.clocks[names[i]]
@@ -110,11 +120,24 @@ def _initial_poses(cameras: int, pairs: list[SharedPair]) -> dict[int, Pose]:
     return {i: Pose(poses[i].rotation, unit * poses[i].position) for i in placed}
 
 
-def _run(initial: dict[int, Pose], pairs: list[SharedPair]) -> dict[int, Pose]:
+def _in_the_rigs_world(rig: Rig, names: list[str], initial: dict[int, Pose]) -> dict[int, Pose]:
+    """The initial poses moved into the rig's world, known parts at their given values, in the constants' unit."""
+    found, _ = fit_to_control_points(rig, names, [initial[i] for i in sorted(initial)])
+    out = {}
+    for i, name in zip(sorted(initial), names, strict=True):
+        pose, camera = found.pose(initial[i]), rig.cameras[name]
+        rotation = pose.rotation if camera.rotation is None else camera.rotation
+        position = pose.position if camera.position is None else camera.position
+        out[i] = Pose(rotation, position / found.scale)
+    return out
+
+
+def _run(
+    initial: dict[int, Pose], pairs: list[SharedPair], known_positions: list[int], known_attitudes: list[int]
+) -> dict[int, Pose]:
     """The recursive estimate after all shared observations."""
-    known = sorted(initial)[:2]
     nodes = {
-        k: RecursivePoseNode(pose, position_known=k in known, attitude_known=k == known[0])
+        k: RecursivePoseNode(pose, position_known=k in known_positions, attitude_known=k in known_attitudes)
         for k, pose in initial.items()
     }
     pending: dict[int, set[int]] = {}

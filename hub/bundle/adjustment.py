@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from hub.bundle.bordered_system import solve
 from hub.bundle.normal_equations import assemble, build_system, weigh_residuals
@@ -84,8 +85,8 @@ def adjust(
 def estimate_noise(problem: Problem, state: AdjustmentState) -> Floats:
     """Robust noise (cameras,) of one pixel coordinate from the median residual.
 
-    Each separate point absorbs three of the few coordinates that observe it. There all cameras share one noise
-    (separate estimates would attribute all of it to one camera), corrected for the redundancy.
+    Each separate point absorbs three of the few coordinates that observe it. There all cameras share one noise:
+    separate estimates would attribute all of it to one camera.
     """
     sigma = state.sigma.copy()
     if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
@@ -104,20 +105,23 @@ def estimate_noise(problem: Problem, state: AdjustmentState) -> Floats:
 
 
 def _pooled_noise(problem: Problem, state: AdjustmentState) -> float:
-    parts, point_count = [], 0
+    """Noise from the squared residuals of each point over the median of chi-squared at its redundancy.
+
+    A point that two cameras see leaves one degree of freedom: its residuals are half-normal, not Rayleigh.
+    """
+    ratios = []
     for label, path in enumerate(state.trajectories):
-        seen = np.zeros(path.basis.size, dtype=np.bool_)
+        squares, rows_of = np.zeros(path.basis.size), np.zeros(path.basis.size)
         for rows in problem.rows:
             if rows.label == label:
                 norms = residual_norms(rows, state.cameras[rows.camera], path)
                 good = rows.use & np.isfinite(norms)
-                parts.append(norms[good])
                 index = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[good]))[0]
-                seen[index] = True
-        point_count += int(seen.sum())
-    norms = np.concatenate(parts)
-    redundancy = max(2 * len(norms) - 3 * point_count, 0.05 * len(norms))
-    return max(_MIN_SIGMA_PX, float(np.median(norms)) / 1.1774 * float(np.sqrt(2 * len(norms) / redundancy)))
+                squares += np.bincount(index, norms[good] ** 2, path.basis.size)
+                rows_of += np.bincount(index, minlength=path.basis.size)
+        seen = rows_of >= 2
+        ratios.append(squares[seen] / chdtri(2.0 * rows_of[seen] - 3.0, 0.5))
+    return max(_MIN_SIGMA_PX, float(np.sqrt(np.median(np.concatenate(ratios)))))
 
 
 def mark_inliers(problem: Problem, state: AdjustmentState) -> Problem:

@@ -1,7 +1,7 @@
 """Re-fit of the adjustment where residuals are autocorrelated: generalised least squares with Gauss-Markov noise.
 
 Where residuals are correlated from frame to frame, the adjustment is repeated by generalised least squares (`gls`).
-Lens errors have the same appearance, so all lens parameters are estimated too, under priors for how far given
+Lens errors have the same appearance: on request all lens parameters are estimated too, under priors for how far given
 intrinsics may be off. With independent rows a free lens absorbs the detector's errors; with correlated noise and only
 two free parameters a lens, those two absorb the errors of its other parameters.
 """
@@ -61,13 +61,13 @@ def lens_tolerance(lens: Intrinsics) -> LensPrior:
 
 
 def refit_with_correlated_noise(
-    problem: Problem, state: AdjustmentState, min_inflation: float = MIN_INFLATION
+    problem: Problem, state: AdjustmentState, refine_lenses: bool = False, min_inflation: float = MIN_INFLATION
 ) -> tuple[Problem, AdjustmentState]:
     """Problem and state after the re-fit where residuals are autocorrelated; otherwise both unchanged.
 
-    problem, state: adjusted. Both are also unchanged where poses are given, where clocks are shared, where frame times
-    were estimated, where the recording is too long (`gls.is_tractable`), and where the re-fit would leave the std of a
-    camera's orientation above 1°.
+    problem, state: adjusted. refine_lenses: whether measured lenses may change within their tolerance. Both are also
+    unchanged where poses are given, where clocks are shared, where frame times were estimated, where the recording is
+    too long (`gls.is_tractable`), and where the re-fit would leave the std of a camera's orientation above 1°.
     """
     excluded = state.jitter is not None or not problem.free_parameters.clock or not problem.free_parameters.pose
     if excluded or any(isinstance(path.basis, PointBasis) for path in state.trajectories):
@@ -79,10 +79,11 @@ def refit_with_correlated_noise(
     if not is_tractable(problem, noise_model):
         return problem, state
     nominal_problem = replace(problem, free_parameters=replace(problem.free_parameters, lens=False))
-    found = replace(nominal_problem, lens_tolerances=tuple(lens_tolerance(lens) for lens in problem.nominal))
+    tolerances = tuple(lens_tolerance(lens) for lens in problem.nominal) if refine_lenses else ()
+    found = replace(nominal_problem, lens_tolerances=tolerances)
     try:
         best = solve_gls(found, state, estimate_smoothness(found, state), noise_model)
-        if prefers_nominal_lenses(found, best):
+        if refine_lenses and prefers_nominal_lenses(found, best):
             # The state may have been adjusted with other lenses, and its residuals contain their errors.
             found, start = nominal_problem, _with_nominal_lenses(nominal_problem, state)
             best = solve_gls(nominal_problem, start, estimate_smoothness(nominal_problem, start), noise_model)

@@ -43,12 +43,14 @@ def covariance(
     prior: SmoothnessPrior,
     control_information: Floats | None = None,
     datum_points: list[tuple[int, Floats]] | None = None,
+    exact: Floats | None = None,
 ) -> Covariance:
     """Covariance at the solution.
 
     control_information: (18 n, 18 n) information of control points: surveyed positions, attitudes and distances. Gauge
     directions that they leave free are fixed by convention: the first camera's pose and the first baseline, or, with
-    datum_points (label index, internal times), by inner constraints over these points of the trajectories.
+    datum_points (label index, internal times), by inner constraints over these points of the trajectories. exact:
+    (q, 18 n) directions in which nothing is uncertain, because control points without std fix them.
     """
     system, _ = build_system(problem, state, prior, robust=False)
     parts = eliminate(system)
@@ -66,18 +68,33 @@ def covariance(
             constraints = inner_constraints(parts.a_inv_b, state, datum_points)
         else:
             constraints = gauge_constraints([camera.pose for camera in state.cameras], prior_information)[:, columns]
-    if constraints is not None and len(constraints):
-        _, _, vt = np.linalg.svd(constraints)
-        tangent = vt[len(constraints) :].T
-        free = tangent @ np.linalg.inv(tangent.T @ information @ tangent) @ tangent.T
-    elif len(columns):
-        free = np.linalg.inv(information)
-    else:
-        free = np.zeros((0, 0))
+        if exact is not None:
+            constraints = np.concatenate([constraints, exact[:, columns]])
+    free = np.zeros((0, 0))
+    if len(columns):
+        rows = np.zeros((0, len(columns))) if constraints is None else constraints
+        _, free = constrained_step(information, np.zeros(len(columns)), rows, np.zeros(len(rows)))
     width = len(state.cameras) * CAMERA_PARAMETERS
     full = np.zeros((width, width))
     full[np.ix_(columns, columns)] = free
     return Covariance(full, parts.a_inv_b, free, _inverse_blocks(system.band))
+
+
+def constrained_step(normal: Floats, right: Floats, rows: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """The step (p,) that solves ``normal @ step = right`` subject to ``rows @ step = -values``, and its covariance.
+
+    Rows may repeat each other; ones that contradict each other are met in the least-squares sense.
+    """
+    if not len(rows):
+        covariance: Floats = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+        return covariance @ right, covariance
+    length = np.linalg.norm(rows, axis=1)
+    left, size, vt = np.linalg.svd(rows / length[:, None])
+    rank = int(np.count_nonzero(size > 1e-9 * size[0]))
+    fixed = -vt[:rank].T @ ((left[:, :rank].T @ (values / length)) / size[:rank])
+    tangent = vt[rank:].T
+    covariance = np.asarray(tangent @ np.linalg.inv(tangent.T @ normal @ tangent) @ tangent.T, dtype=np.float64)
+    return fixed + covariance @ (right - normal @ fixed), covariance
 
 
 def relative_rotation_stds(cameras: Floats, state: AdjustmentState) -> Floats:
@@ -179,11 +196,10 @@ def relative_clock_stds(cov: Covariance, problem: Problem, state: AdjustmentStat
     That is where their lag is used; away from it the uncertain rates increase the std. For cameras without a common
     span: in the middle of the gap. Diagonal 0.
     """
-    spans = _observed_spans(problem, state)
     count = len(state.cameras)
     out = np.zeros((count, count))
     for i, j in itertools.combinations(range(count), 2):
-        middle = 0.5 * (max(spans[i, 0], spans[j, 0]) + min(spans[i, 1], spans[j, 1]))
+        middle = float(middle_of_overlap(problem, state, i, j)[0])
         row = np.zeros(len(cov.cameras))
         for camera, sign in ((i, 1.0), (j, -1.0)):
             now = state.cameras[camera]
@@ -191,6 +207,12 @@ def relative_clock_stds(cov: Covariance, problem: Problem, state: AdjustmentStat
             row[camera * CAMERA_PARAMETERS + RATE] = sign * (middle - now.offset) / now.rate
         out[i, j] = out[j, i] = np.sqrt(max(float(row @ cov.cameras @ row), 0.0))
     return out
+
+
+def middle_of_overlap(problem: Problem, state: AdjustmentState, first: int, second: int) -> Floats:
+    """Internal reference time (1,) in the middle of the common span of two cameras, or of the gap between them."""
+    spans = _observed_spans(problem, state)
+    return np.array([0.5 * (spans[[first, second], 0].max() + spans[[first, second], 1].min())])
 
 
 def _observed_spans(problem: Problem, state: AdjustmentState) -> Floats:

@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 
 from hub.bundle.adjustment import apply_step, gauge_tangent
 from hub.bundle.bordered_system import PathBlocks, sparse_row_sums
-from hub.bundle.covariance import gauge_constraints
+from hub.bundle.covariance import constrained_step
 from hub.bundle.datum.gauge import ControlPointTerms
 from hub.bundle.gauss_markov import GaussMarkov
 from hub.bundle.normal_equations import camera_priors
@@ -35,6 +35,7 @@ _MAX_ROWS = 150_000
 _MAX_ITERATIONS = 40
 _HALVINGS = 5
 _GROSS_ERROR_COST = 100.0**2
+_ON_CONSTRAINTS = 1e-9  # rig units or rad: what rounding leaves
 _RELATIVE_TOLERANCE = 1e-5  # relative decrease of the cost at convergence
 
 
@@ -75,7 +76,7 @@ class _NoiseBlock:
     interpolation: csr_array
     precision: Floats
     factor: Floats
-    white_information: float
+    white_information: Floats
 
 
 def solve_gls(
@@ -84,10 +85,12 @@ def solve_gls(
     prior: SmoothnessPrior,
     noise: CorrelatedNoise,
     control_terms: Callable[[AdjustmentState], ControlPointTerms] | None = None,
+    constraints: Callable[[AdjustmentState], tuple[Floats, Floats]] | None = None,
 ) -> GlsSolution:
     """Gauss-Newton with step halving from a state near the optimum, over the rows in use.
 
-    control_terms: normal equations of the control points at a state; without it the gauge is fixed
+    control_terms, constraints: normal equations of the control points with a std at a state, and constraints (rows,
+    values; see `covariance.constrained_step`) of the others and of the gauge; without them the gauge is fixed
     (`adjustment.gauge_tangent`). Rows that are off the trajectory at ``state``, and a camera's only row of a label, are
     left out. Stops after forty steps at the latest. Raises LinAlgError where the rows do not determine a trajectory.
     """
@@ -95,7 +98,11 @@ def solve_gls(
     parts = _noise_blocks(problem, noise)
     cost = _cost(problem, state, prior, parts, control_terms)
     for _ in range(_MAX_ITERATIONS):
-        path, cameras, free = _step(problem, state, prior, parts, control_terms)
+        path, cameras, free, must = _step(problem, state, prior, parts, control_terms, constraints)
+        if must:  # a state off the constraints has to move onto them, whatever that costs
+            state = apply_step(problem, state, path, cameras)
+            cost = _cost(problem, state, prior, parts, control_terms)
+            continue
         shrink, trial_cost, trial = 1.0, np.inf, state
         for _ in range(_HALVINGS):
             trial = apply_step(problem, state, shrink * path, shrink * cameras)
@@ -173,9 +180,10 @@ def _noise_block(rows: TrackObservations, count: int, noise: CorrelatedNoise) ->
     # Between two knots the process deviates from the line: mean variance of the bridge.
     width, correlated_std = float(knots[1] - knots[0]), float(noise.correlated_std[rows.camera])
     bridge_variance = correlated_std**2 * min(width / (3.0 * float(noise.time_constant[rows.camera])), 1.0)
-    white_information = 1.0 / (float(noise.white_std[rows.camera]) ** 2 + bridge_variance)
+    white_variance = float(noise.white_std[rows.camera]) ** 2 * rows.used_relative_std**2
+    white_information = 1.0 / (white_variance + bridge_variance)
     precision = GaussMarkov.sampled_at(knots, float(noise.time_constant[rows.camera])).precision() / correlated_std**2
-    both = precision + _knot_information(interval, knot_weights, np.full(len(time), white_information), count)
+    both = precision + _knot_information(interval, knot_weights, white_information, count)
     return _NoiseBlock(
         rows,
         knots,
@@ -216,9 +224,9 @@ def _cost(
         evaluation = evaluate_residuals(part.rows, state.cameras[part.rows.camera], state.trajectories[part.rows.label])
         total += _GROSS_ERROR_COST * float(np.count_nonzero(~evaluation.valid))
         residual = np.where(evaluation.valid, evaluation.residual, 0.0)
-        weighted_residual = part.white_information * (part.interpolation.T @ residual.T)
+        weighted_residual = part.interpolation.T @ (residual * part.white_information).T
         noise_estimate = cho_solve_banded((part.factor, False), weighted_residual, check_finite=False)
-        total += part.white_information * float((residual**2).sum()) - float((weighted_residual * noise_estimate).sum())
+        total += float((part.white_information * residual**2).sum()) - float((weighted_residual * noise_estimate).sum())
     return float(total)
 
 
@@ -234,8 +242,10 @@ def _step(
     prior: SmoothnessPrior,
     parts: list[_NoiseBlock],
     control_terms: Callable[[AdjustmentState], ControlPointTerms] | None,
-) -> tuple[Floats, Floats, Floats]:
-    """Steps of the paths (3 n,) and the free camera parameters (p,), and the covariance (p, p) of these."""
+    constraints: Callable[[AdjustmentState], tuple[Floats, Floats]] | None,
+) -> tuple[Floats, Floats, Floats, bool]:
+    """Steps of the paths (3 n,) and the free camera parameters (p,), the covariance (p, p) of these, and whether the
+    state is off the constraints."""
     columns = problem.free_columns()
     first_columns = np.r_[0, np.cumsum([3 * path.basis.size for path in state.trajectories])]
     motion = [_motion(state, prior, label) for label in range(len(state.trajectories))]
@@ -275,21 +285,22 @@ def _step(
         if column in column_index:
             corner[column_index[column], column_index[column]] += 1.0 / std**2
             camera_gradient[column_index[column]] += value / std**2
-    tangent = gauge_tangent(problem, state)
     if control_terms is not None:
         control_at_state = control_terms(state)
         corner += control_at_state.information[np.ix_(columns, columns)]
         camera_gradient += control_at_state.gradient[columns]
-        constraints = gauge_constraints([camera.pose for camera in state.cameras], control_at_state.information)[
-            :, columns
-        ]
-        tangent = np.linalg.svd(constraints)[2][len(constraints) :].T if len(constraints) else None
     solution = _solve_banded(entries, _time_order(state, parts), np.column_stack([border, gradient]))
     reduced, right_side = corner - border.T @ solution[:, :-1], border.T @ solution[:, -1] - camera_gradient
-    free = np.eye(len(columns)) if tangent is None else tangent
-    covariance = free @ np.linalg.inv(free.T @ reduced @ free) @ free.T if len(columns) else reduced
-    cameras = covariance @ right_side
-    return -(solution[:, -1] + solution[:, :-1] @ cameras)[:paths], cameras, covariance
+    if constraints is None:
+        tangent = gauge_tangent(problem, state)
+        free = np.eye(len(columns)) if tangent is None else tangent
+        covariance = free @ np.linalg.inv(free.T @ reduced @ free) @ free.T if len(columns) else reduced
+        cameras, must = covariance @ right_side, False
+    else:
+        fixed, values = constraints(state)
+        cameras, covariance = constrained_step(reduced, right_side, fixed[:, columns], values)
+        must = bool(np.abs(values).max(initial=0.0) > _ON_CONSTRAINTS)
+    return -(solution[:, -1] + solution[:, :-1] @ cameras)[:paths], cameras, covariance, must
 
 
 class SparseEntries:

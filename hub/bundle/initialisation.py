@@ -34,6 +34,7 @@ from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
 
 _MIN_PARALLAX = 0.02  # rad between rays; less does not triangulate
+_MIN_POINT_PARALLAX = 2e-3  # rad: the same for separate points, no part of a path; two pixels of a bearing
 _MIN_BEARING_ANGLE = 0.05  # rad between two directions that intersect
 _MAX_PNP_POINTS = 400
 _PNP_THRESHOLD_PX = 8.0
@@ -223,11 +224,7 @@ def _subsampled(problem: Problem, state: AdjustmentState) -> Problem:
         interval = float(np.median(np.diff(rows.time))) * state.cameras[rows.camera].rate if len(rows.time) > 1 else 1.0
         rows_per_knot = state.trajectories[rows.label].basis.spacing / interval
         every = max(1, int(min(rows_per_knot / _MIN_ROWS_PER_KNOT, share)))
-        stamp = None if rows.stamp is None else rows.stamp[::every]
-        subsampled = replace(
-            rows, time=rows.time[::every], pixels=rows.pixels[::every], use=rows.use[::every], stamp=stamp
-        )
-        out.append(subsampled)
+        out.append(rows.every(every))
     return replace(problem, rows=tuple(out))
 
 
@@ -277,7 +274,7 @@ def triangulate_label(
 def _triangulate_instants(seeing: list[tuple[CameraState, ImageTrack]]) -> Trajectory | None:
     """The trajectory of a shared clock: one point for every instant that two cameras triangulate."""
     instants = merged_instants([state.reference_time(track.time) for state, track in seeing])
-    points, good = linear_triangulation(seeing, instants)
+    points, good = linear_triangulation(seeing, instants, _MIN_POINT_PARALLAX)
     if good.sum() < _MIN_PNP_POINTS:
         return None
     basis = PointBasis(instants[good])
@@ -286,7 +283,9 @@ def _triangulate_instants(seeing: list[tuple[CameraState, ImageTrack]]) -> Traje
     )
 
 
-def linear_triangulation(seeing: list[tuple[CameraState, ImageTrack]], time: Floats) -> tuple[Floats, Bools]:
+def linear_triangulation(
+    seeing: list[tuple[CameraState, ImageTrack]], time: Floats, min_parallax: float = _MIN_PARALLAX
+) -> tuple[Floats, Bools]:
     """Points (n, 3) at reference times, and which of them are triangulated in front of all their cameras.
 
     Least squares over the distances to the rays, which needs no initial values.
@@ -309,7 +308,7 @@ def linear_triangulation(seeing: list[tuple[CameraState, ImageTrack]], time: Flo
     matrix, right = np.ascontiguousarray(sums.transpose(2, 0, 1)), target.T
     eigenvalues = np.linalg.eigvalsh(matrix)
     # Smallest eigenvalue of two rays at angle t: 1 - cos t.
-    good = (count >= 2) & (eigenvalues[:, 0] > 1.0 - np.cos(_MIN_PARALLAX))
+    good = (count >= 2) & (eigenvalues[:, 0] > 1.0 - np.cos(min_parallax))
     points = np.zeros((len(time), 3))
     points[good] = np.linalg.solve(matrix[good], right[good][:, :, None])[:, :, 0]
     for position, ray in rays:  # a ray of length 0 marks a camera that does not see the point
@@ -326,7 +325,7 @@ def _resection_points(camera: CameraInput, clock: CameraState, reconstruction: R
             continue
         time = clock.reference_time(track.time)
         where = path.at(time)
-        both = np.isfinite(where).all(axis=1) & _seen_by_two(reconstruction, number, time)
+        both = np.isfinite(where).all(axis=1) & seen_by_two(reconstruction, number, time)
         positions.append(where[both])
         seen.append(track.points[both])
     if not positions:
@@ -334,7 +333,7 @@ def _resection_points(camera: CameraInput, clock: CameraState, reconstruction: R
     return np.concatenate(positions), np.concatenate(seen)
 
 
-def _seen_by_two(reconstruction: Reconstruction, number: int, time: Floats) -> Bools:
+def seen_by_two(reconstruction: Reconstruction, number: int, time: Floats) -> Bools:
     """Times (n,) within 0.2 s of observations of at least two placed cameras."""
     count = np.zeros(len(time), dtype=np.int64)
     for camera, state in enumerate(reconstruction.state.cameras):

@@ -60,7 +60,7 @@ def weigh_residuals(
     evaluations, weights = [], []
     for camera, parts in by_camera.items():
         residuals = evaluate_labels(parts, state.cameras[camera], paths)
-        information = 1.0 / state.sigma[camera] ** 2
+        information = residuals.relative_information / state.sigma[camera] ** 2
         squared = (residuals.residual[0] ** 2 + residuals.residual[1] ** 2) * information
         if robust:
             ratio = squared / CAUCHY_WIDTH**2
@@ -127,9 +127,10 @@ def assemble(
 def camera_priors(problem: Problem, state: AdjustmentState) -> list[tuple[int, float, float]]:
     """Column, difference and std of every prior on rates, readouts and lenses."""
     free_parameters, out = problem.free_parameters, list[tuple[int, float, float]]()
+    reference_rate = state.cameras[problem.clock_reference].rate  # the internal time may run at any rate near 1
     for camera, (current, nominal) in enumerate(zip(state.cameras, problem.nominal, strict=True)):
         base = camera * CAMERA_PARAMETERS
-        terms = [(RATE, current.rate - 1.0, free_parameters.rate_std)]
+        terms = [(RATE, current.rate - reference_rate, problem.rate_std(camera))]
         if free_parameters.readout:
             terms.append((READOUT, current.readout, free_parameters.readout_std))
         lens_prior = problem.lens_prior(camera)

@@ -14,9 +14,11 @@ from hub.trajectory.image_tracks import ImageTrack, SmoothTrack, smooth_track, w
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.sphere_projection import outline_to_centre
 from protocols.geometry.types import Floats
-from protocols.session.observations import Observations
+from protocols.session.observations import Observations, Track
 from protocols.session.rig import Rig, RigCamera
 
+_MAX_STD_RATIO = 10.0
+"""Ratio of a row's stated std to the camera's median beyond which it is not believed: lens errors are no smaller."""
 NO_INTRINSICS = "no intrinsics (matrix and distortions in rig.toml): run `syncline intrinsics`"
 
 
@@ -135,7 +137,13 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
             use = np.ones(len(track), dtype=np.bool_)
             mine.append(
                 TrackObservations(
-                    -1, labels.index(track.label), time - time_origin, pixels, use, stamp=track.time - time_origin
+                    -1,
+                    labels.index(track.label),
+                    time - time_origin,
+                    pixels,
+                    use,
+                    stamp=track.time - time_origin,
+                    relative_std=_relative_stds(track, tracks),
                 )
             )
         if not smooth:
@@ -166,6 +174,21 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
         uncalibrated,
         outlines=outlines,
     )
+
+
+def _relative_stds(track: Track, tracks: list[Track]) -> Floats | None:
+    """Stds (n,) of a track's rows by the detector, over the median of the camera's; None if it states none.
+
+    Only ratios count: the noise of a camera is estimated from its residuals.
+    """
+    stated = [one.std for one in tracks if one.std is not None]
+    known = np.concatenate([np.zeros(0), *stated])
+    known = known[known > 0.0]
+    if track.std is None or not len(known):
+        return None
+    typical = float(np.median(known))
+    std = np.where(track.std > 0.0, track.std, typical)
+    return np.clip(std / typical, 1.0 / _MAX_STD_RATIO, _MAX_STD_RATIO)
 
 
 def nominal_intrinsics(camera: RigCamera) -> Intrinsics:

@@ -18,6 +18,8 @@ CAMERA_PARAMETERS = 18
 a lens that was not measured also the principal point 11, 12, k2 13, k3 14, log fy/fx 15 and, for a pinhole lens, p1, p2
 16, 17."""
 OFFSET, RATE, FOCAL, K1, READOUT, CENTRE, K2, K3, ASPECT, P1 = 6, 7, 8, 9, 10, 11, 13, 14, 15, 16
+CRYSTAL_RATE_STD = 1.4e-4
+"""Prior std of one crystal's rate against another's: each is within 100 ppm."""
 GIVEN_PARAMETERS = 11
 """Columns of a camera with given intrinsics; the others are never free."""
 
@@ -63,7 +65,8 @@ class TrackObservations:
 
     camera, label: indices. time: (n,) on the camera's clock relative to its epoch [s]. pixels: (n, 2) distorted.
     use: (n,) inliers. stamp: (n,) the frames' original timestamps where ``time`` differs from them, because it is
-    corrected for a given readout or by an estimated frame time (`timestamp_jitter`).
+    corrected for a given readout or by an estimated frame time (`timestamp_jitter`). relative_std: (n,) std of each
+    row's noise relative to the camera's typical row, by the detector's covariances; None = all alike.
     """
 
     camera: int
@@ -72,11 +75,29 @@ class TrackObservations:
     pixels: Floats
     use: Bools
     stamp: Floats | None = None
+    relative_std: Floats | None = None
 
     @property
     def stamps(self) -> Floats:
         """Timestamps (n,) of the rows' frames [s]: the same for all rows of a frame."""
         return self.time if self.stamp is None else self.stamp
+
+    def every(self, step: int) -> TrackObservations:
+        """Every ``step``-th row."""
+        part = slice(None, None, step)
+        return replace(
+            self,
+            time=self.time[part],
+            pixels=self.pixels[part],
+            use=self.use[part],
+            stamp=None if self.stamp is None else self.stamp[part],
+            relative_std=None if self.relative_std is None else self.relative_std[part],
+        )
+
+    @property
+    def used_relative_std(self) -> Floats:
+        """Relative stds of the rows in use."""
+        return np.ones(int(np.count_nonzero(self.use))) if self.relative_std is None else self.relative_std[self.use]
 
     def using(self, use: Bools) -> TrackObservations:
         """The same rows with another inlier mask."""
@@ -111,6 +132,19 @@ class CorrelatedNoise:
         return CorrelatedNoise(self.white_std[cameras], self.correlated_std[cameras], self.time_constant[cameras])
 
 
+@dataclass(frozen=True, slots=True)
+class ClockStep:
+    """A step of a camera's clock. camera: index. time: camera time [s] from which on it holds; size: [s] by which the
+    clock is set forward there, and its std. statistic: chi-squared of the size, its noise scaled to the effective
+    sample size."""
+
+    camera: int
+    time: float
+    size: float
+    std: float
+    statistic: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustmentState:
     """All parameters that the adjustment estimates.
@@ -118,6 +152,7 @@ class AdjustmentState:
     sigma: (cameras,) noise of one pixel coordinate. steps: convergence history. jitter: (cameras,) std [s] of the
     cameras' timestamps where frame times were estimated (`timestamp_jitter`); None = not estimated, or no jitter found.
     correlated_noise: noise model of the re-fit by generalised least squares (`gls`); None = independent rows.
+    clock_steps: for which the rows' times are corrected.
     """
 
     cameras: tuple[CameraState, ...]
@@ -126,6 +161,7 @@ class AdjustmentState:
     steps: tuple[AdjustmentStep, ...] = ()
     jitter: Floats | None = None
     correlated_noise: CorrelatedNoise | None = None
+    clock_steps: tuple[ClockStep, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +192,7 @@ class FreeParameters:
 
     pose, clock, lens: whether poses, time maps, and focal length with k1 are estimated.
     readout: whether rolling-shutter readouts are. focal_std: prior std of log focal length. k1_std: prior std of k1.
-    rate_std: prior std of a rate about 1: crystals err by 50 ppm, nominal frame rates by 1000.
+    rate_std: prior std of a rate about 1 while it is not known whether the frame rate is the nominal one.
     readout_std: prior std [s] of a readout about 0.
     """
 
@@ -178,7 +214,8 @@ class Problem:
     whose clock is the internal time. anchors: the two cameras whose pose and distance fix the gauge. lens_priors: by
     camera, priors of lenses that were not measured, None = given; () = all are given. readout_given: by camera, whether
     its readout was given, so that the rows' times are already corrected; () = none was. lens_tolerances: by camera,
-    priors for given lenses that are estimated all the same; () = they are fixed.
+    priors for given lenses that are estimated all the same; () = they are fixed. crystal_rates: by camera, whether its
+    rate differs from the reference's only as two crystals do (`CRYSTAL_RATE_STD`); () = not decided.
     """
 
     rows: tuple[TrackObservations, ...]
@@ -189,6 +226,12 @@ class Problem:
     lens_priors: tuple[LensPrior | None, ...] = ()
     readout_given: tuple[bool, ...] = ()
     lens_tolerances: tuple[LensPrior, ...] = ()
+    crystal_rates: tuple[bool, ...] = ()
+
+    def rate_std(self, camera: int) -> float:
+        """Prior std of a camera's rate about 1."""
+        crystal = bool(self.crystal_rates) and self.crystal_rates[camera]
+        return min(self.free_parameters.rate_std, CRYSTAL_RATE_STD) if crystal else self.free_parameters.rate_std
 
     def lens_prior(self, camera: int) -> LensPrior | None:
         """The prior of a lens whose parameters are all estimated; None = at most focal length and k1 are."""

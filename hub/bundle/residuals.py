@@ -60,7 +60,7 @@ class ResidualEvaluation:
     finite but meaningless. time: (n,) on the camera's clock, corrected for readout. index, weights, slope_weights:
     support in ``control`` (size, 3), the path's or all paths' control points. camera_points: (3, n) in camera axes.
     normalised: (2, n) undistorted. distortion_jacobian: (n, 2, 2) derivative of distorted by undistorted coordinates,
-    where it was computed with the residuals.
+    where it was computed with the residuals. relative_information: (n,) of the rows, by their relative stds.
     """
 
     residual: Floats
@@ -74,6 +74,7 @@ class ResidualEvaluation:
     camera_points: Floats
     normalised: Floats
     distortion_jacobian: Floats | None
+    relative_information: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,9 +109,10 @@ def predict(rows: TrackObservations, camera: CameraState, path: Trajectory) -> F
 
 
 def residual_norms(rows: TrackObservations, camera: CameraState, path: Trajectory) -> Floats:
-    """Distances (n,) [px] of rows from their predictions; NaN where the path is not defined."""
+    """Distances (n,) [px] of rows from their predictions, over their relative stds; NaN where the path is undefined."""
     residual = predict(rows, camera, path) - rows.pixels
-    return np.asarray(np.sqrt(residual[:, 0] ** 2 + residual[:, 1] ** 2))
+    norms = np.asarray(np.sqrt(residual[:, 0] ** 2 + residual[:, 1] ** 2))
+    return norms if rows.relative_std is None else norms / rows.relative_std
 
 
 def evaluate_residuals(rows: TrackObservations, camera: CameraState, path: Trajectory) -> ResidualEvaluation:
@@ -179,6 +181,7 @@ def evaluate_points(
         camera_points,
         normalised,
         distortion_jacobian,
+        np.concatenate([part.used_relative_std for part in parts]) ** -2.0,
     )
 
 

@@ -259,13 +259,7 @@ def _without_older_rows(observations: Observations, since: Mapping[str, float]) 
     for key, track in observations.tracks.items():
         keep = track.time >= since.get(key[0], -np.inf)
         if keep.any():
-            tracks[key] = replace(
-                track,
-                frame=track.frame[keep],
-                time=track.time[keep],
-                pixels=track.pixels[keep],
-                size=track.size[keep],
-            )
+            tracks[key] = track.select(keep)
     return replace(observations, tracks=tracks)
 
 

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from hub.sync.settings import PairSettings
 from hub.sync.track_cache import TrackCache
 from hub.trajectory.image_tracks import smooth_only
 from hub.two_view.relative_pose import relative_pose_between
+from protocols.geometry.types import Floats
 from protocols.session.calibration import FixedCalibration
 
 Progress = Callable[[str, float], None]
@@ -48,24 +50,25 @@ def solve_pairs(
     prepared: PreparedSession,
     report: Progress,
     *,
-    thorough: bool = False,
+    thorough: bool | Literal["first pair"] = False,
     known: FixedCalibration | None = None,
     clock_priors: Mapping[str, ExternalClockPrior] | None = None,
     arrivals: Mapping[str, ExternalClockPrior] | None = None,
 ) -> tuple[PreparedSession, list[PairSolution]]:
     """All pairs of cameras, uncalibrated ones included, and the session with the time scales that were found.
 
-    thorough: whether to try rates that a wrong nominal frame rate causes, for unconnected cameras. known: given poses;
-    pairs of two such cameras then estimate lag and rate only. clock_priors: external clock priors by camera; they
-    select a lag only where the images leave it ambiguous, which a warning reports. arrivals: the same by times of
-    arrival; pairs that have no solution near them are not searched further.
+    thorough: whether to try rates that a wrong nominal frame rate causes, for unconnected cameras. "first pair": only
+    until a pair is solved; and a camera whose best pair with three connected ones fails is left to resection. known:
+    given poses; pairs of two such cameras then estimate lag and rate only. clock_priors: external clock priors by
+    camera; they select a lag only where the images leave it ambiguous, which a warning reports. arrivals: the same by
+    times of arrival; pairs that have no solution near them are not searched further.
     """
     names = prepared.names
     todo = list(itertools.combinations(names, 2))
     is_large = len(names) > _SMALL_NETWORK and not prepared.shared_clock
     pairs: dict[tuple[str, str], PairSolution] = {}
     unguided: dict[tuple[str, str], PairSolution] = {}
-    synchronised, cache = _SynchronisedGroups(), TrackCache()
+    synchronised, cache, searched_again = _SynchronisedGroups(), TrackCache(), set[str]()
     is_ranked = len(todo) > 1 and not prepared.shared_clock
     for done, (a, b) in enumerate(_ranked(prepared, todo, report, cache) if is_ranked else todo):
         report(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
@@ -77,9 +80,16 @@ def solve_pairs(
                 pairs[a, b] = solution
                 continue
         predicted_lag = None if prepared.shared_clock else synchronised.lag(prepared, a, b)
+        if thorough == "first pair" and predicted_lag is None and synchronised.leaves(a, b, pairs.values()):
+            pairs[a, b] = PairSolution(a, b, "not searched: the most promising pair of the same camera had failed")
+            continue
         solution = _solve(prepared, (a, b), known, predicted_lag=predicted_lag, cache=cache)
         # If the predicted lag is right, a pair with a long overlap must agree with it; else it is solved over all lags.
-        if predicted_lag is not None and not solution.solved and (not is_large or _has_long_overlap(solution)):
+        again = predicted_lag is not None and not solution.solved and (not is_large or _has_long_overlap(solution))
+        if again and thorough == "first pair" and synchronised.size(a) > _MIN_REDUNDANT:
+            again = not {a, b} & searched_again  # resection corrects a camera that a wrong pair has connected
+            searched_again |= {a, b}
+        if again:
             solution, predicted_lag = _solve(prepared, (a, b), known, cache=cache), None
         if predicted_lag is None:
             unguided[a, b] = solution
@@ -96,7 +106,7 @@ def solve_pairs(
             report(f"pair {both[0]}–{both[1]} by itself", 0.56)
             pairs[both] = unguided[both] = _solve(prepared, both, known, standalone=True, cache=cache)
     if thorough and not prepared.shared_clock:
-        prepared = _connect_at_other_rates(prepared, pairs, unguided, known, report)
+        prepared = _connect_at_other_rates(prepared, pairs, unguided, known, report, thorough == "first pair")
     return prepared, list(pairs.values())
 
 
@@ -219,6 +229,23 @@ class _SynchronisedGroups:
             if group == group_b:
                 self._maps[name] = (group_a, rate * r, rate * o + offset)
 
+    def size(self, name: str) -> int:
+        """Number of cameras in the group of a camera."""
+        group = self._maps[name][0]
+        return sum(other == group for other, _, _ in self._maps.values())
+
+    def leaves(self, a: str, b: str, pairs: Iterable[PairSolution]) -> bool:
+        """Whether one of two cameras is in a group of three or more, and the other's best pair with it has failed."""
+        groups = Counter(group for group, _, _ in self._maps.values())
+        for new, old in ((a, b), (b, a)):
+            group = self._maps.get(old, ("", 1.0, 0.0))[0]
+            if new in self._maps or groups[group] < _MIN_REDUNDANT:
+                continue
+            tried = [pair.b if pair.a == new else pair.a for pair in pairs if new in (pair.a, pair.b)]
+            if any(self._maps.get(other, ("", 1.0, 0.0))[0] == group for other in tried):
+                return True
+        return False
+
     def lag(self, prepared: PreparedSession, a: str, b: str) -> float | None:
         """``t_a - t_b`` [s] in the middle of the common recording time; None if they are not connected."""
         if a not in self._maps or b not in self._maps or self._maps[a][0] != self._maps[b][0]:
@@ -248,7 +275,10 @@ def _solve(
         return solve_common_clock_pair(a, b, names)
     given = None
     if known is not None and all(name in known.cameras for name in names):
-        given = relative_pose_between(known.cameras[names[0]].pose, known.cameras[names[1]].pose)
+        poses = [known.cameras[name].pose for name in names]
+        if coincide(*(pose.position for pose in poses)):
+            return PairSolution(*names, "both cameras are known to be in one place: no motion tells their lag")
+        given = relative_pose_between(*poses)
     calibrated = all(name in prepared.cameras for name in names)
     # With more cameras the adjustment estimates lenses and tests each clock: an imprecise lag suffices to start.
     settings = replace(settings or PairSettings(), standalone=standalone or len(prepared.names) < _MIN_REDUNDANT)
@@ -266,12 +296,19 @@ def _solve(
     )
 
 
+def coincide(*positions: Floats) -> bool:
+    """Whether positions (3,) differ by no more than rounding, so that rays from them meet nowhere else."""
+    extent = np.ptp(np.array(positions), axis=0)
+    return bool(np.abs(extent).max() <= 1e-9 * max(float(np.abs(positions).max()), 1e-9))
+
+
 def _connect_at_other_rates(
     prepared: PreparedSession,
     pairs: dict[tuple[str, str], PairSolution],
     unguided: dict[tuple[str, str], PairSolution],
     known: FixedCalibration | None,
     report: Progress,
+    first_pair_only: bool,
 ) -> PreparedSession:
     """Connect cameras outside the largest group at rates far from 1; ``pairs`` are replaced in place.
 
@@ -282,6 +319,8 @@ def _connect_at_other_rates(
     while True:
         groups = connected_components(names, [pair for pair in pairs.values() if pair.solved])
         largest = groups[0] if groups else []
+        if len(largest) > 1 and first_pair_only:
+            return prepared
         found = None
         for a, b in pairs:
             across = (a in largest) != (b in largest) if len(largest) > 1 else not pairs[a, b].solved

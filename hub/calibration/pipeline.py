@@ -8,15 +8,15 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from hub.baselines.session_lags import solve_pair_by_paper
 from hub.bundle import covariance as cov
-from hub.bundle import rolling_shutter
+from hub.bundle import model_comparison
 from hub.bundle.adjustment import adjust, estimate_noise, residual_norms
-from hub.bundle.correlated_noise import refit_with_correlated_noise
+from hub.bundle.correlated_noise import MIN_INFLATION, refit_with_correlated_noise
 from hub.bundle.initialisation import (
     Reconstruction,
     inlier_share,
@@ -28,12 +28,14 @@ from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
 from hub.bundle.problem import AdjustmentState, FreeParameters, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.bundle.timestamp_jitter import estimate_frame_times
-from hub.calibration.pair_network import Progress, describe_timing, frame_rate_warnings, solve_pairs
+from hub.calibration.given_values import refuted_lens
+from hub.calibration.pair_network import Progress, coincide, describe_timing, frame_rate_warnings, solve_pairs
 from hub.calibration.result import assemble_calibration, focal_stds, isolated_pair_report
 from hub.calibration.rigid_body.solve import calibrate_bodies
 from hub.calibration.rigid_body.views import body_labels
 from hub.calibration.self_calibration import MAX_FOCAL_STD, initial_self_calibration, with_updated_lenses
 from hub.calibration.solution import Solution
+from hub.calibration.unconnected import connect_by_resection
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate, connected_components, synchronise_clocks
 from hub.clocks.external_prior import ExternalClockPrior
 from hub.sync.hypothesis import PairSolution
@@ -56,6 +58,10 @@ _MAX_LAG_CHANGE = 20e-3  # s
 _LAG_CONFLICT = "the trajectory puts its clock"
 _LENS_ITERATIONS = 3
 _SMALL_BODY = 4  # points of a single tag
+_MAX_CLOCK_STEPS, _STEP_ITERATIONS = 2, 2
+_SAME_STEP_S = 2.0
+_WRONG_LENS = 0.05  # relative error of a focal length that no zoom, crop or temperature explains: another lens
+_MIN_TO_BLAME_A_LENS = 4  # cameras: of three, another camera's pose absorbs too much of a wrong lens
 _ONLINE_MIN_INFLATION = 2.0  # rows per effective row from which the noise of a recording that goes on is correlated
 _MAX_ONLINE_ROW_RATE = 120.0  # rows a second, of all cameras
 
@@ -72,6 +78,7 @@ def calibrate(
     clock_priors: Mapping[str, ExternalClockPrior] | None = None,
     arrivals: Mapping[str, ExternalClockPrior] | None = None,
     online: bool = False,
+    refine_lenses: bool = False,
 ) -> Calibration:
     """Timing and poses of all cameras from their observations, without initial values.
 
@@ -81,7 +88,7 @@ def calibrate(
     search over clock rates that a wrong nominal frame rate causes (times made from frame numbers, which a live
     camera's are not) and over interrupted tracks. seed: of the random samples of the pose nodes; the other solvers are
     deterministic. clock_priors: external clock priors by camera, used only where the images leave lags ambiguous.
-    arrivals: the same by times of arrival at a hub; lags far from them are not searched. online: see
+    arrivals: the same by times of arrival at a hub; lags far from them are not searched. online, refine_lenses: see
     `final_adjustment`. Raises Refused, with a reason for every camera and the pair reports, where fewer than two
     cameras can be placed.
     """
@@ -107,8 +114,12 @@ def calibrate(
     elif solver == "paper" and known is None:
         pairs = paper_pairs(prepared, observations, report)
     else:
+        # With a solved path, resection finds the other cameras, at a fraction of the cost of further pairs.
+        extent: bool | Literal["first pair"] = (
+            "first pair" if thorough and solver == "joint" and known is None else thorough
+        )
         prepared, pairs = solve_pairs(
-            prepared, report, thorough=thorough, known=known, clock_priors=clock_priors, arrivals=arrivals
+            prepared, report, thorough=extent, known=known, clock_priors=clock_priors, arrivals=arrivals
         )
         prepared = replace(
             prepared,
@@ -119,7 +130,7 @@ def calibrate(
         if known is not None:
             solution = solve_with_known_poses(prepared, pairs, known, report)
         elif solver == "paper":
-            solution = solve_paper(prepared, pairs, report, observations if has_sizes else None)
+            solution = solve_paper(rig, prepared, pairs, report, observations if has_sizes else None)
         elif solver == "distributed":
             from hub.distributed.solver import DistributedPoseSolver
 
@@ -127,7 +138,9 @@ def calibrate(
                 prepared, pairs, report, DistributedPoseSolver(rig, prepared, observations, report, seed)
             )
         else:
-            solution = solve_with_unknown_lenses(rig, prepared, pairs, report, online=online)
+            solution = solve_with_unknown_lenses(
+                rig, prepared, pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough
+            )
         report("covariances", 0.95)
         return assemble_calibration(rig, solution)
     except Refused as refusal:
@@ -183,7 +196,14 @@ def paper_pairs(prepared: PreparedSession, observations: Observations, report: P
 
 
 def solve_with_unknown_lenses(
-    rig: Rig, prepared: PreparedSession, pairs: list[PairSolution], report: Progress, *, online: bool = False
+    rig: Rig,
+    prepared: PreparedSession,
+    pairs: list[PairSolution],
+    report: Progress,
+    *,
+    online: bool = False,
+    refine_lenses: bool = False,
+    thorough: bool = False,
 ) -> Solution:
     """The network with cameras of unknown intrinsics, where the common trajectory determines their focal lengths.
 
@@ -191,11 +211,13 @@ def solve_with_unknown_lenses(
     """
     trial, trial_pairs = initial_self_calibration(rig, prepared, pairs)
     if trial is prepared:
-        return solve_network(prepared, pairs, report, online=online)
+        return solve_network(prepared, pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough)
     report("focal lengths", 0.58)
     try:
         for _ in range(_LENS_ITERATIONS):
-            solution = solve_network(trial, trial_pairs, report, online=online)
+            solution = solve_network(
+                trial, trial_pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough
+            )
             found = dict(zip(solution.reconstruction.names, solution.reconstruction.state.cameras, strict=True))
             lenses = {name: camera.intrinsics for name, camera in found.items()}
             trial, trial_pairs, changed = with_updated_lenses(trial, trial_pairs, lenses)
@@ -206,7 +228,7 @@ def solve_with_unknown_lenses(
             name: refusal.cameras.get(name, "") for name in trial.cameras if trial.cameras[name].lens_prior is not None
         }
         without = replace(prepared, refused=_with_lens_failure(prepared, reasons))
-        return solve_network(without, pairs, report, online=online)
+        return solve_network(without, pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough)
     uncalibrated = [name for name in trial.cameras if trial.cameras[name].lens_prior is not None]
     left = {name: solution.refused[name] for name in uncalibrated if name in solution.refused}
     refused = solution.refused | {
@@ -242,6 +264,8 @@ def solve_network(
     distributed_solver: DistributedPoseSolver | None = None,
     *,
     online: bool = False,
+    refine_lenses: bool = False,
+    thorough: bool = False,
 ) -> Solution:
     """One adjusted network from the pairs; cameras that do not fit are refused with a reason.
 
@@ -250,6 +274,7 @@ def solve_network(
     refused = dict(prepared.refused)
     free_parameters = FreeParameters(clock=not prepared.shared_clock)
     graph = _largest_component(prepared, list(prepared.cameras), pairs, refused)
+    unfit: set[str] = set()
     with_rate_prior = replace(free_parameters, rate_std=_rate_prior_std(graph, free_parameters.rate_std))
     while True:
         if distributed_solver is not None:
@@ -258,12 +283,12 @@ def solve_network(
             reconstruction, unplaced = reconstruct_incrementally(
                 prepared.cameras, graph, prepared.rows, prepared.labels, lambda text: report(text, 0.6), with_rate_prior
             )
-            reconstruction = final_adjustment(reconstruction, report, online=online)
+            reconstruction = final_adjustment(reconstruction, report, online=online, refine_lenses=refine_lenses)
             # The narrow rate prior only stabilises the estimate; stds are computed with the usual one.
             usual = replace(reconstruction.problem.free_parameters, rate_std=free_parameters.rate_std)
             reconstruction.problem = replace(reconstruction.problem, free_parameters=usual)
         refused |= unplaced
-        inconsistent = [name for name in reconstruction.names if not fits_trajectory(reconstruction, name)]
+        inconsistent = misfits(reconstruction)
         # A wrong lens of an uncalibrated camera may be the cause of all the others' misfit: it goes first.
         inconsistent = [name for name in inconsistent if prepared.cameras[name].lens_prior is not None] or inconsistent
         if inconsistent:
@@ -274,7 +299,9 @@ def solve_network(
                 f"only {100 * share:.0f} % of its {count} observations fit the trajectory seen by the other cameras"
             )
         else:
-            worst, reason = _least_certain_lens(reconstruction)
+            worst, reason = _wrong_lens(reconstruction)
+            if not reason:
+                worst, reason = _least_certain_lens(reconstruction)
             if not reason:
                 worst, reason = least_certain_camera(reconstruction)
             if not reason:
@@ -282,10 +309,29 @@ def solve_network(
             if not reason:
                 break
             refused[worst] = reason
+        if not inconsistent:
+            unfit.add(worst)  # resection would place it alike
         remaining = [name for name in reconstruction.names if name != worst]
         if len(remaining) < 2:
             raise Refused(f"no two cameras can be placed ({worst}: {refused[worst]})", refused)
         graph = _largest_component(prepared, remaining, list(graph.inlier_pairs), refused)
+    unconnected = [name for name in prepared.cameras if name in refused and name not in unfit]
+    if thorough and unconnected and not prepared.shared_clock:
+        report("resection of further cameras", 0.93)
+        prepared, reconstruction, more, reasons = connect_by_resection(
+            prepared,
+            reconstruction,
+            unconnected,
+            free_parameters,
+            lambda trial: final_adjustment(trial, report, online=online, refine_lenses=refine_lenses),
+            _misfit,
+        )
+        if more:
+            replaced = {frozenset((pair.a, pair.b)) for pair in more}
+            pairs = [pair for pair in pairs if frozenset((pair.a, pair.b)) not in replaced] + more
+            prepared = replace(prepared, warnings=prepared.warnings + frame_rate_warnings(prepared, pairs))
+        refused = {name: reason for name, reason in refused.items() if name not in reconstruction.names}
+        refused |= {name: f"{reason}; {refused[name]}" for name, reason in reasons.items()}
     warnings = tuple(
         f"pair {pair.a}–{pair.b} contradicts the other pairs and was rejected" for pair in graph.outlier_pairs
     )
@@ -293,6 +339,15 @@ def solve_network(
     if distributed_solver is not None:
         solver, warnings = "distributed", warnings + distributed_solver.warnings
     return Solution(reconstruction, tuple(pairs), in_rig_order(refused, prepared), prepared, solver, warnings)
+
+
+def _misfit(reconstruction: Reconstruction, name: str) -> str:
+    """Why a camera does not fit the others; "" if it does."""
+    if not fits_trajectory(reconstruction, name):
+        share, count = inlier_share(reconstruction, name)
+        return f"only {100 * share:.0f} % of its {count} observations fit the trajectory seen by the other cameras"
+    worst, reason = least_certain_camera(reconstruction)
+    return reason if worst == name else ""
 
 
 def _rate_prior_std(graph: ClockGraph, usual: float) -> float:
@@ -364,7 +419,11 @@ def _conflicts_with_pair(reconstruction: Reconstruction, graph: ClockGraph) -> t
 
 
 def solve_paper(
-    prepared: PreparedSession, pairs: list[PairSolution], report: Progress, sized: Observations | None = None
+    rig: Rig,
+    prepared: PreparedSession,
+    pairs: list[PairSolution],
+    report: Progress,
+    sized: Observations | None = None,
 ) -> Solution:
     """Network from the pairs of the paper's method: averaged clocks, no adjustment.
 
@@ -383,7 +442,7 @@ def solve_paper(
     else:
         from hub.baselines.session_poses import reconstruct_by_paper
 
-        reconstruction, unplaced = reconstruct_by_paper(prepared, sized, graph)
+        reconstruction, unplaced = reconstruct_by_paper(rig, prepared, sized, graph)
     if prepared.shared_clock:
         free_parameters = replace(reconstruction.problem.free_parameters, clock=False)
         reconstruction.problem = replace(reconstruction.problem, free_parameters=free_parameters)
@@ -405,6 +464,8 @@ def solve_with_known_poses(
         refused[name] = "not in the known calibration"
     cameras = {name: camera for name, camera in prepared.cameras.items() if name in known.cameras}
     inside = replace(prepared, cameras=cameras)
+    if len(cameras) > 1 and coincide(*(known.cameras[name].pose.position for name in cameras)):
+        raise Refused(f"the known cameras {', '.join(cameras)} are in one place: their rays meet nowhere else", refused)
     graph = _largest_component(inside, list(cameras), pairs, refused)
     report("adjusting", 0.75)
     poses = {name: known.cameras[name].pose for name in graph.clocks}
@@ -462,27 +523,78 @@ def fits_trajectory(reconstruction: Reconstruction, name: str) -> bool:
     return share >= _MIN_INLIER_SHARE and count >= _MIN_ROWS
 
 
-def final_adjustment(
-    reconstruction: Reconstruction, report: Progress, *, warm: bool = False, online: bool = False
-) -> Reconstruction:
-    """The final adjustment, with lenses and readouts estimated where the data clearly support it.
+def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
+    """Problem and state with the rows after clock steps corrected, as far as these explain the observations better."""
+    for _ in range(_MAX_CLOCK_STEPS):
+        step = model_comparison.find_clock_step(problem, state)
+        if step is None:
+            break
+        middle = state.cameras[step.camera].centre
+        trial, trial_state, _ = adjust(model_comparison.with_clock_step(problem, step, middle), state, rounds=2)
+        for _ in range(_STEP_ITERATIONS):  # the size is of one Gauss-Newton step, which leaves a part of a large one
+            left = model_comparison.find_clock_step(trial, trial_state)
+            if left is None or left.camera != step.camera or abs(left.time - step.time) > _SAME_STEP_S:
+                break
+            step = replace(step, size=step.size + left.size)
+            corrected = model_comparison.with_clock_step(problem, step, middle)
+            trial, trial_state, _ = adjust(corrected, trial_state, rounds=2)
+        if not _bic_prefers(trial, trial_state, problem, state):
+            break
+        problem, state = trial, replace(trial_state, clock_steps=(*trial_state.clock_steps, step))
+    return problem, state
 
-    warm: the state is near the solution, and which lenses to estimate is not decided again. online: a part of a
-    recording that goes on. Then readouts are not estimated: on the first 70 to 110 s of a real rig they came out at
-    -34 and +42 ms with stds of 10 ms, after 130 s not at all. And the re-fit with correlated noise, whose lens
-    tolerances make early stds honest, waits for less correlation.
+
+def misfits(reconstruction: Reconstruction) -> list[str]:
+    """Cameras that do not fit the trajectory that the others give."""
+    return [name for name in reconstruction.names if not fits_trajectory(reconstruction, name)]
+
+
+def _wrong_lens(reconstruction: Reconstruction) -> tuple[str, str]:
+    """The camera whose measured lens is refuted most, by far more than any lens changes in the field, and the reason.
+
+    Without correlated residuals there is none: a wrong lens displaces successive rows alike.
+    """
+    problem, state, names = reconstruction.problem, reconstruction.state, reconstruction.names
+    if state.correlated_noise is not None or not problem.free_parameters.clock or len(names) < _MIN_TO_BLAME_A_LENS:
+        return "", ""
+    if max(correlation_inflation(problem, state, camera) for camera in range(len(names))) < MIN_INFLATION:
+        return "", ""
+    for one in model_comparison.refuted_lenses(problem, state)[:1]:
+        if abs(one.focal_change) - 3.0 * one.focal_std > _WRONG_LENS:
+            return names[one.camera], refuted_lens(one)
+    return "", ""
+
+
+def final_adjustment(
+    reconstruction: Reconstruction,
+    report: Progress,
+    *,
+    warm: bool = False,
+    online: bool = False,
+    refine_lenses: bool = False,
+) -> Reconstruction:
+    """The final adjustment, with readouts estimated where the data clearly support it.
+
+    refine_lenses: measured lenses may change within their tolerance where the data clearly support it; else they are
+    kept exactly. warm: the state is near the solution. online: a part of a recording that goes on. Then readouts are
+    not estimated: on the first 70 to 110 s of a real rig they came out at -34 and +42 ms with stds of 10 ms, after
+    130 s not at all. And the re-fit with correlated noise, which makes early stds honest, waits for less correlation.
     """
     report("adjusting", 0.75)
     problem, state = reconstruction.problem, reconstruction.state
     if warm and online and state.jitter is None:
         # Near the solution the re-fit alone converges; where it does not apply, the adjustment does.
         problem, state = estimate_frame_times(problem, state)
+        problem = model_comparison.with_crystal_rates(problem, state)
         refitted = _refit_online(problem, state)
         if refitted[1] is not state:
             return _with_state(reconstruction, *refitted)
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
+    if not online:
+        problem, state = _with_clock_steps(problem, state)
     problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
-    if not warm:
+    problem = model_comparison.with_crystal_rates(problem, state)
+    if refine_lenses and not warm:
         report("adjusting the lenses", 0.85)
         freed = replace(problem, free_parameters=replace(problem.free_parameters, lens=True))
         freed_problem, freed_state, _ = adjust(freed, state, rounds=2, progress=lambda text: report(text, 0.85))
@@ -491,17 +603,22 @@ def final_adjustment(
     if (
         not online
         and problem.free_parameters.clock
-        and rolling_shutter.are_readouts_observable(problem, state, estimate_smoothness(problem, state))
+        and model_comparison.are_readouts_observable(problem, state, estimate_smoothness(problem, state))
     ):
         report("adjusting the readouts", 0.9)
-        read_problem, read_state, _ = adjust(rolling_shutter.with_free_readouts(problem), state, rounds=2)
-        if rolling_shutter.are_readouts_plausible(read_state) and _bic_prefers(
+        read_problem, read_state, _ = adjust(model_comparison.with_free_readouts(problem), state, rounds=2)
+        if model_comparison.are_readouts_plausible(read_problem, read_state) and _bic_prefers(
             read_problem, read_state, problem, state, 1
         ):
             problem, state = read_problem, read_state
+    adjusted = _with_state(reconstruction, problem, state)
+    if not online and (misfits(adjusted) or _wrong_lens(adjusted)[0]):
+        return adjusted  # a camera that will be left out: its errors are no noise
     report("correlated noise", 0.92)
-    refit = _refit_online if online else refit_with_correlated_noise
-    return _with_state(reconstruction, *refit(problem, state))
+    refitted = _refit_online(problem, state) if online else refit_with_correlated_noise(problem, state, refine_lenses)
+    if refitted[1] is state and any(problem.crystal_rates):
+        refitted = adjust(problem, state, rounds=1, iterations=9)[:2]  # the re-fit would have applied the rates' prior
+    return _with_state(reconstruction, *refitted)
 
 
 def _refit_online(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
@@ -516,20 +633,8 @@ def _refit_online(problem: Problem, state: AdjustmentState) -> tuple[Problem, Ad
     every = max(1, int(np.ceil(rate / _MAX_ONLINE_ROW_RATE)))
     thinned = problem
     if every > 1:
-        thinned = replace(
-            problem,
-            rows=tuple(
-                replace(
-                    rows,
-                    time=rows.time[::every],
-                    pixels=rows.pixels[::every],
-                    use=rows.use[::every],
-                    stamp=None if rows.stamp is None else rows.stamp[::every],
-                )
-                for rows in problem.rows
-            ),
-        )
-    refitted = refit_with_correlated_noise(thinned, state, _ONLINE_MIN_INFLATION)
+        thinned = replace(problem, rows=tuple(rows.every(every) for rows in problem.rows))
+    refitted = refit_with_correlated_noise(thinned, state, min_inflation=_ONLINE_MIN_INFLATION)
     return (problem, state) if refitted[1] is state else refitted
 
 

@@ -11,12 +11,14 @@ from hub.bundle import covariance as cov
 from hub.bundle.adjustment import predict, residual_norms
 from hub.bundle.datum.control_outliers import reject_outliers
 from hub.bundle.datum.control_point_adjustment import adjust_to_control_points
-from hub.bundle.datum.gauge import fix_gauge, identity_gauge, is_overdetermined, transform_state
+from hub.bundle.datum.gauge import fix_gauge, identity_gauge, is_overdetermined, transform_state, with_exact_poses
 from hub.bundle.initialisation import Reconstruction
+from hub.bundle.model_comparison import REFUTED_SIGMA
 from hub.bundle.noise_scale import rescale_noise
 from hub.bundle.preprocessing import PreparedSession
-from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, READOUT, AdjustmentState, Problem
+from hub.bundle.problem import CAMERA_PARAMETERS, CRYSTAL_RATE_STD, FOCAL, READOUT, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
+from hub.calibration.given_values import refuted_lens_warnings
 from hub.calibration.held_gauge import similarity_to_published
 from hub.calibration.pair_network import pair_lag
 from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
@@ -67,14 +69,19 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
             )
             gauge = replace(gauge, similarity=held)
         state = transform_state(state, gauge.similarity)
-        if gauge.scale == "metric" and problem.free_parameters.pose and is_overdetermined(rig, names):
+        adjustable = problem.free_parameters.pose and solution.solver != "paper"  # its method has no adjustment
+        if gauge.scale == "metric" and adjustable and is_overdetermined(rig, names):
             prior = estimate_smoothness(problem, state)
             fitted = adjust_to_control_points(rig, names, problem, rescale_noise(problem, state, prior), prior)
             state = replace(fitted, sigma=state.sigma)
+        if gauge.scale == "metric":
+            state = with_exact_poses(rig, names, state)
     else:
         gauge = identity_gauge(len(names), solution.known.scale)
     prior = estimate_smoothness(problem, state)
-    covariance = cov.covariance(problem, rescale_noise(problem, state, prior), prior, gauge.information, datum_points)
+    covariance = cov.covariance(
+        problem, rescale_noise(problem, state, prior), prior, gauge.information, datum_points, gauge.exact
+    )
     lens_stds = focal_stds(problem, state, covariance)
     readout_stds = np.sqrt(np.maximum(np.diag(covariance.cameras)[READOUT::CAMERA_PARAMETERS], 0.0))
     time_origins = [solution.prepared.time_origins[name] for name in names]
@@ -88,6 +95,10 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         time_at_centre = float(reference_at_centre / time_scales[reference] + time_origins[reference])
         maps.append(TimeMap(rate, time_at_centre - rate * (camera.centre / time_scale + time_origin)))
     maps[reference] = TimeMap(1.0, 0.0)
+    lag_times = [
+        float(camera.camera_time(cov.middle_of_overlap(problem, state, i, reference))[0])
+        for i, camera in enumerate(state.cameras)
+    ]
     cameras = {
         name: CameraCalibration(
             name=name,
@@ -102,10 +113,16 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
             focal_std=float(lens_stds[i]),
             readout=_readout(rig, name, state.cameras[i].readout / time_scales[i]),
             readout_std=float(readout_stds[i]) / time_scales[i],
-            lag_time=state.cameras[i].centre / time_scales[i] + time_origins[i],
+            lag_time=float(lag_times[i]) / time_scales[i] + time_origins[i],
+            lag_std=_lag_std(problem, state, covariance, i, reference) / time_scales[reference],
             clock_rate_std=cov.clock_rate_std(covariance, state, i, reference)
             if problem.free_parameters.clock
             else 0.0,
+            clock_steps=tuple(
+                (step.time / time_scales[i] + time_origins[i], step.size / time_scales[i], step.std / time_scales[i])
+                for step in state.clock_steps
+                if step.camera == i
+            ),
         )
         for i, name in enumerate(names)
     }
@@ -139,8 +156,11 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         + gauge.warnings
         + _estimated_lenses(cameras)
         + _refined_lenses(names, problem, state)
+        + (refuted_lens_warnings(names, problem, state) if published is None else ())
+        + _other_frame_rates(rig, cameras, names[reference])
         + _estimated_readouts(cameras)
-        + _estimated_jitter(names, state, time_scales),
+        + _estimated_jitter(names, state, time_scales)
+        + _clock_step_warnings(cameras),
         residuals={
             name: _residual_rows(problem, state, i, time_origins[i], time_scales[i]) for i, name in enumerate(names)
         },
@@ -195,12 +215,14 @@ def _reordered(problem: Problem, state: AdjustmentState, order: list[int]) -> tu
         lens_priors=tuple(problem.lens_priors[i] for i in order) if problem.lens_priors else (),
         readout_given=tuple(problem.readout_given[i] for i in order) if problem.readout_given else (),
         lens_tolerances=tuple(problem.lens_tolerances[i] for i in order) if problem.lens_tolerances else (),
+        crystal_rates=tuple(problem.crystal_rates[i] for i in order) if problem.crystal_rates else (),
     )
     return reordered, replace(
         state,
         cameras=tuple(state.cameras[i] for i in order),
         sigma=state.sigma[order],
         jitter=None if state.jitter is None else state.jitter[order],
+        clock_steps=tuple(replace(step, camera=new_index[step.camera]) for step in state.clock_steps),
         correlated_noise=None if state.correlated_noise is None else state.correlated_noise.select(order),
     )
 
@@ -236,6 +258,20 @@ def _refined_lenses(names: list[str], problem: Problem, state: AdjustmentState) 
     return (f"given lenses were refined within their tolerance: change of focal lengths {changes} (tolerance 1 %)",)
 
 
+def _other_frame_rates(rig: Rig, cameras: dict[str, CameraCalibration], reference: str) -> tuple[str, ...]:
+    """One sentence for each camera whose clock rate no crystal explains."""
+    out = []
+    for name, camera in cameras.items():
+        rate, std, fps = camera.time_map.clock_rate, camera.clock_rate_std, rig.cameras[name].fps
+        if (rate - 1.0) ** 2 > REFUTED_SIGMA**2 * (CRYSTAL_RATE_STD**2 + std**2):
+            out.append(
+                f"{name}: its times run {1e6 * (rate - 1.0):+.0f} ± {1e6 * std:.0f} ppm against {reference}'s, more "
+                f"than the 100 ppm of crystals: a different frame rate, {fps / rate:.5g} fps for {fps:.5g}, or that of "
+                f"{reference}"
+            )
+    return tuple(out)
+
+
 def _readout(rig: Rig, name: str, found: float) -> float:
     """Readout time [s] from the first row to the last: as given, else as estimated; 0 if neither."""
     given = rig.cameras[name].readout
@@ -262,12 +298,36 @@ def _estimated_jitter(names: list[str], state: AdjustmentState, time_scales: lis
     )
 
 
+def _clock_step_warnings(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
+    """One sentence for each clock step."""
+    return tuple(
+        f"{name}: its clock steps by {1e3 * size:+.1f} ± {1e3 * std:.1g} ms at its time {time:.2f} s; its map holds "
+        f"{'before' if time > camera.lag_time else 'after'} the step, and the rows on the other side were corrected"
+        for name, camera in cameras.items()
+        for time, size, std in camera.clock_steps
+    )
+
+
 def _time_map_std(
     problem: Problem, state: AdjustmentState, covariance: cov.Covariance, camera: int, reference: int
 ) -> float:
     if not problem.free_parameters.clock or camera == reference:
         return 0.0
-    variance = cov.time_map_std(covariance, state, camera, reference) ** 2
+    return _with_jitter(cov.time_map_std(covariance, state, camera, reference), problem, state, camera, reference)
+
+
+def _lag_std(
+    problem: Problem, state: AdjustmentState, covariance: cov.Covariance, camera: int, reference: int
+) -> float:
+    """Std [s] of the map onto the reference camera's clock in the middle of their common span."""
+    if not problem.free_parameters.clock or camera == reference:
+        return 0.0
+    std = float(cov.relative_clock_stds(covariance, problem, state)[camera, reference])
+    return _with_jitter(std / state.cameras[reference].rate, problem, state, camera, reference)
+
+
+def _with_jitter(std: float, problem: Problem, state: AdjustmentState, camera: int, reference: int) -> float:
+    variance = std**2
     if state.jitter is not None:
         # The map refers to the mean time stamp: its variance includes that of the mean of so many jittered stamps.
         for one in (camera, reference):
@@ -318,7 +378,8 @@ def _sampling_rate(rig: Rig, problem: Problem, names: list[str], time_scales: li
 
 
 def observing_cameras(problem: Problem, state: AdjustmentState, label: int, time: Floats) -> Floats:
-    """Number of cameras with an observation of the point within SEEN_WITHIN of internal reference times (n,)."""
+    """Number of cameras that observed the point within SEEN_WITHIN of internal reference times (n,), both before and
+    after them or at them."""
     # With a shared clock a point is observed at its own instant or not at all.
     within = INSTANT_TOLERANCE_S if isinstance(state.trajectories[label].basis, PointBasis) else SEEN_WITHIN
     count = np.zeros(len(time))
@@ -329,9 +390,14 @@ def observing_cameras(problem: Problem, state: AdjustmentState, label: int, time
             continue
         observation_times = np.sort(camera.reference_time(joined))
         after = np.clip(np.searchsorted(observation_times, time), 1, len(observation_times) - 1)
-        count += (
+        near = (
             np.minimum(np.abs(observation_times[after] - time), np.abs(time - observation_times[after - 1])) <= within
         )
+        # Before its first and after its last observation of the point a camera has seen nothing of it.
+        span = (time >= observation_times[0] - INSTANT_TOLERANCE_S) & (
+            time <= observation_times[-1] + INSTANT_TOLERANCE_S
+        )
+        count += near & span
     return count
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from hub.bundle.adjustment import adjust
 from hub.bundle.initialisation import Reconstruction, inlier_share, reconstruct_with_known_poses
 from hub.bundle.preprocessing import PreparedSession, prepare
-from hub.calibration.pair_network import Progress
+from hub.calibration.pair_network import Progress, coincide
 from hub.calibration.result import trajectory_tables
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
 from protocols.core.clocks import CameraTime
@@ -61,6 +61,8 @@ def triangulate(
     while True:
         if len(names) < 2:
             raise Refused(_too_few_cameras(names, unused), unused)
+        if coincide(*(known[name].pose.position for name in names)):
+            raise Refused(f"the cameras {', '.join(names)} are in one place: their rays meet nowhere else", unused)
         report("adjusting the trajectories", 0.4)
         reconstruction = _reconstruct(prepared, known, names)
         worst = min(reconstruction.names, key=lambda name: inlier_share(reconstruction, name)[0])

@@ -214,7 +214,7 @@ def node_calibration(rig: Rig, nodes: NodeHost | None) -> Calibration:
         assert lens is not None
         rate, offset, std = nodes.clock(name)
         pose = gauge.similarity.pose(poses[name])
-        cameras[name] = CameraCalibration(name, lens, pose, TimeMap(rate, offset), std, stds[name], 0.0)
+        cameras[name] = CameraCalibration(name, lens, pose, TimeMap(rate, offset), std, stds[name], 0.0, lag_std=std)
     return Calibration(
         cameras=cameras,
         reference=names[0],

@@ -34,7 +34,7 @@ def calibration_message(calibration: Calibration, revision: int, boot_ids: dict[
                 translation=camera.pose.translation.tolist(),
                 time_offset=camera.time_map.time_offset,
                 clock_rate=camera.time_map.clock_rate,
-                time_offset_std=camera.time_offset_std,
+                time_offset_std=camera.lag_std,
                 position_std=camera.position_std.tolist(),
                 rms_px=camera.rms_px,
                 matrix=lens.matrix.ravel().tolist(),

@@ -108,7 +108,7 @@ def assess_refusal(refused: Refused, rig: Rig) -> QualityAssessment:
 
 def half_interval_ms(camera: CameraCalibration) -> float:
     """Half the 95 % interval of a camera's time offset [ms]."""
-    return 1e3 * INTERVAL_95 * camera.time_offset_std
+    return 1e3 * INTERVAL_95 * camera.lag_std
 
 
 def _ppm(camera: CameraCalibration) -> float:

@@ -41,8 +41,8 @@ def cameras(calibration: Calibration, used: dict[str, RowUsage]) -> str:
     unit = calibration.units if calibration.scale == "metric" else "first baseline = 1"
     head = [
         "Camera",
-        "Clock offset <small>s, ± ms (95 %)</small>",
-        "Clock rate <small>ppm</small>",
+        "Lag <small>s at mid-overlap, ± ms (95 %)</small>",
+        "Clock rate <small>ppm, ± std</small>",
         f"Position <small>{esc(unit)}, ± std</small>",
         "Residual <small>px rms</small>",
         "Rows used",
@@ -51,7 +51,7 @@ def cameras(calibration: Calibration, used: dict[str, RowUsage]) -> str:
     for name, camera in calibration.cameras.items():
         reference = name == calibration.reference
         half = half_interval_ms(camera)
-        offset = number(camera.time_map.time_offset, 6, sign=not reference)
+        offset = number(camera.lag, 6, sign=not reference)
         uncertainty = '<small class="quiet">reference</small>' if reference else f"± {short(half, figures=2)}"
         ppm = 1e6 * (camera.time_map.clock_rate - 1.0)
         total = used[name].total
@@ -59,7 +59,8 @@ def cameras(calibration: Calibration, used: dict[str, RowUsage]) -> str:
             [
                 f"<b>{esc(name)}</b>",
                 f'{offset} <span class="pm">{uncertainty}</span>',
-                number(ppm, 1, sign=not reference),
+                number(ppm, 1, sign=not reference)
+                + ("" if reference else f' <span class="pm">± {short(1e6 * camera.clock_rate_std, figures=2)}</span>'),
                 _position(camera.pose.position, camera.position_std),
                 number(camera.rms_px, 2),
                 f"{whole(used[name].used)} / {whole(total)} <small>({100 * used[name].share:.0f}{THIN}%)</small>",

@@ -41,9 +41,7 @@ def offset_intervals(calibration: Calibration, used: dict[str, RowUsage]) -> str
         y = 8 + row * (index + 0.5)
         camera, half = calibration.cameras[name], halves[name]
         parts.append(text(0, y + 4, name, "rowname"))
-        parts.append(
-            text(left - 20, y + 4, f"{number(camera.time_map.time_offset, 6, sign=True)}{THIN}s", "figure", "end")
-        )
+        parts.append(text(left - 20, y + 4, f"{number(camera.lag, 6, sign=True)}{THIN}s", "figure", "end"))
         if name == calibration.reference:
             parts.append(f'<path class="diamond" d="M{x(0) - 6:.1f} {y:.1f}l6 -6 6 6 -6 6z"/>')
             parts.append(text(_WIDTH - right + 16, y + 4, "reference: exact", "tick"))
@@ -57,7 +55,7 @@ def offset_intervals(calibration: Calibration, used: dict[str, RowUsage]) -> str
         interval = 1e3 * used[name].interval
         share = f" ({100 * half / interval:.1f}{THIN}% of a frame)" if interval > 0 else ""
         parts.append(text(_WIDTH - right + 16, y + 4, f"±{THIN}{short(half, figures=2)}{THIN}ms{share}", "tick"))
-    return drawing(_WIDTH, height, parts, "Time offset of each camera with its 95 % interval")
+    return drawing(_WIDTH, height, parts, "Lag of each camera at mid-overlap with its 95 % interval")
 
 
 def residuals_over_time(calibration: Calibration) -> str:

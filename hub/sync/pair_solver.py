@@ -69,7 +69,7 @@ _MAX_COST_RATIO = 0.2  # of the median cost of lags with similar support
 _SAME_LAG = 0.1  # s
 _MAX_REPETITIONS = 4  # other lags at which the solution's own geometry is tried
 _FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
-_FRAME_RATE_RATIOS = tuple(
+FRAME_RATE_RATIOS = tuple(
     sorted(
         {round(a / b, 9) for a in _FRAME_RATES for b in _FRAME_RATES if 0.4 < a / b < 2.5 and a != b},
         key=lambda rate: abs(np.log(rate)),
@@ -166,7 +166,7 @@ class _PairSearch:
             for k in range(1, count + 1):
                 yield 1.0 + k * slip
                 yield 1.0 - k * slip
-        yield from _FRAME_RATE_RATIOS
+        yield from FRAME_RATE_RATIOS
 
     def reuse_refusal(self, previous_refusal: PairSolution | None) -> PairSolution | None:
         """The known refusal of the search at rate 1, counted as if it were repeated; None if there is none."""
@@ -197,7 +197,7 @@ class _PairSearch:
         scan = scan_lags(moments, s.min_scan_support, known_fundamental, lag_window)
         null_distributions = _NullDistributions(moments, scan, known_fundamental, self.bandwidth)
         fits: list[PairFit] = []
-        frame_rate_ratio = rate in _FRAME_RATE_RATIOS and self.span < _MAX_RATE_BLIND_SPAN
+        frame_rate_ratio = rate in FRAME_RATE_RATIOS and self.span < _MAX_RATE_BLIND_SPAN
         reliable: tuple[float, float] | None = None  # evidence and scan cost of the best reliable fit so far
         count = s.max_candidates if lag_window is None else _PREDICTED_LAG_CANDIDATES
         for index in candidate_lags(scan, s.candidates_per_octave, count, lag_window):

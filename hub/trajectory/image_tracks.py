@@ -152,15 +152,7 @@ def without_clock_steps(tracks: list[RawTrack]) -> tuple[list[RawTrack], str]:
     for track in tracks:
         inside = (track.time >= kept[0]) & (track.time <= kept[-1])
         if inside.any():
-            out.append(
-                replace(
-                    track,
-                    frame=track.frame[inside],
-                    time=track.time[inside],
-                    pixels=track.pixels[inside],
-                    size=track.size[inside],
-                )
-            )
+            out.append(track.select(inside))
     dropped = len(times) - len(kept)
     step = float(np.diff(times)[cuts].max())
     return out, f"its clock steps by {step:.0f} s; {dropped} of {len(times)} rows on the other side are left out"

@@ -52,4 +52,7 @@ def _camera(found: pb.CameraCalibration, info: pb.CameraInfo) -> CameraCalibrati
         time_offset_std=found.time_offset_std,
         position_std=np.array(found.position_std) if found.position_std else np.zeros(3),
         rms_px=found.rms_px,
+        lag_time=found.lag_time_s,
+        lag_std=found.time_offset_std,
+        clock_rate_std=found.clock_rate_std,
     )

@@ -12,6 +12,11 @@ LAG_WINDOW_S = 300.0
 _MAX_SAMPLES = 600
 
 
+def lag_of(found: pb.CameraCalibration) -> float:
+    """Reference time less camera time [s], at the camera time that the std holds for."""
+    return (found.clock_rate - 1.0) * found.lag_time_s + found.time_offset
+
+
 class LagSample(NamedTuple):
     """One published calibration of a camera. at: the view's time [s]. lag: reference time less camera time, at the
     camera time that the std holds for, less the first published lag [s]."""
@@ -35,7 +40,7 @@ class LagHistory:
 
     def add(self, found: pb.CameraCalibration, clocks: tuple[str, ...], now: float) -> None:
         """Add a new revision. clocks: what the lag is between, such as boot ids."""
-        lag = (found.clock_rate - 1.0) * found.lag_time_s + found.time_offset
+        lag = lag_of(found)
         if clocks != self._clocks:
             self.samples.clear()
             self._clocks, self.first = clocks, lag

@@ -9,6 +9,7 @@ import math
 from hub.calibration.coverage import MIN_COVERAGE
 from hub.report.measures import COLUMNS, ROWS
 from hub.report.svg import at, drawing
+from hub.view.lag_history import lag_of
 from hub.view.state import STALE_S, AgentView, CameraState, CameraView, PathView, ViewState
 from protocols.core.jpeg import jpeg_fits
 
@@ -162,7 +163,7 @@ def _clock_row(camera: CameraView) -> str:
         clock = (
             "reference clock"
             if reference
-            else f"{found.time_offset:+.6f} s ± {1e3 * found.time_offset_std:.3f} ms · "
+            else f"{lag_of(found):+.6f} s ± {1e3 * found.time_offset_std:.3f} ms · "
             f"{1e6 * (found.clock_rate - 1.0):+.1f} ppm"
         )
         rows.append(f"<td colspan=5 data-clock='{name}'>{clock} · {found.rms_px:.2f} px</td>")

@@ -56,14 +56,14 @@ class _Columns:
     sequence: array[int] = field(default_factory=lambda: array("Q"))
     chunk: array[int] = field(default_factory=lambda: array("q"))
     label: array[int] = field(default_factory=lambda: array("q"))
-    values: array[float] = field(default_factory=lambda: array("d"))  # u, v, size
+    values: array[float] = field(default_factory=lambda: array("d"))  # u, v, size, std
 
     def __len__(self) -> int:
         return len(self.time_ns)
 
     def take(self, keep: Ints) -> None:
         """Keep only the rows of these indices."""
-        values = np.frombuffer(self.values).reshape(-1, 3)[keep]
+        values = np.frombuffer(self.values).reshape(-1, 4)[keep]
         for name in ("time_ns", "frame", "sequence", "chunk", "label"):
             column = getattr(self, name)
             setattr(self, name, array(column.typecode, np.array(column)[keep].tobytes()))
@@ -213,7 +213,7 @@ class SessionBuilder:
         if not names:
             raise Refused("no camera has seen anything yet")
         taken = [(rows, used) for rows, used in parts if len(used)]
-        values = np.concatenate([np.array(rows.values).reshape(-1, 3)[used] for rows, used in taken])
+        values = np.concatenate([np.array(rows.values).reshape(-1, 4)[used] for rows, used in taken])
 
         def column(name: str) -> Ints:
             return np.concatenate([np.array(getattr(rows, name))[used] for rows, used in taken]).astype(np.int64)
@@ -230,6 +230,7 @@ class SessionBuilder:
             column("time_ns") / NANOSECONDS,
             np.ascontiguousarray(values[:, :2]),
             np.where(values[:, 2] > 0, values[:, 2], np.nan),
+            stds=np.where(values[:, 3] > 0, values[:, 3], np.nan),
             frames_may_repeat=True,
         )
         return self._build_rig(order), observations
@@ -324,7 +325,7 @@ class SessionBuilder:
             rows.sequence.append(message.sequence)
             rows.chunk.append(chunk)
             rows.label.append(index)
-            rows.values.extend((detection.u, detection.v, detection.size))
+            rows.values.extend((detection.u, detection.v, detection.size, _std(detection)))
             if chunk in self._motion:
                 u, v = boot.last.get(index, (detection.u, detection.v))
                 boot.last[index] = detection.u, detection.v
@@ -424,6 +425,13 @@ def rig_camera_from_info(info: pb.CameraInfo) -> RigCamera:
         position_std=_vector(info.position_std),
         rotation_std=_vector(info.rotation_std),
         table={"name": info.camera, "size": [info.width, info.height], "fps": info.fps},
+    )
+
+
+def _std(detection: pb.Detection) -> float:
+    """Std of one coordinate [px] by the detector's covariance; 0 without one."""
+    return (
+        math.sqrt(max(0.5 * (detection.covariance[0] + detection.covariance[2]), 0.0)) if detection.covariance else 0.0
     )
 
 

@@ -39,11 +39,13 @@ _REPLACED_METADATA = (
 class CameraCalibration:
     """One calibrated camera.
 
-    time_map: reference clock from camera clock. time_offset_std: std [s] of that map at camera time ``lag_time``, the
-    middle of the camera's observed span; 0 = not known. clock_rate_std: of its rate. position_std: (3,) [rig units].
-    rms_px: root mean square reprojection error. focal_std: relative std of a focal length estimated by
+    time_map: reference clock from camera clock. time_offset_std: std [s] of that map in the middle of the camera's
+    observed span; 0 = not known. lag_time: camera time [s] in the middle of the span that the camera shares with the
+    reference camera; lag_std: std [s] of `lag`, the map there. clock_rate_std: of its rate. position_std: (3,)
+    [rig units]. rms_px: root mean square reprojection error. focal_std: relative std of a focal length estimated by
     self-calibration; 0 = the lens was given. readout: seconds from the image's first row to its last; 0 = not known.
-    readout_std: its std where it was estimated, else 0.
+    readout_std: its std where it was estimated, else 0. clock_steps: camera time, size and std [s] of each step of its
+    clock; the map holds on the side of ``lag_time``.
     """
 
     name: str
@@ -57,7 +59,14 @@ class CameraCalibration:
     readout: float = 0.0
     readout_std: float = 0.0
     lag_time: float = 0.0
+    lag_std: float = 0.0
     clock_rate_std: float = 0.0
+    clock_steps: tuple[tuple[float, float, float], ...] = ()
+
+    @property
+    def lag(self) -> float:
+        """Reference time less camera time [s] at camera time ``lag_time``."""
+        return (self.time_map.clock_rate - 1.0) * self.lag_time + self.time_map.time_offset
 
 
 @dataclass(frozen=True, slots=True, eq=False)

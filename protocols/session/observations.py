@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,8 @@ class Track:
     """The detections of one label in one camera, sorted by time.
 
     frame: (n,) frame numbers. time: (n,) [s] on the camera's clock, strictly increasing.
-    pixels: (n, 2) distorted pixels. size: (n,) [px], NaN where not measured.
+    pixels: (n, 2) distorted pixels. size: (n,) [px], NaN where not measured. std: (n,) of one pixel coordinate [px] by
+    the detector's own covariance, NaN where it states none; None = nowhere.
     """
 
     camera: str
@@ -34,9 +35,17 @@ class Track:
     time: Floats
     pixels: Floats
     size: Floats
+    std: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def select(self, rows: Bools) -> Track:
+        """The rows of a mask (n,)."""
+        std = None if self.std is None else self.std[rows]
+        return Track(
+            self.camera, self.label, self.frame[rows], self.time[rows], self.pixels[rows], self.size[rows], std
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,10 +130,20 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
         rows.time,
         rows.pixels,
         rows.size,
+        stds=_stds(rows),
         order=known,
         file=file,
         lines=rows.line,
     )
+
+
+def _stds(rows: ObservationRows) -> Floats | None:
+    """Stds (n,) [px] of one coordinate from the columns cov_uu and cov_vv; None without them."""
+    if not {"cov_uu", "cov_vv"} <= rows.column.keys():
+        return None
+    variance = 0.5 * (rows.numbers("cov_uu", MAX_PIXEL**2) + rows.numbers("cov_vv", MAX_PIXEL**2))
+    rows.refuse(variance < 0.0, lambda row: "cov_uu, cov_vv are no covariance")
+    return np.sqrt(variance)
 
 
 def read_rows(file: Path, cameras: Iterable[str], optional: Sequence[str] = ()) -> ObservationRows:
@@ -205,6 +224,7 @@ def gather_tracks(
     pixels: Floats,
     size: Floats,
     *,
+    stds: Floats | None = None,
     order: Iterable[str] = (),
     file: Path | None = None,
     lines: list[int] | None = None,
@@ -214,7 +234,9 @@ def gather_tracks(
     label_ids = {name: index for index, name in enumerate(sorted(set(labels)))}
     c = np.array([camera_ids[name] for name in cameras], dtype=np.int64)
     k = np.array([label_ids[name] for name in labels], dtype=np.int64)
-    return gather_columns(list(camera_ids), list(label_ids), c, k, frame, time, pixels, size, file=file, lines=lines)
+    return gather_columns(
+        list(camera_ids), list(label_ids), c, k, frame, time, pixels, size, stds=stds, file=file, lines=lines
+    )
 
 
 def gather_columns(
@@ -227,6 +249,7 @@ def gather_columns(
     pixels: Floats,
     size: Floats,
     *,
+    stds: Floats | None = None,
     file: Path | None = None,
     lines: list[int] | None = None,
     frames_may_repeat: bool = False,
@@ -245,6 +268,7 @@ def gather_columns(
         size[sorting],
     )
     line = None if lines is None else np.array(lines)[sorting]
+    std = None if stds is None or not np.isfinite(stds).any() else stds[sorting]
     starts = np.flatnonzero(np.r_[True, (np.diff(c) != 0) | (np.diff(k) != 0)])
     ends = np.r_[starts[1:], len(c)]
     tracks: dict[tuple[str, str], Track] = {}
@@ -255,6 +279,8 @@ def gather_columns(
         lines_of = None if line is None else line[part]
         _check_repeats(camera, label, frame[part], time[part], lines_of, file, warnings, frames_may_repeat)
         tracks[camera, label] = Track(camera, label, frame[part], time[part], pixels[part], size[part])
+        if std is not None:
+            tracks[camera, label] = replace(tracks[camera, label], std=std[part])
     return Observations(tracks, tuple(warnings))
 
 

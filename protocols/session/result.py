@@ -23,8 +23,9 @@ def result_document(calibration: Calibration, rig: Rig, *, command: str = "") ->
     """The content of result.json of a solved session; keys always come in the same order.
 
     Lengths are in the rig's units, times in seconds. ``cameras`` holds calibration.toml's tables plus
-    position (camera centre in the world), clock_rate_ppm and rows_used; ``trajectory`` summarises
-    trajectory.csv. A missing or non-finite value is None.
+    position (camera centre in the world), lag_s (reference time less camera time) and lag_std_s at camera time
+    lag_time_s, clock_rate_ppm with its std, and rows_used; ``trajectory`` summarises trajectory.csv. A missing
+    or non-finite value is None.
     """
     tables = calibration_tables(calibration, rig)
     metadata = tables.pop("metadata")
@@ -32,7 +33,14 @@ def result_document(calibration: Calibration, rig: Rig, *, command: str = "") ->
     for name, camera in calibration.cameras.items():
         residuals = calibration.residuals.get(name)
         tables[name]["position"] = camera.pose.position
+        tables[name]["lag_s"] = camera.lag
+        tables[name]["lag_std_s"] = camera.lag_std
+        tables[name]["lag_time_s"] = camera.lag_time
         tables[name]["clock_rate_ppm"] = 1e6 * (camera.time_map.clock_rate - 1.0)
+        tables[name]["clock_rate_ppm_std"] = 1e6 * camera.clock_rate_std
+        tables[name]["clock_steps"] = [
+            {"time_s": time, "size_s": size, "size_std_s": std} for time, size, std in camera.clock_steps
+        ]
         tables[name]["rows_used"] = None if residuals is None else len(residuals)
     return _document(
         status="solved",

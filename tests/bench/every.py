@@ -55,6 +55,8 @@ BENCHES = {
     ),
     "waving": Bench("how long and how fast a marker is waved", ("--seeds", "1")),
     "lenses": Bench("focal lengths that nobody measured", ("--sessions", "3")),
+    "shared_clock": Bench("separate points against the optimum", ("--seeds", "5")),
+    "broken_cameras": Bench("what one broken camera costs", ("--seeds", "1")),
     "poses": Bench("distributed poses against the joint optimum", ("--quick", "--rows", "section4,bearings")),
     "crowd": Bench("a crowd before seven cameras, boxes spoilt", ("--seeds", "2"), data=True),
     "logs": Bench("logs: rates, kill -9, damage", ("--quick",)),

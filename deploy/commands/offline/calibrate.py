@@ -27,6 +27,7 @@ def calibrate(
     observations: Path | None = None,
     solver: Literal["joint", "distributed", "paper"] = "joint",
     from_known: Path | None = None,
+    refine_lenses: Annotated[bool, Parameter(negative="")] = False,
     marker: Path | None = None,
     detector: str | None = None,
     height: float | None = None,
@@ -63,6 +64,9 @@ def calibrate(
         their neighbours, in one process. paper: the alternating method of the paper.
     from_known
         A calibration.toml whose intrinsics and poses are kept fixed; only timing and trajectory are estimated.
+    refine_lenses
+        Let measured lenses change where the observations support it. Without it they are kept exactly as given, and a
+        warning names those that the observations refute.
     marker
         For videos: appearance of the marker, as written by `syncline detect --teach`. Default: marker.toml in the
         folder of videos, otherwise the orange ball of the demo.
@@ -84,7 +88,7 @@ def calibrate(
     from hub.api import calibrate as solve
 
     check_folder(out)
-    options = CalibrationOptions(solver, from_known, seed=seed)
+    options = CalibrationOptions(solver, from_known, seed=seed, refine_lenses=refine_lenses)
     read = _load(session, observations, out, marker, detector, json)
     read = _with_scale(read, height, limb)
     command = shlex.join(["syncline", *sys.argv[1:]])

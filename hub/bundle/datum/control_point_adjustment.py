@@ -1,4 +1,4 @@
-"""Adjustment with control points: redundant surveyed positions and attitudes as measurements with their stds."""
+"""Adjustment with control points: redundant surveyed positions and attitudes, with stds or exact."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from scipy.linalg import cho_solve_banded
 
 from hub.bundle.adjustment import apply_step
 from hub.bundle.bordered_system import eliminate
-from hub.bundle.covariance import gauge_constraints
-from hub.bundle.datum.gauge import ControlPointTerms, control_point_terms
+from hub.bundle.covariance import constrained_step, gauge_constraints
+from hub.bundle.datum.gauge import ControlPointTerms, control_point_terms, exact_constraints, with_exact_poses
 from hub.bundle.gls import solve_gls
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
+from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.rig import Rig
 
@@ -23,55 +24,65 @@ _RELATIVE_TOLERANCE = 1e-9  # relative decrease of the cost at convergence
 def adjust_to_control_points(
     rig: Rig, names: list[str], problem: Problem, state: AdjustmentState, prior: SmoothnessPrior
 ) -> AdjustmentState:
-    """The state in the rig's world that fits observations and control points, each weighted by its std.
+    """The state in the rig's world that fits observations and control points.
 
-    state: the optimum of the observations alone, transformed into the rig's world. Gauss-Newton with step halving;
-    gauge directions that the control points leave free are fixed. With `AdjustmentState.correlated_noise`, generalised
-    least squares.
+    Control points with a std are observations of that weight; those without are constraints and hold exactly. state:
+    the optimum of the observations alone, transformed into the rig's world. Gauss-Newton with step halving; gauge
+    directions that the control points leave free are fixed. With `AdjustmentState.correlated_noise`, generalised least
+    squares.
     """
+
+    def terms(at: AdjustmentState) -> ControlPointTerms:
+        return control_point_terms(rig, names, [camera.pose for camera in at.cameras], exact=False)
+
+    def constraints(at: AdjustmentState) -> tuple[Floats, Floats]:
+        return control_constraints(rig, names, [camera.pose for camera in at.cameras])
+
     if state.correlated_noise is not None:
         try:
-            return solve_gls(problem, state, prior, state.correlated_noise, lambda at: _terms(rig, names, at)).state
+            found = solve_gls(problem, state, prior, state.correlated_noise, terms, constraints).state
+            return with_exact_poses(rig, names, found)
         except np.linalg.LinAlgError:
-            return state
-    terms = _terms(rig, names, state)
-    system, seen = build_system(problem, state, prior, robust=False)
+            pass  # the noise model does not suit these rows: independent noise does
     columns = problem.free_columns()
+    system, seen = build_system(problem, state, prior, robust=False)
+    now = terms(state)
     for _ in range(_MAX_ITERATIONS):
         parts = eliminate(system)
         path = np.asarray(cho_solve_banded((parts.factor, False), system.gradient_path, check_finite=False))
-        rhs = -(system.gradient_cameras - system.border.T @ path + terms.gradient[columns])
-        step = _step(parts.reduced, terms, columns, rhs, state)
+        gradient = system.gradient_cameras - system.border.T @ path + now.gradient[columns]
+        rows, values = constraints(state)
+        step, _ = constrained_step(
+            parts.reduced + now.information[np.ix_(columns, columns)], -gradient, rows[:, columns], values
+        )
+        # A state off the constraints has to move onto them, whatever that costs.
+        must = bool(np.abs(values).max(initial=0.0) > 1e-9 * _size(state))
         shrink, better = 1.0, False
         while shrink > 1e-3 and not better:
             trial = apply_step(problem, state, shrink * (-path - parts.a_inv_b @ step), shrink * step)
-            trial_terms = _terms(rig, names, trial)
+            trial_terms = terms(trial)
             trial_system, trial_seen = build_system(problem, trial, prior, robust=False)
-            better = trial_seen + trial_terms.cost < seen + terms.cost
+            better = must or trial_seen + trial_terms.cost < seen + now.cost
             shrink *= 0.5
         if not better:
             break
-        gain = seen + terms.cost - trial_seen - trial_terms.cost
-        state, terms, system, seen = trial, trial_terms, trial_system, trial_seen
-        if gain < _RELATIVE_TOLERANCE * (seen + terms.cost):
+        gain = seen + now.cost - trial_seen - trial_terms.cost
+        state, now, system, seen = trial, trial_terms, trial_system, trial_seen
+        if not must and gain < _RELATIVE_TOLERANCE * (seen + now.cost):
             break
-    return state
+    return with_exact_poses(rig, names, state)
 
 
-def _terms(rig: Rig, names: list[str], state: AdjustmentState) -> ControlPointTerms:
-    return control_point_terms(rig, names, [camera.pose for camera in state.cameras])
+def control_constraints(rig: Rig, names: list[str], poses: list[Pose]) -> tuple[Floats, Floats]:
+    """Constraints of the step, rows (q, 18 n) and values (q,): exact control points, and what no control point fixes.
+
+    rows @ step = -values.
+    """
+    rows, values = exact_constraints(rig, names, poses)
+    gauge = gauge_constraints(poses, control_point_terms(rig, names, poses).information)
+    return np.concatenate([rows, gauge]), np.concatenate([values, np.zeros(len(gauge))])
 
 
-def _step(
-    reduced: Floats,
-    terms: ControlPointTerms,
-    columns: np.ndarray[tuple[int, ...], np.dtype[np.int64]],
-    rhs: Floats,
-    state: AdjustmentState,
-) -> Floats:
-    matrix = reduced + terms.information[np.ix_(columns, columns)]
-    constraints = gauge_constraints([camera.pose for camera in state.cameras], terms.information)[:, columns]
-    if not len(constraints):
-        return np.asarray(np.linalg.solve(matrix, rhs))
-    tangent = np.linalg.svd(constraints)[2][len(constraints) :].T
-    return np.asarray(tangent @ np.linalg.solve(tangent.T @ matrix @ tangent, tangent.T @ rhs))
+def _size(state: AdjustmentState) -> float:
+    centres = np.array([camera.pose.position for camera in state.cameras])
+    return max(float(np.linalg.norm(np.ptp(centres, axis=0))), 1e-9)

@@ -19,7 +19,9 @@ from protocols.geometry.pose import Pose, Similarity, fit_similarity
 from protocols.geometry.types import Floats
 from protocols.session.rig import Rig
 
-_EXACT_STD = 1e-4  # std of a control point given without one, relative to the size of the rig
+_EXACT_STD = 1e-4
+"""Std of a control point given without one, relative to the size of the rig, where the similarity is chosen among exact
+ones that contradict each other; the adjustment then holds them exactly."""
 _UP_STD = 0.01  # rad
 _GAUGE_FREEDOM = 7
 CONTRADICTION_SIGMA = 8.0  # RMS residual in sigma from which contradicting control points are reported
@@ -30,13 +32,14 @@ _MAX_CONTRADICTION = 0.1  # … and refused if they are off by more than this sh
 class Gauge:
     """The similarity to the published world, and the information of the control points.
 
-    scale: "metric" or "arbitrary". information: (18 n, 18 n) of the control points in the published world.
-    warnings: control points that contradict each other.
+    scale: "metric" or "arbitrary". information: (18 n, 18 n) of the control points in the published world. exact:
+    (q, 18 n) directions that control points without std fix. warnings: control points that contradict each other.
     """
 
     similarity: Similarity
     scale: str
     information: Floats
+    exact: Floats
     warnings: tuple[str, ...]
 
 
@@ -50,7 +53,9 @@ def fix_gauge(rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
             warnings = (
                 "the control points fix no scale, so the first camera is the world: give two positions or a distance",
             )
-        return Gauge(_default_datum(rig, names, poses), "arbitrary", np.zeros((width, width)), warnings)
+        return Gauge(
+            _default_datum(rig, names, poses), "arbitrary", np.zeros((width, width)), np.zeros((0, width)), warnings
+        )
     best, final = fit_to_control_points(rig, names, poses)
     found = []
     if len(final) and float(np.sqrt(np.mean(final**2))) > CONTRADICTION_SIGMA:
@@ -60,8 +65,9 @@ def fix_gauge(rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
             refusal.permanent = True
             raise refusal
         found.append(f"the rig's control points disagree by more than their stds: worst is {worst}")
-    terms = control_point_terms(rig, names, [best.pose(pose) for pose in poses])
-    return Gauge(best, "metric", terms.information, tuple(found))
+    published = [best.pose(pose) for pose in poses]
+    terms, exact = control_point_terms(rig, names, published), exact_constraints(rig, names, published)[0]
+    return Gauge(best, "metric", terms.information, exact, tuple(found))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,7 +143,7 @@ def _worst_control_point(
 def identity_gauge(cameras: int, scale: str) -> Gauge:
     """The gauge of given poses: the identity."""
     width = CAMERA_PARAMETERS * cameras
-    return Gauge(Similarity(1.0, np.eye(3), np.zeros(3)), scale, np.zeros((width, width)), ())
+    return Gauge(Similarity(1.0, np.eye(3), np.zeros(3)), scale, np.zeros((width, width)), np.zeros((0, width)), ())
 
 
 def _default_datum(rig: Rig, names: list[str], poses: list[Pose]) -> Similarity:
@@ -280,8 +286,11 @@ class ControlPointTerms:
     cost: float
 
 
-def control_point_terms(rig: Rig, names: list[str], poses: list[Pose]) -> ControlPointTerms:
-    """Normal equations of the rig's positions, attitudes and distances; ``poses`` of cameras ``names`` in its world."""
+def control_point_terms(rig: Rig, names: list[str], poses: list[Pose], exact: bool = True) -> ControlPointTerms:
+    """Normal equations of the rig's positions, attitudes and distances; ``poses`` of cameras ``names`` in its world.
+
+    exact: whether control points without std are among them, with a small one.
+    """
     width = CAMERA_PARAMETERS * len(names)
     information, gradient, cost = np.zeros((width, width)), np.zeros(width), 0.0
     size = _extent(poses)
@@ -290,43 +299,83 @@ def control_point_terms(rig: Rig, names: list[str], poses: list[Pose]) -> Contro
         terms = []
         if camera.position is not None:
             off = poses[i].position - camera.position
-            terms.append((base + 3, off, _std_or_exact(camera.position_std, _EXACT_STD * size)))
+            terms.append((base + 3, off, camera.position_std, _EXACT_STD * size))
         if camera.rotation is not None:
-            terms.append(
-                (base, so3.log(poses[i].rotation @ camera.rotation.T), _std_or_exact(camera.rotation_std, _EXACT_STD))
-            )
-        for begin, off, std in terms:
-            at = begin + np.arange(3)
+            off = so3.log(poses[i].rotation @ camera.rotation.T)
+            terms.append((base, off, camera.rotation_std, _EXACT_STD))
+        for begin, off, given, small in terms:
+            axes = np.arange(3) if exact else np.flatnonzero(np.zeros(3) if given is None else given > 0.0)
+            at, std = begin + axes, _std_or_exact(given, small)[axes]
             information[at, at] += 1.0 / std**2
-            gradient[at] += off / std**2
-            cost += float(((off / std) ** 2).sum())
-    for a, b, length in rig.distances:
+            gradient[at] += off[axes] / std**2
+            cost += float(((off[axes] / std) ** 2).sum())
+    for a, b, length in rig.distances if exact else ():
         if a in names and b in names:
-            i, j = names.index(a), names.index(b)
-            extent = poses[j].position - poses[i].position
-            far = float(np.linalg.norm(extent))
-            row = np.zeros(width)
-            row[i * CAMERA_PARAMETERS + 3 : i * CAMERA_PARAMETERS + 6] = -extent / far
-            row[j * CAMERA_PARAMETERS + 3 : j * CAMERA_PARAMETERS + 6] = extent / far
+            row, far = _distance_row(names.index(a), names.index(b), poses)
             information += np.outer(row, row) / (_EXACT_STD * length) ** 2
             gradient += row * (far - length) / (_EXACT_STD * length) ** 2
             cost += ((far - length) / (_EXACT_STD * length)) ** 2
     return ControlPointTerms(information, gradient, cost)
 
 
-def is_overdetermined(rig: Rig, names: list[str]) -> bool:
-    """Whether the control points exceed the seven gauge freedoms and at least one has a std.
+def exact_constraints(rig: Rig, names: list[str], poses: list[Pose]) -> tuple[Floats, Floats]:
+    """Control points without std: rows (q, 18 n) and values (q,) with rows @ step = -values.
 
-    Without a std the weight of redundant control points against the observations is unknown.
+    Positions and attitudes without a std, or with std 0 along an axis, and distances. poses: of cameras ``names`` in
+    the rig's world.
     """
+    width = CAMERA_PARAMETERS * len(names)
+    rows, values = [np.zeros((0, width))], [np.zeros(0)]
+
+    def fix(first: int, off: Floats, std: Floats | None) -> None:
+        axes = np.arange(3) if std is None else np.flatnonzero(~(std > 0.0))
+        rows.append(np.eye(width)[first + axes])
+        values.append(off[axes])
+
+    for i, name in enumerate(names):
+        camera, base = rig.cameras[name], i * CAMERA_PARAMETERS
+        if camera.position is not None:
+            fix(base + 3, poses[i].position - camera.position, camera.position_std)
+        if camera.rotation is not None:
+            fix(base, so3.log(poses[i].rotation @ camera.rotation.T), camera.rotation_std)
+    for a, b, length in rig.distances:
+        if a in names and b in names:
+            row, far = _distance_row(names.index(a), names.index(b), poses)
+            rows.append(row[None])
+            values.append(np.array([far - length]))
+    return np.concatenate(rows), np.concatenate(values)
+
+
+def _distance_row(i: int, j: int, poses: list[Pose]) -> tuple[Floats, float]:
+    """Gradient (18 n,) of the distance of two cameras, and the distance."""
+    row = np.zeros(CAMERA_PARAMETERS * len(poses))
+    extent = poses[j].position - poses[i].position
+    far = float(np.linalg.norm(extent))
+    row[i * CAMERA_PARAMETERS + 3 : i * CAMERA_PARAMETERS + 6] = -extent / far
+    row[j * CAMERA_PARAMETERS + 3 : j * CAMERA_PARAMETERS + 6] = extent / far
+    return row, far
+
+
+def is_overdetermined(rig: Rig, names: list[str]) -> bool:
+    """Whether the control points exceed the seven gauge freedoms."""
     cameras = [rig.cameras[name] for name in names]
     rows = sum(3 * (one.position is not None) + 3 * (one.rotation is not None) for one in cameras)
-    has_std = any(
-        (one.position is not None and one.position_std is not None)
-        or (one.rotation is not None and one.rotation_std is not None)
-        for one in cameras
-    )
-    return has_std and rows + sum(a in names and b in names for a, b, _ in rig.distances) > _GAUGE_FREEDOM
+    return rows + sum(a in names and b in names for a, b, _ in rig.distances) > _GAUGE_FREEDOM
+
+
+def with_exact_poses(rig: Rig, names: list[str], state: AdjustmentState) -> AdjustmentState:
+    """The state with control points without std at their given values, without what rounding has left."""
+    cameras = list(state.cameras)
+    for i, name in enumerate(names):
+        known, pose = rig.cameras[name], cameras[i].pose
+        rotation, position = pose.rotation, pose.position
+        if known.rotation is not None and (known.rotation_std is None or not known.rotation_std.any()):
+            rotation = so3.nearest(known.rotation)
+        if known.position is not None:
+            std = known.position_std
+            position = known.position if std is None else np.where(std > 0.0, position, known.position)
+        cameras[i] = replace(cameras[i], pose=Pose(rotation, position))
+    return replace(state, cameras=tuple(cameras))
 
 
 def transform_state(state: AdjustmentState, s: Similarity) -> AdjustmentState:

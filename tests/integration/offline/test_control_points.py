@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from hub.calibration.pipeline import calibrate
+from protocols.geometry import so3
+from protocols.geometry.pose import fit_similarity
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration
 from tests.support import rigs
@@ -31,6 +33,16 @@ def errors(session: rigs.Session, found: Calibration) -> Floats:
     )
 
 
+def gauge_only(session: rigs.Session, surveyed_session: rigs.Session) -> Floats:
+    """Position errors where the survey only places the world: one similarity onto the surveyed positions."""
+    poses = {name: one.pose for name, one in calibrate(session.rig, session.observations()).cameras.items()}
+    given = [surveyed_session.rig.cameras[name].position for name in poses]
+    found = fit_similarity(np.array([pose.position for pose in poses.values()]), np.array(given))
+    return np.array(
+        [np.linalg.norm(found.pose(pose).position - session.poses[name].position) for name, pose in poses.items()]
+    )
+
+
 def weak_session(seed: int) -> rigs.Session:
     """Little motion and much noise: poses are determined to about a centimetre."""
     return rigs.simulate(seed, 3, 12.0, noise=2.5, late=1.0)
@@ -39,25 +51,20 @@ def weak_session(seed: int) -> rigs.Session:
 @pytest.fixture(scope="module")
 def both() -> tuple[Floats, Floats, Floats]:
     """Position errors (sessions, 3) with weighted control points, with them as gauge only, and the stated stds."""
-    weighed, gauge_only, stated = [], [], []
+    weighed, only, stated = [], [], []
     for seed in range(3):
         session = weak_session(seed)
         surveyed_session = surveyed(session, seed, _STD)
         found = calibrate(surveyed_session.rig, session.observations())
         weighed.append(errors(session, found))
         stated.append([np.linalg.norm(one.position_std) for one in found.cameras.values()])
-        without_stds = {
-            name: replace(camera, position_std=None) for name, camera in surveyed_session.rig.cameras.items()
-        }
-        gauge_only.append(
-            errors(session, calibrate(replace(surveyed_session.rig, cameras=without_stds), session.observations()))
-        )
-    return np.array(weighed), np.array(gauge_only), np.array(stated)
+        only.append(gauge_only(session, surveyed_session))
+    return np.array(weighed), np.array(only), np.array(stated)
 
 
 def test_weighted_control_points_are_better_than_the_gauge_alone(both: tuple[Floats, Floats, Floats]) -> None:
-    weighed, gauge_only, _ = both
-    assert np.sqrt((weighed**2).mean()) < 0.8 * np.sqrt((gauge_only**2).mean())
+    weighed, only, _ = both
+    assert np.sqrt((weighed**2).mean()) < 0.8 * np.sqrt((only**2).mean())
     # No worse than the survey itself.
     assert np.sqrt((weighed**2).mean()) < 1.1 * np.sqrt(3.0) * _STD
 
@@ -92,21 +99,42 @@ def test_a_camera_moved_after_the_survey_is_reported_and_does_not_affect_the_oth
 def test_control_points_keep_their_weight_with_correlated_noise() -> None:
     """Generalised least squares weights them too: cameras surveyed to 2 mm stay there, others follow the noise."""
     session = rigs.simulate(5, 4, 40.0, noise=0.4, late=1.0, drops=0.0)
-    rng = np.random.default_rng(6)
-    pixels = session.pixels.copy()
-    for name in session.rig.cameras:
-        mine = np.flatnonzero([one == name for one in session.camera])
-        steps = rng.normal(0.0, 1.2, (len(mine), 2))
-        for i in range(1, len(mine)):
-            steps[i] = 0.98 * steps[i - 1] + np.sqrt(1.0 - 0.98**2) * steps[i]
-        pixels[mine] += steps
-    session = replace(session, pixels=pixels)
+    session = replace(session, pixels=session.pixels + slow_errors(session, 1.2))
     std = 0.002
     surveyed_session = surveyed(session, 7, std, stated_std=std)
-    without_stds = {name: replace(camera, position_std=None) for name, camera in surveyed_session.rig.cameras.items()}
     found = calibrate(surveyed_session.rig, session.observations())
-    loose = calibrate(replace(surveyed_session.rig, cameras=without_stds), session.observations())
     assert any(step.stage == "correlated noise" for step in found.convergence)
-    rms = [float(np.sqrt(np.mean(errors(session, one) ** 2))) for one in (found, loose)]
+    rms = [float(np.sqrt(np.mean(one**2))) for one in (errors(session, found), gauge_only(session, surveyed_session))]
     assert rms[0] < 1.5 * np.sqrt(3.0) * std
-    assert rms[1] > 2.0 * rms[0]
+    assert rms[1] > 1.5 * rms[0]
+
+
+@pytest.mark.parametrize("correlated", [False, True])
+def test_control_points_without_std_hold_exactly(correlated: bool) -> None:
+    session = surveyed(rigs.simulate(5, 4, 40.0, noise=0.4, late=1.0, drops=0.0), 3, _STD)
+    if correlated:
+        session = replace(session, pixels=session.pixels + slow_errors(session, 1.2))
+    cameras = {name: replace(camera, position_std=None) for name, camera in session.rig.cameras.items()}
+    cameras["cam1"] = replace(cameras["cam1"], rotation=session.poses["cam1"].rotation)
+    cameras["cam3"] = replace(cameras["cam3"], position=None)
+    apart = 1.001 * float(np.linalg.norm(session.poses["cam3"].position - session.poses["cam0"].position))
+    rig = replace(session.rig, cameras=cameras, distances=(("cam0", "cam3", apart),))
+    found = calibrate(rig, session.observations()).cameras
+    for name in ("cam0", "cam1", "cam2"):
+        assert np.abs(found[name].pose.position - cameras[name].position).max() < 1e-9
+        assert found[name].position_std.max() == 0.0
+    assert so3.angle_between(found["cam1"].pose.rotation, session.poses["cam1"].rotation) < 1e-9
+    assert np.linalg.norm(found["cam3"].pose.position - found["cam0"].pose.position) == pytest.approx(apart, abs=1e-9)
+    assert found["cam3"].position_std.max() > 0.0
+
+
+def slow_errors(session: rigs.Session, std: float) -> Floats:
+    """Errors (n, 2) [px] that are correlated from frame to frame."""
+    rng, out = np.random.default_rng(6), np.zeros_like(session.pixels)
+    for name in session.rig.cameras:
+        mine = np.flatnonzero([one == name for one in session.camera])
+        steps = rng.normal(0.0, std, (len(mine), 2))
+        for i in range(1, len(mine)):
+            steps[i] = 0.98 * steps[i - 1] + np.sqrt(1.0 - 0.98**2) * steps[i]
+        out[mine] = steps
+    return out

@@ -185,7 +185,7 @@ def test_clocks_are_more_accurate_than_with_independent_errors_and_stds_are_cons
 def test_independent_errors_leave_everything_as_it_is() -> None:
     problem, truth = rig(4, correlated_px=0.0)
     problem, state, _ = adjust(problem, truth, rounds=2, iterations=10)
-    after = refit_with_correlated_noise(problem, state)
+    after = refit_with_correlated_noise(problem, state, refine_lenses=True)
     assert after[0] is problem
     assert after[1] is state
 
@@ -200,7 +200,7 @@ def test_lenses_are_freed_only_where_the_given_ones_are_wrong(focal_scale: float
         ),
     )
     problem, state, _ = adjust(problem, start, rounds=2, iterations=10)
-    found, after = refit_with_correlated_noise(problem, state)
+    found, after = refit_with_correlated_noise(problem, state, refine_lenses=True)
     assert after.correlated_noise is not None
     assert bool(found.lens_tolerances) == free_lenses
     focal = [a.intrinsics.focal / b.intrinsics.focal for a, b in zip(after.cameras, truth.cameras, strict=True)]
@@ -270,10 +270,10 @@ def test_the_noise_with_nominal_lenses_does_not_depend_on_the_initial_lenses(mon
     )
     freed, state, _ = adjust(freed, start, rounds=1, iterations=3)
     monkeypatch.setattr(correlated_noise, "prefers_nominal_lenses", lambda *_: True)
-    found, after = refit_with_correlated_noise(freed, state)
+    found, after = refit_with_correlated_noise(freed, state, refine_lenses=True)
     assert not found.lens_tolerances
     plain, fitted, _ = adjust(problem, truth, rounds=1, iterations=10)
-    expected = refit_with_correlated_noise(plain, fitted)[1].correlated_noise
+    expected = refit_with_correlated_noise(plain, fitted, refine_lenses=True)[1].correlated_noise
     assert after.correlated_noise is not None
     assert expected is not None
     assert after.correlated_noise.correlated_std == pytest.approx(expected.correlated_std, rel=0.1)

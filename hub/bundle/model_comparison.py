@@ -1,0 +1,289 @@
+"""Comparison of models that differ by a few parameters: measured lenses, rolling-shutter readouts, clock steps.
+
+All are score tests: the gain of freeing parameters is predicted by one Gauss-Newton step from the solution in which
+they are fixed, with the paths and all other parameters free to follow.
+
+A slightly wrong lens has nearly the same effect as a rolling shutter, and its errors are correlated from frame to
+frame. So the gain of freeing the readouts is computed with noise scaled to the effective sample size (`noise_scale`).
+On recordings whose lenses err by a pixel no gain remains, while readouts freed by plain least squares come out at -40
+and +35 ms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_solve_banded
+from scipy.special import chdtri
+
+from hub.bundle.adjustment import gauge_tangent
+from hub.bundle.bordered_system import border_block, cho_solve_path, eliminate
+from hub.bundle.noise_scale import correlation_inflation, modelled_inflation
+from hub.bundle.normal_equations import build_system
+from hub.bundle.problem import (
+    CAMERA_PARAMETERS,
+    CRYSTAL_RATE_STD,
+    FOCAL,
+    K1,
+    OFFSET,
+    RATE,
+    READOUT,
+    AdjustmentState,
+    ClockStep,
+    Problem,
+)
+from hub.bundle.residuals import StackedTrajectories, evaluate_labels, jacobians
+from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
+from protocols.geometry.types import Bools, Floats, Ints
+from protocols.session.rig import MAX_READOUT_S
+
+_FALSE_ALARM_PROBABILITY = 1e-4
+"""Probability that one of the lenses of a correct rig is refuted."""
+_READOUT_TOLERANCE_S = 2e-3
+"""Error [s] of an estimated readout that does not make it implausible: a global shutter's comes out at about 0."""
+_STEP_TIMES, _MIN_STEP_ROWS = 24, 60
+"""Times at which a clock step is tried, and rows of a camera below which none is."""
+_MIN_STEP_S = 5e-3
+"""Smallest clock step [s] that is reported: less is jitter or a wandering clock."""
+_MIN_STEP_INFLATION = 4.0
+"""Rows per effective row below which no residuals are correlated, as a step's would be."""
+REFUTED_SIGMA = 4.0
+"""Stds from which a rate is no crystal's: of a hundred cameras with crystals one in 160 is refuted."""
+_WIDE_FOCAL_STD, _WIDE_K1_STD = 0.5, 0.2
+"""Prior stds of a lens in the test: so wide that only the observations count."""
+
+
+@dataclass(frozen=True, slots=True)
+class LensTest:
+    """Score test of one measured lens. camera: index. focal_change: by which the observations would change the focal
+    length (relative), and its std. statistic: chi-squared of focal length and k1; refuted above limit."""
+
+    camera: int
+    focal_change: float
+    focal_std: float
+    statistic: float
+    limit: float
+
+
+def refuted_lenses(problem: Problem, state: AdjustmentState) -> list[LensTest]:
+    """Measured lenses that the observations refute, most significant first.
+
+    problem, state: adjusted with these lenses fixed. Forward selection: the lens whose focal length and k1 lower the
+    cost most is freed, then the next one beside it, so that an honest lens is not blamed for another's error. Noise is
+    scaled to the effective sample size.
+    """
+    if not problem.free_parameters.pose or problem.free_parameters.lens:
+        return []
+    cameras = range(len(state.cameras))
+    given = [camera for camera in cameras if problem.lens_prior(camera) is None]
+    if not given:
+        return []
+    wide = replace(problem.free_parameters, lens=True, focal_std=_WIDE_FOCAL_STD, k1_std=_WIDE_K1_STD)
+    freed = replace(problem, free_parameters=wide)
+    inflation = [
+        max(correlation_inflation(problem, state, camera), modelled_inflation(problem, state, camera))
+        for camera in cameras
+    ]
+    noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
+    columns, normal, gradient = _reduced_system(freed, noisy, estimate_smoothness(problem, state))
+    lens = {
+        camera: np.flatnonzero(np.isin(columns, camera * CAMERA_PARAMETERS + np.array([FOCAL, K1]))) for camera in given
+    }
+    limit = float(chdtri(2, _FALSE_ALARM_PROBABILITY / len(given)))
+    kept = np.setdiff1d(np.arange(len(columns)), np.concatenate(list(lens.values())))
+    out: list[LensTest] = []
+    tangent = gauge_tangent(freed, state)
+    before = _reduction(normal, gradient, tangent, kept)[0]
+    while len(out) < len(given):
+        left = [camera for camera in given if camera not in [one.camera for one in out]]
+        gains = {camera: _reduction(normal, gradient, tangent, np.union1d(kept, lens[camera])) for camera in left}
+        camera = max(left, key=lambda one: gains[one][0])
+        statistic = gains[camera][0] - before
+        if not statistic > limit:
+            break
+        kept, before = np.union1d(kept, lens[camera]), gains[camera][0]
+        focal = int(lens[camera][0])
+        step, covariance = gains[camera][1:]
+        out.append(LensTest(camera, float(step[focal]), float(np.sqrt(covariance[focal, focal])), statistic, limit))
+    return out
+
+
+def with_crystal_rates(problem: Problem, state: AdjustmentState) -> Problem:
+    """The problem with rates held by the prior of crystals, but for those that the observations refute.
+
+    problem, state: adjusted under the wide prior of rates. A rate is refuted where it differs from the reference's by
+    more than `REFUTED_SIGMA` times the std of both the estimate and the prior: then the frame rate is another one.
+    """
+    if not problem.free_parameters.clock:
+        return problem
+    wide = replace(problem, crystal_rates=())
+    inflation = [correlation_inflation(problem, state, camera) for camera in range(len(state.cameras))]
+    noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
+    columns, normal, gradient = _reduced_system(wide, noisy, estimate_smoothness(problem, state))
+    covariance = _reduction(normal, gradient, gauge_tangent(wide, state), np.arange(len(columns)))[2]
+    variance = dict(zip(columns.tolist(), np.diag(covariance).tolist(), strict=True))
+    reference = state.cameras[problem.clock_reference].rate
+    crystal = tuple(
+        (camera.rate - reference) ** 2
+        < REFUTED_SIGMA**2 * (CRYSTAL_RATE_STD**2 + variance.get(i * CAMERA_PARAMETERS + RATE, 0.0))
+        for i, camera in enumerate(state.cameras)
+    )
+    return replace(problem, crystal_rates=crystal)
+
+
+def with_free_readouts(problem: Problem) -> Problem:
+    """The problem with all readouts free that were not given."""
+    return replace(problem, free_parameters=replace(problem.free_parameters, readout=True))
+
+
+def are_readouts_observable(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior) -> bool:
+    """Whether free readouts lower the Bayesian information criterion, predicted by one step from the solution.
+
+    state: adjusted with fixed readouts.
+    """
+    freed_problem = with_free_readouts(problem)
+    columns = freed_problem.free_columns()
+    readout_columns = columns % CAMERA_PARAMETERS == READOUT
+    if not readout_columns.any():
+        return False
+    rows = sum(int(part.use.sum()) for part in problem.rows)
+    bic_penalty = float(np.count_nonzero(readout_columns) * np.log(max(rows, 2)))
+    # Scaling by the effective sample size only lowers the gain, and usually there is none: test the cheap bound first.
+    if _cost_reduction(freed_problem, state, prior, readout_columns) < bic_penalty:
+        return False
+    inflation = np.array([correlation_inflation(problem, state, camera) for camera in range(len(state.cameras))])
+    return (
+        _cost_reduction(freed_problem, replace(state, sigma=state.sigma * np.sqrt(inflation)), prior, readout_columns)
+        > bic_penalty
+    )
+
+
+def are_readouts_plausible(problem: Problem, state: AdjustmentState) -> bool:
+    """Whether all readouts are within the range of real cameras: from 0 to a frame interval, and no longer than 0.1 s.
+
+    A sensor is read from its first row to its last before the next frame; given readouts may say otherwise.
+    """
+    for number, camera in enumerate(state.cameras):
+        steps = [np.diff(np.unique(part.stamps)) for part in problem.rows if part.camera == number]
+        interval = min((float(np.median(step)) for step in steps if len(step)), default=MAX_READOUT_S)
+        if not -_READOUT_TOLERANCE_S < camera.readout < min(interval + _READOUT_TOLERANCE_S, MAX_READOUT_S):
+            return False
+    return True
+
+
+def _cost_reduction(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, readout_columns: Bools) -> float:
+    """Predicted decrease of the cost in one step when the columns ``readout_columns`` (p,) are freed too."""
+    _, normal, gradient = _reduced_system(problem, state, prior)
+    tangent = gauge_tangent(problem, state)
+    everything = np.arange(len(gradient))
+    return (
+        _reduction(normal, gradient, tangent, everything)[0]
+        - _reduction(normal, gradient, tangent, everything[~readout_columns])[0]
+    )
+
+
+def _reduced_system(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior) -> tuple[Ints, Floats, Floats]:
+    """Free columns (p,), normal matrix (p, p) and gradient (p,) of the camera parameters, the paths eliminated."""
+    system, _ = build_system(problem, state, prior, robust=False)
+    parts = eliminate(system)
+    gradient = system.gradient_cameras - system.border.T @ cho_solve_path(parts, system.gradient_path)
+    return problem.free_columns(), parts.reduced, gradient
+
+
+def _reduction(normal: Floats, gradient: Floats, tangent: Floats | None, kept: Ints) -> tuple[float, Floats, Floats]:
+    """Predicted decrease of the cost in one step of the parameters ``kept``, the step (p,) and its covariance (p, p).
+
+    tangent: (p, q) directions that keep the gauge, which fixes poses only.
+    """
+    directions: Floats = np.eye(len(gradient)) if tangent is None else tangent
+    others = np.setdiff1d(np.arange(len(gradient)), kept)
+    if len(others):
+        directions = directions @ np.linalg.svd(directions[others])[2][len(others) :].T
+    covariance = directions @ np.linalg.solve(directions.T @ normal @ directions, directions.T)
+    step = -covariance @ gradient
+    return float(-gradient @ step), step, covariance
+
+
+def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | None:
+    """The clock step that would lower the cost most, if it explains more than any readout; None where none is needed.
+
+    problem, state: adjusted without one. A step inside the recording looks like a rolling shutter of all cameras: both
+    are score tests at the same solution, so that they compete on equal terms.
+    """
+    cameras = range(len(state.cameras))
+    inflation = np.array([correlation_inflation(problem, state, camera) for camera in cameras])
+    if not problem.free_parameters.clock or inflation.max() < _MIN_STEP_INFLATION:
+        return None
+    noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
+    prior = estimate_smoothness(problem, state)
+    best: ClockStep | None = None
+    for camera in cameras:
+        used = [part.time[part.use] for part in problem.rows if part.camera == camera]
+        times = np.sort(np.concatenate([np.zeros(0), *used]))
+        if len(times) < _MIN_STEP_ROWS:
+            continue
+        found = _best_step(problem, noisy, prior, camera, np.quantile(times, np.linspace(0.05, 0.95, _STEP_TIMES)))
+        if best is None or found.statistic > best.statistic:
+            best = found
+    if best is None:
+        return None
+    times = np.concatenate([part.time[part.use] for part in problem.rows if part.camera == best.camera])
+    width = 0.9 * float(np.ptp(times)) / (_STEP_TIMES - 1)
+    near = np.linspace(max(best.time - width, times.min()), min(best.time + width, times.max()), _STEP_TIMES)
+    best = _best_step(problem, noisy, prior, best.camera, near)
+    freed = with_free_readouts(problem)
+    of_readouts = freed.free_columns() % CAMERA_PARAMETERS == READOUT
+    readout = _cost_reduction(freed, noisy, prior, of_readouts) if of_readouts.any() else 0.0
+    rows = sum(int(part.use.sum()) for part in problem.rows)
+    needed = 2.0 * np.log(max(rows, 2)) + 2.0 * np.log(_STEP_TIMES * len(state.cameras))
+    return best if best.statistic > needed and best.statistic > readout and abs(best.size) > _MIN_STEP_S else None
+
+
+def with_clock_step(problem: Problem, step: ClockStep, middle: float) -> Problem:
+    """The problem with the rows beyond a step, seen from camera time ``middle``, at the times of an even clock."""
+    rows = []
+    for part in problem.rows:
+        if part.camera == step.camera:
+            beyond = (part.time >= step.time) == (step.time > middle)
+            shifted = part.time - np.where(beyond, np.copysign(1.0, step.time - middle) * step.size, 0.0)
+            part = replace(part, time=shifted, stamp=part.stamps, use=np.ones_like(part.use))
+        rows.append(part)
+    return replace(problem, rows=tuple(rows))
+
+
+def _best_step(
+    problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, camera: int, times: Floats
+) -> ClockStep:
+    """The best of a camera's steps at camera times (k,)."""
+    system, _ = build_system(problem, state, prior, robust=False)
+    parts = eliminate(system)
+    columns, tangent = problem.free_columns(), gauge_tangent(problem, state)
+    gradient = system.gradient_cameras - system.border.T @ cho_solve_path(parts, system.gradient_path)
+    directions: Floats = np.eye(len(columns)) if tangent is None else tangent
+    covariance = directions @ np.linalg.solve(directions.T @ parts.reduced @ directions, directions.T)
+    seen = evaluate_labels(
+        [part for part in problem.rows if part.camera == camera],
+        state.cameras[camera],
+        StackedTrajectories.of(state.trajectories),
+    )
+    mine = np.flatnonzero(columns // CAMERA_PARAMETERS == camera)
+    own = (columns[mine] % CAMERA_PARAMETERS).tolist()
+    jacobian = jacobians(seen, state.cameras[camera], [OFFSET, *own])
+    weight = np.where(seen.valid, seen.relative_information / state.sigma[camera] ** 2, 0.0)
+    after = seen.time >= times[:, None]
+    weighted = jacobian[:, 3] * weight
+    cross = (weighted[:, None] * jacobian).sum(axis=0)
+    border = border_block(seen.index, seen.weights, cross[:3, None] * after, len(system.gradient_path))
+    corner = np.zeros((len(columns), len(times)))
+    corner[mine] = cross[4:] @ after.T
+    solved = cho_solve_banded((parts.factor, False), border)
+    coupling = corner - system.border.T @ solved
+    score = after @ (weighted * seen.residual).sum(axis=0) - solved.T @ system.gradient_path
+    score -= coupling.T @ (covariance @ gradient)
+    information = after @ cross[3] - (border * solved).sum(axis=0) - (coupling * (covariance @ coupling)).sum(axis=0)
+    information = np.maximum(information, 1e-9)
+    k = int(np.argmax(score**2 / information))
+    rate = state.cameras[camera].rate
+    size, std = float(score[k] / information[k] / rate), float(information[k] ** -0.5 / rate)
+    return ClockStep(camera, float(times[k]), size, std, float(score[k] ** 2 / information[k]))

@@ -1,0 +1,153 @@
+"""What one broken camera costs a rig, and whether it is named and the others' answer stays.
+
+    python -m tests.bench.broken_cameras [--cameras N] [--seconds S] [--seeds N] [--first SEED]
+
+Each rig is calibrated without its last camera, with it as it is, and with it broken in one way after the other: rows
+labelled by another frame numbering, rows shuffled, another recording, a mirrored picture, a wrong lens (focal length
+1.3 times too long). CPU seconds are those of `calibrate`; change: the largest change of another camera's position or
+lag, in its stated stds. Requirement: at most twice the CPU without it, named, changes below one std.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from hub.calibration.pipeline import calibrate
+from protocols.geometry.types import Bools
+from protocols.session.calibration import Calibration
+from tests.support import rigs
+
+Breakage = Callable[[rigs.Session, str, Bools, np.random.Generator], rigs.Session]
+
+
+def other_numbering(session: rigs.Session, name: str, mine: Bools, random: np.random.Generator) -> rigs.Session:
+    """Every label belongs to a frame that is on average 1.7 s away, by jumps: a numbering that skips frames."""
+    times = session.time.copy()
+    times[mine] += np.repeat(random.uniform(-3.0, 3.0, 1 + mine.sum() // 40), 40)[: mine.sum()]
+    return replace(session, time=times)
+
+
+def shuffled(session: rigs.Session, name: str, mine: Bools, random: np.random.Generator) -> rigs.Session:
+    """Pixels permuted among the rows."""
+    pixels = session.pixels.copy()
+    pixels[mine] = pixels[random.permutation(np.flatnonzero(mine))]
+    return replace(session, pixels=pixels)
+
+
+def another_recording(session: rigs.Session, name: str, mine: Bools, random: np.random.Generator) -> rigs.Session:
+    """The camera watched another path."""
+    other = rigs.random_path(np.random.default_rng([7, int(random.integers(1 << 30))]))
+    true = np.array([session.true_time(name, float(t)) for t in session.time[mine]])
+    lens = session.rig.cameras[name].intrinsics
+    assert lens is not None
+    pixels = session.pixels.copy()
+    pixels[mine] = lens.project(session.poses[name].camera_from_world(other.at(true)))
+    return replace(session, pixels=np.nan_to_num(pixels, nan=0.0))
+
+
+def mirrored(session: rigs.Session, name: str, mine: Bools, random: np.random.Generator) -> rigs.Session:
+    """The picture is a mirror image."""
+    pixels = session.pixels.copy()
+    pixels[mine, 0] = rigs.SIZE[0] - 1 - pixels[mine, 0]
+    return replace(session, pixels=pixels)
+
+
+def wrong_lens(session: rigs.Session, name: str, mine: Bools, random: np.random.Generator) -> rigs.Session:
+    """The focal length is given 1.3 times too long."""
+    camera = session.rig.cameras[name]
+    assert camera.intrinsics is not None
+    matrix = camera.intrinsics.matrix.copy()
+    matrix[:2, :2] *= 1.3
+    wrong = replace(camera, intrinsics=replace(camera.intrinsics, matrix=matrix))
+    return replace(session, rig=replace(session.rig, cameras=session.rig.cameras | {name: wrong}))
+
+
+BREAKAGES: dict[str, Breakage] = {
+    "other numbering": other_numbering,
+    "shuffled": shuffled,
+    "another recording": another_recording,
+    "mirrored": mirrored,
+    "wrong lens": wrong_lens,
+}
+
+
+def without(session: rigs.Session, name: str) -> rigs.Session:
+    """The session without a camera."""
+    keep = np.flatnonzero([one != name for one in session.camera])
+    cameras = {one: camera for one, camera in session.rig.cameras.items() if one != name}
+    return replace(
+        session,
+        rig=replace(session.rig, cameras=cameras),
+        camera=[session.camera[i] for i in keep],
+        label=[session.label[i] for i in keep],
+        frame=session.frame[keep],
+        time=session.time[keep],
+        pixels=session.pixels[keep],
+    )
+
+
+def timed(session: rigs.Session) -> tuple[Calibration, float]:
+    """The calibration as the command makes it, and its CPU seconds."""
+    observations, began = session.observations(), time.process_time()
+    found = calibrate(session.rig, observations, thorough=True)
+    return found, time.process_time() - began
+
+
+def change(before: Calibration, after: Calibration) -> float:
+    """Largest change of a position or lag in its stated std; inf where a camera is missing."""
+    worst = 0.0
+    for name, one in before.cameras.items():
+        if name not in after.cameras:
+            return float("inf")
+        other = after.cameras[name]
+        free = one.position_std > 0.0
+        moved = np.abs(other.pose.position - one.pose.position)[free] / one.position_std[free]
+        worst = max(worst, float(moved.max(initial=0.0)))
+        if one.lag_std > 0.0:
+            at_lag = (other.time_map.clock_rate - 1.0) * one.lag_time + other.time_map.time_offset
+            worst = max(worst, abs(at_lag - one.lag) / one.lag_std)
+    return worst
+
+
+def names(found: Calibration, name: str) -> bool:
+    """Whether the answer says that something is wrong with the camera."""
+    return name in found.refused or any(text.startswith(f"{name}:") for text in found.warnings)
+
+
+def main() -> None:
+    """Print one line a rig and breakage."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cameras", type=int, default=7)
+    parser.add_argument("--seconds", type=float, default=40.0)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first", type=int, default=0)
+    options = parser.parse_args()
+    ratios, bad = [], []
+    for seed in range(options.first, options.first + options.seeds):
+        session = rigs.simulate(seed, options.cameras, options.seconds)
+        name = list(session.rig.cameras)[-1]
+        mine = np.array([one == name for one in session.camera])
+        before, base = timed(without(session, name))
+        whole = timed(session)[1]
+        print(f"rig {seed}: {base:.1f} s CPU without {name}, {whole:.1f} s with it", flush=True)
+        for kind, breakage in BREAKAGES.items():
+            found, cpu = timed(breakage(session, name, mine, np.random.default_rng(seed)))
+            moved, named = change(before, found), names(found, name)
+            ratios.append(cpu / base)
+            if not (named and moved < 1.0 and cpu < 2.0 * base):
+                bad.append(f"{seed} {kind}")
+            reason = found.refused.get(name) or next((t for t in found.warnings if t.startswith(f"{name}:")), "")
+            print(
+                f"  {kind}: {cpu:.1f} s ({cpu / base:.2f}), change {moved:.2f} std, {reason[:110] or 'NOT NAMED'}",
+                flush=True,
+            )
+    print(f"CPU ratio: median {np.median(ratios):.2f}, worst {max(ratios):.2f}; {len(bad)} not met: {', '.join(bad)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,209 @@
+"""What is given stays, what is broken is named and costs the others nothing, and what is stated holds where it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hub.bundle import model_comparison
+from hub.bundle.problem import AdjustmentState, CameraState, Problem, TrackObservations
+from hub.calibration.pipeline import calibrate
+from hub.calibration.triangulation import triangulate
+from protocols.core.errors import Refused
+from protocols.geometry.camera import Intrinsics
+from protocols.session.calibration import Calibration, FixedCalibration
+from protocols.session.observations import gather_tracks
+from protocols.session.result import result_document
+from protocols.session.rig import Rig, RigCamera
+from tests.bench import broken_cameras
+from tests.bench.pose_worlds import FOCAL, cube, errors, joint_optimum, observe, section_4
+from tests.support import rigs
+
+
+def of(session: rigs.Session, name: str) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    return np.array([one == name for one in session.camera])
+
+
+@pytest.fixture(scope="module")
+def four() -> tuple[rigs.Session, Calibration]:
+    session = rigs.simulate(1, 4, 30.0)
+    return session, calibrate(session.rig, session.observations())
+
+
+def with_focal(session: rigs.Session, name: str, factor: float) -> rigs.Session:
+    camera = session.rig.cameras[name]
+    assert camera.intrinsics is not None
+    matrix = camera.intrinsics.matrix.copy()
+    matrix[:2, :2] *= factor
+    changed = replace(camera, intrinsics=replace(camera.intrinsics, matrix=matrix))
+    return replace(session, rig=replace(session.rig, cameras=session.rig.cameras | {name: changed}))
+
+
+def test_a_wrong_lens_is_kept_and_named_and_right_ones_are_not(four: tuple[rigs.Session, Calibration]) -> None:
+    session, found = four
+    assert not [text for text in found.warnings if "refuted" in text]
+    wrong = with_focal(session, "cam1", 1.03)
+    again = calibrate(wrong.rig, wrong.observations())
+    assert [text.split(":")[0] for text in again.warnings if "refuted" in text] == ["cam1"]
+    for name, camera in again.cameras.items():
+        given = wrong.rig.cameras[name].intrinsics
+        assert given is not None
+        assert np.array_equal(camera.intrinsics.matrix, given.matrix)
+        assert np.array_equal(camera.intrinsics.distortions, given.distortions)
+
+
+@pytest.mark.parametrize("solver", ["joint", "distributed"])
+def test_separate_points_reach_the_optimum(solver: str) -> None:
+    """Two of these 4,000 rows lie beyond four stds: they are noise, no outliers, and two points near an epipole."""
+    rng = np.random.default_rng(0)
+    world = section_4(rng)
+    seen = observe(world, rng, cube(rng, 2000), 1.0, np.inf)
+    lens = Intrinsics(1280, 960, np.array([[FOCAL, 0.0, 639.5], [0.0, FOCAL, 479.5], [0.0, 0.0, 1.0]]))
+    cameras = {f"cam{i}": RigCamera(f"cam{i}", (1280, 960), 30.0, lens) for i in range(5)}
+    first, second = world.poses[:2]
+    cameras["cam0"] = replace(cameras["cam0"], position=first.position, rotation=first.rotation)
+    cameras["cam1"] = replace(cameras["cam1"], position=second.position)
+    frame = np.repeat(np.arange(len(seen.cameras)), 2)
+    pixels = seen.seen[:, :, :2].reshape(-1, 2) * FOCAL + [639.5, 479.5]
+    names = [f"cam{i}" for i in seen.cameras.ravel()]
+    rows = gather_tracks(
+        names, ["p"] * len(names), frame, frame / 30.0, pixels, np.full(len(names), np.nan), order=cameras
+    )
+    found = calibrate(Rig(cameras, clock="shared"), rows, solver=solver).cameras
+    best = errors(world, joint_optimum(world, seen).poses)
+    ours = errors(world, [found[name].pose for name in cameras])
+    assert ours[0] < 1.02 * best[0]
+    assert ours[1] < 1.02 * best[1]
+    assert np.abs(found["cam1"].pose.position - second.position).max() < 1e-9
+
+
+@pytest.mark.parametrize("kind", ["other numbering", "wrong lens"])
+def test_a_broken_camera_is_named_and_the_others_stay(kind: str) -> None:
+    session = rigs.simulate(0, 5, 30.0)
+    before, _ = broken_cameras.timed(broken_cameras.without(session, "cam4"))
+    broken = broken_cameras.BREAKAGES[kind](session, "cam4", of(session, "cam4"), np.random.default_rng(0))
+    found, _ = broken_cameras.timed(broken)
+    assert "lens is refuted" in found.refused["cam4"] if kind == "wrong lens" else "cam4" in found.refused
+    assert broken_cameras.change(before, found) < 1.0
+
+
+def test_a_camera_that_shares_no_moment_with_the_first_pair_is_connected() -> None:
+    windows = [(0.0, 30.0), (0.0, 30.0), (0.0, 60.0), (30.0, 60.0), (28.0, 60.0)]
+    session = rigs.simulate(3, 5, 60.0, windows=windows)
+    found = calibrate(session.rig, session.observations(), thorough=True)
+    assert not found.refused
+    for name, camera in found.cameras.items():
+        assert abs(session.clock_error(name, found.reference, camera.time_map)) < 2e-3
+
+
+def test_a_clock_step_is_reported_with_time_and_size_and_no_other_clock_follows(
+    four: tuple[rigs.Session, Calibration],
+) -> None:
+    session, _ = four
+    mine = of(session, "cam2")
+    at = float(np.quantile(session.time[mine], 0.6))
+    time = session.time + np.where(mine & (session.time >= at), 0.03, 0.0)
+    found = calibrate(session.rig, replace(session, time=time).observations())
+    ((when, size, std),) = found.cameras["cam2"].clock_steps
+    assert when == pytest.approx(at, abs=0.7)
+    assert abs(size - 0.03) < 3.0 * std
+    assert [text for text in found.warnings if text.startswith("cam2: its clock steps by +29.")]
+    for name, camera in found.cameras.items():
+        assert camera.readout == 0.0
+        assert abs(session.clock_error(name, found.reference, camera.time_map)) <= 5.0 * camera.time_offset_std
+
+
+def test_a_readout_is_neither_negative_nor_longer_than_a_frame(four: tuple[rigs.Session, Calibration]) -> None:
+    _, found = four
+    rows, cameras = [], []
+    for name, camera in found.cameras.items():
+        time, pixels = found.residuals[name][:, 0], found.residuals[name][:, 1:3]
+        rows.append(TrackObservations(len(cameras), 0, time, pixels, np.ones(len(time), dtype=np.bool_)))
+        cameras.append(CameraState(camera.intrinsics, camera.pose, 1.0, 0.0, 0.0))
+    problem = Problem(tuple(rows), tuple(one.intrinsics for one in cameras), 0, (0, 1))
+    state = AdjustmentState(tuple(cameras), (), np.ones(4))
+    interval = min(float(np.median(np.diff(rows.time))) for rows in problem.rows)
+    for readout, plausible in ((0.5 * interval, True), (-0.044, False), (1.5 * interval, False)):
+        read = tuple(replace(camera, readout=readout) for camera in state.cameras)
+        assert model_comparison.are_readouts_plausible(problem, replace(state, cameras=read)) == plausible
+
+
+def test_the_lag_is_stated_in_the_middle_of_the_shared_span(four: tuple[rigs.Session, Calibration]) -> None:
+    session, found = four
+    for name, table in result_document(found, session.rig)["cameras"].items():
+        time = table["lag_time_s"]
+        truth = session.shown(found.reference, session.true_time(name, time)) - time
+        assert abs(table["lag_s"] - truth) <= 5.0 * table["lag_std_s"] + 1e-6
+        assert (table["lag_std_s"] > 0.0) == (table["clock_rate_ppm_std"] > 0.0) == (name != found.reference)
+        both = []
+        for one in (found.reference, name):
+            seen = session.time[of(session, one)]
+            both.append([session.true_time(one, float(seen.min())), session.true_time(one, float(seen.max()))])
+        begin, end = np.array(both).T
+        middle = 0.5 * (begin.max() + end.min())
+        assert session.true_time(name, time) == pytest.approx(middle, abs=0.01)
+
+
+def test_rates_are_those_of_crystals_unless_refuted() -> None:
+    session = rigs.simulate(8, 3, 12.0, fps=(6.0,), noise=2.0, ppm=30.0)
+    found = calibrate(session.rig, session.observations())
+    for camera in found.cameras.values():
+        assert abs(camera.time_map.clock_rate - 1.0) < 4e-4
+    assert not [text for text in found.warnings if "frame rate" in text]
+    session = rigs.simulate(9, 3, 30.0, ppm=30.0)
+    mine = of(session, "cam1")
+    start = float(session.time[mine].min())
+    time = np.where(mine, start + 1.002 * (session.time - start), session.time)
+    found = calibrate(session.rig, replace(session, time=time).observations())
+    assert [text for text in found.warnings if text.startswith("cam1: its times run -") and "frame rate" in text]
+
+
+def test_known_cameras_in_one_place_are_refused_in_one_line(four: tuple[rigs.Session, Calibration]) -> None:
+    session, found = four
+    place = found.cameras["cam0"].pose.position
+    cameras = {
+        name: replace(camera, pose=replace(camera.pose, position=place)) for name, camera in found.cameras.items()
+    }
+    with pytest.raises(Refused, match="in one place"):
+        calibrate(session.rig, session.observations(), known=FixedCalibration(cameras, "metric"))
+    with pytest.raises(Refused, match="in one place"):
+        triangulate(session.rig, cameras, session.observations())
+
+
+def test_no_row_of_a_path_is_outside_the_observed_span(four: tuple[rigs.Session, Calibration]) -> None:
+    session, found = four
+    spans = []
+    for name, camera in found.cameras.items():
+        time = session.time[of(session, name)]
+        spans.append(camera.time_map.clock_rate * np.array([time.min(), time.max()]) + camera.time_map.time_offset)
+    begin, end = sorted(span[0] for span in spans)[1], sorted(span[1] for span in spans)[-2]
+    (path,) = found.trajectories
+    assert begin - 1e-3 <= path.time[0] < begin + 0.1
+    assert end - 0.1 < path.time[-1] <= end + 1e-3
+
+
+def test_detectors_covariances_weigh_the_rows() -> None:
+    """Half of the rows have six times the noise, and say so."""
+    ratios = []
+    for seed in (0, 1):
+        session = rigs.simulate(seed, 3, 15.0, noise=0.0)
+        rng = np.random.default_rng(seed)
+        std = np.where(rng.random(len(session.time)) < 0.5, 0.5, 3.0)
+        session = replace(session, pixels=session.pixels + std[:, None] * rng.standard_normal((len(std), 2)))
+        plain = session.observations()
+        weighed = gather_tracks(
+            session.camera,
+            session.label,
+            session.frame,
+            session.time,
+            session.pixels,
+            np.full(len(std), np.nan),
+            stds=std,
+            order=session.rig.cameras,
+        )
+        found = [calibrate(session.rig, rows) for rows in (plain, weighed)]
+        ratios.append([session.turn_error({n: c.pose for n, c in one.cameras.items()}) for one in found])
+    plain_error, weighed_error = np.sqrt(np.mean(np.square(ratios), axis=0))
+    assert weighed_error < 0.75 * plain_error
