@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from edge.uav.correlation.appearance_tracker import AppearanceTracker
 from edge.uav.base import Basis, Box, Estimate, Image, Telemetry, TrackState
+from edge.uav.correlation.appearance_tracker import AppearanceTracker
 from edge.uav.ground_tracker import GroundTracker
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics

@@ -43,8 +43,14 @@ _ACCELERATION = 0.7  # std, in target lengths a second squared
 _DRIFT = 0.05  # std of the predicted place, in target lengths a second
 _LOST_STD, _LOST_AFTER_S = 8.0, 15.0  # in target lengths; as of the ground tracker
 _MAX_GROWTH = 8.0  # of a side since the first frame
-_SCALE_GAIN = 0.3  # of the scale filter's correction, per frame
-_TURN_GAIN = 0.02  # similarity to the first view that a turn must gain
+_SCALE_GAIN = 0.5  # of the scale filter's correction, per frame
+_ANCHOR_GAIN = 0.02  # similarity to the first view that another size, shape or angle must gain
+_ANCHOR_STEP = 0.3  # share of the way to it
+_EXTENT_STEP = 0.3  # share of the way to the extent that the colours measure
+_TRIAL_SIZES = (0.8, 1.25)
+_LEARN_ABOVE = 1.0  # log likelihood ratio above which appearance is learnt
+_KEEP_EVERY = 5  # frames between two keyframes
+_RELOCATE_EVERY = 4  # frames between two attempts to recognise the scene
 _SIZES = (1.0, 0.87, 1.15)
 _ANGLES = (0.0, 0.0, 0.35, 0.0, -0.35, 0.0, 0.7, 0.0, -0.7, 0.0, 1.1, 0.0, -1.1, 0.0, 1.57)
 
@@ -91,6 +97,8 @@ class AppearanceTracker:
         self._peak = 0.0
         self._missed = 0
         self._unseen_s = 0.0
+        self._scene.keep()
+        self._last_sight, self._kept_s = (self.box, self._velocity), time
         self._near = 1.0 - _ANYWHERE
         self._ratio = 0.0
         self._expected: Floats | None = None
@@ -150,7 +158,8 @@ class AppearanceTracker:
             self._velocity = linear @ self._velocity
             self._steps = deque((linear @ step for step in self._steps), maxlen=self._steps.maxlen)
             turn = float(np.arctan2(linear[1, 0], linear[0, 0]))
-            box = box.sized(box.sides * motion.zoom).turned(turn)
+            if self._missed == 0:
+                box = box.sized(box.sides * motion.zoom).turned(turn)
             if self._candidate is not None:
                 moved = self._candidate.box
                 moved = moved.at(motion.at(moved.centre, self._scene.reach)).sized(moved.sides * motion.zoom)
@@ -161,10 +170,27 @@ class AppearanceTracker:
             self._velocity = np.array([[c, -s], [s, c]]) @ self._velocity
             self._turn_rate *= float(np.exp(-dt / 0.7))
             box = box.turned(angle)
+            if self._missed % _RELOCATE_EVERY == 0:
+                relocated = self._relocated()
+                if relocated is not None:
+                    box, origin = relocated, relocated.centre
         self.box = box.at(origin + self._velocity * dt)
         if self._expected is not None and self._missed:
             self.box, self._expected = box.at(self._expected), None
         return origin
+
+    def _relocated(self) -> OrientedBox | None:
+        """The target's prediction from where it was last seen, in the scene that is now recognised."""
+        matrix = self._scene.relocate()
+        if matrix is None:
+            return None
+        seen, velocity = self._last_sight
+        linear = matrix[:, :2]
+        self._velocity = linear @ velocity
+        moved = seen.at(linear @ seen.centre + matrix[:, 2] + self._velocity * (self._time - self._kept_s))
+        zoom = float(np.sqrt(abs(np.linalg.det(linear))))
+        turn = float(np.arctan2(linear[1, 0], linear[0, 0]))
+        return moved.sized(seen.sides * zoom).turned(turn)
 
     def _track(self, image: Image, origin: Floats, dt: float) -> None:
         """Measure the target about its prediction."""
@@ -191,11 +217,18 @@ class AppearanceTracker:
             box = box.sized(box.sides * [wider, higher]).turned(turn)
             self._turn_rate += min(1.0, 4.0 * dt) * (turn / dt - self._turn_rate)
             if self._frame % 3 == 0:
-                box = self._upright(image, box)
-            factor = self._scale.factor(image, box) ** _SCALE_GAIN
+                box = self._anchored(image, box)
+                extent = self._shape.measured(image, box)
+                if extent is not None:
+                    box = box.sized(box.sides * (extent / box.sides) ** _EXTENT_STEP)
+            factor = self._scale.factor(image, box) ** _SCALE_GAIN if self._frame % 2 else 1.0
             sides = np.clip(box.sides * factor, self._first / _MAX_GROWTH, self._first * _MAX_GROWTH)
             box = box.sized(np.clip(sides, 4.0, 0.9 * np.array(self._size)))
-            self._learn(image, box, score, peak)
+            if self._ratio > _LEARN_ABOVE:
+                self._learn(image, box, score, peak)
+            if self._frame % _KEEP_EVERY == 0:
+                self._scene.keep()
+                self._last_sight, self._kept_s = (box, self._velocity.copy()), self._time
         self.box = box
         self._flow.remember(image, box)
 
@@ -219,16 +252,23 @@ class AppearanceTracker:
             self._memory.add(image, box)
             self._observe_background(image, box)
 
-    def _upright(self, image: Image, box: OrientedBox) -> OrientedBox:
-        """The box turned back where turning it does not explain the image better.
+    def _anchored(self, image: Image, box: OrientedBox) -> OrientedBox:
+        """The box, drawn towards the size, shape and angle at which it looks most like the first one.
 
-        Seen obliquely, a target that turns does not turn in the image; the flow inside its box then only drifts.
+        The flow inside a box sums up what the background in it does. Seen obliquely, a target that turns does not turn
+        in the image either. The first template has none of that drift.
         """
-        if abs(box.angle) < 0.02:
+        area = float(np.sqrt(np.prod(box.sides / self._first)))
+        shaped = box.sized(self._first * area)
+        trials = [box.turned(-box.angle), shaped, shaped.turned(-box.angle)]
+        trials += [box.sized(box.sides * factor) for factor in _TRIAL_SIZES]
+        gains = [self._memory.first_score(image, trial) for trial in trials]
+        best = int(np.argmax(gains))
+        if gains[best] < self._memory.first_score(image, box) + _ANCHOR_GAIN:
             return box
-        upright = box.turned(-box.angle)
-        gain = self._memory.first_score(image, box) - self._memory.first_score(image, upright)
-        return box if gain > _TURN_GAIN else box.turned(-0.3 * box.angle)
+        aim = trials[best]
+        sides = box.sides * (aim.sides / box.sides) ** _ANCHOR_STEP
+        return box.sized(sides).turned(_ANCHOR_STEP * ((aim.angle - box.angle + np.pi) % (2.0 * np.pi) - np.pi))
 
     def _observe_background(self, image: Image, box: OrientedBox) -> None:
         """Scores of what lies around the target, and in another part of the image each time."""

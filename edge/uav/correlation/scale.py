@@ -19,7 +19,7 @@ _FLOW_PX = 72  # longer side of the resampled box [px]
 _FLOW_GRID = 7  # points a side
 _FLOW_MARGIN = 1.5  # of the resampled region, over the box
 _MIN_POINTS = 8
-_FLOW_PRIOR = 3.0  # points whose weight holds the size where the flow is weak
+_FLOW_PRIOR = 8.0  # points whose weight holds the size where the flow is weak
 _MAX_STEP = 1.12  # change of a side in one frame
 _MAX_TURN = 0.15  # in one frame [rad]
 

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.uav.base import Image
+from edge.uav.image_motion.keyframe import Keyframe
 from protocols.geometry.types import Bools, Floats
 
 Gray = npt.NDArray[np.uint8]
@@ -25,6 +26,7 @@ _LK_WINDOW, _LK_LEVELS = 13, 3
 _BACKWARD_PX = 0.7  # forward-backward distance of a good track [px of the working image]
 _RANSAC_PX = 1.5  # residual of a track of the static scene [px of the working image]
 _MIN_TRACKS, _MIN_SHARE = 12, 0.35  # of a trusted motion: static tracks, and their share
+_PARTS, _VOTE_PX = (4, 2), 2  # parts that are searched after a fast pan; agreement of their shifts [px, reduced]
 _PARALLAX_PX = 6.0  # largest correction [px of the working image]
 _REACH = 0.3  # of the parallax correction, over the image's width
 
@@ -70,6 +72,7 @@ class SceneMotion:
         self._size = (round(size[0] / self._scale), round(size[1] / self._scale))
         self._gray: Gray | None = None
         self._last = np.eye(2, 3)
+        self._keyframe: Keyframe | None = None
         self.reach = _REACH * size[0]
         """Distance over which parallax is taken to be alike [px]."""
 
@@ -127,10 +130,26 @@ class SceneMotion:
         near = np.square(residual).sum(axis=1) < _PARALLAX_PX**2
         zoom = float(np.hypot(matrix[0, 0], matrix[1, 0]))
         trusted = bool(int(mask.sum()) >= _MIN_TRACKS and share > _MIN_SHARE and 0.5 < zoom < 2.0)
-        full = np.asarray(matrix, np.float64).copy()
-        full[:, 2] = self._scale * full[:, 2] + 0.5 * (self._scale - 1.0) * (1.0 - full[:, :2].sum(axis=1))
+        full = self._to_full(np.asarray(matrix, np.float64))
         points = self._scale * (old[near] + 0.5) - 0.5
         return Motion(full, points, self._scale * residual[near], trusted, share)
+
+    def keep(self) -> None:
+        """Keep the last image as the keyframe."""
+        if self._gray is not None:
+            self._keyframe = Keyframe(self._gray)
+
+    def relocate(self) -> Floats | None:
+        """Similarity (2, 3) to the last image from the keyframe [px]; None where the scene is not recognised."""
+        if self._keyframe is None or self._gray is None:
+            return None
+        found = self._keyframe.locate(self._gray)
+        return None if found is None else self._to_full(found)
+
+    def _to_full(self, matrix: Floats) -> Floats:
+        out = matrix.copy()
+        out[:, 2] = self._scale * out[:, 2] + 0.5 * (self._scale - 1.0) * (1.0 - out[:, :2].sum(axis=1))
+        return out
 
     def _to_working(self, matrix: Floats) -> Floats:
         out = matrix.copy()
@@ -138,9 +157,21 @@ class SceneMotion:
         return out
 
     def _coarse_shift(self, old: Gray, new: Gray) -> Floats:
-        """(2, 3) translation by phase correlation."""
-        window = cv2.createHanningWindow(self._size, cv2.CV_32F)
-        (dx, dy), _ = cv2.phaseCorrelate(old.astype(np.float32), new.astype(np.float32), window)
+        """(2, 3) translation of a fast pan: parts of the reduced old image are searched in the new one, and vote."""
+        small = [cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA) for image in (old, new)]
+        rows, columns = small[0].shape[0] // _PARTS[1], small[0].shape[1] // _PARTS[0]
+        shifts, scores = [], []
+        for k in range(_PARTS[0] * _PARTS[1]):
+            x, y = columns * (k % _PARTS[0]), rows * (k // _PARTS[0])
+            part = small[0][y : y + rows, x : x + columns]
+            _, score, _, at = cv2.minMaxLoc(cv2.matchTemplate(small[1], part, cv2.TM_CCOEFF_NORMED))
+            shifts.append((at[0] - x, at[1] - y))
+            scores.append(max(score, 0.0) if part.std() > 1.0 else 0.0)
+        shift = np.array(shifts, dtype=np.float64)
+        agree = np.abs(shift[:, None] - shift[None]).max(axis=2) <= _VOTE_PX
+        votes = agree @ np.array(scores)
+        chosen = agree[int(votes.argmax())]
+        dx, dy = 4.0 * shift[chosen].mean(axis=0)
         return np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]])
 
 
