@@ -22,6 +22,7 @@ from protocols.geometry.types import Floats
 _STEEP_COSINE = 0.82  # of the angle between optical axis and vertical, 35 degrees: the ground fills the image
 _AGREE, _CONTRADICT = 0.35, 0.7  # distance of the two estimates, in target lengths
 _FRAMES_TO_TRUST, _FRAMES_TO_DROP = 20, 6  # consecutive frames of agreement, contradiction
+_HIDDEN_FRAMES = 3  # frames without the target after which an untrusted ground is given up
 _CHECK_EVERY = 3  # frames between two looks of the appearance tracker while the ground is trusted
 _RETRY_S = 4.0  # after which the ground is tried again; doubles each time
 _ATTITUDE = "the attitude says that the camera looks down"
@@ -46,6 +47,7 @@ class AdaptiveTracker:
         self._trust = 0.0  # -1: contradicted, 1: held
         self._retry_s, self._retry_at = _RETRY_S, np.inf
         self._frame = 0
+        self._hidden = 0  # consecutive frames in which an untrusted ground could not be compared
         self._shift = np.zeros(2)  # of the box seen by appearance from the ground's estimate [px]
         self._sides: Floats | None = None
 
@@ -130,6 +132,13 @@ class AdaptiveTracker:
 
     def _compare(self, ground: Estimate, seen: Estimate, time: float) -> None:
         """Evidence for and against the ground, from a frame in which the appearance is certain of the target."""
+        if seen.state is not TrackState.VISIBLE and self._trust < 1.0:
+            # Whether it would have held is not known, and two searches would cost twice.
+            self._hidden += 1
+            if self._hidden > _HIDDEN_FRAMES:
+                self._ground, self._retry_at = None, time + self._retry_s
+            return
+        self._hidden = 0
         if seen.state is not TrackState.VISIBLE or not self._appearance.certain:
             return
         distance = float(np.hypot(seen.x - ground.x, seen.y - ground.y))

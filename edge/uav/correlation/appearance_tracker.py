@@ -38,6 +38,8 @@ _DETECTION = 0.25  # probability that one search finds a target in view
 _CHANGE = 0.1  # std of the similarity of a target that has been away
 _HITS = 3  # consecutive frames of a re-detection
 _PEAK_SHARE = 0.55  # of the usual height of the filter's answer, at a re-detection
+_PEAK_TARGET, _PEAK_BACKGROUND = (0.9, 0.2), (0.3, 0.15)  # mean and std of that share, on and off the target
+_PEAK_LIMIT = 3.0  # of the log likelihood ratio of that share
 _VELOCITY_S = 0.5  # over which velocity is averaged
 _ACCELERATION = 0.7  # std, in target lengths a second squared
 _DRIFT = 0.05  # std of the predicted place, in target lengths a second
@@ -94,13 +96,15 @@ class AppearanceTracker:
         self._memory.add(image, self.box)
         self._observe_background(image, self.box)
         self._shape = Outline(image, self.box)
-        self._peak = 0.0
+        # On the image that it has learnt a filter answers higher than it will on any other.
+        self._peak = 0.6 * max(self._filter.respond(image, self.box).peak, 0.05)
         self._missed = 0
         self._unseen_s = 0.0
         self._scene.keep()
-        self._last_sight, self._kept_s = (self.box, self._velocity), time
+        self._last_sight, self._since_keyframe = (self.box, self._velocity), np.eye(3)
         self._near = 1.0 - _ANYWHERE
         self._ratio = 0.0
+        self._broken = False  # whether the motion of the scene was unknown in a frame since the last sight
         self._expected: Floats | None = None
         self._candidate: _Candidate | None = None
         return self._estimate(time)
@@ -154,6 +158,8 @@ class AppearanceTracker:
         origin = box.centre
         if motion.trusted:
             linear = motion.matrix[:, :2]
+            if self._missed == 0:
+                self._since_keyframe = _square(motion.matrix) @ self._since_keyframe
             origin = motion.at(box.centre, self._scene.reach)
             self._velocity = linear @ self._velocity
             self._steps = deque((linear @ step for step in self._steps), maxlen=self._steps.maxlen)
@@ -165,15 +171,17 @@ class AppearanceTracker:
                 moved = moved.at(motion.at(moved.centre, self._scene.reach)).sized(moved.sides * motion.zoom)
                 self._candidate.box = moved.turned(turn)
         if self._missed:
+            self._broken |= not motion.trusted
             angle = self._turn_rate * dt
             c, s = np.cos(angle), np.sin(angle)
             self._velocity = np.array([[c, -s], [s, c]]) @ self._velocity
             self._turn_rate *= float(np.exp(-dt / 0.7))
             box = box.turned(angle)
-            if self._missed % _RELOCATE_EVERY == 0:
+            # A similarity to the whole scene is coarser than the chain with its parallax, as long as that holds.
+            if self._broken and self._missed > _GRACE_FRAMES and self._missed % _RELOCATE_EVERY == 0:
                 relocated = self._relocated()
                 if relocated is not None:
-                    box, origin = relocated, relocated.centre
+                    box, origin, self._broken = relocated, relocated.centre, False
         self.box = box.at(origin + self._velocity * dt)
         if self._expected is not None and self._missed:
             self.box, self._expected = box.at(self._expected), None
@@ -185,9 +193,11 @@ class AppearanceTracker:
         if matrix is None:
             return None
         seen, velocity = self._last_sight
+        # From the image of the last sight to the keyframe, and on to this image.
+        matrix = (_square(matrix) @ np.linalg.inv(self._since_keyframe))[:2]
         linear = matrix[:, :2]
         self._velocity = linear @ velocity
-        moved = seen.at(linear @ seen.centre + matrix[:, 2] + self._velocity * (self._time - self._kept_s))
+        moved = seen.at(linear @ seen.centre + matrix[:, 2] + self._velocity * self._unseen_s)
         zoom = float(np.sqrt(abs(np.linalg.det(linear))))
         turn = float(np.arctan2(linear[1, 0], linear[0, 0]))
         return moved.sized(seen.sides * zoom).turned(turn)
@@ -200,15 +210,24 @@ class AppearanceTracker:
             return
         box, peak = self._respond(image, self.box)
         score = self._memory.score(image, box)
-        ratio = self._ratio = self._memory.log_ratio(score)
+        ratio = self._ratio = self._memory.log_ratio(score) + self._peak_ratio(peak)
         self.debug = {"peak": peak, "score": score, "llr": ratio}
         if ratio < _REJECT:
             self._miss(dt)
             return
         self._accept(image, box, score, peak, origin, dt)
 
+    def _peak_ratio(self, peak: float) -> float:
+        """log likelihood ratio of the filter's answer: target against background, bounded."""
+        share = peak / self._peak
+        target = -0.5 * (min(share - _PEAK_TARGET[0], 0.0) / _PEAK_TARGET[1]) ** 2 - np.log(_PEAK_TARGET[1])
+        background = -0.5 * (max(share - _PEAK_BACKGROUND[0], 0.0) / _PEAK_BACKGROUND[1]) ** 2
+        return float(np.clip(target - background + np.log(_PEAK_BACKGROUND[1]), -_PEAK_LIMIT, _PEAK_LIMIT))
+
     def _accept(self, image: Image, box: OrientedBox, score: float, peak: float, origin: Floats, dt: float) -> None:
         self._missed, self._unseen_s, self._near = 0, 0.0, 1.0 - _ANYWHERE
+        self._broken = False
+        self._peak += max(0.1, 1.0 / (self._frame + 1.0)) * (peak - self._peak)
         if box.share_inside(self._size) > _LEARN_INSIDE:
             step = (box.centre - origin) / dt
             self._steps.append(step)
@@ -228,7 +247,8 @@ class AppearanceTracker:
                 self._learn(image, box, score, peak)
             if self._frame % _KEEP_EVERY == 0:
                 self._scene.keep()
-                self._last_sight, self._kept_s = (box, self._velocity.copy()), self._time
+                self._since_keyframe = np.eye(3)
+            self._last_sight = box, self._velocity.copy()
         self.box = box
         self._flow.remember(image, box)
 
@@ -247,7 +267,6 @@ class AppearanceTracker:
         if self._frame % 2 == 0:
             self._scale.learn(image, box)
         self._memory.confirm(score)
-        self._peak += 0.1 * (peak - self._peak) if self._peak else peak
         if self._frame % _OBSERVE_EVERY == 0:
             self._memory.add(image, box)
             self._observe_background(image, box)
@@ -359,3 +378,8 @@ class AppearanceTracker:
         centre, extent = self._shape.bounds(self.box)
         x, y = (nan, nan) if state is TrackState.LOST else (float(centre[0]), float(centre[1]))
         return Estimate(time, state, x, y, float(extent[0]), float(extent[1]), nan, std)
+
+
+def _square(matrix: Floats) -> Floats:
+    """(3, 3) of a map (2, 3)."""
+    return np.vstack([matrix, [0.0, 0.0, 1.0]])
