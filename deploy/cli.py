@@ -72,7 +72,7 @@ COMMANDS: tuple[tuple[str, str, str], ...] = (
         "deploy.commands.data.import_:import_",
         "Read other tools' calibrations and tracks, or convert a session to a log.",
     ),
-    ("track", "deploy.commands.offline.track:track", "Track one car from the air, also while it is out of view."),
+    ("track", "deploy.commands.offline.track:track", "Track one target from the air, also while it is out of view."),
     (
         "report",
         "deploy.commands.offline.report:report",

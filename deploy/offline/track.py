@@ -1,4 +1,4 @@
-"""Offline tracking of one car: reads images and telemetry, writes track.csv and hypotheses.csv."""
+"""Offline tracking of one target: reads images and telemetry, writes track.csv and hypotheses.csv."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from edge.devices.base import Frame
 from edge.devices.playback.video_file import image_files
-from edge.uav.base import Box, Estimate, Image, Telemetry, Tracker, TrackState
+from edge.uav.base import Basis, Box, Estimate, Image, Telemetry, Tracker, TrackState
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.files import read_text
@@ -26,6 +26,7 @@ from protocols.session.rig import RigCamera, read_rig
 TRACK, HYPOTHESES, OVERLAY = "track.csv", "hypotheses.csv", "overlay.mp4"
 COLUMNS = ("frame", "time", "state", "x", "y", "width", "height", "heading", "std")
 GROUND_COLUMNS = ("north", "east", "speed", "course", "std_m")
+BASIS = "basis"
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _POSITION = ("north", "east", "down")
 _TELEMETRY_LOOKAHEAD_S = 0.6  # lead with which samples are passed to the tracker: clocks may differ by 0.5 s
@@ -221,9 +222,10 @@ def without_overlay_data(row: TrackedFrame) -> TrackedFrame:
 
 
 def track_text(rows: Sequence[TrackedFrame]) -> str:
-    """Text of track.csv; the ground-plane columns only if any frame has them."""
+    """Text of track.csv; the ground-plane columns and the basis only if any frame has them."""
     metric = any(math.isfinite(row.estimate.north) for row in rows)
-    lines = [",".join(COLUMNS + (GROUND_COLUMNS if metric else ()))]
+    based = any(row.estimate.basis is not None for row in rows)
+    lines = [",".join(COLUMNS + (GROUND_COLUMNS if metric else ()) + ((BASIS,) if based else ()))]
     for row in rows:
         e = row.estimate
         lost = e.state is TrackState.LOST
@@ -232,8 +234,20 @@ def track_text(rows: Sequence[TrackedFrame]) -> str:
         cells += [_cell(value) for value in (e.width, e.height, e.heading, e.std)]
         if metric:
             cells += [_cell(value) for value in (e.north, e.east, e.speed, e.course, e.std_m)]
+        if based:
+            cells.append("" if e.basis is None else e.basis.value)
         lines.append(",".join(cells))
     return "\n".join(lines) + "\n"
+
+
+def basis_summary(rows: Sequence[TrackedFrame]) -> dict[str, dict[str, int | str]]:
+    """Frames by frame of reference, the best one first, each with the reason that the last of them had."""
+    found: dict[str, dict[str, int | str]] = {}
+    for basis in Basis:
+        chosen = [row.estimate for row in rows if row.estimate.basis is basis]
+        if chosen:
+            found[basis.value] = {"frames": len(chosen), "reason": chosen[-1].reason}
+    return found
 
 
 def hypotheses_text(rows: Sequence[TrackedFrame]) -> str:

@@ -89,6 +89,9 @@ def draw(image: Image, tracked: TrackedFrame) -> Image:
             cv2.circle(canvas, (int(at[0]), int(at[1])), radius, colour, 1, cv2.LINE_AA)
     text = f"{tracked.frame}  {tracked.time:.2f} s  {estimate.state.value}"
     cv2.putText(canvas, text, (12, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, 1, cv2.LINE_AA)
+    if estimate.basis is not None:
+        why = f"{estimate.basis.value}: {estimate.reason}"
+        cv2.putText(canvas, why, (12, 48), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (200, 200, 200), 1, cv2.LINE_AA)
     return canvas
 
 

@@ -30,6 +30,19 @@ class TrackState(StrEnum):
     """The particle set is too dispersed to give a useful estimate."""
 
 
+class Basis(StrEnum):
+    """Frame of reference of an estimate, the best one first."""
+
+    GROUND = "ground"
+    """The ground plane in metres: lens, attitude and height are known."""
+    PLANE = "plane"
+    """The ground plane up to scale."""
+    STABILISED = "stabilised"
+    """The image, its motion compensated by what lies around."""
+    IMAGE = "image"
+    """The plain image."""
+
+
 @dataclass(frozen=True, slots=True)
 class Box:
     """A bounding box in image pixels: x, y are its top left corner, as in ``--target x,y,w,h``."""
@@ -69,7 +82,8 @@ class Estimate:
     x, y: centre in image pixels, also outside the image; nan when lost. heading: atan2(dy, dx) in the image
     [rad], y down; nan where unknown. std: of the centre, one coordinate [px].
     north, east, speed, course, std_m: on the ground [m, m/s, rad]; nan where no metric ground frame is available;
-    course = atan2(east, north). particles: (n, 2) image pixels, for overlays. layers: further named
+    course = atan2(east, north). basis: frame of reference, and the reason for it; None where a
+    tracker has only one. particles: (n, 2) image pixels, for overlays. layers: further named
     geometry in image pixels for overlays (road, regions, tracks), (n, 2) each.
     """
 
@@ -86,6 +100,8 @@ class Estimate:
     speed: float = float("nan")
     course: float = float("nan")
     std_m: float = float("nan")
+    basis: Basis | None = None
+    reason: str = ""
     hypotheses: tuple[Hypothesis, ...] = ()
     particles: Floats | None = None
     layers: Mapping[str, Floats] = field(default_factory=dict)

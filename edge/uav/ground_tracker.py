@@ -1,4 +1,4 @@
-"""The default tracker: one car tracked on the ground plane, also while it is outside the image.
+"""One car tracked on the ground plane, also while it is outside the image.
 
 Each frame: localise the camera over the ground (``CameraLocaliser``), search for the target where the particle set
 predicts it (``Target``), weight the particles by detections and missed detections (``evaluate_candidates``), update the
@@ -149,6 +149,16 @@ class GroundTracker:
         """The observed road near the target: image pixels (n, 2), and north, east (n, 2) [m] where metric."""
         ground = self._road.road_cells(self._particles.weights @ self._particles.position, _ROAD_OVERLAY_REACH)
         return self._localiser.pixels(ground), ground if self._localiser.metric else None
+
+    @property
+    def metric(self) -> bool:
+        """Whether the ground frame is in metres."""
+        return self._localiser.metric
+
+    @property
+    def view_cosine(self) -> float:
+        """Cosine of the angle between optical axis and vertical; nan where no attitude is known."""
+        return self._localiser.view_cosine
 
     @property
     def _heading(self) -> float:

@@ -74,6 +74,12 @@ BENCHES = {
     "uav_agent": Bench(
         "UAV agent: latency, clocks, closed loops", ("--only", "latency,offset", "--seeds", "1"), data=True
     ),
+    "uav_any_view": Bench(
+        "any target in oblique views",
+        ("--kinds", "rendered,rendered away", "--models", "ground"),
+        ("--models", "ground"),
+        data=True,
+    ),
     "uav_aerial": Bench("one car from a drone, real video", ("--models", "ground"), data=True),
 }
 

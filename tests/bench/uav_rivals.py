@@ -1,4 +1,4 @@
-"""OpenCV's CSRT and KCF trackers behind the tracker interface. They need opencv-contrib, which only the benches use.
+"""OpenCV's CSRT, KCF and MOSSE behind the tracker interface. They need opencv-contrib, which only the benches use.
 
 opencv-contrib-python-headless and opencv-python-headless are both ``cv2`` and can't share an environment. Put the
 former, of the same version as the latter, into a folder of its own and that folder first on the path:
@@ -16,7 +16,7 @@ import cv2
 
 from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
 
-NAMES = ("csrt", "kcf")
+NAMES = ("csrt", "kcf", "mosse")
 
 
 def available(name: str) -> bool:

@@ -1,4 +1,4 @@
-"""`syncline track`: tracks one car in a video, also while it is out of view."""
+"""`syncline track`: tracks one target in a video, also while it is out of view."""
 
 from __future__ import annotations
 
@@ -31,8 +31,9 @@ def track(
     json: Annotated[bool, Parameter(negative="")] = False,
     seed: int = 0,
 ) -> int:
-    """Track one car in an aerial video, also while it is occluded or out of view, with uncertainty.
+    """Track one target in an aerial video, also while it is occluded or out of view, with uncertainty.
 
+    The target may be a car, boat, bicycle or person, the view steep or oblique; neither lens nor telemetry is needed.
     Writes track.csv (one row per frame: visible, coasting or lost, with a std) and hypotheses.csv to --out.
 
     Example: syncline track flight.mp4 --target 312,200,44,20 --out tracked --overlay
@@ -43,7 +44,7 @@ def track(
         A video file, a folder of images sorted by name, or a .mcap log of a UAV agent with [images], which also
         contains the intrinsics and body_from_camera.
     target
-        The car's bounding box in the first tracked frame, x,y,w,h in pixels; x,y is the top left corner.
+        The target's bounding box in the first tracked frame, x,y,w,h in pixels; x,y is the top left corner.
     out
         Folder for the results.
     start
@@ -55,7 +56,9 @@ def track(
         clock offset is estimated from the rotation seen in the video. The ground model cannot use telemetry without
         matrix and body_from_camera in --rig, and refuses it.
     model
-        ground: tracks on the ground plane; the most accurate. paper, plain: the paper's models, for comparison.
+        ground: on the best frame of reference that the evidence supports: the ground plane, metric or up to scale, the
+        stabilised or the plain image; track.csv's column basis has it. paper, plain: the paper's models of a car, for
+        comparison.
     fps
         Frame rate, instead of the file's time stamps or rig.toml's.
     overlay
@@ -184,8 +187,11 @@ def _print_summary(
     scores: dict[str, float | int] | None,
     as_json: bool,
 ) -> None:
-    """Print the summary: number of frames by state, scores, and output files."""
+    """Print the summary: number of frames by state and by frame of reference, scores, and output files."""
+    from deploy.offline.track import basis_summary
+
     states = Counter(row.estimate.state.value for row in rows)
+    bases = basis_summary(rows)
     names = ["track.csv", "hypotheses.csv", *(["overlay.mp4"] if overlay else [])]
     if as_json:
         import json
@@ -198,6 +204,7 @@ def _print_summary(
             "first_frame": rows[0].frame,
             "frames": len(rows),
             **{state: states.get(state, 0) for state in ("visible", "coasting", "lost")},
+            "basis": bases,
             "warnings": warnings,
         }
         if scores is not None:
@@ -206,6 +213,8 @@ def _print_summary(
         return
     parts = ", ".join(f"{states.get(state, 0)} {state}" for state in ("visible", "coasting", "lost"))
     print(f"{len(rows)} frames from {rows[0].frame}: {parts}")
+    for basis, entry in bases.items():
+        print(f"{basis}: {entry['frames']} frames; {entry['reason']}")
     for name, value in (scores or {}).items():
         print(f"{name}: {value}" if isinstance(value, int) else f"{name}: {value:.3f}")
     for warning in warnings:

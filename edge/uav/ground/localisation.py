@@ -61,6 +61,12 @@ class CameraLocaliser:
         return self._kind == "metric"
 
     @property
+    def view_cosine(self) -> float:
+        """Cosine of the angle between optical axis and vertical; nan where no attitude is known."""
+        pose = self._ego.pose
+        return float(pose.rotation[2, 2]) if isinstance(pose, PlanePose) else float("nan")
+
+    @property
     def frames_without_pose(self) -> int:
         """Consecutive frames without a trusted camera pose."""
         return self._ego.frames_without_pose

@@ -30,4 +30,4 @@ def check_target_box(image: Image, size: tuple[int, int], target: Box) -> None:
             f"target {text} is outside the image of {width}x{height}", remedy="give x,y,w,h of a car in the image"
         )
     if target.width * target.height > 0.5 * width * height:
-        raise InputError(f"target {text} fills the image", remedy="draw the box round one car")
+        raise InputError(f"target {text} fills the image", remedy="draw the box round one target")

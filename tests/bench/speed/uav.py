@@ -1,4 +1,4 @@
-"""The UAV tracker beside OpenCV's CSRT, KCF and MIL on the same flight: CPU per frame while the car is in the image.
+"""The UAV tracker beside OpenCV's CSRT, KCF, MOSSE and MIL on the same flights: CPU per frame while the car is in the image.
 
 Run with a folder that holds opencv-contrib first on the path (``make bench`` makes it): ours then runs on it too.
 """
@@ -12,7 +12,7 @@ import cv2
 
 from edge.uav.base import Tracker
 from edge.uav.world import scenarios
-from tests.bench import uav_rivals
+from tests.bench import uav_any_view, uav_rivals
 from tests.bench.speed.rows import Limit, Row, Section
 from tests.bench.uav_tracker import Options, make
 
@@ -50,6 +50,22 @@ def flight(size: tuple[int, int], frames: int, opencv_names: tuple[str, ...]) ->
     return {name: 1e3 * spent[name] / max(count[name], 1) for name in trackers}
 
 
+def _oblique(quick: bool, opencv_names: tuple[str, ...]) -> list[Row]:
+    """A rendered oblique flight without lens and telemetry: CPU a frame, and overlap with the true box."""
+    sequence = uav_any_view.flight("car", "orbit", 5, 15.0, 0.0, 30 if quick else 90)
+    scores = {name: uav_any_view.run(sequence, name) for name in ("ground", *opencv_names)}
+    ours = scores["ground"]
+    rows = []
+    for name in opencv_names:
+        theirs, beside = scores[name], name.upper()
+        rows.append(
+            Row("any target 640×360, oblique, a frame", ours.ms, "ms", beside, theirs.ms, must=Limit("ours", 15.0))
+        )
+        overlap = "any target, oblique: overlap with the truth"
+        rows.append(Row(overlap, ours.overlap, "IoU", beside, theirs.overlap, less=False))
+    return rows
+
+
 def measure(quick: bool, data: Path) -> Section:
     """Both sizes, with the OpenCV trackers that are available."""
     del data
@@ -67,4 +83,5 @@ def measure(quick: bool, data: Path) -> Section:
             found.rows.append(Row(work, ms["ground"], "ms", **limits))
         for number, name in enumerate(opencv_names):
             found.rows.append(Row(work, ms["ground"], "ms", name.upper(), ms[name], **(limits if number == 0 else {})))
+    found.rows += _oblique(quick, tuple(name for name in uav_rivals.NAMES if uav_rivals.available(name)))
     return found

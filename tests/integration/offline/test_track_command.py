@@ -70,7 +70,7 @@ def test_a_folder_of_images_is_tracked_until_out_of_view(
     assert run([*arguments, "--csv-truth", str(recording / "truth.csv")]) == 0
     output = json.loads(capsys.readouterr().out)
     header = (tmp_path / "track.csv").read_text().splitlines()[0]
-    assert header == "frame,time,state,x,y,width,height,heading,std"
+    assert header == "frame,time,state,x,y,width,height,heading,std,basis"
     rows = table(tmp_path / "track.csv")
     assert [int(row["frame"]) for row in rows] == list(range(FRAMES))
     assert float(rows[30]["time"]) == pytest.approx(1.0)
@@ -95,7 +95,8 @@ def test_telemetry_adds_ground_columns_and_start_selects_the_frame(
     assert run(["track", str(recording / "pictures"), *place, *extra]) == 0
     assert "1 rows hold no sample" in capsys.readouterr().out
     rows = table(tmp_path / "track.csv")
-    assert list(rows[0])[-5:] == ["north", "east", "speed", "course", "std_m"]
+    assert list(rows[0])[-6:] == ["north", "east", "speed", "course", "std_m", "basis"]
+    assert {row["basis"] for row in rows} == {"ground"}
     assert int(rows[0]["frame"]) == 5
     assert float(rows[0]["time"]) == pytest.approx(0.25)  # 20 fps, as rig.toml says
     assert float(rows[20]["speed"]) == pytest.approx(12.0, abs=1.0)

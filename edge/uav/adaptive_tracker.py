@@ -1,0 +1,181 @@
+"""The default tracker: any target in any view, on the best frame of reference that the evidence supports.
+
+Two trackers share the work. ``GroundTracker`` follows on the ground plane, where it knows roads and can say what a car
+does out of view; it needs a view in which that plane holds. ``AppearanceTracker`` follows in the stabilised image and
+needs nothing. Telemetry that says that the camera looks down decides for the ground; else the two are compared while
+both see the target, and the ground is used once it has held, and given up where it is contradicted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from edge.uav.base import Basis, Box, Estimate, Image, Telemetry, TrackState
+from edge.uav.correlation.appearance_tracker import AppearanceTracker
+from edge.uav.ground_tracker import GroundTracker
+from protocols.core.errors import InputError
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Floats
+
+_STEEP_COSINE = 0.82  # of the angle between optical axis and vertical, 35 degrees: the ground fills the image
+_AGREE, _CONTRADICT = 0.35, 0.7  # distance of the two estimates, in target lengths
+_FRAMES_TO_TRUST, _FRAMES_TO_DROP = 20, 6  # consecutive frames of agreement, contradiction
+_HIDDEN_FRAMES = 3  # frames without the target after which an untrusted ground is given up
+_CHECK_EVERY = 3  # frames between two looks of the appearance tracker while the ground is trusted
+_RETRY_S = 4.0  # after which the ground is tried again; doubles each time
+_ATTITUDE = "the attitude says that the camera looks down"
+
+
+class AdaptiveTracker:
+    """Tracker of one target. size: (width, height) [px]. lens, body_from_camera: without them telemetry is unused."""
+
+    def __init__(
+        self,
+        size: tuple[int, int],
+        lens: Intrinsics | None = None,
+        body_from_camera: Floats | None = None,
+        fps: float = 30.0,
+        seed: int = 0,
+    ) -> None:
+        self._settings = (size, lens, body_from_camera, fps, seed)
+        self._size, self._fps = size, fps
+        self._ground: GroundTracker | None = GroundTracker(size, lens, body_from_camera, fps, seed)
+        self._appearance = AppearanceTracker(size, fps)
+        self._samples: list[Telemetry] = []
+        self._trust = 0.0  # -1: contradicted, 1: held
+        self._retry_s, self._retry_at = _RETRY_S, np.inf
+        self._frame = 0
+        self._hidden = 0  # consecutive frames in which an untrusted ground could not be compared
+        self._shift = np.zeros(2)  # of the box seen by appearance from the ground's estimate [px]
+        self._sides: Floats | None = None
+
+    def begin(self, image: Image, time: float, target: Box) -> Estimate:
+        """Initialise the target from its first frame. Raises InputError for an invalid box."""
+        assert self._ground is not None
+        first = self._ground.begin(image, time, target)
+        self._appearance.begin(image, time, target)
+        self._steep = self._ground.view_cosine > _STEEP_COSINE
+        self._cut = not self._is_complete(target)
+        return self._on_ground(first) if self._steep else self._on_image(self._appearance.begin(image, time, target))
+
+    def handle_telemetry(self, sample: Telemetry) -> None:
+        """Add one sample; without lens and mounting it is not used."""
+        self._samples = [*self._samples[-199:], sample]
+        if self._ground is not None:
+            self._ground.handle_telemetry(sample)
+
+    def handle_frame(self, image: Image | None, time: float) -> Estimate:
+        """Track the target into the next frame; ``None`` for a frame that could not be decoded."""
+        self._frame += 1
+        if self._ground is None:
+            return self._without_ground(image, time)
+        ground = self._ground.handle_frame(image, time)
+        if not self._steep and self._ground.view_cosine > _STEEP_COSINE and self._trust >= 0.0:
+            self._steep = True
+        if self._steep:
+            return self._on_ground(ground)
+        if self._cut and image is not None:
+            return self._complete(image, ground, time)
+        trusted = self._trust >= 1.0
+        if trusted and self._frame % _CHECK_EVERY and ground.state is TrackState.VISIBLE:
+            return self._on_ground(self._corrected(ground))
+        if trusted:
+            self._appearance.expect(ground)
+        seen = self._appearance.handle_frame(image, time)
+        self._compare(ground, seen, time)
+        if self._ground is None or self._trust < 1.0:
+            return self._on_image(seen)
+        if seen.state is TrackState.VISIBLE and ground.state is TrackState.VISIBLE:
+            self._shift = np.array([seen.x - ground.x, seen.y - ground.y])
+            self._sides = np.array([seen.width / ground.width, seen.height / ground.height])
+        return self._on_ground(self._corrected(ground))
+
+    def road_outline(self) -> tuple[Floats, Floats | None]:
+        """The observed road near the target, see ``GroundTracker``."""
+        return (np.zeros((0, 2)), None) if self._ground is None else self._ground.road_outline()
+
+    def _is_complete(self, box: Box) -> bool:
+        """Whether a box lies in the image without touching its border."""
+        right, bottom = self._size[0] - box.x - box.width, self._size[1] - box.y - box.height
+        return min(box.x, box.y, right, bottom) > 1.0
+
+    def _complete(self, image: Image, ground: Estimate, time: float) -> Estimate:
+        """A target that the border cut in the first image: the ground tracker learns all of it as it comes in."""
+        if ground.state is not TrackState.VISIBLE:
+            self._cut = False
+            return self._on_image(self._appearance.handle_frame(image, time))
+        whole = _box(ground)
+        if self._is_complete(whole):
+            self._cut = False
+            self._appearance.begin(image, time, whole)
+        return self._on_ground(ground)
+
+    def _without_ground(self, image: Image | None, time: float) -> Estimate:
+        seen = self._appearance.handle_frame(image, time)
+        ready = image is not None and time > self._retry_at and self._appearance.certain
+        if ready and image is not None:
+            self._retry_at, self._retry_s = np.inf, 2.0 * self._retry_s
+            self._restart_ground(image, time, seen)
+        return self._on_image(seen)
+
+    def _restart_ground(self, image: Image, time: float, seen: Estimate) -> None:
+        ground = GroundTracker(*self._settings)
+        for sample in self._samples:
+            ground.handle_telemetry(sample)
+        try:
+            ground.begin(image, time, _box(seen))
+        except InputError:
+            return
+        self._ground, self._trust, self._steep = ground, 0.0, False
+
+    def _compare(self, ground: Estimate, seen: Estimate, time: float) -> None:
+        """Evidence for and against the ground, from a frame in which the appearance is certain of the target."""
+        if seen.state is not TrackState.VISIBLE and self._trust < 1.0:
+            # Whether it would have held is not known, and two searches would cost twice.
+            self._hidden += 1
+            if self._hidden > _HIDDEN_FRAMES:
+                self._ground, self._retry_at = None, time + self._retry_s
+            return
+        self._hidden = 0
+        if seen.state is not TrackState.VISIBLE or not self._appearance.certain:
+            return
+        distance = float(np.hypot(seen.x - ground.x, seen.y - ground.y))
+        length = max(seen.width, seen.height)
+        weight = _CHECK_EVERY if self._trust >= 1.0 else 1
+        if ground.state is TrackState.VISIBLE and distance < _AGREE * length + 2.0:
+            self._trust = min(self._trust + weight / _FRAMES_TO_TRUST, 1.0)
+        elif ground.state is not TrackState.VISIBLE or distance > _CONTRADICT * length + 4.0:
+            self._trust -= weight / _FRAMES_TO_DROP
+        if self._trust <= -1.0 + 1e-9:
+            self._ground, self._retry_at = None, time + self._retry_s
+
+    def _corrected(self, ground: Estimate) -> Estimate:
+        """The ground's estimate with the offset and the size at which the appearance last saw the target."""
+        if ground.state is not TrackState.VISIBLE or self._sides is None:
+            return ground
+        sides = self._sides * [ground.width, ground.height]
+        return replace(
+            ground,
+            x=ground.x + float(self._shift[0]),
+            y=ground.y + float(self._shift[1]),
+            width=float(sides[0]),
+            height=float(sides[1]),
+        )
+
+    def _on_ground(self, estimate: Estimate) -> Estimate:
+        metric = bool(np.isfinite(estimate.north)) or (self._ground is not None and self._ground.metric)
+        reason = _ATTITUDE if self._steep else "the target moves on one plane"
+        return replace(estimate, basis=Basis.GROUND if metric else Basis.PLANE, reason=reason)
+
+    def _on_image(self, estimate: Estimate) -> Estimate:
+        motion = self._appearance.motion
+        if motion.trusted:
+            reason = f"{100 * motion.share:.0f} % of the corners around move alike"
+            return replace(estimate, basis=Basis.STABILISED, reason=reason)
+        return replace(estimate, basis=Basis.IMAGE, reason="too few corners around move alike")
+
+
+def _box(e: Estimate) -> Box:
+    return Box(e.x - 0.5 * (e.width - 1.0), e.y - 0.5 * (e.height - 1.0), e.width, e.height)

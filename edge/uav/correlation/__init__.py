@@ -1,0 +1,1 @@
+"""Appearance of any target in the image: correlation filter, scale, template memory, search."""

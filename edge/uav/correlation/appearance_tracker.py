@@ -1,0 +1,385 @@
+"""Tracks any target in any view by its appearance, on the image stabilised by what lies around.
+
+Each frame: image motion of the static scene, prediction, correlation filter, size and turn, and verification against
+the target's own background. While the target is away, its place moves with the scene and its own last velocity, and
+the region in which it can be is searched. No lens and no telemetry are used.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
+from edge.uav.correlation.filter import CorrelationFilter
+from edge.uav.correlation.memory import TemplateMemory
+from edge.uav.correlation.oriented_box import OrientedBox
+from edge.uav.correlation.scale import BoxFlow, ScaleFilter
+from edge.uav.correlation.search import Found, search, tile
+from edge.uav.correlation.shape import Outline
+from edge.uav.image_motion.scene_motion import STILL, Motion, SceneMotion
+from edge.uav.target.box import check_target_box
+from protocols.geometry.types import Floats
+
+_LEARN_INSIDE = 0.97  # share of the box in the image above which appearance, size and velocity are learnt
+_MEASURE_INSIDE = 0.6  # below it nothing is measured
+_GRACE_FRAMES = 3  # frames with clear evidence against the target before it is searched for
+_REJECT = -3.0  # log likelihood ratio of clear evidence against the target
+_ACCEPT = 0.0  # log odds of a re-detection
+_TENTATIVE = -3.0  # log odds below which a place is not tested further
+_MARGIN = 1.0  # log odds by which a re-detection must exceed the next best place
+_MAX_TESTS = 8  # frames for which a place is tested
+_ANYWHERE = 0.01  # prior probability that the target is not near its prediction
+_OBSERVE_EVERY = 6  # frames between two looks at the background
+_CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
+_DETECTION = 0.25  # probability that one search finds a target in view
+_CHANGE = 0.1  # std of the similarity of a target that has been away
+_HITS = 3  # consecutive frames of a re-detection
+_PEAK_SHARE = 0.55  # of the usual height of the filter's answer, at a re-detection
+_PEAK_TARGET, _PEAK_BACKGROUND = (0.9, 0.2), (0.3, 0.15)  # mean and std of that share, on and off the target
+_PEAK_LIMIT = 3.0  # of the log likelihood ratio of that share
+_VELOCITY_S = 0.5  # over which velocity is averaged
+_ACCELERATION = 0.7  # std, in target lengths a second squared
+_DRIFT = 0.05  # std of the predicted place, in target lengths a second
+_LOST_STD, _LOST_AFTER_S = 8.0, 15.0  # in target lengths; as of the ground tracker
+_MAX_GROWTH = 8.0  # of a side since the first frame
+_SCALE_GAIN = 0.5  # of the scale filter's correction, per frame
+_ANCHOR_GAIN = 0.02  # similarity to the first view that another size, shape or angle must gain
+_ANCHOR_STEP = 0.3  # share of the way to it
+_EXTENT_STEP = 0.3  # share of the way to the extent that the colours measure
+_TRIAL_SIZES = (0.8, 1.25)
+_LEARN_ABOVE = 1.0  # log likelihood ratio above which appearance is learnt
+_KEEP_EVERY = 5  # frames between two keyframes
+_RELOCATE_EVERY = 4  # frames between two attempts to recognise the scene
+_SIZES = (1.0, 0.87, 1.15)
+_ANGLES = (0.0, 0.0, 0.35, 0.0, -0.35, 0.0, 0.7, 0.0, -0.7, 0.0, 1.1, 0.0, -1.1, 0.0, 1.57)
+
+
+@dataclass(slots=True)
+class _Candidate:
+    """A re-detection under test: its log prior, for how many frames it has held, and their mean evidence."""
+
+    box: OrientedBox
+    prior: float
+    hits: int = 0
+    evidence: float = 0.0
+
+
+class AppearanceTracker:
+    """Tracker of one target. size: (width, height) of the images [px]; fps: nominal frame rate."""
+
+    def __init__(self, size: tuple[int, int], fps: float = 30.0, seed: int = 0) -> None:
+        self._size = size
+        self._fps = fps
+        self._rng = np.random.default_rng(seed)
+        self._scene = SceneMotion(size)
+        self.debug: dict[str, float] = {}
+
+    def begin(self, image: Image, time: float, target: Box) -> Estimate:
+        """Initialise the target from its first frame. Raises InputError for an invalid box."""
+        check_target_box(image, self._size, target)
+        self._time, self._frame = time, 0
+        self.box = OrientedBox.upright(target)
+        self._first = self.box.sides
+        self._velocity = np.zeros(2)  # over the scene, in image pixels a second
+        self._turn_rate = 0.0
+        self._steps: deque[Floats] = deque(maxlen=int(np.clip(_VELOCITY_S * self._fps, 4, 20)))
+        self._filter = CorrelationFilter(target.width, target.height)
+        self._scale, self._flow, self._memory = ScaleFilter(), BoxFlow(), TemplateMemory()
+        self._scene.update(image, None)
+        self.motion: Motion = STILL
+        self._filter.learn(image, self.box)
+        self._scale.learn(image, self.box)
+        self._flow.remember(image, self.box)
+        self._memory.add(image, self.box)
+        self._observe_background(image, self.box)
+        self._shape = Outline(image, self.box)
+        # On the image that it has learnt a filter answers higher than it will on any other.
+        self._peak = 0.6 * max(self._filter.respond(image, self.box).peak, 0.05)
+        self._missed = 0
+        self._unseen_s = 0.0
+        self._scene.keep()
+        self._last_sight, self._since_keyframe = (self.box, self._velocity), np.eye(3)
+        self._near = 1.0 - _ANYWHERE
+        self._ratio = 0.0
+        self._broken = False  # whether the motion of the scene was unknown in a frame since the last sight
+        self._expected: Floats | None = None
+        self._candidate: _Candidate | None = None
+        return self._estimate(time)
+
+    def handle_telemetry(self, sample: Telemetry) -> None:
+        """Unused."""
+
+    def handle_frame(self, image: Image | None, time: float) -> Estimate:
+        """Track the target into the next frame; ``None`` for a frame that could not be decoded."""
+        dt = float(np.clip(time - self._time, 1e-3, 2.0)) if np.isfinite(time) else 1.0 / self._fps
+        self._time += dt
+        self._frame += 1
+        if image is None or image.shape[:2] != (self._size[1], self._size[0]):
+            self._miss(dt)
+            return self._estimate(time)
+        self.motion = self._scene.update(image, self._outline() if self._missed == 0 else None)
+        origin = self._predict(dt)
+        self.debug = {}
+        if self._missed <= _GRACE_FRAMES:
+            self._track(image, origin, dt)
+        else:
+            self._look_for(image, dt)
+        return self._estimate(time)
+
+    @property
+    def length(self) -> float:
+        """Longer side of the target's box [px]."""
+        return max(self.box.width, self.box.height)
+
+    @property
+    def std(self) -> float:
+        """Of the target's centre, one coordinate [px]."""
+        t = self._unseen_s
+        if self._missed == 0:
+            return 0.5 + 0.02 * self.length
+        return float(0.5 + self.length * (0.05 + _DRIFT * t + 0.5 * _ACCELERATION * t * t))
+
+    @property
+    def certain(self) -> bool:
+        """Whether the last frame shows the target, by clear evidence."""
+        return self._missed == 0 and self._ratio > _CERTAIN
+
+    def expect(self, other: Estimate) -> None:
+        """Take the place where another tracker has the target before this frame: the search begins there."""
+        if np.isfinite([other.x, other.y]).all() and (self._missed or other.state is TrackState.VISIBLE):
+            self._expected = np.array([other.x, other.y])
+
+    def _predict(self, dt: float) -> Floats:
+        """Move the box with the scene and its own velocity; returns where the scene alone would have moved it (2,)."""
+        motion, box = self.motion, self.box
+        origin = box.centre
+        if motion.trusted:
+            linear = motion.matrix[:, :2]
+            if self._missed == 0:
+                self._since_keyframe = _square(motion.matrix) @ self._since_keyframe
+            origin = motion.at(box.centre, self._scene.reach)
+            self._velocity = linear @ self._velocity
+            self._steps = deque((linear @ step for step in self._steps), maxlen=self._steps.maxlen)
+            turn = float(np.arctan2(linear[1, 0], linear[0, 0]))
+            if self._missed == 0:
+                box = box.sized(box.sides * motion.zoom).turned(turn)
+            if self._candidate is not None:
+                moved = self._candidate.box
+                moved = moved.at(motion.at(moved.centre, self._scene.reach)).sized(moved.sides * motion.zoom)
+                self._candidate.box = moved.turned(turn)
+        if self._missed:
+            self._broken |= not motion.trusted
+            angle = self._turn_rate * dt
+            c, s = np.cos(angle), np.sin(angle)
+            self._velocity = np.array([[c, -s], [s, c]]) @ self._velocity
+            self._turn_rate *= float(np.exp(-dt / 0.7))
+            box = box.turned(angle)
+            # A similarity to the whole scene is coarser than the chain with its parallax, as long as that holds.
+            if self._broken and self._missed > _GRACE_FRAMES and self._missed % _RELOCATE_EVERY == 0:
+                relocated = self._relocated()
+                if relocated is not None:
+                    box, origin, self._broken = relocated, relocated.centre, False
+        self.box = box.at(origin + self._velocity * dt)
+        if self._expected is not None and self._missed:
+            self.box, self._expected = box.at(self._expected), None
+        return origin
+
+    def _relocated(self) -> OrientedBox | None:
+        """The target's prediction from where it was last seen, in the scene that is now recognised."""
+        matrix = self._scene.relocate()
+        if matrix is None:
+            return None
+        seen, velocity = self._last_sight
+        # From the image of the last sight to the keyframe, and on to this image.
+        matrix = (_square(matrix) @ np.linalg.inv(self._since_keyframe))[:2]
+        linear = matrix[:, :2]
+        self._velocity = linear @ velocity
+        moved = seen.at(linear @ seen.centre + matrix[:, 2] + self._velocity * self._unseen_s)
+        zoom = float(np.sqrt(abs(np.linalg.det(linear))))
+        turn = float(np.arctan2(linear[1, 0], linear[0, 0]))
+        return moved.sized(seen.sides * zoom).turned(turn)
+
+    def _track(self, image: Image, origin: Floats, dt: float) -> None:
+        """Measure the target about its prediction."""
+        if self.box.share_inside(self._size) < _MEASURE_INSIDE:
+            self._missed = max(self._missed, _GRACE_FRAMES)  # it leaves the image: no grace
+            self._miss(dt)
+            return
+        box, peak = self._respond(image, self.box)
+        score = self._memory.score(image, box)
+        ratio = self._ratio = self._memory.log_ratio(score) + self._peak_ratio(peak)
+        self.debug = {"peak": peak, "score": score, "llr": ratio}
+        if ratio < _REJECT:
+            self._miss(dt)
+            return
+        self._accept(image, box, score, peak, origin, dt)
+
+    def _peak_ratio(self, peak: float) -> float:
+        """log likelihood ratio of the filter's answer: target against background, bounded."""
+        share = peak / self._peak
+        target = -0.5 * (min(share - _PEAK_TARGET[0], 0.0) / _PEAK_TARGET[1]) ** 2 - np.log(_PEAK_TARGET[1])
+        background = -0.5 * (max(share - _PEAK_BACKGROUND[0], 0.0) / _PEAK_BACKGROUND[1]) ** 2
+        return float(np.clip(target - background + np.log(_PEAK_BACKGROUND[1]), -_PEAK_LIMIT, _PEAK_LIMIT))
+
+    def _accept(self, image: Image, box: OrientedBox, score: float, peak: float, origin: Floats, dt: float) -> None:
+        self._missed, self._unseen_s, self._near = 0, 0.0, 1.0 - _ANYWHERE
+        self._broken = False
+        self._peak += max(0.1, 1.0 / (self._frame + 1.0)) * (peak - self._peak)
+        if box.share_inside(self._size) > _LEARN_INSIDE:
+            step = (box.centre - origin) / dt
+            self._steps.append(step)
+            self._velocity = np.median(np.array(self._steps), axis=0) * min(1.0, len(self._steps) / 4)
+            wider, higher, turn = self._flow.change(image, box.centre)
+            box = box.sized(box.sides * [wider, higher]).turned(turn)
+            self._turn_rate += min(1.0, 4.0 * dt) * (turn / dt - self._turn_rate)
+            if self._frame % 3 == 0:
+                box = self._anchored(image, box)
+                extent = self._shape.measured(image, box)
+                if extent is not None:
+                    box = box.sized(box.sides * (extent / box.sides) ** _EXTENT_STEP)
+            factor = self._scale.factor(image, box) ** _SCALE_GAIN if self._frame % 2 else 1.0
+            sides = np.clip(box.sides * factor, self._first / _MAX_GROWTH, self._first * _MAX_GROWTH)
+            box = box.sized(np.clip(sides, 4.0, 0.9 * np.array(self._size)))
+            if self._ratio > _LEARN_ABOVE:
+                self._learn(image, box, score, peak)
+            if self._frame % _KEEP_EVERY == 0:
+                self._scene.keep()
+                self._since_keyframe = np.eye(3)
+            self._last_sight = box, self._velocity.copy()
+        self.box = box
+        self._flow.remember(image, box)
+
+    def _respond(self, image: Image, box: OrientedBox) -> tuple[OrientedBox, float]:
+        """The box at the peak of the filter's answer, and the peak; a second look where the first was off centre."""
+        answer = self._filter.respond(image, box)
+        moved = box.at(box.centre + [answer.x, answer.y])
+        if np.hypot(answer.x, answer.y) > 0.35 * np.sqrt(box.width * box.height):
+            again = self._filter.respond(image, moved)
+            if again.peak > answer.peak:
+                return moved.at(moved.centre + [again.x, again.y]), again.peak
+        return moved, answer.peak
+
+    def _learn(self, image: Image, box: OrientedBox, score: float, peak: float) -> None:
+        self._filter.learn(image, box)
+        if self._frame % 2 == 0:
+            self._scale.learn(image, box)
+        self._memory.confirm(score)
+        if self._frame % _OBSERVE_EVERY == 0:
+            self._memory.add(image, box)
+            self._observe_background(image, box)
+
+    def _anchored(self, image: Image, box: OrientedBox) -> OrientedBox:
+        """The box, drawn towards the size, shape and angle at which it looks most like the first one.
+
+        The flow inside a box sums up what the background in it does. Seen obliquely, a target that turns does not turn
+        in the image either. The first template has none of that drift.
+        """
+        area = float(np.sqrt(np.prod(box.sides / self._first)))
+        shaped = box.sized(self._first * area)
+        trials = [box.turned(-box.angle), shaped, shaped.turned(-box.angle)]
+        trials += [box.sized(box.sides * factor) for factor in _TRIAL_SIZES]
+        gains = [self._memory.first_score(image, trial) for trial in trials]
+        best = int(np.argmax(gains))
+        if gains[best] < self._memory.first_score(image, box) + _ANCHOR_GAIN:
+            return box
+        aim = trials[best]
+        sides = box.sides * (aim.sides / box.sides) ** _ANCHOR_STEP
+        return box.sized(sides).turned(_ANCHOR_STEP * ((aim.angle - box.angle + np.pi) % (2.0 * np.pi) - np.pi))
+
+    def _observe_background(self, image: Image, box: OrientedBox) -> None:
+        """Scores of what lies around the target, and in another part of the image each time."""
+        index = self._frame // _OBSERVE_EVERY
+        for where, reach in ((box, 2.0 * box.sides), tile(box, self._size, index)):
+            found = search(image, self._memory, where, reach, 8)
+            away = [f.score for f in found if np.abs(box.axes.T @ (f.box.centre - box.centre) / box.sides).max() > 0.7]
+            self._memory.observe_background(np.array(away), float(np.prod(1.0 + 2.0 * reach / box.sides)))
+
+    def _miss(self, dt: float) -> None:
+        self._missed += 1
+        self._unseen_s += dt
+        self._candidate = None
+
+    def _look_for(self, image: Image, dt: float) -> None:
+        """Search for the target where it can be."""
+        self._missed += 1
+        self._unseen_s += dt
+        if self._candidate is not None:
+            self._test(image)
+            return
+        k = self._missed - _GRACE_FRAMES
+        box = self.box.sized(self.box.sides * _SIZES[k // 2 % len(_SIZES)]).turned(_ANGLES[k // 2 % len(_ANGLES)])
+        reach = 2.5 * self.std + 0.3 * box.sides
+        if k % 2:
+            box, reach = tile(box, self._size, k // 2)
+        found = search(image, self._memory, box, reach)
+        if found:
+            self._consider(image, found)
+        if k % 2 == 0:
+            # Where it was expected and is not seen, it is less and less likely to be.
+            self._near *= 1.0 - _DETECTION * self.box.share_within(reach, self._size)
+
+    def _log_prior(self, place: Floats) -> float:
+        """Log probability that the target is in the box about ``place`` (2,): near the prediction, or anywhere."""
+        area = float(self.box.width * self.box.height)
+        std = self.std
+        squared = float(np.square(place - self.box.centre).sum()) / std**2
+        share = self._near / (self._near + _ANYWHERE)
+        near = np.log(share + 1e-12) - 0.5 * squared + np.log(min(area / (2.0 * np.pi * std * std), 1.0))
+        return float(np.logaddexp(near, np.log((1.0 - share) * area / (self._size[0] * self._size[1]))))
+
+    def _consider(self, image: Image, found: list[Found]) -> None:
+        """Take up the likeliest of the places found, if it is likelier by far than any other."""
+        odds = [self._memory.log_ratio(f.score, _CHANGE) + self._log_prior(f.box.centre) for f in found]
+        order = np.argsort(odds)[::-1]
+        best = int(order[0])
+        self.debug = {"score": found[best].score, "odds": odds[best], "near": self._near}
+        if len(odds) > 1 and odds[best] - odds[int(order[1])] < _MARGIN:
+            return
+        self._candidate = _Candidate(found[best].box, self._log_prior(found[best].box.centre))
+        self._test(image)
+
+    def _test(self, image: Image) -> None:
+        """Add a frame's evidence to the candidate's odds; take it for the target, or drop it."""
+        candidate = self._candidate
+        assert candidate is not None
+        box, peak = self._respond(image, candidate.box)
+        score = self._memory.score(image, box)
+        evidence = self._memory.log_ratio(score, _CHANGE)
+        self.debug |= {"score": score, "llr": evidence, "peak": peak, "usual": self._peak, "prior": candidate.prior}
+        candidate.hits += 1
+        # Further frames show the same look-alike, if it is one: they make the evidence surer, not larger.
+        candidate.evidence += (evidence - candidate.evidence) / candidate.hits
+        candidate.box = box
+        odds = candidate.prior + candidate.evidence
+        weak = evidence < 0.0 or peak < _PEAK_SHARE * self._peak or box.share_inside(self._size) < _MEASURE_INSIDE
+        if weak or odds < _TENTATIVE or candidate.hits > _MAX_TESTS:
+            self._candidate = None
+        elif candidate.hits >= _HITS and odds > _ACCEPT:
+            self._candidate = None
+            self._steps.clear()
+            self._missed, self._unseen_s = 0, 0.0
+            self.box = box
+            self._flow.remember(image, box)
+
+    def _outline(self) -> Floats:
+        """x0, y0, x1, y1 about the target [px]."""
+        half = 0.6 * self.box.extent
+        return np.concatenate([self.box.centre - half, self.box.centre + half])
+
+    def _estimate(self, time: float) -> Estimate:
+        state = TrackState.VISIBLE if self._missed == 0 else TrackState.COASTING
+        std = self.std
+        if self._missed and (std > _LOST_STD * self.length or self._unseen_s > _LOST_AFTER_S):
+            state = TrackState.LOST
+        nan = float("nan")
+        centre, extent = self._shape.bounds(self.box)
+        x, y = (nan, nan) if state is TrackState.LOST else (float(centre[0]), float(centre[1]))
+        return Estimate(time, state, x, y, float(extent[0]), float(extent[1]), nan, std)
+
+
+def _square(matrix: Floats) -> Floats:
+    """(3, 3) of a map (2, 3)."""
+    return np.vstack([matrix, [0.0, 0.0, 1.0]])

@@ -1,0 +1,159 @@
+"""Templates of the target and the likelihood ratio of "target" against "its own background".
+
+A template is the box resampled to 6x6 cells of features. The score of a place is its normalised correlation with the
+most similar template. What scores the target and what its surroundings reach is learnt from the images themselves, so
+that the ratio means something from the first frame on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import scipy.fft
+
+from edge.uav.base import Image
+from edge.uav.correlation.features import Features, cell_features
+from edge.uav.correlation.oriented_box import OrientedBox, crop
+from protocols.geometry.types import Floats
+
+CELLS, CELL_PX = 6, 4
+SIDE = CELLS * CELL_PX
+_MAX_TEMPLATES = 8
+_NEW_BELOW = 0.9  # similarity to the most similar template below which a view becomes a template
+_FIRST_ABOVE = 0.35  # similarity to the first template that a new one must have, against drift
+_TAIL_BINS = 20  # of the histogram of what places beside the target score, from 0 to 1
+_LOOK_ALIKES = 0.5  # places as similar as the target that are taken to have been seen before the first image
+_PLACES = 300.0  # number of places that this start is worth
+_MAX_SCANNED = 4  # templates with which a region is searched
+_COLOUR_WEIGHT = np.float32(1.3)
+_CENTRED = np.float32(0.5)  # share of a channel's mean that is taken out
+
+
+@dataclass(slots=True)
+class _Normal:
+    """A running normal distribution. weight: number of observations that the start is worth."""
+
+    mean: float
+    std: float
+    weight: float
+    limit: float
+
+    def add(self, value: float) -> None:
+        self.weight = min(self.weight + 1.0, self.limit)
+        gain = 1.0 / self.weight
+        step = value - self.mean
+        self.mean += gain * step
+        self.std = float(np.sqrt(max((1.0 - gain) * (self.std**2 + gain * step * step), 1e-6)))
+
+
+class TemplateMemory:
+    """Templates of one target, the first of which is never forgotten."""
+
+    def __init__(self) -> None:
+        self._templates: list[Features] = []
+        self._used: list[int] = []
+        self._count = 0
+        # Before anything was seen: a target changes by about a tenth from frame to frame.
+        self._target = _Normal(0.8, 0.15, 4.0, 60.0)
+        self._background = _Normal(0.2, 0.2, 2.0, 200.0)
+        self._tail = np.zeros(_TAIL_BINS)
+        self._places = _PLACES
+
+    def add(self, image: Image, box: OrientedBox) -> None:
+        """Consider the box as a new template."""
+        new = vector(image, box)
+        if self._templates:
+            similarity = np.array([float(t @ new) for t in self._templates])
+            if similarity.max() > _NEW_BELOW or similarity[0] < _FIRST_ABOVE:
+                return
+        self._templates.append(new)
+        self._used.append(self._count)
+        if len(self._templates) > _MAX_TEMPLATES:
+            oldest = 1 + int(np.argmin(self._used[1:]))
+            del self._templates[oldest], self._used[oldest]
+
+    def score(self, image: Image, box: OrientedBox) -> float:
+        """Similarity (-1 to 1) of the box to the most similar template."""
+        self._count += 1
+        similarity = np.array(self._templates) @ vector(image, box)
+        best = int(similarity.argmax())
+        self._used[best] = self._count
+        return float(similarity[best])
+
+    def first_score(self, image: Image, box: OrientedBox) -> float:
+        """Similarity of the box to the first template."""
+        return float(self._templates[0] @ vector(image, box))
+
+    def scan(self, features: Features) -> Floats:
+        """Scores (h - 5, w - 5) of all boxes of 6x6 cells of a feature map (12, h, w)."""
+        planes = _weighted(features)
+        rows, columns = planes.shape[1:]
+        shape = (scipy.fft.next_fast_len(rows, True), scipy.fft.next_fast_len(columns, True))
+        valid = (slice(0, rows - CELLS + 1), slice(0, columns - CELLS + 1))
+        anchor = (0, 0)
+        mean = np.stack([cv2.boxFilter(plane, -1, (CELLS, CELLS), anchor=anchor) for plane in planes])[:, *valid]
+        square = cv2.boxFilter(np.square(planes).sum(axis=0), -1, (CELLS, CELLS), anchor=anchor)[valid] * CELLS**2
+        # A block without the share c of its mean m has the energy sum(b²) - (2 c - c²) n m².
+        share = _CENTRED * (2.0 - _CENTRED)
+        norm = np.sqrt(np.maximum(square - share * CELLS**2 * np.square(mean).sum(axis=0), 1e-6))
+        spectrum = scipy.fft.rfft2(planes, s=shape)
+        best = np.full(norm.shape, -1.0)
+        for template in self._scanned():
+            cells = template.reshape(len(features), CELLS, CELLS)
+            product = (spectrum * np.conj(scipy.fft.rfft2(cells, s=shape))).sum(axis=0)
+            raw = scipy.fft.irfft2(product, s=shape)[valid]
+            raw = raw - _CENTRED * np.tensordot(cells.sum(axis=(1, 2)), mean, 1)
+            np.maximum(best, raw / norm, out=best)
+        return best
+
+    def _scanned(self) -> list[Features]:
+        """The first template and those that matched last."""
+        order = sorted(range(1, len(self._templates)), key=lambda k: -self._used[k])[: _MAX_SCANNED - 1]
+        return [self._templates[0], *(self._templates[k] for k in order)]
+
+    def log_ratio(self, score: float, change: float = 0.0) -> float:
+        """log p(score | target) - log p(score | background), natural.
+
+        change: std of what the score of a target that has been away may have changed.
+        """
+        t, b = self._target, self._background
+        std = float(np.hypot(t.std, change))
+        target = -0.5 * (min(score - t.mean, 0.0) / std) ** 2 - np.log(std)
+        background = -0.5 * (max(score - b.mean, 0.0) / b.std) ** 2 - np.log(b.std)
+        # Something that looks like the target may stand anywhere, however unlike it the rest of the background is.
+        k = min(int(max(score, 0.0) * _TAIL_BINS), _TAIL_BINS - 1)
+        tail = (self._tail[k] + _LOOK_ALIKES / _TAIL_BINS) / (self._places + 1.0) * _TAIL_BINS
+        return float(target - np.logaddexp(background, np.log(np.sqrt(2.0 * np.pi) * tail)))
+
+    def confirm(self, score: float) -> None:
+        """Learn what the target scores."""
+        self._target.add(score)
+        self._target.std = max(self._target.std, 0.05)
+
+    def observe_background(self, scores: Floats, places: float) -> None:
+        """Learn what places beside the target score. scores: (n,) of the best; places: number of boxes searched."""
+        if not scores.size:
+            return
+        b = self._background
+        b.add(float(scores.mean()))
+        b.std = 0.9 * b.std + 0.1 * max(float(scores.std()), 0.05)  # the spread over places, not that of their mean
+        np.add.at(self._tail, np.clip((scores * _TAIL_BINS).astype(int), 0, _TAIL_BINS - 1), 1.0)
+        self._places += places
+
+
+def _weighted(features: Features) -> Features:
+    out = features.copy()
+    out[-3:] *= _COLOUR_WEIGHT
+    return out
+
+
+def vector(image: Image, box: OrientedBox) -> npt.NDArray[np.float32]:
+    """Unit vector (432,) of a box: its cells, each channel partly without its mean."""
+    patch = crop(image, box.sized(box.sides * (SIDE + 8) / SIDE), (SIDE + 8, SIDE + 8))
+    features = _weighted(cell_features(patch, CELL_PX))[:, 1:-1, 1:-1].reshape(-1, CELLS * CELLS)
+    features = features - _CENTRED * features.mean(axis=1, keepdims=True)
+    flat = features.reshape(-1)
+    return np.asarray(flat / (np.linalg.norm(flat) + 1e-6), np.float32)

@@ -1,0 +1,181 @@
+"""Frame-to-frame image motion of the static scene: robust similarity of corner tracks, and parallax about a place.
+
+A camera that turns and zooms moves the whole image by one map; one that travels moves near ground more than distant
+background. The map is therefore a similarity fitted to the largest consistent set of tracks, plus a correction at
+the place of interest: the weighted median of what the tracks near it move beyond the similarity. A similarity, unlike
+a homography, stays bounded outside the image, where the target is while it is away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from edge.uav.base import Image
+from edge.uav.image_motion.keyframe import Keyframe
+from protocols.geometry.types import Bools, Floats
+
+Gray = npt.NDArray[np.uint8]
+
+_WORKING_WIDTH = 400  # approximate width of the image on which the flow is computed [px]
+_MAX_TRACKS = 120
+_LK_WINDOW, _LK_LEVELS = 13, 3
+_BACKWARD_PX = 0.7  # forward-backward distance of a good track [px of the working image]
+_RANSAC_PX = 1.5  # residual of a track of the static scene [px of the working image]
+_MIN_TRACKS, _MIN_SHARE = 12, 0.35  # of a trusted motion: static tracks, and their share
+_PARTS, _VOTE_PX = (4, 2), 2  # parts that are searched after a fast pan; agreement of their shifts [px, reduced]
+_PARALLAX_PX = 6.0  # largest correction [px of the working image]
+_REACH = 0.3  # of the parallax correction, over the image's width
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Image motion between two frames.
+
+    matrix: (2, 3) similarity, new from old pixels. points, residuals: (n, 2) old pixels of the static tracks and what
+    they moved beyond the similarity [px]. trusted: whether enough of the image moves alike. share: of the tracks.
+    """
+
+    matrix: Floats
+    points: Floats
+    residuals: Floats
+    trusted: bool
+    share: float
+
+    @property
+    def zoom(self) -> float:
+        """Change of scale."""
+        return float(np.hypot(self.matrix[0, 0], self.matrix[1, 0]))
+
+    def at(self, point: Floats, reach: float) -> Floats:
+        """Where the static scene at ``point`` (2,) [px] has moved, with the parallax of the tracks within ``reach``."""
+        moved = self.matrix[:, :2] @ point + self.matrix[:, 2]
+        if not self.trusted or len(self.points) < _MIN_TRACKS:
+            return np.asarray(moved)
+        weight = np.exp(-0.5 * np.square(self.points - point).sum(axis=1) / reach**2)
+        total = float(weight.sum())
+        correction = np.array([_weighted_median(self.residuals[:, k], weight) for k in range(2)])
+        return np.asarray(moved + correction * total / (total + 2.0))
+
+
+STILL = Motion(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), False, 0.0)
+
+
+class SceneMotion:
+    """Estimates the motion from image to image. size: (width, height) [px]."""
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self._scale = max(1.0, size[0] / _WORKING_WIDTH)
+        self._size = (round(size[0] / self._scale), round(size[1] / self._scale))
+        self._gray: Gray | None = None
+        self._last = np.eye(2, 3)
+        self._keyframe: Keyframe | None = None
+        self.reach = _REACH * size[0]
+        """Distance over which parallax is taken to be alike [px]."""
+
+    def update(self, image: Image, excluded: Floats | None) -> Motion:
+        """The motion since the last image. excluded: x0, y0, x1, y1 of the moving target in the last image [px]."""
+        small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), self._size, interpolation=cv2.INTER_AREA)
+        gray = np.asarray(small, np.uint8)
+        previous, self._gray = self._gray, gray
+        if previous is None:
+            return STILL
+        corners = self._corners(previous, excluded)
+        motion = STILL
+        if len(corners) >= _MIN_TRACKS:
+            motion = self._fit(*self._flow(previous, gray, corners, self._last))
+            if not motion.trusted:
+                again = self._fit(*self._flow(previous, gray, corners, self._coarse_shift(previous, gray)))
+                motion = again if again.share > motion.share else motion
+        self._last = self._to_working(motion.matrix) if motion.trusted else np.eye(2, 3)
+        return motion
+
+    def _corners(self, gray: Gray, excluded: Floats | None) -> npt.NDArray[np.float32]:
+        mask = np.full(gray.shape, 255, np.uint8)
+        if excluded is not None and np.isfinite(excluded).all():
+            x0, y0, x1, y1 = (int(v) for v in np.clip(excluded / self._scale, -10, 1e4))
+            mask[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = 0
+        found = cv2.goodFeaturesToTrack(gray, _MAX_TRACKS, 0.005, max(gray.shape[1] // 36, 5), mask=mask, blockSize=3)
+        return np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
+
+    def _flow(self, old: Gray, new: Gray, corners: npt.NDArray[np.float32], start: Floats) -> tuple[Floats, Floats]:
+        """Old and new positions (n, 2) of the corners that are tracked forward and back."""
+        guess = (corners @ start[:, :2].T + start[:, 2]).astype(np.float32)
+        window, flags = (_LK_WINDOW, _LK_WINDOW), cv2.OPTFLOW_USE_INITIAL_FLOW
+        criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 12, 0.03)
+        moved, ok, _ = cv2.calcOpticalFlowPyrLK(
+            old, new, corners, guess.copy(), winSize=window, maxLevel=_LK_LEVELS, criteria=criteria, flags=flags
+        )
+        back, ok_back, _ = cv2.calcOpticalFlowPyrLK(
+            new, old, moved, corners.copy(), winSize=window, maxLevel=1, criteria=criteria, flags=flags
+        )
+        good = (ok.ravel() == 1) & (ok_back.ravel() == 1)
+        good &= np.square(back - corners).sum(axis=1) < _BACKWARD_PX**2
+        return corners[good].astype(np.float64), moved[good].astype(np.float64)
+
+    def _fit(self, old: Floats, new: Floats) -> Motion:
+        if len(old) < _MIN_TRACKS:
+            return STILL
+        matrix, inlier = cv2.estimateAffinePartial2D(
+            old, new, method=cv2.RANSAC, ransacReprojThreshold=_RANSAC_PX, maxIters=300, confidence=0.995
+        )
+        if matrix is None:
+            return STILL
+        mask: Bools = inlier.ravel() > 0
+        share = float(mask.mean())
+        residual = new - (old @ matrix[:, :2].T + matrix[:, 2])
+        near = np.square(residual).sum(axis=1) < _PARALLAX_PX**2
+        zoom = float(np.hypot(matrix[0, 0], matrix[1, 0]))
+        trusted = bool(int(mask.sum()) >= _MIN_TRACKS and share > _MIN_SHARE and 0.5 < zoom < 2.0)
+        full = self._to_full(np.asarray(matrix, np.float64))
+        points = self._scale * (old[near] + 0.5) - 0.5
+        return Motion(full, points, self._scale * residual[near], trusted, share)
+
+    def keep(self) -> None:
+        """Keep the last image as the keyframe."""
+        if self._gray is not None:
+            self._keyframe = Keyframe(self._gray)
+
+    def relocate(self) -> Floats | None:
+        """Similarity (2, 3) to the last image from the keyframe [px]; None where the scene is not recognised."""
+        if self._keyframe is None or self._gray is None:
+            return None
+        found = self._keyframe.locate(self._gray)
+        return None if found is None else self._to_full(found)
+
+    def _to_full(self, matrix: Floats) -> Floats:
+        out = matrix.copy()
+        out[:, 2] = self._scale * out[:, 2] + 0.5 * (self._scale - 1.0) * (1.0 - out[:, :2].sum(axis=1))
+        return out
+
+    def _to_working(self, matrix: Floats) -> Floats:
+        out = matrix.copy()
+        out[:, 2] /= self._scale
+        return out
+
+    def _coarse_shift(self, old: Gray, new: Gray) -> Floats:
+        """(2, 3) translation of a fast pan: parts of the reduced old image are searched in the new one, and vote."""
+        small = [cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA) for image in (old, new)]
+        rows, columns = small[0].shape[0] // _PARTS[1], small[0].shape[1] // _PARTS[0]
+        shifts, scores = [], []
+        for k in range(_PARTS[0] * _PARTS[1]):
+            x, y = columns * (k % _PARTS[0]), rows * (k // _PARTS[0])
+            part = small[0][y : y + rows, x : x + columns]
+            _, score, _, at = cv2.minMaxLoc(cv2.matchTemplate(small[1], part, cv2.TM_CCOEFF_NORMED))
+            shifts.append((at[0] - x, at[1] - y))
+            scores.append(max(score, 0.0) if part.std() > 1.0 else 0.0)
+        shift = np.array(shifts, dtype=np.float64)
+        agree = np.abs(shift[:, None] - shift[None]).max(axis=2) <= _VOTE_PX
+        votes = agree @ np.array(scores)
+        chosen = agree[int(votes.argmax())]
+        dx, dy = 4.0 * shift[chosen].mean(axis=0)
+        return np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]])
+
+
+def _weighted_median(values: Floats, weights: Floats) -> float:
+    order = np.argsort(values)
+    cumulative = np.cumsum(weights[order])
+    return float(values[order[int(np.searchsorted(cumulative, 0.5 * cumulative[-1]))]])

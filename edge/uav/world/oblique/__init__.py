@@ -1,0 +1,1 @@
+"""Rendered oblique flights with truth: horizon, buildings, trees, water, cars, people, bicycles, boats."""

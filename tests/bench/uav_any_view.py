@@ -1,0 +1,199 @@
+"""Any target in any view: cars, boats, bicycles and people in oblique video, also while the camera looks away.
+
+    python -m tests.bench.uav_any_view [--models ground,csrt,kcf,mosse] [--seeds 1] [--kinds oblique] [--json]
+
+Rendered oblique flights with truth, and where the data folder has them real ones: whole sequences, and windows that pan
+away from the target for 0.5 to 4 s and come back. No lens, no telemetry.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edge.uav import tracker_factory
+from edge.uav.base import Box, Estimate, Tracker, TrackState
+from edge.uav.world.oblique.world import FLIGHTS, TARGETS, ObliqueWorld
+from protocols.geometry.types import Floats
+from tests.bench import uav_rivals
+from tests.bench.real_rigs import DEFAULT_DATA
+from tests.bench.uav_sequences import AWAY_S, Sequence, aerial, oblique, pan_away
+
+MODELS = ("ground", *uav_rivals.NAMES)
+NEAR_PX, HELD_FRAMES = 20.0, 20
+_RATES = (10.0, 15.0, 30.0)
+
+
+@dataclass(slots=True)
+class Score:
+    """Counts of one sequence and one tracker.
+
+    near, frames: frames in view (at least half) within max(20 px, half a box), of all. overlap: mean intersection over
+    union in view. away_near, claimed, away: frames without any part of the target: within two box lengths, reported
+    visible, all. held: visible and near in all of the last 20 frames. ms: CPU per frame.
+    """
+
+    kind: str
+    name: str
+    model: str
+    near: int
+    frames: int
+    overlap: float
+    away_near: int
+    claimed: int
+    away: int
+    held: bool
+    ms: float
+
+
+def score(sequence: Sequence, estimates: list[Estimate], model: str, ms: float) -> Score:
+    """Compare the estimates with the boxes of all frames."""
+    box = sequence.box
+    centre = box[:, :2] + 0.5 * (box[:, 2:] - 1.0)
+    nan = float("nan")
+    guess = np.array([(nan, nan) if e.state is TrackState.LOST else (e.x, e.y) for e in estimates])
+    error = np.nan_to_num(np.hypot(*(guess - centre).T), nan=np.inf)
+    length = box[:, 2:].max(axis=1)
+    near = error < np.maximum(NEAR_PX, 0.5 * length)
+    visible = np.array([e.state is TrackState.VISIBLE for e in estimates])
+    seen, away = sequence.visible >= 0.5, sequence.visible == 0.0
+    overlap = _overlap(box, estimates)
+    return Score(
+        sequence.kind,
+        sequence.name,
+        model,
+        int((near & seen).sum()),
+        int(seen.sum()),
+        float(overlap[seen].mean()),
+        int((away & (error < 2.0 * length)).sum()),
+        int((away & visible).sum()),
+        int(away.sum()),
+        bool((visible & near)[-HELD_FRAMES:].all()),
+        ms,
+    )
+
+
+def _overlap(box: Floats, estimates: list[Estimate]) -> Floats:
+    """Intersection over union (n,)."""
+    own = np.array([(e.x - 0.5 * (e.width - 1), e.y - 0.5 * (e.height - 1), e.width, e.height) for e in estimates])
+    low = np.maximum(box[:, :2], own[:, :2])
+    high = np.minimum(box[:, :2] + box[:, 2:], own[:, :2] + own[:, 2:])
+    both = np.prod(np.clip(high - low, 0.0, None), axis=1)
+    return np.nan_to_num(both / (np.prod(box[:, 2:], axis=1) + np.prod(own[:, 2:], axis=1) - both))
+
+
+def run(sequence: Sequence, model: str) -> Score:
+    """Track one sequence."""
+    tracker: Tracker
+    if model in uav_rivals.NAMES:
+        tracker = uav_rivals.OpenCvTracker(model)
+    else:
+        tracker = tracker_factory.make_tracker(model, sequence.size, fps=sequence.fps)
+    estimates: list[Estimate] = []
+    began = time.process_time()
+    for k, image in enumerate(sequence.images):
+        if k == 0:
+            estimates.append(tracker.begin(image, 0.0, Box(*(float(value) for value in sequence.box[0]))))
+        else:
+            estimates.append(tracker.handle_frame(image, k / sequence.fps))
+    return score(sequence, estimates, model, 1e3 * (time.process_time() - began) / len(estimates))
+
+
+def flight(target: str, path: str, seed: int, rate: float, away_s: float, frames: int | None = None) -> Sequence:
+    """One rendered flight as a sequence."""
+    seconds = 2.5 + 1.2 + away_s + 2.5 if path == "away" else 8.0
+    count = round(seconds * rate) if frames is None else frames
+    world = ObliqueWorld(target, path, seed, fps=rate, frames=count, away_s=away_s)
+    pairs = [world.rendered(i) for i in range(count)]
+    box = np.array([(t.box.x, t.box.y, t.box.width, t.box.height) for _, t in pairs])
+    visible = np.array([t.visible for _, t in pairs])
+    kind = "rendered away" if path == "away" else "rendered"
+    return Sequence(f"{target} {path} {seed}", kind, [image for image, _ in pairs], box, rate, visible)
+
+
+def rendered(seeds: range) -> Iterator[Sequence]:
+    """Rendered flights: every target, every flight, at 10 to 30 frames a second."""
+    for seed in seeds:
+        for k, target in enumerate(TARGETS):
+            for path in FLIGHTS:
+                yield flight(target, path, 10 * seed + k, _RATES[(seed + k) % len(_RATES)], AWAY_S[(seed + k) % 4])
+
+
+def real(data: Path, windows: bool = True) -> Iterator[Sequence]:
+    """Sequences of the data folder, and windows in them that pan away."""
+    if (data / "oblique").is_dir():
+        yield from oblique(data / "oblique")
+    if (data / "oblique").is_dir() and windows:
+        for whole in oblique(data / "oblique", None, 10**6):
+            for k, away in enumerate(AWAY_S):
+                for start in range(0, len(whole.images), 60):
+                    window = pan_away(whole, away, (640, 360), 2.0, k + start, start)
+                    if window is not None:
+                        yield window
+    if (data / "aerial-traffic").is_dir() and windows:
+        for whole in aerial(data / "aerial-traffic"):
+            window = pan_away(whole, 0.5, (480, 270), 0.6, 0)
+            if window is not None:
+                yield window
+
+
+def table(scores: list[Score]) -> str:
+    """One line for each kind and model."""
+    titles = ("in view", "overlap", "away", "claimed", "held", "ms/frame")
+    lines = [f"{'kind':16s}{'model':8s}" + "".join(f"{title:>9s}" for title in titles)]
+    for kind, model in dict.fromkeys((s.kind, s.model) for s in scores):
+        part = [s for s in scores if (s.kind, s.model) == (kind, model)]
+        away = sum(s.away for s in part)
+        share = f"{100 * sum(s.away_near for s in part) / away:6.1f} %" if away else "-"
+        claimed = f"{100 * sum(s.claimed for s in part) / away:7.1f} %" if away else "-"
+        lines.append(
+            f"{kind:16s}{model:8s}{100 * sum(s.near for s in part) / sum(s.frames for s in part):7.1f} %"
+            f"{np.mean([s.overlap for s in part]):9.2f}{share:>9s}{claimed:>9s}"
+            f"{f'{sum(s.held for s in part)}/{len(part)}':>9s}{np.mean([s.ms for s in part]):9.1f}"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=DEFAULT_DATA)
+    parser.add_argument("--models", default=",".join(MODELS))
+    parser.add_argument("--seeds", type=int, default=1, help="rendered flights of each kind")
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--kinds", default="", help="only these kinds, by comma: rendered, oblique, 'oblique away' …")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    cv2.setNumThreads(1)
+    models = [m for m in options.models.split(",") if m not in uav_rivals.NAMES or uav_rivals.available(m)]
+    left_out = [m for m in options.models.split(",") if m not in models]
+    kinds = [kind for kind in options.kinds.split(",") if kind]
+    sources: list[Iterator[Sequence]] = []
+    if not kinds or any(kind.startswith("rendered") for kind in kinds):
+        sources.append(rendered(range(options.first_seed, options.first_seed + options.seeds)))
+    if not kinds or any(not kind.startswith("rendered") for kind in kinds):
+        sources.append(real(options.data, not kinds or any("away" in kind for kind in kinds)))
+    scores = [
+        run(sequence, model)
+        for source in sources
+        for sequence in source
+        if not kinds or sequence.kind in kinds
+        for model in models
+    ]
+    if options.json:
+        print(json.dumps([asdict(s) for s in scores], indent=1))
+        return
+    if left_out:
+        print(f"{', '.join(left_out)} left out: uav_rivals.py says how to get them")
+    print(table(scores))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,192 @@
+"""Targets followed by their appearance in the stabilised image: filter, size, states, re-detection, ego-motion."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from edge.uav.base import Basis, Box, Estimate, Image, TrackState
+from edge.uav.correlation.appearance_tracker import AppearanceTracker
+from edge.uav.correlation.filter import CorrelationFilter, windowed
+from edge.uav.correlation.oriented_box import OrientedBox, crop
+from edge.uav.correlation.scale import BoxFlow
+from edge.uav.image_motion.keyframe import Keyframe
+from edge.uav.image_motion.scene_motion import SceneMotion
+from edge.uav.tracker_factory import make_tracker
+from edge.uav.world.oblique.world import ObliqueWorld
+
+SIZE = (320, 240)
+TARGET = (34, 22)
+FPS = 15.0
+
+
+@pytest.fixture(scope="module")
+def scene() -> Image:
+    """A textured scene (700, 1400, 3) through which windows move."""
+    rng = np.random.default_rng(5)
+    coarse = cv2.resize(
+        rng.uniform(60, 190, (35, 70, 3)).astype(np.float32), (1400, 700), interpolation=cv2.INTER_CUBIC
+    )
+    fine = cv2.GaussianBlur(rng.normal(0, 60, (700, 1400, 3)).astype(np.float32), (0, 0), 1.5)
+    return np.asarray(np.clip(coarse + fine, 0, 255), np.uint8)
+
+
+def paint(image: Image, x: float, y: float, hue: int = 0) -> None:
+    """A boat-like target about (x, y); hue exchanges its colours."""
+    colours = [(30, 40, 220), (240, 240, 240), (20, 20, 20)]
+    a, b, c = (colours[(k + hue) % 3] for k in range(3))
+    w, h = TARGET
+    cv2.rectangle(image, (round(x - w / 2), round(y - h / 2)), (round(x + w / 2) - 1, round(y + h / 2) - 1), a, -1)
+    cv2.rectangle(image, (round(x - w / 4), round(y - h / 4)), (round(x), round(y + h / 4)), b, -1)
+    cv2.rectangle(image, (round(x + w / 4), round(y - h / 2)), (round(x + w / 3), round(y + h / 2) - 1), c, -1)
+
+
+def flight(
+    scene: Image, away: float = 0.0, shown_again: bool = True, rival: bool = False
+) -> tuple[list[Image], np.ndarray]:
+    """75 frames of a window that follows a target, looks away by ``away`` px from frame 25 to 50, and comes back."""
+    t = np.arange(75)
+    share = np.clip((t - 20) / 6, 0, 1) - np.clip((t - 47) / 6, 0, 1)
+    corner = np.column_stack([150 + 2.0 * t + away * share, np.full(75, 200.0)]).round().astype(int)
+    place = np.column_stack([310 + 2.5 * t, np.full(75, 320.0)])
+    images = []
+    for k in range(75):
+        world = scene.copy()
+        if shown_again or k < 40:
+            paint(world, *place[k])
+        if rival:
+            paint(world, place[0, 0] + away, place[0, 1] + 40)
+        x, y = corner[k]
+        noise = np.random.default_rng(k).integers(0, 6, (SIZE[1], SIZE[0], 3), np.uint8)
+        images.append(cv2.add(np.ascontiguousarray(world[y : y + SIZE[1], x : x + SIZE[0]]), noise))
+    return images, place - corner
+
+
+def follow(images: list[Image], first: np.ndarray) -> list[Estimate]:
+    tracker = AppearanceTracker(SIZE, FPS)
+    box = Box(float(first[0] - TARGET[0] / 2), float(first[1] - TARGET[1] / 2), *map(float, TARGET))
+    return [
+        tracker.begin(image, 0.0, box) if k == 0 else tracker.handle_frame(image, k / FPS)
+        for k, image in enumerate(images)
+    ]
+
+
+@pytest.mark.parametrize("shift", [-0.4, 0.2, 0.6, 0.8])
+def test_the_filter_finds_the_target_wherever_it_is_in_its_window(scene: Image, shift: float) -> None:
+    """A window that is not freed of its mean locks the filter to its own centre."""
+    image = scene.copy()
+    paint(image, 400, 300)
+    box = OrientedBox(400.0, 300.0, *map(float, TARGET))
+    correlation = CorrelationFilter(box.width, box.height)
+    correlation.learn(image, box)
+    step = shift * np.array(TARGET)
+    answer = correlation.respond(image, box.at(box.centre - step))
+    assert np.abs(np.array([answer.x, answer.y]) - step).max() < 0.06 * max(TARGET)
+
+
+def test_a_constant_patch_has_no_features_under_the_window() -> None:
+    window = np.outer(np.hanning(12), np.hanning(10)).astype(np.float32)
+    assert np.abs(windowed(np.full((3, 12, 10), 5.0, np.float32), window)).max() < 1e-5
+
+
+def test_flow_in_the_box_measures_growth_and_turn(scene: Image) -> None:
+    image = scene.copy()
+    box = OrientedBox(500.0, 300.0, 90.0, 60.0)
+    matrix = cv2.getRotationMatrix2D((500, 300), -2.0, 1.04)
+    later = np.asarray(cv2.warpAffine(image, matrix, (image.shape[1], image.shape[0])), np.uint8)
+    flow = BoxFlow()
+    flow.remember(image, box)
+    wider, higher, turn = flow.change(later, box.centre)
+    assert wider == pytest.approx(1.04, abs=0.012)
+    assert higher == pytest.approx(1.04, abs=0.012)
+    assert turn == pytest.approx(np.deg2rad(2.0), abs=0.008)
+
+
+def test_a_crop_of_a_turned_box_is_the_box_upright(scene: Image) -> None:
+    turned = crop(scene, OrientedBox(600.0, 300.0, 80.0, 40.0, np.pi / 2), (80, 40))
+    upright = crop(scene, OrientedBox(600.0, 300.0, 40.0, 80.0), (40, 80))
+    assert np.abs(np.rot90(upright, 1).astype(int) - turned).mean() < 2.0
+
+
+def test_a_target_is_predicted_while_the_camera_looks_away_and_found_again(scene: Image) -> None:
+    images, truth = flight(scene, away=420.0)
+    found = follow(images, truth[0])
+    error = np.hypot(*(np.array([[e.x, e.y] for e in found]) - truth).T)
+    outside = truth[:, 0] < -TARGET[0]
+    assert outside.sum() > 15
+    assert not any(e.state is TrackState.VISIBLE for e, out in zip(found, outside, strict=True) if out)
+    assert error[outside].max() < 1.5 * TARGET[0]
+    assert all(e.state is TrackState.VISIBLE for e in found[-15:])
+    assert error[-15:].max() < 4.0
+
+
+def test_a_target_that_does_not_return_is_never_claimed(scene: Image) -> None:
+    images, truth = flight(scene, away=420.0, shown_again=False)
+    assert not any(e.state is TrackState.VISIBLE for e in follow(images, truth[0])[30:])
+
+
+def test_a_look_alike_elsewhere_is_not_the_target(scene: Image) -> None:
+    """While the camera looks away, something identical stands 420 px from where the target is expected."""
+    images, truth = flight(scene, away=420.0, rival=True)
+    found = follow(images, truth[0])
+    assert not any(e.state is TrackState.VISIBLE for e in found[30:45])
+    assert np.hypot(found[-1].x - truth[-1, 0], found[-1].y - truth[-1, 1]) < 4.0
+
+
+def test_a_scene_is_recognised_after_a_cut(scene: Image) -> None:
+    gray = cv2.cvtColor(scene, cv2.COLOR_BGR2GRAY)
+    matrix = Keyframe(np.ascontiguousarray(gray[200:440, 150:470])).locate(np.ascontiguousarray(gray[230:470, 240:560]))
+    assert matrix is not None
+    assert np.abs(matrix @ [160.0, 120.0, 1.0] - [70.0, 90.0]).max() < 1.0
+    assert (
+        Keyframe(np.ascontiguousarray(gray[0:240, 0:320])).locate(np.ascontiguousarray(gray[400:640, 900:1220])) is None
+    )
+
+
+def test_zoom_and_turn_of_an_oblique_flight_are_measured_among_moving_cars() -> None:
+    world = ObliqueWorld("car", "zoom", seed=4, frames=12, fps=15.0)
+    motion = SceneMotion(world.size)
+    motion.update(world.frame(0), None)
+    for i in range(1, 12):
+        found = motion.update(world.frame(i), None)
+        before, after = world.truth(i - 1), world.truth(i)
+        assert found.trusted
+        assert found.zoom == pytest.approx(after.focal / before.focal, abs=0.012)
+        step = after.rotation @ before.rotation.T
+        roll = np.arctan2(step[1, 0], step[0, 0])
+        assert np.arctan2(found.matrix[1, 0], found.matrix[0, 0]) == pytest.approx(roll, abs=0.012)
+
+
+@pytest.mark.parametrize("target", ["bicycle", "boat"])
+def test_an_oblique_flight_without_lens_and_telemetry_is_followed(target: str) -> None:
+    world = ObliqueWorld(target, "follow", seed=2, frames=45, fps=15.0)
+    tracker = make_tracker("ground", world.size, fps=world.fps)
+    for i in range(45):
+        image, truth = world.rendered(i)
+        e = tracker.begin(image, 0.0, truth.box) if i == 0 else tracker.handle_frame(image, i / world.fps)
+        if truth.visible < 0.5:
+            continue
+        centre = truth.box.x + 0.5 * truth.box.width, truth.box.y + 0.5 * truth.box.height
+        assert np.hypot(e.x - centre[0], e.y - centre[1]) < max(0.5 * truth.box.width, 12.0)
+        assert e.basis is not None
+        assert e.reason
+    assert e.basis in (Basis.STABILISED, Basis.PLANE)
+
+
+def test_a_black_image_leaves_the_plain_image_as_the_basis(scene: Image) -> None:
+    tracker = AppearanceTracker(SIZE, FPS)
+    images, truth = flight(scene)
+    tracker.begin(images[0], 0.0, Box(float(truth[0, 0] - 17), float(truth[0, 1] - 11), 34.0, 22.0))
+    black = tracker.handle_frame(np.zeros_like(images[0]), 1 / FPS)
+    assert black.state is not TrackState.VISIBLE
+    assert not tracker.motion.trusted
+
+
+def test_the_truth_of_an_oblique_world_is_where_the_target_is_drawn() -> None:
+    world = ObliqueWorld("boat", "away", seed=3, frames=60, fps=10.0, away_s=1.0)
+    again = ObliqueWorld("boat", "away", seed=3, frames=60, fps=10.0, away_s=1.0)
+    assert np.array_equal(world.frame(5), again.frame(5))
+    shares = [world.truth(i).visible for i in range(0, 60, 6)]
+    assert shares[0] > 0.9
+    assert min(shares) == 0.0
