@@ -141,13 +141,19 @@ def evaluate_labels(
     weights, slope_weights = (np.concatenate([support[i] for support in supports]) for i in (1, 2))
     inside = np.concatenate([support[3] for support in supports])
     points = weighted_sums(paths.control, index, weights)
-    return evaluate_points(
-        camera, points, inside, time, pixels, SplineSupport(paths.control, index, weights, slope_weights)
-    )
+    information = np.concatenate([part.used_relative_std for part in parts]) ** -2.0
+    support = SplineSupport(paths.control, index, weights, slope_weights)
+    return evaluate_points(camera, points, inside, time, pixels, support, information)
 
 
 def evaluate_points(
-    camera: CameraState, points: Floats, inside: Bools, time: Floats, pixels: Floats, support: SplineSupport
+    camera: CameraState,
+    points: Floats,
+    inside: Bools,
+    time: Floats,
+    pixels: Floats,
+    support: SplineSupport,
+    relative_information: Floats,
 ) -> ResidualEvaluation:
     """Residuals of pixels (n, 2) of world points (n, 3), which are defined where ``inside`` (n,)."""
     camera_points = camera.pose.rotation @ (points.T - camera.pose.position[:, None])
@@ -181,7 +187,7 @@ def evaluate_points(
         camera_points,
         normalised,
         distortion_jacobian,
-        np.concatenate([part.used_relative_std for part in parts]) ** -2.0,
+        relative_information,
     )
 
 

@@ -239,7 +239,8 @@ def linearised_rows(problem: BodyProblem, state: BodyState, camera: int, robust:
     one[:, 0] = 1.0
     support = SplineSupport(np.vstack([speed, np.zeros((3, 3))]), np.arange(len(pose)), one, one)
     defined = inside[views.view]
-    found = evaluate_points(now, pose[:, :3] + turned, defined, views.time[views.view], views.pixels, support)
+    ones = np.ones(len(pose))
+    found = evaluate_points(now, pose[:, :3] + turned, defined, views.time[views.view], views.pixels, support, ones)
     information = 1.0 / state.sigma[camera] ** 2
     squared = (found.residual**2).sum(axis=0) * information
     weight = information / (1.0 + squared / _CAUCHY**2) if robust else np.full(len(pose), information)
