@@ -1,7 +1,7 @@
 """Calibrations of motion capture systems in XML: Qualisys (QTM's calibration, .qca.txt) and Vicon (.xcp).
 
-Both give camera centres in millimetres and world from camera; Qualisys' cameras look along -z with y up, and its pixels
-are in 64ths. The conversion is that of Pose2Sim's reader.
+Both give camera centres in millimetres and rotations, camera from world. Qualisys' cameras look along -z with y up, and
+its pixels are in 64ths. The conversion is that of Pose2Sim's reader.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def _vicon(root: ElementTree.Element, file: Path) -> Iterator[tuple[str, bool, F
         size = float(np.linalg.norm(axis))
         turn = so3.exp(2.0 * np.arctan2(size, w) / size * axis) if size > 1e-12 else np.eye(3)
         position = _words(frame, "POSITION", 3, file, name)
-        pose = Pose(turn.T, position)
+        pose = Pose(turn, position)
         yield name, "video" in tag.get("TYPE", "video").lower(), ForeignCamera(name, intrinsics, pose)
 
 

@@ -63,24 +63,15 @@ def test_the_tutorial_on_keypoints_runs_as_written(tmp_path: Path, monkeypatch: 
     monkeypatch.chdir(tmp_path)
     names = ["nose", *(f"{side}_{part}" for part in ("hip", "knee", "ankle") for side in ("left", "right"))]
     heights = [-0.7, 0.0, 0.0, 0.43, 0.43, 0.86, 0.86]
-    points = {n: np.array([0.1 * (i % 2) - 0.05, 0.4 * y, 0.02 * i]) for i, (n, y) in enumerate(zip(names, heights))}
+    points = {
+        n: np.array([0.1 * (i % 2) - 0.05, 0.4 * y, 0.02 * i])
+        for i, (n, y) in enumerate(zip(names, heights, strict=True))
+    }
     world = replace(board_world(3, (25.0, 25.0, 25.0)), points=points)
     body_25 = [
         "nose",
-        ".",
-        ".",
-        ".",
-        ".",
-        ".",
-        ".",
-        ".",
-        ".",
-        "right_hip",
-        "right_knee",
-        "right_ankle",
-        "left_hip",
-        "left_knee",
-        "left_ankle",
+        *["."] * 8,
+        *(f"{side}_{part}" for side in ("right", "left") for part in ("hip", "knee", "ankle")),
     ]
     for name, frame, _, pixels in world.views(10.0, 1):
         seen = dict(zip(points, pixels, strict=True))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tomllib
 from pathlib import Path
@@ -54,9 +53,7 @@ def test_two_clips_of_a_board_give_clocks_poses_lenses_and_metres(
     true = first.pose.camera_from_world(second.pose.position[None])[0]
     found = cameras["CVLab1"].pose.camera_from_world(cameras["GoPro 2"].pose.position[None])[0]
     assert np.linalg.norm(found - true) < 0.03
-    document = json.loads((out / "result.json").read_text())
-    lag = document["cameras"]["GoPro 2"]
-    at = lag["lag_time_s"]
+    at = 3.0
     clock = cameras["GoPro 2"].time_map
     expected = second.rate * at + second.offset
     assert abs(clock.clock_rate * at + clock.time_offset - expected) < 0.005

@@ -1,0 +1,108 @@
+"""Calibrations of motion capture systems, OpenSfM and ROS; caliscope's tables of today; unknown tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deploy.cli import run
+from protocols.geometry import so3
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.pose import Pose
+from protocols.session.calibration import read_calibration
+from protocols.session.observations import read_observations
+from protocols.session.rig import read_rig
+from tests.support.foreign_calibration import calibration_file
+
+Capture = pytest.CaptureFixture[str]
+ROTATION, CENTRE = so3.exp(np.array([0.3, -0.8, 1.1])), np.array([1200.0, -300.0, 950.0])
+
+
+def test_a_qualisys_calibration_looks_along_minus_z_in_64ths_of_pixels(tmp_path: Path) -> None:
+    cells = " ".join(f'r{i + 1}{j + 1}="{float(ROTATION[i, j])!r}"' for i in range(3) for j in range(3))
+    file = tmp_path / "calibration.qca.txt"
+    file.write_text(
+        f"""<calibration><cameras><camera serial="17" model="Miqus Video">
+        <fov_video left="0" top="0" right="1919" bottom="1079"/>
+        <transform x="{CENTRE[0]}" y="{CENTRE[1]}" z="{CENTRE[2]}" {cells}/>
+        <intrinsic focalLengthU="96000" focalLengthV="96064" centerPointU="61440" centerPointV="34560"
+         radialDistortion1="-6.4" radialDistortion2="1.28" tangentalDistortion1="0" tangentalDistortion2="0"/>
+        </camera></cameras></calibration>"""
+    )
+    out = tmp_path / "rig.toml"
+    assert run(["import", str(file), "--out", str(out)]) == 0
+    rig, cameras = read_calibration(out)
+    camera = cameras["17"]
+    assert rig.units == "mm"
+    assert camera.intrinsics.matrix == pytest.approx(np.array([[1500, 0, 960], [0, 1501, 540], [0, 0, 1]]))
+    assert camera.intrinsics.distortions[:2] == pytest.approx([-0.1, 0.02])
+    assert camera.pose.rotation == pytest.approx(np.diag([1, -1, -1]) @ ROTATION)
+    assert camera.pose.position == pytest.approx(CENTRE)
+
+
+def test_a_vicon_calibration_has_quaternions_with_the_scalar_last(tmp_path: Path) -> None:
+    turn = so3.log(ROTATION)
+    angle = float(np.linalg.norm(turn))
+    x, y, z = np.sin(angle / 2) * turn / angle
+    file = tmp_path / "rig.xcp"
+    file.write_text(
+        f"""<Cameras><Camera DEVICEID="2107" TYPE="VideoInputDevice" SENSOR_SIZE="1280 720" PIXEL_ASPECT_RATIO="1">
+        <KeyFrames><KeyFrame FOCAL_LENGTH="1100" PRINCIPAL_POINT="640 360"
+        POSITION="{CENTRE[0]} {CENTRE[1]} {CENTRE[2]}"
+        ORIENTATION="{x} {y} {z} {np.cos(angle / 2)}" VICON_RADIAL2="ViconRadial2 640 360 -0.1 0.02 0"/></KeyFrames>
+        </Camera></Cameras>"""
+    )
+    out = tmp_path / "rig.toml"
+    assert run(["import", str(file), "--out", str(out)]) == 0
+    camera = read_calibration(out)[1]["2107"]
+    assert camera.pose.rotation == pytest.approx(ROTATION)
+    assert camera.pose.position == pytest.approx(CENTRE)
+    assert camera.intrinsics.distortions[:2] == pytest.approx([-0.1, 0.02])
+
+
+@pytest.mark.parametrize("text", ["<a><b></a>", '<!DOCTYPE x [<!ENTITY y "z">]><Cameras/>', "<Cameras/>"])
+def test_other_xml_is_bad_input_in_one_line(tmp_path: Path, capsys: Capture, text: str) -> None:
+    file = tmp_path / "rig.xcp"
+    file.write_text(text)
+    assert run(["import", str(file), "--out", str(tmp_path / "rig.toml")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(("to", "target", "posed"), [("opensfm", "reconstruction.json", True), ("ros", "ros", False)])
+def test_an_export_comes_back_as_it_was(tmp_path: Path, to: str, target: str, posed: bool) -> None:
+    lens = Intrinsics(
+        1280, 720, np.array([[900.0, 0, 630], [0, 905.0, 350], [0, 0, 1]]), np.array([-0.2, 0.1, 1e-3, 0, 0.02])
+    )
+    source = calibration_file(tmp_path / "calibration.toml", {"GoPro 2": (lens, Pose(ROTATION, CENTRE / 1000))})
+    assert run(["export", str(source), "--to", to, "--out", str(tmp_path / target)]) == 0
+    out = tmp_path / "again.toml"
+    assert run(["import", str(tmp_path / target), "--out", str(out)]) == 0
+    camera = read_rig(out).cameras["GoPro 2"]
+    assert camera.intrinsics is not None
+    assert camera.intrinsics.matrix == pytest.approx(lens.matrix)
+    assert camera.intrinsics.distortions == pytest.approx(lens.distortions)
+    if posed:
+        assert camera.position == pytest.approx(CENTRE / 1000)
+
+
+def test_caliscopes_table_of_today_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "xy.csv"
+    file.write_text(
+        "sync_index,cam_id,frame_index,frame_time,object_id,keypoint_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y,obj_loc_z\n"
+        "0,1,5,0.25,0,7,100.5,50.25,0.1,0.2,0\n1,1,6,0.3,0,7,101.5,50.25,0.1,0.2,0\n"
+        "1,1,6,0.3,0,8,121.5,50.25,0.2,0.2,0\n"
+    )
+    out = tmp_path / "observations.csv"
+    assert run(["import", str(file), "--out", str(out)]) == 0
+    track = read_observations(out, ["cam_1"]).tracks["cam_1", "7"]
+    assert track.frame.tolist() == [5, 6]
+    assert track.time.tolist() == [0.25, 0.3]
+
+
+def test_an_unknown_table_is_compared_with_the_nearest_layout(tmp_path: Path, capsys: Capture) -> None:
+    file = tmp_path / "xy.csv"
+    file.write_text("sync_index,cam_id,frame_index,frame_time,object_id,img_loc_x,img_loc_y\n0,1,5,0.2,0,1,2\n")
+    assert run(["import", str(file), "--out", str(tmp_path / "o.csv")]) == 2
+    assert "looks like caliscope's xy.csv of 2025, but column keypoint_id is missing" in capsys.readouterr().err
