@@ -34,8 +34,8 @@ def default_folder(out: Path | None, site: str, agent: str) -> Path:
 class AnswerStore:
     """Writes answers in a thread of its own, atomically; the hub's loop never waits for a disk.
 
-    history: how many answers are kept. copy: the calibration.toml that is always the newest. problem: why the last answer could not be
-    kept; "" if it was. kept_unix_s: when the loaded answer was kept.
+    history: how many answers are kept. copy: the calibration.toml that is always the newest. problem: why the last
+    answer could not be kept; "" if it was. kept_unix_s: when the loaded answer was kept.
     """
 
     def __init__(self, folder: Path, history: int = 200, copy: Path | None = None) -> None:
