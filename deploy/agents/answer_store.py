@@ -34,8 +34,8 @@ def default_folder(out: Path | None, site: str, agent: str) -> Path:
 class AnswerStore:
     """Writes answers in a thread of its own, atomically; the hub's loop never waits for a disk.
 
-    history: how many answers are kept. copy: another file for the newest one. problem: why the last answer could not be
-    kept; "" if it was. kept_unix_s: when the loaded answer was kept.
+    history: how many answers are kept. copy: the calibration.toml that is always the newest. problem: why the last
+    answer could not be kept; "" if it was. kept_unix_s: when the loaded answer was kept.
     """
 
     def __init__(self, folder: Path, history: int = 200, copy: Path | None = None) -> None:
@@ -84,7 +84,8 @@ class AnswerStore:
             # By number, and not by the time alone: a clock may be set back.
             number = _number(there[-1]) + 1 if there else 1
             newest = history / f"{number:06d}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}.toml"
-            write_together({newest: text, **({} if self._copy is None else {self._copy: text})})
+            plain = {} if self._copy is None else {self._copy: calibration_text(calibration, rig)}
+            write_together({newest: text, **plain})
             link = self.folder / f".{LAST}.new"
             link.unlink(missing_ok=True)
             link.symlink_to(newest.relative_to(self.folder))

@@ -331,15 +331,6 @@ def _public_key(request: str) -> ec.EllipticCurvePublicKey:
     return public
 
 
-def signing_request(key: ec.EllipticCurvePrivateKey, name: str) -> str:
-    """A signing request (PEM) for a key."""
-    from cryptography import x509
-    from cryptography.hazmat.primitives import hashes, serialization
-
-    made = x509.CertificateSigningRequestBuilder().subject_name(_name(name)).sign(key, hashes.SHA256())
-    return made.public_bytes(serialization.Encoding.PEM).decode("ascii")
-
-
 def _general_name(host: str) -> x509.GeneralName:
     from cryptography import x509
 

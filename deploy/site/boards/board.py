@@ -45,7 +45,10 @@ def folder_of(role: str, agent: str, root: Path = Path("/")) -> Path:
 def request(role: str, agent: str, root: Path = Path("/")) -> str:
     """A signing request for a new key, which stays here. The present key is in use until a certificate for it comes."""
     keys.need_cryptography()
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import NameOID
 
     folder = folder_of(role, agent, root)
     try:
@@ -55,7 +58,10 @@ def request(role: str, agent: str, root: Path = Path("/")) -> str:
         keys.write_key(folder / NEW_KEY, key)
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", file=folder, remedy="run it as root (sudo)") from None
-    return keys.signing_request(key, certificate_name("record" if role == "recorder" else role, agent))
+    name = certificate_name("record" if role == "recorder" else role, agent)
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    made = x509.CertificateSigningRequestBuilder().subject_name(subject).sign(key, hashes.SHA256())
+    return made.public_bytes(serialization.Encoding.PEM).decode("ascii")
 
 
 def accept(
