@@ -9,7 +9,7 @@ import numpy as np
 
 from hub.bundle import covariance as cov
 from hub.bundle.adjustment import predict, residual_norms
-from hub.bundle.datum.control_outliers import reject_outliers
+from hub.bundle.datum.control_outliers import reject_outliers, reject_refuted
 from hub.bundle.datum.control_point_adjustment import adjust_to_control_points
 from hub.bundle.datum.gauge import fix_gauge, identity_gauge, is_overdetermined, transform_state, with_exact_poses
 from hub.bundle.initialisation import Reconstruction
@@ -57,6 +57,11 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
     datum_points: list[tuple[int, Floats]] = []
     if solution.known is None:
         rig, control_outliers = reject_outliers(rig, names, [camera.pose for camera in state.cameras])
+        if is_overdetermined(rig, names) and problem.free_parameters.pose:
+            prior = estimate_smoothness(problem, state)
+            network = cov.covariance(problem, rescale_noise(problem, state, prior), prior).cameras
+            rig, refuted = reject_refuted(rig, names, [camera.pose for camera in state.cameras], network)
+            control_outliers += refuted
         gauge = fix_gauge(rig, names, [camera.pose for camera in state.cameras])
         gauge = scaled_by_bars(gauge, measure_scale_bars(rig, reconstruction.labels, problem, state))
         if published is not None and gauge.scale == "arbitrary":
