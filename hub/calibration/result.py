@@ -20,7 +20,7 @@ from hub.bundle.problem import CAMERA_PARAMETERS, CRYSTAL_RATE_STD, FOCAL, READO
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.calibration.given_values import refuted_lens_warnings
 from hub.calibration.held_gauge import similarity_to_published
-from hub.calibration.pair_network import pair_lag
+from hub.calibration.pair_network import RATE_TOLERANCE, pair_lag
 from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
 from hub.calibration.solution import Solution
 from hub.sync.hypothesis import PairSolution
@@ -268,7 +268,7 @@ def _other_frame_rates(rig: Rig, cameras: dict[str, CameraCalibration], referenc
     out = []
     for name, camera in cameras.items():
         rate, std, fps = camera.time_map.clock_rate, camera.clock_rate_std, rig.cameras[name].fps
-        if (rate - 1.0) ** 2 > REFUTED_SIGMA**2 * (CRYSTAL_RATE_STD**2 + std**2):
+        if abs(rate - 1.0) < RATE_TOLERANCE and (rate - 1.0) ** 2 > REFUTED_SIGMA**2 * (CRYSTAL_RATE_STD**2 + std**2):
             out.append(
                 f"{name}: its times run {1e6 * (rate - 1.0):+.0f} ± {1e6 * std:.0f} ppm against {reference}'s, more "
                 f"than the 100 ppm of crystals: a different frame rate, {fps / rate:.5g} fps for {fps:.5g}, or that of "
