@@ -40,8 +40,8 @@ from protocols.session.rig import MAX_READOUT_S
 
 _FALSE_ALARM_PROBABILITY = 1e-4
 """Probability that one of the lenses of a correct rig is refuted."""
-_READOUT_TOLERANCE_S = 2e-3
-"""Error [s] of an estimated readout that does not make it implausible: a global shutter's comes out at about 0."""
+_READOUT_MARGIN = 0.25
+"""Error of an estimated readout, in frame intervals, that is plausible: a global shutter's comes out at about 0."""
 _STEP_TIMES, _MIN_STEP_ROWS = 24, 60
 """Times at which a clock step is tried, and rows of a camera below which none is."""
 _MIN_STEP_S = 5e-3
@@ -167,9 +167,19 @@ def are_readouts_plausible(problem: Problem, state: AdjustmentState) -> bool:
     for number, camera in enumerate(state.cameras):
         steps = [np.diff(np.unique(part.stamps)) for part in problem.rows if part.camera == number]
         interval = min((float(np.median(step)) for step in steps if len(step)), default=MAX_READOUT_S)
-        if not -_READOUT_TOLERANCE_S < camera.readout < min(interval + _READOUT_TOLERANCE_S, MAX_READOUT_S):
+        margin = _READOUT_MARGIN * interval
+        if not -margin < camera.readout < min(interval + margin, MAX_READOUT_S):
             return False
     return True
+
+
+def without_negative_readouts(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
+    """The problem with readouts that came out below 0 held there: those of global shutters."""
+    below = [camera.readout < 0.0 for camera in state.cameras]
+    given = problem.readout_given or (False,) * len(below)
+    cameras = [replace(one, readout=max(one.readout, 0.0)) for one in state.cameras]
+    held = tuple(a or b for a, b in zip(given, below, strict=True))
+    return replace(problem, readout_given=held), replace(state, cameras=tuple(cameras))
 
 
 def _cost_reduction(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, readout_columns: Bools) -> float:

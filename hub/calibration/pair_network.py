@@ -319,13 +319,14 @@ def _connect_at_other_rates(
     while True:
         groups = connected_components(names, [pair for pair in pairs.values() if pair.solved])
         largest = groups[0] if groups else []
-        if len(largest) > 1 and first_pair_only:
-            return prepared
         found = None
         for a, b in pairs:
             across = (a in largest) != (b in largest) if len(largest) > 1 else not pairs[a, b].solved
             if not across or (a, b) in tried:
                 continue
+            outside = b if a in largest else a
+            if first_pair_only and len(largest) > 1 and outside not in prepared.uncalibrated:
+                continue  # resection finds it
             tried.add((a, b))
             report(f"pair {a}–{b} at other frame rates", 0.57)
             solution = _solve(prepared, (a, b), known, thorough=True, unguided=unguided.get((a, b)))

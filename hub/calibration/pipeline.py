@@ -607,6 +607,11 @@ def final_adjustment(
     ):
         report("adjusting the readouts", 0.9)
         read_problem, read_state, _ = adjust(model_comparison.with_free_readouts(problem), state, rounds=2)
+        if any(camera.readout < 0.0 for camera in read_state.cameras) and model_comparison.are_readouts_plausible(
+            read_problem, read_state
+        ):
+            held = model_comparison.without_negative_readouts(read_problem, read_state)
+            read_problem, read_state, _ = adjust(*held, rounds=2)
         if model_comparison.are_readouts_plausible(read_problem, read_state) and _bic_prefers(
             read_problem, read_state, problem, state, 1
         ):

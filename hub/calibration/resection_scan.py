@@ -176,7 +176,7 @@ def _moment_scan(
     paths = reconstruction.state.trajectories
     begin, end = min(path.basis.begin for path in paths), max(path.basis.end for path in paths)
     grid = grid_tracks([track.scaled(rate) for _, track in labels], _STEP_S, 0.5)
-    time = begin + _STEP_S * np.arange(int((end - begin) / _STEP_S) + 1, dtype=np.float64)
+    time = np.asarray(begin + _STEP_S * np.arange(int((end - begin) / _STEP_S) + 1), dtype=np.float64)
     world = np.stack([paths[number].at(time) for number, _ in labels])
     present = np.isfinite(world).all(axis=2) & np.stack([seen_by_two(reconstruction, i, time) for i, _ in labels])
     if not present.any():

@@ -9,7 +9,7 @@ import numpy as np
 
 from hub.bundle import covariance as cov
 from hub.bundle.adjustment import predict, residual_norms
-from hub.bundle.datum.control_outliers import reject_outliers
+from hub.bundle.datum.control_outliers import reject_outliers, reject_refuted
 from hub.bundle.datum.control_point_adjustment import adjust_to_control_points
 from hub.bundle.datum.gauge import fix_gauge, identity_gauge, is_overdetermined, transform_state, with_exact_poses
 from hub.bundle.initialisation import Reconstruction
@@ -20,7 +20,7 @@ from hub.bundle.problem import CAMERA_PARAMETERS, CRYSTAL_RATE_STD, FOCAL, READO
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.calibration.given_values import refuted_lens_warnings
 from hub.calibration.held_gauge import similarity_to_published
-from hub.calibration.pair_network import pair_lag
+from hub.calibration.pair_network import RATE_TOLERANCE, pair_lag
 from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
 from hub.calibration.solution import Solution
 from hub.sync.hypothesis import PairSolution
@@ -57,6 +57,11 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
     datum_points: list[tuple[int, Floats]] = []
     if solution.known is None:
         rig, control_outliers = reject_outliers(rig, names, [camera.pose for camera in state.cameras])
+        if is_overdetermined(rig, names) and problem.free_parameters.pose:
+            prior = estimate_smoothness(problem, state)
+            network = cov.covariance(problem, rescale_noise(problem, state, prior), prior).cameras
+            rig, refuted = reject_refuted(rig, names, [camera.pose for camera in state.cameras], network)
+            control_outliers += refuted
         gauge = fix_gauge(rig, names, [camera.pose for camera in state.cameras])
         gauge = scaled_by_bars(gauge, measure_scale_bars(rig, reconstruction.labels, problem, state))
         if published is not None and gauge.scale == "arbitrary":
@@ -263,7 +268,7 @@ def _other_frame_rates(rig: Rig, cameras: dict[str, CameraCalibration], referenc
     out = []
     for name, camera in cameras.items():
         rate, std, fps = camera.time_map.clock_rate, camera.clock_rate_std, rig.cameras[name].fps
-        if (rate - 1.0) ** 2 > REFUTED_SIGMA**2 * (CRYSTAL_RATE_STD**2 + std**2):
+        if abs(rate - 1.0) < RATE_TOLERANCE and (rate - 1.0) ** 2 > REFUTED_SIGMA**2 * (CRYSTAL_RATE_STD**2 + std**2):
             out.append(
                 f"{name}: its times run {1e6 * (rate - 1.0):+.0f} ± {1e6 * std:.0f} ppm against {reference}'s, more "
                 f"than the 100 ppm of crystals: a different frame rate, {fps / rate:.5g} fps for {fps:.5g}, or that of "

@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from scipy.special import fdtri
+from scipy.special import chdtri, fdtri
 
 from hub.bundle.datum.gauge import (
     CONTRADICTION_SIGMA,
@@ -15,8 +15,10 @@ from hub.bundle.datum.gauge import (
     control_points_of,
     fit_to_control_points,
 )
+from hub.bundle.problem import CAMERA_PARAMETERS
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, Similarity
+from protocols.geometry.types import Floats
 from protocols.session.rig import Rig
 
 ControlItem = str | tuple[str, str, float]
@@ -30,6 +32,10 @@ _MIN_SCATTER_RATIO = 3.0
 """Factor by which the scatter of the second-best outlier set must be larger."""
 _MAX_OUTLIERS = 2
 """Most control points rejected together; with more outliers among few points they cannot be identified."""
+_REFUTED_PROBABILITY = 1e-3
+"""Probability that a reference of a correct survey is refuted: what its own error leaves of five stds is about four."""
+_ALIKE_SHARE = 0.8
+"""Share of the largest chi-squared from which another camera's error explains the contradiction alike."""
 _EXHAUSTIVE_LIMIT = 10
 """Control points up to which all pairs are tried; with more, the search is greedy: the worst, then the next worst."""
 
@@ -144,3 +150,80 @@ def _describe(rig: Rig, names: list[str], poses: list[Pose], item: ControlItem, 
         f"the control point of {item} was rejected as an outlier: {' and '.join(errors)} "
         "relative to the others; was the camera moved?"
     )
+
+
+def reject_refuted(rig: Rig, names: list[str], poses: list[Pose], network: Floats) -> tuple[Rig, tuple[str, ...]]:
+    """The rig without references (positions and attitudes of a camera) that the network refutes, and their names.
+
+    poses: of the solved cameras in any world and unit. network: (18 n, 18 n) covariance of their parameters there, by
+    the observations alone. Data snooping (Baarda): the error of one camera's reference is freed at a time; its
+    chi-squared has the stds of the references and of the network in it. Where the errors of two cameras explain the
+    contradiction alike, neither is rejected, and both are named. References without std are named and kept.
+    """
+    control = control_points_of(rig, names)
+    if not control.fixes_scale:
+        return rig, ()
+    found, _ = fit_to_control_points(rig, names, poses)
+    published = [found.pose(pose) for pose in poses]
+    residual, jacobian, design, variance, owner = [], [], [], [], []
+    floor = 1e-6 * max(float(np.linalg.norm(np.ptp([pose.position for pose in published], axis=0))), 1e-9)
+    for i, name in enumerate(names):
+        camera, base = rig.cameras[name], i * CAMERA_PARAMETERS
+        for known, std, first in ((camera.position, camera.position_std, 3), (camera.rotation, camera.rotation_std, 0)):
+            if known is None:
+                continue
+            block, freedom = np.zeros((3, len(network))), np.zeros((3, 7))
+            if first:
+                block[:, base + 3 : base + 6] = found.scale * found.rotation
+                place = published[i].position
+                freedom = np.column_stack([np.eye(3), -so3.hat(place), place])
+                off = place - known
+            else:
+                block[:, base : base + 3] = np.eye(3)
+                freedom[:, 3:6] = -published[i].rotation
+                off = so3.log(published[i].rotation @ known.T)
+            residual.append(off)
+            jacobian.append(block)
+            design.append(freedom)
+            variance.append(np.maximum(np.zeros(3) if std is None else std, floor if first else 1e-6) ** 2)
+            owner += [i] * 3
+    rows = np.concatenate(jacobian)
+    weight = np.linalg.inv(rows @ network @ rows.T + np.diag(np.concatenate(variance)))
+    offs, freedoms, cameras = np.concatenate(residual), np.concatenate(design), np.array(owner)
+    warnings: list[str] = []
+    rejected: list[str] = []
+    while True:
+        reduced = weight - weight @ freedoms @ np.linalg.pinv(freedoms.T @ weight @ freedoms) @ freedoms.T @ weight
+        pull = reduced @ offs
+        tests = {}
+        for i in np.unique(cameras):
+            mine = np.flatnonzero(cameras == i)
+            own = reduced[np.ix_(mine, mine)]
+            inner = np.linalg.pinv(own, rcond=1e-9)
+            dimensions = int(np.linalg.matrix_rank(own, tol=1e-9 * float(np.abs(reduced).max())))
+            if dimensions:
+                tests[int(i)] = float(pull[mine] @ inner @ pull[mine]), dimensions, inner @ pull[mine]
+        limits = {i: float(chdtri(one[1], _REFUTED_PROBABILITY / len(tests))) for i, one in tests.items()}
+        over = sorted((i for i in tests if tests[i][0] > limits[i]), key=lambda i: -tests[i][0])
+        if not over:
+            break
+        worst = over[0]
+        alike = [names[i] for i in over if tests[i][0] > _ALIKE_SHARE * tests[worst][0]]
+        if len(alike) > 1:
+            warnings.append(
+                f"the reference of one of {', '.join(alike)} is wrong, and which one cannot be decided "
+                f"(chi-squared {tests[worst][0]:.0f}, limit {limits[worst]:.0f}): the result follows it"
+            )
+            break
+        given = rig.cameras[names[worst]]
+        exact = given.position_std is None and given.rotation_std is None
+        amount = float(np.linalg.norm(tests[worst][2][:3]))
+        unit = rig.units if given.position is not None else "rad"
+        fate = "kept" if exact else "rejected as an outlier"
+        warnings.append(
+            f"the control point of {names[worst]} was {fate}: the observations and the other references put it "
+            f"{amount:.3g} {unit} off (chi-squared {tests[worst][0]:.0f}, limit {limits[worst]:.0f})"
+        )
+        rejected += [] if exact else [names[worst]]
+        freedoms = np.concatenate([freedoms, np.eye(len(cameras))[:, cameras == worst]], axis=1)
+    return _without(rig, tuple(rejected)) if rejected else rig, tuple(warnings)

