@@ -19,6 +19,7 @@ from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
+_OBLIQUE_COSINE = 0.7  # of that angle, 45 degrees, beyond which the appearance joins in
 _STEEP_COSINE = 0.82  # of the angle between optical axis and vertical, 35 degrees: the ground fills the image
 _AGREE, _CONTRADICT = 0.35, 0.7  # distance of the two estimates, in target lengths
 _FRAMES_TO_TRUST, _FRAMES_TO_DROP = 20, 6  # consecutive frames of agreement, contradiction
@@ -55,10 +56,10 @@ class AdaptiveTracker:
         """Initialise the target from its first frame. Raises InputError for an invalid box."""
         assert self._ground is not None
         first = self._ground.begin(image, time, target)
-        self._appearance.begin(image, time, target)
+        seen = self._appearance.begin(image, time, target)
         self._steep = self._ground.view_cosine > _STEEP_COSINE
         self._cut = not self._is_complete(target)
-        return self._on_ground(first) if self._steep else self._on_image(self._appearance.begin(image, time, target))
+        return self._on_ground(first) if self._steep else self._on_image(seen)
 
     def handle_telemetry(self, sample: Telemetry) -> None:
         """Add one sample; without lens and mounting it is not used."""
@@ -74,6 +75,8 @@ class AdaptiveTracker:
         ground = self._ground.handle_frame(image, time)
         if not self._steep and self._ground.view_cosine > _STEEP_COSINE and self._trust >= 0.0:
             self._steep = True
+        if self._steep and image is not None:
+            self._leave_steep(image, ground, time)
         if self._steep:
             return self._on_ground(ground)
         if self._cut and image is not None:
@@ -95,6 +98,15 @@ class AdaptiveTracker:
     def road_outline(self) -> tuple[Floats, Floats | None]:
         """The observed road near the target, see ``GroundTracker``."""
         return (np.zeros((0, 2)), None) if self._ground is None else self._ground.road_outline()
+
+    def _leave_steep(self, image: Image, ground: Estimate, time: float) -> None:
+        """Where the camera has come up to an oblique view, the appearance joins in, with the ground trusted so far."""
+        assert self._ground is not None
+        oblique = self._ground.view_cosine < _OBLIQUE_COSINE
+        if oblique and ground.state is TrackState.VISIBLE and self._is_complete(_box(ground)):
+            self._appearance = AppearanceTracker(self._size, self._fps)
+            self._appearance.begin(image, time, _box(ground))
+            self._steep, self._trust = False, 1.0
 
     def _is_complete(self, box: Box) -> bool:
         """Whether a box lies in the image without touching its border."""

@@ -42,6 +42,7 @@ _PEAK_TARGET, _PEAK_BACKGROUND = (0.9, 0.2), (0.3, 0.15)  # mean and std of that
 _PEAK_LIMIT = 3.0  # of the log likelihood ratio of that share
 _VELOCITY_S = 0.5  # over which velocity is averaged
 _ACCELERATION = 0.7  # std, in target lengths a second squared
+_MOVES = 0.3  # speed over the scene at which a heading is given, in target lengths a second
 _DRIFT = 0.05  # std of the predicted place, in target lengths a second
 _LOST_STD, _LOST_AFTER_S = 8.0, 15.0  # in target lengths; as of the ground tracker
 _MAX_GROWTH = 8.0  # of a side since the first frame
@@ -377,7 +378,10 @@ class AppearanceTracker:
         nan = float("nan")
         centre, extent = self._shape.bounds(self.box)
         x, y = (nan, nan) if state is TrackState.LOST else (float(centre[0]), float(centre[1]))
-        return Estimate(time, state, x, y, float(extent[0]), float(extent[1]), nan, std)
+        # Below it, the direction of the velocity is noise.
+        moves = state is not TrackState.LOST and np.hypot(*self._velocity) > _MOVES * self.length
+        heading = float(np.arctan2(self._velocity[1], self._velocity[0])) if moves else nan
+        return Estimate(time, state, x, y, float(extent[0]), float(extent[1]), heading, std)
 
 
 def _square(matrix: Floats) -> Floats:

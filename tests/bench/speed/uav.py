@@ -1,4 +1,4 @@
-"""The UAV tracker beside OpenCV's CSRT, KCF, MOSSE and MIL on the same flights: CPU per frame while the car is in the image.
+"""The UAV tracker beside OpenCV's CSRT, KCF, MOSSE and MIL on the same flights: CPU per frame with the target in view.
 
 Run with a folder that holds opencv-contrib first on the path (``make bench`` makes it): ours then runs on it too.
 """

@@ -81,6 +81,8 @@ def test_a_folder_of_images_is_tracked_until_out_of_view(
     assert len(rows[10]["x"].replace(".", "")) >= 16
     assert (tmp_path / "hypotheses.csv").read_text().splitlines()[0] == "frame,rank,weight,x,y"
     assert output["frames"] == FRAMES
+    assert sum(entry["frames"] for entry in output["basis"].values()) == FRAMES
+    assert all(entry["reason"] for entry in output["basis"].values())
     assert output["visible"] + output["coasting"] + output["lost"] == FRAMES
     assert output["scores"]["visible_while_out"] == 0.0
     assert output["scores"]["in_frame_20px"] == 1.0
