@@ -327,8 +327,8 @@ def solve_network(
             _misfit,
         )
         if more:
-            replaced = {frozenset((pair.a, pair.b)) for pair in more}
-            pairs = [pair for pair in pairs if frozenset((pair.a, pair.b)) not in replaced] + more
+            joint = {(pair.a, pair.b): pair for pair in more}
+            pairs = [joint.get((pair.a, pair.b), pair) for pair in pairs]
             prepared = replace(prepared, warnings=prepared.warnings + frame_rate_warnings(prepared, pairs))
         refused = {name: reason for name, reason in refused.items() if name not in reconstruction.names}
         refused |= {name: f"{reason}; {refused[name]}" for name, reason in reasons.items()}

@@ -31,7 +31,7 @@ def connect_by_resection(
     """The session and reconstruction with those of the cameras ``names`` that the solved path places.
 
     adjust: the final adjustment. misfit: why a placed camera does not fit the others, "" if it does; then it is left
-    out again. Returns also a solved pair for each connected camera, and the reasons of the others.
+    out again. Returns also the pairs of the connected cameras with the placed ones, and the reasons of the others.
     """
     pairs: list[PairSolution] = []
     reasons: dict[str, str] = {}
@@ -63,5 +63,6 @@ def connect_by_resection(
         if not reasons[name]:
             del reasons[name]
             prepared, reconstruction = scaled, trial
-            pairs.append(PairSolution(anchors[0], name, "ok"))
+            both = (sorted((other, name), key=prepared.names.index) for other in placed)
+            pairs += [PairSolution(a, b, "ok") for a, b in both]
     return prepared, reconstruction, pairs, reasons

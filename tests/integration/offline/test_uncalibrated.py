@@ -102,8 +102,9 @@ def check_pairs(full: Session, session: Session, result: dict[str, Any], within:
         assert np.linalg.norm(matrix) == pytest.approx(1.0)
         assert np.linalg.svd(matrix, compute_uv=False)[2] < 1e-9
         assert epipolar_px(full, session, pair) < 1.5
-        assert 0.9 < pair["inliers"] <= 1.0
-        assert 0.2 < pair["rms_px"] < 1.0
+        # A pair whose camera resection has connected has no fit of its own.
+        assert pair["inliers"] is None or 0.9 < pair["inliers"] <= 1.0
+        assert pair["rms_px"] is None or 0.2 < pair["rms_px"] < 1.0
 
 
 def test_a_camera_whose_lens_is_undetermined_is_timed_while_the_others_are_placed(tmp_path: Path) -> None:
