@@ -120,7 +120,13 @@ def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable
     nodes = NodeHost(config.id, config.nodes, leave_after_s=config.leave_after_s) if runs_nodes else None
     goes_on = config.known == "last"
     known = None if config.known is None or goes_on else KnownCalibration(*read_calibration(Path(config.known)))
-    settings = LiveSettings(config.window_s, config.interval_s, solve=config.solve, track=config.track)
+    settings = LiveSettings(
+        config.window_s,
+        config.interval_s,
+        solve=config.solve,
+        track=config.track,
+        refine_lenses=config.refine_lenses,
+    )
     hub = LiveHub(settings, rig, None if known is not None else nodes, known, WorkerSolver())
     export = None if config.out is None else partial(_export, out=config.out)
     state = config.state or default_folder(config.out, config.site, config.id)

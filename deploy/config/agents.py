@@ -320,6 +320,7 @@ class HubConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     disappeared is removed. known: a calibration.toml whose poses, intrinsics and clocks are kept fixed; nothing is
     solved then. known = "last": the last answer of this hub, however old, is used until the rows give a new one, also
     where cameras were restarted since. track: whether people, vehicles and unlabelled markers are tracked.
+    refine_lenses: whether measured lenses may change, as `calibrate --refine-lenses`.
     """
 
     id: str = "hub"
@@ -335,6 +336,7 @@ class HubConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     leave_after_s: Seconds = 30.0
     known: KnownName | None = None
     track: bool = True
+    refine_lenses: bool = False
 
 
 class ViewConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=False):

@@ -66,17 +66,24 @@ def update_calibration(
     full: bool = True,
     clock_priors: Mapping[str, ExternalClockPrior] | None = None,
     arrivals: Mapping[str, ExternalClockPrior] | None = None,
+    refine_lenses: bool = False,
 ) -> Update:
     """The calibration from all given rows, starting from the last one.
 
     last: the answer before, of which cameras with another clock or pose have been removed; None = from scratch.
     search: whether cameras that are not tied are searched. full: whether it is searched over all lags, and whether
     lenses and readouts are tried again. clock_priors: by camera; bounds for lags that the images leave ambiguous.
-    arrivals: the same by times of arrival at the hub. Raises Refused where fewer than two cameras can be placed.
+    arrivals: the same by times of arrival at the hub. refine_lenses: whether measured lenses may change.
+    Raises Refused where fewer than two cameras can be placed.
     """
     if last is None or sum(name in last.cameras for name in observations.cameras) < 2:
         found = calibrate(
-            rig, observations, clock_priors=clock_priors, arrivals=None if full else arrivals, online=True
+            rig,
+            observations,
+            clock_priors=clock_priors,
+            arrivals=None if full else arrivals,
+            online=True,
+            refine_lenses=refine_lenses,
         )
         return Update(found if last is None else _in_published_clock(found, last), {})
     if last.reference in rig.cameras:
@@ -132,7 +139,9 @@ def update_calibration(
         reasons |= unplaced
     refuted = set(moved)
     while True:
-        reconstruction = final_adjustment(reconstruction, lambda text, share: None, warm=not full, online=True)
+        reconstruction = final_adjustment(
+            reconstruction, lambda text, share: None, warm=not full, online=True, refine_lenses=refine_lenses
+        )
         worst, reason = _inconsistent(reconstruction)
         if reason:
             refuted.add(worst)

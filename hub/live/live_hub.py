@@ -79,7 +79,7 @@ class LiveSettings:
 
     least_rows: detections that two cameras need before solving is tried. solve: whether timing is estimated here; if
     not, only pose nodes run, on a shared clock or on another hub's timing. track: whether people, vehicles and
-    markers are tracked as soon as there is a calibration.
+    markers are tracked as soon as there is a calibration. refine_lenses: whether measured lenses may change.
     """
 
     window_s: float = 180.0
@@ -87,6 +87,7 @@ class LiveSettings:
     least_rows: int = 90
     solve: bool = True
     track: bool = True
+    refine_lenses: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -500,6 +501,7 @@ class LiveHub:
             verify,
             self.clock_priors.for_boots(boots),
             arrivals,
+            self.settings.refine_lenses,
         )
         ranges = [one for one in self._builder.ranges() if one[0] in rig.cameras] if self._has_marker() else []
         return self._hand_over(job, boots, ranges, now)

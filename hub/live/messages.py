@@ -67,6 +67,7 @@ def solver_event(
     )
     if kind == "submitted":
         message.search, message.full, message.verify = job.search, job.full, job.verify
+        message.refine_lenses = job.refine_lenses
         for field, priors in ((message.clock_priors, job.clock_priors), (message.arrivals, job.arrivals)):
             field.extend(
                 pb.SolverEvent.ClockPrior(

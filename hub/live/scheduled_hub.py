@@ -72,6 +72,7 @@ class ScheduledHub(LiveHub):
             False,
             _priors(event.clock_priors, boots),
             _priors(event.arrivals, boots),
+            event.refine_lenses,
         )
         ranges = [(r.camera, r.boot_id, r.first_sequence, r.last_sequence, r.count) for r in event.rows]
         return self._hand_over(job, boots, ranges, now)

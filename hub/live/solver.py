@@ -26,7 +26,8 @@ class SolverJob:
     """A snapshot of what a hub knows.
 
     last: the answer to start from, with the cameras whose clock and pose hold; None = from scratch. search, full: of
-    cameras that are not tied, see `update_calibration`. verify: only test whether the rows agree with ``last``.
+    cameras that are not tied, and refine_lenses: see `update_calibration`. verify: only test whether the
+    rows agree with ``last``.
     """
 
     number: int
@@ -38,6 +39,7 @@ class SolverJob:
     verify: bool = False
     clock_priors: Mapping[str, ExternalClockPrior] = field(default_factory=dict)
     arrivals: Mapping[str, ExternalClockPrior] = field(default_factory=dict)
+    refine_lenses: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,6 +121,7 @@ def run_job(job: SolverJob, cpu_clock: Callable[[], float] = time.process_time) 
             full=job.full,
             clock_priors=job.clock_priors,
             arrivals=job.arrivals,
+            refine_lenses=job.refine_lenses,
         )
     except Refused as refusal:
         return SolverAnswer(

@@ -212,7 +212,7 @@ class Calibration(_message.Message):
     def __init__(self, schema_version: _Optional[int] = ..., revision: _Optional[int] = ..., status: _Optional[str] = ..., reason: _Optional[str] = ..., reference_camera: _Optional[str] = ..., scale: _Optional[str] = ..., units: _Optional[str] = ..., solver: _Optional[str] = ..., cameras: _Optional[_Iterable[_Union[CameraCalibration, _Mapping]]] = ..., refused: _Optional[_Iterable[_Union[Refusal, _Mapping]]] = ..., progress: _Optional[_Iterable[_Union[CameraProgress, _Mapping]]] = ..., state: _Optional[str] = ...) -> None: ...
 
 class SolverEvent(_message.Message):
-    __slots__ = ("schema_version", "job", "kind", "rows", "clock_priors", "reason", "cpu_s", "arrivals", "search", "full", "verify")
+    __slots__ = ("schema_version", "job", "kind", "rows", "clock_priors", "reason", "cpu_s", "arrivals", "search", "full", "verify", "refine_lenses")
     class Rows(_message.Message):
         __slots__ = ("camera", "boot_id", "first_sequence", "last_sequence", "count")
         CAMERA_FIELD_NUMBER: _ClassVar[int]
@@ -246,6 +246,7 @@ class SolverEvent(_message.Message):
     SEARCH_FIELD_NUMBER: _ClassVar[int]
     FULL_FIELD_NUMBER: _ClassVar[int]
     VERIFY_FIELD_NUMBER: _ClassVar[int]
+    REFINE_LENSES_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     job: int
     kind: str
@@ -257,7 +258,8 @@ class SolverEvent(_message.Message):
     search: bool
     full: bool
     verify: bool
-    def __init__(self, schema_version: _Optional[int] = ..., job: _Optional[int] = ..., kind: _Optional[str] = ..., rows: _Optional[_Iterable[_Union[SolverEvent.Rows, _Mapping]]] = ..., clock_priors: _Optional[_Iterable[_Union[SolverEvent.ClockPrior, _Mapping]]] = ..., reason: _Optional[str] = ..., cpu_s: _Optional[float] = ..., arrivals: _Optional[_Iterable[_Union[SolverEvent.ClockPrior, _Mapping]]] = ..., search: _Optional[bool] = ..., full: _Optional[bool] = ..., verify: _Optional[bool] = ...) -> None: ...
+    refine_lenses: bool
+    def __init__(self, schema_version: _Optional[int] = ..., job: _Optional[int] = ..., kind: _Optional[str] = ..., rows: _Optional[_Iterable[_Union[SolverEvent.Rows, _Mapping]]] = ..., clock_priors: _Optional[_Iterable[_Union[SolverEvent.ClockPrior, _Mapping]]] = ..., reason: _Optional[str] = ..., cpu_s: _Optional[float] = ..., arrivals: _Optional[_Iterable[_Union[SolverEvent.ClockPrior, _Mapping]]] = ..., search: _Optional[bool] = ..., full: _Optional[bool] = ..., verify: _Optional[bool] = ..., refine_lenses: _Optional[bool] = ...) -> None: ...
 
 class Track(_message.Message):
     __slots__ = ("schema_version", "sequence", "label", "state", "reference_time_ns", "position", "velocity", "position_covariance", "kind", "heading", "height", "height_std", "colour", "cameras", "unseen_s", "velocity_covariance")

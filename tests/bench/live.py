@@ -85,7 +85,7 @@ ROWS = {
 
 def recorded(session: Path) -> Reference:
     """A flight, its offline calibration and RTK. Raises CommandFailed where `calibrate` does."""
-    run = run_calibrate(session, "observations.csv")
+    run = run_calibrate(session, "observations.csv", refine_lenses=True)
     rig = read_rig(session / "rig.toml")
     table = np.loadtxt(session / "truth_trajectory.csv", delimiter=",", skiprows=1)
     label = next(iter(run.path))
@@ -149,8 +149,11 @@ def _bumped(session: rigs.Session, at: float, rng: np.random.Generator) -> tuple
     return Bump(BUMPED, at, {**session.poses, BUMPED: new}), moved
 
 
-def measure(reference: Reference, seconds: float, seed: int) -> dict[str, Any]:
-    """The figures of one run of at most ``seconds``, and its lag errors by answer. Raises RunFailed."""
+def measure(reference: Reference, seconds: float, seed: int, refine_lenses: bool = False) -> dict[str, Any]:
+    """The figures of one run of at most ``seconds``, and its lag errors by answer. Raises RunFailed.
+
+    refine_lenses: for the flights, whose lens data are off by up to 2 %.
+    """
     missing = [name for name in reference.rig.cameras if name not in reference.cameras]
     if missing:
         raise RunFailed(f"not calibrated offline: {', '.join(missing)}")
@@ -158,7 +161,7 @@ def measure(reference: Reference, seconds: float, seed: int) -> dict[str, Any]:
         folder = Path(name)
         arrivals = Arrivals(reference.cameras, DELAY_S, JITTER_S, seed)
         session_to_log(reference.rig, reference.seen, folder / "log.mcap", arrivals)
-        heard = run_live(folder / "log.mcap", folder, seconds)
+        heard = run_live(folder / "log.mcap", folder, seconds, refine_lenses)
     scores = LiveScores(heard, reference)
     found = scores.figures()
     for name, offline in (("track", "track"), ("smoothed", "smoothed"), ("last_answer", "track")):
@@ -176,7 +179,7 @@ def run(name: str, data: Path, seconds: float | None, seed: int) -> dict[str, An
             return measure(simulated(seconds, seed), seconds, seed)
         if not (data / name / "truth_trajectory.csv").is_file():
             return "no such recording in the data folder"
-        return measure(recorded(data / name), seconds or 1e6, seed)
+        return measure(recorded(data / name), seconds or 1e6, seed, refine_lenses=True)
     except (CommandFailed, Refused, RunFailed) as error:
         return str(error)
 

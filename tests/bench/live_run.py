@@ -68,15 +68,16 @@ class Heard:
     ended: float = 0.0
 
 
-def run_live(log: Path, folder: Path, seconds: float) -> Heard:
+def run_live(log: Path, folder: Path, seconds: float, refine_lenses: bool) -> Heard:
     """Play at most ``seconds`` of a log to a new hub and listen. Raises RunFailed.
 
-    folder: for the configuration and what the processes print.
+    folder: for the configuration and what the processes print. refine_lenses: the hub's setting.
     """
     endpoint = free_endpoint()
     bus_table = {"mode": "client", "connect": [endpoint]}
     config, stamps = folder / "hub.toml", folder / "stamps.npy"
-    config.write_text(tomli_w.dumps({"id": _HUB, "site": _SITE, "state": "state", "bus": bus_table}), encoding="utf-8")
+    table = {"id": _HUB, "site": _SITE, "state": "state", "refine_lenses": refine_lenses, "bus": bus_table}
+    config.write_text(tomli_w.dumps(table), encoding="utf-8")
     with Router(endpoint), open_bus(_SITE, BusConfig(mode="client", connect=(endpoint,)), timeout_s=10.0) as bus:
         listener = _Listener(bus)
         with _process(["deploy", "hub", str(config)], folder / "hub.txt") as hub:
