@@ -53,7 +53,8 @@ def solved_session(
         if name != names[-1]:
             std = 0.0 if number == 0 else time_offset_std
             rms = float(np.sqrt(np.mean(np.sum(error[inside] ** 2, axis=1))))
-            cameras[name] = CameraCalibration(name, lens, pose, clock, std, np.full(3, 0.002 * (number > 0)), rms)
+            position_std = np.full(3, 0.002 * (number > 0))
+            cameras[name] = CameraCalibration(name, lens, pose, clock, std, position_std, rms, lag_std=std)
             residuals[name] = np.column_stack([seen, pixels, error])[inside]
     ok = names[:-1]
     matrix = np.array([[0.0, -1e-6, 1e-3], [2e-6, 0.0, -2e-3], [-1e-3, 2e-3, 1.0]])

@@ -129,9 +129,9 @@ def test_good_data_is_assessed_as_good() -> None:
 @pytest.mark.parametrize(
     ("change", "level", "words"),
     [
-        ({"time_offset_std": 0.02}, "attention", "that is imprecise"),
-        ({"time_offset_std": 0.0025}, "note", "that is imprecise"),
-        ({"time_offset_std": 0.0004}, "good", "Clocks are known to"),
+        ({"lag_std": 0.02}, "attention", "that is imprecise"),
+        ({"lag_std": 0.0025}, "note", "that is imprecise"),
+        ({"lag_std": 0.0004}, "good", "Clocks are known to"),
         ({"rms_px": 9.0}, "attention", "leaves 9.00"),
         ({"rms_px": 1.4}, "note", "leaves 1.40"),
         ({"rms_px": 0.4}, "good", "within about a pixel"),
