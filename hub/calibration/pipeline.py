@@ -586,7 +586,7 @@ def final_adjustment(
         # Near the solution the re-fit alone converges; where it does not apply, the adjustment does.
         problem, state = estimate_frame_times(problem, state)
         problem = model_comparison.with_crystal_rates(problem, state)
-        refitted = _refit_online(problem, state)
+        refitted = _refit_online(problem, state, refine_lenses)
         if refitted[1] is not state:
             return _with_state(reconstruction, *refitted)
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
@@ -620,13 +620,14 @@ def final_adjustment(
     if not online and (misfits(adjusted) or _wrong_lens(adjusted)[0]):
         return adjusted  # a camera that will be left out: its errors are no noise
     report("correlated noise", 0.92)
-    refitted = _refit_online(problem, state) if online else refit_with_correlated_noise(problem, state, refine_lenses)
+    refit = _refit_online if online else refit_with_correlated_noise
+    refitted = refit(problem, state, refine_lenses)
     if refitted[1] is state and any(problem.crystal_rates):
         refitted = adjust(problem, state, rounds=1, iterations=9)[:2]  # the re-fit would have applied the rates' prior
     return _with_state(reconstruction, *refitted)
 
 
-def _refit_online(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
+def _refit_online(problem: Problem, state: AdjustmentState, refine_lenses: bool) -> tuple[Problem, AdjustmentState]:
     """The re-fit with correlated noise, on a part of many rows: its cost grows with the cube of the rows a second.
 
     Eight cameras at 30 frames a second took 17 s for 60 s; errors correlated over tenths of a second are sampled often
@@ -639,7 +640,7 @@ def _refit_online(problem: Problem, state: AdjustmentState) -> tuple[Problem, Ad
     thinned = problem
     if every > 1:
         thinned = replace(problem, rows=tuple(rows.every(every) for rows in problem.rows))
-    refitted = refit_with_correlated_noise(thinned, state, min_inflation=_ONLINE_MIN_INFLATION)
+    refitted = refit_with_correlated_noise(thinned, state, refine_lenses, _ONLINE_MIN_INFLATION)
     return (problem, state) if refitted[1] is state else refitted
 
 
