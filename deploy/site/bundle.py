@@ -47,6 +47,8 @@ ROLE_PACKAGES: dict[str, tuple[str, ...]] = {
     "router": _COMMON_PACKAGES,
 }
 """Packages that a role imports; ``tests/faults/test_bundle.py`` runs each role with only these."""
+_UNUSED = ("lxml",)
+"""Dependencies that no agent imports: pymavlink reads descriptions of parameters with lxml."""
 BUDGET_MB = {"camera": 350.0, "uav": 350.0}
 """Largest installed size of a role [MB], without depthai for OAK boards."""
 _PRECOMPILED_MODULES = {
@@ -137,6 +139,9 @@ def make_bundle(role: str, target: Target, out: Path, extras: Sequence[str] = ()
     for file in sorted(folder.glob("*.whl")):
         name, version = _identity(file)
         if name == "pip":
+            continue
+        if name in _UNUSED:
+            file.unlink()
             continue
         bundle.sizes[file.name] = _installed_size(file)
         pins.append(f"{name}=={version} --hash=sha256:{hashlib.sha256(file.read_bytes()).hexdigest()}")

@@ -125,7 +125,7 @@ def test_every_refusal_is_a_counter_on_metrics_and_in_the_status(tmp_path: Path)
             bad = observation("cam7", 17)
             bad.detections[0].u = float("nan")
             publisher.put(bad)
-            line = 'agent="recorder",reason="not_finite",role="record",source="cam7"} 1.0'
+            line = 'agent="recorder",reason="not_finite",role="record",site="local",source="cam7"} 1.0'
             seconds = wait_until(lambda: line in get("metrics")[1])
             wait_until(
                 lambda: any(item.message.counters.get("rejected.not_finite@cam7") == 1 for item in statuses.drain())  # type: ignore[attr-defined]
