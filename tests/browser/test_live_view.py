@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from hub.view.lag_history import lag_of
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.log.read.reader import LogReader
@@ -72,7 +73,7 @@ def test_the_view_of_a_running_demo(demo: Demo, tab: Tab) -> None:
             for received in answers.drain():
                 assert isinstance(received.message, pb.Calibration)
                 shown.update(
-                    f"{found.time_offset:+.6f} s ± {1e3 * found.time_offset_std:.3f} ms · "
+                    f"{lag_of(found):+.6f} s ± {1e3 * found.time_offset_std:.3f} ms · "
                     f"{1e6 * (found.clock_rate - 1.0):+.1f} ppm · {found.rms_px:.2f} px"
                     for found in received.message.cameras
                     if found.camera == "cam1"
