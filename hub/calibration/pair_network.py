@@ -277,7 +277,7 @@ def _solve(
     if known is not None and all(name in known.cameras for name in names):
         poses = [known.cameras[name].pose for name in names]
         if coincide(*(pose.position for pose in poses)):
-            return PairSolution(*names, "both cameras are known to be in one place: no motion tells their lag")
+            return PairSolution(*names, "both cameras are known to be in one place: no motion determines their lag")
         given = relative_pose_between(*poses)
     calibrated = all(name in prepared.cameras for name in names)
     # With more cameras the adjustment estimates lenses and tests each clock: an imprecise lag suffices to start.

@@ -117,32 +117,32 @@ def test_each_loss_is_reported_with_its_reason_and_cleared_when_it_is_over(site:
 
     site.kill("cam1")
     site.kill("cam2")
-    told = wait_until(lambda: site.reported({"hub": r"no frames from cam1 \(\d s\), cam2 \(\d s\)"}), 15.0)
+    reported_s = wait_until(lambda: site.reported({"hub": r"no frames from cam1 \(\d s\), cam2 \(\d s\)"}), 15.0)
     assert site.all_ready("recorder", "cam0"), "they do their job"
     site.start("cam1", "cam2")
     wait_until(lambda: site.all_ready("cam1", "cam2"), 30.0)
-    _drill("two of three cameras killed", told, wait_until(lambda: site.all_ready("hub"), 30.0))
+    _drill("two of three cameras killed", reported_s, wait_until(lambda: site.all_ready("hub"), 30.0))
 
     site.kill("router")
     site.processes["router"].child.wait()
-    told = wait_until(lambda: site.reported(dict.fromkeys(everyone, f"no router at {site.endpoint} for")), 15.0)
+    reported_s = wait_until(lambda: site.reported(dict.fromkeys(everyone, f"no router at {site.endpoint} for")), 15.0)
     time.sleep(2.0)
     site.start("router")
     wait_until(lambda: site.all_ready("router"), 30.0)
-    _drill("router killed", told, wait_until(lambda: site.all_ready(*everyone), 30.0))
+    _drill("router killed", reported_s, wait_until(lambda: site.all_ready(*everyone), 30.0))
 
     site.kill("cam0", signal.SIGSTOP)
-    told = wait_until(lambda: site.reported({"hub": "no frames from cam0"}), 15.0)
+    reported_s = wait_until(lambda: site.reported({"hub": "no frames from cam0"}), 15.0)
     site.kill("cam0", signal.SIGCONT)
-    _drill("a camera frozen", told, wait_until(lambda: site.all_ready("hub", "cam0"), 30.0))
+    _drill("a camera frozen", reported_s, wait_until(lambda: site.all_ready("hub", "cam0"), 30.0))
 
     disk = site.folder / "disk"
     filler = disk / "filler"
     if os.path.ismount(disk):
         filler.write_bytes(bytes(max(shutil.disk_usage(disk).free - 4_000_000, 0)))
-        told = wait_until(lambda: site.reported({"recorder": "MB are free"}), 15.0)
+        reported_s = wait_until(lambda: site.reported({"recorder": "MB are free"}), 15.0)
         filler.unlink()
-        _drill("the recorder's disk full", told, wait_until(lambda: site.all_ready("recorder"), 30.0))
+        _drill("the recorder's disk full", reported_s, wait_until(lambda: site.all_ready("recorder"), 30.0))
     # A power cut of the hub and of all cameras: nobody stops in order, and all clocks begin anew.
     for name in ("hub", *CAMERAS):
         site.kill(name)
@@ -152,12 +152,12 @@ def test_each_loss_is_reported_with_its_reason_and_cleared_when_it_is_over(site:
         assert set(read_calibration(file)[1]) <= set(CAMERAS)
     assert (state / "current.toml").resolve().parent == (state / "history").resolve()
     site.start("hub", *CAMERAS)
-    told = wait_until(lambda: site.reported({"hub": "reloaded and is not verified yet"}), 60.0)
+    reported_s = wait_until(lambda: site.reported({"hub": "reloaded and is not verified yet"}), 60.0)
     verified = wait_until(lambda: site.all_ready("hub"), 60.0)
     measured(
         "power cut of hub and cameras, known = last",
         "the last calibration again, not verified, then verified",
-        f"published {told:.1f} s after the start of all processes, verified {verified:.1f} s later",
+        f"published {reported_s:.1f} s after the start of all processes, verified {verified:.1f} s later",
     )
     # A line for each state, not for each second of it.
     for name in everyone:

@@ -24,7 +24,7 @@ _GOOD_STD_S = 0.003  # precise enough to pause the estimation
 _PAUSE_S = 60.0
 _MAX_CHANGE_WHILE_TRACKING_S = 0.015  # a larger change of the offset is not applied while a tracker uses it
 _CONFIRMING_FRAMES = 8  # a quarter of a second at 30 fps
-_CLOCK_STEP_NS = 150_000_000  # a smaller step of the clock cannot be told from delays
+_CLOCK_STEP_NS = 150_000_000  # a smaller step of the clock cannot be distinguished from delays
 
 
 class CameraHostClock:

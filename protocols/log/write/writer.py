@@ -229,7 +229,7 @@ class _DirectFile:
 
     def __init__(self, path: Path) -> None:
         self._raw = path.open("xb", buffering=0)
-        with suppress(OSError):  # not every file system has locks; one tells others that this file is being written
+        with suppress(OSError):  # not every file system has locks; one marks the file as being written
             fcntl.flock(self._raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._position = 0
 

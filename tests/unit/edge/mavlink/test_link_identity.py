@@ -159,7 +159,7 @@ def test_a_vehicle_that_is_back_at_its_address_gets_the_link_from_whoever_resemb
     under_test = LinkUnderTest()
     under_test.autopilot(A, 3.0, telemetry=telemetry)
     under_test.silence(12.0)
-    assert under_test.autopilot(C, 3.0, telemetry=telemetry) is not None  # nothing tells it from the vehicle
+    assert under_test.autopilot(C, 3.0, telemetry=telemetry) is not None  # nothing distinguishes it from the vehicle
     for _ in range(3):
         under_test.autopilot(A, 0.5, telemetry=telemetry)
         under_test.received.clear()
