@@ -110,6 +110,8 @@ def test_a_tolerance_applies_to_its_field_only(tmp_path: Path, capsys: pytest.Ca
     both = ("--tolerance", "observation.detections.u=0.25", "--tolerance", "observation.detections.v=0.3")
     assert compared(tmp_path, capsys, change, *both)[0] == 0
     assert compared(tmp_path, capsys, change, "--topics", "track")[0] == 0
+    assert compared(tmp_path, capsys, change, "--topics", "track", "observation")[0] == 3
+    assert compared(tmp_path, capsys, change, "--topics", "track", "status")[0] == 0
 
 
 @pytest.mark.parametrize(
