@@ -15,15 +15,16 @@ from hypothesis import strategies as st
 from hub.live.agent import status_message
 from hub.live.live_hub import LiveHub, LiveSettings
 from protocols.messages import syncline_pb2 as pb
-from protocols.topics import CAMERA_INFO, OBSERVATION, STATUS, TOPICS_BY_NAME
+from protocols.topics import CAMERA_INFO, OBSERVATION, STATUS, TOPICS_BY_NAME, Topic
 from protocols.validation.codec import Rejected, admit, decode, encode
 from tests.faults.fuzz import spoiled
 from tests.integration.live.test_live_hub import feed, messages
+from tests.support import samples
 from tests.support.rigs import simulate
-from tests.support.samples import camera_info, observation
 
 EVIL = "cam2"
 FUZZING = settings.get_current_profile_name() == "fuzz"
+_TOPICS: dict[type[Message], Topic] = {pb.CameraInfo: CAMERA_INFO, pb.Observation: OBSERVATION, pb.AgentStatus: STATUS}
 _PUBLISHED = {"Calibration": "calibration", "Track": "track", "SolverEvent": "solver_event", "Prediction": "prediction"}
 
 
@@ -46,18 +47,22 @@ def admissible(seed: int, count: int) -> Iterator[Message]:
     """Messages of the hostile camera that pass the gate: its own, with numbers and texts made extreme."""
     rng = random.Random(seed)
     own = [one for one in stream() if getattr(one, "camera", "") == EVIL]
-    samples: list[Message] = [
+    status = samples.status(EVIL)
+    status.boot_id = "boot0"
+    for name in ("clock_synchronised", "unix_minus_camera_s", "clock_error_s"):
+        status.gauges[name] = rng.choice((1.0, 0.0, -1e-9, 1e9, 1e308))
+    sent: list[Message] = [
         *own,
-        camera_info(EVIL),
-        observation(EVIL, 3, points=5),
-        observation(EVIL, 4, "boot-2", 300),
+        *[status] * len(own),
+        samples.camera_info(EVIL),
+        samples.observation(EVIL, 3, points=5),
+        samples.observation(EVIL, 4, "boot-2", 300),
     ]
     for number in range(count):
-        sample = own[number % len(own)] if rng.random() < 0.7 else rng.choice(samples)
+        sample = own[number % len(own)] if rng.random() < 0.7 else rng.choice(sent)
         payload = sample.SerializeToString() if rng.random() < 0.5 else spoiled(rng, sample)
-        topic = CAMERA_INFO if isinstance(sample, pb.CameraInfo) else OBSERVATION
         try:
-            yield admit(topic.key_for("local", EVIL), payload)[1]
+            yield admit(_TOPICS[type(sample)].key_for("local", EVIL), payload)[1]
         except Rejected:
             continue
 
