@@ -5,12 +5,13 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DATA ?= ../shared/data
 SECONDS_OF_SOAK ?= 900
+SECONDS_OF_FUZZ ?= 3600
 # One thread a process, as the command itself has it: more of them fight over the cores for matrices this small.
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 
-.PHONY: demo test lint types contracts docs check proto lock bench benches faults fuzz soak browser clean
+.PHONY: demo test lint types contracts docs check proto lock bench benches faults fuzz fuzz-decoders fuzz-hub soak browser clean
 
 demo: $(STAMP)
 	$(BIN)/syncline demo --out demo-out
@@ -56,9 +57,15 @@ faults: $(STAMP)
 browser: $(STAMP)
 	$(BIN)/python -m pytest tests/browser
 
-# A million and more damaged inputs for every decoder of what others send; seed by the time, printed in the output.
+# Damaged inputs for every decoder of what others send, for an hour of one core, and beside it hostile cameras against
+# a whole hub; seeds by the time, printed in the output.
 fuzz: $(STAMP)
-	$(BIN)/python -m tests.faults.fuzz
+	$(MAKE) --jobs 2 fuzz-decoders fuzz-hub
+
+fuzz-decoders: $(STAMP)
+	$(BIN)/python -m tests.faults.fuzz --seconds $(SECONDS_OF_FUZZ)
+
+fuzz-hub: $(STAMP)
 	$(BIN)/python -m pytest tests/property --hypothesis-profile=fuzz
 
 # The demo's processes for 15 minutes: memory of each, and its growth after warm-up.

@@ -1,6 +1,6 @@
 """Fuzzing of every decoder of received data with randomly damaged inputs; `make fuzz` does a million and more.
 
-    python -m tests.faults.fuzz [--count N] [--seed S]
+    python -m tests.faults.fuzz [--count N] [--seed S] [--seconds CPU_SECONDS]
 
 Inputs are valid messages with bytes changed, cut, doubled, joined, lengths and numbers made extreme. An input must be
 refused with a reason, or what comes out must be usable: every number finite. Anything else ends the run with the
@@ -10,6 +10,7 @@ input in hexadecimal.
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import random
 import struct
@@ -284,32 +285,39 @@ def _one_line(text: str) -> None:
         raise AssertionError(f"more than one line: {text!r}")
 
 
-def main() -> None:
-    """Run all and print the counts."""
-    parser = argparse.ArgumentParser(description="Random damage for every decoder.")
-    parser.add_argument("--count", type=int, default=60_000, help="inputs for each topic's decoder")
-    parser.add_argument("--seed", type=int, default=int(time.time()))
-    words = parser.parse_args()
-    began, total = time.process_time(), 0
-    print(f"seed {words.seed}")
-
-    def report(name: str, counts: Counter[str]) -> None:
-        nonlocal total
+def fuzz_all(count: int, seed: int) -> int:
+    """Run each once, print its counts, and return the number of inputs."""
+    total = 0
+    others: tuple[tuple[str, Callable[[int, int], Counter[str]], int], ...] = (
+        ("mavlink", fuzz_mavlink, count),
+        ("config", fuzz_config, max(1, count // 10)),
+        ("rig", fuzz_rig, max(1, count // 10)),
+        ("log", fuzz_log, max(1, count // 20)),
+    )
+    for name, counts in (
+        *fuzz_gate(count, seed).items(),
+        *((name, run(number, seed)) for name, run, number in others),
+    ):
         total += sum(counts.values())
         reasons = ", ".join(f"{number} {reason}" for reason, number in counts.most_common())
         print(f"{name}: {sum(counts.values())} inputs: {reasons}", flush=True)
+    return total
 
-    for name, counts in fuzz_gate(words.count, words.seed).items():
-        report(name, counts)
-    others: tuple[tuple[str, Callable[[int, int], Counter[str]], int], ...] = (
-        ("mavlink", fuzz_mavlink, words.count),
-        ("config", fuzz_config, max(1, words.count // 10)),
-        ("rig", fuzz_rig, max(1, words.count // 10)),
-        ("log", fuzz_log, max(1, words.count // 20)),
-    )
-    for name, run, count in others:
-        report(name, run(count, words.seed))
-    print(f"{total} inputs, 0 crashes, 0 non-finite values past the gate, {time.process_time() - began:.0f} s of CPU")
+
+def main() -> None:
+    """Run all, again and again with another seed for as long as is asked, and print the counts."""
+    parser = argparse.ArgumentParser(description="Random damage for every decoder.")
+    parser.add_argument("--count", type=int, default=60_000, help="inputs for each topic's decoder")
+    parser.add_argument("--seed", type=int, default=int(time.time()))
+    parser.add_argument("--seconds", type=float, default=0.0, help="repeat until so much CPU time is used")
+    words = parser.parse_args()
+    total = 0
+    for seed in itertools.count(words.seed):
+        print(f"seed {seed}", flush=True)
+        total += fuzz_all(words.count, seed)
+        if time.process_time() >= words.seconds:
+            break
+    print(f"{total} inputs, 0 crashes, 0 non-finite values past the gate, {time.process_time():.0f} s of CPU")
 
 
 if __name__ == "__main__":
