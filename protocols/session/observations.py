@@ -269,15 +269,25 @@ def gather_columns(
     )
     line = None if lines is None else np.array(lines)[sorting]
     std = None if stds is None or not np.isfinite(stds).any() else stds[sorting]
-    starts = np.flatnonzero(np.r_[True, (np.diff(c) != 0) | (np.diff(k) != 0)])
+    begins = np.r_[True, (np.diff(c) != 0) | (np.diff(k) != 0)]
+    starts = np.flatnonzero(begins)
     ends = np.r_[starts[1:], len(c)]
+    # Tracks with two rows of one time or of one frame, of all at once: a hub has thousands of tracks.
+    track = np.cumsum(begins) - 1
+    by_frame = np.lexsort((frame, track))
+    twice = np.r_[
+        track[1:][(np.diff(time) == 0) & ~begins[1:]],
+        track[by_frame][1:][(np.diff(frame[by_frame]) == 0) & (np.diff(track[by_frame]) == 0)],
+    ]
+    repeats = np.bincount(twice, minlength=len(starts)) > 0
     tracks: dict[tuple[str, str], Track] = {}
     warnings: list[str] = []
-    for start, end in zip(starts, ends, strict=True):
+    for start, end, repeated in zip(starts, ends, repeats, strict=True):
         part = slice(start, end)
         camera, label = camera_names[c[start]], label_names[k[start]]
-        lines_of = None if line is None else line[part]
-        _check_repeats(camera, label, frame[part], time[part], lines_of, file, warnings, frames_may_repeat)
+        if repeated:
+            lines_of = None if line is None else line[part]
+            _check_repeats(camera, label, frame[part], time[part], lines_of, file, warnings, frames_may_repeat)
         tracks[camera, label] = Track(camera, label, frame[part], time[part], pixels[part], size[part])
         if std is not None:
             tracks[camera, label] = replace(tracks[camera, label], std=std[part])
@@ -306,8 +316,6 @@ def _check_repeats(
         )
     unique, counts = np.unique(frame, return_counts=True)
     repeated = int((counts - 1).sum())
-    if not repeated:
-        return
     if repeated <= max(1.0, _MAX_REPEATED_SHARE * len(frame)) and not frames_may_repeat:
         twice = unique[counts > 1][0]
         at = np.flatnonzero(frame == twice)

@@ -16,7 +16,7 @@ from protocols.core.names import name_of_segment
 from protocols.topics import Topic
 from protocols.validation.codec import MAX_PAYLOAD, Rejected, RejectionReason, admit, parse_key
 
-MAX_BYTES = 64 * 1024 * 1024
+MAX_BYTES = 32 * 1024 * 1024
 """Upper bound of one inbox in bytes, so that a reader that has stopped does not exhaust the memory."""
 MAX_BYTES_OF_KEY = MAX_BYTES // 8
 """The same of one sender, four times as much of images: who floods pays, not the others."""
