@@ -6,13 +6,12 @@ import gc
 import threading
 import time
 import uuid
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, closing
 
 from google.protobuf.message import Message
 
 from hub.distributed.network.host import ROLE as NODES
-from hub.distributed.network.host import NodeHost
 from hub.live.fair_share import FairShare
 from hub.live.live_hub import SILENT_S, LiveHub
 from protocols.bus.base import Bus, Publisher, Received
@@ -31,6 +30,7 @@ from protocols.topics import (
     STATUS,
     TRACK,
     TRACK_SMOOTHED,
+    Topic,
 )
 
 ROLE = "hub"
@@ -69,117 +69,136 @@ def run_hub(
     heartbeat, called after every round, so that a watchdog detects a hanging loop. export: writes the calibration on
     request of a view; returns a status text.
     """
-    boot = boot_id or uuid.uuid4().hex
-    nodes = hub.nodes
-    node_topics = () if nodes is None else (NODE_STATE, CALIBRATION)
-    subscriptions = [bus.subscribe(topic) for topic in (CAMERA_INFO, OBSERVATION, STATUS, *node_topics)]
-    publishers = {
-        "Calibration": bus.publisher(CALIBRATION, agent),
-        "Track": bus.publisher(TRACK, agent, rate_hz=200.0),
-        "SolverEvent": bus.publisher(SOLVER_EVENT, agent),
-        "Prediction": bus.publisher(PREDICTION, agent),
-        "RigInfo": bus.publisher(RIG_INFO, agent),
-        "AgentStatus": bus.publisher(STATUS, agent),
-    }
-    smoothed = bus.publisher(TRACK_SMOOTHED, agent)
-    orders = CommandSubscription(bus, agent, boot, ("recalibrate", "export"))
-    observations = subscriptions[1]
-    sequence, next_status, next_rig, next_progress = 0, 0.0, 0.0, 0.0
-    last_action = ""
-    began = time.monotonic()
-    finish_by: float | None = None
-
-    def handle(received: Received) -> None:
-        if received.agent != agent or not isinstance(received.message, pb.Calibration):
-            backlog = time.monotonic() < began + _BACKLOG_S
-            hub.handle(received.message, received.arrival_ns * 1e-9, backlog=backlog)
-
-    shares = FairShare(handle, time.monotonic, _MESSAGES_S)
-
-    def publish(messages: list[Message]) -> None:
-        for message in messages:
-            publishers[message.DESCRIPTOR.name].put(message)
-
-    node_publishers: dict[str, Publisher] = {}
-
-    def publish_nodes(host: NodeHost, now: float) -> None:
-        for state in host.tick(now):
-            if state.camera not in node_publishers:
-                node_publishers[state.camera] = bus.publisher(NODE_STATE, state.camera)
-            node_publishers[state.camera].put(state)
-
-    watch = None if nodes is None else bus.watch_agents()
-    freeze_garbage_collector()
-    memory_frozen = False
-    try:
-        with bus.announce(ROLE, agent, boot), nullcontext() if nodes is None else bus.announce(NODES, agent, boot):
-            while True:
-                if stop.is_set() and finish_by is None:
-                    finish_by = time.monotonic() + _FINISH_S
-                finishing = finish_by is not None
-                if nodes is not None and watch is not None:
-                    for event in watch.drain():
-                        nodes.on_liveliness(event.role, event.agent, event.boot_id, alive=event.alive)
-                shares.take(received for subscription in subscriptions for received in subscription.drain())
-                for action in orders.take():
-                    hub.counters[f"asked.{action}"] += 1
-                    if action == "recalibrate":
-                        hub.reset()
-                        last_action = "recalibrating, as requested"
-                    elif action == "export":
-                        last_action = "no folder to export to: set out" if export is None else export(hub)
-                if nodes is not None:
-                    publish_nodes(nodes, time.monotonic())
-                now = time.monotonic()
-                before = hub.results
-                publish(hub.tick(now, final=finishing and not hub.finished))
-                if hub.tracking is not None:
-                    for track in hub.tracking.smoothed():
-                        smoothed.put(track)
-                has_result = hub.results > before
-                last = finish_by is not None and (now >= finish_by or (hub.finished and not hub.solver.busy))
-                if has_result and not memory_frozen:
+    with ExitStack() as stack:
+        running = _HubAgent(hub, bus, agent, boot_id or uuid.uuid4().hex, stack)
+        finish_by: float | None = None
+        results, memory_frozen = hub.results, False
+        freeze_garbage_collector()
+        while True:
+            if stop.is_set() and finish_by is None:
+                finish_by = time.monotonic() + _FINISH_S
+            running.receive()
+            running.obey(export)
+            now = time.monotonic()
+            running.estimate(now, final=finish_by is not None and not hub.finished)
+            if hub.results > results:
+                results = hub.results
+                if not memory_frozen:
                     memory_frozen = True
                     freeze_garbage_collector()
-                if on_result is not None and has_result:
+                if on_result is not None:
                     on_result(hub)
-                if now >= next_progress and hub.calibration is None and hub.settings.solve:
-                    next_progress = now + _PROGRESS_S
-                    publish(hub.waiting(now))
-                if rig is not None and now >= next_rig:
-                    next_rig = now + _RIG_S
-                    publish([rig_message(rig)])
-                if now >= next_status or last:
-                    next_status = now + _STATUS_S
-                    status = status_message(hub, agent, boot, sequence, [s.counters for s in subscriptions], now)
-                    needs_advice = hub.calibration is None or hub.refusal is not None or hub.calibration.refused
-                    if shares.dropped:
-                        status.counters["dropped_behind"] = shares.dropped.total()
-                    if shares.behind:
-                        status.message = f"{status.message}; messages wait of {', '.join(shares.behind[:8])}"
-                    advice = [one.text for one in hub.guidance.advice()] if needs_advice else []
-                    status.message = "; ".join(text for text in (status.message, *advice, last_action) if text)[
-                        :_MAX_TEXT
-                    ]
-                    publish([status])
-                    sequence += 1
-                beat()
-                if last:
-                    break
-                if hub.calibration is None:
-                    stop.wait(_TICK_S)  # nothing is published at the cameras' pace yet
-                else:
-                    time.sleep(_ROUND_S)
-                    observations.wait(_TICK_S)
-    finally:
-        hub.solver.close()
-        for publisher in (*publishers.values(), smoothed, *node_publishers.values()):
-            publisher.close()
-        if watch is not None:
-            watch.close()
-        orders.close()
-        for subscription in subscriptions:
-            subscription.close()
+            last = finish_by is not None and (now >= finish_by or (hub.finished and not hub.solver.busy))
+            running.report(now, rig, last=last)
+            beat()
+            if last:
+                break
+            if hub.calibration is None:
+                stop.wait(_TICK_S)  # nothing is published at the cameras' pace yet
+            else:
+                time.sleep(_ROUND_S)
+                running.observations.wait(_TICK_S)
+
+
+class _HubAgent:
+    """The steps of a round, and what the hub has open on the bus; stack: closes it."""
+
+    def __init__(self, hub: LiveHub, bus: Bus, agent: str, boot: str, stack: ExitStack) -> None:
+        self._hub, self._bus, self._agent, self._boot, self._stack = hub, bus, agent, boot, stack
+        stack.callback(hub.solver.close)
+        node_topics = () if hub.nodes is None else (NODE_STATE, CALIBRATION)
+        topics = (CAMERA_INFO, OBSERVATION, STATUS, *node_topics)
+        self._subscriptions = [stack.enter_context(closing(bus.subscribe(topic))) for topic in topics]
+        self.observations = self._subscriptions[1]
+        self._publishers = {
+            "Calibration": self._publisher(CALIBRATION),
+            "Track": self._publisher(TRACK, rate_hz=200.0),
+            "SolverEvent": self._publisher(SOLVER_EVENT),
+            "Prediction": self._publisher(PREDICTION),
+            "RigInfo": self._publisher(RIG_INFO),
+            "AgentStatus": self._publisher(STATUS),
+        }
+        self._smoothed = self._publisher(TRACK_SMOOTHED)
+        self._node_publishers: dict[str, Publisher] = {}
+        self._orders = stack.enter_context(closing(CommandSubscription(bus, agent, boot, ("recalibrate", "export"))))
+        self._watch = None if hub.nodes is None else stack.enter_context(closing(bus.watch_agents()))
+        stack.enter_context(bus.announce(ROLE, agent, boot))
+        if hub.nodes is not None:
+            stack.enter_context(bus.announce(NODES, agent, boot))
+        self._shares = FairShare(self._handle, time.monotonic, _MESSAGES_S)
+        self._began = time.monotonic()
+        self._sequence, self._next_status, self._next_rig, self._next_progress = 0, 0.0, 0.0, 0.0
+        self._last_action = ""
+
+    def _publisher(self, topic: Topic, rate_hz: float | None = None) -> Publisher:
+        return self._stack.enter_context(closing(self._bus.publisher(topic, self._agent, rate_hz=rate_hz)))
+
+    def _handle(self, received: Received) -> None:
+        if received.agent != self._agent or not isinstance(received.message, pb.Calibration):
+            backlog = time.monotonic() < self._began + _BACKLOG_S
+            self._hub.handle(received.message, received.arrival_ns * 1e-9, backlog=backlog)
+
+    def _publish(self, messages: Iterable[Message]) -> None:
+        for message in messages:
+            self._publishers[message.DESCRIPTOR.name].put(message)
+
+    def receive(self) -> None:
+        """Take what has arrived."""
+        if self._hub.nodes is not None and self._watch is not None:
+            for event in self._watch.drain():
+                self._hub.nodes.on_liveliness(event.role, event.agent, event.boot_id, alive=event.alive)
+        self._shares.take(received for subscription in self._subscriptions for received in subscription.drain())
+
+    def obey(self, export: Callable[[LiveHub], str] | None) -> None:
+        """Do what a view has asked for."""
+        for action in self._orders.take():
+            self._hub.counters[f"asked.{action}"] += 1
+            if action == "recalibrate":
+                self._hub.reset()
+                self._last_action = "recalibrating, as requested"
+            elif action == "export":
+                self._last_action = "no folder to export to: set out" if export is None else export(self._hub)
+
+    def estimate(self, now: float, *, final: bool) -> None:
+        """Publish what nodes, calibration and tracking have to say."""
+        hub = self._hub
+        if hub.nodes is not None:
+            for state in hub.nodes.tick(time.monotonic()):
+                if state.camera not in self._node_publishers:
+                    publisher = self._bus.publisher(NODE_STATE, state.camera)
+                    self._node_publishers[state.camera] = self._stack.enter_context(closing(publisher))
+                self._node_publishers[state.camera].put(state)
+        self._publish(hub.tick(now, final=final))
+        if hub.tracking is not None:
+            for track in hub.tracking.smoothed():
+                self._smoothed.put(track)
+
+    def report(self, now: float, rig: Rig | None, *, last: bool) -> None:
+        """Publish progress, the rig and the status, each when it is due."""
+        hub = self._hub
+        if now >= self._next_progress and hub.calibration is None and hub.settings.solve:
+            self._next_progress = now + _PROGRESS_S
+            self._publish(hub.waiting(now))
+        if rig is not None and now >= self._next_rig:
+            self._next_rig = now + _RIG_S
+            self._publish([rig_message(rig)])
+        if now >= self._next_status or last:
+            self._next_status = now + _STATUS_S
+            self._publish([self._status(now)])
+            self._sequence += 1
+
+    def _status(self, now: float) -> pb.AgentStatus:
+        hub, shares = self._hub, self._shares
+        counters = [subscription.counters for subscription in self._subscriptions]
+        status = status_message(hub, self._agent, self._boot, self._sequence, counters, now)
+        if shares.dropped:
+            status.counters["dropped_behind"] = shares.dropped.total()
+        needs_advice = hub.calibration is None or hub.refusal is not None or hub.calibration.refused
+        behind = f"messages wait of {', '.join(shares.behind[:8])}" if shares.behind else ""
+        advice = [one.text for one in hub.guidance.advice()] if needs_advice else []
+        texts = (status.message, behind, *advice, self._last_action)
+        status.message = "; ".join(text for text in texts if text)[:_MAX_TEXT]
+        return status
 
 
 def freeze_garbage_collector() -> None:
@@ -235,13 +254,22 @@ def status_message(
         # What is waited for, per camera: the search needs motion that two cameras see at the same time.
         shared = [f"{one.camera} {one.shared_motion_s:.0f} s" for one in hub.progress()[:_NAMED_CAMERAS]]
         message.message += f"; motion shared with another camera: {', '.join(shared)}" if shared else ""
+    alarms = [*hub.clocks.alarms.values(), *hub.clock_contradictions()]
+    if alarms:
+        message.message = "; ".join([*alarms, message.message])[:1000]
+    _add_parts(message, hub, now)
+    for counts in counters:
+        for name, count in counts.items():
+            message.counters[name] = message.counters[name] + count
+    return message
+
+
+def _add_parts(message: pb.AgentStatus, hub: LiveHub, now: float) -> None:
+    """What calibration, tracking and nodes count."""
     if hub.calibration is not None:
         message.gauges["calibrated_cameras"] = len(hub.calibration.cameras)
         message.gauges["calibration_age_s"] = max(now - hub.calibrated_at, 0.0)
         message.gauges["calibration_verified"] = float(not hub.unverified)
-    alarms = [*hub.clocks.alarms.values(), *hub.clock_contradictions()]
-    if alarms:
-        message.message = "; ".join([*alarms, message.message])[:1000]
     if hub.tracking is not None and hub.tracking.has_detections:
         for name, value in hub.tracking.gauges().items():
             message.gauges[name] = value
@@ -251,7 +279,3 @@ def status_message(
         message.gauges["nodes"] = len(hub.nodes.cameras())
         for name, count in hub.nodes.counters.items():
             message.counters[f"nodes.{name}"] = count
-    for counts in counters:
-        for name, count in counts.items():
-            message.counters[name] = message.counters[name] + count
-    return message
