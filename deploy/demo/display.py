@@ -43,7 +43,7 @@ class ProgressDisplay:
         if self._live is None:
             if elapsed - self._printed >= _PRINT_INTERVAL_S or (elapsed == 0.0 and status != self._status):
                 self._printed, self._status = elapsed, status
-                print(f"{elapsed:5.1f} s  {counts}  {status}", flush=True)
+                print(f"{elapsed:5.1f} s", *filter(None, (counts, status)), sep="  ", flush=True)
             return
         from rich.console import Group
         from rich.progress_bar import ProgressBar

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from edge.devices.base import Device, DeviceInfo, Frame
+from edge.devices.settings import OakSettings, PiSettings, UsbSettings
 from protocols.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -116,16 +116,15 @@ def _device(
 
         return open_network(text, fps=fps, intrinsics=intrinsics)
     kind, _, rest = text.partition(":")
+    given: dict[str, Any] = {key: value for key, value in (("fps", fps), ("size", size)) if value is not None}
     if kind == "oak":
-        from edge.devices.live.oak import OakCamera, OakSettings
+        from edge.devices.live.oak import OakCamera
 
-        oak = OakSettings(device=rest)
-        return OakCamera(replace(oak, fps=fps or oak.fps, size=size or oak.size), intrinsics=intrinsics)
+        return OakCamera(OakSettings(device=rest, **given), intrinsics=intrinsics)
     if text == "picamera2":
-        from edge.devices.live.picamera import PiCamera, PiSettings
+        from edge.devices.live.picamera import PiCamera
 
-        pi = PiSettings()
-        return PiCamera(replace(pi, fps=fps or pi.fps, size=size or pi.size), intrinsics=intrinsics)
+        return PiCamera(PiSettings(**given), intrinsics=intrinsics)
     if kind == "simulated":
         from edge.devices.simulated.camera import open_simulated
 
@@ -143,9 +142,9 @@ def _usb(text: str, fps: float | None, size: tuple[int, int] | None, intrinsics:
         from edge.devices.playback.open_video import open_video
 
         return open_video(int(text), fps=fps, intrinsics=intrinsics)
-    from edge.devices.live.usb import UsbSettings, device_path, open_usb
+    from edge.devices.live.usb import open_usb
 
-    return open_usb(UsbSettings(device_path(text), size, fps), intrinsics=intrinsics)
+    return open_usb(UsbSettings(device=text, size=size, fps=fps), intrinsics=intrinsics)
 
 
 def _playback(text: str, fps: float | None, size: tuple[int, int] | None, intrinsics: Intrinsics | None) -> Device:

@@ -10,34 +10,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame, check_size
 from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera
+from edge.devices.settings import PiSettings
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
 _REMEDY = "check the ribbon cable (contacts, both ends), and that `rpicam-hello --list-cameras` shows it"
-
-
-@dataclass(frozen=True, slots=True)
-class PiSettings:
-    """One camera of a Raspberry Pi.
-
-    camera: its number. size: (width, height) [px]. exposure_us: fixed; None = automatic, reported with each frame.
-    gain: fixed analogue gain; None = automatic. readout_s: time from first to last row; None = the shortest frame
-    duration of this sensor mode, which is a few per cent too long (vertical blanking).
-    """
-
-    camera: int = 0
-    size: tuple[int, int] = (1280, 720)
-    fps: float = 30.0
-    exposure_us: int | None = 5000
-    gain: float | None = None
-    readout_s: float | None = None
 
 
 class PiCamera(ReconnectingCamera):
