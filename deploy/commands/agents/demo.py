@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from cyclopts import Parameter
-
-from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
+from deploy.commands.common import Flag, Json, check_range, check_seed
+from protocols.core.errors import EXIT_DONE, EXIT_REFUSED
 
 
 def demo(
@@ -16,10 +15,10 @@ def demo(
     cameras: int | None = None,
     scene: Literal["marker", "people", "town"] = "marker",
     out: Path = Path("demo-out"),
-    view: Annotated[bool, Parameter(negative="")] = False,
+    view: Flag = False,
     view_port: int = 8080,
     seed: int = 1,
-    json: Annotated[bool, Parameter(negative="")] = False,
+    json: Json = False,
 ) -> int:
     """Calibrate simulated cameras that share no clock, and compare clock offsets and poses with the ground truth.
 
@@ -48,19 +47,14 @@ def demo(
         Port of the live view; 0 = any free port.
     seed
         Seed of the simulated scene: the same seed gives the same cameras and motion.
-    json
-        Print the table as JSON.
     """
     if cameras is None:
         cameras = 5 if scene == "people" else 3
     if seconds is None:
         seconds = 60.0 if scene == "people" else 30.0  # the limits for people hold for a recording of one minute
-    if seed < 0:
-        raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
-    if not 2 <= cameras <= 20:
-        raise InputError(f"--cameras {cameras} is out of range", remedy="give 2 to 20")
-    if not 5.0 <= seconds <= 3600.0:
-        raise InputError(f"--seconds {seconds:g} is out of range", remedy="give 5 to 3600")
+    check_seed(seed)
+    check_range("--cameras", cameras, 2, 20)
+    check_range("--seconds", seconds, 5.0, 3600.0)
     if scene == "town":
         return _town(out, seconds, seed, view_port if view else None, as_json=json)
     from deploy.demo.display import ProgressDisplay

@@ -8,11 +8,10 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Any
 
 from deploy.agents.signals import stop_on_signals
+from deploy.commands.common import PrintConfig
 from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig, effective_toml, load
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import EXIT_BUG, EXIT_DONE
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from deploy.agents.systemd_notify import Notifier
 
 _PROGRESS_S = 5.0
-PrintConfig = Annotated[bool, Parameter(negative="")]
 
 
 def camera(config: Path, /, *, print_config: PrintConfig = False) -> int:
@@ -34,8 +32,6 @@ def camera(config: Path, /, *, print_config: PrintConfig = False) -> int:
     config
         TOML file: id, site, [bus], driver ("simulated", "video", "usb", "picamera2", "rtsp", "oak" or "log") with its
         table, detector, [marker], rig.
-    print_config
-        Show the configuration with all defaults filled in, and stop.
     """
     settings = load(config, CameraConfig)
     if print_config:
@@ -62,8 +58,6 @@ def uav(config: Path, /, *, print_config: PrintConfig = False) -> int:
     config
         TOML file: id, site, [bus], rig, driver ("simulated", "video" or "oak") with its table, mount, [mavlink],
         [control], [video_out], [images].
-    print_config
-        Show the configuration with all defaults filled in, and stop.
     """
     from deploy.config.uav import UavConfig
 
@@ -85,8 +79,6 @@ def hub(config: Path, /, *, print_config: PrintConfig = False) -> int:
     ----------
     config
         TOML file: id, site, [bus], rig (optional rig.toml), out (optional folder), window_s, interval_s.
-    print_config
-        Show the configuration with all defaults filled in, and stop.
     """
     settings = load(config, HubConfig)
     if print_config:
@@ -111,8 +103,6 @@ def record(config: Path, /, *, print_config: PrintConfig = False) -> int:
     config
         TOML file: id, site, [bus], out (a .mcap file, or a folder for files named by start time), part_s, part_mb,
         keep_days, keep_mb, keep_free_mb, min_free_mb, foxglove.
-    print_config
-        Show the configuration with all defaults filled in, and stop.
     """
     settings = load(config, RecorderConfig)
     if print_config:

@@ -6,12 +6,11 @@ from collections import Counter
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from cyclopts import Parameter
-
+from deploy.commands.common import Flag, Json, answer, check_rate, check_seed, closing_lines
 from deploy.offline.progress import progress_bar
-from protocols.core.errors import EXIT_DONE, InputError
+from protocols.core.errors import InputError
 from protocols.core.files import check_folder, write_together
 
 
@@ -26,9 +25,9 @@ def track(
     telemetry: Path | None = None,
     model: Literal["ground", "paper", "plain"] = "ground",
     fps: float | None = None,
-    overlay: Annotated[bool, Parameter(negative="")] = False,
+    overlay: Flag = False,
     csv_truth: Path | None = None,
-    json: Annotated[bool, Parameter(negative="")] = False,
+    json: Json = False,
     seed: int = 0,
 ) -> int:
     """Track one target in an aerial video, also while it is occluded or out of view, with uncertainty.
@@ -65,13 +64,14 @@ def track(
         Also write overlay.mp4: particles, road and estimate on a canvas larger than the image.
     csv_truth
         Ground truth CSV with frame,x,y[,width,height][,inside][,visible]: prints the track's scores.
-    json
-        Print a summary as JSON.
     seed
         Seed of the tracker's random numbers.
     """
     check_folder(out)
-    _check(video, start, fps, seed)
+    check_seed(seed)
+    check_rate(fps)
+    if start < 0:
+        raise InputError(f"--start {start} is negative", remedy="give the index of a frame, 0 is the first")
     from deploy.evaluation.track_scores import read_truth, score
     from deploy.offline import track as tracking
     from deploy.offline.track_log import LoggedFlightImages, open_recording
@@ -164,20 +164,10 @@ def track(
     if recording.repaired:
         warnings.append(f"{video}: {recording.repaired} frames have no usable time stamp")
     scores = score(rows, truth, size) if truth is not None else None
-    _print_summary(out, rows, model, seed, overlay, warnings, scores, json)
-    return EXIT_DONE
+    return _summarise(out, rows, model, seed, overlay, warnings, scores, json)
 
 
-def _check(video: Path, start: int, fps: float | None, seed: int) -> None:
-    if start < 0:
-        raise InputError(f"--start {start} is negative", remedy="give the index of a frame, 0 is the first")
-    if seed < 0:
-        raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
-    if fps is not None and not 0.1 <= fps <= 10_000:
-        raise InputError(f"--fps {fps:g} is out of range", remedy="give the frame rate in Hz")
-
-
-def _print_summary(
+def _summarise(
     out: Path,
     rows: list[Any],
     model: str,
@@ -186,37 +176,30 @@ def _print_summary(
     warnings: list[str],
     scores: dict[str, float | int] | None,
     as_json: bool,
-) -> None:
+) -> int:
     """Print the summary: number of frames by state and by frame of reference, scores, and output files."""
     from deploy.offline.track import basis_summary
 
     states = Counter(row.estimate.state.value for row in rows)
     bases = basis_summary(rows)
     names = ["track.csv", "hypotheses.csv", *(["overlay.mp4"] if overlay else [])]
-    if as_json:
-        import json
-
-        document: dict[str, Any] = {
-            "out": str(out),
-            "files": names,
-            "model": model,
-            "seed": seed,
-            "first_frame": rows[0].frame,
-            "frames": len(rows),
-            **{state: states.get(state, 0) for state in ("visible", "coasting", "lost")},
-            "basis": bases,
-            "warnings": warnings,
-        }
-        if scores is not None:
-            document["scores"] = scores
-        print(json.dumps(document, allow_nan=False))
-        return
+    document: dict[str, Any] = {
+        "out": str(out),
+        "files": names,
+        "model": model,
+        "seed": seed,
+        "first_frame": rows[0].frame,
+        "frames": len(rows),
+        **{state: states.get(state, 0) for state in ("visible", "coasting", "lost")},
+        "basis": bases,
+        "warnings": warnings,
+    }
+    if scores is not None:
+        document["scores"] = scores
     parts = ", ".join(f"{states.get(state, 0)} {state}" for state in ("visible", "coasting", "lost"))
-    print(f"{len(rows)} frames from {rows[0].frame}: {parts}")
-    for basis, entry in bases.items():
-        print(f"{basis}: {entry['frames']} frames; {entry['reason']}")
-    for name, value in (scores or {}).items():
-        print(f"{name}: {value}" if isinstance(value, int) else f"{name}: {value:.3f}")
-    for warning in warnings:
-        print(f"warning: {warning}")
-    print(f"written: {', '.join(str(out / name) for name in names)}")
+    lines = [
+        f"{len(rows)} frames from {rows[0].frame}: {parts}",
+        *(f"{basis}: {entry['frames']} frames; {entry['reason']}" for basis, entry in bases.items()),
+        *(f"{name}: {v}" if isinstance(v, int) else f"{name}: {v:.3f}" for name, v in (scores or {}).items()),
+    ]
+    return answer(document, [*lines, *closing_lines(warnings, [out / name for name in names])], as_json)

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import json as json_module
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
 
-from cyclopts import Parameter
-
+from deploy.commands.common import Json, Role, answer
 from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
-
-Flag = Annotated[bool, Parameter(negative="")]
-Role = Literal["router", "recorder", "hub", "camera", "uav"]
 
 
 def image(root: Path, /, *, bundle: Path) -> int:
@@ -156,7 +150,7 @@ def update(bundle: Path, /, *, role: Role, id: str, patience: float = 60.0, home
     return EXIT_DONE
 
 
-def ready(*, role: Role, id: str, patience: float = 0.0, root: Path = Path("/"), json: Flag = False) -> int:
+def ready(*, role: Role, id: str, patience: float = 0.0, root: Path = Path("/"), json: Json = False) -> int:
     """On a board: wait until the agent is ready, and print what it says. Exit status 3 if it is not.
 
     Example: syncline site ready --role camera --id cam07 --patience 60
@@ -171,11 +165,9 @@ def ready(*, role: Role, id: str, patience: float = 0.0, root: Path = Path("/"),
         Seconds to wait.
     root
         Root folder of the agent's configuration.
-    json
-        Print JSON.
     """
     from deploy.site.boards import board
 
     good, text = board.ready(role, id, patience, root)
-    print(json_module.dumps({"ready": good, "text": text}) if json else text)
+    answer({"ready": good, "text": text}, [text], json)
     return EXIT_DONE if good else EXIT_REFUSED
