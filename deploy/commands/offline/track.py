@@ -6,12 +6,17 @@ from collections import Counter
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from deploy.commands.common import Flag, Json, answer, check_rate, check_seed, closing_lines
 from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError
 from protocols.core.files import check_folder, write_together
+
+if TYPE_CHECKING:
+    from edge.uav.base import Telemetry
+    from protocols.geometry.camera import Intrinsics
+    from protocols.geometry.types import Floats
 
 
 def track(
@@ -77,7 +82,6 @@ def track(
     from deploy.offline.track_log import LoggedFlightImages, open_recording
     from deploy.offline.track_overlay import Overlay
     from edge.uav import tracker_factory
-    from edge.uav.base import Telemetry
 
     box = tracking.parse_target(target)
     camera = tracking.choose_camera(rig, video) if rig is not None else None
@@ -85,51 +89,19 @@ def track(
     lens = camera.intrinsics if camera is not None else None
     mounting = camera.body_from_camera if camera is not None else None
     warnings: list[str] = []
-    samples: tuple[Telemetry, ...] = ()
-    own_clock = telemetry is not None and telemetry.suffix.lower() in (".tlog", ".mcap")
-    recorded: tracking.TelemetryFile | None = None
-    if telemetry is not None and own_clock:
-        from deploy.offline.telemetry_files import read_telemetry_log
-
-        recorded = read_telemetry_log(telemetry)
-    elif telemetry is not None:
-        recorded = tracking.read_telemetry(telemetry)
     rate = fps
     if rate is None and camera is not None and camera.fps > 0 and video.is_dir():
         rate = camera.fps
     recording, counted = open_recording(video, rate, lens)
-    same_log = False
     if isinstance(recording, LoggedFlightImages):
         lens = recording.lens
         mounting = recording.body_from_camera if mounting is None else mounting
-        same_log = telemetry is not None and telemetry.resolve() == video.resolve()
-    if recorded is not None and telemetry is not None:
-        if model == "ground" and (lens is None or mounting is None):
-            what = "telemetry cannot be used without the camera's matrix and body_from_camera"
-            raise InputError(what, file=telemetry, remedy="give both in --rig, or leave --telemetry out")
-        if recorded.left_out:
-            warnings.append(f"{telemetry}: {recorded.left_out} rows hold no sample and were left out")
-        samples = recorded.samples
     size = (recording.info.width, recording.info.height)
     count = tracking.count_frames(video) if counted is None else counted
-    if recorded is not None and same_log and isinstance(recording, LoggedFlightImages):
-        # The agent has already put both on one clock.
-        first_s = recording.first_s
-        samples = tuple(replace(sample, time=sample.time - first_s) for sample in recorded.samples)
-    elif recorded is not None and own_clock:
-        samples = ()
-        if lens is not None and mounting is not None:
-            from deploy.offline.telemetry_files import align_to_video
-
-            with progress_bar(f"looking for the telemetry's clock in {video.name}", quiet=json) as progress:
-                samples, line = align_to_video(
-                    recorded, video, rate, lens, mounting, lambda i: progress(f"frame {i}", i / count if count else 0.0)
-                )
-            if not samples:
-                warnings.append(line)
-    elif recorded is not None and telemetry is not None:
-        end = count / recording.info.fps if count else float("inf")
-        tracking.check_clock(recorded, telemetry, start / recording.info.fps, end)
+    samples: tuple[Telemetry, ...] = ()
+    if telemetry is not None:
+        flight = _Flight(video, recording, rate, lens, mounting, start, count)
+        samples, warnings = _samples(telemetry, flight, json, model == "ground")
     tracker = tracker_factory.make_tracker(model, size, lens, mounting, recording.info.fps, seed)
     rows: list[tracking.TrackedFrame] = []
     with ExitStack() as stack:
@@ -165,6 +137,55 @@ def track(
         warnings.append(f"{video}: {recording.repaired} frames have no usable time stamp")
     scores = score(rows, truth, size) if truth is not None else None
     return _summarise(out, rows, model, seed, overlay, warnings, scores, json)
+
+
+class _Flight(NamedTuple):
+    """A recording to which telemetry belongs. frames: their number; 0 = not known."""
+
+    video: Path
+    recording: Any
+    rate: float | None
+    lens: Intrinsics | None
+    mounting: Floats | None
+    start: int
+    frames: int
+
+
+def _samples(
+    telemetry: Path, flight: _Flight, quiet: bool, needs_lens: bool
+) -> tuple[tuple[Telemetry, ...], list[str]]:
+    """The telemetry's samples on the video's clock, and warnings. Raises InputError."""
+    from deploy.offline import track as tracking
+    from deploy.offline.telemetry_files import align_to_video, read_telemetry_log
+    from deploy.offline.track_log import LoggedFlightImages
+
+    recording, count, warnings = flight.recording, flight.frames, []
+    own_clock = telemetry.suffix.lower() in (".tlog", ".mcap")
+    recorded = read_telemetry_log(telemetry) if own_clock else tracking.read_telemetry(telemetry)
+    if needs_lens and (flight.lens is None or flight.mounting is None):
+        what = "telemetry cannot be used without the camera's matrix and body_from_camera"
+        raise InputError(what, file=telemetry, remedy="give both in --rig, or leave --telemetry out")
+    if recorded.left_out:
+        warnings.append(f"{telemetry}: {recorded.left_out} rows hold no sample and were left out")
+    samples = recorded.samples
+    if not own_clock:
+        end = count / recording.info.fps if count else float("inf")
+        tracking.check_clock(recorded, telemetry, flight.start / recording.info.fps, end)
+    elif isinstance(recording, LoggedFlightImages) and telemetry.resolve() == flight.video.resolve():
+        # The agent has already put both on one clock.
+        samples = tuple(replace(sample, time=sample.time - recording.first_s) for sample in samples)
+    elif flight.lens is None or flight.mounting is None:
+        samples = ()
+    else:
+        with progress_bar(f"looking for the telemetry's clock in {flight.video.name}", quiet=quiet) as progress:
+
+            def done(frame: int) -> None:
+                progress(f"frame {frame}", frame / count if count else 0.0)
+
+            samples, line = align_to_video(recorded, flight.video, flight.rate, flight.lens, flight.mounting, done)
+        if not samples:
+            warnings.append(line)
+    return samples, warnings
 
 
 def _summarise(
