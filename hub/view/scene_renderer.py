@@ -412,8 +412,7 @@ def _lens(camera: CameraView) -> Intrinsics | None:
     if found is None or len(found.matrix) != 9:
         return None
     size = (info.width, info.height) if info is not None else _guessed_image_size(found.matrix)
-    distortions = np.array(found.distortions) if found.distortions else np.zeros(4 if found.fisheye else 5)
-    return Intrinsics(size[0], size[1], np.array(found.matrix).reshape(3, 3), distortions, found.fisheye)
+    return Intrinsics.of_message(found, size)
 
 
 def _guessed_image_size(matrix: Any) -> tuple[int, int]:

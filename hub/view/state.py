@@ -17,7 +17,6 @@ from hub.calibration.coverage import CoverageMonitor
 from hub.view.lag_history import LagHistory
 from hub.view.uav_state import UavView
 from protocols.core.clocks import NANOSECONDS
-from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
@@ -84,8 +83,7 @@ class CameraView:
         found = self.calibration
         if found is None:
             return None
-        rotation = so3.exp(np.array(found.rotation))
-        return Pose(rotation, -rotation.T @ np.array(found.translation))
+        return Pose.from_rodrigues(np.array(found.rotation), np.array(found.translation))
 
     def detections_in_image(self) -> list[tuple[float, float, float]]:
         """Detections in the frame of the shown image, which is older than the last frame; u, v, size [px]."""

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from edge.detectors.network.boxes import BoxLabeller
-from edge.devices.base import DeviceInfo, Frame, check_size
+from edge.devices.base import DeviceInfo, Frame
 from edge.devices.live.oak_network import boxes_in_image
 from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera
 from edge.devices.settings import OakSettings
@@ -69,12 +69,10 @@ class OakCamera(ReconnectingCamera):
             except RuntimeError as error:
                 raise InputError(f"{name} does not answer: {_one_line(error)}", remedy=_REMEDY) from None
 
-        def describe(connection: Connection, first: Frame) -> DeviceInfo:
-            height, width = first.image.shape[:2]
-            check_size(intrinsics, width, height, name)
-            return DeviceInfo(width, height, settings.fps, "oak", "monotonic", intrinsics)
+        def describe(connection: OakConnection, width: int, height: int) -> DeviceInfo:
+            return DeviceInfo(width, height, settings.fps, "oak", "monotonic")
 
-        super().__init__(name, connected, describe, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
+        super().__init__(name, connected, describe, intrinsics, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
 
 
 class OakConnection:

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from edge.devices.base import DeviceInfo, Frame, check_size
+from edge.devices.base import DeviceInfo, Frame
 from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera, redact_password
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
@@ -49,15 +49,11 @@ class OpenCvCamera(ReconnectingCamera):
         def connect() -> Connection:
             return OpenCvConnection(source, fps, name, now_ns, sleep)
 
-        def describe(connection: Connection, first: Frame) -> DeviceInfo:
-            assert isinstance(connection, OpenCvConnection)
-            height, width = first.image.shape[:2]
-            check_size(intrinsics, width, height, name)
-            return DeviceInfo(
-                width, height, fps or connection.fps, driver, "monotonic", intrinsics, unknown=UNKNOWN_WITH_OPENCV
-            )
+        def describe(connection: OpenCvConnection, width: int, height: int) -> DeviceInfo:
+            rate = fps or connection.fps
+            return DeviceInfo(width, height, rate, driver, "monotonic", unknown=UNKNOWN_WITH_OPENCV)
 
-        super().__init__(name, connect, describe, remedy=_remedy(source), now_ns=now_ns, sleep=sleep)
+        super().__init__(name, connect, describe, intrinsics, remedy=_remedy(source), now_ns=now_ns, sleep=sleep)
 
 
 class OpenCvConnection:

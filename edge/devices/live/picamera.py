@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from edge.devices.base import DeviceInfo, Frame, check_size
+from edge.devices.base import DeviceInfo, Frame
 from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera
 from edge.devices.settings import PiSettings
 from protocols.core.errors import InputError
@@ -50,16 +50,12 @@ class PiCamera(ReconnectingCamera):
                 what = f"{name} does not answer: {' '.join(str(error).split())[:160]}"
                 raise InputError(what, remedy=_REMEDY) from None
 
-        def describe(connection: Connection, first: Frame) -> DeviceInfo:
-            assert isinstance(connection, PiConnection)
-            height, width = first.image.shape[:2]
-            check_size(intrinsics, width, height, name)
+        def describe(connection: PiConnection, width: int, height: int) -> DeviceInfo:
             unknown = () if connection.readout_s else ("readout of a rolling shutter",)
-            return DeviceInfo(
-                width, height, settings.fps, "picamera2", "monotonic", intrinsics, connection.readout_s, unknown
-            )
+            readout_s = connection.readout_s
+            return DeviceInfo(width, height, settings.fps, "picamera2", "monotonic", None, readout_s, unknown)
 
-        super().__init__(name, connect, describe, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
+        super().__init__(name, connect, describe, intrinsics, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
 
 
 class PiConnection:

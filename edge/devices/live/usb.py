@@ -20,7 +20,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from edge.devices.base import Device, DeviceInfo, Frame, Image, check_size
+from edge.devices.base import Device, DeviceInfo, Frame, Image
 from edge.devices.live.opencv_capture import OpenCvCamera
 from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera
 from edge.devices.settings import UsbSettings
@@ -73,16 +73,11 @@ class UsbCamera(ReconnectingCamera):
                 what = f"{name} does not answer: {error.strerror or error}"
                 raise InputError(what, remedy=_REMEDY) from None
 
-        def describe(connection: Connection, first: Frame) -> DeviceInfo:
-            assert isinstance(connection, UsbConnection)
-            height, width = first.image.shape[:2]
-            check_size(intrinsics, width, height, name)
-            unknown = connection.unknown
-            return DeviceInfo(
-                width, height, connection.fps, "usb", "monotonic", intrinsics, settings.readout_s, unknown=unknown
-            )
+        def describe(connection: UsbConnection, width: int, height: int) -> DeviceInfo:
+            readout_s, unknown = settings.readout_s, connection.unknown
+            return DeviceInfo(width, height, connection.fps, "usb", "monotonic", None, readout_s, unknown)
 
-        super().__init__(name, connect, describe, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
+        super().__init__(name, connect, describe, intrinsics, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
 
 
 class V4l2Stream:
