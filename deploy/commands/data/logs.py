@@ -72,7 +72,8 @@ def recover(log: Path, /, *, out: Path, json: Json = False) -> int:
     if recovery.skipped_bytes:
         lines.append(f"lost: {recovery.skipped_bytes} bytes that are no records")
     if recovery.cut:
-        lines.append("lost: what its writer had not yet synced at the end (a recorder does so twice a second)")
+        when = "at the end (a recorder does so twice a second)"
+        lines.append(f"lost: what its writer had not yet brought to the disk {when}")
     if recovery.foreign:
         lines.append(f"left out: {recovery.foreign} messages of channels that are not Syncline's")
     if not recovery.damage and not recovery.missing:
