@@ -29,7 +29,7 @@ from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.session.rig import Rig
 
-WINDOW_S = 600.0
+WINDOW_S = 600.0  # of observations: longer than any run of `quick` waves a marker
 _TARGET_OFFSET_STD_S = 0.0005  # clock offset std of every camera at which the calibration is sufficient
 _ADVICE_INTERVAL_S = 3.0  # shortest time between two lines of advice
 _MIN_CONSECUTIVE_GOOD = 3  # sufficient calibrations in a row before it ends

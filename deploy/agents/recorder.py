@@ -25,10 +25,10 @@ from protocols.topics import PICTURE, STATUS, TOPICS
 from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "record"
-_TICK_S = 0.02
+_TICK_S = 0.02  # between two looks at the bus: a queue holds seconds
 _SYNC_S = 0.5
 """Interval of fsync: half of the second that may be lost, because writing and the disk take time too."""
-_STATUS_S = 1.0
+_STATUS_S = 1.0  # as all agents: health counts 5 s without a status as dead
 _MISSING_S = 2.0
 """How long a status names messages that went missing."""
 

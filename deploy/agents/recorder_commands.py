@@ -22,7 +22,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.topics import STATUS
 from protocols.validation.codec import SCHEMA_VERSION
 
-_STATUS_S = 1.0
+_STATUS_S = 1.0  # as all agents: health counts 5 s without a status as dead
 _START, _STOP = "start_recording", "stop_recording"
 
 

@@ -17,7 +17,7 @@ from edge.devices.base import Device, Frame, WrappedDevice
 
 ALIVE_FILE = "SYNCLINE_ALIVE_FILE"
 """Environment variable: a file whose modification time is that of the last data flow."""
-_FILE_S = 1.0
+_FILE_S = 1.0  # between two touches: container checks ask every few seconds
 
 
 class Notifier:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from edge.uav.base import Estimate, Image
     from edge.uav.world.flight_world import FlightWorld
 
-_HOVER_HEIGHT_M = 62.0
+_HOVER_HEIGHT_M = 62.0  # m above the ground
 _GIMBAL_PITCH_RAD = math.radians(-62.0)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self
 if TYPE_CHECKING:
     from rich.live import Live
 
-_PRINT_INTERVAL_S = 5.0
+_PRINT_INTERVAL_S = 5.0  # between two lines where there is no terminal to redraw
 
 
 class ProgressDisplay:

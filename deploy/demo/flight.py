@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 RESULT = "result.json"
 AGENT = "drone"
-_SELECT_TIMEOUT_S = 60.0
+_SELECT_TIMEOUT_S = 60.0  # five periods of the path, in each of which the car is in view
 _EXTRA_WORLD_S = 150.0  # world time beyond the shown duration, for starting and selecting
 _GEO = "CAMERA_TRACKING_GEO_STATUS"
 

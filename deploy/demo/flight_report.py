@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from edge.uav.world.flight_world import FlightWorld
 
 _COLOURS = {"visible": "#1d6b3a", "coasting": "#c2510a"}
-_MAP_PX, _MARGIN_PX = (900.0, 560.0), 40.0
+_MAP_PX, _MARGIN_PX = (900.0, 560.0), 40.0  # size of the map, and of the room around the paths
 _MIN_MAP_SPAN_M = 3.0  # smallest extent of the map
 
 

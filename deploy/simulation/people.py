@@ -21,7 +21,7 @@ from protocols.session.observations import Observations, gather_tracks
 
 TRUTH_BOXES, TRUTH_PLACES = "truth_boxes.csv", "truth.csv"
 TRUTH_VIDEO_CALIBRATION = "truth_video_calibration.toml"
-_TRUTH_HZ, _PLACES_HZ = 50.0, 10.0
+_TRUTH_HZ, _PLACES_HZ = 50.0, 10.0  # a step takes half a second, a walk between two places seconds
 
 
 def write_people_session(

@@ -18,7 +18,7 @@ from protocols.session.observations import DEFAULT_LABEL, Observations, gather_t
 from protocols.session.rig import Rig, RigCamera
 
 TRUTH_CALIBRATION, TRUTH_TRAJECTORY = "truth_calibration.toml", "truth_trajectory.csv"
-_TRUTH_HZ = 50.0
+_TRUTH_HZ = 50.0  # above every camera's frame rate
 
 
 def write_simulated_session(

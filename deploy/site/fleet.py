@@ -26,9 +26,9 @@ from protocols.topics import CALIBRATION, STATUS
 
 STATE = "fleet.json"
 COMMANDS = {"recorder": "record"}
-_MIN_RESTART_DELAY_S, _MAX_RESTART_DELAY_S, _STABLE_S = 1.0, 10.0, 30.0
+_MIN_RESTART_DELAY_S, _MAX_RESTART_DELAY_S, _STABLE_S = 1.0, 10.0, 30.0  # doubled up to; reset after
 _STOP_TIMEOUT_S = {"camera": 15.0, "uav": 15.0, "hub": 300.0, "recorder": 30.0, "router": 10.0}
-_TICK_S = 0.2
+_TICK_S = 0.2  # between two looks at the processes
 
 
 @dataclass(slots=True)

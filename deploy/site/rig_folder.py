@@ -29,7 +29,7 @@ SHIPPED = Path(__file__).parents[1] / "examples" / "rigs"
 ROLES = ("router", "recorder", "hub", "camera", "uav")
 """Roles in start order; they are stopped in reverse order."""
 _NOT_AGENTS = {"rig.toml", "fleet.toml"}
-_FLIGHT_DURATION_S = 600.0
+_FLIGHT_DURATION_S = 600.0  # of a simulated flight in a fleet without --seconds
 
 
 class SimulatedWorldConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

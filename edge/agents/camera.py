@@ -32,11 +32,11 @@ from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "camera"
 _READ_TIMEOUT_S = 0.1  # upper bound of the stop latency while no frame comes
-_INFO_PERIOD_S = 2.0
-_STATUS_PERIOD_S = 1.0
+_INFO_PERIOD_S = 2.0  # for late joiners over a lossy link
+_STATUS_PERIOD_S = 1.0  # as all agents: health counts 5 s without a status as dead
 # Drivers of real cameras: such a source has no end of its own, so an end means that the camera was lost.
 _LIVE_DRIVERS = frozenset({"video", "usb", "picamera2", "rtsp", "oak"})
-_QUEUE_CAPACITY = 1024
+_QUEUE_CAPACITY = 1024  # messages: half a minute of frames while the bus is blocked
 
 
 class CameraAgent:

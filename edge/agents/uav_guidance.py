@@ -14,7 +14,7 @@ from edge.uav.base import Estimate, TrackState
 from protocols.core.clocks import NANOSECONDS
 
 LINK_STALE_S = 1.5  # without messages from the vehicle no command is sent
-FRAME_TIMEOUT_S = 2.0
+FRAME_TIMEOUT_S = 2.0  # without a frame for longer, nothing is commanded
 _STOPPED = "stopped by the operator"
 
 

@@ -22,8 +22,8 @@ from protocols.core.errors import InputError
 
 PATH = "/stream.mjpg"
 _BOUNDARY = "frame"
-_MAX_VIEWERS = 4
-_MAX_CONNECTIONS = 16
+_MAX_VIEWERS = 4  # of the operator's video
+_MAX_CONNECTIONS = 16  # with those that are turned away
 _SEND_TIMEOUT_S = 5.0  # for a request's bytes, and for an image to a slow reader
 _PAGE = (
     b"<!doctype html><title>Syncline</title><style>body{margin:0;background:#111}img{width:100%}</style>"

@@ -30,11 +30,11 @@ from protocols.geometry.types import Floats, Ints
 
 _KNOTS_PER_TIME_CONSTANT, _MIN_KNOTS_PER_TIME_CONSTANT = 8.0, 2.0  # of a correlated error, per time constant
 _MAX_KNOT_SPACING_S = 5.0  # between two knots: unknowns that one row couples must be close together in the band
-_MAX_KNOTS = 15_000
-_MAX_ROWS = 150_000
-_MAX_ITERATIONS = 40
-_HALVINGS = 5
-_GROSS_ERROR_COST = 100.0**2
+_MAX_KNOTS = 15_000  # bounds time and memory
+_MAX_ROWS = 150_000  # the same
+_MAX_ITERATIONS = 40  # a bound: it stops where a step gains nothing
+_HALVINGS = 5  # of a step that does not lower the cost
+_GROSS_ERROR_COST = 100.0**2  # of a row off the trajectory: a hundred sigma
 _ON_CONSTRAINTS = 1e-9  # rig units or rad: what rounding leaves
 _RELATIVE_TOLERANCE = 1e-5  # relative decrease of the cost at convergence
 

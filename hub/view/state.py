@@ -26,7 +26,7 @@ SILENT_S = 2.0
 STALE_S = 5.0
 """An agent without a status, or a track without a message, for longer than this is not to be trusted."""
 _RATE_S = 3.0  # window of the frame rate [s]
-_PATH_POINTS = 700
+_PATH_POINTS = 700  # 23 s at 30 a second, a little more than is drawn
 _PATH_INTERVAL_S = 1 / 30  # between two kept points of a trajectory: tracks come at up to 120 Hz
 _NEW_CLOCK_S = 5.0  # a track that goes back by more is on another clock
 _MAX_PATHS = 48  # tracked people get new labels: the track not updated for longest is dropped

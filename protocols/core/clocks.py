@@ -17,7 +17,7 @@ ReferenceTime = NewType("ReferenceTime", float)
 BusTime = NewType("BusTime", int)
 """Nanoseconds on the recorder's clock (log time); never used as a capture time."""
 
-NANOSECONDS = 1_000_000_000
+NANOSECONDS = 1_000_000_000  # in a second
 UNSET_CLOCK_UNIX_S = 1_735_689_600.0
 """2025: a machine whose Unix time is before that has a clock that was never set."""
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from protocols.geometry.types import Floats
 
-_NEWTON_STEPS = 20
-_NEWTON_TOLERANCE = 1e-12
+_NEWTON_STEPS = 20  # a bound: it converges quadratically
+_NEWTON_TOLERANCE = 1e-12  # normalised: 1e-9 px
 _MAX_NORMALISED = 100.0  # in normalised coordinates: 89.4 degrees off the axis
 
 

@@ -20,7 +20,7 @@ from protocols.core.errors import EXIT_BUG, EXIT_DONE
 if TYPE_CHECKING:
     from deploy.agents.systemd_notify import Notifier
 
-_PROGRESS_S = 5.0
+_PROGRESS_S = 5.0  # between two lines of an agent that waits
 
 
 def camera(config: Path, /, *, print_config: PrintConfig = False) -> int:

@@ -7,7 +7,7 @@ from pathlib import Path
 from deploy.commands.common import Flag, Json, answer, check_range, check_seed, parse_size, refuse
 from protocols.core.files import check_folder
 
-_SECONDS, _NOISE_PX = 60.0, 0.5
+_SECONDS, _NOISE_PX = 60.0, 0.5  # default length; a ball's centre is located this well
 _BODY_NOISE_PX = 2.0  # head tops and foot points are located less precisely than a ball
 _PEOPLE = "people"
 

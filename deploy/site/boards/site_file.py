@@ -20,8 +20,8 @@ from protocols.core.names import check_identifier
 
 RoleName = Literal["router", "recorder", "hub", "camera", "uav"]
 _RANGE = re.compile(r"\{(\d{1,4})\.\.(\d{1,4})\}")
-_MOST = 1024
-_HEALTH_PORT = 9100
+_MOST = 1024  # agents: bounds what a range stands for
+_HEALTH_PORT = 9100  # the default of [health]
 Days = Annotated[float, Meta(gt=0.0, le=825.0)]
 
 

@@ -16,7 +16,7 @@ from deploy.site.boards.site_file import Site, SiteAgent
 from protocols.core.errors import InputError, Refused
 
 _SSH = ("ssh", "-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
-_MOST_BYTES = 8 << 20
+_MOST_BYTES = 8 << 20  # of one file: certificates and configurations have kilobytes
 _BUNDLE = "/var/tmp/syncline-bundle"
 
 

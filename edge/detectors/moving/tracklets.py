@@ -11,9 +11,9 @@ from protocols.geometry.types import Floats
 
 Box = tuple[float, float, float, float]
 _CONFIRM_HITS = 3  # detections after which a tracklet is confirmed
-_COAST_S = 1.2
+_COAST_S = 1.2  # for which a confirmed one goes on unseen
 _MIN_DIRECTNESS = 0.35  # displacement over the path length
-_TENTATIVE_COAST_S = 0.25
+_TENTATIVE_COAST_S = 0.25  # the same before it is confirmed: a flicker ends
 # largest number of height samples that count; weight of the prior in samples
 _MAX_HEIGHT_SAMPLES, _PRIOR_HEIGHT_SAMPLES = 20, 2.0
 

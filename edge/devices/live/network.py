@@ -20,7 +20,7 @@ from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
-_OPEN_S, _READ_S = 5.0, 3.0
+_OPEN_S, _READ_S = 5.0, 3.0  # to open; to read, which blocks the agent's loop
 _REMEDY = "check address, user and password, and that the camera is on this network"
 _TIMESTAMPED_SCHEMES = ("rtsp", "rtp", "srt", "udp")  # URL schemes whose streams carry the sender's time stamps
 

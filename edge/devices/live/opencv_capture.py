@@ -21,8 +21,8 @@ from protocols.geometry.camera import Intrinsics
 
 UNKNOWN_WITH_OPENCV = ("exposure", "time of capture: stamped on arrival", "dropped frames")
 """Quantities that OpenCV does not provide for a frame."""
-_OPEN_TIMEOUT_MS = 5000
-_READ_TIMEOUT_MS = 3000
+_OPEN_TIMEOUT_MS = 5000  # as of network cameras
+_READ_TIMEOUT_MS = 3000  # it blocks the agent's loop
 _LOST_AFTER_S = 1.0  # a source that fails and has given no frame for this long is lost
 
 

@@ -16,8 +16,8 @@ from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
-_RETRY_S, _MAX_RETRY_S = 0.5, 5.0
-_FIRST_FRAME_S = 10.0
+_RETRY_S, _MAX_RETRY_S = 0.5, 5.0  # between attempts: doubled from, up to
+_FIRST_FRAME_S = 10.0  # cameras may take seconds to start
 
 
 class ConnectionLost(Exception):

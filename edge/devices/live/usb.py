@@ -31,7 +31,7 @@ from protocols.geometry.camera import Intrinsics
 _MONOTONIC, _CLOCK_MASK = 0x2000, 0xE000  # V4L2_BUF_FLAG_TIMESTAMP_…
 _START_OF_EXPOSURE, _SOURCE_MASK = 0x10000, 0x70000  # V4L2_BUF_FLAG_TSTAMP_SRC_…; else the end of the frame
 _DAMAGED = 0x40  # V4L2_BUF_FLAG_ERROR: the pixels are damaged
-_BUFFERS = 4
+_BUFFERS = 4  # of the kernel: 130 ms at 30 Hz
 _REMEDY = "check that it is plugged in, that no other program uses it, and that you may read /dev/video*"
 _EXPOSURE_UNIT_US = 100  # V4L2_CID_EXPOSURE_ABSOLUTE
 

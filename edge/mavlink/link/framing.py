@@ -11,9 +11,9 @@ from typing import Any
 
 from edge.mavlink.dialect import mavlink
 
-V1, V2 = 0xFE, 0xFD
-SIGNED = 0x01
-_SIGNATURE = 13
+V1, V2 = 0xFE, 0xFD  # first byte of a frame of each version (MAVLink serialization)
+SIGNED = 0x01  # incompatibility flag of a signed frame
+_SIGNATURE = 13  # bytes: link id, time stamp, signature
 _LONGEST = 280 + _SIGNATURE
 
 

@@ -22,10 +22,10 @@ from protocols.core.errors import InputError
 from protocols.core.files import read_bytes
 from protocols.geometry.types import Floats
 
-_STAMP = 8
-_LONGEST = 280 + 13
+_STAMP = 8  # bytes: Unix time in µs before each frame
+_LONGEST = 280 + 13  # bytes: the largest frame of version 2, and its signature
 _POSITION_GAP_S = 3.0  # greatest interval over which positions are interpolated
-_REBOOT_S = 1.0
+_REBOOT_S = 1.0  # by which a boot time goes back: less is reordering
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -33,9 +33,9 @@ _DEFAULT_RATES = {
     "GIMBAL_DEVICE_ATTITUDE_STATUS": 10.0,
     "GIMBAL_MANAGER_STATUS": 1.0,
 }
-_MAX_RATE_HZ = 100.0
-_UNIX_AT_START = 1_700_000_000.0
-_MAX_SENDERS = 8
+_MAX_RATE_HZ = 100.0  # real ones limit their streams too
+_UNIX_AT_START = 1_700_000_000.0  # s: any time after GPS has set the clock
+_MAX_SENDERS = 8  # that it answers on one port
 DEFAULT_ORIGIN = Origin(47.3977, 8.5456, 488.0)
 """Default origin of the simulated aircraft's local NED frame."""
 

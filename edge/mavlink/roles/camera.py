@@ -16,7 +16,7 @@ from edge.mavlink.roles.status_texts import StatusText, StatusTexts
 from protocols.geometry.camera import Intrinsics
 
 MESSAGE_TYPES = ("HEARTBEAT", "COMMAND_LONG", "COMMAND_INT", "PARAM_REQUEST_LIST")
-_HEARTBEAT_S = 1.0
+_HEARTBEAT_S = 1.0  # of every MAVLink component
 _REPEAT_WINDOW_S = 2  # s within which identical commands are retransmissions of the station
 _DEFAULT_HZ = {"CAMERA_TRACKING_IMAGE_STATUS": 10.0, "CAMERA_TRACKING_GEO_STATUS": 5.0, "CAMERA_FOV_STATUS": 1.0}
 

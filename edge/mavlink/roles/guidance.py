@@ -19,9 +19,9 @@ from edge.mavlink.settings import GuidanceLimits
 from edge.uav.navigation import Origin
 from protocols.geometry.types import Floats
 
-_CONFIGURE_S = 5.0
+_CONFIGURE_S = 5.0  # between two claims of the gimbal
 _MIN_HORIZONTAL_M = 3.0  # horizontal distance below which the bearing to the target is undefined
-_TARGET_HEIGHT_M = 0.7
+_TARGET_HEIGHT_M = 0.7  # of a car's middle above the ground
 _NOT_ARMED = "follow is not armed"
 
 

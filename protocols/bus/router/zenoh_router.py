@@ -24,8 +24,8 @@ from protocols.topics import STATUS
 from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "router"
-_TICK_S = 0.1
-_STATUS_S = 1.0
+_TICK_S = 0.1  # several looks at the canary in DEAD_AFTER_S
+_STATUS_S = 1.0  # as all agents: health counts 5 s without a status as dead
 
 
 class RulesChanged(Exception):

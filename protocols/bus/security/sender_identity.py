@@ -29,8 +29,8 @@ SOURCE_TIMEOUT_S = 10.0
 _MAX_SOURCES = _MAX_AGENTS = 4096
 _MAX_HEARD = 16
 """Boots of one agent whose late messages are accepted, and that may be alive at once."""
-_PUBLISHED_SOURCES = 48
-_MAX_COUNTER_NAME = 64
+_PUBLISHED_SOURCES = 48  # of rejections in a status, whose counters are bounded
+_MAX_COUNTER_NAME = 64  # characters: the validation's limit
 
 
 @dataclass(slots=True)

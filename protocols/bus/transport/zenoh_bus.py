@@ -27,10 +27,10 @@ from protocols.validation.codec import Rejected, RejectionReason, encode, parse_
 
 HEARTBEAT_S = 0.5
 """Period after which a subscriber detects that the last message before a pause is missing."""
-_POLL_S = 0.005
-_HISTORY_QUERY_S = 2.0
-_GAP_QUERY_S = 10.0
-_MAX_KEYS, _KEYS_PER_CALL = 8192, 8
+_POLL_S = 0.005  # for a matching subscriber
+_HISTORY_QUERY_S = 2.0  # below JOIN_TIMEOUT_S
+_GAP_QUERY_S = 10.0  # a third of GAP_TIMEOUT_S: three queries before it is lost
+_MAX_KEYS, _KEYS_PER_CALL = 8192, 8  # that are declared in all, and by one drain
 
 _Source: TypeAlias = tuple[str, int]
 """A publisher's identity in Zenoh: session id and entity id."""

@@ -42,7 +42,7 @@ WORLD = "world"
 _METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _MARKER_DIAMETER_M = 0.05
 """Diameter of a tracked point in a viewer [m]; with arbitrary scale, in baselines."""
-_SMALLEST_CIRCLE_PX = 6.0
+_SMALLEST_CIRCLE_PX = 6.0  # diameter that is still seen in a viewer
 _ORANGE = Color(r=1.0, g=0.55, b=0.0, a=1.0)
 _POINT_FIELDS = [
     PackedElementField(name=name, offset=4 * place, type=PackedElementField.FLOAT32) for place, name in enumerate("xyz")

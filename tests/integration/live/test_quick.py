@@ -109,7 +109,7 @@ def test_the_ball_of_the_simulated_scene_is_learned_from_a_click() -> None:
         (["--cameras", "front,back"], "'front' is no camera"),
         (["--source", "a.mp4", "--source", "b.mp4"], "a.mp4: this video does not exist"),
         (["--target", "1,2"], "is not four"),
-        (["--target", "1,2,0,5"], "has no size"),
+        (["--target", "1,2,0,5"], "has no width or height"),
         (["--simulated", "--source", "a.mp4"], "exclude each other"),
         (["--field-of-view", "0"], "is out of range"),
         (["--seconds", "nan"], "is out of range"),
