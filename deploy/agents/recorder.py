@@ -13,7 +13,8 @@ from math import inf
 from pathlib import Path
 
 from deploy.agents.retention import Retention, Space, free_bytes, unused_log_path
-from deploy.config.agents import RecorderConfig, effective_toml
+from deploy.config.agents import RecorderConfig
+from deploy.config.file import effective_toml
 from protocols.bus.base import Bus, Received, Subscription
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError

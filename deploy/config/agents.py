@@ -8,33 +8,11 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from deploy.config.file import DetectorName, KnownName, Source, effective_toml, load
+from deploy.config.file import DetectorName, KnownName, Source
 from edge.devices.settings import Byte, Hertz, OakSettings, PiSettings, UsbSettings
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import InputError
 from protocols.core.names import check_identifier, check_name
-
-__all__ = [
-    "BusConfig",
-    "CameraConfig",
-    "HealthConfig",
-    "HubConfig",
-    "LogConfig",
-    "MarkerConfig",
-    "MovingConfig",
-    "OakSettings",
-    "PiSettings",
-    "RecorderConfig",
-    "RouterConfig",
-    "RtspConfig",
-    "SimulatedConfig",
-    "Source",
-    "UsbConfig",
-    "VideoConfig",
-    "ViewConfig",
-    "effective_toml",
-    "load",
-]
 
 Seconds = Annotated[float, Meta(gt=0.0, le=86_400.0)]
 Pixels = Annotated[float, Meta(gt=0.0, le=65_535.0)]

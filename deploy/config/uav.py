@@ -8,8 +8,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from deploy.config.agents import AgentConfig, OakSettings, Seconds, Seed, StrictConfig, VideoConfig
+from deploy.config.agents import AgentConfig, Seconds, Seed, StrictConfig, VideoConfig
 from deploy.config.file import DetectorName
+from edge.devices.settings import OakSettings
 from edge.mavlink.settings import GuidanceLimits
 from protocols.core.errors import InputError
 

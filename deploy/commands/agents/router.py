@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, NoReturn
 
 from deploy.agents.signals import stop_on_signals
 from deploy.commands.common import PrintConfig
-from deploy.config.agents import RouterConfig, effective_toml, load
+from deploy.config.agents import RouterConfig
+from deploy.config.file import effective_toml, load
 from protocols.core.errors import EXIT_BUG, EXIT_DONE
 
 if TYPE_CHECKING:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from deploy.agents.signals import stop_on_signals
 from deploy.commands.common import PrintConfig
-from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig, effective_toml, load
+from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig
+from deploy.config.file import effective_toml, load
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import EXIT_BUG, EXIT_DONE
 

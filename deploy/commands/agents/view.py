@@ -135,7 +135,8 @@ def _bus(source: Path | None, connect: tuple[str, ...], site: str) -> tuple[BusC
         config = BusConfig(mode="client", connect=connect)
         config.endpoints()
         return config, site or "local"
-    from deploy.config.agents import ViewConfig, load
+    from deploy.config.agents import ViewConfig
+    from deploy.config.file import load
 
     settings = load(source, ViewConfig)
     bus = _local_bus(settings.bus) if not connect else BusConfig(mode="client", connect=connect)

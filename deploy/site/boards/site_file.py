@@ -12,8 +12,8 @@ import msgspec
 import tomli_w
 from msgspec import Meta
 
-from deploy.config.agents import StrictConfig, load
-from deploy.config.file import convert
+from deploy.config.agents import StrictConfig
+from deploy.config.file import convert, load
 from deploy.site.install.plan import config_type
 from protocols.core.errors import InputError
 from protocols.core.names import check_identifier
