@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -39,6 +40,13 @@ def last_line(log: Path) -> str:
     """The last line that a process has written."""
     lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     return lines[-1].removeprefix("syncline: ") if lines else "no output"
+
+
+def free_udp_port() -> int:
+    """A UDP port of this machine that is free at this moment."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def kill_all(processes: Mapping[str, subprocess.Popen[bytes]]) -> None:

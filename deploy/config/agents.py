@@ -23,6 +23,19 @@ class StrictConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """Base of all tables. Unknown keys are errors: a misspelt setting would otherwise silently have no effect."""
 
 
+def check_address(key: str, value: str, example: int, *, beyond_loopback: bool = True, least: int = 0) -> str:
+    """The host of "address:port". Raises ValueError if it is none, or if others could reach it and may not.
+
+    example, least: a port to propose, and the smallest that is allowed.
+    """
+    host, _, port = value.rpartition(":")
+    if not host or not port.isdigit() or not least <= int(port) <= 65_535:
+        raise ValueError(f'{key} {value!r} is no address; write it like "127.0.0.1:{example}"')
+    if not (beyond_loopback or host in ("localhost", "[::1]") or host.startswith("127.")):
+        raise ValueError(f"{key} {value!r} is open to the network; take 127.0.0.1, or set beyond_loopback = true")
+    return host
+
+
 class HealthConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """[health]: /metrics, /livez and /readyz over HTTP at ``listen``, "address:port".
 
@@ -33,13 +46,7 @@ class HealthConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_field
     beyond_loopback: bool = False
 
     def __post_init__(self) -> None:
-        host, _, port = self.listen.rpartition(":")
-        if not host or not port.isdigit() or int(port) > 65_535:
-            raise ValueError(f'listen {self.listen!r} is no address; write it like "127.0.0.1:9100"')
-        if not (self.beyond_loopback or host in ("localhost", "[::1]") or host.startswith("127.")):
-            raise ValueError(
-                f"listen {self.listen!r} is open to the network; take 127.0.0.1, or set beyond_loopback = true"
-            )
+        check_address("listen", self.listen, 9100, beyond_loopback=self.beyond_loopback)
 
 
 class AgentConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):

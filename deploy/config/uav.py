@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from deploy.config.agents import AgentConfig, Seconds, Seed, StrictConfig, VideoConfig
+from deploy.config.agents import AgentConfig, Seconds, Seed, StrictConfig, VideoConfig, check_address
 from deploy.config.file import DetectorName
 from edge.devices.settings import OakSettings
 from edge.mavlink.settings import GuidanceLimits
@@ -64,13 +64,7 @@ class VideoOutConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fie
     kbps: Annotated[int, Meta(ge=100, le=20_000)] = 2000
 
     def __post_init__(self) -> None:
-        host, _, port = self.listen.rpartition(":")
-        if not host or not port.isdigit() or int(port) > 65_535:
-            raise ValueError(f'listen {self.listen!r} is no address; write it like "127.0.0.1:8560"')
-        if not (self.beyond_loopback or host == "localhost" or host.startswith("127.")):
-            raise ValueError(
-                f"listen {self.listen!r} is open to the network; take 127.0.0.1, or set beyond_loopback = true"
-            )
+        host = check_address("listen", self.listen, 8560, beyond_loopback=self.beyond_loopback)
         if self.uri is None and host in ("0.0.0.0", "[::]"):
             raise ValueError(
                 f"listen {self.listen!r} is not an address that can be opened; add the uri that ground stations open"
@@ -115,9 +109,7 @@ class SimulatedFlightConfig(StrictConfig, frozen=True, kw_only=True, forbid_unkn
     reboot_at: tuple[Seconds, ...] = ()
 
     def __post_init__(self) -> None:
-        host, _, port = self.autopilot.rpartition(":")
-        if not host or not port.isdigit() or not 0 < int(port) <= 65_535:
-            raise ValueError(f'autopilot {self.autopilot!r} is no address; write it like "127.0.0.1:14551"')
+        check_address("autopilot", self.autopilot, 14551, least=1)
 
 
 class UavConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deploy.agents.processes import START_TIMEOUT_S, AgentProcesses
+from deploy.agents.processes import START_TIMEOUT_S, AgentProcesses, free_udp_port
 from deploy.agents.signals import interrupt_on_signals
 from deploy.config.uav import SimulatedFlightConfig
 from deploy.demo.display import ProgressDisplay
@@ -58,7 +58,7 @@ def run_town(
 
     out = out.resolve()
     processes = AgentProcesses(out, (LOG, RESULT, REPORT), interrupt_on_signals())
-    endpoint, port = free_endpoint(), _free_port()
+    endpoint, port = free_endpoint(), free_udp_port()
     display.show(0.0, "starting")
     world = patrol_world(seed, seconds + _EXTRA_WORLD_S)
     epoch = time.time()
@@ -190,11 +190,3 @@ def _tables(out: Path, endpoint: str, port: int, seconds: float, seed: int, epoc
             "images": {},
         },
     }
-
-
-def _free_port() -> int:
-    import socket
-
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
