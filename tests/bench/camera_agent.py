@@ -23,12 +23,12 @@ from edge.agents.camera import run_camera_agent
 from edge.detectors.base import Detection, Prediction
 from edge.detectors.marker.ball import MarkerDetector
 from edge.devices.base import DeviceInfo, Frame, Image
-from edge.devices.playback.playback_clock import AsFastAsPossible
 from edge.devices.simulated.camera import SimulatedDevice
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.topics import OBSERVATION
+from tests.support.clocks import AsFastAsPossible
 
 SIZE, FPS = (1280, 720), 30.0
 

@@ -20,7 +20,6 @@ from deploy.agents.uav import gimbal_from_camera, make_agent
 from deploy.config.uav import SimulatedFlightConfig, UavConfig
 from edge.agents.uav import UavAgent, UavSettings
 from edge.devices.base import Frame
-from edge.devices.playback.playback_clock import AsFastAsPossible
 from edge.devices.simulated.aircraft import Disturbance, SimulatedAircraft
 from edge.devices.simulated.aircraft_camera import FlightCamera
 from edge.mavlink.dialect import CAMERA
@@ -32,6 +31,7 @@ from edge.mavlink.roles.autopilot import Autopilot, LinkFaults
 from edge.mavlink.roles.camera_messages import VideoStream
 from edge.mavlink.settings import GuidanceLimits
 from edge.uav.world.flight_world import FlightWorld, GroundTruth
+from tests.support.clocks import AsFastAsPossible
 
 STEP_S = 0.01
 TRANSFER_S = 0.02

@@ -38,7 +38,6 @@ class ImageTracklet:
     moved: bool = False
     ghost: bool = False
     path_length: float = 0.0
-    missed_since: float | None = None
     colour: Floats | None = None
     height_samples: int = 0
     relative_height: float = 1.0
@@ -75,7 +74,6 @@ class ImageTracklet:
         self.box = tuple(float(a + gain * (b - a)) for a, b in zip(expected, box, strict=True))  # type: ignore[assignment]
         self.time = time
         self.hits += 1
-        self.missed_since = None
         if colour is not None:
             self.colour = colour if self.colour is None else 0.9 * self.colour + 0.1 * colour
         self.path_length += float(

@@ -17,7 +17,6 @@ from edge.agents.camera import CameraAgent, run_camera_agent
 from edge.detectors.base import Detection
 from edge.detectors.marker.ball import MarkerDetector
 from edge.devices.base import DeviceInfo, Frame
-from edge.devices.playback.playback_clock import AsFastAsPossible
 from edge.devices.simulated.camera import SimulatedDevice
 from protocols.bus.base import BusDead
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
@@ -25,6 +24,7 @@ from protocols.core.errors import InputError
 from protocols.geometry import so3
 from protocols.session.rig import RigCamera
 from protocols.topics import CAMERA_INFO, OBSERVATION, STATUS
+from tests.support.clocks import AsFastAsPossible
 
 
 class ListedDevice:
