@@ -11,8 +11,8 @@ from pathlib import Path
 
 from tests.unit.test_structure import PACKAGES, ROOT, _tracked
 
-MOST_SOURCE_LINES = 86_700
-MOST_UNEXPLAINED_CONSTANTS = 270
+MOST_SOURCE_LINES = 86_500
+MOST_UNEXPLAINED_CONSTANTS = 274
 MOST_COMPLEXITY = 15
 MOST_EXCEPTIONS = 5
 """Files in which ruff allows more complexity."""
