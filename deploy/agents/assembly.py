@@ -30,7 +30,7 @@ def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event, beat: Ca
     import cv2
 
     from deploy.agents.systemd_notify import HeartbeatDevice
-    from edge.agents.camera import run_camera_agent
+    from edge.agents.camera import CameraAgent
 
     cv2.setNumThreads(1)  # one core a camera: several agents share a board
     known = _known_camera(config)
@@ -42,17 +42,16 @@ def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event, beat: Ca
     info = device.info if config.driver in ("simulated", "log") else None
     lens = info.intrinsics if info is not None else None if known is None else known.intrinsics
     detector = _detector(config, lens, _fps(config) if info is None or info.fps <= 0.0 else info.fps)
-    run_camera_agent(
+    CameraAgent(
         HeartbeatDevice(device, beat),
         detector,
         bus,
         config.id,
-        stop,
         known=known,
         pictures_hz=config.pictures_hz,
         picture_width=config.picture_width,
         predictions=config.detector != "marker",
-    )
+    ).run(stop)
     return EXIT_DONE
 
 

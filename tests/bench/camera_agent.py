@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from edge import scenes
-from edge.agents.camera import run_camera_agent
+from edge.agents.camera import CameraAgent
 from edge.detectors.base import Detection, Prediction
 from edge.detectors.marker.ball import MarkerDetector
 from edge.devices.base import DeviceInfo, Frame, Image
@@ -118,7 +118,7 @@ def main() -> None:
         device = Played(pictures, options.seconds)
         cpu = time.process_time()
         agent = threading.Thread(
-            target=run_camera_agent, args=(device, detector, sending, "cam0", threading.Event()), daemon=True
+            target=CameraAgent(device, detector, sending, "cam0").run, args=(threading.Event(),), daemon=True
         )
         agent.start()
         while agent.is_alive() or heard.wait(0.5):

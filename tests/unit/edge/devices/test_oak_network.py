@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge.agents.camera import run_camera_agent
+from edge.agents.camera import CameraAgent
 from edge.detectors.network.boxes import BoxLabeller, NetworkBox
 from edge.devices.base import Frame
 from edge.devices.live.oak import OakCamera, OakStream, open_archive, open_stream
@@ -182,7 +182,7 @@ def test_an_agent_publishes_the_boards_detections_and_runs_no_detector() -> None
     camera = OakCamera(SETTINGS, prefix="cam4", connect=lambda settings: stream(pictures, found))
     hub, stop = MemoryHub(), threading.Event()
     subscription = MemoryBus(hub).subscribe(OBSERVATION)
-    agent = threading.Thread(target=run_camera_agent, args=(camera, UnusedDetector(), MemoryBus(hub), "cam4", stop))
+    agent = threading.Thread(target=CameraAgent(camera, UnusedDetector(), MemoryBus(hub), "cam4").run, args=(stop,))
     agent.start()
     messages: list[Any] = []
     for _ in range(100):
