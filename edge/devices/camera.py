@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
-from edge.devices.base import Device, DeviceInfo, Frame
+from edge.devices.base import Device, Frame, WrappedDevice
 from edge.devices.settings import OakSettings, PiSettings, UsbSettings
+from protocols.core.closing import Closing
 from protocols.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,46 +22,27 @@ _REMEDY = (
 )
 
 
-class Camera:
+class Camera(WrappedDevice, Closing):
     """An open device as a context manager and an iterator over its frames.
 
     Iteration ends with the recording; on a live camera it waits for the next frame, also while the camera reconnects.
-    device: the driver behind it, for properties that only some drivers have (``reconnections``, ``temperature``).
+    device: the driver behind it. ``reconnections`` and ``temperature`` are 0 and None where a driver has none.
     """
 
     def __init__(self, device: Device) -> None:
+        super().__init__(device)
         self.device = device
         device.open()
 
-    @property
-    def info(self) -> DeviceInfo:
-        """Image size [px], frame rate [Hz], clock of the time stamps, intrinsics if known."""
-        return self.device.info
-
-    @property
-    def ended(self) -> bool:
-        """True once no further frame will come."""
-        return self.device.ended
-
     def read(self, timeout_s: float = 1.0) -> Frame | None:
         """The next frame; None if none came within ``timeout_s`` or the source has ended."""
-        return self.device.read(timeout_s)
-
-    def close(self) -> None:
-        """Release the device; may be called twice."""
-        self.device.close()
+        return super().read(timeout_s)
 
     def __iter__(self) -> Iterator[Frame]:
         while not self.ended:
             frame = self.read()
             if frame is not None:
                 yield frame
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def open_camera(
