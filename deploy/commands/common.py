@@ -20,7 +20,7 @@ PrintConfig = Annotated[
 ]
 UnusedSeed = Annotated[int, Parameter(help="Accepted for consistency; this command uses no random numbers.")]
 Role = Literal["camera", "uav", "hub", "recorder", "router"]
-Names = Annotated[list[str] | None, Parameter(negative="")]
+Names = Annotated[list[str] | None, Parameter(negative="", help="Only these agents, by id or ROLE-ID.")]
 
 
 def check_range(option: str, value: float | None, low: float, high: float, remedy: str = "") -> None:

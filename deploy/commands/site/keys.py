@@ -12,7 +12,13 @@ from deploy.commands.common import Json, answer
 from protocols.core.errors import EXIT_DONE, EXIT_REFUSED
 
 Many = Annotated[tuple[str, ...], Parameter(negative="")]
-Role = Literal["camera", "uav", "hub", "record", "view", "router"]
+Role = Annotated[
+    Literal["camera", "uav", "hub", "record", "view", "router"],
+    Parameter(help="Role of the agent, which determines what it may publish and subscribe to."),
+]
+
+Authority = Annotated[Path, Parameter(help="The authority, from `keys init`.")]
+OfId = Annotated[str, Parameter(help="The agent's id.")]
 
 KEYS = App(
     name="keys",
@@ -48,7 +54,7 @@ def init(folder: Path, /, *, site: str, json: Json = False) -> int:
 
 @KEYS.command
 def issue(
-    folder: Path,
+    folder: Authority,
     /,
     *,
     role: Role,
@@ -65,10 +71,6 @@ def issue(
 
     Parameters
     ----------
-    folder
-        The authority, from `keys init`.
-    role
-        Role of the agent, which determines what it may publish and subscribe to.
     id
         The agent's id, as in its configuration.
     days
@@ -94,22 +96,13 @@ def issue(
 
 
 @KEYS.command
-def revoke(folder: Path, /, *, role: Role, id: str, json: Json = False) -> int:
+def revoke(folder: Authority, /, *, role: Role, id: OfId, json: Json = False) -> int:
     """Revoke an agent's certificates: routers with the new rules let them neither publish nor subscribe.
 
     Zenoh does not read certificate revocation lists, so a revoked certificate can still open a connection until it
     expires: keep --days short. Its name is never used again; `keys issue` gives the agent a new one.
 
     Example: syncline keys revoke keys --role camera --id cam0
-
-    Parameters
-    ----------
-    folder
-        The authority, from `keys init`.
-    role
-        Role of the agent.
-    id
-        The agent's id.
     """
     from deploy.site import keys
 
@@ -120,7 +113,7 @@ def revoke(folder: Path, /, *, role: Role, id: str, json: Json = False) -> int:
 
 
 @KEYS.command
-def check(folder: Path, /, *, json: Json = False) -> int:
+def check(folder: Authority, /, *, json: Json = False) -> int:
     """Test, over real connections on this machine, what every certificate may and may not do.
 
     It also tests which clients the router refuses, and with which message: a missing, wrong or expired certificate, and

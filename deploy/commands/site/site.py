@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from deploy.site.boards.site_file import Site
 
 
+SiteToml = Annotated[Path, Parameter(help="The site.toml.")]
+
 SITE = App(
     name="site",
     help="All boards of a site from one file, site.toml: enrolment, renewal, updates, state.\n\n"
@@ -66,20 +68,16 @@ def init(file: Path, /, *, site: str = "", cameras: int = 4, json: Json = False)
 
 
 @SITE.command
-def enrol(file: Path, names: Names = None, /, *, stick: Path | None = None, again: Flag = False) -> int:
+def enrol(file: SiteToml, names: Names = None, /, *, stick: Path | None = None, again: Flag = False) -> int:
     """Enrol boards: each makes its own key, and gets a certificate, its configuration, and its agent installed.
 
     A private key never leaves its board. Boards that do not answer are named, and enrolled by the next run. Exit status
-    3 if any failed.
+    3 if any failed. Without names, all that are not enrolled.
 
     Example: syncline site enrol site.toml
 
     Parameters
     ----------
-    file
-        The site.toml.
-    names
-        Only these agents, by id or ROLE-ID; default: all that are not enrolled.
     stick
         USB stick for boards without a network: takes the requests in STICK/requests, writes what is for the boards to
         STICK/boards.
@@ -103,7 +101,7 @@ def enrol(file: Path, names: Names = None, /, *, stick: Path | None = None, agai
 
 @SITE.command
 def rollout(
-    file: Path,
+    file: SiteToml,
     names: Names = None,
     /,
     *,
@@ -120,10 +118,6 @@ def rollout(
 
     Parameters
     ----------
-    file
-        The site.toml.
-    names
-        Only these agents, by id or ROLE-ID.
     role
         Only agents of this role.
     bundle
@@ -150,7 +144,7 @@ def rollout(
 
 @SITE.command
 def renew(
-    file: Path, names: Names = None, /, *, every: Annotated[bool, Parameter(name="--all", negative="")] = False
+    file: SiteToml, names: Names = None, /, *, every: Annotated[bool, Parameter(name="--all", negative="")] = False
 ) -> int:
     """Renew the certificates that end within renew_days, each with a new key that its board makes.
 
@@ -161,10 +155,6 @@ def renew(
 
     Parameters
     ----------
-    file
-        The site.toml.
-    names
-        Only these agents, by id or ROLE-ID.
     every
         Also those that are not due.
     """
@@ -178,15 +168,13 @@ def renew(
 
 
 @SITE.command
-def revoke(file: Path, name: str, /) -> int:
+def revoke(file: SiteToml, name: str, /) -> int:
     """Revoke an agent's certificates, and bring the new rules to the routers. `enrol NAME` takes it in again.
 
     Example: syncline site revoke site.toml cam07
 
     Parameters
     ----------
-    file
-        The site.toml.
     name
         The agent, by id or ROLE-ID.
     """
@@ -200,17 +188,13 @@ def revoke(file: Path, name: str, /) -> int:
 
 
 @SITE.command
-def status(file: Path, names: Names = None, /, *, offline: Flag = False, json: Json = False) -> int:
+def status(file: SiteToml, names: Names = None, /, *, offline: Flag = False, json: Json = False) -> int:
     """Show every agent: certificate, ready or not, and what it says of itself. Exit status 3 if any is not ready.
 
     Example: syncline site status site.toml
 
     Parameters
     ----------
-    file
-        The site.toml.
-    names
-        Only these agents, by id or ROLE-ID.
     offline
         Do not ask the boards: only what is known here.
     """
