@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tests.unit.test_structure import PACKAGES, ROOT, _tracked
 
-MOST_SOURCE_LINES = 86_500
+MOST_SOURCE_LINES = 86_420
 MOST_UNEXPLAINED_CONSTANTS = 274
 MOST_COMPLEXITY = 15
 MOST_EXCEPTIONS = 5
