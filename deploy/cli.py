@@ -28,81 +28,41 @@ from cyclopts.exceptions import UnknownCommandError  # noqa: E402
 from protocols.core.errors import EXIT_BUG, EXIT_DONE, EXIT_INPUT, SynclineError  # noqa: E402
 from protocols.core.version import VERSION  # noqa: E402
 
-# Name, import path, one-line summary for the overview.
+# Name, module below deploy.commands and function, one-line summary for the overview.
 COMMANDS: tuple[tuple[str, str, str], ...] = (
-    (
-        "demo",
-        "deploy.commands.agents.demo:demo",
-        "Calibrate simulated cameras on this machine and compare with the ground truth.",
-    ),
-    (
-        "simulate",
-        "deploy.commands.offline.simulate:simulate",
-        "Write a session of a simulated scene with its ground truth.",
-    ),
+    ("demo", "agents.demo:demo", "Calibrate simulated cameras on this machine and compare with the ground truth."),
+    ("simulate", "offline.simulate:simulate", "Write a session of a simulated scene with its ground truth."),
     (
         "calibrate",
-        "deploy.commands.offline.calibrate:calibrate",
+        "offline.calibrate:calibrate",
         "Estimate clock offsets and poses of all cameras of a session or log.",
     ),
-    (
-        "follow",
-        "deploy.commands.offline.follow:follow",
-        "Follow people or vehicles through all cameras, offline.",
-    ),
-    (
-        "triangulate",
-        "deploy.commands.offline.triangulate:triangulate",
-        "Triangulate labelled points with a given calibration.",
-    ),
-    ("detect", "deploy.commands.offline.detect:detect", "Run one detector on one video."),
-    (
-        "intrinsics",
-        "deploy.commands.offline.intrinsics:intrinsics",
-        "Calibrate a camera's intrinsics from a video of a board.",
-    ),
-    (
-        "sync",
-        "deploy.commands.offline.sync:sync",
-        "Reference times of all frames, and synchronised copies of the videos.",
-    ),
-    ("export", "deploy.commands.data.export:export", "Write calibrations and trajectories in other tools' formats."),
-    (
-        "import",
-        "deploy.commands.data.import_:import_",
-        "Read other tools' calibrations and tracks, or convert a session to a log.",
-    ),
-    ("track", "deploy.commands.offline.track:track", "Track one target from the air, also while it is out of view."),
-    (
-        "report",
-        "deploy.commands.offline.report:report",
-        "Write a self-contained HTML report on the quality of a calibration.",
-    ),
-    ("quick", "deploy.commands.agents.quick:quick", "Calibrate two webcams without a configuration."),
-    ("view", "deploy.commands.agents.view:view", "Show a rig in a browser: live, or a log with a timeline."),
-    ("camera", "deploy.commands.agents.run:camera", "Camera agent: detect and publish."),
-    ("uav", "deploy.commands.agents.run:uav", "UAV agent: track a car and report it over MAVLink."),
-    ("hub", "deploy.commands.agents.run:hub", "Hub agent: collect observations, calibrate, track."),
-    ("record", "deploy.commands.agents.run:record", "Recorder: write all bus messages to a log."),
-    ("router", "deploy.commands.agents.router:router", "Router: relay messages between agents, with a self-test."),
-    ("replay", "deploy.commands.data.logs:replay", "Play a log back onto the bus, or compare two."),
-    ("recover", "deploy.commands.data.logs:recover", "Recover a damaged log."),
-    ("info", "deploy.commands.data.logs:info", "Show the contents of a log or a session."),
-    ("keys", "deploy.commands.site.keys:KEYS", "Certificates and access rules of a site."),
-    ("install", "deploy.commands.site.install:install", "Install an agent as a systemd service."),
-    ("uninstall", "deploy.commands.site.install:uninstall", "Remove the agents' systemd services."),
-    ("site", "deploy.commands.site.site:SITE", "Enrol, update, renew and watch all boards of a site."),
-    ("fleet", "deploy.commands.site.fleet:fleet", "Run all agents of a rig on this machine."),
-    (
-        "bundle",
-        "deploy.commands.site.bundle:bundle",
-        "Collect wheels and an install script for a board without a network.",
-    ),
-    (
-        "doctor",
-        "deploy.commands.site.doctor:doctor",
-        "Diagnose this machine and its agents, with a remedy for each problem.",
-    ),
+    ("follow", "offline.follow:follow", "Follow people or vehicles through all cameras, offline."),
+    ("triangulate", "offline.triangulate:triangulate", "Triangulate labelled points with a given calibration."),
+    ("detect", "offline.detect:detect", "Run one detector on one video."),
+    ("intrinsics", "offline.intrinsics:intrinsics", "Calibrate a camera's intrinsics from a video of a board."),
+    ("sync", "offline.sync:sync", "Reference times of all frames, and synchronised copies of the videos."),
+    ("export", "data.export:export", "Write calibrations and trajectories in other tools' formats."),
+    ("import", "data.import_:import_", "Read other tools' calibrations and tracks, or convert a session to a log."),
+    ("track", "offline.track:track", "Track one target from the air, also while it is out of view."),
+    ("report", "offline.report:report", "Write a self-contained HTML report on the quality of a calibration."),
+    ("quick", "agents.quick:quick", "Calibrate two webcams without a configuration."),
+    ("view", "agents.view:view", "Show a rig in a browser: live, or a log with a timeline."),
+    ("camera", "agents.run:camera", "Camera agent: detect and publish."),
+    ("uav", "agents.run:uav", "UAV agent: track a car and report it over MAVLink."),
+    ("hub", "agents.run:hub", "Hub agent: collect observations, calibrate, track."),
+    ("record", "agents.run:record", "Recorder: write all bus messages to a log."),
+    ("router", "agents.router:router", "Router: relay messages between agents, with a self-test."),
+    ("replay", "data.logs:replay", "Play a log back onto the bus, or compare two."),
+    ("recover", "data.logs:recover", "Recover a damaged log."),
+    ("info", "data.logs:info", "Show the contents of a log or a session."),
+    ("keys", "site.keys:KEYS", "Certificates and access rules of a site."),
+    ("install", "site.install:install", "Install an agent as a systemd service."),
+    ("uninstall", "site.install:uninstall", "Remove the agents' systemd services."),
+    ("site", "site.site:SITE", "Enrol, update, renew and watch all boards of a site."),
+    ("fleet", "site.fleet:fleet", "Run all agents of a rig on this machine."),
+    ("bundle", "site.bundle:bundle", "Collect wheels and an install script for a board without a network."),
+    ("doctor", "site.doctor:doctor", "Diagnose this machine and its agents, with a remedy for each problem."),
 )
 
 _NO_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory", "can't start new thread")
@@ -133,10 +93,7 @@ def build_app(called: str = "") -> App:
         suppress_keyboard_interrupt=False,
     )
     for name, place, text in COMMANDS:
-        if name == called:
-            app.command(place, name=name)
-        else:
-            app.command(place, name=name, help=text)
+        app.command(f"deploy.commands.{place}", name=name, **({} if name == called else {"help": text}))
     return app
 
 

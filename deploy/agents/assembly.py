@@ -14,9 +14,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import get_args
 
-from deploy.config.agents import CameraConfig, HubConfig, OakConfig, PiCameraConfig, SimulatedConfig, UsbConfig
+from deploy.config.agents import CameraConfig, HubConfig, SimulatedConfig, UsbConfig
 from edge.detectors.base import Detector, Kind
 from edge.devices.base import Device
+from edge.devices.settings import OakSettings, PiSettings
 from protocols.bus.base import Bus
 from protocols.core.errors import EXIT_DONE, InputError
 from protocols.geometry.camera import Intrinsics
@@ -29,7 +30,7 @@ def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event, beat: Ca
     import cv2
 
     from deploy.agents.systemd_notify import HeartbeatDevice
-    from edge.agents.camera import run_camera_agent
+    from edge.agents.camera import CameraAgent
 
     cv2.setNumThreads(1)  # one core a camera: several agents share a board
     known = _known_camera(config)
@@ -41,17 +42,16 @@ def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event, beat: Ca
     info = device.info if config.driver in ("simulated", "log") else None
     lens = info.intrinsics if info is not None else None if known is None else known.intrinsics
     detector = _detector(config, lens, _fps(config) if info is None or info.fps <= 0.0 else info.fps)
-    run_camera_agent(
+    CameraAgent(
         HeartbeatDevice(device, beat),
         detector,
         bus,
         config.id,
-        stop,
         known=known,
         pictures_hz=config.pictures_hz,
         picture_width=config.picture_width,
         predictions=config.detector != "marker",
-    )
+    ).run(stop)
     return EXIT_DONE
 
 
@@ -181,39 +181,17 @@ def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:
     if config.driver == "simulated":
         return _simulated(config)
     if config.driver == "oak":
-        from edge.devices.live.oak import OakCamera, OakSettings
+        from edge.devices.live.oak import OakCamera
 
-        oak = config.oak or OakConfig()
-        settings = OakSettings(
-            oak.device,
-            oak.socket,
-            oak.size,
-            oak.fps,
-            oak.exposure_us,
-            oak.iso,
-            oak.focus,
-            oak.nn,
-            oak.labels,
-            oak.confidence,
-            prefix=config.id[:48],
-        )
-        return OakCamera(settings, intrinsics=intrinsics)
+        return OakCamera(config.oak or OakSettings(), intrinsics=intrinsics, prefix=config.id[:48])
     if config.driver == "usb":
-        from edge.devices.live.usb import UsbSettings, device_path, open_usb
+        from edge.devices.live.usb import open_usb
 
-        usb = config.usb or UsbConfig()
-        return open_usb(
-            UsbSettings(
-                device_path(str(usb.device)), usb.size, usb.fps, usb.pixels, usb.exposure_us, usb.gain, usb.readout_s
-            ),
-            intrinsics=intrinsics,
-        )
+        return open_usb(config.usb or UsbConfig(), intrinsics=intrinsics)
     if config.driver == "picamera2":
-        from edge.devices.live.picamera import PiCamera, PiSettings
+        from edge.devices.live.picamera import PiCamera
 
-        pi = config.picamera2 or PiCameraConfig()
-        made = PiSettings(pi.camera, pi.size, pi.fps, pi.exposure_us, pi.gain, pi.readout_s)
-        return PiCamera(made, intrinsics=intrinsics)
+        return PiCamera(config.picamera2 or PiSettings(), intrinsics=intrinsics)
     if config.driver == "rtsp":
         from edge.devices.live.network import open_network
 

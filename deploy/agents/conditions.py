@@ -20,7 +20,7 @@ _CERTIFICATE_S = 30.0
 """Between two readings of the certificate, which may be renewed."""
 _CLOCK_STEP_S = 2.0
 """A change of Unix time against the monotonic clock by more is a step: time services slew what is less."""
-_CLOCK_STEP_NOTICE_S = 60.0
+_CLOCK_STEP_NOTICE_S = 60.0  # for so long a status names the step: long enough for a person to see it
 _MAX_TEXT = 2000  # characters of a status message
 _EXPIRY = "certificate_expiry_timestamp_s"
 

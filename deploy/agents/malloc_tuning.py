@@ -5,10 +5,10 @@ from __future__ import annotations
 import ctypes
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of glibc's mallopt
-_MAX_ARENAS = 2
-_LARGE_BLOCK_BYTES = 128 * 1024
+_MAX_ARENAS = 2  # glibc would make eight a core
+_LARGE_BLOCK_BYTES = 128 * 1024  # glibc's own initial threshold, here kept from growing
 _MAX_MMAP_THRESHOLD_BYTES = 32 * 1024 * 1024  # glibc's upper limit
-_NEVER_TRIM_BYTES = 1024**3
+_NEVER_TRIM_BYTES = 1024**3  # more than any command frees
 
 
 def limit_heap_growth(*, release_large_blocks: bool) -> bool:

@@ -15,7 +15,7 @@ from pathlib import Path
 from edge.agents.camera import CameraAgent
 from edge.detectors.marker.ball import MarkerModel, learn_marker_model
 from edge.detectors.marker.interactive import InteractiveMarkerDetector, learn_marker_at
-from edge.devices.base import Device, DeviceInfo, Frame
+from edge.devices.base import Device, DeviceInfo, Frame, WrappedDevice
 from edge.lens.solve import intrinsics_from_field_of_view
 from hub.calibration.coverage import MIN_COVERAGE
 from hub.live.agent import run_hub
@@ -29,20 +29,21 @@ from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.session.rig import Rig
 
-WINDOW_S = 600.0
+WINDOW_S = 600.0  # of observations: longer than any run of `quick` waves a marker
 _TARGET_OFFSET_STD_S = 0.0005  # clock offset std of every camera at which the calibration is sufficient
 _ADVICE_INTERVAL_S = 3.0  # shortest time between two lines of advice
 _MIN_CONSECUTIVE_GOOD = 3  # sufficient calibrations in a row before it ends
 
 
-class LastFrameDevice:
+class LastFrameDevice(WrappedDevice):
     """A device that keeps its last frame for other threads, with assumed intrinsics where it has none.
 
     field_of_view: assumed horizontal field of view [degrees].
     """
 
     def __init__(self, device: Device, field_of_view: float) -> None:
-        self._device, self._field_of_view = device, field_of_view
+        super().__init__(device)
+        self._field_of_view = field_of_view
         self.frame: Frame | None = None
         self.lens_assumed = False
         self.done = False
@@ -50,32 +51,22 @@ class LastFrameDevice:
     @property
     def info(self) -> DeviceInfo:
         """The device's information, with intrinsics."""
-        info = self._device.info
+        info = super().info
         if info.intrinsics is not None:
             return info
         self.lens_assumed = True
-        return replace(
-            info, intrinsics=intrinsics_from_field_of_view((info.width, info.height), self._field_of_view, False)
-        )
-
-    @property
-    def ended(self) -> bool:
-        """Whether the device has ended."""
-        return self._device.ended
-
-    def open(self) -> None:
-        """Open the device. Raises InputError if it does not respond."""
-        self._device.open()
+        lens = intrinsics_from_field_of_view((info.width, info.height), self._field_of_view, False)
+        return replace(info, intrinsics=lens)
 
     def read(self, timeout_s: float) -> Frame | None:
         """The next frame."""
-        frame = self._device.read(timeout_s)
+        frame = super().read(timeout_s)
         self.frame = frame or self.frame
         return frame
 
     def close(self) -> None:
         """Release the device."""
-        self._device.close()
+        super().close()
         self.done = True
 
 

@@ -13,7 +13,8 @@ from math import inf
 from pathlib import Path
 
 from deploy.agents.retention import Retention, Space, free_bytes, unused_log_path
-from deploy.config.agents import RecorderConfig, effective_toml
+from deploy.config.agents import RecorderConfig
+from deploy.config.file import effective_toml
 from protocols.bus.base import Bus, Received, Subscription
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
@@ -25,10 +26,10 @@ from protocols.topics import PICTURE, STATUS, TOPICS
 from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "record"
-_TICK_S = 0.02
+_TICK_S = 0.02  # between two looks at the bus: a queue holds seconds
 _SYNC_S = 0.5
 """Interval of fsync: half of the second that may be lost, because writing and the disk take time too."""
-_STATUS_S = 1.0
+_STATUS_S = 1.0  # as all agents: health counts 5 s without a status as dead
 _MISSING_S = 2.0
 """How long a status names messages that went missing."""
 

@@ -16,14 +16,22 @@ from deploy.agents.retention import RESUME_MARGIN, Retention, Space, free_bytes
 from deploy.config.agents import RecorderConfig
 from protocols.bus.base import Bus
 from protocols.bus.commands import CommandSubscription
-from protocols.core.errors import InputError
+from protocols.core.errors import EXIT_DONE, InputError
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import STATUS
 from protocols.validation.codec import SCHEMA_VERSION
 
-_STATUS_S = 1.0
+_STATUS_S = 1.0  # as all agents: health counts 5 s without a status as dead
 _START, _STOP = "start_recording", "stop_recording"
+
+
+def start_recorder(config: RecorderConfig, bus: Bus, stop: threading.Event, beat: Callable[[], None]) -> int:
+    """Run a recorder until it is stopped. beat: called in every cycle."""
+    result = record_on_command(config, bus, stop, beat=beat, report=lambda line: print(line, flush=True))
+    more = f" and {result.parts - 1} more parts" if result.parts > 1 else ""
+    print(f"recorded {result.messages} messages to {result.path}{more}")
+    return EXIT_DONE
 
 
 def record_on_command(

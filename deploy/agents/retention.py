@@ -19,7 +19,7 @@ from typing import NamedTuple
 from deploy.config.agents import RecorderConfig
 from protocols.core.clocks import UNSET_CLOCK_UNIX_S
 
-_DAY_S = 86_400.0
+_DAY_S = 86_400.0  # s
 RESUME_MARGIN = 1.1
 """Factor of the least free space from which a recorder that waits goes on, so that it does not begin to end at once."""
 _NAME = re.compile(r"(?P<time>syncline-\d{8}T\d{6}Z)(-after(?P<number>\d{4}))?(-(?P<part>\d{3,6}))?\Z")

@@ -11,7 +11,7 @@ from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig, Router
 from protocols.bus.settings import unprotected_listeners
 
 _ROLES: dict[type, str] = {CameraConfig: "camera", HubConfig: "hub", RecorderConfig: "record", RouterConfig: "router"}
-_RENEW_DAYS = 3.0
+_RENEW_DAYS = 3.0  # a tenth of the default validity of 30 days
 
 
 def role_of(settings: Any) -> str:

@@ -13,11 +13,11 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from edge.devices.base import Device, DeviceInfo, Frame, HasTemperature, Reconnecting
+from edge.devices.base import Device, Frame, WrappedDevice
 
 ALIVE_FILE = "SYNCLINE_ALIVE_FILE"
 """Environment variable: a file whose modification time is that of the last data flow."""
-_FILE_S = 1.0
+_FILE_S = 1.0  # between two touches: container checks ask every few seconds
 
 
 class Notifier:
@@ -96,7 +96,7 @@ class Notifier:
             line.sendto(text.encode(), self._address)
 
 
-class HeartbeatDevice:
+class HeartbeatDevice(WrappedDevice):
     """A device that sends a heartbeat with every frame: see ``edge.devices.base.Device``.
 
     It also sends heartbeats while it waits for an unplugged camera to return: the agent's status reports that, and a
@@ -104,44 +104,12 @@ class HeartbeatDevice:
     """
 
     def __init__(self, device: Device, beat: Callable[[], None]) -> None:
-        self._device, self._beat = device, beat
-
-    @property
-    def info(self) -> DeviceInfo:
-        """The device's."""
-        return self._device.info
-
-    @property
-    def ended(self) -> bool:
-        """The device's."""
-        return self._device.ended
-
-    @property
-    def disconnected(self) -> bool:
-        """Whether the device is disconnected; False for one that does not reconnect."""
-        return isinstance(self._device, Reconnecting) and self._device.disconnected
-
-    @property
-    def reconnections(self) -> int:
-        """The device's."""
-        return self._device.reconnections if isinstance(self._device, Reconnecting) else 0
-
-    @property
-    def temperature(self) -> float | None:
-        """The device's temperature [°C]; None if it does not measure one."""
-        return self._device.temperature if isinstance(self._device, HasTemperature) else None
-
-    def open(self) -> None:
-        """Open the device."""
-        self._device.open()
+        super().__init__(device)
+        self._beat = beat
 
     def read(self, timeout_s: float) -> Frame | None:
         """The next frame. When this is called again, the previous one has been processed and published."""
-        frame = self._device.read(timeout_s)
+        frame = super().read(timeout_s)
         if frame is not None or self.disconnected:
             self._beat()
         return frame
-
-    def close(self) -> None:
-        """Close the device."""
-        self._device.close()

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from edge.uav.base import Estimate, Image
     from edge.uav.world.flight_world import FlightWorld
 
-_HOVER_HEIGHT_M = 62.0
+_HOVER_HEIGHT_M = 62.0  # m above the ground
 _GIMBAL_PITCH_RAD = math.radians(-62.0)
 
 
@@ -123,7 +123,7 @@ def make_agent(
     """The agent for a device and a link. settings: a ``UavSettings``; now_ns: the host's monotonic clock."""
     from edge.agents.uav import UavAgent, UavSettings
     from edge.mavlink.roles.camera import CameraComponent
-    from edge.mavlink.roles.guidance import Guidance, GuidanceLimits
+    from edge.mavlink.roles.guidance import Guidance
     from edge.mavlink.roles.vehicle import Vehicle
 
     assert isinstance(settings, UavSettings)
@@ -133,19 +133,6 @@ def make_agent(
 
         detector = load_detector(config.detector, fps=settings.fps, seed=config.seed)
     numbers = tuple(int(part) for part in VERSION.split(".")[:3])
-    bounds = config.control
-    limits = GuidanceLimits(
-        gimbal=bounds.gimbal,
-        follow=bounds.follow,
-        pitch=(math.radians(bounds.pitch_deg[0]), math.radians(bounds.pitch_deg[1])),
-        rate=math.radians(bounds.rate_deg_s),
-        coast_s=bounds.coast_s,
-        std_m=bounds.std_m,
-        range_m=bounds.range_m,
-        speed=bounds.speed,
-        fence_m=bounds.fence_m,
-        height=bounds.height_m,
-    )
 
     def component(on_command: Callable[[OperatorCommand], bool]) -> CameraComponent:
         return CameraComponent(
@@ -164,7 +151,7 @@ def make_agent(
         link,
         Vehicle(link, gimbal=config.mount == "gimbal", rate_hz=config.mavlink.rate_hz),
         component,
-        Guidance(link, limits),
+        Guidance(link, config.control),
         config.id,
         settings,
         shown=shown,

@@ -8,43 +8,32 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from deploy.config.file import DetectorName, KnownName, Source, effective_toml, load
+from deploy.config.file import DetectorName, KnownName, Source
+from edge.devices.settings import Byte, Hertz, OakSettings, PiSettings, UsbSettings
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import InputError
 from protocols.core.names import check_identifier, check_name
 
-__all__ = [
-    "BusConfig",
-    "CameraConfig",
-    "HealthConfig",
-    "HubConfig",
-    "LogConfig",
-    "MarkerConfig",
-    "MovingConfig",
-    "OakConfig",
-    "PiCameraConfig",
-    "RecorderConfig",
-    "RouterConfig",
-    "RtspConfig",
-    "SimulatedConfig",
-    "Source",
-    "UsbConfig",
-    "VideoConfig",
-    "ViewConfig",
-    "effective_toml",
-    "load",
-]
-
 Seconds = Annotated[float, Meta(gt=0.0, le=86_400.0)]
-Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
-Hertz = Annotated[float, Meta(gt=0.0, le=1000.0)]
 Pixels = Annotated[float, Meta(gt=0.0, le=65_535.0)]
-Byte = Annotated[int, Meta(ge=0, le=255)]
 Seed = Annotated[int, Meta(ge=0)]
 
 
 class StrictConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of all tables. Unknown keys are errors: a misspelt setting would otherwise silently have no effect."""
+
+
+def check_address(key: str, value: str, example: int, *, beyond_loopback: bool = True, least: int = 0) -> str:
+    """The host of "address:port". Raises ValueError if it is none, or if others could reach it and may not.
+
+    example, least: a port to propose, and the smallest that is allowed.
+    """
+    host, _, port = value.rpartition(":")
+    if not host or not port.isdigit() or not least <= int(port) <= 65_535:
+        raise ValueError(f'{key} {value!r} is no address; write it like "127.0.0.1:{example}"')
+    if not (beyond_loopback or host in ("localhost", "[::1]") or host.startswith("127.")):
+        raise ValueError(f"{key} {value!r} is open to the network; take 127.0.0.1, or set beyond_loopback = true")
+    return host
 
 
 class HealthConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -57,13 +46,7 @@ class HealthConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_field
     beyond_loopback: bool = False
 
     def __post_init__(self) -> None:
-        host, _, port = self.listen.rpartition(":")
-        if not host or not port.isdigit() or int(port) > 65_535:
-            raise ValueError(f'listen {self.listen!r} is no address; write it like "127.0.0.1:9100"')
-        if not (self.beyond_loopback or host in ("localhost", "[::1]") or host.startswith("127.")):
-            raise ValueError(
-                f"listen {self.listen!r} is open to the network; take 127.0.0.1, or set beyond_loopback = true"
-            )
+        check_address("listen", self.listen, 9100, beyond_loopback=self.beyond_loopback)
 
 
 class AgentConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -151,31 +134,6 @@ class SimulatedConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fi
     fps: Hertz | None = None
 
 
-class OakConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[oak]: one sensor of an OAK board, through depthai.
-
-    device: IP address, device id or USB path; "" = the only one connected. size: [w, h]. exposure_us, iso: fixed, so
-    that mid-exposure time and brightness stay constant. focus: lens position 0..255, fixed; None = a fixed-focus lens.
-    nn: archive of a detection network (.tar.xz) that then runs on the board instead of a detector on the host. labels:
-    which of its classes are published; none = all. confidence: smallest confidence of a published detection.
-    """
-
-    device: str = ""
-    socket: Literal["CAM_A", "CAM_B", "CAM_C"] = "CAM_A"
-    size: tuple[Annotated[int, Meta(ge=64, le=8192)], Annotated[int, Meta(ge=64, le=8192)]] = (1280, 800)
-    fps: Hertz = 30.0
-    exposure_us: Annotated[int, Meta(ge=1, le=500_000)] = 5000
-    iso: Annotated[int, Meta(ge=100, le=6400)] = 400
-    focus: Byte | None = None
-    nn: Path | None = None
-    labels: tuple[Annotated[str, Meta(min_length=1, max_length=64)], ...] = ()
-    confidence: Fraction = 0.5
-
-    def __post_init__(self) -> None:
-        if self.labels and self.nn is None:
-            raise ValueError("labels are of a network; give its archive as nn")
-
-
 class VideoConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """[video]: a file, a stream or a USB camera through OpenCV. fps: None = the rate that the source reports."""
 
@@ -184,41 +142,10 @@ class VideoConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields
     loop: bool = False
 
 
-Size = tuple[Annotated[int, Meta(ge=16, le=16_384)], Annotated[int, Meta(ge=16, le=16_384)]]
-Microseconds = Annotated[int, Meta(ge=1, le=1_000_000)]
-Readout = Annotated[float, Meta(ge=0.0, le=1.0)]
-
-
-class UsbConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[usb]: a V4L2 camera with the kernel's time stamps. Settings that are absent are left as the camera has them.
-
-    device: /dev/video0, a stable udev name, or a number. size: [w, h]. exposure_us: fixed, so that the mid-exposure
-    time stays constant. gain: in the camera's own units. readout_s: rolling-shutter readout time from the first to
-    the last row; 0 = not known.
-    """
+class UsbConfig(UsbSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """[usb]: a V4L2 camera; see there. device: relative paths are the file's own folder's."""
 
     device: Source = Source("/dev/video0")
-    size: Size | None = None
-    fps: Hertz | None = None
-    pixels: Literal["MJPG", "YUYV", "GREY"] = "MJPG"
-    exposure_us: Microseconds | None = None
-    gain: Annotated[int, Meta(ge=0, le=1_000_000)] | None = None
-    readout_s: Readout = 0.0
-
-
-class PiCameraConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[picamera2]: a camera on a Raspberry Pi's ribbon cable.
-
-    camera: its number. size: [w, h]. exposure_us, gain: fixed; without exposure_us, auto exposure. readout_s:
-    rolling-shutter readout time; None = the shortest frame duration of the sensor mode.
-    """
-
-    camera: Annotated[int, Meta(ge=0, le=15)] = 0
-    size: Size = (1280, 720)
-    fps: Hertz = 30.0
-    exposure_us: Microseconds | None = 5000
-    gain: Annotated[float, Meta(ge=1.0, le=64.0)] | None = None
-    readout_s: Readout | None = None
 
 
 class RtspConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -291,9 +218,9 @@ class CameraConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields
     simulated: SimulatedConfig | None = None
     video: VideoConfig | None = None
     usb: UsbConfig | None = None
-    picamera2: PiCameraConfig | None = None
+    picamera2: PiSettings | None = None
     rtsp: RtspConfig | None = None
-    oak: OakConfig | None = None
+    oak: OakSettings | None = None
     log: LogConfig | None = None
     marker: MarkerConfig = msgspec.field(default_factory=MarkerConfig)
     moving: MovingConfig = msgspec.field(default_factory=MovingConfig)

@@ -8,13 +8,13 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from deploy.config.agents import AgentConfig, OakConfig, Seconds, Seed, StrictConfig, VideoConfig
+from deploy.config.agents import AgentConfig, Seconds, Seed, StrictConfig, VideoConfig, check_address
 from deploy.config.file import DetectorName
+from edge.devices.settings import OakSettings
+from edge.mavlink.settings import GuidanceLimits
 from protocols.core.errors import InputError
 
-Degrees = Annotated[float, Meta(ge=-180.0, le=180.0)]
 SystemId = Annotated[int, Meta(ge=1, le=255)]
-Metres = Annotated[float, Meta(ge=0.0, le=10_000.0)]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
@@ -47,36 +47,6 @@ class MavlinkConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fiel
             raise ValueError("key_state goes with key; add key, or remove it")
 
 
-class ControlConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """[control]: commands that the agent may send. All are off unless they are enabled here.
-
-    gimbal: point the gimbal at the target (GIMBAL_MANAGER_SET_PITCHYAW). follow: send FOLLOW_TARGET once an
-    operator has armed it for the target (MAV_CMD_DO_FOLLOW to the camera). The other keys are
-    limits beyond which nothing is sent. pitch_deg: lowest and highest commanded pitch; rate_deg_s: largest rate of the
-    commanded angles. coast_s: longest time without a detection of the target. std_m: largest position std of the
-    target. range_m: largest distance from where it was selected. speed: largest speed that is sent [m/s].
-    fence_m: largest distance of vehicle and target from where the vehicle took off; height_m: least and greatest
-    height above there of a vehicle that follows; beyond them it has to be armed again.
-    """
-
-    gimbal: bool = False
-    follow: bool = False
-    pitch_deg: tuple[Degrees, Degrees] = (-90.0, 10.0)
-    rate_deg_s: Annotated[float, Meta(gt=0.0, le=180.0)] = 60.0
-    coast_s: Annotated[float, Meta(gt=0.0, le=15.0)] = 8.0
-    std_m: Annotated[float, Meta(gt=0.0, le=100.0)] = 15.0
-    range_m: Annotated[float, Meta(gt=0.0, le=5000.0)] = 300.0
-    speed: Annotated[float, Meta(gt=0.0, le=50.0)] = 20.0
-    fence_m: Annotated[float, Meta(gt=0.0, le=10_000.0)] = 500.0
-    height_m: tuple[Metres, Metres] = (5.0, 120.0)
-
-    def __post_init__(self) -> None:
-        if not self.height_m[0] < self.height_m[1]:
-            raise ValueError("height_m is least, greatest; correct it")
-        if not self.pitch_deg[0] < self.pitch_deg[1]:
-            raise ValueError("pitch_deg is lowest, highest; correct it")
-
-
 class VideoOutConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """[video_out]: video stream of the frames with the estimate drawn on them.
 
@@ -94,13 +64,7 @@ class VideoOutConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fie
     kbps: Annotated[int, Meta(ge=100, le=20_000)] = 2000
 
     def __post_init__(self) -> None:
-        host, _, port = self.listen.rpartition(":")
-        if not host or not port.isdigit() or int(port) > 65_535:
-            raise ValueError(f'listen {self.listen!r} is no address; write it like "127.0.0.1:8560"')
-        if not (self.beyond_loopback or host == "localhost" or host.startswith("127.")):
-            raise ValueError(
-                f"listen {self.listen!r} is open to the network; take 127.0.0.1, or set beyond_loopback = true"
-            )
+        host = check_address("listen", self.listen, 8560, beyond_loopback=self.beyond_loopback)
         if self.uri is None and host in ("0.0.0.0", "[::]"):
             raise ValueError(
                 f"listen {self.listen!r} is not an address that can be opened; add the uri that ground stations open"
@@ -145,9 +109,7 @@ class SimulatedFlightConfig(StrictConfig, frozen=True, kw_only=True, forbid_unkn
     reboot_at: tuple[Seconds, ...] = ()
 
     def __post_init__(self) -> None:
-        host, _, port = self.autopilot.rpartition(":")
-        if not host or not port.isdigit() or not 0 < int(port) <= 65_535:
-            raise ValueError(f'autopilot {self.autopilot!r} is no address; write it like "127.0.0.1:14551"')
+        check_address("autopilot", self.autopilot, 14551, least=1)
 
 
 class UavConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -165,13 +127,13 @@ class UavConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     driver: Literal["simulated", "video", "oak"] = "simulated"
     simulated: SimulatedFlightConfig | None = None
     video: VideoConfig | None = None
-    oak: OakConfig | None = None
+    oak: OakSettings | None = None
     mount: Literal["fixed", "gimbal"] = "fixed"
     model: Literal["ground", "paper", "plain"] = "ground"
     seed: Seed = 0
     detector: DetectorName | None = None
     mavlink: MavlinkConfig = msgspec.field(default_factory=MavlinkConfig)
-    control: ControlConfig = msgspec.field(default_factory=ControlConfig)
+    control: GuidanceLimits = msgspec.field(default_factory=GuidanceLimits)
     video_out: VideoOutConfig | None = None
     images: ImagesConfig | None = None
     pictures_hz: Annotated[float, Meta(ge=0.0, le=30.0)] = 2.0

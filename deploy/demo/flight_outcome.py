@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from edge.uav.world.flight_world import FlightWorld
 
 LOG, REPORT = "demo.mcap", "report.html"
-_MAX_IMAGE_ERROR_PX = 20.0
-_MIN_GEO_TOLERANCE_M = 5.0
+_MAX_IMAGE_ERROR_PX = 20.0  # as NEAR_PX of deploy.evaluation.track_scores
+_MIN_GEO_TOLERANCE_M = 5.0  # about a car's length: for accuracies that are stated as less
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deploy.demo.flight_outcome import FlightOutcome, as_rows
-from hub.report.style import STYLE
+from hub.report.page import html_page, section
 from hub.report.svg import at, drawing, esc, points, text
 from hub.report.tables import table
 from protocols.core.files import write_atomically
@@ -25,9 +25,8 @@ if TYPE_CHECKING:
     from edge.uav.world.flight_world import FlightWorld
 
 _COLOURS = {"visible": "#1d6b3a", "coasting": "#c2510a"}
-_MAP_PX, _MARGIN_PX = (900.0, 560.0), 40.0
+_MAP_PX, _MARGIN_PX = (900.0, 560.0), 40.0  # size of the map, and of the room around the paths
 _MIN_MAP_SPAN_M = 3.0  # smallest extent of the map
-_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,23 +46,12 @@ def write_report(path: Path, log: Path, outcome: FlightOutcome, world: FlightWor
     parts = [
         f'<section><div class="assessment{"" if outcome.good else " attention"}"><h1>{esc(headline)}</h1></div>'
         f"{table(['', 'estimated', 'limit'], rows)}</section>",
-        _section("Trajectory of the car", _map(states, world)),
-        _section("Selected frames of the operator's video", _pictures(log, states, world)),
+        section("Trajectory of the car", "", _map(states, world)),
+        section("Selected frames of the operator's video", "", _pictures(log, states, world)),
     ]
-    page = (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{esc(headline)} · Syncline</title>\n"
-        f"<style>{STYLE}\nfigure{{margin:0}}figure img{{width:100%}}</style>\n</head>\n<body>\n"
-        '<header class="top"><b>Syncline</b><span>demo, scene town</span></header>\n'
-        f"<main>\n{''.join(parts)}\n</main>\n</body>\n</html>\n"
-    )
+    style = "<style>figure{margin:0}figure img{width:100%}</style>"
+    page = html_page("demo, scene town", headline, [style, *parts])
     write_atomically(path, page)
-
-
-def _section(title: str, content: str) -> str:
-    return f"<section><h2>{esc(title)}</h2>{content}</section>" if content else ""
 
 
 def _map(states: Sequence[pb.TargetState], world: FlightWorld) -> str:

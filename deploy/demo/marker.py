@@ -2,37 +2,29 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import tomli_w
-
-from deploy.agents.signals import Interruption, interrupt_on_signals
+from deploy.agents.processes import START_TIMEOUT_S, AgentProcesses, last_line
+from deploy.agents.signals import interrupt_on_signals
+from deploy.demo.display import ProgressDisplay
 from protocols.bus.base import Bus
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
-from protocols.core.errors import InputError, Refused
-from protocols.core.files import check_folder
+from protocols.core.errors import Refused
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import CALIBRATION, OBSERVATION
 
 LOG = "demo.mcap"
-_START_TIMEOUT_S = 60.0
-_STOP_TIMEOUT_S = 40.0
-_OUTPUTS = ("config", "logs", LOG, "calibration.toml", "trajectory.csv", "tracks.csv", "result.json", "report.html")
+_OUTPUTS = (LOG, "calibration.toml", "trajectory.csv", "tracks.csv", "result.json", "report.html")
 
 
 @dataclass(slots=True)
 class DemoProgress:
-    """Progress of the running demo. observations, detections: counts by camera. address: of the live view."""
+    """Progress of the running demo. observations, detections: counts by camera."""
 
     elapsed: float = 0.0
     observations: dict[str, int] = field(default_factory=dict)
@@ -40,7 +32,11 @@ class DemoProgress:
     status: str = "starting"
     first_calibration_s: float | None = None
     calibration: pb.Calibration | None = None
-    address: str = ""
+
+    def show(self, display: ProgressDisplay, names: list[str]) -> None:
+        """Show the frames of each camera, and how many of them had a detection."""
+        counts = (f"{name} {self.detections.get(name, 0)}/{self.observations.get(name, 0)}" for name in names)
+        display.show(self.elapsed, self.status, f"seen / frames: {'  '.join(counts)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,35 +64,27 @@ class DemoProcesses:
         self.settings = settings
         self.out = settings.out.resolve()
         self.names = [f"cam{i}" for i in range(settings.cameras)]
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
-        self._interrupted = Interruption()
         self._endpoint = free_endpoint()
-        self._site = "demo"
 
-    def run(self, show: Callable[[DemoProgress], None]) -> DemoProgress:
-        """Record for the set time; ``show`` is called several times a second. Raises Refused if an agent exits."""
-        self._clean()
-        configs = self._write_configs()
+    def run(self, display: ProgressDisplay) -> DemoProgress:
+        """Record for the set time. Raises Refused if an agent exits."""
         live = DemoProgress()
         # When the demo is terminated it must also stop its agents: as after Ctrl-C, ``finally`` does that.
-        self._interrupted = interrupt_on_signals()
+        processes = AgentProcesses(self.out, _OUTPUTS, interrupt_on_signals())
         bus_config = BusConfig(mode="client", connect=(self._endpoint,))
-        with Router(self._endpoint), open_bus(self._site, bus_config, timeout_s=10.0) as bus:
+        with Router(self._endpoint), open_bus("demo", bus_config, timeout_s=10.0) as bus:
             observations, calibrations = bus.subscribe(OBSERVATION), bus.subscribe(CALIBRATION)
             try:
                 # Recorder and hub first, so that they receive all messages from the first frame on.
-                for name in ("recorder", "hub", *self.names):
-                    self._start(name, configs[name])
+                for name, table in self._tables().items():
+                    processes.start(name, {"recorder": "record", "hub": "hub"}.get(name, "camera"), table)
                 if self.settings.view_port is not None:
-                    live.address = self._open_view(self.settings.view_port)
-                    show(live)
+                    display.announce(processes.open_view(self._endpoint, self.settings.view_port))
                 poll_topics = self._make_listener(bus)
                 began = time.monotonic()
                 first: float | None = None
                 while first is None or time.monotonic() - first < self.settings.seconds:
                     observations.wait(0.2)
-                    if self._interrupted.is_set():
-                        raise KeyboardInterrupt
                     for received in observations.drain():
                         assert isinstance(received.message, pb.Observation)
                         name = received.message.camera
@@ -114,133 +102,50 @@ class DemoProcesses:
                         live.status = _status(received.message)
                     poll_topics(live)
                     live.elapsed = 0.0 if first is None else time.monotonic() - first
-                    self._check_alive()
-                    if first is None and time.monotonic() - began > _START_TIMEOUT_S:
+                    processes.check()
+                    if first is None and time.monotonic() - began > START_TIMEOUT_S:
                         missing = [name for name in self.names if name not in live.observations]
                         raise Refused(
-                            f"no frame from {', '.join(missing)} within {_START_TIMEOUT_S:.0f} s; see {self.out}/logs"
+                            f"no frame from {', '.join(missing)} within {START_TIMEOUT_S:.0f} s; see {self.out}/logs"
                         )
-                    show(live)
+                    live.show(display, self.names)
                 if self.settings.view_port is not None:
-                    self._stop("view")
+                    processes.stop("view")
                 live.status = "stopping the cameras"
-                show(live)
-                for name in self.names:
-                    self._stop(name)
+                live.show(display, self.names)
+                processes.stop(*self.names)
                 live.status = "final calibration with all observations"
-                show(live)
-                self._stop("hub")
-                self._stop("recorder")
+                live.show(display, self.names)
+                processes.stop("hub", "recorder")
             finally:
-                for process in self._processes.values():
-                    if process.poll() is None:
-                        process.kill()
-                        process.wait()
+                processes.kill()
         return live
 
     def check_calibrated(self) -> None:
         """Raise Refused with the hub's last words if it ended without a calibration."""
         if not (self.out / "calibration.toml").exists():
-            raise Refused(
-                f"no calibration from {self.settings.seconds:g} s ({self._last_line('hub')}): give more --seconds"
-            )
+            last = last_line(self.out / "logs" / "hub.txt")
+            raise Refused(f"no calibration from {self.settings.seconds:g} s ({last}): give more --seconds")
 
     def _make_listener(self, bus: Bus) -> Callable[[DemoProgress], None]:
         """A function that polls further topics of a scene's demo; called in every cycle."""
         return lambda live: None
 
-    def _clean(self) -> None:
-        """Create the folder, and remove only the files of an earlier demo."""
-        check_folder(self.out)
-        try:
-            for name in _OUTPUTS:
-                path = self.out / name
-                if path.is_dir():
-                    shutil.rmtree(path)
-                else:
-                    path.unlink(missing_ok=True)
-            (self.out / "config").mkdir(parents=True)
-            (self.out / "logs").mkdir()
-        except OSError as error:
-            raise InputError(
-                f"cannot be made: {error.strerror}", file=self.out, remedy="choose another --out"
-            ) from None
-
-    def _write_configs(self) -> dict[str, Path]:
-        """Write one configuration file per agent, as a user would."""
-        bus = {"mode": "client", "connect": [self._endpoint]}
+    def _tables(self) -> dict[str, dict[str, object]]:
+        """Configuration of each agent, in the order in which they start."""
+        common = {"site": "demo", "bus": {"mode": "client", "connect": [self._endpoint]}}
         world = {
             "scene": self.settings.scene,
             "seed": self.settings.seed,
             "cameras": self.settings.cameras,
             "start_unix_s": time.time() - self._world_start_s,
         }
-        tables: dict[str, dict[str, object]] = {
-            "recorder": {"id": "recorder", "site": self._site, "out": str(self.out / LOG), "bus": bus},
-            "hub": {
-                "id": "hub",
-                "site": self._site,
-                "out": str(self.out),
-                "window_s": self.settings.seconds + 60.0,
-                "interval_s": 3.0,
-                "bus": bus,
-            },
+        window = {"window_s": self.settings.seconds + 60.0, "interval_s": 3.0}
+        return {
+            "recorder": {"id": "recorder", "out": str(self.out / LOG), **common},
+            "hub": {"id": "hub", "out": str(self.out), **window, **common},
+            **{name: {"id": name, "driver": "simulated", "simulated": world, **common} for name in self.names},
         }
-        for name in self.names:
-            tables[name] = {"id": name, "site": self._site, "driver": "simulated", "simulated": world, "bus": bus}
-        files = {}
-        for name, table in tables.items():
-            files[name] = self.out / "config" / f"{name}.toml"
-            files[name].write_text(tomli_w.dumps(table), encoding="utf-8")
-        return files
-
-    def _start(self, name: str, config: Path) -> None:
-        role = {"recorder": "record", "hub": "hub"}.get(name, "camera")
-        self._run(name, [role, str(config)])
-
-    def _open_view(self, port: int) -> str:
-        """Start the live view; returns its address."""
-        self._run("view", ["view", "--connect", self._endpoint, "--site", self._site, "--port", str(port)])
-        deadline = time.monotonic() + 3 * _START_TIMEOUT_S
-        while time.monotonic() < deadline and self._processes["view"].poll() is None:
-            for line in (self.out / "logs" / "view.txt").read_text(encoding="utf-8").splitlines():
-                if line.startswith("open http") and len(line.split()) > 1:
-                    return line.split()[1]
-            time.sleep(0.05)
-        raise Refused(f"the view did not start: {self._last_line('view')}")
-
-    def _run(self, name: str, arguments: list[str]) -> None:
-        with (self.out / "logs" / f"{name}.txt").open("wb") as log, self._interrupted.deferred():
-            self._processes[name] = subprocess.Popen(
-                [sys.executable, "-m", "deploy", *arguments],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                stdin=subprocess.DEVNULL,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
-            )
-
-    def _stop(self, name: str) -> None:
-        process = self._processes[name]
-        if process.poll() is None:
-            process.send_signal(signal.SIGTERM)
-        try:
-            status = process.wait(_STOP_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            raise Refused(
-                f"{name} did not stop within {_STOP_TIMEOUT_S:.0f} s; see {self.out}/logs/{name}.txt"
-            ) from None
-        if status != 0:
-            raise Refused(f"{name} ended with status {status}: {self._last_line(name)}")
-
-    def _check_alive(self) -> None:
-        for name, process in self._processes.items():
-            if process.poll() is not None:
-                raise Refused(f"{name} ended with status {process.returncode}: {self._last_line(name)}")
-
-    def _last_line(self, name: str) -> str:
-        lines = (self.out / "logs" / f"{name}.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return lines[-1] if lines else "no output"
 
 
 def _status(message: pb.Calibration) -> str:

@@ -45,19 +45,16 @@ class PeopleDemoProcesses(DemoProcesses):
         super().__init__(settings)
         self.scene = scenes.get_people_scene(settings.seed, settings.cameras)
 
-    def _write_configs(self) -> dict[str, Path]:
-        files = super()._write_configs()
+    def _tables(self) -> dict[str, dict[str, object]]:
         _, tables = camera_tables(self.scene, self.scene.name)
         # The world frame is that of the room: z is up.
         tables["metadata"]["up"] = [0.0, 0.0, 1.0]
-        known = self.out / "config" / KNOWN_CALIBRATION
-        known.write_text(tomli_w.dumps(tables), encoding="utf-8")
+        (self.out / "config" / KNOWN_CALIBRATION).write_text(tomli_w.dumps(tables), encoding="utf-8")
+        agents = super()._tables()
+        agents["hub"]["known"] = KNOWN_CALIBRATION
         for name in self.names:
-            text = files[name].read_text(encoding="utf-8")
-            files[name].write_text('detector = "person"\n' + text, encoding="utf-8")
-        hub = files["hub"].read_text(encoding="utf-8")
-        files["hub"].write_text(f'known = "{known.name}"\n' + hub, encoding="utf-8")
-        return files
+            agents[name]["detector"] = "person"
+        return agents
 
     def _make_listener(self, bus: Bus) -> Callable[[DemoProgress], None]:
         tracks = bus.subscribe(TRACK)

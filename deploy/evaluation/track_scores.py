@@ -16,9 +16,9 @@ from protocols.core.errors import InputError
 from protocols.core.files import read_text
 from protocols.geometry.types import Bools, Floats
 
-NEAR_PX = 20.0
-_REACQUIRED_FRAMES = 5
-_SEARCH_FRAMES = 60
+NEAR_PX = 20.0  # of a track that is on its target
+_REACQUIRED_FRAMES = 5  # in a row within the limit: one alone may be chance
+_SEARCH_FRAMES = 60  # 2 s at 30 Hz after it is half visible again: later counts as never
 _EXIT_GRACE_FRAMES = 2  # frames after an exit in which the target may still be reported visible
 
 

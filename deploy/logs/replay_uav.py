@@ -82,11 +82,7 @@ def _infos(reader: LogReader) -> dict[tuple[str, str], pb.UavInfo]:
 def _estimator(info: pb.UavInfo) -> TargetEstimator:
     from edge.uav.estimator import TargetEstimator
 
-    lens = None
-    if info.matrix:
-        matrix = np.array(info.matrix).reshape(3, 3)
-        distortions = np.array(info.distortions) if info.distortions else np.zeros(5)
-        lens = Intrinsics(info.width, info.height, matrix, distortions, info.fisheye)
+    lens = Intrinsics.of_message(info)
     mounting = np.array(info.body_from_camera).reshape(3, 3) if info.body_from_camera else None
     return TargetEstimator(
         info.agent,

@@ -22,7 +22,7 @@ VIDEO_FILE, FRAMES_FOLDER, TELEMETRY_FILE, TRUTH_FILE = "video.mp4", "frames", "
 _USUAL = "exit-bend"
 _CAMERA = "drone"
 _CODEC = "mp4v"  # MPEG-4 part 2: in every build of OpenCV with FFmpeg
-_JPEG_QUALITY = 95
+_JPEG_QUALITY = 95  # as good cameras write
 
 
 def write_simulated_flight(

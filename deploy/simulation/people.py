@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from deploy.simulation.session import TRUTH_CALIBRATION, TRUTH_TRAJECTORY, camera_tables
+from deploy.simulation.session import TRUTH_TRAJECTORY, write_scene
 from edge import scenes
 from edge.scenes import renderer_for
 from edge.scenes.people.scene import PeopleScene
@@ -16,12 +16,10 @@ from edge.scenes.people.session import PeopleTrack, simulate_people_tracks, visi
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.files import write_atomically
-from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
-from protocols.session.observations import Observations, gather_tracks
 
 TRUTH_BOXES, TRUTH_PLACES = "truth_boxes.csv", "truth.csv"
 TRUTH_VIDEO_CALIBRATION = "truth_video_calibration.toml"
-_TRUTH_HZ, _PLACES_HZ = 50.0, 10.0
+_TRUTH_HZ, _PLACES_HZ = 50.0, 10.0  # a step takes half a second, a walk between two places seconds
 
 
 def write_people_session(
@@ -41,15 +39,7 @@ def write_people_session(
     rows = sum(len(track) for track in tracks.values())
     if not rows:
         raise InputError("no camera saw anybody", remedy="simulate a longer time or use another seed")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made: {error.strerror}", file=out, remedy="choose another --out") from None
-    rig, truth = camera_tables(scene, scene.name)
-    truth["metadata"]["up"] = [0.0, 0.0, 1.0]
-    write_rig(out / RIG_FILE, rig)
-    write_observations(out / OBSERVATIONS_FILE, people_observations(scene, tracks))
-    write_atomically(out / TRUTH_CALIBRATION, tomli_w.dumps(truth))
+    truth = write_scene(out, scene, scene.name, tracks, {"up": [0.0, 0.0, 1.0]})
     _write_truth_trajectory(out / TRUTH_TRAJECTORY, scene, seconds)
     _write_truth_boxes(out / TRUTH_BOXES, scene, tracks)
     _write_truth_places(out / TRUTH_PLACES, scene, seconds)
@@ -71,20 +61,6 @@ def write_people_session(
         "seconds": seconds,
         "videos": videos,
     }
-
-
-def people_observations(scene: PeopleScene, tracks: dict[str, PeopleTrack]) -> Observations:
-    """The simulated detections as a session's observations, with two labels per person."""
-    tracks_by_camera = list(tracks.values())
-    return gather_tracks(
-        [film.camera for film in tracks_by_camera for _ in range(len(film))],
-        [label for film in tracks_by_camera for label in film.label],
-        np.concatenate([film.frame for film in tracks_by_camera]),
-        np.concatenate([film.time for film in tracks_by_camera]),
-        np.concatenate([film.pixels for film in tracks_by_camera]),
-        np.concatenate([film.size for film in tracks_by_camera]),
-        order=[camera.name for camera in scene.cameras],
-    )
 
 
 def _write_truth_trajectory(file: Path, scene: PeopleScene, seconds: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,8 @@ import tomli_w
 
 from edge import scenes
 from edge.scenes.common.base import SimulatedScene
-from edge.scenes.marker.session import SimulatedTracks, simulate_tracks
+from edge.scenes.marker.session import SimulatedTrack, SimulatedTracks, simulate_tracks
+from edge.scenes.people.session import PeopleTrack
 from protocols.core.errors import InputError
 from protocols.core.files import write_atomically
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
@@ -18,7 +20,7 @@ from protocols.session.observations import DEFAULT_LABEL, Observations, gather_t
 from protocols.session.rig import Rig, RigCamera
 
 TRUTH_CALIBRATION, TRUTH_TRAJECTORY = "truth_calibration.toml", "truth_trajectory.csv"
-_TRUTH_HZ = 50.0
+_TRUTH_HZ = 50.0  # above every camera's frame rate
 
 
 def write_simulated_session(
@@ -40,16 +42,32 @@ def write_simulated_session(
     rows = sum(len(track) for track in simulated.tracks.values())
     if not rows:
         raise InputError("no camera saw the marker", remedy="simulate a longer time or use another seed")
+    write_scene(out, scene, scene_name, simulated.tracks)
+    _write_truth_trajectory(out / TRUTH_TRAJECTORY, simulated)
+    return {"scene": scene_name, "seed": seed, "cameras": len(scene.cameras), "rows": rows, "seconds": seconds}
+
+
+def write_scene(
+    out: Path,
+    scene: SimulatedScene,
+    name: str,
+    tracks: Mapping[str, SimulatedTrack | PeopleTrack],
+    metadata: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Write rig.toml, observations.csv and the true calibration of a scene; returns the tables of the latter.
+
+    metadata: more for these. Raises InputError.
+    """
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot be made: {error.strerror}", file=out, remedy="choose another --out") from None
-    rig, truth = camera_tables(scene, scene_name)
+    rig, truth = camera_tables(scene, name)
+    truth["metadata"].update(metadata or {})
     write_rig(out / RIG_FILE, rig)
-    write_observations(out / OBSERVATIONS_FILE, observations_from_tracks(simulated))
+    write_observations(out / OBSERVATIONS_FILE, simulated_observations(scene, tracks))
     write_atomically(out / TRUTH_CALIBRATION, tomli_w.dumps(truth))
-    _write_truth_trajectory(out / TRUTH_TRAJECTORY, simulated)
-    return {"scene": scene_name, "seed": seed, "cameras": len(scene.cameras), "rows": rows, "seconds": seconds}
+    return truth
 
 
 def camera_tables(scene: SimulatedScene, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -90,18 +108,17 @@ def rig_from_tracks(simulated: SimulatedTracks) -> Rig:
     )
 
 
-def observations_from_tracks(simulated: SimulatedTracks) -> Observations:
-    """The simulated detections as a session's observations."""
-    tracks = list(simulated.tracks.values())
-    names = [track.camera for track in tracks for _ in range(len(track))]
+def simulated_observations(scene: SimulatedScene, tracks: Mapping[str, SimulatedTrack | PeopleTrack]) -> Observations:
+    """The simulated detections as a session's observations; of people with two labels each."""
+    found = list(tracks.values())
     return gather_tracks(
-        names,
-        [DEFAULT_LABEL] * len(names),
-        np.concatenate([track.frame for track in tracks]),
-        np.concatenate([track.time for track in tracks]),
-        np.concatenate([track.pixels for track in tracks]),
-        np.concatenate([track.size for track in tracks]),
-        order=[camera.name for camera in simulated.cameras],
+        [track.camera for track in found for _ in range(len(track))],
+        [label for track in found for label in getattr(track, "label", (DEFAULT_LABEL,) * len(track))],
+        np.concatenate([track.frame for track in found]),
+        np.concatenate([track.time for track in found]),
+        np.concatenate([track.pixels for track in found]),
+        np.concatenate([track.size for track in found]),
+        order=[camera.name for camera in scene.cameras],
     )
 
 

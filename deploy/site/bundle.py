@@ -343,11 +343,6 @@ echo "Syncline {VERSION} ({role}) is in $target: $(du -sm "$target" | cut -f1) M
 """
 
 
-def folder_size_mb(folder: Path) -> float:
-    """Total size of all files below a folder [MB]."""
-    return sum(file.lstat().st_size for file in folder.rglob("*") if file.is_file() or file.is_symlink()) / 1e6
-
-
 def default_folder(role: str, target: Target) -> Path:
     """The default output folder of a bundle."""
     return Path(f"syncline-{VERSION}-{role}-{target.platform}-py{target.python}")

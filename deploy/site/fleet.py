@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
@@ -15,6 +14,7 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
+from deploy.agents.processes import kill_all, last_line, start_process
 from deploy.site.rig_folder import ROLES, Agent, RigFolder, client_bus, write_agent_configs
 from protocols.bus.base import Bus
 from protocols.bus.router.zenoh_router import Router, free_endpoint
@@ -26,9 +26,9 @@ from protocols.topics import CALIBRATION, STATUS
 
 STATE = "fleet.json"
 COMMANDS = {"recorder": "record"}
-_MIN_RESTART_DELAY_S, _MAX_RESTART_DELAY_S, _STABLE_S = 1.0, 10.0, 30.0
+_MIN_RESTART_DELAY_S, _MAX_RESTART_DELAY_S, _STABLE_S = 1.0, 10.0, 30.0  # doubled up to; reset after
 _STOP_TIMEOUT_S = {"camera": 15.0, "uav": 15.0, "hub": 300.0, "recorder": 30.0, "router": 10.0}
-_TICK_S = 0.2
+_TICK_S = 0.2  # between two looks at the processes
 
 
 @dataclass(slots=True)
@@ -74,7 +74,7 @@ class Fleet:
         with ExitStack() as stack:
             if own_router:
                 self._host_router(stack, endpoint or LOOPBACK_ROUTER)
-            stack.callback(self._kill_all)
+            stack.callback(kill_all, self._processes)
             self._save()
             try:
                 for agent in agents:
@@ -144,16 +144,9 @@ class Fleet:
         )
 
     def _start(self, agent: Agent) -> None:
-        with (self.out / "logs" / f"{agent.name}.txt").open("ab") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "deploy", COMMANDS.get(agent.role, agent.role), str(agent.file)],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                stdin=subprocess.DEVNULL,
-                # Ctrl-C goes to the whole process group, but agents must be stopped in order.
-                start_new_session=True,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
-            )
+        # Ctrl-C goes to the whole process group, but agents must be stopped in order.
+        words = [COMMANDS.get(agent.role, agent.role), str(agent.file)]
+        process = start_process(words, self._log(agent.name), new_session=True)
         self._processes[agent.name] = process
         self._started_at[agent.name] = time.monotonic()
         seen = self.seen[agent.name]
@@ -175,7 +168,7 @@ class Fleet:
                 self._backoff_s[name] = min(2.0 * pause, _MAX_RESTART_DELAY_S)
                 self._restart_at[name] = now + pause
                 seen = self.seen[name]
-                seen.pid, seen.state, seen.message = 0, "down", self._last_line(name)
+                seen.pid, seen.state, seen.message = 0, "down", last_line(self._log(name))
                 self._report(
                     f"{name} ended ({_exit_description(process.returncode)}): {seen.message}; again in {pause:g} s"
                 )
@@ -199,15 +192,9 @@ class Fleet:
                 self._drain()  # the final calibration of a hub
                 if not dead_already:
                     seen.state = "stopped" if status == 0 else "failed"
-                    seen.message = self._last_line(agent.name) if status else ""
+                    seen.message = last_line(self._log(agent.name)) if status else ""
                 seen.pid = 0
                 show(self)
-
-    def _kill_all(self) -> None:
-        for process in self._processes.values():
-            if process.poll() is None:
-                process.kill()
-                process.wait()
 
     def _host_router(self, stack: ExitStack, endpoint: str) -> None:
         """Run a router in this process, for a rig that has none."""
@@ -263,9 +250,8 @@ class Fleet:
         beside.write_text(json.dumps(state, indent=1), encoding="utf-8")
         beside.replace(self.out / STATE)
 
-    def _last_line(self, name: str) -> str:
-        lines = (self.out / "logs" / f"{name}.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return lines[-1].removeprefix("syncline: ") if lines else "no output"
+    def _log(self, name: str) -> Path:
+        return self.out / "logs" / f"{name}.txt"
 
 
 def start_time(pid: int) -> int:

@@ -37,7 +37,7 @@ SITE_FILE = "site.json"
 CA_FILE, CA_KEY_FILE = "ca.pem", "ca-key.pem"
 CERTIFICATE_FILE, KEY_FILE, BUS_FILE = "certificate.pem", "key.pem", "bus.toml"
 ZENOH_FILE, ROUTER_FILE = "zenoh.json5", "router.toml"
-_CA_DAYS = 3650
+_CA_DAYS = 3650  # ten years: the authority outlives its boards
 _BACKDATE = timedelta(minutes=5)
 """Certificates are valid from this long before their issue, for machines whose clock is behind."""
 

@@ -5,7 +5,6 @@ An agent's role follows from its file's name: router*.toml, recorder*.toml, hub*
 
 from __future__ import annotations
 
-import socket
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,8 +17,10 @@ import numpy as np
 import tomli_w
 from msgspec import Meta
 
+from deploy.agents.processes import free_udp_port
 from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig, SimulatedConfig
 from deploy.config.file import effective_toml, load
+from deploy.site.install.plan import config_type
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import InputError
 from protocols.core.files import read_toml
@@ -29,7 +30,7 @@ SHIPPED = Path(__file__).parents[1] / "examples" / "rigs"
 ROLES = ("router", "recorder", "hub", "camera", "uav")
 """Roles in start order; they are stopped in reverse order."""
 _NOT_AGENTS = {"rig.toml", "fleet.toml"}
-_FLIGHT_DURATION_S = 600.0
+_FLIGHT_DURATION_S = 600.0  # of a simulated flight in a fleet without --seconds
 
 
 class SimulatedWorldConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -75,13 +76,6 @@ class RigFolder:
 def role_of(file: Path) -> str:
     """The role that follows from a file's name."""
     return next((role for role in ROLES if role != "camera" and file.stem.startswith(role)), "camera")
-
-
-def config_type(role: str) -> type[msgspec.Struct]:
-    """The configuration struct of a role. Raises InputError for an unknown role."""
-    from deploy.site.install.plan import config_type
-
-    return config_type(role)
 
 
 def find_rig(rig: str) -> Path:
@@ -192,7 +186,7 @@ def _simulated_flight(config: Any, world: SimulatedWorldConfig, began: float) ->
     """The configuration of a UAV agent over the simulated town, with an autopilot on a free port."""
     from deploy.config.uav import MavlinkConfig, SimulatedFlightConfig
 
-    autopilot = f"127.0.0.1:{_free_port()}"
+    autopilot = f"127.0.0.1:{free_udp_port()}"
     flight = SimulatedFlightConfig(
         autopilot=autopilot,
         seed=world.seed,
@@ -233,9 +227,3 @@ def _simulated_rig(rig: RigFolder, cameras: Sequence[str]) -> dict[str, Any]:
         if frozenset((a, b)) in wanted
     ]
     return {"metadata": metadata, **tables}
-
-
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

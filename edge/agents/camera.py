@@ -11,6 +11,7 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from typing import Self
 
 from google.protobuf.message import Message
 
@@ -32,11 +33,11 @@ from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "camera"
 _READ_TIMEOUT_S = 0.1  # upper bound of the stop latency while no frame comes
-_INFO_PERIOD_S = 2.0
-_STATUS_PERIOD_S = 1.0
+_INFO_PERIOD_S = 2.0  # for late joiners over a lossy link
+_STATUS_PERIOD_S = 1.0  # as all agents: health counts 5 s without a status as dead
 # Drivers of real cameras: such a source has no end of its own, so an end means that the camera was lost.
 _LIVE_DRIVERS = frozenset({"video", "usb", "picamera2", "rtsp", "oak"})
-_QUEUE_CAPACITY = 1024
+_QUEUE_CAPACITY = 1024  # messages: half a minute of frames while the bus is blocked
 
 
 class CameraAgent:
@@ -90,8 +91,8 @@ class CameraAgent:
         self._exposure_ns = 0
         self._clock = ClockMonitor()
 
-    def run(self, stop: threading.Event) -> None:
-        """Read, detect and publish until ``stop`` is set or the device has ended.
+    def run(self, stop: threading.Event) -> Self:
+        """Read, detect and publish until ``stop`` is set or the device has ended; returns itself, with its counters.
 
         Raises InputError where the device cannot be opened, BusDead where the bus has died.
         """
@@ -111,6 +112,7 @@ class CameraAgent:
             if self._predictions is not None:
                 self._predictions.close()
             self._device.close()
+        return self
 
     def _loop(self, stop: threading.Event, out_queue: PublishQueue) -> None:
         next_info = next_picture = self._now_ns()
@@ -246,37 +248,6 @@ class CameraAgent:
             gauges=gauges,
             version=VERSION,
         )
-
-
-def run_camera_agent(
-    device: Device,
-    detector: Detector,
-    bus: Bus,
-    camera: str,
-    stop: threading.Event,
-    now_ns: Callable[[], int] = time.monotonic_ns,
-    *,
-    known: RigCamera | None = None,
-    boot_id: str | None = None,
-    pictures_hz: float = 2.0,
-    picture_width: int = THUMBNAIL_WIDTH,
-    predictions: bool = False,
-) -> CameraAgent:
-    """Run a camera agent until it ends and return it with its counters; arguments as for ``CameraAgent``."""
-    agent = CameraAgent(
-        device,
-        detector,
-        bus,
-        camera,
-        now_ns=now_ns,
-        known=known,
-        boot_id=boot_id,
-        pictures_hz=pictures_hz,
-        picture_width=picture_width,
-        predictions=predictions,
-    )
-    agent.run(stop)
-    return agent
 
 
 def add_rig_pose(message: pb.CameraInfo, known: RigCamera) -> None:

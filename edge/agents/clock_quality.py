@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 CommandRunner = Callable[[Sequence[str]], tuple[int, str]]
-_STA_UNSYNC = 0x0040
-_COMMAND_TIMEOUT_S = 2.0
-_PERIOD_S = 30.0
-_CHRONY_FIELDS = 14
+_STA_UNSYNC = 0x0040  # adjtimex(2): the kernel's clock is not synchronised
+_COMMAND_TIMEOUT_S = 2.0  # chronyc answers in milliseconds, or hangs
+_PERIOD_S = 30.0  # between two queries: time services poll every minute or so
+_CHRONY_FIELDS = 14  # of `chronyc -c tracking`
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,8 +16,8 @@ REPORT_DELAY_S = 1.0
 """Duration of a fault [s] before it is reported; half the allowed latency of a status."""
 _DARK_LEVEL = 12
 """Grey level up to which an image counts as black: sensors with a lens cap give 0 to 8."""
-_STRIDE = 8
-_TIMEOUT_PERIODS = 3.0
+_STRIDE = 8  # px: a lit area of this size is found
+_TIMEOUT_PERIODS = 3.0  # two frames may be lost in a row
 _SHARPNESS_PERIOD_S = 0.2  # between two measurements of the sharpness
 _BLUR_RATIO = 0.3  # of the reference sharpness of this camera
 _REFERENCE_DECAY = 0.02  # per measurement: decay of the reference when the scene has less detail; it rises at once

@@ -14,8 +14,8 @@ from google.protobuf.message import Message
 from protocols.bus.base import Bus, Publisher
 from protocols.topics import Topic
 
-_FLUSH_S = 2.0
-_POLL_S = 0.2
+_FLUSH_S = 2.0  # for what is left at the end; a bus that hangs does not hold the process
+_POLL_S = 0.2  # between two looks whether the thread is to end
 _SUBSCRIBER_CHECK_S = 1.0  # between two checks of which topics have subscribers
 
 

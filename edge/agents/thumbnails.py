@@ -10,7 +10,7 @@ from protocols.validation.codec import SCHEMA_VERSION
 
 THUMBNAIL_WIDTH = 320
 """Default width of a thumbnail [px]: 8 kB as JPEG, so that fifty cameras fit a wireless link."""
-_JPEG_QUALITY = 70
+_JPEG_QUALITY = 70  # 8 kB at 320 px
 
 
 def thumbnail_message(frame: Frame, camera: str, boot_id: str, width: int = THUMBNAIL_WIDTH) -> pb.Picture:

@@ -50,10 +50,10 @@ from protocols.topics import (
 from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "uav"
-_READ_S = 0.02
-_QUEUE_CAPACITY = 2048
-_INFO_S, _STATUS_S = 2.0, 1.0
-_STEP_BACK_S = 0.2
+_READ_S = 0.02  # the MAVLink connection is served between two reads
+_QUEUE_CAPACITY = 2048  # messages: half a minute of telemetry and estimates
+_INFO_S, _STATUS_S = 2.0, 1.0  # as camera agents
+_STEP_BACK_S = 0.2  # of an autopilot's clock: more is a reboot, less is jitter
 _DELAY_STD_S = 0.03  # std of the unknown delays of frames and attitudes, until the offset is estimated from the images
 TOPICS = {
     topic.message: topic

@@ -14,7 +14,7 @@ from edge.uav.base import Estimate, TrackState
 from protocols.core.clocks import NANOSECONDS
 
 LINK_STALE_S = 1.5  # without messages from the vehicle no command is sent
-FRAME_TIMEOUT_S = 2.0
+FRAME_TIMEOUT_S = 2.0  # without a frame for longer, nothing is commanded
 _STOPPED = "stopped by the operator"
 
 
@@ -47,7 +47,7 @@ class GuidanceControl:
             say(f"Syncline: no follow, {'vehicle disarmed' if has_target else 'no target'}")
             return False
         accepted = guidance.arm(command.by)
-        fence_m, height = guidance.limits.fence_m, guidance.limits.height
+        fence_m, height = guidance.limits.fence_m, guidance.limits.height_m
         within = f"fence {fence_m:.0f} m, {height[0]:.0f}-{height[1]:.0f} m"
         say(f"Syncline: follow by {command.by}, {within}" if accepted else "Syncline: no follow, it is off")
         return accepted

@@ -92,6 +92,50 @@ class Reconnecting(Protocol):
         """Number of successful reconnections."""
 
 
+class WrappedDevice:
+    """A device that passes everything on to another; base of those that add something to it."""
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+
+    @property
+    def info(self) -> DeviceInfo:
+        """The device's."""
+        return self._device.info
+
+    @property
+    def ended(self) -> bool:
+        """The device's."""
+        return self._device.ended
+
+    @property
+    def disconnected(self) -> bool:
+        """Whether the device is disconnected; False for one that does not reconnect."""
+        return isinstance(self._device, Reconnecting) and self._device.disconnected
+
+    @property
+    def reconnections(self) -> int:
+        """The device's."""
+        return self._device.reconnections if isinstance(self._device, Reconnecting) else 0
+
+    @property
+    def temperature(self) -> float | None:
+        """The device's temperature [°C]; None if it does not measure one."""
+        return self._device.temperature if isinstance(self._device, HasTemperature) else None
+
+    def open(self) -> None:
+        """Open the device."""
+        self._device.open()
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """The device's next frame."""
+        return self._device.read(timeout_s)
+
+    def close(self) -> None:
+        """Close the device."""
+        self._device.close()
+
+
 @runtime_checkable
 class HasTemperature(Protocol):
     """Additional property of a device with a temperature sensor."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any
 
-from edge.devices.base import Device, DeviceInfo, Frame
+from edge.devices.base import Device, Frame, WrappedDevice
+from edge.devices.settings import OakSettings, PiSettings, UsbSettings
+from protocols.core.closing import Closing
 from protocols.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,46 +22,27 @@ _REMEDY = (
 )
 
 
-class Camera:
+class Camera(WrappedDevice, Closing):
     """An open device as a context manager and an iterator over its frames.
 
     Iteration ends with the recording; on a live camera it waits for the next frame, also while the camera reconnects.
-    device: the driver behind it, for properties that only some drivers have (``reconnections``, ``temperature``).
+    device: the driver behind it. ``reconnections`` and ``temperature`` are 0 and None where a driver has none.
     """
 
     def __init__(self, device: Device) -> None:
+        super().__init__(device)
         self.device = device
         device.open()
 
-    @property
-    def info(self) -> DeviceInfo:
-        """Image size [px], frame rate [Hz], clock of the time stamps, intrinsics if known."""
-        return self.device.info
-
-    @property
-    def ended(self) -> bool:
-        """True once no further frame will come."""
-        return self.device.ended
-
     def read(self, timeout_s: float = 1.0) -> Frame | None:
         """The next frame; None if none came within ``timeout_s`` or the source has ended."""
-        return self.device.read(timeout_s)
-
-    def close(self) -> None:
-        """Release the device; may be called twice."""
-        self.device.close()
+        return super().read(timeout_s)
 
     def __iter__(self) -> Iterator[Frame]:
         while not self.ended:
             frame = self.read()
             if frame is not None:
                 yield frame
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def open_camera(
@@ -116,16 +98,15 @@ def _device(
 
         return open_network(text, fps=fps, intrinsics=intrinsics)
     kind, _, rest = text.partition(":")
+    given: dict[str, Any] = {key: value for key, value in (("fps", fps), ("size", size)) if value is not None}
     if kind == "oak":
-        from edge.devices.live.oak import OakCamera, OakSettings
+        from edge.devices.live.oak import OakCamera
 
-        oak = OakSettings(device=rest)
-        return OakCamera(replace(oak, fps=fps or oak.fps, size=size or oak.size), intrinsics=intrinsics)
+        return OakCamera(OakSettings(device=rest, **given), intrinsics=intrinsics)
     if text == "picamera2":
-        from edge.devices.live.picamera import PiCamera, PiSettings
+        from edge.devices.live.picamera import PiCamera
 
-        pi = PiSettings()
-        return PiCamera(replace(pi, fps=fps or pi.fps, size=size or pi.size), intrinsics=intrinsics)
+        return PiCamera(PiSettings(**given), intrinsics=intrinsics)
     if kind == "simulated":
         from edge.devices.simulated.camera import open_simulated
 
@@ -143,9 +124,9 @@ def _usb(text: str, fps: float | None, size: tuple[int, int] | None, intrinsics:
         from edge.devices.playback.open_video import open_video
 
         return open_video(int(text), fps=fps, intrinsics=intrinsics)
-    from edge.devices.live.usb import UsbSettings, device_path, open_usb
+    from edge.devices.live.usb import open_usb
 
-    return open_usb(UsbSettings(device_path(text), size, fps), intrinsics=intrinsics)
+    return open_usb(UsbSettings(device=text, size=size, fps=fps), intrinsics=intrinsics)
 
 
 def _playback(text: str, fps: float | None, size: tuple[int, int] | None, intrinsics: Intrinsics | None) -> Device:

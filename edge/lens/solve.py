@@ -21,9 +21,9 @@ COVERAGE_GRID = (8, 6)
 """Columns and rows of the grid over the image on which coverage is counted."""
 MIN_VIEWS = 8
 """From so many views on a lens counts as measured; fewer give one with a wide std, if they fix it at all."""
-_LEAST_VIEWS, _FEW_FOCAL_STD = 3, 0.05
-_MAX_VIEWS = 40
-_MIN_COVERAGE = 0.5
+_LEAST_VIEWS, _FEW_FOCAL_STD = 3, 0.05  # of which a focal length follows at all; relative, for few views
+_MAX_VIEWS = 40  # bounds the solution's time
+_MIN_COVERAGE = 0.5  # of the image's cells: distortion is extrapolated beyond
 _MAX_RMS = 1.0  # px, at a width of up to 1280
 _MAX_FOCAL_STD = 0.004  # relative
 _PRINCIPAL_POINT_STD = 0.012  # of the larger image side, of usual cameras about the middle

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from typing import Any
 
@@ -28,3 +29,16 @@ GIMBAL = 154
 """Component id of the first gimbal."""
 STATION = 190
 """Component id of a ground station's mission planner."""
+
+
+def message_name(number: float) -> str:
+    """The name of a message id, which commands carry as a float; "" for one that the dialect lacks."""
+    kind = mavlink.mavlink_map.get(int(number)) if math.isfinite(number) and number == int(number) else None
+    return "" if kind is None else str(kind.msgname)
+
+
+def camera_heartbeat() -> Any:
+    """The heartbeat of a camera component."""
+    return mavlink.MAVLink_heartbeat_message(
+        mavlink.MAV_TYPE_CAMERA, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
+    )

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from edge.devices.base import Image
 
 MovingDetector = PersonDetector | VehicleDetector
-_LEARN_S, _LEARN_IMAGES = 60.0, 48
-_HEIGHT_FRAMES = 400
-_MIN_FRAMES = 5
+_LEARN_S, _LEARN_IMAGES = 60.0, 48  # from the beginning of a video: in a minute everybody has moved
+_HEIGHT_FRAMES = 400  # from which the height model is learned first
+_MIN_FRAMES = 5  # of a track: fewer are flicker
 MAX_MOVING_SHARE = 0.3
 """Share of the time: where a camera moves for longer, people are not detected."""
 

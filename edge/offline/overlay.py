@@ -13,7 +13,7 @@ from edge.devices.base import Image
 from edge.devices.playback.video_reader import VideoReader
 from protocols.core.errors import InputError
 
-_HUES = 12
+_HUES = 12  # that the eye can tell apart
 
 
 def write_overlay(video: VideoReader, out: Path, found: Mapping[int, Sequence[tuple[str, Detection]]]) -> None:

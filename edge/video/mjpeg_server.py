@@ -14,7 +14,6 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from types import TracebackType
 from typing import Any, Self
 from urllib.parse import urlsplit
 
@@ -22,8 +21,8 @@ from protocols.core.errors import InputError
 
 PATH = "/stream.mjpg"
 _BOUNDARY = "frame"
-_MAX_VIEWERS = 4
-_MAX_CONNECTIONS = 16
+_MAX_VIEWERS = 4  # of the operator's video
+_MAX_CONNECTIONS = 16  # with those that are turned away
 _SEND_TIMEOUT_S = 5.0  # for a request's bytes, and for an image to a slow reader
 _PAGE = (
     b"<!doctype html><title>Syncline</title><style>body{margin:0;background:#111}img{width:100%}</style>"
@@ -123,9 +122,7 @@ class MjpegServer:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with self._new_frame:
             self._closed = True
             self._new_frame.notify_all()

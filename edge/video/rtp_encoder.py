@@ -11,9 +11,9 @@ import numpy as np
 from edge.devices.base import Image
 from protocols.core.errors import InputError
 
-CLOCK_HZ = 90_000
+CLOCK_HZ = 90_000  # RTP's for video (RFC 6184)
 _PACKET_BYTES = 1400  # with IP's and UDP's headers within 1500
-_KEY_FRAME_S = 1.0
+_KEY_FRAME_S = 1.0  # a viewer that joins waits so long at most
 
 
 class RtpEncoder:

@@ -18,7 +18,6 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from types import TracebackType
 from typing import Self
 from urllib.parse import urlsplit
 
@@ -27,13 +26,13 @@ from edge.video.rtp_encoder import RtpEncoder, is_rtcp
 from protocols.core.errors import InputError
 
 PATH = "/overlay"
-_MAX_VIEWERS = 4
-_MAX_CONNECTIONS = 16
-_MAX_REQUEST_BYTES = 8192
+_MAX_VIEWERS = 4  # of the operator's video, 2 Mbit/s each
+_MAX_CONNECTIONS = 16  # with those that are turned away
+_MAX_REQUEST_BYTES = 8192  # players send some hundred
 _SESSION_TIMEOUT_S = 60  # without a request for this long the client is dropped
 _SETUP_TIMEOUT_S = 5.0  # how long a viewer's place is held between SETUP (or PAUSE) and PLAY, and the first request
 _MAX_UNSENT_BYTES = 262_144  # queued for a slow client: beyond this it is skipped until the next key frame
-_STALL_TIMEOUT_S = 10.0
+_STALL_TIMEOUT_S = 10.0  # for which a viewer may take nothing
 _ENCODER_RETRY_S = 0.2  # pause before the encoder is recreated after a failure
 _METHODS = "OPTIONS, DESCRIBE, SETUP, PLAY, PAUSE, TEARDOWN, GET_PARAMETER, SET_PARAMETER"
 _REASONS = {
@@ -107,9 +106,7 @@ class RtspServer:
         self._encoder_thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._closed = True
         self._new_frame.set()
         self._encoder_thread.join(5.0)

@@ -16,7 +16,7 @@ from protocols.core.errors import Refused
 from protocols.geometry.types import Bools, Floats
 
 _TOLERANCE = 1e-6  # relative decrease of E below which the iteration has converged (eq. 22)
-_MAX_ITERATIONS = 60
+_MAX_ITERATIONS = 60  # bounds the alternation
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,7 +23,7 @@ _UPDATE_INTERVAL = 10
 """Observations between two updates."""
 _INITIAL_OBSERVATIONS = 200
 """Shared observations from which an initial pose is computed."""
-_MIN_OBSERVATIONS = 12
+_MIN_OBSERVATIONS = 12  # of a camera: twice the unknowns of its pose
 _BASELINE = 250.0
 """Distance of the first two cameras in the unit of the method's constants (cm, as in the paper's section 4)."""
 

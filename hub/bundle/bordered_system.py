@@ -86,7 +86,7 @@ class PathBlocks:
 
 
 _PAIRS = tuple((a, b) for a in range(SUPPORT) for b in range(a, SUPPORT))
-_UPPER = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
+_UPPER = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # index of (i, j) in the stored upper triangle
 _ROWS, _COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
 
 

@@ -18,9 +18,9 @@ from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 
-_Z_95 = 1.96
+_Z_95 = 1.96  # 97.5 % quantile of the standard normal distribution
 _COVERAGE_95 = float(erf(_Z_95 / np.sqrt(2.0)))
-_HALVINGS = 24
+_HALVINGS = 24  # of the interval: to 1e-7 of its width
 
 
 @dataclass(frozen=True, slots=True, eq=False)

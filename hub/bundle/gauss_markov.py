@@ -19,11 +19,11 @@ from protocols.geometry.types import Floats
 
 _MAX_ROWS = 6000
 """Most consecutive rows of one label from which a camera's noise is estimated."""
-_MIN_ROWS = 50
-_MIN_STD_PX = 0.05
+_MIN_ROWS = 50  # for the three parameters of a camera's noise
+_MIN_STD_PX = 0.05  # a floor: noise of 0 has no likelihood
 _CORRELATED_SHARE_RANGE = (1e-3, 0.999)
 """Smallest and largest share of the variance in the correlated part."""
-_TIME_CONSTANT_RANGE_S = (0.1, 30.0)
+_TIME_CONSTANT_RANGE_S = (0.1, 30.0)  # a few frames; a share of a recording
 _FIRST_STEP, _LAST_STEP = 1.0, 0.1  # of the coordinate search, in the log parameters
 
 

@@ -30,11 +30,11 @@ from protocols.geometry.types import Floats, Ints
 
 _KNOTS_PER_TIME_CONSTANT, _MIN_KNOTS_PER_TIME_CONSTANT = 8.0, 2.0  # of a correlated error, per time constant
 _MAX_KNOT_SPACING_S = 5.0  # between two knots: unknowns that one row couples must be close together in the band
-_MAX_KNOTS = 15_000
-_MAX_ROWS = 150_000
-_MAX_ITERATIONS = 40
-_HALVINGS = 5
-_GROSS_ERROR_COST = 100.0**2
+_MAX_KNOTS = 15_000  # bounds time and memory
+_MAX_ROWS = 150_000  # the same
+_MAX_ITERATIONS = 40  # a bound: it stops where a step gains nothing
+_HALVINGS = 5  # of a step that does not lower the cost
+_GROSS_ERROR_COST = 100.0**2  # of a row off the trajectory: a hundred sigma
 _ON_CONSTRAINTS = 1e-9  # rig units or rad: what rounding leaves
 _RELATIVE_TOLERANCE = 1e-5  # relative decrease of the cost at convergence
 
@@ -213,10 +213,7 @@ def _cost(
     control_terms: Callable[[AdjustmentState], ControlPointTerms] | None,
 ) -> float:
     """The cost at a state with optimal correlated errors; a row off the trajectory costs as much as a gross error."""
-    total = sum(
-        smoothness_cost(path, prior.weights[label], prior.scatters[label] if prior.scatters else None)
-        for label, path in enumerate(state.trajectories)
-    )
+    total = sum(smoothness_cost(path, *prior.of(label)) for label, path in enumerate(state.trajectories))
     total += sum((value / std) ** 2 for _, value, std in camera_priors(problem, state))
     if control_terms is not None:
         total += control_terms(state).cost
@@ -228,12 +225,6 @@ def _cost(
         noise_estimate = cho_solve_banded((part.factor, False), weighted_residual, check_finite=False)
         total += float((part.white_information * residual**2).sum()) - float((weighted_residual * noise_estimate).sum())
     return float(total)
-
-
-def _motion(state: AdjustmentState, prior: SmoothnessPrior, label: int) -> tuple[Floats, Floats, float]:
-    return smoothness_terms(
-        state.trajectories[label], prior.weights[label], prior.scatters[label] if prior.scatters else None
-    )
 
 
 def _step(
@@ -248,7 +239,7 @@ def _step(
     state is off the constraints."""
     columns = problem.free_columns()
     first_columns = np.r_[0, np.cumsum([3 * path.basis.size for path in state.trajectories])]
-    motion = [_motion(state, prior, label) for label in range(len(state.trajectories))]
+    motion = [smoothness_terms(path, *prior.of(label)) for label, path in enumerate(state.trajectories)]
     paths, first_knot = int(first_columns[-1]), int(first_columns[-1])
     size = first_knot + 2 * sum(len(part.knots) for part in parts)
     border, gradient = np.zeros((size, len(columns)), order="F"), np.zeros(size)

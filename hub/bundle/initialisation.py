@@ -36,10 +36,10 @@ from protocols.geometry.types import Bools, Floats
 _MIN_PARALLAX = 0.02  # rad between rays; less does not triangulate
 _MIN_POINT_PARALLAX = 2e-3  # rad: the same for separate points, no part of a path; two pixels of a bearing
 _MIN_BEARING_ANGLE = 0.05  # rad between two directions that intersect
-_MAX_PNP_POINTS = 400
-_PNP_THRESHOLD_PX = 8.0
-_MIN_PNP_POINTS = 12
-_MIN_FRAMES_PER_KNOT = 1.5
+_MAX_PNP_POINTS = 400  # evenly spread: bounds the time of RANSAC
+_PNP_THRESHOLD_PX = 8.0  # generous: the first trajectory is rough
+_MIN_PNP_POINTS = 12  # twice the six unknowns of a pose
+_MIN_FRAMES_PER_KNOT = 1.5  # below it a spline fits the noise
 _MAX_INITIAL_ROWS, _MIN_ROWS_PER_KNOT = 20_000, 2.0  # of more rows, early adjustments use a share
 _SMALL_NETWORK, _ADJUST_GROWTH = 6, 1.33  # cameras; growth
 _TRIANGULATION_STEP = 0.05  # s between triangulated points

@@ -26,7 +26,7 @@ _MIN_REDUNDANCY = 0.2
 """Smallest redundancy of a camera: share of its residuals not absorbed by the fit."""
 _MAX_LAG_S = 2.0
 """Largest lag [s] of the autocorrelation of residuals."""
-_MAX_INFLATION = 1000.0
+_MAX_INFLATION = 1000.0  # rows per effective row: a bound
 _MIN_PAIRS = 200
 """Fewest pairs of residuals at one lag for an estimate of their correlation."""
 _SIGNIFICANCE_SIGMA = 3.0

@@ -46,10 +46,7 @@ def weigh_residuals(
     problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, robust: bool
 ) -> WeightedResiduals:
     """Residuals, robust weights and the cost: the cheap part of `assemble`."""
-    cost = sum(
-        smoothness_cost(path, prior.weights[label], prior.scatters[label] if prior.scatters else None)
-        for label, path in enumerate(state.trajectories)
-    )
+    cost = sum(smoothness_cost(path, *prior.of(label)) for label, path in enumerate(state.trajectories))
     cost += sum((value / std) ** 2 for _, value, std in camera_priors(problem, state))
     # A point behind the camera or off the path costs as much as a gross outlier, and has no gradient.
     gross_error_cost = CAUCHY_WIDTH**2 * np.log1p((100.0 / CAUCHY_WIDTH) ** 2) if robust else 100.0**2
@@ -111,9 +108,7 @@ def assemble(
     system.band += blocks.band()
     for label, path in enumerate(state.trajectories):
         part = slice(first_columns[label], first_columns[label + 1])
-        band, gradient, _ = smoothness_terms(
-            path, prior.weights[label], prior.scatters[label] if prior.scatters else None
-        )
+        band, gradient, _ = smoothness_terms(path, *prior.of(label))
         system.band[:, part] += band
         system.gradient_path[part] += gradient
     column_index = {int(column): i for i, column in enumerate(columns)}

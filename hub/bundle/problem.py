@@ -17,7 +17,7 @@ CAMERA_PARAMETERS = 18
 """Columns of one camera: rotation 0..2, position 3..5, offset 6, rate 7, log focal length 8, k1 9, readout 10; for
 a lens that was not measured also the principal point 11, 12, k2 13, k3 14, log fy/fx 15 and, for a pinhole lens, p1, p2
 16, 17."""
-OFFSET, RATE, FOCAL, K1, READOUT, CENTRE, K2, K3, ASPECT, P1 = 6, 7, 8, 9, 10, 11, 13, 14, 15, 16
+OFFSET, RATE, FOCAL, K1, READOUT, CENTRE, K2, K3, ASPECT, P1 = 6, 7, 8, 9, 10, 11, 13, 14, 15, 16  # columns of a camera
 CRYSTAL_RATE_STD = 1.4e-4
 """Prior std of one crystal's rate against another's: each is within 100 ppm."""
 GIVEN_PARAMETERS = 11

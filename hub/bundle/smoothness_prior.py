@@ -29,6 +29,10 @@ class SmoothnessPrior:
     weights: tuple[Floats, ...]
     scatters: tuple[PathScatter | None, ...] = ()
 
+    def of(self, label: int) -> tuple[Floats, PathScatter | None]:
+        """Weights and scatter of one label."""
+        return self.weights[label], self.scatters[label] if self.scatters else None
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathScatter:

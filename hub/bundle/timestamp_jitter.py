@@ -22,15 +22,15 @@ from hub.bundle.residuals import linearise
 from hub.trajectory.discrete import PointBasis
 from protocols.geometry.types import Bools, Floats, Ints
 
-_MIN_FRAMES = 25
+_MIN_FRAMES = 25  # from which a variance ratio is known to a third
 _FALSE_ALARM_PROBABILITY = 1e-4
 """False-alarm probability of the variance ratio (F-test, along against across the motion) without jitter."""
 _MIN_VARIANCE_RATIO = 2.0
 """Smallest variance ratio: with jitter below the rows' own noise, estimating frame times is not worth it."""
-_MAX_ROUNDS = 15
+_MAX_ROUNDS = 15  # a bound: it stops where times change no more
 _CONVERGED_SHARE = 0.03
 """Change of the frame times relative to their jitter at which the iteration has converged."""
-_REWEIGHTINGS = 4
+_REWEIGHTINGS = 4  # of outliers' weights
 _OUTLIER_SIGMA = 6.0  # sigma beyond which a row or a frame is an outlier
 _MIN_SIGMA_PX = 0.05  # px
 _MAD_TO_SIGMA = 1.4826  # std of a Gaussian from its median absolute value

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from hub.report.svg import THIN, at, drawing, line, number, points, short, text, time_axis
 from protocols.session.calibration import AdjustmentStep
 
-_WIDTH, _LEFT, _RIGHT, _HEIGHT = 1000.0, 84.0, 190.0, 250.0
+_WIDTH, _LEFT, _RIGHT, _HEIGHT = 1000.0, 84.0, 190.0, 250.0  # px of the drawing, and of its margins
 _DASHES = ("", "9 4", "2 4", "14 4 2 4", "5 2", "1 3")
 
 

@@ -9,10 +9,10 @@ from hub.report.svg import THIN, at, drawing, esc, line, number, rect, short, wh
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration
 
-_WIDTH = 340.0
-_ARROW_BINS = 16
+_WIDTH = 340.0  # px of the drawing
+_ARROW_BINS = 16  # across the image: arrows stay apart
 _MIN_ROWS = 3  # the mean residual of fewer rows is noise
-_MAX_DOTS = 400
+_MAX_DOTS = 400  # in one image: more are a blot
 
 
 def residual_maps(calibration: Calibration) -> str:

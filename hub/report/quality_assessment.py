@@ -22,15 +22,15 @@ INTERVAL_95 = 1.96
 """Half width of the 95 % interval of a normal distribution, in standard deviations."""
 
 _GOOD_MS = 2.0  # half of a 95 % interval that is good at any frame rate
-_GOOD_SHARE_OF_FRAME, _POOR_SHARE_OF_FRAME = 0.05, 0.25
+_GOOD_SHARE_OF_FRAME, _POOR_SHARE_OF_FRAME = 0.05, 0.25  # of a frame interval: half a 95 % interval
 _SLOW_PPM, _WRONG_PPM = 300.0, 2000.0  # crystals drift by 50 ppm; nominal frame rates are off by up to 1000
 _WRONG_RATE_PPM = 10_000.0  # beyond this the times are frame numbers, not a clock
-_GOOD_PX_AT_1920 = 1.5
+_GOOD_PX_AT_1920 = 1.5  # of detectors' noise and measured lenses; more is an error
 _LENS_SHARE = 0.4  # of the squared residuals that the image position explains
-_FEW_ROWS, _VERY_FEW_ROWS = 0.7, 0.5
-_LITTLE_COVERAGE = 0.25
+_FEW_ROWS, _VERY_FEW_ROWS = 0.7, 0.5  # shares of a camera's rows that fit
+_LITTLE_COVERAGE = 0.25  # of the image's cells
 UNIT_WORDS = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
-_GOOD_PATH, _POOR_PATH = 0.97, 0.9
+_GOOD_PATH, _POOR_PATH = 0.97, 0.9  # shares of the time that two cameras saw
 
 
 @dataclass(frozen=True, slots=True)

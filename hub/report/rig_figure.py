@@ -19,7 +19,7 @@ from protocols.session.rig import Rig
 
 Rows = Sequence[Sequence[float | None]]
 
-MOST_POINTS = 3000
+MOST_POINTS = 3000  # of the trajectory: the page stays below 6 MB
 _BREAK = 0.5  # a trajectory is not drawn across a longer gap [s]
 _NAVY, _ORANGE, _GREY = "#123a5f", "#c2510a", "#667"
 DIV = "scene-3d"

@@ -12,7 +12,7 @@ from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations
 
-_WIDTH, _LEFT, _RIGHT = 1000.0, 130.0, 16.0
+_WIDTH, _LEFT, _RIGHT = 1000.0, 130.0, 16.0  # px of the drawing, and of its margins
 _MAX_SPANS = 400  # drawn per camera; long recordings have more
 _TIME_BINS, _ROWS_A_BIN = 250, 8  # largest number of bins; rows per bin for meaningful quantiles
 

@@ -29,13 +29,13 @@ _FINE_STIFFNESS = (1e-2, 1e-1, 1.0)  # third differences; the strength is chosen
 _STIFFNESS = 1e-3  # only bridges empty intervals
 _SPACING_LIMITS = (0.06, 0.8)  # s
 _BRIDGED_KNOTS = 1.5  # gaps of so many knot intervals are bridged: so smooth a track cannot leave its path in them
-_NEIGHBOURS = 4
-_NEIGHBOUR_QUANTILE = 0.2
-_DISCONTINUITY_PASSES = 4
+_NEIGHBOURS = 4  # on each side
+_NEIGHBOUR_QUANTILE = 0.2  # of the residuals to lines through two of them: one good pair in five
+_DISCONTINUITY_PASSES = 4  # each may split a stretch once more
 _DISCONTINUITY_FACTOR = 3.0  # times the 90 % quantile of the track's accelerations
 _OUTLIER_SIGMAS = 4.0  # residuals beyond this many sigma are false detections
 _MIN_POINTS = 4  # per stretch
-_MIN_OUTLIER_PX = 1.5
+_MIN_OUTLIER_PX = 1.5  # three sigma of a good detector
 _UNDERFIT_PX = 3.0  # more noise than this is rather motion too fast for the knots
 # Interpolated labels are exactly straight: without a floor the hand-set ones would look like outliers.
 _MIN_SIGMA_PX = 0.05

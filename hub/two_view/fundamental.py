@@ -12,7 +12,7 @@ from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 
-_MIN_PAIRS = 8
+_MIN_PAIRS = 8  # of the eight-point algorithm
 
 
 def hartley_normalisation(points: Floats) -> Floats:

@@ -20,7 +20,7 @@ SEARCH_WIDTH = 2.0
 """Final width [sigma] of the Cauchy weight in a search."""
 FINAL_WIDTH = 4.0
 """Final width [sigma] of the Cauchy weight in a final fit: 0.996 of the efficiency of least squares."""
-_MIN_ROWS = 12
+_MIN_ROWS = 12  # twice the six unknowns of a relative pose and a lag
 
 
 @dataclass(frozen=True, slots=True, eq=False)

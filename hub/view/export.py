@@ -25,8 +25,9 @@ def calibration_file(state: ViewState) -> str:
     cameras = {}
     for found in solved.cameras:
         info = infos.get(found.camera)
-        if info is not None and len(found.matrix) == 9:
-            cameras[found.camera] = _camera(found, info)
+        lens = None if info is None else Intrinsics.of_message(found, (info.width, info.height))
+        if lens is not None:
+            cameras[found.camera] = _camera(found, lens)
     return calibration_text(
         Calibration(
             cameras,
@@ -41,9 +42,7 @@ def calibration_file(state: ViewState) -> str:
     )
 
 
-def _camera(found: pb.CameraCalibration, info: pb.CameraInfo) -> CameraCalibration:
-    distortions = np.array(found.distortions) if found.distortions else np.zeros(4 if found.fisheye else 5)
-    lens = Intrinsics(info.width, info.height, np.array(found.matrix).reshape(3, 3), distortions, found.fisheye)
+def _camera(found: pb.CameraCalibration, lens: Intrinsics) -> CameraCalibration:
     return CameraCalibration(
         name=found.camera,
         intrinsics=lens,

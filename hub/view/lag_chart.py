@@ -11,7 +11,7 @@ from hub.view.lag_history import LAG_WINDOW_S, LagSample
 from hub.view.state import CameraView, ViewState
 from protocols.geometry.types import Floats
 
-_LAG_WIDTH, _RMS_LEFT, _RMS_WIDTH, _HEIGHT = 232.0, 248.0, 92.0, 56.0
+_LAG_WIDTH, _RMS_LEFT, _RMS_WIDTH, _HEIGHT = 232.0, 248.0, 92.0, 56.0  # px of the drawing
 _MIN_SPAN_S = 30.0  # of the time axis
 _STEP_S = 2.0  # how often the charts move
 _STYLE = (

@@ -9,7 +9,7 @@ from protocols.messages import syncline_pb2 as pb
 
 LAG_WINDOW_S = 300.0
 """Samples older than this are not shown [s]."""
-_MAX_SAMPLES = 600
+_MAX_SAMPLES = 600  # two a second over the window
 
 
 def lag_of(found: pb.CameraCalibration) -> float:

@@ -26,7 +26,7 @@ SIGNS: dict[CameraState, str] = {
 
 TRACK_SIGNS = {"confirmed": "●", "tentative": "◐", "coasting": "◌", "stale": "–"}
 _MAX_TRACKS = 8  # in words
-_STALE_PICTURE_S = 5.0
+_STALE_PICTURE_S = 5.0  # a picture older than that is said to be
 
 _STYLE = (
     "<style>.sl{font:12px/1.35 system-ui,sans-serif;padding:0 .75em .5em;overflow-x:auto}"

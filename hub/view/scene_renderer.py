@@ -31,6 +31,7 @@ COLOURS: dict[CameraState, tuple[int, int, int]] = {
     "gone": (190, 190, 190),
 }
 _PATHS = ((214, 96, 20), (30, 130, 90), (120, 70, 170), (20, 120, 160), (170, 40, 90))
+"""RGB, told apart by the colour-blind too."""
 _IMAGES_PER_S = 24.0  # over all cameras: decoding and encoding one image costs 2 ms
 _PATH_S = 20.0  # length of the trajectory that is drawn [s]
 _FADE_S = 1.0  # how often a trajectory fades: between, only what is new is sent [s]
@@ -412,8 +413,7 @@ def _lens(camera: CameraView) -> Intrinsics | None:
     if found is None or len(found.matrix) != 9:
         return None
     size = (info.width, info.height) if info is not None else _guessed_image_size(found.matrix)
-    distortions = np.array(found.distortions) if found.distortions else np.zeros(4 if found.fisheye else 5)
-    return Intrinsics(size[0], size[1], np.array(found.matrix).reshape(3, 3), distortions, found.fisheye)
+    return Intrinsics.of_message(found, size)
 
 
 def _guessed_image_size(matrix: Any) -> tuple[int, int]:

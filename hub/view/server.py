@@ -40,10 +40,10 @@ from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "view"
 _TICK_S = 0.04  # a cycle while a browser is open: what moves is drawn 25 times a second [s]
-_IDLE_TICK_S = 0.1
-_MIN_REST_S = 0.01
-_DRAW_S = 0.2
-_PANEL_S = 0.5
+_IDLE_TICK_S = 0.1  # without a browser: queues must not run over
+_MIN_REST_S = 0.01  # between two cycles of a loop that is late
+_DRAW_S = 0.2  # between two drawings of what does not move
+_PANEL_S = 0.5  # between two updates of the panels' text
 _CONNECTION_S = 1.0  # between two looks whether the router is there
 _UNWATCHED_S = 1.0  # redraw interval without an open browser
 _ROLE_OF_ACTION = {"start_recording": "record", "stop_recording": "record", "recalibrate": "hub", "export": "hub"}

@@ -17,7 +17,6 @@ from hub.calibration.coverage import CoverageMonitor
 from hub.view.lag_history import LagHistory
 from hub.view.uav_state import UavView
 from protocols.core.clocks import NANOSECONDS
-from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
@@ -27,7 +26,7 @@ SILENT_S = 2.0
 STALE_S = 5.0
 """An agent without a status, or a track without a message, for longer than this is not to be trusted."""
 _RATE_S = 3.0  # window of the frame rate [s]
-_PATH_POINTS = 700
+_PATH_POINTS = 700  # 23 s at 30 a second, a little more than is drawn
 _PATH_INTERVAL_S = 1 / 30  # between two kept points of a trajectory: tracks come at up to 120 Hz
 _NEW_CLOCK_S = 5.0  # a track that goes back by more is on another clock
 _MAX_PATHS = 48  # tracked people get new labels: the track not updated for longest is dropped
@@ -84,8 +83,7 @@ class CameraView:
         found = self.calibration
         if found is None:
             return None
-        rotation = so3.exp(np.array(found.rotation))
-        return Pose(rotation, -rotation.T @ np.array(found.translation))
+        return Pose.from_rodrigues(np.array(found.rotation), np.array(found.translation))
 
     def detections_in_image(self) -> list[tuple[float, float, float]]:
         """Detections in the frame of the shown image, which is older than the last frame; u, v, size [px]."""

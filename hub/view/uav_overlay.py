@@ -18,8 +18,8 @@ _MARGIN = 0.35
 """Canvas margin on each side as a fraction of the image: within it an estimate outside the image is drawn at its
 position, beyond it as an arrow at the edge."""
 _WIDTH = 720  # of the canvas [px]
-_BACKGROUND, _FRAME = (40, 44, 50), (255, 255, 255)
-_ROAD, _PARTICLES = (120, 160, 210), (240, 150, 220)
+_BACKGROUND, _FRAME = (40, 44, 50), (255, 255, 255)  # RGB
+_ROAD, _PARTICLES = (120, 160, 210), (240, 150, 220)  # RGB
 _STATES = {"visible": (90, 220, 90), "coasting": (255, 175, 50), "lost": (235, 70, 60)}
 SIGNS = {"visible": "✓", "coasting": "…", "lost": "✗"}
 """Sign before a state's name, so that it can be read without colour."""

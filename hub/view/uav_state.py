@@ -25,7 +25,6 @@ class UavView:
     particle_sets: deque[pb.TargetCloud] = field(default_factory=lambda: deque(maxlen=50))
     roads: deque[pb.RoadMap] = field(default_factory=lambda: deque(maxlen=20))
     last_picture: float | None = None
-    last_target: float | None = None
     status: pb.AgentStatus | None = None
 
     def handle(
@@ -40,7 +39,6 @@ class UavView:
             self.info = message
         elif isinstance(message, pb.TargetState):
             self.targets.append(message)
-            self.last_target = now
         elif isinstance(message, pb.TargetCloud):
             self.particle_sets.append(message)
         elif isinstance(message, pb.RoadMap):

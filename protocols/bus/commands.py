@@ -9,7 +9,7 @@ from protocols.bus.base import Bus
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import COMMAND
 
-_DUPLICATE_WINDOW = 1024
+_DUPLICATE_WINDOW = 1024  # commands: a click a second for a quarter of an hour
 
 
 class CommandSubscription:

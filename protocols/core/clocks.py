@@ -14,10 +14,8 @@ CameraTime = NewType("CameraTime", float)
 """Seconds on one camera's own clock."""
 ReferenceTime = NewType("ReferenceTime", float)
 """Seconds on the clock of the reference camera."""
-BusTime = NewType("BusTime", int)
-"""Nanoseconds on the recorder's clock (log time); never used as a capture time."""
 
-NANOSECONDS = 1_000_000_000
+NANOSECONDS = 1_000_000_000  # in a second
 UNSET_CLOCK_UNIX_S = 1_735_689_600.0
 """2025: a machine whose Unix time is before that has a clock that was never set."""
 

@@ -13,10 +13,10 @@ from pathlib import Path
 
 from protocols.core.pair_report import PairReport
 
-EXIT_DONE = 0
-EXIT_BUG = 1
-EXIT_INPUT = 2
-EXIT_REFUSED = 3
+EXIT_DONE = 0  # the result is there
+EXIT_BUG = 1  # a traceback or a dead process: a supervisor starts it again
+EXIT_INPUT = 2  # wrong usage or input
+EXIT_REFUSED = 3  # the data allow no answer
 
 
 def printable(text: str) -> str:

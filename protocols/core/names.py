@@ -23,7 +23,7 @@ from urllib.parse import quote, unquote
 
 from protocols.core.errors import InputError
 
-MAX_CHARACTERS = 63
+MAX_CHARACTERS = 63  # fits into a key segment and a certificate's common name
 MAX_BYTES = 200
 """UTF-8 bytes of a name: with a suffix it stays below the 255 bytes that file systems allow for a file name."""
 MAX_SEGMENT = 3 * MAX_BYTES

@@ -7,13 +7,14 @@ pixel. ``normalised`` coordinates are (x/z, y/z) without distortion.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from protocols.geometry.types import Floats
 
-_NEWTON_STEPS = 20
-_NEWTON_TOLERANCE = 1e-12
+_NEWTON_STEPS = 20  # a bound: it converges quadratically
+_NEWTON_TOLERANCE = 1e-12  # normalised: 1e-9 px
 _MAX_NORMALISED = 100.0  # in normalised coordinates: 89.4 degrees off the axis
 
 
@@ -42,6 +43,19 @@ class Intrinsics:
         radial = self.distortions if self.fisheye else self.distortions[[0, 1, 4]]
         slope = np.r_[1.0, radial * (3.0 + 2.0 * np.arange(len(radial)))]
         object.__setattr__(self, "fold", _first_fold(slope))
+
+    @classmethod
+    def of_message(cls, message: Any, size: tuple[int, int] | None = None) -> Intrinsics | None:
+        """Those in a bus message with matrix, distortions and fisheye; None where it has none.
+
+        size: (width, height) of the images [px], where the message does not hold it.
+        """
+        if len(message.matrix) != 9:
+            return None
+        width, height = (message.width, message.height) if size is None else size
+        zeros = np.zeros(4 if message.fisheye else 5)
+        distortions = np.array(message.distortions) if message.distortions else zeros
+        return cls(width, height, np.array(message.matrix).reshape(3, 3), distortions, message.fisheye)
 
     @property
     def focal(self) -> float:

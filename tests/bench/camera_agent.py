@@ -19,16 +19,16 @@ import cv2
 import numpy as np
 
 from edge import scenes
-from edge.agents.camera import run_camera_agent
+from edge.agents.camera import CameraAgent
 from edge.detectors.base import Detection, Prediction
 from edge.detectors.marker.ball import MarkerDetector
 from edge.devices.base import DeviceInfo, Frame, Image
-from edge.devices.playback.playback_clock import AsFastAsPossible
 from edge.devices.simulated.camera import SimulatedDevice
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.topics import OBSERVATION
+from tests.support.clocks import AsFastAsPossible
 
 SIZE, FPS = (1280, 720), 30.0
 
@@ -118,7 +118,7 @@ def main() -> None:
         device = Played(pictures, options.seconds)
         cpu = time.process_time()
         agent = threading.Thread(
-            target=run_camera_agent, args=(device, detector, sending, "cam0", threading.Event()), daemon=True
+            target=CameraAgent(device, detector, sending, "cam0").run, args=(threading.Event(),), daemon=True
         )
         agent.start()
         while agent.is_alive() or heard.wait(0.5):

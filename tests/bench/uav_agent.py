@@ -21,11 +21,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from deploy.config.uav import ControlConfig
 from edge.devices.base import Frame
 from edge.devices.simulated.aircraft import Disturbance
 from edge.mavlink.link.connection import ReceivedMessage
 from edge.mavlink.link.tlog import read_tlog
+from edge.mavlink.settings import GuidanceLimits
 from edge.uav.timing.telemetry_offset import find_offset
 from edge.uav.timing.visual_rotation import VisualRotationEstimator, median_tilt_rotation
 from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA
@@ -178,7 +178,7 @@ def loops(seeds: list[int], kind: str) -> bool:
             gimbal = (float(_PITCH), yaw)
         elif kind == "follow":
             gimbal = (-0.5 * np.pi, yaw)
-        control = ControlConfig(gimbal=kind == "gimbal", follow=kind != "gimbal", coast_s=15.0)
+        control = GuidanceLimits(gimbal=kind == "gimbal", follow=kind != "gimbal", coast_s=15.0)
         flight = Flight(
             world, control=control, flies="follow", gimbal=gimbal, start=start, yaw=yaw,
             disturbances=tuple(disturbances), seed=seed, piloted=kind != "gimbal",

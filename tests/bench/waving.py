@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from deploy.simulation.session import observations_from_tracks, rig_from_tracks
+from deploy.simulation.session import rig_from_tracks, simulated_observations
 from edge import scenes
 from edge.scenes.marker.session import simulate_tracks
 from hub.calibration.pipeline import calibrate
@@ -44,7 +44,7 @@ def one(seed: int, seconds: float, rate: float) -> tuple[float, int, float]:
     positions = scene.marker_position(times)
     speed = float(np.mean(np.linalg.norm(np.diff(positions, axis=0), axis=1)) / (times[1] - times[0]))
     try:
-        found = calibrate(rig_from_tracks(filmed), observations_from_tracks(filmed))
+        found = calibrate(rig_from_tracks(filmed), simulated_observations(filmed.scene, filmed.tracks))
     except Refused:
         return speed, 0, float("nan")
     reference = found.reference

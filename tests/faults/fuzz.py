@@ -181,7 +181,8 @@ def fuzz_mavlink(count: int, seed: int) -> Counter[str]:
 
 def fuzz_config(count: int, seed: int) -> Counter[str]:
     """``count`` inputs for the configuration reader: InputError, or a configuration."""
-    from deploy.config.agents import CameraConfig, load
+    from deploy.config.agents import CameraConfig
+    from deploy.config.file import load
     from protocols.core.errors import InputError
 
     rng, counts = random.Random(f"{seed} config"), Counter[str]()

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edge.agents.camera import run_camera_agent
+from edge.agents.camera import CameraAgent
 from edge.detectors.base import Detection
 from edge.devices.base import DeviceInfo, Frame
 from edge.devices.live.opencv_capture import OpenCvCamera
@@ -165,7 +165,7 @@ def test_a_network_camera_that_was_unplugged_comes_back_in_the_same_run_of_its_a
     observations, statuses = MemoryBus(hub).subscribe(OBSERVATION), MemoryBus(hub).subscribe(STATUS)
     camera, stop = OpenCvCamera(f"http://127.0.0.1:{server.server_port}/"), threading.Event()
     agent = threading.Thread(
-        target=run_camera_agent, args=(camera, Bright(), MemoryBus(hub), "cam0", stop), daemon=True
+        target=CameraAgent(camera, Bright(), MemoryBus(hub), "cam0").run, args=(stop,), daemon=True
     )
     agent.start()
     seen: list[pb.Observation] = []
@@ -221,11 +221,11 @@ def test_a_camera_that_is_gone_for_good_ends_its_agent_with_the_reason() -> None
     device = Flawed("unplugged")
     device.gone = True
     with pytest.raises(InputError, match="camera cam0 is gone; plug it in"):
-        run_camera_agent(device, Bright(), MemoryBus(MemoryHub()), "cam0", threading.Event())
+        CameraAgent(device, Bright(), MemoryBus(MemoryHub()), "cam0").run(threading.Event())
 
 
 def _run(device: Flawed, bus: MemoryBus, stop: threading.Event) -> None:
-    run_camera_agent(device, Bright(), bus, "cam0", stop)
+    CameraAgent(device, Bright(), bus, "cam0").run(stop)
 
 
 def _until(condition: Callable[[], bool], timeout_s: float = 10.0) -> float:

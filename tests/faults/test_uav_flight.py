@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy.config.uav import ControlConfig
 from deploy.demo.flight_outcome import compare_log_with_world
 from deploy.demo.flight_report import write_report
 from deploy.logs.replay_uav import replay_through_uav
 from edge.agents.uav import TOPICS
 from edge.devices.simulated.aircraft import Disturbance
 from edge.mavlink.roles.autopilot import LinkFaults
+from edge.mavlink.settings import GuidanceLimits
 from edge.uav.base import TrackState
 from edge.uav.world.flight_world import FlightWorld
 from edge.uav.world.patrol import patrol_world
@@ -111,7 +111,7 @@ def test_an_aircraft_with_permission_is_commanded_to_follow_and_stops_on_the_ope
 ) -> None:
     start = np.array([*world.target.ground[0], -62.0])
     flight = Flight(
-        world, control=ControlConfig(follow=True), flies="follow", start=start, yaw=float(world.target.course[0])
+        world, control=GuidanceLimits(follow=True), flies="follow", start=start, yaw=float(world.target.course[0])
     )
     flight.run(1.5)
     assert flight.select()
@@ -156,7 +156,7 @@ def test_a_vehicle_that_follows_in_wind_stops_at_the_fence(world: FlightWorld) -
     )
     flight = Flight(
         world,
-        control=ControlConfig(follow=True, fence_m=fence),
+        control=GuidanceLimits(follow=True, fence_m=fence),
         flies="follow",
         start=start,
         gimbal=(-0.5 * np.pi, 0.0),
@@ -203,7 +203,7 @@ def test_commands_stop_while_the_link_is_silent_or_no_frames_come_and_when_the_t
 ) -> None:
     start = np.array([*world.target.ground[0], -62.0])
     flight = Flight(
-        world, control=ControlConfig(follow=True), flies="follow", start=start, yaw=float(world.target.course[0])
+        world, control=GuidanceLimits(follow=True), flies="follow", start=start, yaw=float(world.target.course[0])
     )
     control = flight.agent._guidance
 

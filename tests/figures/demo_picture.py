@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.simulation.session import observations_from_tracks, rig_from_tracks
+from deploy.simulation.session import rig_from_tracks, simulated_observations
 from edge import scenes
 from edge.scenes import renderer_for
 from edge.scenes.marker.scene import MarkerScene
@@ -32,7 +32,7 @@ def draw(out: Path = OUT) -> None:
 
     scene = scenes.get_marker_scene("marker", SEED, CAMERAS)
     filmed = simulate_tracks(scene, SECONDS, SEED)
-    calibration = calibrate(rig_from_tracks(filmed), observations_from_tracks(filmed))
+    calibration = calibrate(rig_from_tracks(filmed), simulated_observations(filmed.scene, filmed.tracks))
     figure = plt.figure(figsize=(12.6, 4.6), dpi=90)
     colours = ["#0072b2", "#d55e00", "#009e73"]
     for i, camera in enumerate(scene.cameras):

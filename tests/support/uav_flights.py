@@ -17,10 +17,9 @@ from google.protobuf.message import Message
 from pymavlink.dialects.v20 import common as mavlink
 
 from deploy.agents.uav import gimbal_from_camera, make_agent
-from deploy.config.uav import ControlConfig, SimulatedFlightConfig, UavConfig
+from deploy.config.uav import SimulatedFlightConfig, UavConfig
 from edge.agents.uav import UavAgent, UavSettings
 from edge.devices.base import Frame
-from edge.devices.playback.playback_clock import AsFastAsPossible
 from edge.devices.simulated.aircraft import Disturbance, SimulatedAircraft
 from edge.devices.simulated.aircraft_camera import FlightCamera
 from edge.mavlink.dialect import CAMERA
@@ -30,7 +29,9 @@ from edge.mavlink.link.transport import Address, Pipe
 from edge.mavlink.roles import camera, telemetry
 from edge.mavlink.roles.autopilot import Autopilot, LinkFaults
 from edge.mavlink.roles.camera_messages import VideoStream
+from edge.mavlink.settings import GuidanceLimits
 from edge.uav.world.flight_world import FlightWorld, GroundTruth
+from tests.support.clocks import AsFastAsPossible
 
 STEP_S = 0.01
 TRANSFER_S = 0.02
@@ -104,7 +105,7 @@ class Flight:
     """One flight. published: all messages that the agent published on the bus."""
 
     world: FlightWorld
-    control: ControlConfig = field(default_factory=ControlConfig)
+    control: GuidanceLimits = field(default_factory=GuidanceLimits)
     flies: str = "path"
     gimbal: tuple[float, float] | None = None
     gimbal_ahead_s: float = 0.0

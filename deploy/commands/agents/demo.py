@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Literal
 
-from cyclopts import Parameter
-
-from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
-
-if TYPE_CHECKING:
-    from rich.live import Live as RichLive
-
-    from deploy.demo.marker import DemoProgress
+from deploy.commands.common import Flag, Json, check_range, check_seed
+from protocols.core.errors import EXIT_DONE, EXIT_REFUSED
 
 
 def demo(
@@ -22,10 +15,10 @@ def demo(
     cameras: int | None = None,
     scene: Literal["marker", "people", "town"] = "marker",
     out: Path = Path("demo-out"),
-    view: Annotated[bool, Parameter(negative="")] = False,
+    view: Flag = False,
     view_port: int = 8080,
     seed: int = 1,
-    json: Annotated[bool, Parameter(negative="")] = False,
+    json: Json = False,
 ) -> int:
     """Calibrate simulated cameras that share no clock, and compare clock offsets and poses with the ground truth.
 
@@ -54,21 +47,17 @@ def demo(
         Port of the live view; 0 = any free port.
     seed
         Seed of the simulated scene: the same seed gives the same cameras and motion.
-    json
-        Print the table as JSON.
     """
     if cameras is None:
         cameras = 5 if scene == "people" else 3
     if seconds is None:
         seconds = 60.0 if scene == "people" else 30.0  # the limits for people hold for a recording of one minute
-    if seed < 0:
-        raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
-    if not 2 <= cameras <= 20:
-        raise InputError(f"--cameras {cameras} is out of range", remedy="give 2 to 20")
-    if not 5.0 <= seconds <= 3600.0:
-        raise InputError(f"--seconds {seconds:g} is out of range", remedy="give 5 to 3600")
+    check_seed(seed)
+    check_range("--cameras", cameras, 2, 20)
+    check_range("--seconds", seconds, 5.0, 3600.0)
     if scene == "town":
         return _town(out, seconds, seed, view_port if view else None, as_json=json)
+    from deploy.demo.display import ProgressDisplay
     from deploy.demo.marker import DemoProcesses, DemoSettings
 
     settings = DemoSettings(scene, seed, cameras, seconds, out, view_port if view else None)
@@ -76,8 +65,8 @@ def demo(
         from deploy.demo.people import PeopleDemoProcesses, compare_with_people
 
         people = PeopleDemoProcesses(settings)
-        with _ProgressDisplay(seconds, people.names, quiet=json, what="people") as show:
-            people.run(show)
+        with ProgressDisplay("filming", seconds, quiet=json) as display:
+            people.run(display)
         followed = compare_with_people(out, seed, cameras)
         if json:
             print(followed.as_json())
@@ -87,8 +76,8 @@ def demo(
     from deploy.evaluation.ground_truth import compare_with_truth
 
     fleet = DemoProcesses(settings)
-    with _ProgressDisplay(seconds, fleet.names, quiet=json) as show:
-        live = fleet.run(show)
+    with ProgressDisplay("filming", seconds, quiet=json) as display:
+        live = fleet.run(display)
     fleet.check_calibrated()
     comparison = compare_with_truth(out, scene, seed, cameras)
     if json:
@@ -99,70 +88,15 @@ def demo(
 
 
 def _town(out: Path, seconds: float, seed: int, view_port: int | None, *, as_json: bool) -> int:
+    from deploy.demo.display import ProgressDisplay
     from deploy.demo.flight import run_town
-    from deploy.demo.flight_display import FlightDisplay
     from deploy.demo.flight_outcome import as_json as to_json
     from deploy.demo.flight_outcome import print_outcome
 
-    with FlightDisplay(seconds, quiet=as_json) as show:
-
-        def on_view_address(address: str) -> None:
-            print(f"live view: open {address}", file=sys.stderr if as_json else sys.stdout, flush=True)
-
-        outcome = run_town(out, seconds, seed, show, view_port=view_port, on_view_address=on_view_address)
+    with ProgressDisplay("tracking", seconds, quiet=as_json) as display:
+        outcome = run_town(out, seconds, seed, display, view_port)
     if as_json:
         print(to_json(outcome))
     else:
         print_outcome(outcome, out)
     return EXIT_DONE if outcome.good else EXIT_REFUSED
-
-
-class _ProgressDisplay:
-    """Progress display: a bar and the counts of each camera; redrawn on a terminal, otherwise printed line by line."""
-
-    def __init__(self, seconds: float, names: list[str], quiet: bool, what: str = "marker") -> None:
-        self._seconds, self._names, self._quiet, self._what = seconds, names, quiet, what
-        self._printed = -10.0
-        self._address_printed = False
-        self._live: RichLive | None = None
-
-    def __enter__(self):  # type: ignore[no-untyped-def]
-        if not self._quiet and sys.stdout.isatty():
-            from rich.console import Console
-            from rich.live import Live as RichLive
-
-            self._live = RichLive(console=Console(), refresh_per_second=4, transient=True)
-            self._live.__enter__()
-        return self.show
-
-    def __exit__(self, *details: object) -> None:
-        if self._live is not None:
-            self._live.__exit__(None, None, None)
-
-    def show(self, live: DemoProgress) -> None:
-        """Display the current progress."""
-        if live.address and not self._address_printed:
-            self._address_printed = True
-            print(f"live view: open {live.address}", file=sys.stderr if self._quiet else sys.stdout, flush=True)
-        if self._quiet:
-            return
-        seen = "  ".join(
-            f"{name} {live.detections.get(name, 0)}/{live.observations.get(name, 0)}" for name in self._names
-        )
-        if self._live is None:
-            if live.elapsed - self._printed >= 5.0:
-                self._printed = live.elapsed
-                print(f"{live.elapsed:5.1f} s  {seen}  {live.status}", flush=True)
-            return
-        from rich.console import Group
-        from rich.progress_bar import ProgressBar
-        from rich.text import Text
-
-        self._live.update(
-            Group(
-                Text(f"filming {live.elapsed:4.0f} of {self._seconds:.0f} s"),
-                ProgressBar(total=self._seconds, completed=min(live.elapsed, self._seconds), width=60),
-                Text(f"{self._what} seen / frames: {seen}"),
-                Text(live.status),
-            )
-        )

@@ -2,40 +2,36 @@
 
 from __future__ import annotations
 
-import json as json_module
 import os
 import shlex
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from cyclopts import Parameter
-
+from deploy.commands.common import Flag, Json, answer, check_range, check_seed, parse_box
 from protocols.core.errors import EXIT_DONE, InputError, Refused
 
 if TYPE_CHECKING:
     from edge.devices.base import Device
     from hub.view.server import ViewServer
 
-_Flag = Annotated[bool, Parameter(negative="")]
-
 
 def quick(
     *,
     cameras: str = "0,1",
     source: tuple[Path, ...] = (),
-    simulated: _Flag = False,
+    simulated: Flag = False,
     out: Path = Path("quick-out"),
     target: str | None = None,
     rig: Path | None = None,
     field_of_view: float = 65.0,
     seconds: float = 300.0,
     port: int = 8080,
-    headless: _Flag = False,
+    headless: Flag = False,
     seed: int = 1,
-    json: _Flag = False,
+    json: Json = False,
 ) -> int:
     """Calibrate the cameras connected to this machine by waving a ball. No configuration file is needed.
 
@@ -76,18 +72,13 @@ def quick(
         Serve no page, for use in scripts.
     seed
         Seed of the simulated scene.
-    json
-        Print the result as JSON.
     """
-    if not 5.0 <= field_of_view <= 170.0:
-        raise InputError(f"--field-of-view {field_of_view:g} is out of range", remedy="give 5 to 170 degrees")
-    if not 1.0 <= seconds <= 86_400.0:
-        raise InputError(f"--seconds {seconds:g} is out of range", remedy="give 1 to 86400")
+    check_range("--field-of-view", field_of_view, 5.0, 170.0, "give 5 to 170 degrees")
+    check_range("--seconds", seconds, 1.0, 86_400.0, "give 1 to 86400")
     if simulated and source:
         raise InputError("--simulated and --source exclude each other", remedy="leave one of the two out")
-    if seed < 0:
-        raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
-    box = None if target is None else _box(target)
+    check_seed(seed)
+    box = None if target is None else parse_box(target)
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     import cv2
 
@@ -111,7 +102,7 @@ def quick(
     )
     run = QuickCalibration(settings, view)
     if view is not None:
-        print(json_module.dumps({"address": view.address}) if json else f"open {view.address}", flush=True)
+        answer({"address": view.address}, [f"open {view.address}"], json)
     began = time.process_time()
     hub = run.run(stop_on_signals())
     if hub.session is None:
@@ -135,16 +126,6 @@ def quick(
     if hub.refusal is not None:
         raise hub.refusal
     return EXIT_DONE
-
-
-def _box(text: str) -> tuple[float, float, float, float]:
-    try:
-        x, y, w, h = (float(part) for part in text.split(","))
-    except ValueError:
-        raise InputError(f"--target {text!r} is not four numbers", remedy="give x,y,w,h in pixels") from None
-    if not (w > 0 and h > 0):
-        raise InputError(f"--target {text!r} has no size", remedy="give x,y,w,h in pixels, w and h above 0")
-    return x, y, w, h
 
 
 def _webcams(cameras: str) -> dict[str, Device]:

@@ -6,12 +6,12 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, NoReturn
 
 from deploy.agents.signals import stop_on_signals
-from deploy.config.agents import RouterConfig, effective_toml, load
+from deploy.commands.common import PrintConfig
+from deploy.config.agents import RouterConfig
+from deploy.config.file import effective_toml, load
 from protocols.core.errors import EXIT_BUG, EXIT_DONE
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ _RESTARTS = "SYNCLINE_ROUTER_RESTARTS"
 """Environment variable that carries the restart count over an exec; informational only."""
 
 
-def router(config: Path, /, *, print_config: Annotated[bool, Parameter(negative="")] = False) -> int:
+def router(config: Path, /, *, print_config: PrintConfig = False) -> int:
     """Run a router: agents in client mode connect to it, and it relays messages between them.
 
     It sends itself a test message four times a second. If none arrives for 0.9 s it restarts in place; agents
@@ -35,8 +35,6 @@ def router(config: Path, /, *, print_config: Annotated[bool, Parameter(negative=
     config
         TOML file: id, site, [bus] with listen (default tcp/127.0.0.1:7447), connect for other routers, and the tls and
         access settings that `syncline keys issue --role router` writes.
-    print_config
-        Print the configuration with all defaults filled in, and exit.
     """
     settings = load(config, RouterConfig)
     if print_config:

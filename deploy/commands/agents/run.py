@@ -7,21 +7,21 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Any
 
 from deploy.agents.signals import stop_on_signals
-from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig, effective_toml, load
+from deploy.commands.common import PrintConfig
+from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig
+from deploy.config.file import effective_toml, load
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import EXIT_BUG, EXIT_DONE
 
 if TYPE_CHECKING:
     from deploy.agents.systemd_notify import Notifier
 
-_PROGRESS_S = 5.0
-PrintConfig = Annotated[bool, Parameter(negative="")]
+_PROGRESS_S = 5.0  # between two lines of an agent that waits
 
 
 def camera(config: Path, /, *, print_config: PrintConfig = False) -> int:
@@ -34,20 +34,8 @@ def camera(config: Path, /, *, print_config: PrintConfig = False) -> int:
     config
         TOML file: id, site, [bus], driver ("simulated", "video", "usb", "picamera2", "rtsp", "oak" or "log") with its
         table, detector, [marker], rig.
-    print_config
-        Show the configuration with all defaults filled in, and stop.
     """
-    settings = load(config, CameraConfig)
-    if print_config:
-        print(effective_toml(settings), end="")
-        return EXIT_DONE
-
-    def start(bus: Any, stop: Any, beat: Any) -> int:
-        from deploy.agents.assembly import start_camera  # imported late, so that configuration errors are reported fast
-
-        return start_camera(settings, bus, stop, beat)
-
-    return _with_bus(settings, start)
+    return _run(config, CameraConfig, print_config, "deploy.agents.assembly", "start_camera")
 
 
 def uav(config: Path, /, *, print_config: PrintConfig = False) -> int:
@@ -62,18 +50,10 @@ def uav(config: Path, /, *, print_config: PrintConfig = False) -> int:
     config
         TOML file: id, site, [bus], rig, driver ("simulated", "video" or "oak") with its table, mount, [mavlink],
         [control], [video_out], [images].
-    print_config
-        Show the configuration with all defaults filled in, and stop.
     """
     from deploy.config.uav import UavConfig
 
-    settings = load(config, UavConfig)
-    if print_config:
-        print(effective_toml(settings), end="")
-        return EXIT_DONE
-    from deploy.agents.uav import start_uav
-
-    return _with_bus(settings, lambda bus, stop, beat: start_uav(settings, bus, stop, beat))
+    return _run(config, UavConfig, print_config, "deploy.agents.uav", "start_uav")
 
 
 def hub(config: Path, /, *, print_config: PrintConfig = False) -> int:
@@ -85,20 +65,8 @@ def hub(config: Path, /, *, print_config: PrintConfig = False) -> int:
     ----------
     config
         TOML file: id, site, [bus], rig (optional rig.toml), out (optional folder), window_s, interval_s.
-    print_config
-        Show the configuration with all defaults filled in, and stop.
     """
-    settings = load(config, HubConfig)
-    if print_config:
-        print(effective_toml(settings), end="")
-        return EXIT_DONE
-
-    def start(bus: Any, stop: Any, beat: Any) -> int:
-        from deploy.agents.assembly import start_hub
-
-        return start_hub(settings, bus, stop, beat)
-
-    return _with_bus(settings, start)
+    return _run(config, HubConfig, print_config, "deploy.agents.assembly", "start_hub")
 
 
 def record(config: Path, /, *, print_config: PrintConfig = False) -> int:
@@ -111,25 +79,17 @@ def record(config: Path, /, *, print_config: PrintConfig = False) -> int:
     config
         TOML file: id, site, [bus], out (a .mcap file, or a folder for files named by start time), part_s, part_mb,
         keep_days, keep_mb, keep_free_mb, min_free_mb, foxglove.
-    print_config
-        Show the configuration with all defaults filled in, and stop.
     """
-    settings = load(config, RecorderConfig)
+    return _run(config, RecorderConfig, print_config, "deploy.agents.recorder_commands", "start_recorder")
+
+
+def _run(config: Path, kind: type[Any], print_config: bool, module: str, start: str) -> int:
+    """Read a configuration and run its agent; ``start`` is imported late, so that errors in it are reported fast."""
+    settings = load(config, kind)
     if print_config:
         print(effective_toml(settings), end="")
         return EXIT_DONE
-    from deploy.agents.recorder_commands import record_on_command
-
-    def start(bus: Any, stop: Any, beat: Any) -> int:
-        result = record_on_command(settings, bus, stop, beat=beat, report=lambda line: print(line, flush=True))
-        print(f"recorded {result.messages} messages to {result.path}" + _more_parts(result.parts))
-        return EXIT_DONE
-
-    return _with_bus(settings, start)
-
-
-def _more_parts(parts: int) -> str:
-    return f" and {parts - 1} more parts" if parts > 1 else ""
+    return _with_bus(settings, lambda *given: getattr(import_module(module), start)(settings, *given))
 
 
 def _with_bus(settings: Any, start: Any) -> int:

@@ -6,17 +6,14 @@ import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from cyclopts import Parameter
-
+from deploy.commands.common import Flag, Json, answer, open_browser
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import EXIT_BUG, EXIT_DONE, InputError
 
 if TYPE_CHECKING:
     from hub.view.server import ViewServer
-
-_Flag = Annotated[bool, Parameter(negative="")]
 
 
 def view(
@@ -28,10 +25,10 @@ def view(
     port: int = 8080,
     listen: str = "127.0.0.1",
     token: str = "",
-    look_only: _Flag = False,
-    browser: _Flag = False,
+    look_only: Flag = False,
+    browser: Flag = False,
     rerun: Path | None = None,
-    json: _Flag = False,
+    json: Json = False,
 ) -> int:
     """Show a rig in a browser: cameras, trajectories, uncertainty, and missing coverage of each camera.
 
@@ -68,8 +65,6 @@ def view(
         Also open the browser.
     rerun
         Write a .rrd file for the rerun viewer from a log or a calibration instead of serving (needs rerun-sdk).
-    json
-        Print the address as JSON.
     """
     recording = None if source is None or source.suffix == ".toml" else _recording(source)
     if rerun is not None:
@@ -140,7 +135,8 @@ def _bus(source: Path | None, connect: tuple[str, ...], site: str) -> tuple[BusC
         config = BusConfig(mode="client", connect=connect)
         config.endpoints()
         return config, site or "local"
-    from deploy.config.agents import ViewConfig, load
+    from deploy.config.agents import ViewConfig
+    from deploy.config.file import load
 
     settings = load(source, ViewConfig)
     bus = _local_bus(settings.bus) if not connect else BusConfig(mode="client", connect=connect)
@@ -174,15 +170,7 @@ def _server(listen: str, port: int, token: str, look_only: bool) -> Callable[[An
 
 def _announce(shown: ViewServer, browser: bool, json: bool) -> ViewServer:
     """Print the address of the page, and open a browser if requested."""
-    if json:
-        import json as json_module
-
-        print(json_module.dumps({"address": shown.address, "port": shown.port}), flush=True)
-    else:
-        print(f"open {shown.address}   (Ctrl-C ends it)", flush=True)
+    answer({"address": shown.address, "port": shown.port}, [f"open {shown.address}   (Ctrl-C ends it)"], json)
     if browser:
-        import webbrowser
-
-        if not webbrowser.open(shown.address):
-            print("syncline: no browser could be opened here", file=sys.stderr)
+        open_browser(shown.address)
     return shown

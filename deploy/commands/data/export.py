@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from cyclopts import Parameter
-
-from protocols.core.errors import EXIT_DONE, InputError
+from deploy.commands.common import Json, UnusedSeed, answer, check_file, closing_lines
+from protocols.core.errors import InputError
 
 
 def export(
@@ -31,8 +30,8 @@ def export(
     | None = None,
     out: Path,
     units: Literal["m", "cm", "mm"] = "m",
-    json: Annotated[bool, Parameter(negative="")] = False,
-    seed: int = 0,
+    json: Json = False,
+    seed: UnusedSeed = 0,
 ) -> int:
     """Write a calibration or a trajectory in another tool's format, or a log as a session folder.
 
@@ -59,10 +58,6 @@ def export(
         The folder for opencv, ros, colmap and session; the file for all others.
     units
         Length unit of a trajectory, for trc and c3d.
-    json
-        Print a summary as JSON.
-    seed
-        Accepted for consistency; this command uses no random numbers.
     """
     from deploy.offline import exports
     from protocols.core.files import check_folder, write_together
@@ -89,8 +84,8 @@ def export(
         assert to is not None
         if to in exports.IN_FOLDERS:
             check_folder(out)
-        elif out.is_dir():
-            raise InputError("this is a folder, but a file is needed", file=out, remedy="give --out the name of a file")
+        else:
+            check_file(out, "a file")
         texts: dict[Path, str] = {}
         if to == "c3d":
             exports.write_c3d(source, out, units)
@@ -100,14 +95,5 @@ def export(
             texts, warnings = exports.calibration_files(source, to, out)
         write_together(texts)
         files, summary = list(texts) or [out], ""
-    if json:
-        import json as json_module
-
-        print(json_module.dumps({"files": [str(file) for file in files], "warnings": list(warnings)}))
-        return EXIT_DONE
-    if summary:
-        print(summary)
-    for warning in warnings:
-        print(f"warning: {warning}")
-    print(f"written: {', '.join(str(file) for file in files)}")
-    return EXIT_DONE
+    document = {"files": [str(file) for file in files], "warnings": list(warnings)}
+    return answer(document, [*([summary] if summary else []), *closing_lines(warnings, files)], json)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from cyclopts import Parameter
-
-from protocols.core.errors import EXIT_DONE, InputError
+from deploy.commands.common import Json, answer, check_file, check_range, check_rate, closing_lines, parse_size
+from protocols.core.errors import InputError
 from protocols.core.ranges import MAX_IMAGE_SIDE
 
 
@@ -48,7 +46,7 @@ def import_(
     calibration: Path | None = None,
     arrival_delay_ms: float = 0.0,
     arrival_jitter_ms: float = 0.0,
-    json: Annotated[bool, Parameter(negative="")] = False,
+    json: Json = False,
     seed: int = 0,
 ) -> int:
     """Convert another tool's calibration or 2-D tracks, or a session folder.
@@ -101,25 +99,20 @@ def import_(
     arrival_jitter_ms
         With --calibration: standard deviation of a normal distribution, whose magnitude is added to each delay. A
         camera's frames keep their order.
-    json
-        Print a summary as JSON.
     seed
         Seed of the jitter.
     """
     if not sources:
         raise InputError("nothing to import", remedy="give files, or a folder")
-    if out.is_dir():
-        raise InputError("this is a folder, but a file is needed", file=out, remedy="give --out the name of a file")
-    if fps is not None and not 0.1 <= fps <= 10_000:
-        raise InputError(f"--fps {fps:g} is out of range", remedy="give the frame rate in Hz")
-    if not 0.0 <= likelihood <= 1.0:
-        raise InputError(f"--likelihood {likelihood:g} is out of range", remedy="give 0 to 1")
+    check_file(out, "a file")
+    check_rate(fps)
+    check_range("--likelihood", likelihood, 0.0, 1.0)
     if fps is not None and videos is not None:
         raise InputError("--fps and --videos each give the frames' times", remedy="keep one")
     if calibration is None and (arrival_delay_ms or arrival_jitter_ms):
         raise InputError("arrival times need the cameras' clocks", remedy="give --calibration CALIB.toml")
-    if not (0.0 <= arrival_delay_ms <= 1e6 and 0.0 <= arrival_jitter_ms <= 1e6):
-        raise InputError("the arrival's delay or jitter is out of range", remedy="give milliseconds, 0 or more")
+    for option, value in (("--arrival-delay-ms", arrival_delay_ms), ("--arrival-jitter-ms", arrival_jitter_ms)):
+        check_range(option, value, 0.0, 1e6, "give milliseconds, 0 or more")
     from deploy.offline import imports
     from protocols.core.files import write_atomically
     from protocols.session.folder import read_folder, write_observations
@@ -151,7 +144,9 @@ def import_(
         summary = f"{len(rig.cameras)} cameras, {len(seen)} observations, {count} messages"
         cameras = list(rig.cameras)
     elif source.kind in imports.POINTS:
-        tables = imports.camera_tables(videos, _parsed_size(size), fps)
+        remedy = "give width x height in pixels: 1920x1080"
+        wanted = None if size is None else parse_size("--size", size, remedy, 1, MAX_IMAGE_SIDE)
+        tables = imports.camera_tables(videos, wanted, fps)
         seen = imports.read_points(source, imports.frame_clock(fps, videos), likelihood, camera, tables)
         write_observations(out, seen)
         imports.write_missing_rig(out.parent, seen.cameras, tables)
@@ -170,26 +165,8 @@ def import_(
             f"{len(foreign.cameras)} cameras ({', '.join(foreign.cameras)}), {posed} with poses, {timed} with clocks"
         )
         cameras = list(foreign.cameras)
-    if json:
-        import json as json_module
-
-        document = {"out": str(out), "format": source.kind, "cameras": cameras, "warnings": list(warnings)}
-        print(json_module.dumps(document, allow_nan=False))
-        return EXIT_DONE
-    print(f"{source.kind}: {summary}")
-    for warning in warnings:
-        print(f"warning: {warning}")
-    print(f"written: {out}")
-    return EXIT_DONE
-
-
-def _parsed_size(size: str | None) -> tuple[int, int] | None:
-    if size is None:
-        return None
-    found = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", size.strip())
-    if found is None or not all(1 <= int(side) <= MAX_IMAGE_SIDE for side in found.groups()):
-        raise InputError(f"--size {size} is no image size", remedy="give width x height in pixels: 1920x1080")
-    return int(found[1]), int(found[2])
+    document = {"out": str(out), "format": source.kind, "cameras": cameras, "warnings": list(warnings)}
+    return answer(document, [f"{source.kind}: {summary}", *closing_lines(warnings, [out])], json)
 
 
 def _check_suffix(kind: str, out: Path) -> None:

@@ -8,10 +8,11 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from deploy.commands.common import Flag, Json, answer
 from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
 
 
-def info(path: Path, /, *, json: Annotated[bool, Parameter(negative="")] = False) -> int:
+def info(path: Path, /, *, json: Json = False) -> int:
     """Show the contents of a log (topics, counts, times, damage) or of a session folder.
 
     Example: syncline info demo-out/demo.mcap
@@ -20,8 +21,6 @@ def info(path: Path, /, *, json: Annotated[bool, Parameter(negative="")] = False
     ----------
     path
         A .mcap log, the folder or the first part of a log in several files, or a session folder.
-    json
-        Print the description as JSON.
     """
     from protocols.log.read.session import is_log
 
@@ -36,17 +35,14 @@ def info(path: Path, /, *, json: Annotated[bool, Parameter(negative="")] = False
 
     description = describe_log(path)
     if json:
-        import json as json_module
-
-        print(json_module.dumps(asdict(description)))
-        return EXIT_DONE
+        return answer(asdict(description), (), json)
     from deploy.offline.outputs import wide_console
 
     wide_console(markup=True).print(as_table(description))
     return EXIT_DONE
 
 
-def recover(log: Path, /, *, out: Path, json: Annotated[bool, Parameter(negative="")] = False) -> int:
+def recover(log: Path, /, *, out: Path, json: Json = False) -> int:
     """Recover a log that is damaged, truncated or was never closed, and report what was lost.
 
     Example: syncline recover flight.mcap --out fixed.mcap
@@ -59,36 +55,30 @@ def recover(log: Path, /, *, out: Path, json: Annotated[bool, Parameter(negative
         The .mcap log; the folder or the first part of a log in several files, which are merged.
     out
         The new log; must not exist.
-    json
-        Print what was recovered and lost as JSON.
     """
     from protocols.log.read.recovery import recover as make_whole
 
     recovery = make_whole(log, out)
-    if json:
-        import json as json_module
-        from dataclasses import asdict
+    from dataclasses import asdict
 
-        print(json_module.dumps(asdict(recovery)))
-        return EXIT_DONE
     parts = f" from {recovery.parts} parts" if recovery.parts > 1 else ""
-    print(
+    lines = [
         f"{recovery.path}: {recovery.messages} messages, {recovery.duration_s:.1f} s{parts}, "
         f"{recovery.bytes / 1e6:.2f} MB; read back and verified"
-    )
+    ]
     if recovery.damage:
-        print(f"damage: {recovery.damage}")
-    for key, count in recovery.missing.items():
-        print(f"lost: {count} messages of {key}")
+        lines.append(f"damage: {recovery.damage}")
+    lines += [f"lost: {count} messages of {key}" for key, count in recovery.missing.items()]
     if recovery.skipped_bytes:
-        print(f"lost: {recovery.skipped_bytes} bytes that are no records")
+        lines.append(f"lost: {recovery.skipped_bytes} bytes that are no records")
     if recovery.cut:
-        print("lost: what its writer had not yet brought to the disk at the end (a recorder does so twice a second)")
+        when = "at the end (a recorder does so twice a second)"
+        lines.append(f"lost: what its writer had not yet brought to the disk {when}")
     if recovery.foreign:
-        print(f"left out: {recovery.foreign} messages of channels that are not Syncline's")
+        lines.append(f"left out: {recovery.foreign} messages of channels that are not Syncline's")
     if not recovery.damage and not recovery.missing:
-        print("nothing was lost")
-    return EXIT_DONE
+        lines.append("nothing was lost")
+    return answer(asdict(recovery), lines, json)
 
 
 def replay(
@@ -97,7 +87,7 @@ def replay(
     *,
     rate: str = "1",
     start: float = 0.0,
-    loop: Annotated[bool, Parameter(negative="")] = False,
+    loop: Flag = False,
     topics: Annotated[list[str] | None, Parameter(consume_multiple=True, negative="")] = None,
     compare: Path | None = None,
     tolerance: list[str] | None = None,
@@ -106,7 +96,7 @@ def replay(
     calibration: Path | None = None,
     site: str = "local",
     connect: list[str] | None = None,
-    json: Annotated[bool, Parameter(negative="")] = False,
+    json: Json = False,
 ) -> int:
     """Publish the messages of a log on the bus at their recorded times, or compare two logs.
 
@@ -143,8 +133,6 @@ def replay(
         Site to publish on.
     connect
         Endpoints of the bus, such as tcp/127.0.0.1:7447.
-    json
-        Print the count as JSON.
     """
     try:
         speed = 0.0 if rate == "max" else float(rate)
@@ -177,8 +165,7 @@ def replay(
             from deploy.logs.replay_hub import replay_through_hub
 
             count = replay_through_hub(log, out, calibration=calibration)
-        print(f'{{"written": {count}}}' if json else f"{count} messages written to {out}")
-        return EXIT_DONE
+        return answer({"written": count}, [f"{count} messages written to {out}"], json)
     if compare is not None:
         return _compare(log, compare, topics, tolerance or [], as_json=json)
     if not 0.0 <= start < 1e9:
@@ -199,8 +186,7 @@ def replay(
             count = play(log, bus, rate=speed, start_s=start, loop=loop, topics=topics, stop=stop)
     except BusStopped:
         count = 0
-    print(f'{{"published": {count}}}' if json else f"{count} messages published")
-    return EXIT_DONE
+    return answer({"published": count}, [f"{count} messages published"], json)
 
 
 def _compare(log: Path, other: Path, topics: list[str] | None, tolerances: list[str], as_json: bool) -> int:
@@ -209,9 +195,7 @@ def _compare(log: Path, other: Path, topics: list[str] | None, tolerances: list[
 
     comparison = compare_logs(log, other, parse_tolerances(tolerances), topics)
     if as_json:
-        import json as json_module
-
-        print(json_module.dumps(to_json(comparison)))
+        answer(to_json(comparison), (), as_json)
     else:
         from deploy.offline.outputs import wide_console
 

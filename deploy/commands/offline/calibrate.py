@@ -7,11 +7,10 @@ import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
-
-from cyclopts import Parameter
+from typing import Literal
 
 from deploy.agents.malloc_tuning import retain_freed_memory
+from deploy.commands.common import Flag, Json
 from deploy.offline.progress import progress_bar
 from protocols.core.errors import EXIT_DONE, InputError, Refused
 from protocols.core.files import check_folder
@@ -27,12 +26,12 @@ def calibrate(
     observations: Path | None = None,
     solver: Literal["joint", "distributed", "paper"] = "joint",
     from_known: Path | None = None,
-    refine_lenses: Annotated[bool, Parameter(negative="")] = False,
+    refine_lenses: Flag = False,
     marker: Path | None = None,
     detector: str | None = None,
     height: float | None = None,
     limb: str | None = None,
-    json: Annotated[bool, Parameter(negative="")] = False,
+    json: Json = False,
     seed: int = 0,
 ) -> int:
     """Estimate clock offset and pose of each camera of a session, and the trajectory of the moving target.
@@ -79,8 +78,6 @@ def calibrate(
         For keypoints of a person: the height [rig units], which gives the scale by thighs and shanks (about 3 %).
     limb
         The distance between two labels, as left_knee-left_ankle=0.41 [rig units]: gives the scale.
-    json
-        Print the result as JSON on standard output.
     seed
         Seed of the pose nodes' random samples (--solver distributed); the other solvers use no random numbers.
     """

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from cyclopts import Parameter
-
+from deploy.commands.common import (
+    Flag,
+    Json,
+    UnusedSeed,
+    answer,
+    check_file,
+    check_range,
+    check_rate,
+    closing_lines,
+    parse_box,
+    refuse,
+)
 from deploy.offline.progress import progress_bar
-from protocols.core.errors import EXIT_DONE, InputError, Refused
+from protocols.core.errors import InputError, Refused
 from protocols.core.names import check_name, name_from_file
 
 _REMEDIES = {
@@ -31,7 +41,7 @@ def detect(
     mode: Literal["colour", "bright", "tag"] = "colour",
     threshold: int | None = None,
     dictionary: str | None = None,
-    teach: Annotated[bool, Parameter(negative="")] = False,
+    teach: Flag = False,
     target: str | None = None,
     start: int = 0,
     marker: Path | None = None,
@@ -41,8 +51,8 @@ def detect(
     overlay: Path | None = None,
     background: Literal["mog2", "knn"] = "mog2",
     detector: str | None = None,
-    json: Annotated[bool, Parameter(negative="")] = False,
-    seed: int = 0,
+    json: Json = False,
+    seed: UnusedSeed = 0,
 ) -> int:
     """Detect a marker, people or vehicles in every frame of a video, and write the times and pixels.
 
@@ -105,22 +115,16 @@ def detect(
     detector
         For people and vehicles: the .toml file of an ONNX network, or the name of a detector that another package
         registers, in place of the shipped one.
-    json
-        Print a summary as JSON.
-    seed
-        Accepted by every command; nothing here is random.
     """
     shown = {"--teach": teach or None, "--target": target, "--marker": marker, "--colour": colour, "--rig": rig}
-    if what != "marker" and (useless := [option for option, value in shown.items() if value is not None]):
-        raise InputError(f"{useless[0]} cannot be used with `detect {what}`", remedy="leave it out")
+    if what != "marker":
+        refuse(shown, f"`detect {what}`")
     _check_mode(what, mode, shown, threshold, dictionary)
     if detector is not None and (what == "marker" or background != "mog2"):
         other = "`detect marker`" if what == "marker" else "--background"
         raise InputError(f"--detector cannot be used with {other}", remedy="leave one of them out")
-    if fps is not None and not 0.1 <= fps <= 10_000:
-        raise InputError(f"--fps {fps:g} is out of range", remedy="give the frame rate in Hz")
-    if out.is_dir():
-        raise InputError("this is a folder, but a file is needed", file=out, remedy="give --out the name of a CSV file")
+    check_rate(fps)
+    check_file(out, "a CSV file")
     if overlay is not None and (overlay.is_dir() or not overlay.parent.is_dir()):
         raise InputError("cannot be written", file=overlay, remedy="give --overlay a file in a folder that exists")
     if teach != (target is not None):
@@ -128,7 +132,7 @@ def detect(
         raise InputError("--teach and --target go together", remedy=remedy)
     if sum((teach, marker is not None, colour is not None)) > 1:
         raise InputError("--teach, --marker and --colour each say what the marker looks like", remedy="keep one")
-    from deploy.offline.track import choose_camera, parse_target
+    from deploy.offline.track import choose_camera
     from edge.detectors.marker.ball import MarkerModel
     from edge.devices.playback.video_reader import VideoReader
     from edge.offline.video import MARKER_FILE, detect_video, learn_marker_from_frame, marker_toml
@@ -138,8 +142,7 @@ def detect(
     files: dict[Path, str] = {}
     model: MarkerModel | Path | None = marker
     if target is not None:
-        box = parse_target(target)
-        model = learn_marker_from_frame(VideoReader(video, fps), (box.x, box.y, box.width, box.height), start)
+        model = learn_marker_from_frame(VideoReader(video, fps), parse_box(target), start)
         files[out.parent / MARKER_FILE] = marker_toml(model)
     elif colour is not None:
         model = MarkerModel.of_colour(*_colour(colour))
@@ -165,46 +168,36 @@ def detect(
         raise Refused(f"{video}: no {what} in any of {found.frames} frames; {remedy}")
     write_together({**files, out: found.to_csv()})
     warnings = [f"{video}: {warning}" for warning in found.warnings]
-    if json:
-        import json as json_module
-
-        document = {
-            "out": str(out),
-            "files": [str(file) for file in (*files, out, *([overlay] if overlay else []))],
-            "labels": sorted({row.split(",")[6] for row in found.rows}),
-            "camera": name,
-            "size": list(found.size),
-            "fps": found.fps,
-            "frames": found.frames,
-            "frames_with_detection": found.frames_with_detection,
-            "corrupt": found.corrupt,
-            "repaired": found.repaired,
-            "warnings": warnings,
-        }
-        print(json_module.dumps(document, allow_nan=False))
-        return EXIT_DONE
-    if overlay is not None:
-        files[overlay] = ""
-    print(f"{name}: seen in {found.frames_with_detection} of {found.frames} frames, {found.fps:.3f} frames a second")
-    for warning in warnings:
-        print(f"warning: {warning}")
-    print(f"written: {', '.join(str(file) for file in (out, *files))}")
-    return EXIT_DONE
+    document = {
+        "out": str(out),
+        "files": [str(file) for file in (*files, out, *([overlay] if overlay else []))],
+        "labels": sorted({row.split(",")[6] for row in found.rows}),
+        "camera": name,
+        "size": list(found.size),
+        "fps": found.fps,
+        "frames": found.frames,
+        "frames_with_detection": found.frames_with_detection,
+        "corrupt": found.corrupt,
+        "repaired": found.repaired,
+        "warnings": warnings,
+    }
+    frames = f"{found.frames_with_detection} of {found.frames} frames"
+    written = [out, *files, *([overlay] if overlay else [])]
+    lines = [f"{name}: seen in {frames}, {found.fps:.3f} frames a second", *closing_lines(warnings, written)]
+    return answer(document, lines, json)
 
 
 def _check_mode(
     what: str, mode: str, shown: Mapping[str, object], threshold: int | None, dictionary: str | None
 ) -> None:
     """Check that the options fit together. Raises InputError."""
-    if mode != "colour" and what != "marker":
-        raise InputError(f"--mode cannot be used with `detect {what}`", remedy="leave it out")
-    if mode != "colour" and (useless := [option for option, value in shown.items() if value is not None]):
-        raise InputError(f"{useless[0]} cannot be used with a marker of --mode {mode}", remedy="leave it out")
+    if mode != "colour":
+        refuse({"--mode": None if what == "marker" else mode}, f"`detect {what}`")
+        refuse(shown, f"a marker of --mode {mode}")
     for option, value, owner in (("--threshold", threshold, "bright"), ("--dictionary", dictionary, "tag")):
         if value is not None and mode != owner:
             raise InputError(f"{option} belongs to --mode {owner}", remedy=f"add --mode {owner}, or leave it out")
-    if threshold is not None and not 30 <= threshold <= 254:
-        raise InputError(f"--threshold {threshold} is out of range", remedy="give a grey level from 30 to 254")
+    check_range("--threshold", threshold, 30, 254, "give a grey level from 30 to 254")
 
 
 def _colour(text: str) -> tuple[int, int, int]:

@@ -6,12 +6,11 @@ import resource
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from cyclopts import Parameter
-
+from deploy.commands.common import Json, answer, check_range, closing_lines
 from deploy.offline.progress import progress_bar
-from protocols.core.errors import EXIT_DONE, InputError, Refused
+from protocols.core.errors import InputError, Refused
 from protocols.core.files import check_folder, write_together
 
 
@@ -28,7 +27,7 @@ def follow(
     truth: Path | None = None,
     area: str | None = None,
     crops: Path | None = None,
-    json: Annotated[bool, Parameter(negative="")] = False,
+    json: Json = False,
     seed: int = 0,
 ) -> int:
     """Follow people or vehicles through all cameras of a calibrated rig, offline.
@@ -73,14 +72,11 @@ def follow(
     crops
         A folder for pictures of the heads, faces and torsos of the followed people, one folder a track. Needs videos,
         or a log with pictures.
-    json
-        Print result.json on standard output.
     seed
         Seed of detectors that use random numbers; it stands in result.json.
     """
     check_folder(out)
-    if fps is not None and not 0.01 <= fps <= 1000.0:
-        raise InputError(f"--fps {fps:g} is out of range", remedy="give the rows a second, 0.01 to 1000")
+    check_range("--fps", fps, 0.01, 1000.0, "give the rows a second, 0.01 to 1000")
     if area is not None and truth is None:
         raise InputError("--area goes with --truth", remedy="leave it out, or give --truth truth.csv")
     if crops is not None:
@@ -166,21 +162,14 @@ def follow(
             out / REPORT: follow_report(result, source, known, document),
         }
     )
-    if json:
-        print(result_text(document), end="")
-        return EXIT_DONE
-    seconds = times[-1] - times[0]
-    print(
-        f"{len(result.tracks)} tracks in {seconds:.1f} s, {len(result.cameras)} cameras, {_cpu_seconds():.1f} s of CPU"
-    )
+    spent, seconds = _cpu_seconds(), times[-1] - times[0]
+    lines = [f"{len(result.tracks)} tracks in {seconds:.1f} s, {len(result.cameras)} cameras, {spent:.1f} s of CPU"]
     for name, camera in result.cameras.items():
-        print(f"{name}: {camera.frames} frames, {camera.detections} detections, {100 * camera.used:.0f} % used")
+        used = f"{100 * camera.used:.0f} % used"
+        lines.append(f"{name}: {camera.frames} frames, {camera.detections} detections, {used}")
     if scores is not None:
-        print(", ".join(f"{name.upper()} {_shown(scores[name])}" for name in ("moda", "mota", "idf1", "hota")))
-    for warning in warnings:
-        print(f"warning: {warning}")
-    print(f"written: {', '.join(map(str, written))}")
-    return EXIT_DONE
+        lines.append(", ".join(f"{name.upper()} {_shown(scores[name])}" for name in ("moda", "mota", "idf1", "hota")))
+    return answer(document, [*lines, *closing_lines(warnings, written)], json)
 
 
 def _shown(value: float | int | None) -> str:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from cyclopts import Parameter
-
+from deploy.commands.common import Flag, Json, UnusedSeed, answer, check_file, check_range, closing_lines, parse_size
 from deploy.offline.progress import progress_bar
-from protocols.core.errors import EXIT_DONE, InputError
+from protocols.core.errors import InputError
 from protocols.core.names import check_name, name_from_file
 
 _MAX_FRAMES = 250  # most frames in which the board is searched
@@ -26,11 +24,11 @@ def intrinsics(
     squares: str = "8x5",
     dictionary: str = "4X4_50",
     ratio: float = 0.75,
-    fisheye: Annotated[bool, Parameter(negative="")] = False,
+    fisheye: Flag = False,
     field_of_view: float | None = None,
     model: str | None = None,
-    json: Annotated[bool, Parameter(negative="")] = False,
-    seed: int = 0,
+    json: Json = False,
+    seed: UnusedSeed = 0,
 ) -> int:
     """Calibrate a camera's intrinsics (camera matrix and distortion) with a printed board, into a rig.toml.
 
@@ -69,22 +67,12 @@ def intrinsics(
         Without a board: horizontal field of view in degrees, from the data sheet; distortion is assumed to be zero.
     model
         Without a board: the camera model, such as gopro-wide, oak-d, pixel-main, logitech-c920, raspberry-pi-camera-3.
-    json
-        Print a summary as JSON.
-    seed
-        Accepted for consistency; this command uses no random numbers.
     """
-    if out.is_dir():
-        raise InputError("this is a folder, but a file is needed", file=out, remedy="give --out the name of a rig.toml")
-    numbers = re.fullmatch(r"(\d{1,3})x(\d{1,3})", squares)
-    if numbers is None or min(int(numbers[1]), int(numbers[2])) < 4:
-        raise InputError(f"--squares {squares} is no board", remedy="give squares across x down, at least 4x4: 8x5")
-    if not 0.1 <= ratio < 1.0:
-        raise InputError(f"--ratio {ratio:g} is out of range", remedy="give a marker's side as a share of a square's")
+    check_file(out, "a rig.toml")
+    grid = parse_size("--squares", squares, "give squares across x down, at least 4x4: 8x5", 4, 999)
+    check_range("--ratio", ratio, 0.1, 0.99, "give a marker's side as a share of a square's")
     widest = 175.0 if fisheye else 150.0
-    if field_of_view is not None and not 5.0 <= field_of_view <= widest:
-        what = f"--field-of-view {field_of_view:g} is out of range"
-        raise InputError(what, remedy=f"give 5 to {widest:g} degrees")
+    check_range("--field-of-view", field_of_view, 5.0, widest, f"give 5 to {widest:g} degrees")
     if model is not None and field_of_view is not None:
         raise InputError("--model and --field-of-view each give the field of view", remedy="keep one")
     from edge.detectors.board.description import Board, check_board
@@ -107,7 +95,6 @@ def intrinsics(
     elif field_of_view is not None:
         lens, guess_std = intrinsics_from_field_of_view(reader.info.size, field_of_view, fisheye), FIELD_OF_VIEW_STD
     else:
-        grid = int(numbers[1]), int(numbers[2])
         described = Board(board, grid, dictionary, ratio)
         check_board(described)
         total = reader.info.frames
@@ -133,33 +120,28 @@ def intrinsics(
     if guess_std:
         table["focal_std"] = guess_std
     write_atomically(out, _completed(out, name, table))
-    if json:
-        import json as json_module
-
-        document: dict[str, Any] = {"out": str(out), "camera": name, **table, "fisheye": lens.fisheye}
-        if fit is not None:
-            document |= {
-                "views": fit.views,
-                "rms_px": fit.rms_px,
-                "focal_std": fit.focal_std,
-                "coverage": fit.coverage,
-                "cells": fit.cells.tolist(),
-            }
-        print(json_module.dumps(document, allow_nan=False))
-        return EXIT_DONE
-    model = "fisheye" if lens.fisheye else "pinhole"
+    document: dict[str, Any] = {"out": str(out), "camera": name, **table, "fisheye": lens.fisheye}
+    if fit is not None:
+        document |= {
+            "views": fit.views,
+            "rms_px": fit.rms_px,
+            "focal_std": fit.focal_std,
+            "coverage": fit.coverage,
+            "cells": fit.cells.tolist(),
+        }
+    focal = f"{name}: {'fisheye' if lens.fisheye else 'pinhole'}, focal length"
     if fit is None:
-        print(f"{name}: {model}, focal length {lens.focal:.1f} px ± {100 * guess_std:.0f} % from the field of view")
-        print("approximate: `syncline calibrate` refines it from the marker's motion; a board is more precise")
+        lines = [
+            f"{focal} {lens.focal:.1f} px ± {100 * guess_std:.0f} % from the field of view",
+            "approximate: `syncline calibrate` refines it from the marker's motion; a board is more precise",
+        ]
     else:
-        print(f"{name}: {model}, focal length {lens.focal:.2f} px ± {100 * fit.focal_std:.2g} %, {fit.views} views")
+        lines = [f"{focal} {lens.focal:.2f} px ± {100 * fit.focal_std:.2g} %, {fit.views} views"]
         if guess_std:
-            print(f"approximate: fewer than {MIN_VIEWS} different views; `syncline calibrate` refines it")
-        print(f"corners fit to {fit.rms_px:.3f} px; corners in each part of the image ({100 * fit.coverage:.0f} %):")
-        for row in coverage_map(fit.cells):
-            print(row)
-    print(f"written: {out}")
-    return EXIT_DONE
+            lines.append(f"approximate: fewer than {MIN_VIEWS} different views; `syncline calibrate` refines it")
+        covered = f"corners in each part of the image ({100 * fit.coverage:.0f} %):"
+        lines += [f"corners fit to {fit.rms_px:.3f} px; {covered}", *coverage_map(fit.cells)]
+    return answer(document, [*lines, *closing_lines((), [out])], json)
 
 
 def _completed(file: Path, name: str, table: dict[str, Any]) -> str:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json as json_module
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated
 
-from cyclopts import Parameter
-
+from deploy.commands.common import Flag, Json, answer, closing_lines, open_browser
 from protocols.core.errors import EXIT_DONE, InputError, Refused
 
 
@@ -19,8 +16,8 @@ def report(
     *,
     out: Path | None = None,
     session: Path | None = None,
-    json: Annotated[bool, Parameter(negative="")] = False,
-    browser: Annotated[bool, Parameter(negative="")] = False,
+    json: Json = False,
+    browser: Flag = False,
 ) -> int:
     """Write report.html for a result folder, a session or a log: the quality assessment first, then the evidence.
 
@@ -40,8 +37,6 @@ def report(
         The file to write. Default: report.html in the result folder, else in the current folder.
     session
         The session of a result folder, if it has been moved since the calibration.
-    json
-        Print the file and the assessment as JSON.
     browser
         Open the report in a browser.
     """
@@ -71,22 +66,14 @@ def report(
             report_input.observations,
             row_usage(outcome, report_input.rig, report_input.observations),
         )
-    if json:
-        summary = {
-            "report": str(file),
-            "level": assessment.level,
-            "verdict": assessment.headline,
-            "todo": assessment.actions,
-        }
-        print(json_module.dumps(summary, ensure_ascii=False))
-    else:
-        print(assessment.headline)
-        for line in assessment.actions:
-            print(f"to do: {line}")
-        print(f"written: {file}")
+    summary = {
+        "report": str(file),
+        "level": assessment.level,
+        "verdict": assessment.headline,
+        "todo": assessment.actions,
+    }
+    todo = [f"to do: {line}" for line in assessment.actions]
+    answer(summary, [assessment.headline, *todo, *closing_lines((), [file])], json)
     if browser:
-        import webbrowser
-
-        if not webbrowser.open(file.resolve().as_uri()):
-            print("syncline: no browser could be opened here", file=sys.stderr)
+        open_browser(file.resolve().as_uri())
     return EXIT_DONE

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
 
-from cyclopts import Parameter
-
-from protocols.core.errors import EXIT_DONE, InputError
+from deploy.commands.common import Flag, Json, answer, check_range, check_seed, parse_size, refuse
 from protocols.core.files import check_folder
 
-_SECONDS, _NOISE_PX = 60.0, 0.5
+_SECONDS, _NOISE_PX = 60.0, 0.5  # default length; a ball's centre is located this well
 _BODY_NOISE_PX = 2.0  # head tops and foot points are located less precisely than a ball
 _PEOPLE = "people"
 
@@ -32,8 +27,8 @@ def simulate(
     size: str | None = None,
     telemetry_hz: float | None = None,
     people: int | None = None,
-    render: Annotated[bool, Parameter(negative="")] = False,
-    json: Annotated[bool, Parameter(negative="")] = False,
+    render: Flag = False,
+    json: Json = False,
 ) -> int:
     """Write a session of a simulated scene: rig.toml, observations.csv and the ground truth.
 
@@ -81,12 +76,9 @@ def simulate(
         Number of people, 1 to 12 (default 5); only for people.
     render
         Also write every camera's video, cam0.mp4, ...; only for people.
-    json
-        Print what was written as JSON.
     """
     check_folder(out)
-    if seed < 0:
-        raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
+    check_seed(seed)
     marker_options: dict[str, object] = {
         "--seconds": seconds,
         "--cameras": cameras,
@@ -96,20 +88,19 @@ def simulate(
     town_options: dict[str, object] = {"--frames": frames, "--size": size, "--telemetry-hz": telemetry_hz}
     people_options: dict[str, object] = {"--people": people, "--render": render or None}
     if scene.partition(":")[0] == "town":
-        _refuse(marker_options | people_options | {"--drops": drops}, scene)
+        refuse(marker_options | people_options | {"--drops": drops}, f"scene {scene}")
         return _fly(scene, out, seed, frames, size, 30.0 if telemetry_hz is None else telemetry_hz, json)
     unused_options: dict[str, object] = {"--outliers": outliers} if scene == _PEOPLE else people_options
-    _refuse(town_options | unused_options, scene)
+    refuse(town_options | unused_options, f"scene {scene}")
     seconds = _SECONDS if seconds is None else seconds
     if noise_px is None:
         noise_px = _BODY_NOISE_PX if scene == _PEOPLE else _NOISE_PX
     outliers = 0.0 if outliers is None else outliers
-    if cameras is not None and not 2 <= cameras <= 64:
-        raise InputError(f"--cameras {cameras} is out of range", remedy="give 2 to 64")
-    if not 1.0 <= seconds <= 7200.0:
-        raise InputError(f"--seconds {seconds:g} is out of range", remedy="give 1 to 7200")
-    if not 0.0 <= outliers < 1.0 or (drops is not None and not 0.0 <= drops < 1.0) or not 0.0 <= noise_px <= 50.0:
-        raise InputError("--outliers and --drops are shares below 1, --noise-px is 0 to 50", remedy="correct them")
+    check_range("--cameras", cameras, 2, 64)
+    check_range("--seconds", seconds, 1.0, 7200.0)
+    check_range("--outliers", outliers, 0.0, 0.99)
+    check_range("--drops", drops, 0.0, 0.99)
+    check_range("--noise-px", noise_px, 0.0, 50.0)
     if scene == _PEOPLE:
         from deploy.simulation.people import write_people_session
 
@@ -129,45 +120,27 @@ def simulate(
         written = write_simulated_session(
             scene, out, seconds=seconds, cameras=cameras, seed=seed, noise_px=noise_px, outliers=outliers, drops=drops
         )
-    if json:
-        import json as json_module
-
-        print(json_module.dumps({"out": str(out), **written}))
-    else:
-        print(f"{written['cameras']} cameras, {written['rows']} observations in {out}")
-        print(f"next: syncline calibrate {out} --out {out}-result")
-    return EXIT_DONE
-
-
-def _refuse(options: Mapping[str, object], scene: str) -> None:
-    for option, value in options.items():
-        if value is not None:
-            raise InputError(f"{option} cannot be used with scene {scene}", remedy="leave it out")
+    lines = (
+        f"{written['cameras']} cameras, {written['rows']} observations in {out}",
+        f"next: syncline calibrate {out} --out {out}-result",
+    )
+    return answer({"out": str(out), **written}, lines, json)
 
 
 def _fly(
     scene: str, out: Path, seed: int, frames: int | None, size: str | None, telemetry_hz: float, as_json: bool
 ) -> int:
-    wanted = re.fullmatch(r"(\d{1,5})x(\d{1,5})", "640x480" if size is None else size)
-    if wanted is None:
-        raise InputError(f"--size {size} is no size", remedy="give width x height, for example 1280x720")
-    if not 1.0 <= telemetry_hz <= 50.0:
-        raise InputError(f"--telemetry-hz {telemetry_hz:g} is out of range", remedy="give 1 to 50")
+    pixels = parse_size("--size", size or "640x480", "give width x height, for example 1280x720")
+    check_range("--telemetry-hz", telemetry_hz, 1.0, 50.0)
     from deploy.simulation.flight import write_simulated_flight
 
-    pixels = int(wanted[1]), int(wanted[2])
     written = write_simulated_flight(scene, out, seed=seed, frames=frames, size=pixels, rate_hz=telemetry_hz)
-    if as_json:
-        import json
-
-        print(json.dumps({"out": str(out), **written}))
-    else:
-        begin, end = written["out_of_picture"]
-        where = f"the car out of view in frames {begin} to {end - 1}" if end else "the car always in view"
-        print(f"{written['frames']} frames in {written['video']}, {where}")
-        target = ",".join(f"{value:g}" for value in written["target"])
-        print(
-            f"next: syncline track {written['video']} --target {target} --rig {out}/rig.toml "
-            f"--telemetry {out}/telemetry.csv --out {out}-result"
-        )
-    return EXIT_DONE
+    begin, end = written["out_of_picture"]
+    where = f"the car out of view in frames {begin} to {end - 1}" if end else "the car always in view"
+    target = ",".join(f"{value:g}" for value in written["target"])
+    files = f"--rig {out}/rig.toml --telemetry {out}/telemetry.csv --out {out}-result"
+    lines = (
+        f"{written['frames']} frames in {written['video']}, {where}",
+        f"next: syncline track {written['video']} --target {target} {files}",
+    )
+    return answer({"out": str(out), **written}, lines, as_json)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from cyclopts import Parameter
-
+from deploy.commands.common import Json, UnusedSeed, answer, check_range, closing_lines
 from deploy.offline.progress import progress_bar
-from protocols.core.errors import EXIT_DONE, InputError
+from protocols.core.errors import InputError
 
 
 def sync(
@@ -19,8 +18,8 @@ def sync(
     out: Path,
     videos: Literal["retime", "trim", "none"] = "retime",
     fps: float | None = None,
-    json: Annotated[bool, Parameter(negative="")] = False,
-    seed: int = 0,
+    json: Json = False,
+    seed: UnusedSeed = 0,
 ) -> int:
     """Compute the time of every frame of every video on one reference clock, and write synchronised videos.
 
@@ -49,16 +48,11 @@ def sync(
         retime, trim, or none (only the tables).
     fps
         Frame rate of retimed videos; default: the highest frame rate of the videos.
-    json
-        Print a summary as JSON.
-    seed
-        Accepted for consistency; this command uses no random numbers.
     """
     from protocols.core.files import check_folder, file_in, write_together
 
     check_folder(out)
-    if fps is not None and not 0.1 <= fps <= 1000:
-        raise InputError(f"--fps {fps:g} is out of range", remedy="give the frame rate in Hz")
+    check_range("--fps", fps, 0.1, 1000.0, "give the frame rate in Hz")
     if fps is not None and videos == "trim":
         raise InputError("--fps cannot be used with --videos trim", remedy="leave one of the two out")
     if out.exists() and folder.exists() and out.resolve() == folder.resolve():
@@ -110,38 +104,29 @@ def sync(
     written = [str(file) for file in files]
     if videos != "none":
         written += [str(out / f"{name}.mp4") for name in done]
-    if json:
-        import json as json_module
-
-        document = {
-            "out": str(out),
-            "files": written,
-            "reference": reference,
-            "fps": rate,
-            "begin": float(grid[0]),
-            "end": float(grid[-1]),
-            "frames": {name: len(video.source_frames) for name, video in done.items()},
-            "largest_error_s": {name: float(abs(video.error).max(initial=0.0)) for name, video in done.items()},
-            "time_offset_std": {name: stds[name] for name in done},
-            "warnings": warnings,
-        }
-        print(json_module.dumps(document, allow_nan=False))
-        return EXIT_DONE
-    print(f"common span: {grid[0]:.3f} to {grid[-1]:.3f} s of the reference clock, {grid[-1] - grid[0]:.3f} s")
+    document = {
+        "out": str(out),
+        "files": written,
+        "reference": reference,
+        "fps": rate,
+        "begin": float(grid[0]),
+        "end": float(grid[-1]),
+        "frames": {name: len(video.source_frames) for name, video in done.items()},
+        "largest_error_s": {name: float(abs(video.error).max(initial=0.0)) for name, video in done.items()},
+        "time_offset_std": {name: stds[name] for name in done},
+        "warnings": warnings,
+    }
+    lines = [f"common span: {grid[0]:.3f} to {grid[-1]:.3f} s of the reference clock, {grid[-1] - grid[0]:.3f} s"]
     for name, video in done.items():
         at = 0.5 * (video.time[0] + video.time[-1])
         lag = known[name].clock_rate * at + known[name].time_offset - at
         std = f" ± {1e3 * stds[name]:.3f} ms" if stds[name] > 0.0 else ""
         text = f"{name}: {len(video.time)} frames, clock {lag:+.4f} s{std} against {reference}"
         if videos == "retime":
-            middle = 1e3 * float(abs(video.error).mean())
-            worst = 1e3 * float(abs(video.error).max())
+            middle, worst = 1e3 * float(abs(video.error).mean()), 1e3 * float(abs(video.error).max())
             text += f"; frames shown up to {worst:.1f} ms (mean {middle:.1f}) from the grid"
-        print(text)
-    for warning in warnings:
-        print(f"warning: {warning}")
-    print(f"written: {', '.join(written)}")
-    return EXIT_DONE
+        lines.append(text)
+    return answer(document, [*lines, *closing_lines(warnings, written)], json)
 
 
 def _readable(path: Path) -> bool:

@@ -6,13 +6,17 @@ from collections import Counter
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from cyclopts import Parameter
-
+from deploy.commands.common import Flag, Json, answer, check_rate, check_seed, closing_lines
 from deploy.offline.progress import progress_bar
-from protocols.core.errors import EXIT_DONE, InputError
+from protocols.core.errors import InputError
 from protocols.core.files import check_folder, write_together
+
+if TYPE_CHECKING:
+    from edge.uav.base import Telemetry
+    from protocols.geometry.camera import Intrinsics
+    from protocols.geometry.types import Floats
 
 
 def track(
@@ -26,9 +30,9 @@ def track(
     telemetry: Path | None = None,
     model: Literal["ground", "paper", "plain"] = "ground",
     fps: float | None = None,
-    overlay: Annotated[bool, Parameter(negative="")] = False,
+    overlay: Flag = False,
     csv_truth: Path | None = None,
-    json: Annotated[bool, Parameter(negative="")] = False,
+    json: Json = False,
     seed: int = 0,
 ) -> int:
     """Track one target in an aerial video, also while it is occluded or out of view, with uncertainty.
@@ -65,19 +69,19 @@ def track(
         Also write overlay.mp4: particles, road and estimate on a canvas larger than the image.
     csv_truth
         Ground truth CSV with frame,x,y[,width,height][,inside][,visible]: prints the track's scores.
-    json
-        Print a summary as JSON.
     seed
         Seed of the tracker's random numbers.
     """
     check_folder(out)
-    _check(video, start, fps, seed)
+    check_seed(seed)
+    check_rate(fps)
+    if start < 0:
+        raise InputError(f"--start {start} is negative", remedy="give the index of a frame, 0 is the first")
     from deploy.evaluation.track_scores import read_truth, score
     from deploy.offline import track as tracking
     from deploy.offline.track_log import LoggedFlightImages, open_recording
     from deploy.offline.track_overlay import Overlay
     from edge.uav import tracker_factory
-    from edge.uav.base import Telemetry
 
     box = tracking.parse_target(target)
     camera = tracking.choose_camera(rig, video) if rig is not None else None
@@ -85,51 +89,19 @@ def track(
     lens = camera.intrinsics if camera is not None else None
     mounting = camera.body_from_camera if camera is not None else None
     warnings: list[str] = []
-    samples: tuple[Telemetry, ...] = ()
-    own_clock = telemetry is not None and telemetry.suffix.lower() in (".tlog", ".mcap")
-    recorded: tracking.TelemetryFile | None = None
-    if telemetry is not None and own_clock:
-        from deploy.offline.telemetry_files import read_telemetry_log
-
-        recorded = read_telemetry_log(telemetry)
-    elif telemetry is not None:
-        recorded = tracking.read_telemetry(telemetry)
     rate = fps
     if rate is None and camera is not None and camera.fps > 0 and video.is_dir():
         rate = camera.fps
     recording, counted = open_recording(video, rate, lens)
-    same_log = False
     if isinstance(recording, LoggedFlightImages):
         lens = recording.lens
         mounting = recording.body_from_camera if mounting is None else mounting
-        same_log = telemetry is not None and telemetry.resolve() == video.resolve()
-    if recorded is not None and telemetry is not None:
-        if model == "ground" and (lens is None or mounting is None):
-            what = "telemetry cannot be used without the camera's matrix and body_from_camera"
-            raise InputError(what, file=telemetry, remedy="give both in --rig, or leave --telemetry out")
-        if recorded.left_out:
-            warnings.append(f"{telemetry}: {recorded.left_out} rows hold no sample and were left out")
-        samples = recorded.samples
     size = (recording.info.width, recording.info.height)
     count = tracking.count_frames(video) if counted is None else counted
-    if recorded is not None and same_log and isinstance(recording, LoggedFlightImages):
-        # The agent has already put both on one clock.
-        first_s = recording.first_s
-        samples = tuple(replace(sample, time=sample.time - first_s) for sample in recorded.samples)
-    elif recorded is not None and own_clock:
-        samples = ()
-        if lens is not None and mounting is not None:
-            from deploy.offline.telemetry_files import align_to_video
-
-            with progress_bar(f"looking for the telemetry's clock in {video.name}", quiet=json) as progress:
-                samples, line = align_to_video(
-                    recorded, video, rate, lens, mounting, lambda i: progress(f"frame {i}", i / count if count else 0.0)
-                )
-            if not samples:
-                warnings.append(line)
-    elif recorded is not None and telemetry is not None:
-        end = count / recording.info.fps if count else float("inf")
-        tracking.check_clock(recorded, telemetry, start / recording.info.fps, end)
+    samples: tuple[Telemetry, ...] = ()
+    if telemetry is not None:
+        flight = _Flight(video, recording, rate, lens, mounting, start, count)
+        samples, warnings = _samples(telemetry, flight, json, model == "ground")
     tracker = tracker_factory.make_tracker(model, size, lens, mounting, recording.info.fps, seed)
     rows: list[tracking.TrackedFrame] = []
     with ExitStack() as stack:
@@ -164,20 +136,59 @@ def track(
     if recording.repaired:
         warnings.append(f"{video}: {recording.repaired} frames have no usable time stamp")
     scores = score(rows, truth, size) if truth is not None else None
-    _print_summary(out, rows, model, seed, overlay, warnings, scores, json)
-    return EXIT_DONE
+    return _summarise(out, rows, model, seed, overlay, warnings, scores, json)
 
 
-def _check(video: Path, start: int, fps: float | None, seed: int) -> None:
-    if start < 0:
-        raise InputError(f"--start {start} is negative", remedy="give the index of a frame, 0 is the first")
-    if seed < 0:
-        raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
-    if fps is not None and not 0.1 <= fps <= 10_000:
-        raise InputError(f"--fps {fps:g} is out of range", remedy="give the frame rate in Hz")
+class _Flight(NamedTuple):
+    """A recording to which telemetry belongs. frames: their number; 0 = not known."""
+
+    video: Path
+    recording: Any
+    rate: float | None
+    lens: Intrinsics | None
+    mounting: Floats | None
+    start: int
+    frames: int
 
 
-def _print_summary(
+def _samples(
+    telemetry: Path, flight: _Flight, quiet: bool, needs_lens: bool
+) -> tuple[tuple[Telemetry, ...], list[str]]:
+    """The telemetry's samples on the video's clock, and warnings. Raises InputError."""
+    from deploy.offline import track as tracking
+    from deploy.offline.telemetry_files import align_to_video, read_telemetry_log
+    from deploy.offline.track_log import LoggedFlightImages
+
+    recording, count, warnings = flight.recording, flight.frames, []
+    own_clock = telemetry.suffix.lower() in (".tlog", ".mcap")
+    recorded = read_telemetry_log(telemetry) if own_clock else tracking.read_telemetry(telemetry)
+    if needs_lens and (flight.lens is None or flight.mounting is None):
+        what = "telemetry cannot be used without the camera's matrix and body_from_camera"
+        raise InputError(what, file=telemetry, remedy="give both in --rig, or leave --telemetry out")
+    if recorded.left_out:
+        warnings.append(f"{telemetry}: {recorded.left_out} rows hold no sample and were left out")
+    samples = recorded.samples
+    if not own_clock:
+        end = count / recording.info.fps if count else float("inf")
+        tracking.check_clock(recorded, telemetry, flight.start / recording.info.fps, end)
+    elif isinstance(recording, LoggedFlightImages) and telemetry.resolve() == flight.video.resolve():
+        # The agent has already put both on one clock.
+        samples = tuple(replace(sample, time=sample.time - recording.first_s) for sample in samples)
+    elif flight.lens is None or flight.mounting is None:
+        samples = ()
+    else:
+        with progress_bar(f"looking for the telemetry's clock in {flight.video.name}", quiet=quiet) as progress:
+
+            def done(frame: int) -> None:
+                progress(f"frame {frame}", frame / count if count else 0.0)
+
+            samples, line = align_to_video(recorded, flight.video, flight.rate, flight.lens, flight.mounting, done)
+        if not samples:
+            warnings.append(line)
+    return samples, warnings
+
+
+def _summarise(
     out: Path,
     rows: list[Any],
     model: str,
@@ -186,37 +197,30 @@ def _print_summary(
     warnings: list[str],
     scores: dict[str, float | int] | None,
     as_json: bool,
-) -> None:
+) -> int:
     """Print the summary: number of frames by state and by frame of reference, scores, and output files."""
     from deploy.offline.track import basis_summary
 
     states = Counter(row.estimate.state.value for row in rows)
     bases = basis_summary(rows)
     names = ["track.csv", "hypotheses.csv", *(["overlay.mp4"] if overlay else [])]
-    if as_json:
-        import json
-
-        document: dict[str, Any] = {
-            "out": str(out),
-            "files": names,
-            "model": model,
-            "seed": seed,
-            "first_frame": rows[0].frame,
-            "frames": len(rows),
-            **{state: states.get(state, 0) for state in ("visible", "coasting", "lost")},
-            "basis": bases,
-            "warnings": warnings,
-        }
-        if scores is not None:
-            document["scores"] = scores
-        print(json.dumps(document, allow_nan=False))
-        return
+    document: dict[str, Any] = {
+        "out": str(out),
+        "files": names,
+        "model": model,
+        "seed": seed,
+        "first_frame": rows[0].frame,
+        "frames": len(rows),
+        **{state: states.get(state, 0) for state in ("visible", "coasting", "lost")},
+        "basis": bases,
+        "warnings": warnings,
+    }
+    if scores is not None:
+        document["scores"] = scores
     parts = ", ".join(f"{states.get(state, 0)} {state}" for state in ("visible", "coasting", "lost"))
-    print(f"{len(rows)} frames from {rows[0].frame}: {parts}")
-    for basis, entry in bases.items():
-        print(f"{basis}: {entry['frames']} frames; {entry['reason']}")
-    for name, value in (scores or {}).items():
-        print(f"{name}: {value}" if isinstance(value, int) else f"{name}: {value:.3f}")
-    for warning in warnings:
-        print(f"warning: {warning}")
-    print(f"written: {', '.join(str(out / name) for name in names)}")
+    lines = [
+        f"{len(rows)} frames from {rows[0].frame}: {parts}",
+        *(f"{basis}: {entry['frames']} frames; {entry['reason']}" for basis, entry in bases.items()),
+        *(f"{name}: {v}" if isinstance(v, int) else f"{name}: {v:.3f}" for name, v in (scores or {}).items()),
+    ]
+    return answer(document, [*lines, *closing_lines(warnings, [out / name for name in names])], as_json)

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from cyclopts import Parameter
-
+from deploy.commands.common import Json, UnusedSeed, answer, check_file, closing_lines
 from deploy.offline.progress import progress_bar
-from protocols.core.errors import EXIT_DONE, InputError
 
 if TYPE_CHECKING:
     from hub.api import TriangulationResult
@@ -21,8 +19,8 @@ def triangulate(
     calibration: Path,
     out: Path,
     observations: Path | None = None,
-    json: Annotated[bool, Parameter(negative="")] = False,
-    seed: int = 0,
+    json: Json = False,
+    seed: UnusedSeed = 0,
 ) -> int:
     """Triangulate the observations of several cameras into 3-D trajectories, with poses, intrinsics and clocks given.
 
@@ -45,13 +43,8 @@ def triangulate(
         position.
     observations
         Another observations file to use instead of the session's own.
-    json
-        Print a summary as JSON.
-    seed
-        Accepted for consistency; this command uses no random numbers.
     """
-    if out.is_dir():
-        raise InputError("this is a folder, but a file is needed", file=out, remedy="give --out the name of a CSV file")
+    check_file(out, "a CSV file")
     from hub.api import triangulate as solve
 
     with progress_bar(f"triangulating {session.name}", quiet=json) as progress:
@@ -60,35 +53,26 @@ def triangulate(
     rig, warnings = result.rig, result.warnings
     scale = str(rig.metadata.get("scale", "metric"))
     unit = rig.units if scale == "metric" else "baselines"
-    if json:
-        import json as json_module
-
-        document = {
-            "out": str(out),
-            "units": rig.units,
-            "scale": scale,
-            "reference": str(rig.metadata.get("reference", next(iter(rig.cameras)))),
-            "rows": sum(len(table.time) for table in result.tables),
-            "labels": {table.label: len(table.time) for table in result.tables},
-            "sigma_px": result.sigma_px,
-            "unused": result.unused,
-            "unplaced": list(result.unplaced),
-            "warnings": list(warnings),
-        }
-        print(json_module.dumps(document, allow_nan=False))
-        return EXIT_DONE
+    document = {
+        "out": str(out),
+        "units": rig.units,
+        "scale": scale,
+        "reference": str(rig.metadata.get("reference", next(iter(rig.cameras)))),
+        "rows": sum(len(table.time) for table in result.tables),
+        "labels": {table.label: len(table.time) for table in result.tables},
+        "sigma_px": result.sigma_px,
+        "unused": result.unused,
+        "unplaced": list(result.unplaced),
+        "warnings": list(warnings),
+    }
+    lines = []
     for table in result.tables:
         span = f"{table.time[0]:.3f} to {table.time[-1]:.3f} s"
         middle = sorted(table.std)[len(table.std) // 2]
-        print(f"{table.label}: {len(table.time)} points, {span}, median std {middle:.2g} {unit}")
-    for label in result.unplaced:
-        print(f"no path: {label} (not seen by two cameras at a time)")
-    for name, reason in result.unused.items():
-        print(f"not used: {name}: {reason}")
-    for warning in warnings:
-        print(f"warning: {warning}")
-    print(f"written: {out}")
-    return EXIT_DONE
+        lines.append(f"{table.label}: {len(table.time)} points, {span}, median std {middle:.2g} {unit}")
+    lines += [f"no path: {label} (not seen by two cameras at a time)" for label in result.unplaced]
+    lines += [f"not used: {name}: {reason}" for name, reason in result.unused.items()]
+    return answer(document, [*lines, *closing_lines(warnings, [out])], json)
 
 
 def _save(result: TriangulationResult, out: Path) -> None:

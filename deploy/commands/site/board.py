@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import json as json_module
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
+from deploy.commands.common import Json, Role, answer
 from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
 
-Flag = Annotated[bool, Parameter(negative="")]
-Role = Literal["router", "recorder", "hub", "camera", "uav"]
+OfRole = Annotated[Role, Parameter(help="The agent's role.")]
+OfId = Annotated[str, Parameter(help="The agent's id.")]
+Root = Annotated[Path, Parameter(help="Root folder of a system image.")]
 
 
 def image(root: Path, /, *, bundle: Path) -> int:
@@ -34,21 +35,15 @@ def image(root: Path, /, *, bundle: Path) -> int:
     return EXIT_DONE
 
 
-def request(*, role: Role, id: str, out: Path | None = None, root: Path = Path("/")) -> int:
+def request(*, role: OfRole, id: OfId, out: Path | None = None, root: Root = Path("/")) -> int:
     """On a board: make a new key, which stays here, and print a signing request for it.
 
     Example: syncline site request --role camera --id cam07 --out /media/stick/requests
 
     Parameters
     ----------
-    role
-        The agent's role.
-    id
-        The agent's id.
     out
         Folder, as on a USB stick, for ROLE-ID.csr instead of printing.
-    root
-        Root folder of a system image.
     """
     from deploy.site.boards import board
     from protocols.core.files import write_atomically
@@ -69,7 +64,7 @@ def accept(
     role: Role | None = None,
     id: str = "",
     time_server: tuple[str, ...] = (),
-    root: Path = Path("/"),
+    root: Root = Path("/"),
 ) -> int:
     """On a board: take the certificate and configuration that `site enrol` made, and install the agent.
 
@@ -85,8 +80,6 @@ def accept(
         The agent's id; default: by the file's name.
     time_server
         NTP servers that this board is to ask.
-    root
-        Root folder of a system image.
     """
     from deploy.site.boards import board
     from deploy.site.boards.transport import unpack
@@ -104,19 +97,10 @@ def accept(
     return EXIT_DONE
 
 
-def restore(*, role: Role, id: str, root: Path = Path("/")) -> int:
+def restore(*, role: OfRole, id: OfId, root: Root = Path("/")) -> int:
     """On a board: return to certificate and configuration before the last `accept`.
 
     Example: sudo syncline site restore --role camera --id cam07
-
-    Parameters
-    ----------
-    role
-        The agent's role.
-    id
-        The agent's id.
-    root
-        Root folder of a system image.
     """
     from deploy.site.boards import board
 
@@ -156,26 +140,20 @@ def update(bundle: Path, /, *, role: Role, id: str, patience: float = 60.0, home
     return EXIT_DONE
 
 
-def ready(*, role: Role, id: str, patience: float = 0.0, root: Path = Path("/"), json: Flag = False) -> int:
+def ready(*, role: OfRole, id: OfId, patience: float = 0.0, root: Path = Path("/"), json: Json = False) -> int:
     """On a board: wait until the agent is ready, and print what it says. Exit status 3 if it is not.
 
     Example: syncline site ready --role camera --id cam07 --patience 60
 
     Parameters
     ----------
-    role
-        The agent's role.
-    id
-        The agent's id.
     patience
         Seconds to wait.
     root
         Root folder of the agent's configuration.
-    json
-        Print JSON.
     """
     from deploy.site.boards import board
 
     good, text = board.ready(role, id, patience, root)
-    print(json_module.dumps({"ready": good, "text": text}) if json else text)
+    answer({"ready": good, "text": text}, [text], json)
     return EXIT_DONE if good else EXIT_REFUSED

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import json as jsons
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from cyclopts import Parameter
-
-from protocols.core.errors import EXIT_DONE
+from deploy.commands.common import Json, Role, answer
 
 
 def bundle(
     *,
     platform: Literal["aarch64", "x86_64"] = "aarch64",
     python: Literal["3.11", "3.12", "3.13"] = "3.11",
-    role: Literal["camera", "uav", "hub", "recorder", "router"] = "camera",
+    role: Role = "camera",
     extra: list[str] | None = None,
     out: Path | None = None,
-    json: Annotated[bool, Parameter(negative="")] = False,
+    json: Json = False,
 ) -> int:
     """Collect the wheels that a board without a network needs, and a script that installs them there.
 
@@ -40,31 +37,25 @@ def bundle(
         detectors of people and vehicles. May be given several times.
     out
         Folder to write and copy to the board; by default named by version, role and platform.
-    json
-        Print sizes as JSON.
     """
     from deploy.site.bundle import Target, default_folder, make_bundle
 
     target = Target(platform, python)
     made = make_bundle(role, target, out or default_folder(role, target), extra or ())
-    if json:
-        print(
-            jsons.dumps(
-                {
-                    "role": role,
-                    "platform": platform,
-                    "python": python,
-                    "out": str(made.out),
-                    "carried_mb": round(made.carried_mb, 1),
-                    "installed_mb": round(made.installed_mb, 1),
-                    "wheels": {name: round(size / 1e6, 1) for name, size in sorted(made.sizes.items())},
-                }
-            )
-        )
-        return EXIT_DONE
+    document = {
+        "role": role,
+        "platform": platform,
+        "python": python,
+        "out": str(made.out),
+        "carried_mb": round(made.carried_mb, 1),
+        "installed_mb": round(made.installed_mb, 1),
+        "wheels": {name: round(size / 1e6, 1) for name, size in sorted(made.sizes.items())},
+    }
     largest = sorted(made.sizes.items(), key=lambda item: -item[1])[:5]
     largest_mb = ", ".join(f"{name.partition('-')[0]} {size / 1e6:.0f}" for name, size in largest)
     installed = f"{made.installed_mb:.0f} MB installed ({largest_mb}), {len(made.sizes)} wheels"
-    print(f"{role}, {platform}, Python {python}: {installed}")
-    print(f"{made.carried_mb:.0f} MB to carry over in {made.out}; there: sh install.sh")
-    return EXIT_DONE
+    lines = (
+        f"{role}, {platform}, Python {python}: {installed}",
+        f"{made.carried_mb:.0f} MB to carry over in {made.out}; there: sh install.sh",
+    )
+    return answer(document, lines, json)

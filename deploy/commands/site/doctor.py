@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json as jsons
 from pathlib import Path
-from typing import Annotated, Literal
 
-from cyclopts import Parameter
+from deploy.commands.common import Json, Role, answer
 
 
 def doctor(
     config: Path | None = None,
     /,
     *,
-    role: Literal["camera", "uav", "hub", "recorder", "router"] | None = None,
-    json: Annotated[bool, Parameter(negative="")] = False,
+    role: Role | None = None,
+    json: Json = False,
 ) -> int:
     """Check this machine and, with a configuration, its agent: one line per check, with a remedy.
 
@@ -31,8 +29,6 @@ def doctor(
     role
         Role of the agent, if it does not follow from the file's name (hub*.toml, recorder*.toml, router*.toml,
         uav*.toml; any other is a camera).
-    json
-        Print a list of check, verdict, text, remedy and exit_status.
     """
     from dataclasses import asdict
 
@@ -48,5 +44,5 @@ def doctor(
                 flush=True,
             )
     if json:
-        print(jsons.dumps([asdict(result) for result in results]))
+        answer([asdict(result) for result in results], (), json)
     return exit_status(results)

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import json as jsons
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
-from cyclopts import Parameter
-
+from deploy.commands.common import Flag, Json, answer, check_range
 from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
 
 if TYPE_CHECKING:
     from deploy.site.fleet import Fleet
-
-Flag = Annotated[bool, Parameter(negative="")]
 
 
 def fleet(
@@ -27,7 +23,7 @@ def fleet(
     simulated: Flag = False,
     seconds: float | None = None,
     out: Path = Path("fleet-out"),
-    json: Flag = False,
+    json: Json = False,
 ) -> int:
     """Start all agents of a rig on this machine, supervise them, restart those that exit, and stop them in order.
 
@@ -50,14 +46,11 @@ def fleet(
         Stop this long after the first frames of all cameras; without it, run until stopped.
     out
         Folder for logs, recordings, calibrations and the fleet's state file.
-    json
-        Print the result as JSON.
     """
     if action == "up":
         if rig is None:
             raise InputError("`fleet up` needs a rig", remedy="give its folder, or a shipped one's name")
-        if seconds is not None and not 0.0 < seconds <= 1e7:
-            raise InputError(f"--seconds {seconds:g} is out of range", remedy="give a positive number")
+        check_range("--seconds", seconds, 0.1, 1e7, "give a positive number")
         return _up(rig, simulated, seconds, out, json)
     if rig is not None or simulated or seconds is not None:
         raise InputError(f"`fleet {action}` takes only --out and --json", remedy="give the --out of `fleet up`")
@@ -65,8 +58,7 @@ def fleet(
         from deploy.site.fleet import stop_fleet
 
         done = stop_fleet(out)
-        print(jsons.dumps({"done": done}) if json else "\n".join(done))
-        return EXIT_DONE
+        return answer({"done": done}, done, json)
     return _status(out, json)
 
 
@@ -101,19 +93,16 @@ def _summary(fleet: Fleet, json: bool, silent: list[str], failed: list[str]) -> 
     from dataclasses import asdict
 
     if json:
-        print(
-            jsons.dumps(
-                {
-                    "rig": fleet.rig.name,
-                    "simulated": fleet.simulated,
-                    "seconds": round(fleet.elapsed, 1),
-                    "agents": {name: asdict(seen) for name, seen in fleet.seen.items()},
-                    "calibrations": fleet.calibrations,
-                    "silent": silent,
-                    "failed": failed,
-                }
-            )
-        )
+        document = {
+            "rig": fleet.rig.name,
+            "simulated": fleet.simulated,
+            "seconds": round(fleet.elapsed, 1),
+            "agents": {name: asdict(seen) for name, seen in fleet.seen.items()},
+            "calibrations": fleet.calibrations,
+            "silent": silent,
+            "failed": failed,
+        }
+        answer(document, (), json)
         return
     _table({name: asdict(seen) for name, seen in fleet.seen.items()})
     for hub, text in fleet.calibrations.items():
@@ -135,7 +124,7 @@ def _status(out: Path, json: bool) -> int:
     for seen in state["agents"].values():
         seen["runs"] = is_running(seen["pid"], seen["started"])
     if json:
-        print(jsons.dumps(state))
+        answer(state, (), json)
     else:
         print(f"{state['rig']}: " + (f"up for {state['elapsed_s']:.0f} s" if state["up"] else "down"))
         _table(state["agents"])

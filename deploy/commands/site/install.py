@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import json as jsons
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING
 
-from cyclopts import Parameter
-
-from protocols.core.errors import EXIT_DONE, InputError
+from deploy.commands.common import Flag, Json, Role, answer
+from protocols.core.errors import InputError
 
 if TYPE_CHECKING:
     from deploy.site.install.plan import Plan
 
-Flag = Annotated[bool, Parameter(negative="")]
-
 
 def install(
-    role: Literal["camera", "uav", "hub", "recorder", "router"],
+    role: Role,
     /,
     *,
     config: Path,
     root: Path = Path("/"),
     program: str | None = None,
     dry_run: Flag = False,
-    json: Flag = False,
+    json: Json = False,
 ) -> int:
     """Install an agent as a systemd service that starts at boot and is always restarted.
 
@@ -45,20 +41,15 @@ def install(
     program
         Path of `syncline` on the target; by default that of the running program.
     dry_run
-        Print what would be written and run, and change nothing.
-    json
-        Print JSON, with --dry-run including the contents of all files.
+        Print what would be written and run (with --json, the contents of all files), and change nothing.
     """
     from deploy.site.install.plan import apply, plan_install
 
     _check_root(root)
     plan = plan_install(role, config, program)
     if dry_run:
-        _show(plan, root, json)
-        return EXIT_DONE
-    changes = apply(plan, root)
-    _print_changes(plan, changes, json)
-    return EXIT_DONE
+        return _show(plan, root, json)
+    return _done(plan, apply(plan, root), json)
 
 
 def uninstall(
@@ -68,7 +59,7 @@ def uninstall(
     root: Path = Path("/"),
     purge: Flag = False,
     dry_run: Flag = False,
-    json: Flag = False,
+    json: Json = False,
 ) -> int:
     """Stop agents and remove their services. Recordings and other state are kept.
 
@@ -84,19 +75,14 @@ def uninstall(
         Also remove the configuration below /etc/syncline.
     dry_run
         Print what would be removed, and change nothing.
-    json
-        Print JSON.
     """
     from deploy.site.install.plan import apply, plan_uninstall
 
     _check_root(root)
     plan = plan_uninstall(list(names or []), root, purge)
     if dry_run:
-        _show(plan, root, json)
-        return EXIT_DONE
-    changes = apply(plan, root)
-    _print_changes(plan, [*changes, *plan.notes], json)
-    return EXIT_DONE
+        return _show(plan, root, json)
+    return _done(plan, [*apply(plan, root), *plan.notes], json)
 
 
 def _check_root(root: Path) -> None:
@@ -104,36 +90,25 @@ def _check_root(root: Path) -> None:
         raise InputError("--root is not a folder", file=root, remedy="give the folder in which the image is mounted")
 
 
-def _show(plan: Plan, root: Path, as_json: bool) -> None:
-    if as_json:
-        print(
-            jsons.dumps(
-                {
-                    "name": plan.name,
-                    "files": {place: text.decode(errors="replace") for place, text in plan.files.items()},
-                    "links": plan.links,
-                    "remove": plan.remove,
-                    "commands": plan.commands,
-                    "notes": plan.notes,
-                }
-            )
-        )
-        return
-    for place, content in plan.files.items():
-        print(f"write {place} ({len(content)} bytes, mode {plan.modes[place]:o})")
-    for place, target in plan.links.items():
-        print(f"link {place} -> {target}")
-    for place in plan.remove:
-        print(f"remove {place}")
-    for command in plan.commands:
-        print(f"run {' '.join(command)}" + ("" if root == Path("/") else " (not with --root)"))
-    for note in plan.notes:
-        print(note)
+def _show(plan: Plan, root: Path, as_json: bool) -> int:
+    document = {
+        "name": plan.name,
+        "files": {place: text.decode(errors="replace") for place, text in plan.files.items()},
+        "links": plan.links,
+        "remove": plan.remove,
+        "commands": plan.commands,
+        "notes": plan.notes,
+    }
+    aside = "" if root == Path("/") else " (not with --root)"
+    lines = [
+        *(f"write {place} ({len(text)} bytes, mode {plan.modes[place]:o})" for place, text in plan.files.items()),
+        *(f"link {place} -> {target}" for place, target in plan.links.items()),
+        *(f"remove {place}" for place in plan.remove),
+        *(f"run {' '.join(command)}{aside}" for command in plan.commands),
+        *plan.notes,
+    ]
+    return answer(document, lines, as_json)
 
 
-def _print_changes(plan: Plan, changes: list[str], as_json: bool) -> None:
-    if as_json:
-        print(jsons.dumps({"name": plan.name, "done": changes}))
-        return
-    for line in changes or ["nothing to change"]:
-        print(line)
+def _done(plan: Plan, changes: list[str], as_json: bool) -> int:
+    return answer({"name": plan.name, "done": changes}, changes or ["nothing to change"], as_json)

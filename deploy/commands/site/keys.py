@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-import json as json_module
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
+from deploy.commands.common import Json, answer
 from protocols.core.errors import EXIT_DONE, EXIT_REFUSED
 
-Json = Annotated[bool, Parameter(negative="")]
 Many = Annotated[tuple[str, ...], Parameter(negative="")]
-Role = Literal["camera", "uav", "hub", "record", "view", "router"]
+Role = Annotated[
+    Literal["camera", "uav", "hub", "record", "view", "router"],
+    Parameter(help="Role of the agent, which determines what it may publish and subscribe to."),
+]
+
+Authority = Annotated[Path, Parameter(help="The authority, from `keys init`.")]
+OfId = Annotated[str, Parameter(help="The agent's id.")]
 
 KEYS = App(
     name="keys",
@@ -39,22 +44,17 @@ def init(folder: Path, /, *, site: str, json: Json = False) -> int:
         Folder of the authority. Whoever has its ca-key.pem can impersonate any agent.
     site
         Name of the site, as in the agents' configurations.
-    json
-        Print JSON.
     """
     from deploy.site import keys
 
     keys.make_site(folder, site)
-    if json:
-        print(json_module.dumps({"folder": str(folder), "site": site}))
-    else:
-        print(f"authority of site {site} in {folder}; keep ca-key.pem on this machine only")
-    return EXIT_DONE
+    line = f"authority of site {site} in {folder}; keep ca-key.pem on this machine only"
+    return answer({"folder": str(folder), "site": site}, [line], json)
 
 
 @KEYS.command
 def issue(
-    folder: Path,
+    folder: Authority,
     /,
     *,
     role: Role,
@@ -71,10 +71,6 @@ def issue(
 
     Parameters
     ----------
-    folder
-        The authority, from `keys init`.
-    role
-        Role of the agent, which determines what it may publish and subscribe to.
     id
         The agent's id, as in its configuration.
     days
@@ -85,57 +81,39 @@ def issue(
         For a router: endpoints to listen on; default tls/127.0.0.1:7447.
     host
         For a router: additional host names or addresses for its certificate.
-    json
-        Print JSON.
     """
     from deploy.site import keys
 
     issued = keys.issue(folder, role, id, days=days, connect=connect, listen=listen, hosts=host)
-    if json:
-        print(json_module.dumps({"folder": str(issued.folder), "until": issued.until.isoformat(timespec="seconds")}))
-        return EXIT_DONE
-    print(f"{role} {id}: {issued.folder}, valid until {issued.until:%Y-%m-%d %H:%M} UTC")
-    if role == "router":
-        print(f"run it with: syncline router {issued.folder / keys.ROUTER_FILE}")
-    else:
-        print(f"copy that folder to its machine and begin its configuration with {keys.BUS_FILE} there")
-    return EXIT_DONE
+    lines = [
+        f"{role} {id}: {issued.folder}, valid until {issued.until:%Y-%m-%d %H:%M} UTC",
+        f"run it with: syncline router {issued.folder / keys.ROUTER_FILE}"
+        if role == "router"
+        else f"copy that folder to its machine and begin its configuration with {keys.BUS_FILE} there",
+    ]
+    until = issued.until.isoformat(timespec="seconds")
+    return answer({"folder": str(issued.folder), "until": until}, lines, json)
 
 
 @KEYS.command
-def revoke(folder: Path, /, *, role: Role, id: str, json: Json = False) -> int:
+def revoke(folder: Authority, /, *, role: Role, id: OfId, json: Json = False) -> int:
     """Revoke an agent's certificates: routers with the new rules let them neither publish nor subscribe.
 
     Zenoh does not read certificate revocation lists, so a revoked certificate can still open a connection until it
     expires: keep --days short. Its name is never used again; `keys issue` gives the agent a new one.
 
     Example: syncline keys revoke keys --role camera --id cam0
-
-    Parameters
-    ----------
-    folder
-        The authority, from `keys init`.
-    role
-        Role of the agent.
-    id
-        The agent's id.
-    json
-        Print JSON.
     """
     from deploy.site import keys
 
     files = keys.revoke(folder, role, id)
-    if json:
-        print(json_module.dumps({"revoked": f"{role}.{id}", "rules": [str(file) for file in files]}))
-        return EXIT_DONE
-    print(f"{role} {id}: revoked")
-    for file in files:
-        print(f"copy {file} to its router: `syncline router` reloads it automatically, zenohd must be restarted")
-    return EXIT_DONE
+    reloads = "`syncline router` reloads it automatically, zenohd must be restarted"
+    lines = [f"{role} {id}: revoked", *(f"copy {file} to its router: {reloads}" for file in files)]
+    return answer({"revoked": f"{role}.{id}", "rules": [str(file) for file in files]}, lines, json)
 
 
 @KEYS.command
-def check(folder: Path, /, *, json: Json = False) -> int:
+def check(folder: Authority, /, *, json: Json = False) -> int:
     """Test, over real connections on this machine, what every certificate may and may not do.
 
     It also tests which clients the router refuses, and with which message: a missing, wrong or expired certificate, and
@@ -147,8 +125,6 @@ def check(folder: Path, /, *, json: Json = False) -> int:
     ----------
     folder
         The authority, from `keys init`, with a router issued.
-    json
-        Print JSON.
     """
     from deploy.site.keys_check import check_site
 
@@ -159,7 +135,7 @@ def check(folder: Path, /, *, json: Json = False) -> int:
             {"who": f.who, "what": f.what, "wanted": f.wanted, "found": f.found, "reason": f.reason, "s": f.seconds}
             for f in findings
         ]
-        print(json_module.dumps({"ok": not bad, "tried": rows}))
+        answer({"ok": not bad, "tried": rows}, (), json)
         return EXIT_REFUSED if bad else EXIT_DONE
     for who in dict.fromkeys(finding.who for finding in findings):
         own = [finding for finding in findings if finding.who == who]

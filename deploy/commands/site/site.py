@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json as json_module
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
+from deploy.commands.common import Flag, Json, Names, Role, answer, check_range
 from deploy.commands.site.board import accept, image, ready, request, restore, update
 from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
 
@@ -16,9 +16,8 @@ if TYPE_CHECKING:
     from deploy.site.boards.operations import Boards
     from deploy.site.boards.site_file import Site
 
-Flag = Annotated[bool, Parameter(negative="")]
-Role = Literal["router", "recorder", "hub", "camera", "uav"]
-Names = Annotated[list[str] | None, Parameter(negative="")]
+
+SiteToml = Annotated[Path, Parameter(help="The site.toml.")]
 
 SITE = App(
     name="site",
@@ -34,7 +33,7 @@ SITE = App(
 
 
 @SITE.command
-def init(file: Path, /, *, site: str = "", cameras: int = 4, json: Flag = False) -> int:
+def init(file: Path, /, *, site: str = "", cameras: int = 4, json: Json = False) -> int:
     """Write a site.toml to begin with, unless it is there, and make the site's certificate authority beside it.
 
     Example: syncline site init site.toml --site yard --cameras 50
@@ -47,8 +46,6 @@ def init(file: Path, /, *, site: str = "", cameras: int = 4, json: Flag = False)
         Name of the site, for a new file.
     cameras
         Number of cameras in a new file.
-    json
-        Print JSON.
     """
     from deploy.site import keys
     from deploy.site.boards.site_file import read_site_file, template
@@ -63,29 +60,24 @@ def init(file: Path, /, *, site: str = "", cameras: int = 4, json: Flag = False)
     made = not (found.keys / keys.SITE_FILE).exists()
     if made:
         keys.make_site(found.keys, found.settings.site)
-    if json:
-        print(json_module.dumps({"file": str(file), "keys": str(found.keys), "agents": len(found.agents)}))
-        return EXIT_DONE
-    print(f"{file}: {len(found.agents)} agents" + ("; correct hosts and configuration" if written else ""))
-    print(f"authority in {found.keys}" + ("; keep ca-key.pem on this machine only, and a copy of it" if made else ""))
-    return EXIT_DONE
+    lines = (
+        f"{file}: {len(found.agents)} agents" + ("; correct hosts and configuration" if written else ""),
+        f"authority in {found.keys}" + ("; keep ca-key.pem on this machine only, and a copy of it" if made else ""),
+    )
+    return answer({"file": str(file), "keys": str(found.keys), "agents": len(found.agents)}, lines, json)
 
 
 @SITE.command
-def enrol(file: Path, names: Names = None, /, *, stick: Path | None = None, again: Flag = False) -> int:
+def enrol(file: SiteToml, names: Names = None, /, *, stick: Path | None = None, again: Flag = False) -> int:
     """Enrol boards: each makes its own key, and gets a certificate, its configuration, and its agent installed.
 
     A private key never leaves its board. Boards that do not answer are named, and enrolled by the next run. Exit status
-    3 if any failed.
+    3 if any failed. Without names, all that are not enrolled.
 
     Example: syncline site enrol site.toml
 
     Parameters
     ----------
-    file
-        The site.toml.
-    names
-        Only these agents, by id or ROLE-ID; default: all that are not enrolled.
     stick
         USB stick for boards without a network: takes the requests in STICK/requests, writes what is for the boards to
         STICK/boards.
@@ -109,7 +101,7 @@ def enrol(file: Path, names: Names = None, /, *, stick: Path | None = None, agai
 
 @SITE.command
 def rollout(
-    file: Path,
+    file: SiteToml,
     names: Names = None,
     /,
     *,
@@ -126,10 +118,6 @@ def rollout(
 
     Parameters
     ----------
-    file
-        The site.toml.
-    names
-        Only these agents, by id or ROLE-ID.
     role
         Only agents of this role.
     bundle
@@ -144,8 +132,7 @@ def rollout(
     agents = [one for one in operations.selected(site, names or ()) if role in (None, one.role)]
     if bundle is not None and not (bundle / "install.sh").is_file():
         raise InputError("is no bundle", file=bundle, remedy="make one with `syncline bundle`")
-    if not 1 <= batch <= 1000:
-        raise InputError(f"--batch {batch} is out of range", remedy="give 1 to 1000")
+    check_range("--batch", batch, 1, 1000)
     agents = [agent for agent in agents if agent.name in enrolled or bundle is not None]
     done, problem = operations.rollout(site, agents, _boards(site), _report, bundle=bundle, batch=batch)
     print(f"{len(done)} of {len(agents)} done")
@@ -157,7 +144,7 @@ def rollout(
 
 @SITE.command
 def renew(
-    file: Path, names: Names = None, /, *, every: Annotated[bool, Parameter(name="--all", negative="")] = False
+    file: SiteToml, names: Names = None, /, *, every: Annotated[bool, Parameter(name="--all", negative="")] = False
 ) -> int:
     """Renew the certificates that end within renew_days, each with a new key that its board makes.
 
@@ -168,10 +155,6 @@ def renew(
 
     Parameters
     ----------
-    file
-        The site.toml.
-    names
-        Only these agents, by id or ROLE-ID.
     every
         Also those that are not due.
     """
@@ -185,15 +168,13 @@ def renew(
 
 
 @SITE.command
-def revoke(file: Path, name: str, /) -> int:
+def revoke(file: SiteToml, name: str, /) -> int:
     """Revoke an agent's certificates, and bring the new rules to the routers. `enrol NAME` takes it in again.
 
     Example: syncline site revoke site.toml cam07
 
     Parameters
     ----------
-    file
-        The site.toml.
     name
         The agent, by id or ROLE-ID.
     """
@@ -207,21 +188,15 @@ def revoke(file: Path, name: str, /) -> int:
 
 
 @SITE.command
-def status(file: Path, names: Names = None, /, *, offline: Flag = False, json: Flag = False) -> int:
+def status(file: SiteToml, names: Names = None, /, *, offline: Flag = False, json: Json = False) -> int:
     """Show every agent: certificate, ready or not, and what it says of itself. Exit status 3 if any is not ready.
 
     Example: syncline site status site.toml
 
     Parameters
     ----------
-    file
-        The site.toml.
-    names
-        Only these agents, by id or ROLE-ID.
     offline
         Do not ask the boards: only what is known here.
-    json
-        Print JSON.
     """
     from datetime import UTC, datetime
 
@@ -247,13 +222,12 @@ def status(file: Path, names: Names = None, /, *, offline: Flag = False, json: F
         }
         for state in found
     ]
-    if json:
-        print(json_module.dumps(rows))
-    else:
-        for row in rows:
-            days = f"{row['days']} days" if row["days"] is not None else str(row["certificate"])
-            ready = "-" if row["ready"] is None else "ready" if row["ready"] else "NOT READY"
-            print(f"{row['agent']!s:<24}{days:<16}{ready:<10} {row['text']}".rstrip())
+    lines = []
+    for row in rows:
+        days = f"{row['days']} days" if row["days"] is not None else str(row["certificate"])
+        ready = "-" if row["ready"] is None else "ready" if row["ready"] else "NOT READY"
+        lines.append(f"{row['agent']!s:<24}{days:<16}{ready:<10} {row['text']}".rstrip())
+    answer(rows, lines, json)
     bad = [state for state in found if state.ready is False or (state.until is not None and state.days(now) <= 0.0)]
     return EXIT_REFUSED if bad else EXIT_DONE
 

@@ -30,7 +30,7 @@ from protocols.core.files import file_in
 SLOTS, CURRENT = ("a", "b"), "current"
 NEW_KEY = "key.new.pem"
 CONFIG_FILE = "config.toml"
-READY_S = 60.0
+READY_S = 60.0  # in which a board has to have started its agent
 _EPOCH = "usr/lib/clock-epoch"
 """systemd sets the clock at least to this file's time when it starts (systemd(1))."""
 _TIMESYNC = "etc/systemd/timesyncd.conf.d/70-syncline.conf"

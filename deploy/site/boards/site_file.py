@@ -12,16 +12,16 @@ import msgspec
 import tomli_w
 from msgspec import Meta
 
-from deploy.config.agents import StrictConfig, load
-from deploy.config.file import convert
+from deploy.config.agents import StrictConfig
+from deploy.config.file import convert, load
 from deploy.site.install.plan import config_type
 from protocols.core.errors import InputError
 from protocols.core.names import check_identifier
 
 RoleName = Literal["router", "recorder", "hub", "camera", "uav"]
 _RANGE = re.compile(r"\{(\d{1,4})\.\.(\d{1,4})\}")
-_MOST = 1024
-_HEALTH_PORT = 9100
+_MOST = 1024  # agents: bounds what a range stands for
+_HEALTH_PORT = 9100  # the default of [health]
 Days = Annotated[float, Meta(gt=0.0, le=825.0)]
 
 

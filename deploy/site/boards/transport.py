@@ -16,7 +16,7 @@ from deploy.site.boards.site_file import Site, SiteAgent
 from protocols.core.errors import InputError, Refused
 
 _SSH = ("ssh", "-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
-_MOST_BYTES = 8 << 20
+_MOST_BYTES = 8 << 20  # of one file: certificates and configurations have kilobytes
 _BUNDLE = "/var/tmp/syncline-bundle"
 
 
@@ -57,15 +57,12 @@ class ImageBoard:
         self._agent, self._root, self._servers = agent, root, time_servers
 
     def request(self) -> str:
-        """See Board."""
         return board.request(self._agent.role, self._agent.id, self._root)
 
     def accept(self, files: Mapping[str, bytes]) -> list[str]:
-        """See Board."""
         return board.accept(self._agent.role, self._agent.id, files, self._root, self._servers)
 
     def restore(self) -> None:
-        """See Board."""
         board.restore(self._agent.role, self._agent.id, self._root)
 
     def update(self, bundle: Path) -> str:
@@ -73,7 +70,6 @@ class ImageBoard:
         raise Refused(f"{self._agent.name} is a system image: make it again with the new bundle")
 
     def ready(self, patience_s: float) -> tuple[bool, str]:
-        """See Board."""
         return True, "a system image: it starts with the board"
 
 
@@ -84,7 +80,6 @@ class StickBoard:
         self._agent, self._stick = agent, stick
 
     def request(self) -> str:
-        """See Board."""
         file = self._stick / "requests" / f"{self._agent.name}.csr"
         try:
             return file.read_text(encoding="ascii")
@@ -97,7 +92,6 @@ class StickBoard:
             ) from None
 
     def accept(self, files: Mapping[str, bytes]) -> list[str]:
-        """See Board."""
         file = self._stick / "boards" / f"{self._agent.name}.tar"
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
@@ -107,14 +101,12 @@ class StickBoard:
         return [f"wrote {file}; on the board: syncline site accept STICK/boards/{file.name}"]
 
     def restore(self) -> None:
-        """See Board."""
+        pass
 
     def update(self, bundle: Path) -> str:
-        """See Board."""
         raise Refused(f"{self._agent.name}: copy the bundle to the stick; on the board: syncline site update BUNDLE")
 
     def ready(self, patience_s: float) -> tuple[bool, str]:
-        """See Board."""
         return True, "reached by a stick only"
 
 
@@ -130,16 +122,13 @@ class SshBoard:
         self._program = site.settings.program
 
     def request(self) -> str:
-        """See Board."""
         return self._run([*self._syncline, "site", "request", *self._who]).decode("ascii", "replace")
 
     def accept(self, files: Mapping[str, bytes]) -> list[str]:
-        """See Board."""
         words = [*self._syncline, "site", "accept", *self._who, *self._servers]
         return self._run(words, pack(files)).decode(errors="replace").splitlines()
 
     def restore(self) -> None:
-        """See Board."""
         self._run([*self._syncline, "site", "restore", *self._who])
 
     def update(self, bundle: Path) -> str:
@@ -154,7 +143,6 @@ class SshBoard:
         return lines[-1] if lines else ""
 
     def ready(self, patience_s: float) -> tuple[bool, str]:
-        """See Board."""
         words = [*self._syncline, "site", "ready", *self._who, "--patience", f"{patience_s:g}", "--json"]
         try:
             found = json.loads(self._run(words, patience_s=patience_s + 30.0))

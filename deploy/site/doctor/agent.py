@@ -17,7 +17,7 @@ from protocols.core.errors import InputError
 from protocols.core.names import key_segment
 
 _SMALL, _LARGE = 1024, 1_000_000  # sizes of test messages [bytes]
-_EXPIRES_SOON_DAYS = 7.0
+_EXPIRES_SOON_DAYS = 7.0  # a week, in which somebody looks
 _SUBSCRIBES_TO_ALL = ("hub", "recorder", "uav")
 CERTIFICATE_ROLES = {"recorder": "record"}
 

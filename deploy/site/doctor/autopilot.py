@@ -39,7 +39,7 @@ class Heard:
 def check(config: Any, patience_s: float = 3.0, listen_s: float = 2.5) -> Iterator[CheckResult]:
     """Wait for a heartbeat, then see what telemetry, gimbal and stations are heard. config: a ``UavConfig``."""
     try:
-        from edge.mavlink.dialect import CAMERA, mavlink
+        from edge.mavlink.dialect import CAMERA, camera_heartbeat
         from edge.mavlink.link.connection import Link
         from edge.mavlink.link.signing import Signing, read_key
         from edge.mavlink.link.transport import parse_url
@@ -61,9 +61,7 @@ def check(config: Any, patience_s: float = 3.0, listen_s: float = 2.5) -> Iterat
         signing=signing,
         vehicle=settings.vehicle,
     )
-    hello = mavlink.MAVLink_heartbeat_message(
-        mavlink.MAV_TYPE_CAMERA, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
-    )
+    hello = camera_heartbeat()
     try:
         found = wait_for_heartbeat(link, hello if url.kind == "udpout" else None, patience_s)
         yield found

@@ -13,7 +13,7 @@ from deploy.site.doctor.check_result import CheckResult, misconfigured, ok, skip
 from protocols.bus.settings import split_endpoint
 from protocols.core.errors import InputError
 
-_PATIENCE_S = 3.0
+_PATIENCE_S = 3.0  # in which TCP sends its first packet three times
 _UNREACHABLE = {
     errno.ECONNREFUSED: (
         "{host} answers, but nothing listens at port {port}",

@@ -33,7 +33,7 @@ BOARD_FILE = "board.toml"
 BoardKind = Literal["charuco", "chessboard", "aruco", "apriltag"]
 _KEYS = ("board", "squares", "tag_size", "dictionary", "ratio", "square_size", "inverted", "mirrored", "legacy")
 _PRINTS = ("inverted", "mirrored", "legacy")
-_MOST_SQUARES, _LARGEST = 100, 1e6
+_MOST_SQUARES, _LARGEST = 100, 1e6  # each way; units: bounds of what a file may say
 _EXAMPLE = 'as board = "charuco", squares = "8x5", square_size = 0.03'
 
 

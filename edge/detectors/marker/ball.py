@@ -32,7 +32,7 @@ _STEP = 2  # of the coarse pass [px]
 _CANDIDATES = 6  # blobs that are measured, largest first
 _MIN_AREA = 6.0  # px²: smaller blobs may be colour noise
 _MAX_SHARE = 0.2  # share of the image: larger blobs are walls
-_MIN_SCORE = 0.35
+_MIN_SCORE = 0.35  # agreement of the outline times solidity: below it, blobs are no discs
 # px: largest distance of a blob's centroid from its outline's centre, plus this share of its smear
 _MAX_DISTANCE, _MAX_DISTANCE_SMEAR = 0.6, 0.04
 # px: std of a blob's centroid where the two contradict, plus this share of their distance

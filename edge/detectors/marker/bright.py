@@ -21,7 +21,7 @@ from protocols.geometry.types import Floats
 _CANDIDATES = 12  # blobs that are measured, largest first
 _MOST_BLOBS = 2000  # an image with more is overexposed or noise
 _RING = 3.0  # px: width of the ring around a spot that gives its background,
-_PASSES = 2
+_PASSES = 2  # the second measures within the first's ellipse
 _HALF_HEIGHT = 0.5  # share of the contrast: brighter pixels belong to the spot
 _WHITE = 250.0  # grey level at which a sensor clips
 _CUT = 0.3  # share of the contrast: fainter pixels are background and its texture

@@ -25,11 +25,11 @@ _LUMA_WEIGHT = 0.35
 _TO_METRIC = np.array([[0.114, 0.587, 0.299], [0.5, -0.331, -0.169], [-0.081, -0.419, 0.5]]) * np.array(
     [[_LUMA_WEIGHT], [1.6], [1.6]]
 )
-_REJECT = 30.0
+_REJECT = 30.0  # distance in colour beyond which nothing is the target
 # Palette of everything that is not the target: hues [°], saturations, values.
 _PALETTE_HUES = tuple(float(turn) for turn in range(0, 360, 14))
-_PALETTE_SATURATIONS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-_PALETTE_VALUES = (0.08, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
+_PALETTE_SATURATIONS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # of the palette
+_PALETTE_VALUES = (0.08, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)  # of the palette
 _PALETTE_DISTANCE = 28.0  # from the target's examples, in the metric: farther palette colours are other
 _MAX_BACKGROUND_RATIO = 0.25  # a colour is background where it is this frequent outside the box relative to inside
 

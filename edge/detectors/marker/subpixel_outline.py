@@ -20,14 +20,14 @@ from protocols.geometry.types import Bools, Floats
 
 Image = npt.NDArray[np.uint8]
 
-_RAYS = 48
+_RAYS = 48  # across the outline, evenly spaced
 _MIN_SAMPLES = 20  # samples of the ball alone
 _STEP = 0.5  # px between samples of a ray
-_PASSES = 3
+_PASSES = 3  # each begins with the outline of the last
 _PIXEL_STD = 6.0  # std of a colour about the mixture of its two ends, by noise and texture [8-bit steps]
 _SHADE_STD = 0.04  # relative variation of either end's brightness along a ray, by shading and texture
-_SHADE_RIDGE = 2.5
-_CURVED_RIDGE = 2.5
+_SHADE_RIDGE = 2.5  # px² of samples: with fewer pixels gradients stay small
+_CURVED_RIDGE = 2.5  # the same for the curvature of the shading
 _SHADING_RADIUS = 13.0  # px: radius from which a ball's shading is well determined
 _INNER_BAND, _INNER_RIDGE = 1.0, 2.0  # px inside the rim where the shading model is corrected, and px² of its ridge
 _OUTER_BAND = 3.0  # px beyond the rim from which the background's colour is taken

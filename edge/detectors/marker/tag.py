@@ -27,7 +27,7 @@ DICTIONARIES = (
 )  # fmt: skip
 """Families of tags, by OpenCV's names."""
 _SIDE_START, _SIDE_END = 0.12, 0.88  # part of a side that is measured: corners are mixtures of two sides
-_PASSES = 3
+_PASSES = 3  # each refines the sides that the last has found
 _REACH = 0.07  # over the tag's size, on both sides of its border: beyond the middle of a cell other cells smear in
 _STEP = 0.5  # px across a side
 _LEAST_CONTRAST = 20.0  # grey levels between the border and the margin

@@ -12,7 +12,7 @@ import numpy.typing as npt
 Image = npt.NDArray[np.uint8]
 Motion = npt.NDArray[np.float32]
 
-_MAX_IMAGES = 32
+_MAX_IMAGES = 32  # that are kept for the first background: bounds the memory
 _CELL, _BLUR_CELLS = 8, 3  # cell size [px]; width [cells] of the motion blur filter
 _MOTION_LAG_S = 0.1  # between the images whose difference measures motion
 # share of the images used per cell; quantile of their values, because shadows only darken

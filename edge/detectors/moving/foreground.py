@@ -38,8 +38,8 @@ _SWAY, _SWAY_STEP = 0.004, 8
 """Over the image width: displacement of swaying leaves; 8-bit steps of noise about the colours beside a pixel."""
 _PASSING_STEP = 40  # 8-bit steps
 _SCENE_CHANGE_SHARE = 0.4  # share of foreground pixels at which the camera has moved or the light has changed
-_SUBSAMPLE = 8
-_GAIN = (0.3, 3.3)
+_SUBSAMPLE = 8  # px: a gain of the exposure is the same everywhere
+_GAIN = (0.3, 3.3)  # of the exposure between two images; beyond, it is another scene
 _UNIFORM_GAIN = 0.08  # deviation of a gain from 1 above which it varies over the image
 _NOISE_STEP = 11  # 8-bit steps, times the gain, which amplifies the noise of a dim image
 _GHOST_STEP = 22  # 8-bit steps

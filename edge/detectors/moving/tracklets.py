@@ -11,9 +11,9 @@ from protocols.geometry.types import Floats
 
 Box = tuple[float, float, float, float]
 _CONFIRM_HITS = 3  # detections after which a tracklet is confirmed
-_COAST_S = 1.2
+_COAST_S = 1.2  # for which a confirmed one goes on unseen
 _MIN_DIRECTNESS = 0.35  # displacement over the path length
-_TENTATIVE_COAST_S = 0.25
+_TENTATIVE_COAST_S = 0.25  # the same before it is confirmed: a flicker ends
 # largest number of height samples that count; weight of the prior in samples
 _MAX_HEIGHT_SAMPLES, _PRIOR_HEIGHT_SAMPLES = 20, 2.0
 
@@ -38,7 +38,6 @@ class ImageTracklet:
     moved: bool = False
     ghost: bool = False
     path_length: float = 0.0
-    missed_since: float | None = None
     colour: Floats | None = None
     height_samples: int = 0
     relative_height: float = 1.0
@@ -75,7 +74,6 @@ class ImageTracklet:
         self.box = tuple(float(a + gain * (b - a)) for a, b in zip(expected, box, strict=True))  # type: ignore[assignment]
         self.time = time
         self.hits += 1
-        self.missed_since = None
         if colour is not None:
             self.colour = colour if self.colour is None else 0.9 * self.colour + 0.1 * colour
         self.path_length += float(

@@ -24,14 +24,14 @@ from protocols.geometry.types import Floats
 
 Image = npt.NDArray[np.uint8]
 Box = tuple[float, float, float, float]
-_MAX_PIXELS = 500_000
+_MAX_PIXELS = 500_000  # larger images are downscaled to this
 _MIN_AREA_SHARE = 0.00025  # over the image area: smaller silhouettes are ignored
 _MOVING_SHIFT_PX = 0.35  # per frame: above it for a while, the camera moves
 _MOVING_TRAVEL_PX = 3.0  # between images seconds apart
 _DECISION_FRAMES = 8  # frames
 _MAX_GROWTH = 2.5  # factor: a silhouette this much larger than a vehicle contains more than that
 _DIFFERENCE_STEP = 26  # 8-bit steps
-_STALE_FRAMES = 20
+_STALE_FRAMES = 20  # after which what differs becomes background again
 _LEARNING_RATE = 0.12  # smallest weight of a frame in the compensated background
 _REFERENCE_FRAMES = 2  # frames, up to twice as many, without change after which something is static
 # px beside a static region, and the share of moving ones among them that makes it part of a vehicle

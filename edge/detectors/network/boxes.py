@@ -27,7 +27,7 @@ KINDS: dict[str, Literal["person", "vehicle"]] = {
 """Kinds by the usual names of classes."""
 BOX_STD = 0.05
 """Std of a box's centre over the box's side: assumed, not measured."""
-_MIN_STD_PX = 0.5
+_MIN_STD_PX = 0.5  # boxes are whole pixels of the network's input at best
 _MIDDLE = {"person": 0.38, "vehicle": 0.5}
 """Of the representative point, over the height below the top: 0.62 of a person's height above the ground, as the
 maximum of a silhouette's distance transform (0.12 above the centre in the hub's model of a person)."""

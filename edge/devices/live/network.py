@@ -13,14 +13,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from edge.devices.base import Device, DeviceInfo, Frame, check_size
+from edge.devices.base import Device, DeviceInfo, Frame
 from edge.devices.live.opencv_capture import OpenCvCamera
 from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera, redact_password
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
-_OPEN_S, _READ_S = 5.0, 3.0
+_OPEN_S, _READ_S = 5.0, 3.0  # to open; to read, which blocks the agent's loop
 _REMEDY = "check address, user and password, and that the camera is on this network"
 _TIMESTAMPED_SCHEMES = ("rtsp", "rtp", "srt", "udp")  # URL schemes whose streams carry the sender's time stamps
 
@@ -63,15 +63,12 @@ class NetworkCamera(ReconnectingCamera):
         def connect() -> Connection:
             return NetworkConnection(url, transport, fps, name, now_ns)
 
-        def describe(connection: Connection, first: Frame) -> DeviceInfo:
-            assert isinstance(connection, NetworkConnection)
-            height, width = first.image.shape[:2]
-            check_size(intrinsics, width, height, name)
+        def describe(connection: NetworkConnection, width: int, height: int) -> DeviceInfo:
             late = "time of capture: late by the camera's own delay"
             unknown = ("exposure", late if connection.stamped else "time of capture: stamped on arrival")
-            return DeviceInfo(width, height, connection.fps, "rtsp", "monotonic", intrinsics, unknown=unknown)
+            return DeviceInfo(width, height, connection.fps, "rtsp", "monotonic", unknown=unknown)
 
-        super().__init__(name, connect, describe, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
+        super().__init__(name, connect, describe, intrinsics, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
 
 
 class NetworkConnection:

@@ -18,38 +18,15 @@ from typing import Any
 import numpy as np
 
 from edge.detectors.network.boxes import BoxLabeller
-from edge.devices.base import DeviceInfo, Frame, check_size
+from edge.devices.base import DeviceInfo, Frame
 from edge.devices.live.oak_network import boxes_in_image
 from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera
+from edge.devices.settings import OakSettings
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
 _QUEUE_LENGTH = 4  # frames: older ones are discarded
 _SYNC_QUEUE_LENGTH = 16  # frames that wait for the network's result
-
-
-@dataclass(frozen=True, slots=True)
-class OakSettings:
-    """One sensor of one OAK board.
-
-    device: IP address, device id or USB path; "" = the only one there is. socket: CAM_A, CAM_B or CAM_C.
-    size: (width, height) [px]. exposure_us, iso: fixed, so that mid-exposure and brightness stay constant.
-    focus: fixed lens position 0..255 of an auto-focus lens; None = a fixed-focus lens.
-    nn: archive of a detection network that runs on the board; None = none. labels: the classes to keep; empty = all.
-    confidence: threshold of a detection, 0..1. prefix: of the labels of people and vehicles.
-    """
-
-    device: str = ""
-    socket: str = "CAM_A"
-    size: tuple[int, int] = (1280, 800)
-    fps: float = 30.0
-    exposure_us: int = 5000
-    iso: int = 400
-    focus: int | None = None
-    nn: Path | None = None
-    labels: tuple[str, ...] = ()
-    confidence: float = 0.5
-    prefix: str = "oak"
 
 
 @dataclass(slots=True)
@@ -65,7 +42,8 @@ class OakCamera(ReconnectingCamera):
     """A camera on an OAK board; see ``edge.devices.base.Device``.
 
     Stamps are in the host's CLOCK_MONOTONIC, to which depthai maps the board's clock: unlike the board's own clock it
-    continues when the board is plugged in again. connect: opens the stream; tests pass a host-only pipeline.
+    continues when the board is plugged in again.
+    prefix: of the labels of people and vehicles. connect: opens the stream; tests pass a host-only pipeline.
     now_ns: a monotonic clock; sleep: used between reconnection attempts.
     """
 
@@ -74,13 +52,14 @@ class OakCamera(ReconnectingCamera):
         settings: OakSettings,
         *,
         intrinsics: Intrinsics | None = None,
+        prefix: str = "oak",
         connect: Callable[[OakSettings], OakStream] | None = None,
         now_ns: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         name = settings.device or "OAK camera"
         make = connect or open_stream
-        labeller = BoxLabeller(f"{settings.prefix}-")
+        labeller = BoxLabeller(f"{prefix}-")
 
         def connected() -> Connection:
             try:
@@ -90,12 +69,10 @@ class OakCamera(ReconnectingCamera):
             except RuntimeError as error:
                 raise InputError(f"{name} does not answer: {_one_line(error)}", remedy=_REMEDY) from None
 
-        def describe(connection: Connection, first: Frame) -> DeviceInfo:
-            height, width = first.image.shape[:2]
-            check_size(intrinsics, width, height, name)
-            return DeviceInfo(width, height, settings.fps, "oak", "monotonic", intrinsics)
+        def describe(connection: OakConnection, width: int, height: int) -> DeviceInfo:
+            return DeviceInfo(width, height, settings.fps, "oak", "monotonic")
 
-        super().__init__(name, connected, describe, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
+        super().__init__(name, connected, describe, intrinsics, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
 
 
 class OakConnection:

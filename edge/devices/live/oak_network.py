@@ -12,7 +12,7 @@ from typing import Any
 from edge.detectors.network.boxes import NetworkBox
 from protocols.core.errors import InputError
 
-_MAX_BOXES = 64
+_MAX_BOXES = 64  # by confidence: more are noise
 
 
 def boxes_in_image(message: Any, image: Any, size: tuple[int, int], keep: Sequence[str] = ()) -> list[NetworkBox]:

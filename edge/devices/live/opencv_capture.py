@@ -13,7 +13,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from edge.devices.base import DeviceInfo, Frame, check_size
+from edge.devices.base import DeviceInfo, Frame
 from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera, redact_password
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
@@ -21,8 +21,8 @@ from protocols.geometry.camera import Intrinsics
 
 UNKNOWN_WITH_OPENCV = ("exposure", "time of capture: stamped on arrival", "dropped frames")
 """Quantities that OpenCV does not provide for a frame."""
-_OPEN_TIMEOUT_MS = 5000
-_READ_TIMEOUT_MS = 3000
+_OPEN_TIMEOUT_MS = 5000  # as of network cameras
+_READ_TIMEOUT_MS = 3000  # it blocks the agent's loop
 _LOST_AFTER_S = 1.0  # a source that fails and has given no frame for this long is lost
 
 
@@ -49,15 +49,11 @@ class OpenCvCamera(ReconnectingCamera):
         def connect() -> Connection:
             return OpenCvConnection(source, fps, name, now_ns, sleep)
 
-        def describe(connection: Connection, first: Frame) -> DeviceInfo:
-            assert isinstance(connection, OpenCvConnection)
-            height, width = first.image.shape[:2]
-            check_size(intrinsics, width, height, name)
-            return DeviceInfo(
-                width, height, fps or connection.fps, driver, "monotonic", intrinsics, unknown=UNKNOWN_WITH_OPENCV
-            )
+        def describe(connection: OpenCvConnection, width: int, height: int) -> DeviceInfo:
+            rate = fps or connection.fps
+            return DeviceInfo(width, height, rate, driver, "monotonic", unknown=UNKNOWN_WITH_OPENCV)
 
-        super().__init__(name, connect, describe, remedy=_remedy(source), now_ns=now_ns, sleep=sleep)
+        super().__init__(name, connect, describe, intrinsics, remedy=_remedy(source), now_ns=now_ns, sleep=sleep)
 
 
 class OpenCvConnection:

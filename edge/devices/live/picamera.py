@@ -10,34 +10,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from edge.devices.base import DeviceInfo, Frame, check_size
+from edge.devices.base import DeviceInfo, Frame
 from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera
+from edge.devices.settings import PiSettings
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
 _REMEDY = "check the ribbon cable (contacts, both ends), and that `rpicam-hello --list-cameras` shows it"
-
-
-@dataclass(frozen=True, slots=True)
-class PiSettings:
-    """One camera of a Raspberry Pi.
-
-    camera: its number. size: (width, height) [px]. exposure_us: fixed; None = automatic, reported with each frame.
-    gain: fixed analogue gain; None = automatic. readout_s: time from first to last row; None = the shortest frame
-    duration of this sensor mode, which is a few per cent too long (vertical blanking).
-    """
-
-    camera: int = 0
-    size: tuple[int, int] = (1280, 720)
-    fps: float = 30.0
-    exposure_us: int | None = 5000
-    gain: float | None = None
-    readout_s: float | None = None
 
 
 class PiCamera(ReconnectingCamera):
@@ -67,16 +50,12 @@ class PiCamera(ReconnectingCamera):
                 what = f"{name} does not answer: {' '.join(str(error).split())[:160]}"
                 raise InputError(what, remedy=_REMEDY) from None
 
-        def describe(connection: Connection, first: Frame) -> DeviceInfo:
-            assert isinstance(connection, PiConnection)
-            height, width = first.image.shape[:2]
-            check_size(intrinsics, width, height, name)
+        def describe(connection: PiConnection, width: int, height: int) -> DeviceInfo:
             unknown = () if connection.readout_s else ("readout of a rolling shutter",)
-            return DeviceInfo(
-                width, height, settings.fps, "picamera2", "monotonic", intrinsics, connection.readout_s, unknown
-            )
+            readout_s = connection.readout_s
+            return DeviceInfo(width, height, settings.fps, "picamera2", "monotonic", None, readout_s, unknown)
 
-        super().__init__(name, connect, describe, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
+        super().__init__(name, connect, describe, intrinsics, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
 
 
 class PiConnection:

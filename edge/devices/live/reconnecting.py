@@ -9,14 +9,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
-from edge.devices.base import DeviceInfo, Frame
+from edge.devices.base import DeviceInfo, Frame, check_size
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
+from protocols.geometry.camera import Intrinsics
 
-_RETRY_S, _MAX_RETRY_S = 0.5, 5.0
-_FIRST_FRAME_S = 10.0
+_RETRY_S, _MAX_RETRY_S = 0.5, 5.0  # between attempts: doubled from, up to
+_FIRST_FRAME_S = 10.0  # cameras may take seconds to start
 
 
 class ConnectionLost(Exception):
@@ -91,7 +92,8 @@ class ReconnectingCamera:
     """A camera behind a connection that may break; see ``edge.devices.base.Device``.
 
     name: for messages, without passwords. connect: opens the camera; raises InputError where it does not answer.
-    describe: the description of the camera, given the first frame; raises InputError where the frame does not fit.
+    describe: the camera's description, given its connection and the image's width and height. intrinsics: of the
+    camera; ``open`` raises InputError where they are for another size.
     now_ns: a monotonic clock; sleep: used between reconnection attempts.
     """
 
@@ -99,7 +101,8 @@ class ReconnectingCamera:
         self,
         name: str,
         connect: Callable[[], Connection],
-        describe: Callable[[Connection, Frame], DeviceInfo],
+        describe: Callable[[Any, int, int], DeviceInfo],
+        intrinsics: Intrinsics | None = None,
         *,
         remedy: str = "check cable, power and address",
         now_ns: Callable[[], int] = time.monotonic_ns,
@@ -107,7 +110,7 @@ class ReconnectingCamera:
     ) -> None:
         self._name = name
         self._connect = connect
-        self._describe = describe
+        self._describe, self._intrinsics = describe, intrinsics
         self._remedy = remedy
         self._now_ns, self._sleep = now_ns, sleep
         self._connection: Connection | None = None
@@ -153,7 +156,9 @@ class ReconnectingCamera:
                 first = self._connection.take(0.5)
             if first is None:
                 raise InputError(f"{self._name} gives no frame", remedy=self._remedy)
-            self._info = self._describe(self._connection, first)
+            height, width = first.image.shape[:2]
+            check_size(self._intrinsics, width, height, self._name)
+            self._info = replace(self._describe(self._connection, width, height), intrinsics=self._intrinsics)
         except ConnectionLost:
             self.close()
             raise InputError(f"{self._name} gives no frame", remedy=self._remedy) from None

@@ -13,16 +13,17 @@ import select
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 
-from edge.devices.base import Device, DeviceInfo, Frame, Image, check_size
+from edge.devices.base import Device, DeviceInfo, Frame, Image
 from edge.devices.live.opencv_capture import OpenCvCamera
 from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera
+from edge.devices.settings import UsbSettings
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
@@ -30,33 +31,9 @@ from protocols.geometry.camera import Intrinsics
 _MONOTONIC, _CLOCK_MASK = 0x2000, 0xE000  # V4L2_BUF_FLAG_TIMESTAMP_…
 _START_OF_EXPOSURE, _SOURCE_MASK = 0x10000, 0x70000  # V4L2_BUF_FLAG_TSTAMP_SRC_…; else the end of the frame
 _DAMAGED = 0x40  # V4L2_BUF_FLAG_ERROR: the pixels are damaged
-_BUFFERS = 4
+_BUFFERS = 4  # of the kernel: 130 ms at 30 Hz
 _REMEDY = "check that it is plugged in, that no other program uses it, and that you may read /dev/video*"
 _EXPOSURE_UNIT_US = 100  # V4L2_CID_EXPOSURE_ABSOLUTE
-
-
-@dataclass(frozen=True, slots=True)
-class UsbSettings:
-    """One USB camera.
-
-    device: /dev/video…, or a stable name made by udev. size: (width, height) [px]; None = the current setting. fps:
-    None = the current setting. pixels: MJPG, YUYV or GREY. exposure_us: fixed; None = automatic, and mid-exposure then
-    varies with the light. gain: in the camera's own units; None = unchanged. readout_s: time from first to last row;
-    0 = not known.
-    """
-
-    device: str = "/dev/video0"
-    size: tuple[int, int] | None = None
-    fps: float | None = None
-    pixels: str = "MJPG"
-    exposure_us: int | None = None
-    gain: int | None = None
-    readout_s: float = 0.0
-
-
-def device_path(device: str) -> str:
-    """/dev/video… of a camera's number; any other name unchanged."""
-    return f"/dev/video{device}" if device.isdecimal() else device
 
 
 def open_usb(
@@ -67,6 +44,8 @@ def open_usb(
     now_ns: Callable[[], int] = time.monotonic_ns,
 ) -> Device:
     """The device for a USB camera, not yet open: through linuxpy, or through OpenCV, which stamps on arrival."""
+    if settings.device.isdecimal():
+        settings = msgspec.structs.replace(settings, device=f"/dev/video{settings.device}")
     if is_installed("linuxpy"):
         return UsbCamera(settings, intrinsics=intrinsics, now_ns=now_ns)
     return OpenCvCamera(settings.device, fps=settings.fps, intrinsics=intrinsics, driver="usb", now_ns=now_ns)
@@ -94,16 +73,11 @@ class UsbCamera(ReconnectingCamera):
                 what = f"{name} does not answer: {error.strerror or error}"
                 raise InputError(what, remedy=_REMEDY) from None
 
-        def describe(connection: Connection, first: Frame) -> DeviceInfo:
-            assert isinstance(connection, UsbConnection)
-            height, width = first.image.shape[:2]
-            check_size(intrinsics, width, height, name)
-            unknown = connection.unknown
-            return DeviceInfo(
-                width, height, connection.fps, "usb", "monotonic", intrinsics, settings.readout_s, unknown=unknown
-            )
+        def describe(connection: UsbConnection, width: int, height: int) -> DeviceInfo:
+            readout_s, unknown = settings.readout_s, connection.unknown
+            return DeviceInfo(width, height, connection.fps, "usb", "monotonic", None, readout_s, unknown)
 
-        super().__init__(name, connect, describe, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
+        super().__init__(name, connect, describe, intrinsics, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
 
 
 class V4l2Stream:

@@ -20,7 +20,6 @@ from protocols.geometry.camera import Intrinsics
 from protocols.log.read.images import ImageRun, image_runs, read_images
 from protocols.log.read.reader import LogReader
 from protocols.log.write.thumbnails import ThumbnailScale
-from protocols.messages import syncline_pb2 as pb
 
 
 class LogPlayback:
@@ -87,7 +86,7 @@ class LogPlayback:
             raise InputError(f"no image of {self._camera} can be decoded", file=self._log, remedy="give another log")
         height, width = self._pending.image.shape[:2]
         info = run.info
-        lens = self._given_intrinsics if self._given_intrinsics is not None else _logged_intrinsics(info)
+        lens = self._given_intrinsics or (None if info is None else Intrinsics.of_message(info))
         if lens is not None and (lens.width, lens.height) == self._full != (width, height):
             lens = _scaled_intrinsics(lens, width, height)
         check_size(lens, width, height, str(self._log))
@@ -128,14 +127,6 @@ class LogPlayback:
                 self._full = (logged.width, logged.height)
             newest, shape = logged.device_time_ns, image.shape
             yield Frame(image, logged.device_time_ns, logged.frame)
-
-
-def _logged_intrinsics(info: pb.CameraInfo | None) -> Intrinsics | None:
-    """The intrinsics in the camera's own description; None where it has none."""
-    if info is None or not info.matrix:
-        return None
-    distortions = np.array(info.distortions) if info.distortions else np.zeros(4 if info.fisheye else 5)
-    return Intrinsics(info.width, info.height, np.array(info.matrix).reshape(3, 3), distortions, info.fisheye)
 
 
 def _scaled_intrinsics(lens: Intrinsics, width: int, height: int) -> Intrinsics:

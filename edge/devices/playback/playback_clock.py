@@ -37,19 +37,3 @@ class RealTime:
     def sleep(self, seconds: float) -> None:
         if seconds > 0:
             time.sleep(seconds)
-
-
-class AsFastAsPossible:
-    """A clock that advances only by ``sleep``, which returns at once.
-
-    start: its initial time [s].
-    """
-
-    def __init__(self, start: float = 0.0) -> None:
-        self._now = start
-
-    def now(self) -> float:
-        return self._now
-
-    def sleep(self, seconds: float) -> None:
-        self._now += max(seconds, 0.0)

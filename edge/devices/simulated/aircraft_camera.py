@@ -10,7 +10,7 @@ from edge.devices.simulated.aircraft import SimulatedAircraft
 from edge.uav.world.flight_world import FlightWorld
 from protocols.core.clocks import NANOSECONDS
 
-_TRANSFER_S = 0.004
+_TRANSFER_S = 0.004  # from mid-exposure to the host
 
 
 class FlightCamera:

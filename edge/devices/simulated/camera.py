@@ -15,7 +15,7 @@ from edge.scenes.common.base import Renderer, SimulatedClock, SimulatedScene
 from edge.scenes.common.rescaling import rescale_scene
 from protocols.core.clocks import NANOSECONDS
 
-_DAY_S = 86_400.0
+_DAY_S = 86_400.0  # s
 _TRANSFER_S = 0.004  # from the end of the exposure until the frame has been transferred
 
 

@@ -19,11 +19,11 @@ from edge.mavlink.link.signing import Signing
 from edge.mavlink.link.transport import Address, Transport, Url, capacity, open_transport
 from protocols.core.clocks import NANOSECONDS
 
-_DEFAULT_SYSTEM = 1
+_DEFAULT_SYSTEM = 1  # the first vehicle of a network
 _MAX_SENDERS = 8  # senders whose bytes are parsed while no vehicle is locked
 _SILENT_NS = 1_500_000_000  # of an autopilot, which sends a heartbeat each second and here 30 attitudes
 _UNKNOWN_SILENT_NS = 10 * NANOSECONDS  # … of one of which only heartbeats are known, before another host is followed
-_MIN_RETRY_S, _MAX_RETRY_S = 0.2, 1.0
+_MIN_RETRY_S, _MAX_RETRY_S = 0.2, 1.0  # doubled up to, until the device or address is there
 _CONFLICT_SHOWN_NS = 10 * NANOSECONDS
 _NAN_ALLOWED = frozenset({"COMMAND_LONG", "COMMAND_INT", "GIMBAL_MANAGER_SET_PITCHYAW", "CAMERA_TRACKING_IMAGE_STATUS",
                           "CAMERA_TRACKING_GEO_STATUS", "CAMERA_FOV_STATUS", "VIDEO_STREAM_INFORMATION",

@@ -11,10 +11,9 @@ from typing import Any
 
 from edge.mavlink.dialect import mavlink
 
-V1, V2 = 0xFE, 0xFD
-SIGNED = 0x01
-_SIGNATURE = 13
-_LONGEST = 280 + _SIGNATURE
+V1, V2 = 0xFE, 0xFD  # first byte of a frame of each version (MAVLink serialization)
+SIGNED = 0x01  # incompatibility flag of a signed frame
+_SIGNATURE = 13  # bytes: link id, time stamp, signature
 
 
 class Framer:
@@ -37,7 +36,7 @@ class Framer:
         while (found := self._marker(at)) is not None:
             self.unreadable += found - at
             at = found
-            length = self._length(at)
+            length = frame_length(self._buffer[at : at + 3])
             if length is None or at + length > len(self._buffer):
                 if not whole:
                     break
@@ -70,15 +69,6 @@ class Framer:
         first = [place for mark in (V1, V2) if (place := self._buffer.find(mark, at)) >= 0]
         return min(first, default=None)
 
-    def _length(self, at: int) -> int | None:
-        """Length of the message that may start here; None while the header is incomplete."""
-        head = self._buffer[at : at + 3]
-        if len(head) < 3:
-            return None
-        if head[0] == V1:
-            return 8 + head[1]
-        return 12 + head[1] + (_SIGNATURE if head[2] & SIGNED else 0)
-
     def _decode(self, frame: bytes) -> Any:
         if frame[0] == V2 and frame[2] & ~SIGNED:
             return None
@@ -86,3 +76,10 @@ class Framer:
             return self._codec.decode(bytearray(frame))
         except mavlink.MAVError:
             return None
+
+
+def frame_length(head: bytes | bytearray) -> int | None:
+    """Length of the message whose first three bytes these are; None while they are fewer."""
+    if len(head) < 3:
+        return None
+    return 8 + head[1] if head[0] == V1 else 12 + head[1] + (_SIGNATURE if head[2] & SIGNED else 0)

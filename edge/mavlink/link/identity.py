@@ -15,8 +15,8 @@ from protocols.core.clocks import NANOSECONDS
 _SAME_CLOCK_NS = NANOSECONDS  # two readings of one clock: delays of the link, and its drift over a silence
 _POSITION_WAIT_NS = 3 * NANOSECONDS  # for a position, which comes at 5 Hz; without satellites there is none
 _NEAR_M = 200.0  # from the last position: its error, and that of the flight until the silence
-_MAX_SPEED_M_S = 50.0
-_METRES_PER_DEGREE = 111_320.0
+_MAX_SPEED_M_S = 50.0  # of the vehicle: a faster one is another
+_METRES_PER_DEGREE = 111_320.0  # of latitude
 
 
 @dataclass(slots=True)

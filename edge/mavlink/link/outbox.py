@@ -25,7 +25,7 @@ _PRIORITIES = {
     "STATUSTEXT": 3,
     "CAMERA_FOV_STATUS": 5,
 }
-_OTHERS = 4
+_OTHERS = 4  # priority of message types without one
 _ONLY_NEWEST = frozenset(
     {
         "HEARTBEAT",
@@ -38,7 +38,7 @@ _ONLY_NEWEST = frozenset(
     }
 )
 """Message types of which a waiting one is replaced by the next."""
-_CAPACITY = 64
+_CAPACITY = 64  # messages that wait
 _BURST_S = 0.1  # of the link's capacity may lie in the buffers below, which delay what comes after
 
 

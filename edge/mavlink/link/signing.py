@@ -16,13 +16,13 @@ from pathlib import Path
 from protocols.core.errors import InputError
 from protocols.core.files import write_atomically
 
-EPOCH_UNIX_S = 1_420_070_400
+EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01, from which signing times count (MAVLink signing)
 TICKS = 100_000
 """Timestamp counts of 10 µs per second."""
 _MAX_AHEAD = 5 * TICKS
 _MAX_BEHIND = 60 * TICKS  # allowed delay of a new sender, as in pymavlink and the autopilots
 _SAVE_EVERY = 5 * TICKS
-_MAX_STREAMS = 64
+_MAX_STREAMS = 64  # senders whose last time is remembered
 
 
 class Signing:

@@ -15,6 +15,7 @@ import numpy as np
 
 from edge.mavlink.dialect import AUTOPILOT, mavlink
 from edge.mavlink.link.connection import is_autopilot
+from edge.mavlink.link.framing import V1, V2, frame_length
 from edge.mavlink.roles.telemetry import Attitude, GlobalPosition, LocalPosition, parse_telemetry
 from edge.uav.base import Telemetry
 from edge.uav.navigation import Origin
@@ -22,10 +23,9 @@ from protocols.core.errors import InputError
 from protocols.core.files import read_bytes
 from protocols.geometry.types import Floats
 
-_STAMP = 8
-_LONGEST = 280 + 13
+_STAMP = 8  # bytes: Unix time in µs before each frame
 _POSITION_GAP_S = 3.0  # greatest interval over which positions are interpolated
-_REBOOT_S = 1.0
+_REBOOT_S = 1.0  # by which a boot time goes back: less is reordering
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,22 +69,17 @@ def _messages(data: bytes) -> tuple[list[Any], int]:
     at = unreadable = 0
     while at + _STAMP + 8 <= len(data):
         position = at + _STAMP
-        marker = data[position]
-        if marker not in (0xFE, 0xFD):
+        length = frame_length(data[position : position + 3])
+        if data[position] not in (V1, V2) or length is None:
             at, unreadable = at + 1, unreadable + 1
             continue
-        length = (
-            8 + data[position + 1]
-            if marker == 0xFE
-            else 12 + data[position + 1] + (13 if data[position + 2] & 1 else 0)
-        )
         frame = data[position : position + length]
         end = position + length
         try:
             message = codec.decode(bytearray(frame)) if len(frame) == length else None
         except mavlink.MAVError:
             message = None
-        follows = end + _STAMP >= len(data) or data[end + _STAMP] in (0xFE, 0xFD)
+        follows = end + _STAMP >= len(data) or data[end + _STAMP] in (V1, V2)
         if message is None or (isinstance(message, mavlink.MAVLink_unknown) and not follows):
             at, unreadable = at + 1, unreadable + 1
             continue

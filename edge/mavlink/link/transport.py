@@ -22,9 +22,9 @@ Address = tuple[str, int]
 """The sender of bytes: host and port; ("", 0) for a point-to-point transport."""
 ONLY: Address = ("", 0)
 
-_MAX_DATAGRAM = 65_535
+_MAX_DATAGRAM = 65_535  # bytes: UDP's limit
 _MAX_DATAGRAMS = 256  # datagrams read per call, so that a flood cannot block the caller
-_DEFAULT_BAUD = 57_600
+_DEFAULT_BAUD = 57_600  # of ArduPilot's and PX4's telemetry ports
 _LOST = {
     errno.EAGAIN,
     errno.ECONNREFUSED,

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from edge.mavlink.dialect import AUTOPILOT, GIMBAL, mavlink
+from edge.mavlink.dialect import AUTOPILOT, GIMBAL, mavlink, message_name
 from edge.mavlink.link.framing import Framer
 from edge.mavlink.link.signing import Signing
 from edge.mavlink.link.transport import Address, Transport
@@ -33,9 +33,9 @@ _DEFAULT_RATES = {
     "GIMBAL_DEVICE_ATTITUDE_STATUS": 10.0,
     "GIMBAL_MANAGER_STATUS": 1.0,
 }
-_MAX_RATE_HZ = 100.0
-_UNIX_AT_START = 1_700_000_000.0
-_MAX_SENDERS = 8
+_MAX_RATE_HZ = 100.0  # real ones limit their streams too
+_UNIX_AT_START = 1_700_000_000.0  # s: any time after GPS has set the clock
+_MAX_SENDERS = 8  # that it answers on one port
 DEFAULT_ORIGIN = Origin(47.3977, 8.5456, 488.0)
 """Default origin of the simulated aircraft's local NED frame."""
 
@@ -224,7 +224,7 @@ class Autopilot:
     def _command(self, message: Any) -> None:
         result = mavlink.MAV_RESULT_UNSUPPORTED
         if message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-            kind = _message_name(int(message.param1))
+            kind = message_name(message.param1)
             interval = float(message.param2)
             result = mavlink.MAV_RESULT_DENIED
             if kind in self._rates and math.isfinite(interval):
@@ -233,7 +233,7 @@ class Autopilot:
                 self._due.pop(kind, None)
                 result = mavlink.MAV_RESULT_ACCEPTED
         elif message.command == mavlink.MAV_CMD_REQUEST_MESSAGE:
-            kind = _message_name(int(message.param1))
+            kind = message_name(message.param1)
             if kind in _DEFAULT_RATES:
                 result = mavlink.MAV_RESULT_ACCEPTED
                 for answer, part in self._message(kind, self._now):
@@ -345,9 +345,3 @@ class Autopilot:
 class _Sender:
     framer: Framer = field(default_factory=Framer)
     systems: set[tuple[int, int]] = field(default_factory=set)
-
-
-def _message_name(number: int) -> str:
-    """The name of a message id; "" for one that the dialect lacks."""
-    kind = mavlink.mavlink_map.get(number)
-    return "" if kind is None else str(kind.msgname)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from edge.mavlink.dialect import AUTOPILOT, CAMERA, mavlink
+from edge.mavlink.dialect import AUTOPILOT, CAMERA, camera_heartbeat, mavlink, message_name
 from edge.mavlink.link.connection import Link, ReceivedMessage
 from edge.mavlink.roles.camera_messages import STREAM_ID, CameraMessages, TrackingStatus, VideoStream
 from edge.mavlink.roles.message_rates import MessageRates
@@ -16,7 +16,7 @@ from edge.mavlink.roles.status_texts import StatusText, StatusTexts
 from protocols.geometry.camera import Intrinsics
 
 MESSAGE_TYPES = ("HEARTBEAT", "COMMAND_LONG", "COMMAND_INT", "PARAM_REQUEST_LIST")
-_HEARTBEAT_S = 1.0
+_HEARTBEAT_S = 1.0  # of every MAVLink component
 _REPEAT_WINDOW_S = 2  # s within which identical commands are retransmissions of the station
 _DEFAULT_HZ = {"CAMERA_TRACKING_IMAGE_STATUS": 10.0, "CAMERA_TRACKING_GEO_STATUS": 5.0, "CAMERA_FOV_STATUS": 1.0}
 
@@ -139,11 +139,7 @@ class CameraComponent:
         # Also before any vehicle is known: the peer of an outgoing link has to learn that this side exists.
         if now_s >= self._beat_s:
             self._beat_s = now_s + _HEARTBEAT_S
-            self._link.send(
-                mavlink.MAVLink_heartbeat_message(
-                    mavlink.MAV_TYPE_CAMERA, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
-                )
-            )
+            self._link.send(camera_heartbeat())
         if self._link.vehicle is None:
             return
         for kind in _DEFAULT_HZ:
@@ -182,7 +178,7 @@ class CameraComponent:
             # The stream is always there, and costs nothing while nobody opens it: one station cannot end another's.
             return None if not self._has_stream else accepted if p[0] in (0, STREAM_ID) else denied
         if command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-            kind = _message_name(p[0])
+            kind = message_name(p[0])
             if kind not in _DEFAULT_HZ:
                 return None
             if not math.isfinite(p[1]):
@@ -234,7 +230,7 @@ class CameraComponent:
             self.send_status_now()
 
     def _requested(self, command: int, p: tuple[float, ...]) -> str:
-        return _REQUESTS.get(command) or _message_name(p[0])
+        return _REQUESTS.get(command) or message_name(p[0])
 
     def _send_message(self, kind: str) -> None:
         if self._link.send(self._messages.build(kind)):
@@ -286,9 +282,3 @@ def _parameters(message: Any) -> tuple[float, ...]:
     if message.get_type() == "COMMAND_INT":
         return (message.param1, message.param2, message.param3, message.param4, float(message.x), float(message.y))
     return (message.param1, message.param2, message.param3, message.param4, message.param5, message.param6)
-
-
-def _message_name(number: float) -> str:
-    """The name of a message id that came as a float; "" for an unknown one."""
-    kind = mavlink.mavlink_map.get(int(number)) if math.isfinite(number) and number == int(number) else None
-    return "" if kind is None else str(kind.msgname)

@@ -14,7 +14,7 @@ from edge.mavlink.dialect import mavlink
 from protocols.geometry.camera import Intrinsics
 
 NAN = float("nan")
-_UNKNOWN_INT = 0x7FFFFFFF
+_UNKNOWN_INT = 0x7FFFFFFF  # INT32_MAX: the protocol's "not known"
 _MAX_ALTITUDE_M = 2e6  # more does not fit into millimetres of 32 bits
 _MODEL = b"Syncline UAV tracker"
 STREAM_ID = 1

@@ -15,36 +15,14 @@ import numpy as np
 
 from edge.mavlink.dialect import AUTOPILOT, CAMERA, mavlink
 from edge.mavlink.link.connection import Link
+from edge.mavlink.settings import GuidanceLimits
 from edge.uav.navigation import Origin
 from protocols.geometry.types import Floats
 
-_CONFIGURE_S = 5.0
+_CONFIGURE_S = 5.0  # between two claims of the gimbal
 _MIN_HORIZONTAL_M = 3.0  # horizontal distance below which the bearing to the target is undefined
-_TARGET_HEIGHT_M = 0.7
+_TARGET_HEIGHT_M = 0.7  # of a car's middle above the ground
 _NOT_ARMED = "follow is not armed"
-
-
-@dataclass(frozen=True, slots=True)
-class GuidanceLimits:
-    """Limits of the guidance commands. gimbal, follow: whether each is allowed at all.
-
-    pitch: lowest and highest [rad]; rate: greatest angular rate [rad/s]. coast_s: longest time without seeing the
-    target. std_m: greatest std of its position. range_m: greatest distance from where the vehicle was when the target
-    was selected. speed: greatest target speed that is sent [m/s]. fence_m: greatest distance of vehicle and target from
-    the origin of the local frame, where the vehicle took off. height: least and greatest height of a vehicle that
-    follows [m above the origin].
-    """
-
-    gimbal: bool = False
-    follow: bool = False
-    pitch: tuple[float, float] = (-0.5 * math.pi, math.radians(10.0))
-    rate: float = math.radians(60.0)
-    coast_s: float = 8.0
-    std_m: float = 15.0
-    range_m: float = 300.0
-    speed: float = 20.0
-    fence_m: float = 500.0
-    height: tuple[float, float] = (5.0, 120.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,8 +115,8 @@ class Guidance:
         reason = ""
         if not max(float(np.hypot(*position[:2])), float(np.hypot(*vehicle[:2]))) <= limits.fence_m:
             reason = f"fence: {limits.fence_m:.0f} m from take-off"
-        elif not limits.height[0] <= -vehicle[2] <= limits.height[1]:
-            reason = f"height {-vehicle[2]:.0f} m, not {limits.height[0]:.0f} to {limits.height[1]:.0f} m"
+        elif not limits.height_m[0] <= -vehicle[2] <= limits.height_m[1]:
+            reason = f"height {-vehicle[2]:.0f} m, not {limits.height_m[0]:.0f} to {limits.height_m[1]:.0f} m"
         if reason:
             self.disarm(reason)
         return reason
@@ -167,10 +145,10 @@ class Guidance:
             )
         to_target = np.append(position, -_TARGET_HEIGHT_M) - vehicle
         horizontal = float(np.hypot(to_target[0], to_target[1]))
-        pitch = float(np.clip(-math.atan2(to_target[2], horizontal), *self.limits.pitch))
+        pitch = float(np.clip(-math.atan2(to_target[2], horizontal), *np.radians(self.limits.pitch_deg)))
         yaw = math.atan2(to_target[1], to_target[0])
         if self._angles is not None:
-            max_step = self.limits.rate * max(self._period, 0.02)
+            max_step = math.radians(self.limits.rate_deg_s) * max(self._period, 0.02)
             turn = (yaw - self._angles[1] + math.pi) % (2.0 * math.pi) - math.pi
             if horizontal < _MIN_HORIZONTAL_M:
                 turn = 0.0  # straight below the vehicle the bearing is undefined

@@ -16,8 +16,8 @@ Station = tuple[int, int]
 """System and component id."""
 
 _GONE_S = 10.0  # without a heartbeat or command, ten times the period of heartbeats
-_MAX_STATIONS = 32
-_MAX_RATE_HZ = 60.0
+_MAX_STATIONS = 32  # that have asked for rates of their own
+_MAX_RATE_HZ = 60.0  # twice a camera's frame rate
 
 
 @dataclass(slots=True)

@@ -21,10 +21,10 @@ _MESSAGE_TYPES = (
     "CAMERA_TRACKING_GEO_STATUS",
     "CAMERA_FOV_STATUS",
 )
-_SYSTEM = 255
-_HEARTBEAT_S = 1.0
-_RETRY_S = 1.0
-_MAX_TRIES = 5
+_SYSTEM = 255  # of ground stations by convention
+_HEARTBEAT_S = 1.0  # of every MAVLink component
+_RETRY_S = 1.0  # the protocol's proposal for commands
+_MAX_TRIES = 5  # the same
 
 
 @dataclass(frozen=True, slots=True)

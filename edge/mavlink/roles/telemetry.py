@@ -24,7 +24,7 @@ MESSAGE_TYPES = (
     "TIMESYNC",
 )
 _MAX_DISTANCE_M = 100_000.0  # from the local origin, and of a height: beyond it the flat local frame means nothing
-_MAX_SPEED_M_S = 1_000.0
+_MAX_SPEED_M_S = 1_000.0  # beyond it a velocity is garbled
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -31,11 +31,11 @@ from protocols.geometry.types import Floats
 _TIMESYNC_PERIOD_S = 0.5  # between TIMESYNC requests
 _RATE_REQUEST_PERIOD_S = 5.0  # of rates, which an autopilot forgets when it reboots
 _MAX_POSITION_AGE_S = 1.0  # for how long a position is extrapolated at its velocity
-_MAX_HEADING_AGE_S = 0.5
+_MAX_HEADING_AGE_S = 0.5  # an older heading is not used
 _MAX_LOCAL_AGE_S = 2.0  # without a local position, after which the global one is used
 _SOURCE_SILENT_S = 2.0  # after which another gimbal source may take over
-_REFUSAL_SHOWN_S = 10.0
-_MISSING_AFTER_S = 3.0
+_REFUSAL_SHOWN_S = 10.0  # in the status
+_MISSING_AFTER_S = 3.0  # since a message was asked for
 _GIMBALS = frozenset({AUTOPILOT, GIMBAL, *range(mavlink.MAV_COMP_ID_GIMBAL2, mavlink.MAV_COMP_ID_GIMBAL6 + 1)})
 _NEVER = -math.inf
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from protocols.geometry.types import Floats
 
-_CELLS = 256
+_CELLS = 256  # of the texture, each way
 _LIGHT = np.array([0.25, -0.35, 0.9]) / np.linalg.norm([0.25, -0.35, 0.9])
 LIGHT_WORLD: Floats = _LIGHT
 """Unit vector (3,) towards the lamp, in world axes."""

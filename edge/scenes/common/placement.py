@@ -13,7 +13,7 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 
-_MIXED_FPS = (30.0, 25.0, 29.97, 50.0)
+_MIXED_FPS = (30.0, 25.0, 29.97, 50.0)  # PAL, NTSC and phones: no two cameras alike
 
 
 @dataclass(frozen=True, slots=True)

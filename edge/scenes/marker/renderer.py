@@ -24,7 +24,7 @@ BACKGROUND_STREAM = 2  # beside the streams of cameras (0) and path (1)
 _NOISE_STD = 3.0  # of a small sensor indoors, in 8-bit steps
 _MAX_STEPS = 16  # samples of one exposure
 _BACKGROUND_WIDTH = 960  # px; wider images get a background of this width, enlarged
-_AMBIENT, _DIFFUSE, _GLINT = 0.62, 0.42, 0.35
+_AMBIENT, _DIFFUSE, _GLINT = 0.62, 0.42, 0.35  # shares of the light, of a matt ball
 
 
 class MarkerRenderer(Renderer):

@@ -11,7 +11,7 @@ from edge.scenes.common.placement import CameraPlacement, place_cameras
 from edge.scenes.common.trajectory import SmoothPath, flown_path, hand_waved_path
 from protocols.geometry.types import Floats
 
-ORANGE_BGR = (22.0, 112.0, 246.0)
+ORANGE_BGR = (22.0, 112.0, 246.0)  # of the demo's ball
 
 _ROOM = CameraPlacement(
     distance=(2.5, 3.1), height=(0.6, 2.3), aim=0.15, focal=(0.72, 1.05), size=(640, 480), exposure_s=0.008

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from edge.scenes.people.scene import PeopleScene
 
 Image = npt.NDArray[np.uint8]
-_BACKGROUND_STREAM = 2
-_NOISE_STD = 3.0
+_BACKGROUND_STREAM = 2  # of the random numbers, apart from those of people and noise
+_NOISE_STD = 3.0  # 8-bit steps, of a small sensor indoors
 _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 _SHADE = 0.62  # share of light left in a shadow
 _SHRINK = 4  # downscaling of the shadow mask

@@ -11,7 +11,7 @@ from edge.scenes.common.placement import CameraPlacement, place_cameras
 from edge.scenes.people.walking import CROWN, WalkingPaths, body_joints, random_walks
 from protocols.geometry.types import Floats
 
-MAX_PEOPLE = 12
+MAX_PEOPLE = 12  # in the room
 ROOM = (5.0, 3.0)
 """Half the side and the height [m] of the room."""
 _WALKED = 2.7  # half the side of the area where people walk [m]
@@ -25,7 +25,7 @@ _CAMERAS = CameraPlacement(
     fps=(10.0,),
     roll=0.06,
 )
-_MIXED = (10.0, 12.5, 9.99, 15.0)
+_MIXED = (10.0, 12.5, 9.99, 15.0)  # Hz: as cheap network cameras
 _STREAMS = {"cameras": 0, "people": 1}  # the background has stream 2
 RADII = {"head": 0.062, "neck": 0.032, "torso": 0.085, "pelvis": 0.075, "arm": 0.028, "thigh": 0.05, "shank": 0.036}
 """Radii of the parts of a body, over its height."""
@@ -120,14 +120,14 @@ def joint_radii(heights: Floats) -> Floats:
     return np.asarray(heights[:, None] * np.array([share[name.partition("_")[0]] for name in JOINTS]))
 
 
-_SKIN = ((150, 178, 224), (120, 150, 205), (84, 112, 165), (60, 82, 128))
-_HAIR = ((30, 36, 48), (48, 72, 105), (92, 140, 178), (122, 124, 128))
+_SKIN = ((150, 178, 224), (120, 150, 205), (84, 112, 165), (60, 82, 128))  # BGR
+_HAIR = ((30, 36, 48), (48, 72, 105), (92, 140, 178), (122, 124, 128))  # BGR
 _TOPS = (
     (52, 44, 190), (165, 92, 40), (70, 140, 60), (215, 216, 220), (48, 46, 50), (40, 170, 215), (150, 70, 130),
     (120, 118, 112), (165, 150, 60), (80, 110, 200), (110, 60, 40), (60, 90, 100),
 )  # fmt: skip
-_TROUSERS = ((92, 60, 44), (42, 42, 46), (118, 138, 150), (70, 84, 96), (140, 100, 70), (60, 62, 90))
-_SHOES = ((40, 42, 48), (205, 206, 210), (50, 70, 110))
+_TROUSERS = ((92, 60, 44), (42, 42, 46), (118, 138, 150), (70, 84, 96), (140, 100, 70), (60, 62, 90))  # BGR
+_SHOES = ((40, 42, 48), (205, 206, 210), (50, 70, 110))  # BGR
 
 
 def people_room(seed: int, cameras: int, people: int, mixed_fps: bool = False) -> PeopleScene:

@@ -25,7 +25,7 @@ ControlItem = str | tuple[str, str, float]
 """A camera (its position and attitude), or a distance between two cameras."""
 _MIN_REDUNDANCY = 2
 """Redundancy beyond the seven gauge freedoms that the remaining control points need for a meaningful test."""
-_GAUGE_FREEDOM = 7
+_GAUGE_FREEDOM = 7  # three of shift, three of rotation, one of scale
 _FALSE_ALARM_PROBABILITY = 1e-4
 """Probability that a control point of a correct survey is rejected."""
 _MIN_SCATTER_RATIO = 3.0

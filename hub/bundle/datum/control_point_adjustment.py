@@ -17,7 +17,7 @@ from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.rig import Rig
 
-_MAX_ITERATIONS = 8
+_MAX_ITERATIONS = 8  # of Gauss-Newton, which begins at the observations' optimum
 _RELATIVE_TOLERANCE = 1e-9  # relative decrease of the cost at convergence
 
 

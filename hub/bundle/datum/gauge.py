@@ -23,7 +23,7 @@ _EXACT_STD = 1e-4
 """Std of a control point given without one, relative to the size of the rig, where the similarity is chosen among exact
 ones that contradict each other; the adjustment then holds them exactly."""
 _UP_STD = 0.01  # rad
-_GAUGE_FREEDOM = 7
+_GAUGE_FREEDOM = 7  # three of shift, three of rotation, one of scale
 CONTRADICTION_SIGMA = 8.0  # RMS residual in sigma from which contradicting control points are reported
 _MAX_CONTRADICTION = 0.1  # … and refused if they are off by more than this share of the rig's size, or rad
 

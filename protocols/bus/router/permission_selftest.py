@@ -18,8 +18,8 @@ from protocols.core.errors import InputError
 from protocols.topics import TOPICS, Topic
 
 OTHER_AGENT = "somebody-else"
-_SUBSCRIBE_S = 0.5
-_COLLECT_S = 0.6
+_SUBSCRIBE_S = 0.5  # for a subscription to take effect
+_COLLECT_S = 0.6  # for messages to arrive
 
 _PUBLISHERS = {"camera": ("camera",), "uav": ("camera", "uav"), "hub": ("hub", "node"), "view": ("view",)}
 

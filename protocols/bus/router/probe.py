@@ -11,7 +11,7 @@ import zenoh
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.session import close_session, open_session, undeclare_all, zenoh_call
 
-_FIRST_RETRY_S = 0.2
+_FIRST_RETRY_S = 0.2  # doubled each time
 
 
 def round_trip(config: BusConfig, prefix: str, size: int = 0, timeout_s: float = 3.0) -> float | None:

@@ -8,8 +8,7 @@ import time
 import uuid
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
-from typing import NoReturn, Self
+from typing import NoReturn
 
 import msgspec
 
@@ -17,6 +16,7 @@ from protocols.bus.router.canary import DEAD_AFTER_S, Canary
 from protocols.bus.settings import LOOPBACK_ROUTER, BusConfig, split_endpoint
 from protocols.bus.transport.session import close_session, open_session, zenoh_call
 from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.core.closing import Closing
 from protocols.core.names import key_segment
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
@@ -24,15 +24,15 @@ from protocols.topics import STATUS
 from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "router"
-_TICK_S = 0.1
-_STATUS_S = 1.0
+_TICK_S = 0.1  # several looks at the canary in DEAD_AFTER_S
+_STATUS_S = 1.0  # as all agents: health counts 5 s without a status as dead
 
 
 class RulesChanged(Exception):
     """The router's access rules have changed: it must be reopened to apply them."""
 
 
-class Router:
+class Router(Closing):
     """Relays between connected clients while the context is open.
 
     listen: endpoints; more routers to join in connect. config: a complete configuration instead, with certificates and
@@ -52,14 +52,6 @@ class Router:
     def close(self) -> None:
         """Stop relaying."""
         close_session(self._session)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def run_router(

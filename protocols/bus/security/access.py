@@ -43,6 +43,10 @@ def _keys(*patterns: str) -> list[str]:
     return [key for pattern in patterns for key in (pattern, f"{pattern.removesuffix('/**')}/**/@adv/**")]
 
 
+def _rule(name: str, flow: str, messages: list[str], keys: list[str]) -> dict[str, Any]:
+    return {"id": name, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": keys}
+
+
 def certificate_name(role: str, agent: str, generation: int = 1) -> str:
     """The common name of an agent's certificate, ``<role>.<key segment of the id>[.<generation>]``; raises InputError.
 
@@ -72,28 +76,10 @@ def access_rules(
     generations = generations or {}
     base = f"syncline/{check_identifier(site, 'site')}"
     all_keys = _keys(f"{base}/**")
-    rules: list[dict[str, Any]] = [
-        {
-            "id": "be-asked",
-            "permission": "allow",
-            "flows": ["egress"],
-            "messages": _PUBLISH_OUT,
-            "key_exprs": all_keys,
-        },
-        {
-            "id": "ask-all",
-            "permission": "allow",
-            "flows": ["ingress"],
-            "messages": _RECEIVE_IN,
-            "key_exprs": all_keys,
-        },
-        {
-            "id": "receive-all",
-            "permission": "allow",
-            "flows": ["egress"],
-            "messages": _RECEIVE_OUT,
-            "key_exprs": all_keys,
-        },
+    rules = [
+        _rule("be-asked", "egress", _PUBLISH_OUT, all_keys),
+        _rule("ask-all", "ingress", _RECEIVE_IN, all_keys),
+        _rule("receive-all", "egress", _RECEIVE_OUT, all_keys),
     ]
     subjects, policies = [], []
     for role, agent in sorted(set(agents)):
@@ -101,15 +87,7 @@ def access_rules(
         segment = key_segment(agent)
         own = [f"{base}/{key.format(id=segment)}" for key in _PUBLISH_KEYS[role]]
         own += [f"{base}/agent/{segment}/**", f"{base}/alive/{role}/{segment}/*"]
-        rules.append(
-            {
-                "id": f"own-{name}",
-                "permission": "allow",
-                "flows": ["ingress"],
-                "messages": _PUBLISH_IN,
-                "key_exprs": _keys(*own),
-            }
-        )
+        rules.append(_rule(f"own-{name}", "ingress", _PUBLISH_IN, _keys(*own)))
         allowed = [f"own-{name}", "be-asked"]
         if role == "router":
             # The canary receives its own messages; other routers relay what their own rules admitted.
@@ -119,22 +97,9 @@ def access_rules(
         subjects.append({"id": name, "cert_common_names": [name]})
         policies.append({"subjects": [name], "rules": allowed})
     if any("relay" in policy["rules"] for policy in policies):
-        rules.append(
-            {
-                "id": "relay",
-                "permission": "allow",
-                "flows": ["ingress"],
-                "messages": _PUBLISH_IN,
-                "key_exprs": all_keys,
-            }
-        )
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
-    }
+        rules.append(_rule("relay", "ingress", _PUBLISH_IN, all_keys))
+    allowed_only = {"enabled": True, "default_permission": "deny"}
+    return {**allowed_only, "rules": rules, "subjects": subjects, "policies": policies}
 
 
 def tls_settings(tls: TlsConfig) -> dict[str, Any]:

@@ -15,12 +15,11 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from types import TracebackType
-from typing import Self
 
 from google.protobuf.message import Message
 
 from protocols.bus.base import AgentEvent, AgentWatch, Bus, Publisher, Received, Refusal, Subscription
+from protocols.core.closing import Closing
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import STATUS, Topic
 from protocols.validation.rules import MAX_NUMBERS, RejectionReason
@@ -30,8 +29,8 @@ SOURCE_TIMEOUT_S = 10.0
 _MAX_SOURCES = _MAX_AGENTS = 4096
 _MAX_HEARD = 16
 """Boots of one agent whose late messages are accepted, and that may be alive at once."""
-_PUBLISHED_SOURCES = 48
-_MAX_COUNTER_NAME = 64
+_PUBLISHED_SOURCES = 48  # of rejections in a status, whose counters are bounded
+_MAX_COUNTER_NAME = 64  # characters: the validation's limit
 
 
 @dataclass(slots=True)
@@ -165,7 +164,7 @@ class _StatusPublisher:
         self._inner.close()
 
 
-class SenderCheckedBus:
+class SenderCheckedBus(Closing):
     """A bus whose subscriptions accept only messages of verified senders. See ``protocols.bus.base.Bus``.
 
     now: a monotonic clock [s]. amend: called with every status before it is published; may add to it. seen: called with
@@ -222,14 +221,6 @@ class SenderCheckedBus:
         if self._watch is not None:
             self._watch.close()
         self._bus.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def update_agents(self) -> None:
         """Process appearances and disappearances of agents."""

@@ -20,7 +20,7 @@ from protocols.core.clocks import utc_text
 from protocols.core.errors import InputError
 from protocols.core.names import key_segment
 
-_TIMEOUT_S = 0.6
+_TIMEOUT_S = 0.6  # of a handshake in a local network
 _PLAIN = "it speaks plain TCP, and this connection wants TLS: write tcp/, or give the router certificates"
 
 

@@ -41,7 +41,7 @@ _MAX_SOURCES, _MAX_OF_KEY = 16_384, 16
 """Publishers that are remembered, and of these of one key: an agent that restarts again and again has as many."""
 _MAX_BYTES, _MAX_BYTES_OF_KEY = 64 * 1024 * 1024, 8 * 1024 * 1024
 """Bytes held back at once, of all publishers together and of one."""
-_SEQUENCE_MODULUS = 2**32
+_SEQUENCE_MODULUS = 2**32  # Zenoh's sequence numbers have 32 bits
 
 
 @dataclass(frozen=True, slots=True)

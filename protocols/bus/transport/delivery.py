@@ -8,7 +8,7 @@ from protocols.topics import Delivery, Topic
 
 OUTAGE_S = 60.0
 """The longest link outage without message loss, unless configured otherwise."""
-_MARGIN = 1.5
+_MARGIN = 1.5  # rates vary, and an outage is noticed late
 
 
 def cache_size(topic: Topic, rate_hz: float | None = None, outage_s: float = OUTAGE_S) -> int:

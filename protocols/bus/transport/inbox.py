@@ -201,6 +201,30 @@ class Inbox:
             return dict(self._counts)
 
 
+class InboxSubscription:
+    """What subscriptions of all transports share; see ``protocols.bus.base.Subscription``."""
+
+    def __init__(self, topic: Topic, clock_ns: Callable[[], int]) -> None:
+        self.inbox = Inbox(topic, clock_ns)
+
+    def drain(self) -> list[Received]:
+        """Everything since the last call."""
+        return self.inbox.drain()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for something to drain."""
+        return self.inbox.wait(timeout_s)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """See the contract."""
+        return self.inbox.counters
+
+    def refusals(self) -> list[Refusal]:
+        """The messages rejected since the last call."""
+        return self.inbox.refusals()
+
+
 class LivenessTracker:
     """Tracks which agents are alive, as a list of changes. A token seen twice, as after a reconnect, is one change."""
 

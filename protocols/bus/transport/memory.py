@@ -9,16 +9,15 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import TracebackType
-from typing import Self
 
 from google.protobuf.message import Message
 
-from protocols.bus.base import AgentEvent, BusDead, Received, Refusal
+from protocols.bus.base import BusDead
 from protocols.bus.transport.delivery import cache_size
-from protocols.bus.transport.inbox import Inbox, LivenessTracker, subscription_key
+from protocols.bus.transport.inbox import InboxSubscription, LivenessTracker, subscription_key
+from protocols.core.closing import Closing
 from protocols.core.names import check_identifier
 from protocols.topics import Topic, liveliness_key
 from protocols.validation.codec import encode, parse_key
@@ -91,7 +90,7 @@ class MemoryPublisher:
                 self._hub.publishers.remove(self)
 
 
-class MemorySubscription:
+class MemorySubscription(InboxSubscription):
     """See ``protocols.bus.base.Subscription``."""
 
     def __init__(self, hub: MemoryHub, topic: Topic, site: str, agent: str) -> None:
@@ -100,7 +99,7 @@ class MemorySubscription:
         self._topic = topic
         self._site = site
         self._agent = agent
-        self.inbox = Inbox(topic, hub.clock_ns)
+        super().__init__(topic, hub.clock_ns)
         with hub.changed:
             for publisher in hub.publishers:
                 if self.matches(publisher.key):
@@ -119,23 +118,6 @@ class MemorySubscription:
             and self._agent in ("*", address.agent)
         )
 
-    def drain(self) -> list[Received]:
-        """Everything since the last call."""
-        return self.inbox.drain()
-
-    def wait(self, timeout_s: float) -> bool:
-        """Wait for something to drain."""
-        return self.inbox.wait(timeout_s)
-
-    @property
-    def counters(self) -> Mapping[str, int]:
-        """See the contract; ``lost`` stays 0, since memory loses nothing."""
-        return self.inbox.counters
-
-    def refusals(self) -> list[Refusal]:
-        """The messages rejected since the last call."""
-        return self.inbox.refusals()
-
     def close(self) -> None:
         """Stop receiving."""
         with self._hub.lock:
@@ -143,13 +125,13 @@ class MemorySubscription:
                 self._hub.subscriptions.remove(self)
 
 
-class MemoryWatch:
+class MemoryWatch(LivenessTracker):
     """See ``protocols.bus.base.AgentWatch``."""
 
     def __init__(self, hub: MemoryHub, site: str) -> None:
         self._hub = hub
         self._prefix = f"syncline/{site}/alive/"
-        self._liveness = LivenessTracker()
+        super().__init__()
         with hub.lock:
             hub.watches.append(self)
             for key in hub.tokens:
@@ -158,11 +140,7 @@ class MemoryWatch:
     def mark(self, key: str, alive: bool) -> None:
         """Process a liveliness token of this site."""
         if key.startswith(self._prefix):
-            self._liveness.mark(key, alive)
-
-    def drain(self) -> list[AgentEvent]:
-        """Changes since the last call."""
-        return self._liveness.drain()
+            super().mark(key, alive)
 
     def close(self) -> None:
         """Stop watching."""
@@ -171,7 +149,7 @@ class MemoryWatch:
                 self._hub.watches.remove(self)
 
 
-class MemoryBus:
+class MemoryBus(Closing):
     """See ``protocols.bus.base.Bus``."""
 
     def __init__(self, hub: MemoryHub, site: str = "local") -> None:
@@ -234,14 +212,6 @@ class MemoryBus:
             self._declared.pop().close()
         while self._tokens:
             self._hub.mark(self._tokens.pop(), False)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _check_open(self) -> None:
         if self._closed:

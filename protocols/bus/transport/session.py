@@ -26,7 +26,7 @@ later ones are long enough for a link of 300 ms, over which a handshake takes fo
 _OPEN_TIMEOUT_MS = 4000
 """Timeout of one connection attempt. TCP doubles its retransmission pause where a first packet is lost, so an attempt
 that began on a bad link waits for seconds after the link has recovered; a new one does not. Long enough for 800 ms."""
-_PAUSE_S = 0.1
+_PAUSE_S = 0.1  # between two attempts to connect
 
 
 @contextmanager

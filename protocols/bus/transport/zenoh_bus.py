@@ -5,32 +5,32 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from types import TracebackType
-from typing import Any, Self, TypeAlias
+from typing import Any, TypeAlias
 
 import zenoh
 import zenoh.ext
 import zenoh.handlers
 from google.protobuf.message import Message
 
-from protocols.bus.base import AgentEvent, BusDead, Received, Refusal
+from protocols.bus.base import BusDead, Received
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.backfill import Backfill, RecoveryQuery
 from protocols.bus.transport.delivery import cache_size
-from protocols.bus.transport.inbox import Inbox, LivenessTracker, subscription_key
+from protocols.bus.transport.inbox import InboxSubscription, LivenessTracker, subscription_key
 from protocols.bus.transport.session import close_session, open_session, undeclare_all, zenoh_call
+from protocols.core.closing import Closing
 from protocols.core.names import check_identifier
 from protocols.topics import Delivery, Topic, liveliness_key
 from protocols.validation.codec import Rejected, RejectionReason, encode, parse_key
 
 HEARTBEAT_S = 0.5
 """Period after which a subscriber detects that the last message before a pause is missing."""
-_POLL_S = 0.005
-_HISTORY_QUERY_S = 2.0
-_GAP_QUERY_S = 10.0
-_MAX_KEYS, _KEYS_PER_CALL = 8192, 8
+_POLL_S = 0.005  # for a matching subscriber
+_HISTORY_QUERY_S = 2.0  # below JOIN_TIMEOUT_S
+_GAP_QUERY_S = 10.0  # a third of GAP_TIMEOUT_S: three queries before it is lost
+_MAX_KEYS, _KEYS_PER_CALL = 8192, 8  # that are declared in all, and by one drain
 
 _Source: TypeAlias = tuple[str, int]
 """A publisher's identity in Zenoh: session id and entity id."""
@@ -122,14 +122,14 @@ class _DeclaredKeys:
                 self._session.undeclare(self._declared.pop())
 
 
-class ZenohSubscription:
+class ZenohSubscription(InboxSubscription):
     """See ``protocols.bus.base.Subscription``."""
 
     def __init__(self, session: zenoh.Session, topic: Topic, key: str, clock_ns: Callable[[], int]) -> None:
         self._session = session
-        self._inbox = Inbox(topic, clock_ns)
+        super().__init__(topic, clock_ns)
         self._reliable = topic.delivery is Delivery.RELIABLE
-        self._backfill: Backfill[_Source] = Backfill(self._push, self._ask, self._inbox.count_lost)
+        self._backfill: Backfill[_Source] = Backfill(self._push, self._ask, self.inbox.count_lost)
         self._newest: dict[tuple[str, _Source], int] = {}
         self._keys = _DeclaredKeys(session)
         recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
@@ -150,12 +150,12 @@ class ZenohSubscription:
             return
         source, key, payload = sample.source_info, str(sample.key_expr), sample.payload.to_bytes()
         if parse_key(key) is None:  # nothing is remembered of it
-            self._inbox.refuse(Rejected(RejectionReason.UNKNOWN_KEY, key[:200]), key)
+            self.inbox.refuse(Rejected(RejectionReason.UNKNOWN_KEY, key[:200]), key)
             return
         self._keys.meet(key)
         if source is None:
             # A plain publisher, as zenoh-pico's: without recovery, and its gaps are those of its own numbers.
-            self._inbox.push(key, payload, numbered=False)
+            self.inbox.push(key, payload, numbered=False)
             return
         name = (str(source.source_id.zid), source.source_id.eid)
         if self._reliable:
@@ -171,11 +171,11 @@ class ZenohSubscription:
             self._newest.clear()
         if newest is None or newest < number:
             if newest is not None and number > newest + 1:
-                self._inbox.count_skipped(number - newest - 1)
+                self.inbox.count_skipped(number - newest - 1)
             self._newest[publisher] = number
 
     def _push(self, source: _Source, key: str, payload: bytes) -> None:
-        self._inbox.push(key, payload, source[0])
+        self.inbox.push(key, payload, source[0])
 
     def _ask(self, question: RecoveryQuery[_Source]) -> None:
         """Query one publisher's cache; its replies arrive on a Zenoh thread."""
@@ -222,20 +222,7 @@ class ZenohSubscription:
         """Everything since the last call."""
         self._keys.declare()
         self._backfill.poll()
-        return self._inbox.drain()
-
-    def wait(self, timeout_s: float) -> bool:
-        """Wait for something to drain."""
-        return self._inbox.wait(timeout_s)
-
-    @property
-    def counters(self) -> Mapping[str, int]:
-        """See the contract."""
-        return self._inbox.counters
-
-    def refusals(self) -> list[Refusal]:
-        """The messages rejected since the last call."""
-        return self._inbox.refusals()
+        return super().drain()
 
     def close(self) -> None:
         """Undeclare: a process with an open callback never exits."""
@@ -243,11 +230,11 @@ class ZenohSubscription:
         self._keys.close()
 
 
-class ZenohWatch:
+class ZenohWatch(LivenessTracker):
     """See ``protocols.bus.base.AgentWatch``."""
 
     def __init__(self, session: zenoh.Session, site: str) -> None:
-        self._liveness = LivenessTracker()
+        super().__init__()
         key = f"syncline/{site}/alive/**"
         with zenoh_call(f"watch {key}"):
             self._subscriber: zenoh.Subscriber[None] = session.liveliness().declare_subscriber(
@@ -255,18 +242,14 @@ class ZenohWatch:
             )
 
     def _take(self, sample: zenoh.Sample) -> None:
-        self._liveness.mark(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
-
-    def drain(self) -> list[AgentEvent]:
-        """Changes since the last call."""
-        return self._liveness.drain()
+        self.mark(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
     def close(self) -> None:
         """Undeclare."""
         undeclare_all(self._subscriber)
 
 
-class ZenohBus:
+class ZenohBus(Closing):
     """See ``protocols.bus.base.Bus``. Made by ``open_bus``."""
 
     def __init__(
@@ -340,14 +323,6 @@ class ZenohBus:
         while self._declared:
             self._declared.pop().close()
         close_session(self._session)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def open_bus(

@@ -43,11 +43,11 @@ _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQII")
 """Start time, end time, unpacked size, checksum, length of the compression's name; then that name, u64 size, data."""
 _KNOWN = frozenset(int(opcode) for opcode in Opcode)
-_FIRST_PRIVATE_OPCODE = 0x80
+_FIRST_PRIVATE_OPCODE = 0x80  # MCAP leaves these to applications
 _MAX_RECORD = 1 << 40
 """Bytes. A longer record is a damaged length."""
-_MIN_ATTACHMENT = 36
-_FOOTER_LENGTH = 20
+_MIN_ATTACHMENT = 36  # bytes: of one with empty texts and no data
+_FOOTER_LENGTH = 20  # bytes: two offsets and a checksum
 _FIRST_WINDOW, _MAX_WINDOW = 1 << 8, 1 << 20
 """Bytes that are searched at once for the next record: more as the search goes on, so that it costs what it passes."""
 # Chunk, attachment, metadata, message index, end of data or footer, shorter than 4 GiB: a prefilter for headers.

@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from types import TracebackType
-from typing import Any, NamedTuple, Self, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 from google.protobuf.message import Message
 from mcap.data_stream import ReadDataStream
@@ -206,14 +205,6 @@ class LogReader:
             damaged=bool(self._damage.flaws),
             reason=self.damage,
         )
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Nothing stays open between scans."""
 
     def _messages(self, wanted: set[str] | None, start_ns: int | None, end_ns: int | None) -> Iterator[LogMessage]:
         counts: Counter[str] = Counter()

@@ -37,12 +37,12 @@ from protocols.geometry.types import Floats
 from protocols.log.schemas import FOXGLOVE_PREFIX
 from protocols.log.write.thumbnails import ThumbnailScale, thumbnail_scale
 from protocols.messages import syncline_pb2 as pb
+from protocols.session.rig import METRES_PER_UNIT
 
 WORLD = "world"
-_METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _MARKER_DIAMETER_M = 0.05
 """Diameter of a tracked point in a viewer [m]; with arbitrary scale, in baselines."""
-_SMALLEST_CIRCLE_PX = 6.0
+_SMALLEST_CIRCLE_PX = 6.0  # diameter that is still seen in a viewer
 _ORANGE = Color(r=1.0, g=0.55, b=0.0, a=1.0)
 _POINT_FIELDS = [
     PackedElementField(name=name, offset=4 * place, type=PackedElementField.FLOAT32) for place, name in enumerate("xyz")
@@ -92,9 +92,9 @@ class FoxgloveConverter:
             self._own_lens.add(message.camera)
             return [self._lens(where, message.camera, message, stamp)]
         if isinstance(message, pb.RigInfo):
-            self._metres = _METRES_PER_UNIT.get(message.units, 1.0)
+            self._metres = METRES_PER_UNIT.get(message.units, 1.0)
         elif isinstance(message, pb.Calibration) and message.cameras:
-            self._metres = _METRES_PER_UNIT.get(message.units, 1.0) if message.scale == "metric" else 1.0
+            self._metres = METRES_PER_UNIT.get(message.units, 1.0) if message.scale == "metric" else 1.0
             return self._calibration(where, message, stamp)
         elif isinstance(message, pb.Track):
             # rerun's loader supports point clouds, but not scenes.

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from google.protobuf.message import Message
 
 from protocols.core.clocks import NANOSECONDS
+from protocols.core.closing import Closing
 from protocols.core.errors import InputError
 from protocols.log.layout import part_path
 from protocols.log.write.writer import LogWriter
 from protocols.topics import Topic
 
 
-class RotatingWriter:
+class RotatingWriter(Closing):
     """A LogWriter that begins a new file when the present one is large or old enough. For use by one thread.
 
     path: name.mcap gives name-000.mcap, name-001.mcap, …; session: an id that all parts carry.
@@ -90,14 +89,6 @@ class RotatingWriter:
     def close(self) -> None:
         """As LogWriter.close."""
         self._writer.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _due(self, log_time_ns: int) -> bool:
         assert self._first_ns is not None

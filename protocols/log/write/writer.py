@@ -7,13 +7,13 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import IO, TYPE_CHECKING, Any, NoReturn, Self, cast
+from typing import IO, TYPE_CHECKING, Any, NoReturn, cast
 
 from google.protobuf.message import Message
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
+from protocols.core.closing import Closing
 from protocols.core.errors import InputError
 from protocols.core.version import VERSION
 from protocols.log.layout import CHANNEL_RECORD, FORMAT_RECORD, LOG_VERSION, channel_record, with_checksum
@@ -35,7 +35,7 @@ MAX_CHANNELS = 16_384
 """Keys in one file: 1,000 cameras have 12,000, with those for viewers. The format numbers them with 16 bits."""
 
 
-class LogWriter:
+class LogWriter(Closing):
     """Writes messages of the catalogue to a new MCAP file. For use by one thread.
 
     path: the file; its folders are made. An existing file is never overwritten (InputError).
@@ -167,14 +167,6 @@ class LogWriter:
             self._writer.finish()
             self._file.sync()
             self._shut()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _new_channel(self, key: str) -> int:
         schema = schema_of(key)

@@ -13,11 +13,10 @@ import pytest
 
 from deploy.agents.systemd_notify import HeartbeatDevice
 from edge import scenes
-from edge.agents.camera import CameraAgent, run_camera_agent
+from edge.agents.camera import CameraAgent
 from edge.detectors.base import Detection
 from edge.detectors.marker.ball import MarkerDetector
 from edge.devices.base import DeviceInfo, Frame
-from edge.devices.playback.playback_clock import AsFastAsPossible
 from edge.devices.simulated.camera import SimulatedDevice
 from protocols.bus.base import BusDead
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
@@ -25,6 +24,7 @@ from protocols.core.errors import InputError
 from protocols.geometry import so3
 from protocols.session.rig import RigCamera
 from protocols.topics import CAMERA_INFO, OBSERVATION, STATUS
+from tests.support.clocks import AsFastAsPossible
 
 
 class ListedDevice:
@@ -79,7 +79,7 @@ def test_every_frame_is_published_even_without_detections() -> None:
     observations, infos, statuses = (listener.subscribe(topic) for topic in (OBSERVATION, CAMERA_INFO, STATUS))
     device = ListedDevice([0, 1, 4, 5])
     seen = Detection(12.5, 7.25, 9.0, 0.9, "marker", (250, 110, 20), (0.01, 0.001, 0.02))
-    run_camera_agent(device, ScriptedDetector([], [seen], []), MemoryBus(hub), "cam0", threading.Event(), boot_id="b1")
+    CameraAgent(device, ScriptedDetector([], [seen], []), MemoryBus(hub), "cam0", boot_id="b1").run(threading.Event())
     got = messages(observations)
     assert [m.frame for m in got] == [0, 1, 4, 5]
     assert [m.sequence for m in got] == [0, 1, 2, 3]
@@ -115,7 +115,7 @@ def test_pose_and_intrinsics_of_the_rig_file_are_in_the_camera_info() -> None:
         rotation=rotation,
         position_std=np.full(3, 0.01),
     )
-    run_camera_agent(ListedDevice([0]), ScriptedDetector(), MemoryBus(hub), "cam0", threading.Event(), known=known)
+    CameraAgent(ListedDevice([0]), ScriptedDetector(), MemoryBus(hub), "cam0", known=known).run(threading.Event())
     (info,) = messages(infos)
     assert list(info.position) == [1.0, 2.0, 3.0]
     assert list(info.rotation) == pytest.approx([0.1, -0.2, 0.3])
@@ -201,7 +201,7 @@ def test_a_dead_bus_ends_the_agent(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter(range(0, 10**14, 10**8))  # a status is due every few looks at the clock
     device = ListedDevice([0], endless=True)
     with pytest.raises(BusDead, match="panic"):
-        run_camera_agent(device, ScriptedDetector(), bus, "cam0", threading.Event(), lambda: next(clock))
+        CameraAgent(device, ScriptedDetector(), bus, "cam0", now_ns=lambda: next(clock)).run(threading.Event())
     assert device.closed
 
 
@@ -211,7 +211,7 @@ def test_a_device_that_does_not_open_is_reported_before_the_agent_is_announced()
     from edge.devices.playback.video_file import VideoPlayback
 
     with pytest.raises(InputError, match="does not exist"):
-        run_camera_agent(VideoPlayback(Path("gone.mp4")), ScriptedDetector(), MemoryBus(hub), "cam0", threading.Event())
+        CameraAgent(VideoPlayback(Path("gone.mp4")), ScriptedDetector(), MemoryBus(hub), "cam0").run(threading.Event())
     assert watch.drain() == []
 
 
@@ -219,7 +219,7 @@ def test_a_non_finite_detection_is_dropped_and_the_frame_is_published() -> None:
     hub = MemoryHub()
     observations = MemoryBus(hub).subscribe(OBSERVATION)
     bad = Detection(float("nan"), 1.0)
-    run_camera_agent(ListedDevice([0, 1]), ScriptedDetector([bad], [bad]), MemoryBus(hub), "cam0", threading.Event())
+    CameraAgent(ListedDevice([0, 1]), ScriptedDetector([bad], [bad]), MemoryBus(hub), "cam0").run(threading.Event())
     assert [len(m.detections) for m in messages(observations)] == [0, 0]
 
 
@@ -230,7 +230,7 @@ def test_a_simulated_camera_from_pixels_to_messages() -> None:
     scene = scenes.get_marker_scene("marker", 0)
     device = SimulatedDevice(scene, "cam0", 0, AsFastAsPossible(), duration_s=6.0)
     detector = MarkerDetector(intrinsics=device.info.intrinsics)
-    agent = run_camera_agent(device, detector, MemoryBus(hub), "cam0", threading.Event())
+    agent = CameraAgent(device, detector, MemoryBus(hub), "cam0").run(threading.Event())
     got = messages(observations)
     assert len(got) == agent.frames > 150
     seen = [m for m in got if m.detections]
@@ -254,13 +254,8 @@ def test_exposure_and_temperature_are_reported_where_the_device_provides_them(wa
     def last(device: ListedDevice) -> Any:
         hub = MemoryHub()
         statuses = MemoryBus(hub).subscribe(STATUS)
-        run_camera_agent(
-            HeartbeatDevice(device, lambda: None) if watched else device,
-            ScriptedDetector(),
-            MemoryBus(hub),
-            "cam0",
-            threading.Event(),
-        )
+        used = HeartbeatDevice(device, lambda: None) if watched else device
+        CameraAgent(used, ScriptedDetector(), MemoryBus(hub), "cam0").run(threading.Event())
         return messages(statuses)[-1]
 
     gauges = last(WarmDevice([0, 1])).gauges

@@ -19,13 +19,13 @@ from edge.agents.thumbnails import thumbnail_message
 from edge.detectors.marker.ball import MarkerDetector
 from edge.devices.base import Frame
 from edge.devices.playback.log_playback import LogPlayback
-from edge.devices.playback.playback_clock import AsFastAsPossible
 from edge.scenes import renderer_for
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.errors import InputError
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import CAMERA_INFO, OBSERVATION, PICTURE
+from tests.support.clocks import AsFastAsPossible
 
 SCENE = scenes.get_marker_scene("marker", 0)
 LENS = SCENE.camera("cam0").intrinsics

@@ -15,7 +15,8 @@ import pytest
 
 pytest.importorskip("cryptography", reason="the extra `keys` is not installed: enrolment is not tested")
 from deploy.cli import run
-from deploy.config.agents import CameraConfig, HubConfig, RouterConfig, load
+from deploy.config.agents import CameraConfig, HubConfig, RouterConfig
+from deploy.config.file import load
 from deploy.site import keys
 from deploy.site.boards import board, operations
 from deploy.site.boards.site_file import Site, SiteAgent, read_site_file

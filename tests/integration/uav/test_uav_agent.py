@@ -19,7 +19,7 @@ os.environ["MAVLINK20"] = "1"
 from pymavlink import mavutil
 
 from deploy.agents import uav
-from deploy.config.agents import load
+from deploy.config.file import load
 from deploy.config.uav import SimulatedFlightConfig, UavConfig
 from edge.mavlink.roles.autopilot import DEFAULT_ORIGIN
 from edge.uav.world.flight_world import FlightWorld

@@ -7,8 +7,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from deploy.config.agents import BusConfig, CameraConfig, HubConfig, RecorderConfig, effective_toml, load
-from protocols.bus.settings import LOOPBACK_ROUTER, is_loopback
+from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig
+from deploy.config.file import effective_toml, load
+from protocols.bus.settings import LOOPBACK_ROUTER, BusConfig, is_loopback
 from protocols.core.errors import InputError
 
 

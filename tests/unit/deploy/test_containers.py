@@ -14,7 +14,8 @@ from typing import Any
 
 import pytest
 
-from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig, RouterConfig, load
+from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig, RouterConfig
+from deploy.config.file import load
 from deploy.site.bundle import ROLE_PACKAGES
 
 FOLDER = Path(__file__).resolve().parents[3] / "deploy" / "site" / "containers"

@@ -12,7 +12,8 @@ import deploy
 from deploy.agents.assembly import _detector as detector_of
 from deploy.agents.assembly import make_device
 from deploy.commands.agents.run import camera
-from deploy.config.agents import CameraConfig, effective_toml, load
+from deploy.config.agents import CameraConfig
+from deploy.config.file import effective_toml, load
 from edge import scenes
 from edge.agents.image_health import ImageHealth
 from edge.detectors.marker.ball import MarkerDetector

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
-from deploy.config.agents import CameraConfig, HubConfig, load
+from deploy.config.agents import CameraConfig, HubConfig
+from deploy.config.file import load
 from deploy.site.fleet import read_state
 from deploy.site.rig_folder import SHIPPED, find_rig, read_rig_folder, write_agent_configs
 from edge import scenes

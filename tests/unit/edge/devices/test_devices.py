@@ -14,12 +14,13 @@ from edge import scenes
 from edge.devices.base import Frame
 from edge.devices.live.opencv_capture import OpenCvCamera
 from edge.devices.playback.open_video import open_video
-from edge.devices.playback.playback_clock import AsFastAsPossible, RealTime
+from edge.devices.playback.playback_clock import RealTime
 from edge.devices.playback.video_file import VideoPlayback
 from edge.devices.simulated.camera import SimulatedDevice
 from edge.scenes.common.base import Renderer
 from edge.scenes.marker.scene import MarkerScene
 from protocols.core.errors import InputError
+from tests.support.clocks import AsFastAsPossible
 
 
 class BlankRenderer(Renderer):

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge.devices.live.oak import OakCamera, OakSettings, OakStream, open_stream
+from edge.devices.live.oak import OakCamera, OakStream, open_stream
+from edge.devices.settings import OakSettings
 from protocols.core.errors import InputError
 
 dai = pytest.importorskip("depthai", reason="the extra `oak` is not installed: the OAK driver is not tested")

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge.agents.camera import run_camera_agent
+from edge.agents.camera import CameraAgent
 from edge.detectors.network.boxes import BoxLabeller, NetworkBox
 from edge.devices.base import Frame
-from edge.devices.live.oak import OakCamera, OakSettings, OakStream, open_archive, open_stream
+from edge.devices.live.oak import OakCamera, OakStream, open_archive, open_stream
 from edge.devices.live.oak_network import boxes_in_image
+from edge.devices.settings import OakSettings
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.errors import InputError
 from protocols.topics import OBSERVATION
@@ -28,7 +29,7 @@ SENSOR = (1920, 1200)
 SIZE = (640, 400)  # a third of the sensor
 NETWORK = (300, 300)  # letterboxed: 300x187.5 of it is picture, 56 rows of it above are not
 SCALE = NETWORK[0] / SENSOR[0]
-SETTINGS = OakSettings(size=SIZE, fps=50.0, prefix="cam4")
+SETTINGS = OakSettings(size=SIZE, fps=50.0)
 _KEPT: list[Any] = []
 
 
@@ -153,7 +154,7 @@ def test_detections_are_delivered_with_their_own_frame_at_its_mid_exposure() -> 
     other = (900.0, 150.0, 1200.0, 900.0)
     found = [results(0), *(results(number, ("person", 0.9, box)) for number in (2, 4, 5, 6))]
     found[3] = results(5, ("person", 0.9, box), ("person", 0.8, other))
-    camera = OakCamera(SETTINGS, connect=lambda settings: stream(pictures, found))
+    camera = OakCamera(SETTINGS, prefix="cam4", connect=lambda settings: stream(pictures, found))
     camera.open()
     got: list[Frame] = []
     for _ in range(8):
@@ -178,10 +179,10 @@ def test_an_agent_publishes_the_boards_detections_and_runs_no_detector() -> None
 
     pictures = [picture(number, 100.0 + number / 50.0) for number in range(3)]
     found = [results(number, ("ball", 0.75, (300.0, 150.0, 600.0, 450.0))) for number in range(3)]
-    camera = OakCamera(SETTINGS, connect=lambda settings: stream(pictures, found))
+    camera = OakCamera(SETTINGS, prefix="cam4", connect=lambda settings: stream(pictures, found))
     hub, stop = MemoryHub(), threading.Event()
     subscription = MemoryBus(hub).subscribe(OBSERVATION)
-    agent = threading.Thread(target=run_camera_agent, args=(camera, UnusedDetector(), MemoryBus(hub), "cam4", stop))
+    agent = threading.Thread(target=CameraAgent(camera, UnusedDetector(), MemoryBus(hub), "cam4").run, args=(stop,))
     agent.start()
     messages: list[Any] = []
     for _ in range(100):

@@ -11,8 +11,9 @@ import pytest
 
 from edge.devices.base import Frame
 from edge.devices.live.opencv_capture import OpenCvCamera
-from edge.devices.live.picamera import PiCamera, PiSettings
-from edge.devices.live.usb import UsbCamera, UsbSettings, V4l2Stream, open_usb
+from edge.devices.live.picamera import PiCamera
+from edge.devices.live.usb import UsbCamera, V4l2Stream, open_usb
+from edge.devices.settings import PiSettings, UsbSettings
 from protocols.core.errors import InputError
 
 raw = pytest.importorskip("linuxpy.video.raw", reason="the extra `v4l2` is not installed: V4L2 is not tested")
@@ -132,7 +133,7 @@ def test_a_busy_kernel_is_polled_again_and_a_missing_camera_is_refused() -> None
     assert [frame.frame for frame in read_frames(camera)] == [0, 1]
     assert camera.reconnections == 0
     with pytest.raises(InputError, match=r"camera /dev/video97 does not answer.*plugged in"):
-        UsbCamera(UsbSettings("/dev/video97"), stream=V4l2Stream).open()
+        UsbCamera(UsbSettings(device="/dev/video97"), stream=V4l2Stream).open()
     with pytest.raises(InputError, match="gives no frame"):
         usb(FakeStream()).open()
 

@@ -14,7 +14,8 @@ from edge.agents.uav_guidance import GuidanceControl
 from edge.mavlink.dialect import mavlink
 from edge.mavlink.link.connection import Link
 from edge.mavlink.link.transport import Pipe
-from edge.mavlink.roles.guidance import Guidance, GuidanceLimits, GuidanceTarget
+from edge.mavlink.roles.guidance import Guidance, GuidanceTarget
+from edge.mavlink.settings import GuidanceLimits
 from edge.uav.base import Estimate, TrackState
 from edge.uav.navigation import Origin
 
@@ -131,7 +132,7 @@ def test_a_stale_estimate_is_extrapolated_for_at_most_a_second() -> None:
 
 
 def test_the_gimbal_points_at_the_target_with_a_limited_rate() -> None:
-    under_test = GuidanceUnderTest(gimbal=True, rate=math.radians(30.0))
+    under_test = GuidanceUnderTest(gimbal=True, rate_deg_s=30.0)
     first = under_test.tick(0.0, replace(TARGET, velocity=np.zeros(2)))[-1]
     assert first.yaw == pytest.approx(math.atan2(40.0, 30.0), abs=1e-5)
     assert first.pitch == pytest.approx(-math.atan2(49.3, 50.0), abs=1e-5)

@@ -1,0 +1,92 @@
+"""What the subcommands share: options, checks of their values, and the result as text or as JSON."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from protocols.core.errors import EXIT_DONE, InputError
+
+Flag = Annotated[bool, Parameter(negative="")]
+Json = Annotated[bool, Parameter(negative="", help="Print the result as JSON.")]
+PrintConfig = Annotated[
+    bool, Parameter(negative="", help="Print the configuration with all defaults filled in, and exit.")
+]
+UnusedSeed = Annotated[int, Parameter(help="Accepted for consistency; this command uses no random numbers.")]
+Role = Literal["camera", "uav", "hub", "recorder", "router"]
+Names = Annotated[list[str] | None, Parameter(negative="", help="Only these agents, by id or ROLE-ID.")]
+
+
+def check_range(option: str, value: float | None, low: float, high: float, remedy: str = "") -> None:
+    """Raise InputError unless low <= value <= high; None is no value."""
+    if value is not None and not low <= value <= high:
+        raise InputError(f"{option} {value:g} is out of range", remedy=remedy or f"give {low:g} to {high:g}")
+
+
+def check_rate(fps: float | None) -> None:
+    """Raise InputError for a frame rate [Hz] that no camera has."""
+    check_range("--fps", fps, 0.1, 10_000.0, "give the frame rate in Hz")
+
+
+def check_seed(seed: int) -> None:
+    """Raise InputError for a negative seed."""
+    if seed < 0:
+        raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
+
+
+def check_file(out: Path, name: str) -> None:
+    """Raise InputError if ``out`` is a folder. name: of what it has to be."""
+    if out.is_dir():
+        raise InputError("this is a folder, but a file is needed", file=out, remedy=f"give --out the name of {name}")
+
+
+def refuse(options: Mapping[str, object], what: str) -> None:
+    """Raise InputError for the first option that is given (not None) and cannot be used with ``what``."""
+    for option, value in options.items():
+        if value is not None:
+            raise InputError(f"{option} cannot be used with {what}", remedy="leave it out")
+
+
+def parse_size(option: str, text: str, remedy: str, least: int = 1, most: int = 99_999) -> tuple[int, int]:
+    """(width, height) of an option like 1920x1080, each from ``least`` to ``most``. Raises InputError."""
+    found = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text.strip())
+    if found is None or not all(least <= int(side) <= most for side in found.groups()):
+        raise InputError(f"{option} {text} is no size", remedy=remedy)
+    return int(found[1]), int(found[2])
+
+
+def answer(document: Mapping[str, Any] | list[Any], lines: Iterable[str], as_json: bool) -> int:
+    """Print the result of a command, as JSON or in lines; returns EXIT_DONE."""
+    if as_json:
+        print(json.dumps(document, allow_nan=False), flush=True)
+    else:
+        for line in lines:
+            print(line, flush=True)
+    return EXIT_DONE
+
+
+def closing_lines(warnings: Iterable[str], written: Iterable[object]) -> list[str]:
+    """The last lines of a result: warnings, and the files that were written."""
+    return [*(f"warning: {warning}" for warning in warnings), f"written: {', '.join(map(str, written))}"]
+
+
+def parse_box(text: str) -> tuple[float, float, float, float]:
+    """A bounding box ``x,y,w,h`` of --target [px]. Raises InputError."""
+    from deploy.offline.track import parse_target
+
+    box = parse_target(text)
+    return box.x, box.y, box.width, box.height
+
+
+def open_browser(address: str) -> None:
+    """Open a browser, or say that there is none."""
+    import webbrowser
+
+    if not webbrowser.open(address):
+        print("syncline: no browser could be opened here", file=sys.stderr)
