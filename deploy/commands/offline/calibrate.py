@@ -33,6 +33,7 @@ def calibrate(
     height: float | None = None,
     limb: str | None = None,
     json: Annotated[bool, Parameter(negative="")] = False,
+    scheduler: str | None = None,
     seed: int = 0,
 ) -> int:
     """Estimate clock offset and pose of each camera of a session, and the trajectory of the moving target.
@@ -81,6 +82,10 @@ def calibrate(
         The distance between two labels, as left_knee-left_ankle=0.41 [rig units]: gives the scale.
     json
         Print the result as JSON on standard output.
+    scheduler
+        Runs this command over many sessions on dask: an address, a scheduler's file, or a number of processes on this
+        machine. The session is then a folder of sessions, or a .txt file with one and its own options a line; --out is
+        a folder. Called again, it does what is left.
     seed
         Seed of the pose nodes' random samples (--solver distributed); the other solvers use no random numbers.
     """

@@ -42,6 +42,7 @@ def detect(
     background: Literal["mog2", "knn"] = "mog2",
     detector: str | None = None,
     json: Annotated[bool, Parameter(negative="")] = False,
+    scheduler: str | None = None,
     seed: int = 0,
 ) -> int:
     """Detect a marker, people or vehicles in every frame of a video, and write the times and pixels.
@@ -107,6 +108,10 @@ def detect(
         registers, in place of the shipped one.
     json
         Print a summary as JSON.
+    scheduler
+        Runs this command over many videos on dask: an address, a scheduler's file, or a number of processes on this
+        machine. The video is then a folder of videos, or a .txt file with one and its own options a line; --out is a
+        folder. Called again, it does what is left.
     seed
         Accepted by every command; nothing here is random.
     """

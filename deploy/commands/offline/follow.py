@@ -29,6 +29,7 @@ def follow(
     area: str | None = None,
     crops: Path | None = None,
     json: Annotated[bool, Parameter(negative="")] = False,
+    scheduler: str | None = None,
     seed: int = 0,
 ) -> int:
     """Follow people or vehicles through all cameras of a calibrated rig, offline.
@@ -75,6 +76,10 @@ def follow(
         or a log with pictures.
     json
         Print result.json on standard output.
+    scheduler
+        Runs this command over many sessions on dask: an address, a scheduler's file, or a number of processes on this
+        machine. The session is then a folder of sessions, or a .txt file with one and its own options a line; --out is
+        a folder. Called again, it does what is left.
     seed
         Seed of detectors that use random numbers; it stands in result.json.
     """

@@ -29,6 +29,7 @@ def track(
     overlay: Annotated[bool, Parameter(negative="")] = False,
     csv_truth: Path | None = None,
     json: Annotated[bool, Parameter(negative="")] = False,
+    scheduler: str | None = None,
     seed: int = 0,
 ) -> int:
     """Track one target in an aerial video, also while it is occluded or out of view, with uncertainty.
@@ -67,6 +68,10 @@ def track(
         Ground truth CSV with frame,x,y[,width,height][,inside][,visible]: prints the track's scores.
     json
         Print a summary as JSON.
+    scheduler
+        Runs this command over many videos on dask: an address, a scheduler's file, or a number of processes on this
+        machine. The video is then a folder of videos, or a .txt file with one and its own options a line; --out is a
+        folder. Called again, it does what is left.
     seed
         Seed of the tracker's random numbers.
     """
