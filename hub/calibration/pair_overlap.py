@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -16,6 +17,7 @@ from hub.bundle.preprocessing import PreparedSession
 from hub.clocks.external_prior import ExternalClockPrior
 from hub.sync.settings import PairSettings
 from hub.trajectory.image_tracks import smooth_only
+from protocols.geometry.types import Ints
 
 LARGE_NETWORK = 24
 """Cameras from which on pairs are chosen by overlap: up to there all of them take less than the adjustment."""
@@ -49,20 +51,20 @@ def candidate_pairs(
     return [(names[a], names[b]) for a, b in sorted(chosen)]
 
 
-def _overlaps(prepared: PreparedSession, clocks: Mapping[str, ExternalClockPrior]) -> csr_array:
+def _overlaps(prepared: PreparedSession, clocks: Mapping[str, ExternalClockPrior]) -> csr_array[Any]:
     """(cameras, cameras) seconds in which both saw one target, to within a bin."""
-    cameras, bins = [], []
-    targets = {label: number for number, label in enumerate(prepared.labels)}
-    for camera, name in enumerate(prepared.names):
+    cameras, bins = list[Ints](), list[Ints]()
+    targets = {label: index for index, label in enumerate(prepared.labels)}
+    for number, name in enumerate(prepared.names):
         if not prepared.shared_clock and name not in clocks:
             continue
         offset = prepared.time_origins[name] + (clocks[name].unix_minus_camera if name in clocks else 0.0)
         for label, track in smooth_only(prepared.camera(name).tracks).items():
             seen = np.unique(np.floor((track.time + offset) / _BIN_S).astype(np.int64))
             bins.append(seen * len(targets) + targets[label])
-            cameras.append(np.full(len(seen), camera))
+            cameras.append(np.full(len(seen), number))
     if not bins:
-        return csr_array((len(prepared.names), len(prepared.names)))
+        return csr_array(np.zeros((len(prepared.names),) * 2))
     camera, key = np.concatenate(cameras), np.concatenate(bins)
     # A bin and its neighbours, which are as many keys away as there are targets.
     near = np.concatenate([key, key - len(targets), key + len(targets)])
@@ -71,5 +73,5 @@ def _overlaps(prepared: PreparedSession, clocks: Mapping[str, ExternalClockPrior
     exact = csr_array((np.ones(len(key)), (camera, column[: len(key)])), shape)
     around = csr_array((np.ones(len(near)), (np.tile(camera, 3), column)), shape)
     around.data[:] = 1.0  # several neighbours of one bin were added up
-    counts = exact @ around.T
+    counts: Any = exact @ around.T
     return csr_array(_BIN_S * counts.maximum(counts.T))

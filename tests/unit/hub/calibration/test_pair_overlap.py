@@ -29,9 +29,7 @@ def test_of_a_long_street_only_pairs_with_common_motion_are_tried() -> None:
         assert (a, b) not in chosen or apart <= 24.0, "nobody sees further than 12 m"
         common = 0.0
         for label in set(observations.by_label(a)) & set(observations.by_label(b)):
-            one, other = (
-                observations.by_label(name)[label].time + arrivals[name].unix_minus_camera for name in (a, b)
-            )
+            one, other = (observations.by_label(name)[label].time + arrivals[name].unix_minus_camera for name in (a, b))
             near = np.abs(one[:, None] - other[None, :]).min(axis=1) < 0.02
             common += near.sum() / 30.0
         missing += common > 2.0 and (a, b) not in chosen and min(partners[a], partners[b]) < 12
