@@ -72,7 +72,7 @@ def solve_pairs(
     is_ranked = len(todo) > 1 and not prepared.shared_clock
     for done, (a, b) in enumerate(_ranked(prepared, todo, report, cache) if is_ranked else todo):
         report(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
-        if len(names) > LARGE_NETWORK and synchronised.has_enough(a, b):
+        if arrivals and len(names) > LARGE_NETWORK and synchronised.has_enough(a, b):
             pairs[a, b] = PairSolution(a, b, "not searched: both cameras are in enough solved pairs")
             continue
         expected = expected_lag(prepared, a, b, arrivals) if arrivals and not prepared.shared_clock else None

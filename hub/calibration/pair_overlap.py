@@ -32,19 +32,21 @@ def candidate_pairs(
 ) -> list[tuple[str, str]]:
     """Pairs to solve, in the rig's order: all, or in a large network those whose tracks overlap by their clock priors.
 
-    A camera without a prior, on clocks that are not shared, may overlap with every other.
+    A camera without a prior may overlap with every other. On a shared clock no pair is scanned, so none is left out.
     """
     names = prepared.names
     every = itertools.combinations(range(len(names)), 2)
-    known = [prepared.shared_clock or name in (arrivals or {}) for name in names]
-    if len(names) <= LARGE_NETWORK or not any(known):
+    known = [name in (arrivals or {}) for name in names]
+    if len(names) <= LARGE_NETWORK or prepared.shared_clock or not any(known):
         return [(names[a], names[b]) for a, b in every]
-    seconds = _overlaps(prepared, {} if prepared.shared_clock else arrivals or {})
+    seconds = _overlaps(prepared, arrivals or {})
     chosen, least = set[tuple[int, int]](), PairSettings().min_scan_support
     for camera in range(len(names)):
         row = slice(seconds.indptr[camera], seconds.indptr[camera + 1])
-        partners = zip(-seconds.data[row], seconds.indices[row], strict=True)
-        enough = [other for less, other in sorted(partners) if other != camera and -less >= least]
+        # Of equal overlaps the next in the rig's order, so that not all choose the same.
+        after = (seconds.indices[row] - camera) % len(names)
+        partners = zip(-seconds.data[row], after, seconds.indices[row], strict=True)
+        enough = [other for less, _, other in sorted(partners) if other != camera and -less >= least]
         chosen |= {(min(camera, other), max(camera, other)) for other in enough[:_MOST_PARTNERS]}
     unknown = [camera for camera, one in enumerate(known) if not one]
     chosen |= {(min(a, b), max(a, b)) for a in unknown for b in range(len(names)) if a != b}
@@ -56,9 +58,9 @@ def _overlaps(prepared: PreparedSession, clocks: Mapping[str, ExternalClockPrior
     cameras, bins = list[Ints](), list[Ints]()
     targets = {label: index for index, label in enumerate(prepared.labels)}
     for number, name in enumerate(prepared.names):
-        if not prepared.shared_clock and name not in clocks:
+        if name not in clocks:
             continue
-        offset = prepared.time_origins[name] + (clocks[name].unix_minus_camera if name in clocks else 0.0)
+        offset = prepared.time_origins[name] + clocks[name].unix_minus_camera
         for label, track in smooth_only(prepared.camera(name).tracks).items():
             seen = np.unique(np.floor((track.time + offset) / _BIN_S).astype(np.int64))
             bins.append(seen * len(targets) + targets[label])
