@@ -79,7 +79,7 @@ proto: $(STAMP)
 # Renews the pinned versions in requirements.lock from pyproject.toml; it is complete, so that nothing else is installed.
 lock: $(STAMP)
 	$(BIN)/uv pip compile --quiet --universal --no-header --no-annotate --no-emit-index-url --no-emit-find-links \
-	  --python-version 3.11 --extra dev --extra keys --extra uav --extra view --extra video --extra v4l2 --extra onnx --extra evaluation --extra c3d --extra keypoints pyproject.toml -o requirements.lock
+	  --python-version 3.11 --extra dev --extra keys --extra uav --extra view --extra video --extra v4l2 --extra onnx --extra evaluation --extra c3d --extra keypoints --extra cluster pyproject.toml -o requirements.lock
 
 $(STAMP): pyproject.toml requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Syncline needs Python 3.11 or newer: make PYTHON=python3.12")'

@@ -74,6 +74,7 @@ _COMPUTING = frozenset(
     ("calibrate", "camera", "demo", "detect", "follow", "hub", "intrinsics", "quick", "sync", "track", "triangulate")
     + ("replay", "uav")
 )
+_SPREADABLE = ("detect", "calibrate", "follow", "track")
 _AGENTS = ("camera", "uav", "hub", "record", "router")
 
 
@@ -104,7 +105,12 @@ def run(arguments: Sequence[str] | None = None) -> int:
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if words[:1] and words[0] in _COMPUTING and limit != resource.RLIM_INFINITY and limit < _LEAST_ADDRESS_SPACE:
             raise MemoryError
-        result = build_app(words[0] if words else "")(words, exit_on_error=False, print_error=False)
+        app = build_app(words[0] if words else "")
+        if "--scheduler" in {word.partition("=")[0] for word in words[1:]} and words[0] in _SPREADABLE:
+            from deploy.cluster import run_jobs
+
+            return run_jobs(words, lambda one: app.parse_args(list(one), exit_on_error=False, print_error=False))
+        result = app(words, exit_on_error=False, print_error=False)
     except SynclineError as error:
         print(f"syncline: {error}", file=sys.stderr)
         return error.exit_status

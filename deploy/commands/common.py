@@ -19,6 +19,14 @@ PrintConfig = Annotated[
     bool, Parameter(negative="", help="Print the configuration with all defaults filled in, and exit.")
 ]
 UnusedSeed = Annotated[int, Parameter(help="Accepted for consistency; this command uses no random numbers.")]
+Scheduler = Annotated[
+    str | None,
+    Parameter(
+        help="Runs this command over many inputs on dask: an address, a scheduler's file, or a number of processes on "
+        "this machine. The input is then a folder of videos or sessions, or a .txt file with one and its own options a "
+        "line; --out is a folder. Called again, it does what is left."
+    ),
+]
 Role = Literal["camera", "uav", "hub", "recorder", "router"]
 Names = Annotated[list[str] | None, Parameter(negative="", help="Only these agents, by id or ROLE-ID.")]
 

@@ -26,6 +26,7 @@ from hub.bundle.initialisation import (
 from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.bundle.problem import CameraState, FreeParameters
 from hub.calibration.pair_network import expected_lag, solve_new_pairs
+from hub.calibration.pair_overlap import LARGE_NETWORK
 from hub.calibration.pipeline import calibrate, final_adjustment, fits_trajectory, least_certain_camera
 from hub.calibration.resection_scan import scan_resection
 from hub.calibration.result import assemble_calibration
@@ -81,7 +82,7 @@ def update_calibration(
             rig,
             observations,
             clock_priors=clock_priors,
-            arrivals=None if full else arrivals,
+            arrivals=None if full and len(rig.cameras) <= LARGE_NETWORK else arrivals,
             online=True,
             refine_lenses=refine_lenses,
         )

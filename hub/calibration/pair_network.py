@@ -10,7 +10,6 @@ are used last, so that they change no lag that the images determine.
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
@@ -19,6 +18,7 @@ from typing import Literal
 import numpy as np
 
 from hub.bundle.preprocessing import PreparedSession
+from hub.calibration.pair_overlap import LARGE_NETWORK, candidate_pairs
 from hub.clocks.clock_graph import connected_components
 from hub.clocks.external_prior import MAX_CAMERA_DELAY_S, ExternalClockPrior
 from hub.sync.common_clock import solve_common_clock_pair
@@ -64,7 +64,7 @@ def solve_pairs(
     times of arrival; pairs that have no solution near them are not searched further.
     """
     names = prepared.names
-    todo = list(itertools.combinations(names, 2))
+    todo = candidate_pairs(prepared, arrivals)
     is_large = len(names) > _SMALL_NETWORK and not prepared.shared_clock
     pairs: dict[tuple[str, str], PairSolution] = {}
     unguided: dict[tuple[str, str], PairSolution] = {}
@@ -72,6 +72,9 @@ def solve_pairs(
     is_ranked = len(todo) > 1 and not prepared.shared_clock
     for done, (a, b) in enumerate(_ranked(prepared, todo, report, cache) if is_ranked else todo):
         report(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
+        if arrivals and len(names) > LARGE_NETWORK and synchronised.has_enough(a, b):
+            pairs[a, b] = PairSolution(a, b, "not searched: both cameras are in enough solved pairs")
+            continue
         expected = expected_lag(prepared, a, b, arrivals) if arrivals and not prepared.shared_clock else None
         if expected is not None:
             near = PairSettings(predicted_lag_window=expected[1])
@@ -212,12 +215,19 @@ class _SynchronisedGroups:
 
     def __init__(self) -> None:
         self._maps: dict[str, tuple[str, float, float]] = {}
+        self._pairs: Counter[str] = Counter()
+
+    def has_enough(self, a: str, b: str) -> bool:
+        """Whether two cameras are in one group, and each in pairs that check each other."""
+        one, other = (self._maps.get(name, ("", 0.0, 0.0))[0] for name in (a, b))
+        return bool(one) and one == other and min(self._pairs[a], self._pairs[b]) > _ENOUGH_PAIRS
 
     def add(self, pair: PairSolution) -> None:
         """Merge the groups of a solved pair's cameras; a pair within one group changes nothing."""
         if not pair.solved or pair.fit is None:
             return
         for name in (pair.a, pair.b):
+            self._pairs[name] += 1
             self._maps.setdefault(name, (name, 1.0, 0.0))
         (group_a, rate_a, offset_a), (group_b, rate_b, offset_b) = self._maps[pair.a], self._maps[pair.b]
         if group_a == group_b:

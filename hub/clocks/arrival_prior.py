@@ -22,13 +22,13 @@ class ArrivalPriors:
     """The smallest delays of each camera's clock over the last half minute."""
 
     def __init__(self) -> None:
-        self._least: dict[tuple[str, str], dict[int, float]] = {}
+        self._least: dict[str, tuple[str, dict[int, float]]] = {}
 
     def handle(self, camera: str, boot_id: str, camera_time: float, arrival: float) -> None:
         """Add one frame: its time on the camera's clock and its arrival on the hub's [s]."""
-        for key in [key for key in self._least if key[0] == camera and key[1] != boot_id]:
-            del self._least[key]
-        least = self._least.setdefault((camera, boot_id), {})
+        boot, least = self._least.get(camera, (boot_id, {}))
+        if boot != boot_id or not least:
+            self._least[camera] = boot_id, (least := {})
         interval = int(arrival // _INTERVAL_S)
         delay = arrival - camera_time
         least[interval] = min(least.get(interval, delay), delay)
@@ -38,7 +38,7 @@ class ArrivalPriors:
     def priors(self) -> dict[str, ExternalClockPrior]:
         """By camera, the hub's clock in place of Unix time."""
         out = {}
-        for (camera, boot_id), least in self._least.items():
+        for camera, (boot_id, least) in self._least.items():
             complete = [least[interval] for interval in sorted(least)[:-1]]
             if len(complete) >= _MIN_INTERVALS and max(complete) - min(complete) <= _MAX_SPREAD_S:
                 out[camera] = ExternalClockPrior(boot_id, min(complete), ERROR_BOUND_S)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import heapq
 import threading
 import time
 import uuid
@@ -48,7 +49,8 @@ _STATUS_S = 1.0
 _RIG_S = 5.0
 _MAX_TEXT = 2000  # characters of a status message
 _NAMED_CAMERAS = 16  # that a status has counters of their own for
-_MEASURED_CAMERAS = 64  # that it has gauges of their own for: three each of the 256 that a message may have
+_MEASURED_CAMERAS = 64
+"""That a status has gauges of their own for, the worst first: three each of the 256 numbers that one may have."""
 
 
 def run_hub(
@@ -248,8 +250,10 @@ def status_message(
     ages = hub.frame_ages(now)
     rates = {camera: ppm for camera, ppm in hub.clocks.rates_ppm().items() if ages.get(camera, SILENT_S) < SILENT_S}
     for kind, values in (("ppm", rates), ("frame_age_s", ages), ("offset_std_s", hub.offset_stds())):
-        for camera, value in list(values.items())[:_MEASURED_CAMERAS]:
-            message.gauges[f"{kind}.{camera}"[:64]] = value
+        for camera in heapq.nlargest(_MEASURED_CAMERAS, values, key=lambda name, of=values: abs(of[name])):  # type: ignore[misc]
+            message.gauges[f"{kind}.{camera}"[:64]] = values[camera]
+    message.gauges["cameras"] = len(ages)
+    message.gauges["silent_cameras"] = sum(age > SILENT_S for age in ages.values())
     if state in ("collecting", "searching"):
         # What is waited for, per camera: the search needs motion that two cameras see at the same time.
         shared = [f"{one.camera} {one.shared_motion_s:.0f} s" for one in hub.progress()[:_NAMED_CAMERAS]]

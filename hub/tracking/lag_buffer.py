@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Generic, Protocol, TypeVar
 
@@ -33,6 +34,8 @@ class LagBuffer(Generic[Row, State]):
     def __init__(self, base: State, process: Callable[[State, Row], State], lag_ns: int, keep_ns: int) -> None:
         self.base = base
         self.rows: list[Row] = []
+        self.counts: Counter[str] = Counter()
+        """Rows by camera."""
         self.states: list[State] = []
         self._process, self._lag_ns, self._keep_ns = process, lag_ns, keep_ns
         self._keys: list[Key] = []
@@ -61,6 +64,7 @@ class LagBuffer(Generic[Row, State]):
             return "duplicates"
         self._keys.insert(position, key)
         self.rows.insert(position, row)
+        self.counts[key[1]] += 1
         del self.states[position:]
         return "rows" if position == len(self._keys) - 1 else "reordered"
 
@@ -84,6 +88,7 @@ class LagBuffer(Generic[Row, State]):
         count = min(count, len(self.states))
         if count:
             self.base, self._base_key = self.states[count - 1], self._keys[count - 1]
+            self.counts -= Counter(key[1] for key in self._keys[:count])
             del self._keys[:count], self.rows[:count], self.states[:count]
 
     def restart(self, base: State, rows: Iterable[Row]) -> None:
@@ -92,6 +97,7 @@ class LagBuffer(Generic[Row, State]):
         after = self._base_key
         self.rows = sorted((row for row in rows if after is None or row.key > after), key=lambda row: row.key)
         self._keys = [row.key for row in self.rows]
+        self.counts = Counter(key[1] for key in self._keys)
 
     def clear(self, base: State) -> None:
         """Forget all rows and begin with a base at any time."""

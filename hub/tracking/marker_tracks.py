@@ -184,8 +184,7 @@ class _LabelTrack:
 
     def insert(self, row: MarkerRow) -> str:
         """Insert a row; how it was handled."""
-        most, rows = _MAX_ROWS_PER_S * self._keep_ns // NANOSECONDS, self._rows.rows
-        if len(rows) >= most and sum(old.camera.name == row.camera.name for old in rows) >= most:
+        if self._rows.counts[row.camera.name] >= _MAX_ROWS_PER_S * self._keep_ns // NANOSECONDS:
             return "flood"
         return self._rows.insert(row)
 

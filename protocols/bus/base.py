@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 from google.protobuf.message import Message
 
@@ -20,8 +20,7 @@ class BusStopped(Exception):
     """Opening the bus was cancelled by the caller's stop condition."""
 
 
-@dataclass(frozen=True, slots=True)
-class Received:
+class Received(NamedTuple):
     """One validated message.
 
     arrival_ns: the receiver's clock (Unix, ns) when it was received, not when it was drained.

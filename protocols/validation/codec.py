@@ -16,7 +16,8 @@ from google.protobuf.message import DecodeError, Message
 from protocols.core.names import name_of_segment
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import TOPICS, Topic
-from protocols.validation.rules import SCHEMA_VERSION, Rejected, RejectionReason, check
+from protocols.validation.layouts import Layouts
+from protocols.validation.rules import SCHEMA_VERSION, Rejected, RejectionReason, check, check_names
 
 __all__ = [
     "MAX_PAYLOAD",
@@ -45,6 +46,7 @@ UAV_MESSAGES = (
 )
 """The messages of a UAV agent; all have its name in the field ``agent``."""
 _CLASSES: Mapping[str, type[Message]] = {topic.message: getattr(pb, topic.message) for topic in TOPICS}
+_LAYOUTS = Layouts()
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,17 +97,28 @@ def decode(topic: Topic, payload: bytes) -> Message:
     """Parse and validate one payload of ``topic``; raises Rejected."""
     if len(payload) > MAX_PAYLOAD:
         raise Rejected(RejectionReason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD}")
-    message = _CLASSES[topic.message]()
     try:
-        message.ParseFromString(payload)
+        message = _CLASSES[topic.message].FromString(payload)
     except DecodeError as error:
         raise Rejected(RejectionReason.GARBLED, str(error)) from None
     try:
-        check(message)
+        if isinstance(message, pb.Observation):
+            _check_observation(message, payload)
+        else:
+            check(message)
     except Rejected as error:
         error.sequence = getattr(message, "sequence", None)
         raise
     return message
+
+
+def _check_observation(message: pb.Observation, payload: bytes) -> None:
+    """``check``, by the layout of earlier observations where one matches."""
+    if _LAYOUTS.match(payload):
+        check_names(message.camera, message.boot_id)
+    else:
+        check(message)
+        _LAYOUTS.learn(payload)
 
 
 def admit(key: str, payload: bytes) -> tuple[Address, Message]:
@@ -118,7 +131,7 @@ def admit(key: str, payload: bytes) -> tuple[Address, Message]:
     if address is None:
         raise Rejected(RejectionReason.UNKNOWN_KEY, key[:200])
     message = decode(address.topic, payload)
-    claimed = sender(message)
+    claimed = message.camera if isinstance(message, pb.Observation) else sender(message)
     if claimed is not None and claimed != address.agent:
         raise Rejected(RejectionReason.WRONG_SENDER, f"{claimed!r} under the key of {address.agent!r}")
     return address, message

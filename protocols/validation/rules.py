@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from enum import Enum
+from functools import lru_cache
 from math import inf, isfinite
 from typing import Any
 
@@ -224,9 +225,15 @@ def _detection(detection: pb.Detection) -> None:
         _text(detection.target, "target", MAX_LABEL)
 
 
+@lru_cache(maxsize=8192)
+def check_names(camera: str, boot_id: str) -> None:
+    """Raise Rejected unless a camera's name and its boot id are valid."""
+    _name(camera, "camera")
+    _id(boot_id, "boot id")
+
+
 def _observation(message: pb.Observation) -> None:
-    _name(message.camera, "camera")
-    _id(message.boot_id, "boot id")
+    check_names(message.camera, message.boot_id)
     _times(message, "device_time_ns")
     _counts(message, "sequence", "frame")
     if not 0 <= message.exposure_ns <= MAX_EXPOSURE_NS:

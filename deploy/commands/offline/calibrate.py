@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from deploy.agents.malloc_tuning import retain_freed_memory
-from deploy.commands.common import Flag, Json
+from deploy.commands.common import Flag, Json, Scheduler
 from deploy.offline.progress import progress_bar
 from protocols.core.errors import EXIT_DONE, InputError, Refused
 from protocols.core.files import check_folder
@@ -32,6 +32,7 @@ def calibrate(
     height: float | None = None,
     limb: str | None = None,
     json: Json = False,
+    scheduler: Scheduler = None,
     seed: int = 0,
 ) -> int:
     """Estimate clock offset and pose of each camera of a session, and the trajectory of the moving target.

@@ -9,6 +9,7 @@ from typing import Literal
 from deploy.commands.common import (
     Flag,
     Json,
+    Scheduler,
     UnusedSeed,
     answer,
     check_file,
@@ -52,6 +53,7 @@ def detect(
     background: Literal["mog2", "knn"] = "mog2",
     detector: str | None = None,
     json: Json = False,
+    scheduler: Scheduler = None,
     seed: UnusedSeed = 0,
 ) -> int:
     """Detect a marker, people or vehicles in every frame of a video, and write the times and pixels.

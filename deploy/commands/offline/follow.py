@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Literal
 
-from deploy.commands.common import Json, answer, check_range, closing_lines
+from deploy.commands.common import Json, Scheduler, answer, check_range, closing_lines
 from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError, Refused
 from protocols.core.files import check_folder, write_together
@@ -28,6 +28,7 @@ def follow(
     area: str | None = None,
     crops: Path | None = None,
     json: Json = False,
+    scheduler: Scheduler = None,
     seed: int = 0,
 ) -> int:
     """Follow people or vehicles through all cameras of a calibrated rig, offline.

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from deploy.commands.common import Flag, Json, answer, check_rate, check_seed, closing_lines
+from deploy.commands.common import Flag, Json, Scheduler, answer, check_rate, check_seed, closing_lines
 from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError
 from protocols.core.files import check_folder, write_together
@@ -33,6 +33,7 @@ def track(
     overlay: Flag = False,
     csv_truth: Path | None = None,
     json: Json = False,
+    scheduler: Scheduler = None,
     seed: int = 0,
 ) -> int:
     """Track one target in an aerial video, also while it is occluded or out of view, with uncertainty.

@@ -21,9 +21,10 @@ from google.protobuf.message import Message
 from protocols.bus.base import AgentEvent, AgentWatch, Bus, Publisher, Received, Refusal, Subscription
 from protocols.core.closing import Closing
 from protocols.messages import syncline_pb2 as pb
-from protocols.topics import STATUS, Topic
+from protocols.topics import STATUS, TOPICS, Topic
 from protocols.validation.rules import MAX_NUMBERS, RejectionReason
 
+_ROLES = {topic.name: topic.key.partition("/")[0] for topic in TOPICS}
 SOURCE_TIMEOUT_S = 10.0
 """Silence after which a boot may use another connection: a log that is replayed twice has the same boot ids."""
 _MAX_SOURCES = _MAX_AGENTS = 4096
@@ -93,9 +94,9 @@ class SenderValidator:
 
 
 def _role(received: Received) -> str:
-    if isinstance(received.message, pb.AgentStatus):
+    if received.topic is STATUS and isinstance(received.message, pb.AgentStatus):
         return received.message.role
-    return received.topic.key.partition("/")[0]
+    return _ROLES[received.topic.name]
 
 
 class SenderCheckedSubscription:
@@ -108,9 +109,9 @@ class SenderCheckedSubscription:
     def drain(self) -> list[Received]:
         """The accepted messages since the last call."""
         self._bus.update_agents()
-        accepted = []
+        accepted, refuse, now = [], self._bus.guard.refuse, self._bus.now()
         for received in self._inner.drain():
-            why = self._bus.guard.refuse(received, self._bus.now())
+            why = refuse(received, now)
             if why is None:
                 accepted.append(received)
                 continue

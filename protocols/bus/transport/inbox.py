@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 import threading
 import time
 from collections import Counter, deque
@@ -20,9 +19,10 @@ MAX_BYTES = 32 * 1024 * 1024
 """Upper bound of one inbox in bytes, so that a reader that has stopped does not exhaust the memory."""
 MAX_BYTES_OF_KEY = MAX_BYTES // 8
 """The same of one sender, four times as much of images: who floods pays, not the others."""
-BYTES_PER_S, _BURST_S = 8 * 1024 * 1024, 4.0
+BYTES_PER_S = 8 * 1024 * 1024
 """What one sender of anything but images may send; to validate that takes a quarter of a core. A hundred people with
 all their fields at 30 Hz are 0.6 MB/s, and a log that is replayed as fast as it goes 2 MB/s."""
+_BYTES_PER_NS, _BURST_BYTES = BYTES_PER_S * 1e-9, 4.0 * BYTES_PER_S
 _MAX_DRAIN, _LEAST_DRAIN = 4096, 16
 """Messages that are decoded at once, which takes 0.2 s, and of each sender, where there are so many."""
 _MAX_DRAIN_BYTES = 1024 * 1024
@@ -64,32 +64,41 @@ class Inbox:
 
         numbered: whether the transport counts its publisher's messages; otherwise losses show in their own numbers.
         """
-        if len(payload) > MAX_PAYLOAD:
-            self.refuse(Rejected(RejectionReason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD}"), key)
+        size = len(payload)
+        if size > MAX_PAYLOAD:
+            self.refuse(Rejected(RejectionReason.OVERSIZED, f"{size} bytes, at most {MAX_PAYLOAD}"), key)
             return
         now = self._clock_ns()
         with self._ready:
-            if not self._bulky and not self._affords(key, len(payload), now):
+            if not self._bulky and not self._affords(key, size, now):
                 self._counts["dropped"] += 1
                 return
             self._order += 1
-            self._queues.setdefault(key, deque()).append((self._order, payload, now, source, numbered))
-            self._add(key, 1, len(payload))
+            queue = self._queues.get(key)
+            if queue is None:
+                queue = self._queues[key] = deque()
+            queue.append((self._order, payload, now, source, numbered))
+            self._add(key, 1, size)
+            if self._length == 1:  # nobody waits while there is more
+                self._ready.notify_all()
             while self._sizes[key] > self._most_of_key:
                 self._drop(key)
             while self._length > self._capacity or self._bytes > MAX_BYTES:
                 by_count = self._length > self._capacity
                 self._drop(max(self._queues, key=lambda one: len(self._queues[one]) if by_count else self._sizes[one]))
-            self._ready.notify_all()
 
     def _affords(self, key: str, size: int, now: int) -> bool:
         """Whether a sender has not sent too many bytes lately."""
-        burst = _BURST_S * BYTES_PER_S
-        credit, since = self._credit.get(key, (burst, now))
-        credit = min(burst, credit + max(now - since, 0) * 1e-9 * BYTES_PER_S)
+        known = self._credit.get(key)
+        if known is None:
+            if len(self._credit) >= _MAX_ALIVE:
+                del self._credit[next(iter(self._credit))]
+            credit = _BURST_BYTES
+        else:
+            credit = known[0]
+            if now > known[1]:
+                credit = min(_BURST_BYTES, credit + (now - known[1]) * _BYTES_PER_NS)
         good = credit >= size
-        if key not in self._credit and len(self._credit) >= _MAX_ALIVE:
-            del self._credit[next(iter(self._credit))]
         self._credit[key] = (credit - size if good else credit, now)
         return good
 
@@ -134,7 +143,8 @@ class Inbox:
         with self._ready:
             queues = self._taken()
         messages: list[Received] = []
-        merged = heapq.merge(*([(item[0], key, item) for item in queue] for key, queue in queues.items()))
+        # Sorting joins the queues, each of them in order, faster than a heap that is merged in Python.
+        merged = sorted([(item[0], key, item) for key, queue in queues.items() for item in queue])
         for _, key, (_, payload, arrival_ns, source, numbered) in merged:
             try:
                 address, message = admit(key, payload)

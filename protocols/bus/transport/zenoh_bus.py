@@ -23,7 +23,7 @@ from protocols.bus.transport.session import close_session, open_session, undecla
 from protocols.core.closing import Closing
 from protocols.core.names import check_identifier
 from protocols.topics import Delivery, Topic, liveliness_key
-from protocols.validation.codec import Rejected, RejectionReason, encode, parse_key
+from protocols.validation.codec import Rejected, RejectionReason, encode, message_class, parse_key
 
 HEARTBEAT_S = 0.5
 """Period after which a subscriber detects that the last message before a pause is missing."""
@@ -40,9 +40,10 @@ class ZenohPublisher:
     """See ``protocols.bus.base.Publisher``."""
 
     def __init__(self, session: zenoh.Session, topic: Topic, key: str, cache: int, block: bool) -> None:
-        self._message = topic.message
+        self._class = message_class(topic)
         self._session = session
         self._key = key
+        self._putting = zenoh_call(f"put {key}")
         self._matcher: Any = None  # its stub has the type of matching_status wrong
         reliable = topic.delivery is Delivery.RELIABLE
         congestion = zenoh.CongestionControl.BLOCK if block else zenoh.CongestionControl.DROP
@@ -63,10 +64,10 @@ class ZenohPublisher:
 
     def put(self, message: Message) -> None:
         """Publish one message."""
-        if message.DESCRIPTOR.name != self._message:
-            raise TypeError(f"{message.DESCRIPTOR.name} on a topic of {self._message}")
+        if type(message) is not self._class:
+            raise TypeError(f"{message.DESCRIPTOR.name} on a topic of {self._class.DESCRIPTOR.name}")
         payload = encode(message)
-        with zenoh_call(f"put {self._key}"):
+        with self._putting:
             self._publisher.put(payload)
 
     def wait_matched(self, timeout_s: float) -> bool:
@@ -96,14 +97,15 @@ class _DeclaredKeys:
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
-        self._met: set[str] = set()
+        self.met: set[str] = set()
+        """Valid keys of received messages, a bounded number of them."""
         self._new: deque[str] = deque()
         self._declared: list[zenoh.KeyExpr] = []
 
     def meet(self, key: str) -> None:
         """Note a message's key; called from a callback, so nothing is declared here."""
-        if key not in self._met and len(self._met) < _MAX_KEYS:
-            self._met.add(key)
+        if len(self.met) < _MAX_KEYS:
+            self.met.add(key)
             self._new.append(key)
 
     def declare(self) -> None:
@@ -149,10 +151,11 @@ class ZenohSubscription(InboxSubscription):
         if sample.kind != zenoh.SampleKind.PUT:
             return
         source, key, payload = sample.source_info, str(sample.key_expr), sample.payload.to_bytes()
-        if parse_key(key) is None:  # nothing is remembered of it
-            self.inbox.refuse(Rejected(RejectionReason.UNKNOWN_KEY, key[:200]), key)
-            return
-        self._keys.meet(key)
+        if key not in self._keys.met:
+            if parse_key(key) is None:  # nothing is remembered of it
+                self.inbox.refuse(Rejected(RejectionReason.UNKNOWN_KEY, key[:200]), key)
+                return
+            self._keys.meet(key)
         if source is None:
             # A plain publisher, as zenoh-pico's: without recovery, and its gaps are those of its own numbers.
             self.inbox.push(key, payload, numbered=False)

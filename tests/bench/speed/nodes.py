@@ -92,7 +92,7 @@ def measure(quick: bool, data: Path) -> Section:
     handled, update, _, _ = poses.cost(_SEED)
     found = Section(
         [
-            Row("pose update, 4 neighbours: an observation taken in", handled, "µs", must=Limit("ours", 20.0),
+            Row("pose update, 4 neighbours: an observation taken in", handled, "µs", must=Limit("ours", 5.0),
                 reach=Limit("ours", 3.0), note=f"and {update:.0f} µs an update of the pose, each 20 points")
         ]
     )  # fmt: skip

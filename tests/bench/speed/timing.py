@@ -108,7 +108,7 @@ def measure(quick: bool, data: Path) -> Section:
     return Section(
         [
             Row(work, ms["ours"], "ms", "a plain scipy solve", ms["plain"],
-                must=Limit("ours", 50.0), reach=Limit("ours", 5.0),
+                must=Limit("ours", 10.0), reach=Limit("ours", 5.0),
                 note=f"ours {notes['ours']}, scipy {notes['plain']}; CPU from pixels, smoothing included"),
             Row(work, ms["ours"], "ms", "the paper's basic method", ms["basic"],
                 note=f"begun at lag 0, good for ±0.3 s: {notes['basic']}"),

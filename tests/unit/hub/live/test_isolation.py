@@ -6,18 +6,27 @@ import itertools
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from google.protobuf.message import Message
 
+from hub.live.agent import status_message
 from hub.live.budgets import MAX_CAMERAS, CameraBudgets
 from hub.live.fair_share import FairShare
-from hub.live.live_hub import LiveHub, LiveSettings
+from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
 from hub.live.solver import InlineSolver, SolverAnswer, SolverJob
+from hub.view.state import ViewState
 from protocols.bus.base import Received
-from protocols.core.clocks import NANOSECONDS
+from protocols.bus.security.sender_identity import SenderCheckedBus
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.core.clocks import NANOSECONDS, TimeMap
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder
-from protocols.topics import OBSERVATION
+from protocols.session.calibration import CameraCalibration
+from protocols.session.rig import Rig, RigCamera
+from protocols.topics import CALIBRATION, OBSERVATION, STATUS
 
 
 def frame(camera: str, number: int, points: int = 1, period_ns: int = 33_000_000, **fields: Any) -> pb.Observation:
@@ -205,3 +214,32 @@ def test_who_takes_more_than_its_share_waits_and_the_others_do_not() -> None:
     assert shares.behind == []
     shares.take([message("slow", number) for number in range(50_000)])
     assert shares.dropped["slow"] > 25_000
+
+
+def test_a_thousand_cameras_do_not_make_the_status_inadmissible() -> None:
+    """Three gauges a camera were 1,002 numbers with 334 of them: every listener refused it, and the page had no hub."""
+    names = [f"cam{number}" for number in range(1000)]
+    lens, pose = Intrinsics(640, 480, np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])), Pose.identity()
+    solved = {name: CameraCalibration(name, lens, pose, TimeMap(1.0, 0.0), 1e-4, np.zeros(3), 0.5) for name in names}
+    hub = LiveHub(known=KnownCalibration(Rig({name: RigCamera(name, (640, 480), 30.0) for name in names}), solved))
+    for now, heard in ((7.0, ["cam900"]), (10.0, [name for name in names if name != "cam900"])):
+        hub.tick(now)
+        for name in heard:
+            hub.handle(info(name))
+            for sequence in range(20):
+                hub.handle(frame(name, sequence, 0), now + sequence / 30.0)
+    view = ViewState()
+    with MemoryBus(MemoryHub()) as bus:
+        guarded = SenderCheckedBus(bus, lambda: 0.0)
+        subscriptions = [guarded.subscribe(topic) for topic in (STATUS, CALIBRATION)]
+        guarded.publisher(CALIBRATION, "hub").put(hub.tick(13.0)[0])
+        guarded.publisher(STATUS, "hub").put(status_message(hub, "hub", "b0", 0, [{"received": 20_000}], 11.0))
+        for subscription in subscriptions:
+            for received in subscription.drain():
+                view.handle(received.message, 11.0)
+    (agent,) = view.of_role("hub")
+    gauges = agent.status.gauges
+    assert (gauges["cameras"], gauges["silent_cameras"], gauges["calibrated_cameras"]) == (1000, 1, 1000)
+    assert gauges["frame_age_s.cam900"] == 4.0, "of so many cameras the worst are named"
+    assert view.headline().startswith("degraded: 1000 cameras")
+    assert not any("no hub" in step for step in view.next_steps())

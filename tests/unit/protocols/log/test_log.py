@@ -122,6 +122,16 @@ def test_equal_logs_are_equal_bytes(tmp_path: Path) -> None:
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
 
 
+def test_chunks_are_those_of_mcap_s_own_writer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a later mcap has no place for faster ones: then its own are used."""
+    write_log(tmp_path / "a.mcap", 1000)
+    monkeypatch.setattr("protocols.log.write.chunks._BUILDER", "none")
+    with LogWriter(tmp_path / "c.mcap") as log:
+        assert log._chunk is None
+    write_log(tmp_path / "b.mcap", 1000)
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
 def test_the_schemas_in_the_log_are_enough_to_read_it(tmp_path: Path) -> None:
     """Foxglove and others know nothing of our .proto but what the log itself holds."""
     written = write_log(tmp_path / "a.mcap", count=20)

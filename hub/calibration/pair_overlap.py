@@ -1,0 +1,79 @@
+"""Which pairs of cameras can be synchronised: those that saw the same target at the same time, by times of arrival.
+
+A pair with less common motion than a lag scan needs has no solution whatever its lag, so pairs without that overlap
+need no scan. Of a street's thousand cameras that leaves ten each in place of half a million.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from hub.bundle.preprocessing import PreparedSession
+from hub.clocks.external_prior import ExternalClockPrior
+from hub.sync.settings import PairSettings
+from hub.trajectory.image_tracks import smooth_only
+from protocols.geometry.types import Ints
+
+LARGE_NETWORK = 24
+"""Cameras from which on pairs are chosen by overlap: up to there all of them take less than the adjustment."""
+_MOST_PARTNERS = 12
+"""Of one camera, those with most overlap: the clock graph needs two, and a third to check them."""
+_BIN_S = 0.5
+"""Length of a bin; priors by times of arrival are at most as far apart (``_MAX_PRIOR_WINDOW``), so neighbours count."""
+
+
+def candidate_pairs(
+    prepared: PreparedSession, arrivals: Mapping[str, ExternalClockPrior] | None
+) -> list[tuple[str, str]]:
+    """Pairs to solve, in the rig's order: all, or in a large network those whose tracks overlap by their clock priors.
+
+    A camera without a prior may overlap with every other. On a shared clock no pair is scanned, so none is left out.
+    """
+    names = prepared.names
+    every = itertools.combinations(range(len(names)), 2)
+    known = [name in (arrivals or {}) for name in names]
+    if len(names) <= LARGE_NETWORK or prepared.shared_clock or not any(known):
+        return [(names[a], names[b]) for a, b in every]
+    seconds = _overlaps(prepared, arrivals or {})
+    chosen, least = set[tuple[int, int]](), PairSettings().min_scan_support
+    for camera in range(len(names)):
+        row = slice(seconds.indptr[camera], seconds.indptr[camera + 1])
+        # Of equal overlaps the next in the rig's order, so that not all choose the same.
+        after = (seconds.indices[row] - camera) % len(names)
+        partners = zip(-seconds.data[row], after, seconds.indices[row], strict=True)
+        enough = [other for less, _, other in sorted(partners) if other != camera and -less >= least]
+        chosen |= {(min(camera, other), max(camera, other)) for other in enough[:_MOST_PARTNERS]}
+    unknown = [camera for camera, one in enumerate(known) if not one]
+    chosen |= {(min(a, b), max(a, b)) for a in unknown for b in range(len(names)) if a != b}
+    return [(names[a], names[b]) for a, b in sorted(chosen)]
+
+
+def _overlaps(prepared: PreparedSession, clocks: Mapping[str, ExternalClockPrior]) -> csr_array[Any]:
+    """(cameras, cameras) seconds in which both saw one target, to within a bin."""
+    cameras, bins = list[Ints](), list[Ints]()
+    targets = {label: index for index, label in enumerate(prepared.labels)}
+    for number, name in enumerate(prepared.names):
+        if name not in clocks:
+            continue
+        offset = prepared.time_origins[name] + clocks[name].unix_minus_camera
+        for label, track in smooth_only(prepared.camera(name).tracks).items():
+            seen = np.unique(np.floor((track.time + offset) / _BIN_S).astype(np.int64))
+            bins.append(seen * len(targets) + targets[label])
+            cameras.append(np.full(len(seen), number))
+    if not bins:
+        return csr_array(np.zeros((len(prepared.names),) * 2))
+    camera, key = np.concatenate(cameras), np.concatenate(bins)
+    # A bin and its neighbours, which are as many keys away as there are targets.
+    near = np.concatenate([key, key - len(targets), key + len(targets)])
+    columns, column = np.unique(near, return_inverse=True)
+    shape = (len(prepared.names), len(columns))
+    exact = csr_array((np.ones(len(key)), (camera, column[: len(key)])), shape)
+    around = csr_array((np.ones(len(near)), (np.tile(camera, 3), column)), shape)
+    around.data[:] = 1.0  # several neighbours of one bin were added up
+    counts: Any = exact @ around.T
+    return csr_array(_BIN_S * counts.maximum(counts.T))
