@@ -9,8 +9,9 @@ import numpy as np
 
 from hub.bundle.datum.gauge import fix_gauge
 from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, OFFSET, RATE
-from hub.calibration.rigid_body.adjustment import BodyProblem, BodyState, frame_interval, residuals
 from hub.calibration.rigid_body.lag import BodyPair
+from hub.calibration.rigid_body.noise import residuals
+from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval
 from hub.calibration.rigid_body.uncertainty import BodyCovariance, body_covariance, path_covariance
 from hub.trajectory.discrete import INSTANT_TOLERANCE_S, PointBasis
 from hub.two_view.relative_pose import fundamental_from, relative_pose_between

@@ -9,14 +9,9 @@ import numpy as np
 
 from hub.bundle.preprocessing import nominal_intrinsics
 from hub.bundle.problem import FOCAL, OFFSET
-from hub.calibration.rigid_body.adjustment import (
-    BodyProblem,
-    BodyState,
-    adjust_bodies,
-    frame_interval,
-    initial_jitter,
-)
+from hub.calibration.rigid_body.adjustment import adjust_bodies
 from hub.calibration.rigid_body.lag import BodyPair
+from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval, initial_jitter
 from hub.calibration.rigid_body.result import BodySolution, publish
 from hub.calibration.rigid_body.start import initial_lens, largest_group, solve_body_pairs, start_bodies
 from hub.calibration.rigid_body.uncertainty import body_covariance

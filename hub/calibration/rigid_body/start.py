@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 
 from hub.bundle.problem import CameraState
-from hub.calibration.rigid_body.adjustment import frame_interval
 from hub.calibration.rigid_body.lag import BodyPair, aligned, quaternions, solve_body_pair
 from hub.calibration.rigid_body.motion import BodyMotion, fit_motion
+from hub.calibration.rigid_body.problem import frame_interval
 from hub.calibration.rigid_body.views import CameraViews, ViewPoses
 from hub.trajectory.discrete import PointBasis, merged_instants
 from hub.trajectory.splines import SplineBasis, split_at_gaps

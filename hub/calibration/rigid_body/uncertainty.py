@@ -14,18 +14,16 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solveh_banded
 
 from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET
-from hub.calibration.rigid_body.adjustment import (
+from hub.calibration.rigid_body.linear_system import (
     BLOCK,
-    BodyProblem,
-    BodyState,
     ReducedSystem,
     ViewTerms,
     assemble,
-    frame_interval,
     linearised_rows,
     view_index,
 )
 from hub.calibration.rigid_body.motion import POSE, BodyMotion, rotated
+from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval
 from hub.trajectory.discrete import PointBasis
 from hub.trajectory.splines import SUPPORT
 from protocols.geometry.types import Floats, Ints
