@@ -29,7 +29,7 @@ from hub.calibration.rigid_body.linear_system import (
     view_index,
 )
 from hub.calibration.rigid_body.motion import POSE
-from hub.calibration.rigid_body.noise import jitters, mark_inliers, noise, scatters
+from hub.calibration.rigid_body.noise import jitters, mark_inliers, noise, scatters, shape_stds
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState
 from hub.trajectory.splines import SplineBasis
 from protocols.session.calibration import AdjustmentStep
@@ -48,8 +48,11 @@ def adjust_bodies(problem: BodyProblem, state: BodyState) -> tuple[BodyProblem, 
         stage = "robust" if robust else "fitting rows"
         rms = float(np.sqrt(np.mean(state.sigma**2)))
         state = replace(state, steps=(*state.steps, AdjustmentStep(stage, rms)))
-        if round_ >= 1:
-            state = replace(state, jitter=jitters(problem, state))
+        if 1 <= round_ < _ROUNDS - 1:
+            state = replace(state, jitter=jitters(problem, state), shape_std=shape_stds(problem, state))
+            # Frames that come evenly have no time errors: what was fitted to noise must not stay.
+            shifts = zip(state.shift, state.jitter, strict=True)
+            state = replace(state, shift=tuple(shift if std > 0.0 else np.zeros(len(shift)) for shift, std in shifts))
         if round_ == _ROUNDS - 2:
             problem = mark_inliers(problem, state)
     return problem, replace(state, sigma=noise(problem, state))
@@ -75,7 +78,7 @@ def _minimise(problem: BodyProblem, state: BodyState, robust: bool) -> BodyState
             break
         gain, cost = cost - value, value
         state, rows = trial or state, trial_rows
-        damping = max(damping / 10.0, 1e-10)
+        damping = max(damping / 10.0, 1e-12)
         if gain < _TOLERANCE * cost:
             break
     return state
@@ -91,6 +94,8 @@ def _cost(problem: BodyProblem, state: BodyState, rows: list[CameraRows], robust
         if state.jitter[camera] > 0.0:
             total += float(((state.shift[camera] / state.jitter[camera]) ** 2).sum())
     total += sum((value / std) ** 2 for _, _, value, std in camera_priors(problem, state))
+    if problem.free_shape:
+        total += float(((state.shape / state.shape_std) ** 2).sum())
     for body, scatter in zip(state.bodies, state.scatter, strict=True):
         total += float((((body.control[:, 3:] ** 2).sum(axis=1) - 1.0) ** 2).sum()) / NORM_STD**2
         if scatter is not None and isinstance(body.basis, SplineBasis):
@@ -114,13 +119,11 @@ def _step(
         return None
     path_step = -(solved[:, -1] + solved[:, :-1] @ camera_step)
     cameras, shifts = [], []
-    at = 0
     for camera, now in enumerate(state.cameras):
         columns = problem.columns(camera)
-        mine = camera_step[at : at + len(columns)]
-        at += len(columns)
+        mine = camera_step[terms[camera].columns]
         full = np.zeros(CAMERA_PARAMETERS)
-        full[columns] = mine
+        full[columns] = mine[: len(columns)]
         cameras.append(apply_camera_step(now, full))
         term = terms[camera]
         if state.jitter[camera] > 0.0:
@@ -135,4 +138,7 @@ def _step(
         size = body.control.size
         bodies.append(replace(body, control=body.control + path_step[at : at + size].reshape(-1, POSE)))
         at += size
-    return replace(state, cameras=tuple(cameras), bodies=tuple(bodies), shift=tuple(shifts))
+    shape = state.shape
+    if problem.free_shape:
+        shape = shape + camera_step[-shape.size :].reshape(-1, 3)
+    return replace(state, cameras=tuple(cameras), bodies=tuple(bodies), shift=tuple(shifts), shape=shape)

@@ -8,6 +8,7 @@ import numpy as np
 
 from hub.bundle.problem import ASPECT, CENTRE, FOCAL, K1, K2, K3, OFFSET, P1, RATE
 from hub.bundle.residuals import ResidualEvaluation, SplineSupport, evaluate_points, jacobians
+from hub.calibration.rigid_body.lag import rotations
 from hub.calibration.rigid_body.motion import POSE, BodyMotion, rotated
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState
 from hub.trajectory.splines import SUPPORT, SplineBasis
@@ -21,6 +22,7 @@ _CENTRE_STD = 0.02  # of the larger image side
 _RATE_STD = 1e-3
 NORM_STD = 0.1
 """Of a control quaternion's squared norm about 1."""
+_RIDGE = 1e-10  # relative: gaps that only the smoothness prior bridges are singular to rounding
 CAUCHY = 3.0
 """Scale of the robust loss [sigma of the 2-D residual]."""
 
@@ -31,6 +33,7 @@ class CameraRows:
 
     evaluation: residuals of its n rows. index: (V,) first path parameter of each view. weights, slopes: (n, 4) of the
     four control points. pose_jacobian: (n, 3, 7) of the point by the interpolated pose. weight: (n,) information.
+    turns: (n, 3, 3) world from body, where the shape is estimated.
     """
 
     evaluation: ResidualEvaluation
@@ -39,11 +42,13 @@ class CameraRows:
     slopes: Floats
     pose_jacobian: Floats
     weight: Floats
+    turns: Floats | None
 
 
 @dataclass(slots=True, eq=False)
 class ReducedSystem:
-    """Normal equations without the time errors. band: lower, (28, path). border: (path, cameras' columns)."""
+    """Normal equations without the time errors. band: lower, (28, path). border: (path, columns): those of the cameras
+    and, where it is estimated, of the shape."""
 
     band: Floats
     border: Floats
@@ -56,10 +61,12 @@ class ReducedSystem:
 class ViewTerms:
     """Of one camera's V views: sums over their rows of gradients and of products with the time error.
 
-    path: (V, 28) gradient, camera: (V, c). time_path: (V, 28), time_camera: (V, c), time_gradient: (V,), time: (V,)
-    second derivative by the time error, with its prior; inf where there is none.
+    columns: (c,) of the camera, and of the shape. path: (V, 28) gradient, camera: (V, c). time_path: (V, 28),
+    time_camera: (V, c), time_gradient: (V,), time: (V,) second derivative by the time error, with its prior; inf where
+    there is none.
     """
 
+    columns: Ints
     path: Floats
     camera: Floats
     time_path: Floats
@@ -88,7 +95,7 @@ def linearised_rows(problem: BodyProblem, state: BodyState, camera: int, robust:
     row_weights = weights[views.view] + late[:, None] * slopes[views.view]
     pose = np.einsum("nk,nkp->np", row_weights, control[views.view])
     velocity = np.einsum("vk,vkp->vp", slopes, control)[views.view]
-    turned, by_quaternion = rotated(pose[:, 3:], views.points)
+    turned, by_quaternion = rotated(pose[:, 3:], views.points + state.shape[views.label])
     pose_jacobian = np.concatenate([np.broadcast_to(np.eye(3), (len(pose), 3, 3)), by_quaternion], axis=2)
     speed = np.einsum("nij,nj->ni", pose_jacobian, velocity)
     one = np.zeros((len(pose), SUPPORT))
@@ -101,7 +108,8 @@ def linearised_rows(problem: BodyProblem, state: BodyState, camera: int, robust:
     squared = (found.residual**2).sum(axis=0) * information
     weight = information / (1.0 + squared / CAUCHY**2) if robust else np.full(len(pose), information)
     weight = np.where(found.valid & problem.use[camera], weight, 0.0)
-    return CameraRows(found, index, row_weights, slopes[views.view], pose_jacobian, weight)
+    turns = rotations(pose[:, 3:]) if problem.free_shape else None
+    return CameraRows(found, index, row_weights, slopes[views.view], pose_jacobian, weight, turns)
 
 
 def view_index(problem: BodyProblem, state: BodyState, camera: int) -> Ints:
@@ -121,19 +129,26 @@ def assemble(problem: BodyProblem, state: BodyState, rows: list[CameraRows]) -> 
     """Normal equations over the bodies' paths and the cameras, without the time errors."""
     columns = [problem.columns(camera) for camera in range(len(rows))]
     starts = np.r_[0, np.cumsum([len(one) for one in columns])].astype(int)
+    shape = starts[-1] + np.arange(state.shape.size if problem.free_shape else 0)
+    width = int(starts[-1]) + len(shape)
     size = POSE * sum(len(body.control) for body in state.bodies)
     system = ReducedSystem(
         np.zeros((BLOCK, size)),
-        np.zeros((size, starts[-1])),
-        np.zeros((starts[-1], starts[-1])),
+        np.zeros((size, width)),
+        np.zeros((width, width)),
         np.zeros(size),
-        np.zeros(starts[-1]),
+        np.zeros(width),
     )
     terms = []
     for camera, one in enumerate(rows):
-        mine = slice(starts[camera], starts[camera + 1])
+        mine = np.r_[starts[camera] : starts[camera + 1], shape]
         terms.append(_add_camera(system, problem, state, camera, one, columns[camera], mine))
+    if problem.free_shape:
+        information = np.tile(state.shape_std**-2.0, len(state.shape))
+        system.corner[shape, shape] += information
+        system.gradient_cameras[shape] += information * state.shape.ravel()
     _add_priors(system, problem, state, columns, starts)
+    system.band[0] *= 1.0 + _RIDGE
     return system, terms
 
 
@@ -144,7 +159,7 @@ def _add_camera(
     camera: int,
     rows: CameraRows,
     columns: list[int],
-    mine: slice,
+    mine: Ints,
 ) -> ViewTerms:
     """Add one camera's rows, with the time errors of its views eliminated."""
     view, count = problem.views[camera].view, len(problem.views[camera].time)
@@ -158,6 +173,12 @@ def _add_camera(
     full = np.concatenate([by_path, by_camera, residual], axis=2)
     moments = _moments(full, rows.weight, view, count)  # (V, m, m)
     c = len(columns)
+    crossed, shape_shape = np.zeros((count, full.shape[2], 0)), np.zeros((0, 0))
+    if rows.turns is not None:
+        label = problem.views[camera].label
+        crossed, shape_shape = _shape_moments(
+            full, point @ rows.turns, rows.weight, view, label, count, len(state.shape)
+        )
     time, last = BLOCK + c, BLOCK + c + 1
     curvature = np.full(count, np.inf)
     time_gradient = np.zeros(count)
@@ -165,14 +186,20 @@ def _add_camera(
         prior = 1.0 / state.jitter[camera] ** 2
         curvature = moments[:, time, time] + prior
         time_gradient = moments[:, time, last] + prior * state.shift[camera]
+    # Columns of the camera, then of the shape.
+    by_corner = np.concatenate([moments[:, :, BLOCK:time], crossed], axis=2)
     path_path = moments[:, :BLOCK, :BLOCK]
-    time_path, time_camera = moments[:, time, :BLOCK], moments[:, time, BLOCK:time]
+    time_path, time_camera = moments[:, time, :BLOCK], by_corner[:, time]
     scaled_path, scaled_camera = time_path / curvature[:, None], time_camera / curvature[:, None]
     path_path = path_path - scaled_path[:, :, None] * time_path[:, None, :]
-    path_camera = moments[:, :BLOCK, BLOCK:time] - scaled_path[:, :, None] * time_camera[:, None, :]
-    camera_camera = moments[:, BLOCK:time, BLOCK:time].sum(axis=0) - scaled_camera.T @ time_camera
+    path_camera = by_corner[:, :BLOCK] - scaled_path[:, :, None] * time_camera[:, None, :]
+    camera_camera = np.zeros((len(mine), len(mine)))
+    camera_camera[:c] = by_corner[:, BLOCK:time].sum(axis=0)
+    camera_camera[c:, :c] = camera_camera[:c, c:].T
+    camera_camera[c:, c:] = shape_shape
+    camera_camera -= scaled_camera.T @ time_camera
     gradient_path = moments[:, :BLOCK, last] - scaled_path * time_gradient[:, None]
-    gradient_camera = moments[:, BLOCK:time, last] - scaled_camera * time_gradient[:, None]
+    gradient_camera = by_corner[:, last] - scaled_camera * time_gradient[:, None]
     order = np.argsort(rows.index, kind="stable")
     place, first = np.unique(rows.index[order], return_index=True)
     block = np.add.reduceat(path_path[order], first, axis=0)
@@ -182,11 +209,11 @@ def _add_camera(
     border = np.add.reduceat(path_camera[order], first, axis=0)
     gradient = np.add.reduceat(gradient_path[order], first, axis=0)
     for i in range(BLOCK):
-        system.border[place + i, mine] += border[:, i]
+        system.border[np.ix_(place + i, mine)] += border[:, i]
         system.gradient_path[place + i] += gradient[:, i]
-    system.corner[mine, mine] += camera_camera
+    system.corner[np.ix_(mine, mine)] += camera_camera
     system.gradient_cameras[mine] += gradient_camera.sum(axis=0)
-    return ViewTerms(gradient_path, gradient_camera, time_path, time_camera, time_gradient, curvature)
+    return ViewTerms(mine, gradient_path, gradient_camera, time_path, time_camera, time_gradient, curvature)
 
 
 def _moments(full: Floats, weight: Floats, view: Ints, count: int) -> Floats:
@@ -198,6 +225,23 @@ def _moments(full: Floats, weight: Floats, view: Ints, count: int) -> Floats:
     padded[view, place] = full * np.sqrt(weight)[:, None, None]
     flat = padded.reshape(count, -1, width)
     return np.asarray(np.matmul(flat.transpose(0, 2, 1), flat))
+
+
+def _shape_moments(
+    full: Floats, by_shape: Floats, weight: Floats, view: Ints, label: Ints, count: int, labels: int
+) -> tuple[Floats, Floats]:
+    """Weighted products with the derivatives by the labels' points ``by_shape`` (n, 2, 3).
+
+    (count, m, 3 labels) of ``full`` (n, 2, m) by view, and (3 labels, 3 labels) of ``by_shape`` over all rows.
+    """
+    scaled = by_shape * weight[:, None, None]
+    crossed = np.zeros((count, full.shape[2], labels, 3))
+    crossed[view, :, label] = full.transpose(0, 2, 1) @ scaled  # a label is in a view at most once
+    blocks = np.zeros((labels, 3, 3))
+    np.add.at(blocks, label, by_shape.transpose(0, 2, 1) @ scaled)
+    squares = np.zeros((labels, 3, labels, 3))
+    squares[np.arange(labels), :, np.arange(labels)] = blocks
+    return crossed.reshape(count, full.shape[2], 3 * labels), squares.reshape(3 * labels, 3 * labels)
 
 
 def _add_priors(

@@ -5,17 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import solveh_banded
 
 from hub.bundle.problem import OFFSET
 from hub.bundle.residuals import jacobians
-from hub.calibration.rigid_body.linear_system import linearised_rows, third_differences
-from hub.calibration.rigid_body.problem import BodyProblem, BodyState
+from hub.calibration.rigid_body.linear_system import assemble, linearised_rows, third_differences
+from hub.calibration.rigid_body.problem import BodyProblem, BodyState, pitch
 from hub.trajectory.splines import SplineBasis
 from protocols.geometry.types import Bools, Floats
 
 _OUTLIER = 5.0  # sigma of the 2-D residual
 _MIN_SIGMA_PX = 0.03
 _MIN_JITTER = 2e-4  # s; less is none
+_MIN_SHAPE = 1e-5  # of the distance of neighbouring points
 _MIN_PRIOR = 1e-4  # of a path's scatter
 
 
@@ -93,3 +95,19 @@ def scatters(state: BodyState) -> tuple[Floats | None, ...]:
         extent = max(float(np.ptp(body.control[:, :3], axis=0).max()), 1e-9)
         out.append(np.r_[np.full(3, max(place, _MIN_PRIOR * extent)), np.full(4, max(turn, _MIN_PRIOR))])
     return tuple(out)
+
+
+def shape_stds(problem: BodyProblem, state: BodyState) -> Floats:
+    """Prior stds (3,) of the errors of a board's points, in its plane and across it, as ``jitters``."""
+    if not problem.free_shape:
+        return state.shape_std
+    rows = [linearised_rows(problem, state, camera, False) for camera in range(len(problem.views))]
+    system, _ = assemble(problem, state, rows)
+    reduced = system.corner - system.border.T @ solveh_banded(system.band, system.border, lower=True)
+    covariance = np.linalg.pinv(reduced, hermitian=True)
+    variance = np.diag(covariance)[-state.shape.size :].reshape(-1, 3)
+    known = np.clip(1.0 - variance / state.shape_std**2, 0.0, 1.0)
+    out = np.empty(3)
+    for axes in ([0, 1], [2]):
+        out[axes] = np.sqrt((state.shape[:, axes] ** 2).sum() / max(float(known[:, axes].sum()), 1.0))
+    return np.asarray(np.maximum(out, _MIN_SHAPE * pitch(problem)))

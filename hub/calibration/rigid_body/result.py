@@ -197,11 +197,12 @@ def _trajectories(
             if owner[label][0] != number:
                 continue
             good = _observing(problem, state, index, internal, instants) >= 2
-            position = motion.points(internal[good], owner[label][1])
+            point = owner[label][1] + state.shape[index]
+            position = motion.points(internal[good], point)
             finite = np.isfinite(position).all(axis=1)
             time, inside = ticks[good][finite], internal[good][finite]
             if len(time):
-                std = world.scale * path.point_stds(owner[label][1], inside)
+                std = world.scale * path.point_stds(point, inside)
                 out.append(TrajectoryTable(label, time, world.points(position[finite]), std))
     return tuple(out)
 

@@ -11,7 +11,7 @@ from hub.bundle.preprocessing import nominal_intrinsics
 from hub.bundle.problem import FOCAL, OFFSET
 from hub.calibration.rigid_body.adjustment import adjust_bodies
 from hub.calibration.rigid_body.lag import BodyPair
-from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval, initial_jitter
+from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval, initial_jitter, initial_shape
 from hub.calibration.rigid_body.result import BodySolution, publish
 from hub.calibration.rigid_body.start import initial_lens, largest_group, solve_body_pairs, start_bodies
 from hub.calibration.rigid_body.uncertainty import body_covariance
@@ -19,6 +19,7 @@ from hub.calibration.rigid_body.views import CameraViews, body_labels, gather_vi
 from protocols.core.errors import Refused
 from protocols.core.pair_report import PairReport
 from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, FixedCalibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
@@ -28,13 +29,14 @@ MAX_BOARD_FOCAL_STD = 0.05
 """Largest relative std of a focal length that the board determines; above it the camera is refused."""
 _MAX_ROTATION_STD, _MAX_CLOCK_FRAMES = 0.05, 0.5  # rad; frame intervals
 _MIN_INLIERS, _MIN_VIEWS = 0.5, 3
+_MIN_SHAPE_POINTS = 6  # of a board: fewer are taken as described
 _TIME_ERRORS = 0.1  # of a frame interval: time errors from which stamps are no exposure times
 _SIGMA_START = 1.0  # px
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Input:
-    """Usable cameras by name, and why the others are not."""
+    """Usable cameras by name, and why the others are not. shape: errors (labels, 3) of the bodies' points, if known."""
 
     rig: Rig
     labels: list[str]
@@ -43,6 +45,7 @@ class _Input:
     free_lens: dict[str, bool]
     refused: dict[str, str]
     known: FixedCalibration | None
+    shape: Floats | None = None
 
 
 def calibrate_bodies(
@@ -141,13 +144,17 @@ def _solve(given: _Input, report: Progress, shared_clock: bool) -> BodySolution:
             not shared_clock,
             tuple(0.0 if shared_clock else readouts[name] for name in names),
             tuple(np.ones(len(one.view), dtype=np.bool_) for one in views),
+            given.shape is None and len(given.rig.bodies) == 1 and len(given.labels) >= _MIN_SHAPE_POINTS,
         )
+        shape, shape_std = initial_shape(problem, len(given.labels))
         state = BodyState(
             tuple(start.cameras[name] for name in names),
             start.bodies,
             tuple(np.zeros(len(one.time)) for one in views),
             np.full(len(names), _SIGMA_START),
             initial_jitter(problem),
+            shape if given.shape is None else given.shape,
+            shape_std,
         )
         report("adjusting", 0.5)
         problem, state = adjust_bodies(problem, state)
@@ -216,7 +223,8 @@ def _in_step(given: _Input, free: BodySolution, report: Progress) -> BodySolutio
     for name, one in given.views.items():
         if name in lenses:
             views[name] = replace(one, time=one.time + (one.time_origin - start), time_origin=start)
-    fixed = replace(given, views=views, lenses=lenses, free_lens=dict.fromkeys(views, False), refused=free.refused)
+    still = dict.fromkeys(views, False)
+    fixed = replace(given, views=views, lenses=lenses, free_lens=still, refused=free.refused, shape=free.state.shape)
     solution = _solve(fixed, report, True)
     interval = float(np.median([frame_interval(one) for one in free.problem.views]))
     late = ", ".join(
