@@ -64,7 +64,7 @@ def export(
     seed
         Accepted for consistency; this command uses no random numbers.
     """
-    from deploy.offline import exports
+    from deploy.offline.exchange import exports
     from protocols.core.files import check_folder, write_together
     from protocols.log.read.session import is_log
 
