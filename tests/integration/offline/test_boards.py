@@ -76,9 +76,9 @@ def test_auto_takes_the_board_that_is_there_and_says_so(recorded: tuple[Path, Bo
     for path in paths:
         shutil.copy(path, bare)
     target = find_target(bare, sorted(bare.glob("*.mp4")), "auto", MarkerModel.default(), lambda text, share: None)
-    assert target.kind == "tag"
     assert target.board is not None
-    assert (target.board.dictionary, target.board.inverted) == ("4X4_50", True)
+    assert (target.kind, target.board.squares, target.board.dictionary) == ("charuco", (8, 6), "4X4_50")
+    assert target.board.inverted
     assert "board.toml" in target.notes[0]
 
 
