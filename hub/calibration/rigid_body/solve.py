@@ -13,7 +13,7 @@ from hub.calibration.rigid_body.adjustment import adjust_bodies
 from hub.calibration.rigid_body.lag import BodyPair
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval, initial_jitter, initial_shape
 from hub.calibration.rigid_body.result import BodySolution, publish
-from hub.calibration.rigid_body.start import initial_lens, largest_group, solve_body_pairs, start_bodies
+from hub.calibration.rigid_body.start import initial_lens, largest_group, orient_views, solve_body_pairs, start_bodies
 from hub.calibration.rigid_body.uncertainty import body_covariance
 from hub.calibration.rigid_body.views import CameraViews, body_labels, gather_views, thinned, view_poses
 from protocols.core.errors import Refused
@@ -106,8 +106,11 @@ def _prepare(rig: Rig, observations: Observations, known: FixedCalibration | Non
 def _solve(given: _Input, report: Progress, shared_clock: bool) -> BodySolution:
     """Pairs, cameras and the adjustment; cameras that do not fit are refused one by one."""
     report("the board's poses", 0.05)
-    poses = {name: view_poses(views, given.lenses[name]) for name, views in given.views.items()}
+    poses = {name: view_poses(one, given.lenses[name]) for name, one in given.views.items()}
     report("lags", 0.2)
+    if given.rig.metadata.get("bodies_symmetric") is True:
+        given = replace(given, views=orient_views(given.views, poses, given.lenses, shared_clock))
+        poses = {name: view_poses(one, given.lenses[name]) for name, one in given.views.items()}
     pairs = solve_body_pairs(poses, shared_clock)
     refused = dict(given.refused)
     names = list(given.views)

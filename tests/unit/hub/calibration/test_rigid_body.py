@@ -150,3 +150,21 @@ def test_the_shape_of_an_imperfect_print_is_estimated() -> None:
         off = abs(np.log(camera.intrinsics.focal / world.cameras[name].lens.focal))
         assert off < 3.5 * camera.focal_std
         assert camera.rms_px < 1.15 * 0.15 * np.sqrt(2.0)
+
+
+def test_a_board_that_looks_the_same_upside_down_may_be_seen_either_way_by_each_camera() -> None:
+    world = board_world(14, (10.0, 10.0, 10.0))
+    mine = world.observations(8.0)
+    labels = list(world.points)
+    opposite = dict(zip(labels, labels[::-1], strict=True))
+    tracks = {}
+    for (camera, label), track in mine.tracks.items():
+        name = opposite[label] if camera == "cam1" else label
+        tracks[camera, name] = replace(track, label=name)
+    rig = world.rig()
+    rig = replace(rig, metadata={**rig.metadata, "bodies_symmetric": True})
+    found = calibrate(rig, replace(mine, tracks=tracks))
+    for place, turn, lag in errors(world, found).values():
+        assert place < 0.005
+        assert turn < 0.2
+        assert abs(lag) < 1e-3
