@@ -40,6 +40,9 @@ CALIBRATIONS = (
 POINTS = ("caliscope-points", "deeplabcut", "mvus", *keypoints.FORMATS)
 FORMATS = (*CALIBRATIONS, *POINTS, "session")
 _CROWDED_SHARE = 0.1  # of the frames with more than one person: above it, they are different labels
+# A score is the height of the network's peak. Under constant noise a peak's place is known to a std over its height
+# (the Cramér-Rao bound of a blob's location); the std of a certain point is that of annotated images.
+_KEYPOINT_STD, _LEAST_SCORE = 2.0, 0.05
 _YAML = (".yml", ".yaml")
 _KEYPOINTS = (".json", ".h5", ".hdf5", ".slp", ".npy")
 _REMEDY = f"give the format with --format: {', '.join(FORMATS)}"
@@ -169,7 +172,7 @@ def _keypoint_observations(
 ) -> Observations:
     """Observations of keypoints: joints are labels, of several people with the person's name before them."""
     several = any(_several_people(one.rows) for one in found)
-    columns: list[tuple[str, str, int, float, float]] = []
+    columns: list[tuple[str, str, int, float, float, float]] = []
     stamps: list[float] = []
     for one in found:
         table = tables(one.camera) if one.normalised and tables is not None else None
@@ -185,14 +188,19 @@ def _keypoint_observations(
         shift = 0.5 if one.normalised else 0.0
         for row in rows:
             label = f"{row.person}.{row.joint}" if several else row.joint
-            columns.append((one.camera, label, row.frame, row.u * size[0] - shift, row.v * size[1] - shift))
+            place = row.u * size[0] - shift, row.v * size[1] - shift
+            columns.append((one.camera, label, row.frame, *place, _KEYPOINT_STD / max(row.score, _LEAST_SCORE)))
         stamps += times(one.camera, np.array([row.frame for row in rows], dtype=np.int64), one.file).tolist()
     if not columns:
         raise InputError("no keypoint is above --likelihood", file=found[0].file, remedy="give a lower one")
-    cameras, labels, frames, across, down = (list(column) for column in zip(*columns, strict=True))
+    cameras, labels, frames, across, down, spread = (list(column) for column in zip(*columns, strict=True))
     nothing = np.full(len(columns), np.nan)
     pixels = np.column_stack([np.array(across, dtype=np.float64), np.array(down, dtype=np.float64)])
-    return gather_tracks(cameras, labels, np.array(frames, dtype=np.int64), np.array(stamps), pixels, nothing)
+    stds = np.array(spread, dtype=np.float64)
+    # Equal scores say nothing of a point.
+    known = stds if np.ptp(stds) > 0.0 else None
+    numbers = np.array(frames, dtype=np.int64)
+    return gather_tracks(cameras, labels, numbers, np.array(stamps), pixels, nothing, stds=known)
 
 
 def _several_people(rows: list[keypoints.Keypoint]) -> bool:
