@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ import numpy.typing as npt
 
 from edge.detectors.board.description import BOARD_FILE, Board, BoardKind, load_dictionary, read_board
 from edge.detectors.board.detector import SEARCH_PX, BoardDetector
+from edge.detectors.board.finder import Finder
 from edge.detectors.marker.ball import MarkerModel
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
 from edge.devices.base import Image
@@ -26,6 +28,8 @@ DETECTORS = ("charuco", "chessboard", "tag", "bright", "marker", "person", "vehi
 """What ``calibrate VIDEOS --detector`` names, besides networks and other packages' detectors."""
 _SAMPLES, _LOOK_AT = 8, 4  # frames of a video; videos in which tags of any kind are searched
 _LEAST_FRAMES, _LEAST_VIDEOS = 2, 2  # sampled frames of a video, and videos, in which it must be found
+_LEAST_PERIMETER = 0.06  # of a tag, over the longer side of the image: smaller ones are hardly measured
+_LEAST_SHEET, _SHEET_SHARE = 4, 0.5  # tags of a ChArUco board; corners of it in an image that shows some
 _BALL_SHARE = 0.3  # of the sampled frames
 # Dictionaries of one size are prefixes of their largest: these stand for all.
 _DICTIONARIES = (
@@ -92,12 +96,18 @@ def _look(looks: _Looks, board: Board | None, model: MarkerModel) -> Target:
     tags = looks.tags(_DICTIONARIES)
     if tags is not None:
         found, numbers = tags
+        sheet = looks.charuco(found, numbers)
+        if sheet is not None:
+            notes = (f"auto: a {sheet.text}; {BOARD_FILE} with its squares and square_size gives the scale",)
+            return Target("charuco", sheet, notes)
         hint = (
             f"; if they are on a ChArUco board, {BOARD_FILE} with it finds more and gives the scale ({_EXAMPLE})"
-            if numbers >= 4
+            if len(numbers) >= 4
             else f"; {BOARD_FILE} with tag_size gives the scale"
         )
-        notes = (f"auto: {numbers} tags of {found.dictionary}{', white on black' if found.inverted else ''}{hint}",)
+        notes = (
+            f"auto: {len(numbers)} tags of {found.dictionary}{', white on black' if found.inverted else ''}{hint}",
+        )
         return Target("tag", found, notes)
     tried.append("ArUco and AprilTag tags of all dictionaries, black or white")
     squares = looks.chessboard()
@@ -158,31 +168,44 @@ class _Looks:
                 best, most, seen = print_, total, sum(frames >= _LEAST_FRAMES for _, frames in counts)
         return best, seen
 
-    def tags(self, dictionaries: Sequence[str]) -> tuple[Board, int] | None:
-        """Single tags of the dictionary of which most are seen again and again, and how many there are."""
-        best: tuple[int, str, bool, set[int]] | None = None
-        for inverted in (False, True):
-            images = [
-                [_small(_grey(image), inverted) for image in self.images(path)] for path in self._paths[:_LOOK_AT]
-            ]
-            for name in dictionaries:
-                detector = cv2.aruco.ArucoDetector(load_dictionary(name))
-                seen: Counter[int] = Counter()
-                for video in images:
-                    mine: Counter[int] = Counter()
-                    for image in video:
-                        ids = detector.detectMarkers(image)[1]
-                        mine.update(set() if ids is None else {int(number) for number in np.ravel(ids)})
-                    seen.update({number for number, count in mine.items() if count >= _LEAST_FRAMES})
-                steady = {number for number, count in seen.items() if count >= _LEAST_VIDEOS}
-                if steady and (best is None or len(steady) > best[0]):
-                    best = len(steady), name, inverted, steady
-        if best is None:
+    def tags(self, dictionaries: Sequence[str]) -> tuple[Board, set[int]] | None:
+        """Single tags of the dictionary of which most are seen again and again, and their numbers."""
+        videos = [[_small(_grey(image)) for image in self.images(path)] for path in self._paths[:_LOOK_AT]]
+        black, either = cv2.aruco.DetectorParameters(), cv2.aruco.DetectorParameters()
+        black.minMarkerPerimeterRate = either.minMarkerPerimeterRate = _LEAST_PERIMETER
+        either.detectInvertedMarker = True
+        seen = _steady_tags(videos, dictionaries, either, first=True)
+        name = max(seen, key=lambda one: len(seen[one]))
+        if not seen[name]:
             return None
-        count, name, inverted, steady = best
+        steady = _steady_tags(videos, (name,), either)[name]
+        dark = _steady_tags(videos, (name,), black)[name]
+        inverted = 2 * len(dark) < len(steady)
         kind: BoardKind = "apriltag" if name.startswith("APRILTAG") else "aruco"
         board = Board("aruco", None, _smallest(name, max(steady)), inverted=inverted, mirrored=False, legacy=False)
-        return replace(board, kind=kind), count
+        return replace(board, kind=kind), steady
+
+    def charuco(self, tags: Board, numbers: set[int]) -> Board | None:
+        """The ChArUco board that carries these tags; None = none.
+
+        A board's tags are numbered from 0: their number leaves a few shapes, of which one has corners where tags say.
+        """
+        count = max(numbers) + 1
+        if not _LEAST_SHEET <= count < 2 * len(numbers):
+            return None
+        images = [_small(_grey(image)) for path in self._paths for image in self.images(path)[::3]]
+        best, most = None, 0.0
+        for columns, rows in itertools.product(range(3, count + 1), repeat=2):
+            if columns * rows // 2 != count:
+                continue
+            sheet = replace(tags, kind="charuco", squares=(columns, rows))
+            for print_ in replace(sheet, mirrored=False, legacy=None).prints():
+                finder = Finder(print_)
+                shares = [len(finder.find(image)[0]) / len(finder.labels) for image in images]
+                share = float(np.mean([one for one in shares if one > 0.0] or [0.0]))
+                if share * np.count_nonzero(shares) > most and share >= _SHEET_SHARE:
+                    best, most = print_, share * np.count_nonzero(shares)
+        return best
 
     def chessboard(self) -> tuple[int, int] | None:
         """Squares of the chessboard that most frames show; None where there is none."""
@@ -190,7 +213,7 @@ class _Looks:
         for path in self._paths[:_LOOK_AT]:
             for image in self.images(path):
                 flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
-                found, corners, meta = cv2.findChessboardCornersSBWithMeta(_small(_grey(image), False), (4, 4), flags)
+                found, corners, meta = cv2.findChessboardCornersSBWithMeta(_small(_grey(image)), (4, 4), flags)
                 if found and meta is not None and corners is not None:
                     rows, columns = np.asarray(meta).shape[:2]
                     sizes[max(rows, columns) + 1, min(rows, columns) + 1] += 1
@@ -233,6 +256,34 @@ class _Looks:
         return videos
 
 
+def _steady_tags(
+    videos: Sequence[Sequence[Grey]],
+    dictionaries: Sequence[str],
+    parameters: cv2.aruco.DetectorParameters,
+    first: bool = False,
+) -> dict[str, set[int]]:
+    """By dictionary, the numbers of the tags that are in several frames of several videos.
+
+    first: look no further once there are some; the codes of all dictionaries take most of the time.
+    """
+    detector = cv2.aruco.ArucoDetector([load_dictionary(name) for name in dictionaries], parameters)
+    frames: Counter[tuple[int, int, int]] = Counter()  # with a dictionary's tag, by video
+    steady: dict[str, set[int]] = {name: set() for name in dictionaries}
+    for images in itertools.zip_longest(*videos):
+        for video, image in enumerate(images):
+            ids, which = (None, None) if image is None else detector.detectMarkersMultiDict(image)[1::2]
+            if ids is not None and which is not None:
+                for index, number in {(int(i), int(n)) for i, n in zip(np.ravel(which), np.ravel(ids), strict=True)}:
+                    frames[video, index, number] += 1
+        videos_with = Counter(key[1:] for key, count in frames.items() if count >= _LEAST_FRAMES)
+        for (index, number), count in videos_with.items():
+            if count >= _LEAST_VIDEOS:
+                steady[dictionaries[index]].add(number)
+        if first and any(steady.values()):
+            break
+    return steady
+
+
 def _smallest(name: str, largest: int) -> str:
     """The smallest dictionary with this number of those that begin as ``name`` does: fewer are mistaken."""
     if not name.endswith("_1000"):
@@ -244,8 +295,7 @@ def _grey(image: Image) -> Grey:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
-def _small(grey: Grey, inverted: bool) -> Grey:
+def _small(grey: Grey) -> Grey:
     scale = min(1.0, SEARCH_PX / max(grey.shape))
     size = max(round(grey.shape[1] * scale), 1), max(round(grey.shape[0] * scale), 1)
-    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if scale < 1.0 else grey
-    return np.asarray(cv2.bitwise_not(small) if inverted else small, dtype=np.uint8)
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if scale < 1.0 else grey, dtype=np.uint8)

@@ -325,7 +325,8 @@ def _body_metadata(board: Board, rows: list[str]) -> dict[str, Any]:
     videos = Counter(name for (_, name), count in seen.items() if count >= _LEAST_ROWS)
     bodies = board.bodies([name for name, count in videos.items() if count >= 2])
     plain = {name: {label: point.tolist() for label, point in body.items()} for name, body in bodies.items()}
-    return {"bodies": plain, "bodies_scale": "arbitrary" if board.size is None else "metric"}
+    symmetric = {"bodies_symmetric": True} if board.symmetric else {}
+    return {**symmetric, "bodies": plain, "bodies_scale": "arbitrary" if board.size is None else "metric"}
 
 
 def _same_stamps(found: list[VideoDetections]) -> bool:

@@ -60,14 +60,19 @@ def write_observations(file: Path, observations: Observations) -> None:
     """Write observations.csv, by camera, label and time; floats with 17 significant digits."""
     sized = any(bool(np.isfinite(track.size).any()) for track in observations.tracks.values())
     labelled = len(observations.labels) > 1
+    stated = any(track.std is not None for track in observations.tracks.values())
     header = ["camera", "frame", "time", "u", "v", *(["size"] if sized else []), *(["label"] if labelled else [])]
+    header += ["cov_uu", "cov_uv", "cov_vv"] if stated else []
     lines = [",".join(header)]
     for track in observations.tracks.values():
-        for frame, time, (u, v), size in zip(track.frame, track.time, track.pixels, track.size, strict=True):
+        stds = np.full(len(track), np.nan) if track.std is None else track.std
+        for frame, time, (u, v), size, std in zip(track.frame, track.time, track.pixels, track.size, stds, strict=True):
             cells = [track.camera, str(int(frame)), f"{time:.17g}", f"{u:.17g}", f"{v:.17g}"]
             if sized:
                 cells.append(f"{size:.17g}" if np.isfinite(size) else "")
             if labelled:
                 cells.append(csv_cell(track.label))
+            if stated:
+                cells += [f"{std**2:.9g}", "0", f"{std**2:.9g}"] if np.isfinite(std) else ["", "", ""]
             lines.append(",".join(cells))
     write_atomically(file, "\n".join(lines) + "\n")

@@ -39,6 +39,7 @@ BENCHES = {
     ),
     "real_rigs": Bench("drone flights and webcams", data=True),
     "live": Bench("live hub, streams at their own pace", ("--only", "simulated", "--seconds", "60"), data=True),
+    "board_clips": Bench("clips of a moved board, lenses from the same clips", ("--worlds", "1"), data=True),
     "simulated_rigs": Bench(
         "five cameras, twenty cameras, pairs cut short",
         ("--sessions", "4", "--seconds", "120", "--only", "five,twenty"),

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deploy.cli import run
-from deploy.offline.imports import rig_tables_of_log, session_to_log
+from deploy.offline.exchange.session_log import rig_tables_of_log, session_to_log
 from protocols.core.names import MAX_SEGMENT, is_name, key_segment, name_of_segment
 from protocols.log.read.session import session_from_log
 from protocols.session.calibration import read_calibration

@@ -59,7 +59,7 @@ def export(
     units
         Length unit of a trajectory, for trc and c3d.
     """
-    from deploy.offline import exports
+    from deploy.offline.exchange import exports
     from protocols.core.files import check_folder, write_together
     from protocols.log.read.session import is_log
 

@@ -113,7 +113,7 @@ def import_(
         raise InputError("arrival times need the cameras' clocks", remedy="give --calibration CALIB.toml")
     for option, value in (("--arrival-delay-ms", arrival_delay_ms), ("--arrival-jitter-ms", arrival_jitter_ms)):
         check_range(option, value, 0.0, 1e6, "give milliseconds, 0 or more")
-    from deploy.offline import imports
+    from deploy.offline.exchange import imports, session_log
     from protocols.core.files import write_atomically
     from protocols.session.folder import read_folder, write_observations
     from protocols.session.rig import read_rig
@@ -125,19 +125,19 @@ def import_(
     warnings: tuple[str, ...] = ()
     if source.kind == "session":
         delay, jitter = 1e-3 * arrival_delay_ms, 1e-3 * arrival_jitter_ms
-    if source.kind == "session" and imports.has_objects(source.files[0]):
+    if source.kind == "session" and session_log.has_objects(source.files[0]):
         arrivals = None
         if calibration is not None:
-            arrivals = imports.read_arrivals(calibration, read_rig(calibration), delay, jitter, seed)
-        rig, detections, count = imports.objects_to_log(source.files[0], calibration, out, arrivals)
+            arrivals = session_log.read_arrivals(calibration, read_rig(calibration), delay, jitter, seed)
+        rig, detections, count = session_log.objects_to_log(source.files[0], calibration, out, arrivals)
         summary = f"{len(rig.cameras)} cameras, {detections} detections, {count} messages"
         cameras = list(rig.cameras)
     elif source.kind == "session":
         rig, seen = read_folder(source.files[0])
         arrivals = None
         if calibration is not None:
-            arrivals = imports.read_arrivals(calibration, rig, delay, jitter, seed)
-        count = imports.session_to_log(rig, seen, out, arrivals)
+            arrivals = session_log.read_arrivals(calibration, rig, delay, jitter, seed)
+        count = session_log.session_to_log(rig, seen, out, arrivals)
         warnings = seen.warnings
         if rig.scale_bars:
             warnings += ("a log does not store the scale bar: add it to the rig.toml of its export",)
@@ -171,7 +171,7 @@ def import_(
 
 def _check_suffix(kind: str, out: Path) -> None:
     """Raise InputError if the suffix of ``out`` does not fit its content: it could not be read back."""
-    from deploy.offline.imports import POINTS
+    from deploy.offline.exchange.imports import POINTS
 
     wanted = ".mcap" if kind == "session" else ".csv" if kind in POINTS else ".toml"
     if out.suffix.lower() != wanted:

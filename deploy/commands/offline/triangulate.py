@@ -79,7 +79,7 @@ def _save(result: TriangulationResult, out: Path) -> None:
     """Write the trajectories in the format that the file's suffix names. Raises InputError."""
     from tempfile import TemporaryDirectory
 
-    from deploy.offline.exports import trajectory_files, write_c3d
+    from deploy.offline.exchange.exports import trajectory_files, write_c3d
     from protocols.core.files import write_together
 
     suffix = out.suffix.lower()

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from deploy.offline.exchange.session_log import camera_info, write_observation_log
 from deploy.offline.follow.objects import Kind
-from deploy.offline.imports import camera_info, write_observation_log
 from deploy.offline.video_folder import VideoFile, list_videos
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError

@@ -60,6 +60,11 @@ class Board:
         return self.kind in ("aruco", "apriltag")
 
     @property
+    def symmetric(self) -> bool:
+        """Whether it looks the same turned by 180°: which corner is the first is then a matter of its neighbours."""
+        return self.kind == "chessboard" and self.squares is not None and sum(self.squares) % 2 == 0
+
+    @property
     def text(self) -> str:
         """The board in words."""
         grid = "" if self.squares is None else f" of {self.squares[0]}x{self.squares[1]} squares"

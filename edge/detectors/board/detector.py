@@ -33,6 +33,7 @@ class BoardDetector:
         self._finder = Finder(self._board)
         self._last: Floats | None = None
         self._missed = 0
+        self._order: Floats | None = None
 
     @property
     def board(self) -> Board:
@@ -62,9 +63,19 @@ class BoardDetector:
             if not len(corners[0]) and thorough and max(grey.shape) > SEARCH_PX:
                 corners = self._finder.find(grey)
         found = len(corners[0]) > 0
+        if found and self._board.symmetric:
+            corners = corners[0], self._as_before(corners[1])
         self._last = corners[1] if found else None
         self._missed = 0 if found else self._missed + 1
         return corners
+
+    def _as_before(self, pixels: Floats) -> Floats:
+        """The corners (n, 2) of a board that looks the same upside down, in the order of the last frame that had it."""
+        last, upside_down = self._order, pixels[::-1]
+        if last is not None and np.abs(upside_down - last).sum() < np.abs(pixels - last).sum():
+            pixels = upside_down
+        self._order = pixels
+        return pixels
 
     def _search_nearby(self, grey: Grey) -> Corners | None:
         """The corners around the last place; None if that is not known, or too few are there."""

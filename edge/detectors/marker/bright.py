@@ -26,6 +26,7 @@ _HALF_HEIGHT = 0.5  # share of the contrast: brighter pixels belong to the spot
 _WHITE = 250.0  # grey level at which a sensor clips
 _CUT = 0.3  # share of the contrast: fainter pixels are background and its texture
 _GAP = 1.5  # px: beyond this gap for the spot's own fringe
+_LEAST_RING = 8  # px that fix a plane with some to spare
 _MIN_CONTRAST = 80.0  # grey levels above the background
 _MAX_ASPECT = 6.0  # length over width of a smeared spot
 _MAX_FLARE = 0.35  # share of the contrast: largest excess of the ring over the surround
@@ -101,6 +102,8 @@ class BrightDetector:
             edge = _GAP + 0.25 * shape.width
             ring = (distance > edge) & (distance <= edge + _RING)
             inside = distance <= edge
+            if np.count_nonzero(ring) < _LEAST_RING:
+                return None  # fills the image: nothing around it to measure it against
             background = np.stack([_background_plane(channel, x, y, ring) for channel in channels])
             residual = channels - background
             # Channels are weighted by the light's excess in them, because their background errors are independent.
@@ -263,7 +266,7 @@ def _covariance(
     basis = np.stack([np.ones_like(x), x, y])
     of_ring = np.einsum("ahw,bhw,hw->ab", basis, basis, ring.astype(np.float64))
     lever = np.einsum("ahw,bhw->ab", arms, basis)
-    plane = lever @ np.linalg.inv(of_ring) @ lever.T * (patchy + _QUANTUM)
+    plane = lever @ np.linalg.pinv(of_ring, hermitian=True) @ lever.T * (patchy + _QUANTUM)
     floor = _FLOOR_PX * (1.0 + float(np.clip((_NARROW_PX - width) / _NARROW_STEP, 0.0, 1.0)))
     total = own + plane + floor**2 * np.eye(2)
     return float(total[0, 0]), float(total[0, 1]), float(total[1, 1])

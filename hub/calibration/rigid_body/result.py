@@ -9,8 +9,9 @@ import numpy as np
 
 from hub.bundle.datum.gauge import fix_gauge
 from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, OFFSET, RATE
-from hub.calibration.rigid_body.adjustment import BodyProblem, BodyState, frame_interval, residuals
 from hub.calibration.rigid_body.lag import BodyPair
+from hub.calibration.rigid_body.noise import residuals
+from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval
 from hub.calibration.rigid_body.uncertainty import BodyCovariance, body_covariance, path_covariance
 from hub.trajectory.discrete import INSTANT_TOLERANCE_S, PointBasis
 from hub.two_view.relative_pose import fundamental_from, relative_pose_between
@@ -196,11 +197,12 @@ def _trajectories(
             if owner[label][0] != number:
                 continue
             good = _observing(problem, state, index, internal, instants) >= 2
-            position = motion.points(internal[good], owner[label][1])
+            point = owner[label][1] + state.shape[index]
+            position = motion.points(internal[good], point)
             finite = np.isfinite(position).all(axis=1)
             time, inside = ticks[good][finite], internal[good][finite]
             if len(time):
-                std = world.scale * path.point_stds(owner[label][1], inside)
+                std = world.scale * path.point_stds(point, inside)
                 out.append(TrajectoryTable(label, time, world.points(position[finite]), std))
     return tuple(out)
 

@@ -9,16 +9,11 @@ import numpy as np
 
 from hub.bundle.preprocessing import nominal_intrinsics
 from hub.bundle.problem import FOCAL, OFFSET
-from hub.calibration.rigid_body.adjustment import (
-    BodyProblem,
-    BodyState,
-    adjust_bodies,
-    frame_interval,
-    initial_jitter,
-)
+from hub.calibration.rigid_body.adjustment import adjust_bodies
 from hub.calibration.rigid_body.lag import BodyPair
+from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval, initial_jitter, initial_shape
 from hub.calibration.rigid_body.result import BodySolution, publish
-from hub.calibration.rigid_body.start import initial_lens, largest_group, solve_body_pairs, start_bodies
+from hub.calibration.rigid_body.start import initial_lens, largest_group, orient_views, solve_body_pairs, start_bodies
 from hub.calibration.rigid_body.uncertainty import body_covariance
 from hub.calibration.rigid_body.views import CameraViews, body_labels, gather_views, thinned, view_poses
 from protocols.core.errors import Refused
@@ -33,7 +28,7 @@ MAX_BOARD_FOCAL_STD = 0.05
 """Largest relative std of a focal length that the board determines; above it the camera is refused."""
 _MAX_ROTATION_STD, _MAX_CLOCK_FRAMES = 0.05, 0.5  # rad; frame intervals
 _MIN_INLIERS, _MIN_VIEWS = 0.5, 3
-_TIME_ERRORS = 0.1  # of a frame interval: time errors from which stamps are no exposure times
+_MIN_SHAPE_POINTS = 6  # of a board: fewer are taken as described
 _SIGMA_START = 1.0  # px
 
 
@@ -111,8 +106,11 @@ def _prepare(rig: Rig, observations: Observations, known: FixedCalibration | Non
 def _solve(given: _Input, report: Progress, shared_clock: bool) -> BodySolution:
     """Pairs, cameras and the adjustment; cameras that do not fit are refused one by one."""
     report("the board's poses", 0.05)
-    poses = {name: view_poses(views, given.lenses[name]) for name, views in given.views.items()}
+    poses = {name: view_poses(one, given.lenses[name]) for name, one in given.views.items()}
     report("lags", 0.2)
+    if given.rig.metadata.get("bodies_symmetric") is True:
+        given = replace(given, views=orient_views(given.views, poses, given.lenses, shared_clock))
+        poses = {name: view_poses(one, given.lenses[name]) for name, one in given.views.items()}
     pairs = solve_body_pairs(poses, shared_clock)
     refused = dict(given.refused)
     names = list(given.views)
@@ -146,13 +144,17 @@ def _solve(given: _Input, report: Progress, shared_clock: bool) -> BodySolution:
             not shared_clock,
             tuple(0.0 if shared_clock else readouts[name] for name in names),
             tuple(np.ones(len(one.view), dtype=np.bool_) for one in views),
+            len(given.rig.bodies) == 1 and len(given.labels) >= _MIN_SHAPE_POINTS,
         )
+        shape, shape_std = initial_shape(problem, len(given.labels))
         state = BodyState(
             tuple(start.cameras[name] for name in names),
             start.bodies,
             tuple(np.zeros(len(one.time)) for one in views),
             np.full(len(names), _SIGMA_START),
             initial_jitter(problem),
+            shape,
+            shape_std,
         )
         report("adjusting", 0.5)
         problem, state = adjust_bodies(problem, state)
@@ -195,13 +197,17 @@ def _unacceptable(solution: BodySolution) -> tuple[str, str]:
 def _is_in_step(solution: BodySolution) -> bool:
     """Whether clips with the same stamps were written frame by frame by one recorder, as far as the motion can tell.
 
-    All lags are within a frame, and the stamps are no exposure times: the frames' time errors are a sizeable part of a
-    frame. Clips of free-running cameras have lags of many frames, and their frames come evenly.
+    A recorder takes the latest image of each camera: the image's age, and with it the frame's time error, is uniform
+    over the camera's own frame interval, which is thus sqrt(12) times its std. Between cameras that were read together
+    no lag is larger than the longer of their intervals, within three stds of the lag. Frames of free-running cameras
+    come evenly: their time errors, and the lags that pass, are next to nothing.
     """
     problem, state = solution.problem, solution.state
-    intervals = np.array([frame_interval(views) for views in problem.views])
-    lags = np.array(list(_stamp_lags(solution).values()))
-    return bool((np.abs(lags) < intervals).all() and np.median(state.jitter / intervals) > _TIME_ERRORS)
+    covariance = body_covariance(problem, state)
+    interval = np.sqrt(12.0) * state.jitter
+    lags = np.abs(np.array(list(_stamp_lags(solution).values())))
+    stds = np.array([covariance.std(camera, OFFSET) for camera in range(len(lags))])
+    return bool((lags <= np.maximum(interval, interval[problem.reference]) + 3.0 * stds).all())
 
 
 def _stamp_lags(solution: BodySolution) -> dict[str, float]:
@@ -221,19 +227,20 @@ def _in_step(given: _Input, free: BodySolution, report: Progress) -> BodySolutio
     for name, one in given.views.items():
         if name in lenses:
             views[name] = replace(one, time=one.time + (one.time_origin - start), time_origin=start)
-    fixed = replace(given, views=views, lenses=lenses, free_lens=dict.fromkeys(views, False), refused=free.refused)
+    still = dict.fromkeys(views, False)
+    fixed = replace(given, views=views, lenses=lenses, free_lens=still, refused=free.refused)
     solution = _solve(fixed, report, True)
-    interval = float(np.median([frame_interval(one) for one in free.problem.views]))
-    late = ", ".join(
-        f"{name} {1e3 * lag:+.0f} ms" for name, lag in _stamp_lags(free).items() if abs(lag) > 0.1 * interval
-    )
+    lags = _stamp_lags(free)
+    covariance = body_covariance(free.problem, free.state)
+    stds = {name: covariance.std(camera, OFFSET) for camera, name in enumerate(free.names)}
+    late = ", ".join(f"{name} {1e3 * lag:+.0f} ms" for name, lag in lags.items() if abs(lag) > 3.0 * stds[name])
     warning = (
-        "the clips have the same time stamps and their frames do not come evenly: they are taken as recorded in step, "
-        'frame by frame; clock = "independent" in rig.toml estimates a lag of each'
+        "the clips have the same time stamps, and lags as of a recorder that takes each camera's latest image: "
+        'they are taken as recorded in step, frame by frame; clock = "independent" in rig.toml estimates a lag of each'
     )
     warnings = (warning, *((f"by the board's motion, exposures differ from the stamps: {late}",) if late else ()))
-    stds = free.focal_stds()
-    return replace(solution, warnings=warnings, lens_stds={name: stds[name] for name in solution.names})
+    focal = free.focal_stds()
+    return replace(solution, warnings=warnings, lens_stds={name: focal[name] for name in solution.names})
 
 
 def _failed(pairs: Mapping[tuple[str, str], BodyPair]) -> tuple[PairReport, ...]:

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 
 from hub.bundle.problem import CameraState
-from hub.calibration.rigid_body.adjustment import frame_interval
 from hub.calibration.rigid_body.lag import BodyPair, aligned, quaternions, solve_body_pair
 from hub.calibration.rigid_body.motion import BodyMotion, fit_motion
-from hub.calibration.rigid_body.views import CameraViews, ViewPoses
+from hub.calibration.rigid_body.problem import frame_interval
+from hub.calibration.rigid_body.views import CameraViews, ViewPoses, turned, view_poses
 from hub.trajectory.discrete import PointBasis, merged_instants
 from hub.trajectory.splines import SplineBasis, split_at_gaps
 from protocols.geometry import so3
@@ -81,6 +81,27 @@ def solve_body_pairs(poses: Mapping[str, ViewPoses], shared_clock: bool) -> dict
     """All pairs of cameras."""
     lags = np.zeros(1) if shared_clock else None
     return {(a, b): solve_body_pair(poses[a], poses[b], lags) for a, b in itertools.combinations(poses, 2)}
+
+
+def orient_views(
+    views: Mapping[str, CameraViews],
+    poses: Mapping[str, ViewPoses],
+    lenses: Mapping[str, Intrinsics],
+    shared_clock: bool,
+) -> dict[str, CameraViews]:
+    """The views of a board that looks the same turned by 180°, with corners numbered as the first camera's are.
+
+    Each camera's views are turned, all or none, as they agree better with those of the cameras before.
+    """
+    lags = np.zeros(1) if shared_clock else None
+    out: dict[str, CameraViews] = {}
+    seen: dict[str, ViewPoses] = {}
+    for name, one in views.items():
+        other = turned(one)
+        both = [(one, poses[name]), (other, view_poses(other, lenses[name]))]
+        agreements = [sum(solve_body_pair(seen[before], pose, lags).agreement for before in seen) for _, pose in both]
+        out[name], seen[name] = both[int(agreements[1] > agreements[0])]
+    return out
 
 
 def largest_group(names: list[str], pairs: Mapping[tuple[str, str], BodyPair]) -> dict[str, tuple[float, Pose]]:

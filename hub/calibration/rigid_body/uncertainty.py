@@ -14,18 +14,16 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solveh_banded
 
 from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET
-from hub.calibration.rigid_body.adjustment import (
+from hub.calibration.rigid_body.linear_system import (
     BLOCK,
-    BodyProblem,
-    BodyState,
     ReducedSystem,
     ViewTerms,
     assemble,
-    frame_interval,
     linearised_rows,
     view_index,
 )
 from hub.calibration.rigid_body.motion import POSE, BodyMotion, rotated
+from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval
 from hub.trajectory.discrete import PointBasis
 from hub.trajectory.splines import SUPPORT
 from protocols.geometry.types import Floats, Ints
@@ -67,7 +65,7 @@ def body_covariance(problem: BodyProblem, state: BodyState) -> BodyCovariance:
         [camera * CAMERA_PARAMETERS + np.array(problem.columns(camera), dtype=int) for camera in range(len(rows))]
     ).astype(int)
     full = np.zeros((CAMERA_PARAMETERS * len(rows),) * 2)
-    full[np.ix_(columns, columns)] = enlarged
+    full[np.ix_(columns, columns)] = enlarged[: len(columns), : len(columns)]
     for camera, jitter in enumerate(state.jitter):
         # A clock is that of the mean time stamp, which is known as well as the mean of so many time errors.
         at = camera * CAMERA_PARAMETERS + OFFSET
@@ -79,13 +77,11 @@ def body_covariance(problem: BodyProblem, state: BodyState) -> BodyCovariance:
 
 def _gradient_scatter(problem: BodyProblem, state: BodyState, terms: list[ViewTerms], path: Floats) -> Floats:
     """Sum over clusters of views of the outer products of their gradients, without the paths' part."""
-    columns = [problem.columns(camera) for camera in range(len(terms))]
-    starts = np.r_[0, np.cumsum([len(one) for one in columns])].astype(int)
-    total = np.zeros((starts[-1], starts[-1]))
+    total = np.zeros((path.shape[1], path.shape[1]))
     for camera, term in enumerate(terms):
         index = view_index(problem, state, camera)
         score = -np.einsum("vp,vpc->vc", term.path, path[index[:, None] + np.arange(BLOCK)])
-        score[:, starts[camera] : starts[camera + 1]] += term.camera
+        score[:, term.columns] += term.camera
         views = problem.views[camera]
         span = max(_CLUSTER_S, _CLUSTER_VIEWS * frame_interval(views))
         cluster = np.unique(np.floor((views.time - views.time.min()) / span), return_inverse=True)[1]

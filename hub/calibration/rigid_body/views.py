@@ -161,6 +161,10 @@ def _poses(points: Floats, normalised: Floats, focal: float) -> list[tuple[Float
     return [(rotation, translation) for rms, rotation, translation in out if rms <= limit]
 
 
-def with_pixels(views: CameraViews, pixels: Floats) -> CameraViews:
-    """The same rows at other pixels."""
-    return replace(views, pixels=pixels)
+def turned(views: CameraViews) -> CameraViews:
+    """The views of a board of which all points were seen, with each taken for the one opposite its middle."""
+    labels, first, place = np.unique(views.label, return_index=True, return_inverse=True)
+    points = views.points[first]
+    across = points.min(axis=0) + points.max(axis=0) - points
+    opposite = np.linalg.norm(across[:, None] - points[None], axis=2).argmin(axis=1)
+    return replace(views, label=labels[opposite][place], points=points[opposite][place])

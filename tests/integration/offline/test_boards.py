@@ -76,9 +76,9 @@ def test_auto_takes_the_board_that_is_there_and_says_so(recorded: tuple[Path, Bo
     for path in paths:
         shutil.copy(path, bare)
     target = find_target(bare, sorted(bare.glob("*.mp4")), "auto", MarkerModel.default(), lambda text, share: None)
-    assert target.kind == "tag"
     assert target.board is not None
-    assert (target.board.dictionary, target.board.inverted) == ("4X4_50", True)
+    assert (target.kind, target.board.squares, target.board.dictionary) == ("charuco", (8, 6), "4X4_50")
+    assert target.board.inverted
     assert "board.toml" in target.notes[0]
 
 
@@ -171,3 +171,19 @@ def test_a_large_image_gives_the_corners_of_full_resolution() -> None:
 def test_a_board_too_small_is_bad_input() -> None:
     with pytest.raises(InputError, match="too small"):
         parse_board({"board": "chessboard", "squares": "3x3"})
+
+
+def test_a_chessboard_that_looks_the_same_upside_down_keeps_its_order_while_it_turns() -> None:
+    board = next(iter(Board("chessboard", (8, 6)).prints()))
+    squares = (np.indices((6, 8)).sum(axis=0) % 2 * 255).astype(np.uint8)
+    image = np.pad(np.kron(squares, np.ones((40, 40), np.uint8)), 140, constant_values=255)
+    middle = (np.array(image.shape[::-1]) - 1.0) / 2.0
+    detector = BoardDetector(board)
+    first = None
+    for degrees in range(0, 200, 20):
+        turn = cv2.getRotationMatrix2D(tuple(middle.tolist()), degrees, 1.0)
+        grey = cv2.warpAffine(image, turn, image.shape[::-1], borderValue=255)
+        _, pixels = detector.find(np.asarray(grey, dtype=np.uint8))
+        back = cv2.transform(pixels[None].astype(np.float64), cv2.invertAffineTransform(turn))[0]
+        first = back if first is None else first
+        assert np.abs(back - first).max() < 1.0

@@ -219,3 +219,18 @@ def test_a_person_calibrates_the_cameras_in_metres_by_the_given_height(tmp_path:
     assert file["parameters"]["POINT"]["UNITS"]["value"] == ["mm"]
     missing = np.isnan(file["data"]["points"][0])
     assert (file["data"]["meta_points"]["residuals"][0] < 0).tolist() == missing.tolist()
+
+
+def test_a_keypoint_counts_by_its_score(tmp_path: Path) -> None:
+    out = tmp_path / "observations.csv"
+    source = mmpose(tmp_path)
+    frames = json.loads(source.read_text())
+    for frame in frames:
+        frame["instances"][0]["keypoint_scores"] = [0.9, 0.6] + [0.9] * (len(JOINTS) - 2)
+    source.write_text(json.dumps(frames))
+    assert run(["import", str(source), "--fps", "25", "--size", "1280x720", "--out", str(out)]) == 0
+    seen = read_observations(out, ["cam1"])
+    sure, unsure = seen.tracks["cam1", "nose"].std, seen.tracks["cam1", "left_eye"].std
+    assert sure is not None
+    assert unsure is not None
+    assert unsure == pytest.approx(1.5 * sure)

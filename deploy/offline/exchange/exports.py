@@ -47,7 +47,7 @@ def trajectory_files(source: Path, out: Path, units: str) -> dict[Path, str]:
 
 def export_log(log: Path, out: Path) -> tuple[int, int, tuple[str, ...]]:
     """Write a log as a session folder; returns numbers of cameras and observations, and warnings. Raises InputError."""
-    from deploy.offline.imports import rig_tables_of_log
+    from deploy.offline.exchange.session_log import rig_tables_of_log
     from protocols.log.read.session import session_from_log
     from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
 

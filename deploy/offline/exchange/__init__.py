@@ -1,0 +1,1 @@
+"""Exchange with other tools: imports, exports, and sessions as logs."""

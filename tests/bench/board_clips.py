@@ -1,0 +1,121 @@
+"""Clips of a moved board: the four webcams, and simulated boards with imperfect prints and no lenses.
+
+    python -m tests.bench.board_clips [--worlds 3] [--data FOLDER]
+
+Webcams: `calibrate` with the recording's lenses and without, against its calibration; then the lenses that each half of
+the clips gives, and the residuals with either lens on independent clocks. Needs ../shared/data.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from deploy.cli import run
+from hub.calibration.pipeline import calibrate
+from protocols.geometry import so3
+from protocols.geometry.pose import fit_similarity
+from protocols.session.calibration import CameraCalibration, read_calibration
+from protocols.session.folder import read_folder
+from protocols.session.observations import Observations
+from protocols.session.rig import Rig
+from tests.bench.real_rigs import DEFAULT_DATA
+from tests.support.board_session import board_world
+
+BOARD = 'board = "charuco"\nsquares = "4x5"\nsquare_size = 0.054\ninverted = true\n'
+PRINT = 8e-5  # m: std of a corner's place on a simulated print
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", type=int, default=3)
+    parser.add_argument("--data", type=Path, default=DEFAULT_DATA)
+    options = parser.parse_args()
+    worlds, data = options.worlds, options.data / "webcams"
+    if data.exists():
+        webcams(data)
+    else:
+        print(f"no {data}: webcams left out")
+    off, scores = np.concatenate([simulated(seed) for seed in range(100, 100 + worlds)]).T
+    rms = [float(np.sqrt(np.mean(column**2))) for column in (off, scores)]
+    print(
+        f"simulated, 4 cameras at 6 fps, no lenses: focal lengths off by {100 * rms[0]:.2f} %, {rms[1]:.2f} stds (rms)"
+    )
+    return 0
+
+
+def webcams(data: Path) -> None:
+    """Against the recording's calibration, and the two halves against each other."""
+    truth = {
+        name.replace("cam", "cam_"): camera
+        for name, camera in read_calibration(data / "session" / "truth_calibration.toml")[1].items()
+    }
+    with tempfile.TemporaryDirectory() as temporary:
+        for given in (True, False):
+            folder = Path(temporary) / f"clips-{given}"
+            folder.mkdir()
+            for video in (data / "video").glob("*.mp4"):
+                (folder / video.name).symlink_to(video)
+            (folder / "board.toml").write_text(BOARD)
+            if given:
+                (folder / "rig.toml").write_text("".join(_lens_table(name, one) for name, one in truth.items()))
+            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+                status = run(["calibrate", str(folder), "--detector", "charuco", "--out", str(folder / "out")])
+            _, found = read_calibration(folder / "out" / "calibration.toml")
+            print(f"{'given lenses' if given else 'no lenses'}: exit {status}, {_compared(found, truth)}")
+        rig, seen = read_folder(folder / "out" / "session")
+    apart = replace(rig, metadata={key: value for key, value in rig.metadata.items() if key != "in_step"})
+    known = {name: replace(camera, intrinsics=truth[name].intrinsics) for name, camera in rig.cameras.items()}
+    for text, one, rows in (
+        ("first half", apart, _half(seen, True)),
+        ("second half", apart, _half(seen, False)),
+        ("all, own lenses", apart, seen),
+        ("all, given lenses", replace(apart, cameras=known), seen),
+    ):
+        found = calibrate(one, rows).cameras
+        focal = ", ".join(
+            f"{100 * (c.intrinsics.focal / truth[n].intrinsics.focal - 1):+.1f} ± {100 * c.focal_std:.1f} %"
+            for n, c in found.items()
+        )
+        print(f"{text}: focal lengths {focal}; rms {', '.join(f'{c.rms_px:.2f}' for c in found.values())} px")
+
+
+def _compared(found: dict[str, CameraCalibration], truth: dict[str, CameraCalibration]) -> str:
+    places, true = (np.array([one[name].pose.position for name in found]) for one in (found, truth))
+    fit = fit_similarity(places, true)
+    turns = [so3.angle_between(fit.pose(one.pose).rotation, truth[name].pose.rotation) for name, one in found.items()]
+    place = 100 * float(np.linalg.norm(fit.points(places) - true, axis=1).max())
+    return f"{place:.2f} cm, {np.degrees(max(turns)):.2f}°, scale {100 * abs(fit.scale - 1):.2f} %"
+
+
+def _lens_table(name: str, camera: CameraCalibration) -> str:
+    lens = camera.intrinsics
+    values = f"matrix = {lens.matrix.tolist()}\ndistortions = {lens.distortions.tolist()}"
+    return f'[{name}]\nname = "{name}"\nsize = [{lens.width}, {lens.height}]\n{values}\n'
+
+
+def _half(seen: Observations, first: bool) -> Observations:
+    middle = 0.5 * max(float(track.time.max()) for track in seen.tracks.values())
+    tracks = {key: track.select((track.time < middle) == first) for key, track in seen.tracks.items()}
+    return replace(seen, tracks={key: track for key, track in tracks.items() if len(track)})
+
+
+def simulated(seed: int) -> np.ndarray:
+    """Errors of the logarithms of focal lengths, and over their stds: (cameras, 2)."""
+    world = board_world(seed, (6.0,) * 4, size=0.054)
+    rng = np.random.default_rng(seed)
+    printed = {label: point + rng.normal(0.0, PRINT, 3) for label, point in world.points.items()}
+    rig: Rig = world.rig(lenses=False)
+    found = calibrate(rig, replace(world, points=printed).observations(seed=seed)).cameras
+    off = {n: np.log(one.intrinsics.focal / world.cameras[n].lens.focal) for n, one in found.items()}
+    return np.array([[value, value / found[n].focal_std] for n, value in off.items()])
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
