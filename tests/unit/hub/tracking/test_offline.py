@@ -138,6 +138,22 @@ def test_who_walks_up_to_somebody_and_stops_is_not_exchanged_with_him(seed: int)
     assert scores(result, place).idf1 > 0.95
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_who_stands_beside_somebody_and_sets_off_keeps_his_identity(seed: int) -> None:
+    """Three pairs, 0.6 m apart, at 2 Hz: one of each walks off at 1.4 m/s from one frame to the next."""
+    rng = np.random.default_rng(seed)
+    time, paths = np.arange(24) / FPS, []
+    for index, middle in enumerate(([-2.0, -2.0], [2.0, -1.5], [0.0, 2.0])):
+        angle = rng.uniform(0.0, 2.0 * np.pi, 2)
+        beside, along = (np.array([np.cos(a), np.sin(a)]) for a in angle)
+        away = 1.4 * np.clip(time - 5.0 - index, 0.0, 2.5)
+        paths += [np.tile(middle, (24, 1)), middle + 0.6 * beside + away[:, None] * along]
+    place = np.stack(paths, axis=1) + rng.normal(0.0, 0.02, (24, 6, 2))
+    messages, calibration = boxes(rng, place, cameras=4, height=3.0)
+    result = follow(messages, calibration, [round(at * NANOSECONDS) for at in time])
+    assert scores(result, place).idf1 > 0.97
+
+
 def test_a_hall_that_is_full_at_the_first_frame() -> None:
     """Eighty people at once are not taken for eighty false detections."""
     rng = np.random.default_rng(1)
