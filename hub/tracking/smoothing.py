@@ -40,8 +40,8 @@ _LOG_HIDDEN = -5.0
 that is not known, or where nobody looks for people."""
 _PRESENT = 1.0
 """Log odds by which another link must be better than the present one."""
-_IMPOSSIBLE = -1e3
-"""Below all log odds of a link."""
+_IMPOSSIBLE, _CERTAIN = -1e3, 1e3
+"""Below and above all log odds of a link."""
 _REACH_S = 1.5
 """Associations further than this from a change are not tried again: what else is known of a track outweighs it."""
 
@@ -313,7 +313,7 @@ class BatchSmoother:
         n = len(self.tracks)
         label, count, source = np.arange(n), n, list(range(n))
         lost: list[tuple[int, int, int]] = []  # pasts without a future: track, scan of its last detection, label
-        missed = np.zeros(n)
+        missed, cut = np.zeros(n), np.zeros(n, dtype=np.bool_)
         for index in range(len(self.scans)):
             missed[self.evidence[index].row] = self.evidence[index].total.missed
             if index + 1 == len(self.scans):
@@ -331,12 +331,17 @@ class BatchSmoother:
                 heads, ends = np.array([one[:2] for one in pasts]).T
                 score = self._link_scores(forward, backward[index + 1], heads, tails, ends, index)
                 score += np.maximum((index - ends) * missed[heads], _LOG_HIDDEN)[:, None]
-                score[:present] += _PRESENT * (heads[:present, None] == tails)
+                own = heads[:present, None] == tails
+                score[:present] += _PRESENT * own
+                # The states of a track that was cut still hold who was before: the next iteration judges the rest.
+                done = cut[heads[:present]]
+                score[:present][done] = np.where(own[done], _CERTAIN, -np.inf)
                 a, b = linear_sum_assignment(np.where(score > 0.0, -score, 0.0))
                 follows = {int(j): int(i) for i, j in zip(a, b, strict=True) if score[i, j] > 0.0}
                 for j, tail in enumerate(tails.tolist()):
                     head = follows.get(j)
-                    self._changed[index] |= bool(alive[tail]) and (head is None or pasts[head][:2] != (tail, index))
+                    if alive[tail] and (head is None or pasts[head][:2] != (tail, index)):
+                        self._changed[index], cut[tail] = True, True
                     if head is not None:
                         new[tail] = pasts[head][2]
                     elif alive[tail]:  # its past goes on elsewhere, or ends
