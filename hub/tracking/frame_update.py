@@ -32,8 +32,15 @@ from hub.tracking.filter.detection_model import (
     with_frame_noise,
 )
 from hub.tracking.filter.floor import Floor
-from hub.tracking.filter.kalman import LOG_SIZE, VELOCITY
-from hub.tracking.filter.manoeuvre import ManoeuvreHypothesis, can_manoeuvre, gpb1_update, manoeuvre_hypothesis
+from hub.tracking.filter.kalman import VELOCITY
+from hub.tracking.filter.manoeuvre import (
+    ManoeuvreHypothesis,
+    can_manoeuvre,
+    gpb1_update,
+    manoeuvre_hypothesis,
+    units_of,
+    within_reach,
+)
 from hub.tracking.filter.measurement import PredictedMeasurement, measurements_of, predict_measurement
 from hub.tracking.filter.target_models import KIND_INDEX, TARGET_MODELS
 from hub.tracking.filter.target_states import DetectionStatistics, MultiTargetState, Scan, ScanFrame, Targets
@@ -55,9 +62,8 @@ _MIN_COLOUR_GAIN = 0.02
 _LOG_SIZE_PSD = 1e-4
 _WALKING_M_S, _STANDING_SHARE = 0.4, 0.05
 """Turning and swaying grow with speed: somebody who stands has this share of a walker's acceleration (variance)."""
-_ACCELERATION_PSD = np.array([model.acceleration_psd for model in TARGET_MODELS])
+_ACCELERATION_PSD, _VELOCITY_PSD = np.array([(model.acceleration_psd, model.velocity_psd) for model in TARGET_MODELS]).T
 _UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
-_TYPICAL_SIZE_M = np.array([model.size_m for model in TARGET_MODELS])
 
 
 def process_frame(
@@ -100,13 +106,16 @@ def predict_targets(targets: Targets, elapsed: float, parameters: TrackerParamet
     """The targets predicted by ``elapsed`` seconds."""
     if not len(targets) or elapsed == 0.0:
         return targets
-    size = np.exp(targets.mean[:, LOG_SIZE])
-    units_per_m = np.where(_UPRIGHT[targets.kind], size / _TYPICAL_SIZE_M[targets.kind], parameters.scale.units_per_m)
+    units_per_m = units_of(targets, parameters.scale.units_per_m)
     speed = np.linalg.norm(targets.mean[:, VELOCITY], axis=1) / units_per_m
     share = np.clip((speed / _WALKING_M_S) ** 2, _STANDING_SHARE, 1.0)
     share = np.where(_UPRIGHT[targets.kind], share, 1.0)
-    acceleration_psd = _ACCELERATION_PSD[targets.kind] * units_per_m**2 * share
-    mean, covariance = kalman.predict(targets.mean, targets.covariance, elapsed, acceleration_psd, _LOG_SIZE_PSD)
+    acceleration_psd, velocity_psd = (
+        psd[targets.kind] * units_per_m**2 * share for psd in (_ACCELERATION_PSD, _VELOCITY_PSD)
+    )
+    mean, covariance = kalman.predict(
+        targets.mean, targets.covariance, elapsed, acceleration_psd, _LOG_SIZE_PSD, velocity_psd
+    )
     existence = targets.existence * np.exp(-max(elapsed, 0.0) / _LIFETIME_S)
     return replace(targets, mean=mean, covariance=covariance, existence=existence)
 
@@ -146,7 +155,8 @@ def jointly(state: MultiTargetState, parameters: TrackerParameters) -> MultiTarg
     mean[new], covariance[new], existence[new] = known.mean[old], known.covariance[old], known.existence[old]
     prior = replace(prior, mean=mean, covariance=covariance, existence=existence)
     colour_std = matching_colour_std(state.colour_variance)
-    found = associate_jointly(scan.frames, targets, now, prior, parameters.up, colour_std)
+    manoeuvre = manoeuvre_hypothesis(prior, elapsed, parameters.scale.units_per_m, parameters.up)
+    found = associate_jointly(scan.frames, targets, now, prior, parameters.up, colour_std, manoeuvre=manoeuvre)
     state = replace(state, scan=replace(scan, frames=found.frames))
     targets = replace(found.targets, existence=np.minimum(found.targets.existence, MAX_EXISTENCE))
     return manage_tracks(replace(state, targets=targets), 0.0, parameters)
@@ -156,9 +166,7 @@ def prior_of_births(targets: Targets, floor: Floor | None, parameters: TrackerPa
     """The targets as if nothing had been measured of them: near where they are, on the floor."""
     mean = targets.mean.copy()
     mean[:, VELOCITY] = 0.0
-    unit = np.where(
-        _UPRIGHT[targets.kind], np.exp(mean[:, LOG_SIZE]) / _TYPICAL_SIZE_M[targets.kind], parameters.scale.units_per_m
-    )
+    unit = units_of(targets, parameters.scale.units_per_m)
     speed = np.array([model.speed_std_m_s for model in TARGET_MODELS])[targets.kind] * unit
     spread = np.concatenate(
         [
@@ -199,7 +207,8 @@ def _associate_and_update(
     visible = visible_fraction(frame.camera, predicted)
     probability = detection_probability(statistics, visible, occluded)
     # A target that changes its velocity abruptly leaves its gate for a few frames: that is no evidence against it.
-    probability = np.where(can_manoeuvre(targets), np.minimum(probability, _MANOEUVRING), probability)
+    leaves = can_manoeuvre(targets) & ~_UPRIGHT[targets.kind]
+    probability = np.where(leaves, np.minimum(probability, _MANOEUVRING), probability)
     row, column, nis, beside, ambiguous = none, none, np.zeros(0), none.astype(np.bool_), False
     detected, clutter = np.zeros(len(targets)), np.ones(len(frame))
     if len(frame):
@@ -210,7 +219,9 @@ def _associate_and_update(
         scores = association_scores(frame, value, noise, targets, predicted, names, colour_std)
         manoeuvre = None
         if can_manoeuvre(targets).any():
-            manoeuvre = manoeuvre_hypothesis(targets, frame.reference_ns, parameters.scale.units_per_m)
+            unseen = np.maximum((frame.reference_ns - targets.seen_ns) / NANOSECONDS, 0.0)
+            manoeuvre = manoeuvre_hypothesis(targets, unseen, parameters.scale.units_per_m, parameters.up)
+            manoeuvre = within_reach(targets, unseen, manoeuvre)
             manoeuvring = replace(targets, covariance=manoeuvre.covariance)
             other = association_scores(frame, value, noise, manoeuvring, predicted, names, colour_std)
             scores = combine_hypotheses(scores, other, manoeuvre.prior_odds)

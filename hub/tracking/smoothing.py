@@ -20,6 +20,7 @@ from hub.tracking.association.continuation import continuation_scores
 from hub.tracking.association.scan import FrameEvidence, associate_jointly
 from hub.tracking.filter.floor import Floor
 from hub.tracking.filter.kalman import LOG_SIZE
+from hub.tracking.filter.manoeuvre import fused_predictions, manoeuvre_hypothesis, widened_by_evidence
 from hub.tracking.filter.target_states import ScanFrame, Targets
 from hub.tracking.frame_update import on_floor, predict_targets, prior_of_births
 from hub.tracking.parameters import TrackerParameters
@@ -39,8 +40,8 @@ _LOG_HIDDEN = -5.0
 that is not known, or where nobody looks for people."""
 _PRESENT = 1.0
 """Log odds by which another link must be better than the present one."""
-_IMPOSSIBLE = -1e3
-"""Below all log odds of a link."""
+_IMPOSSIBLE, _CERTAIN = -1e3, 1e3
+"""Below and above all log odds of a link."""
 _REACH_S = 1.5
 """Associations further than this from a change are not tried again: what else is known of a track outweighs it."""
 
@@ -152,6 +153,7 @@ class BatchSmoother:
         first, last = np.maximum(first - 1, 0), np.minimum(last + 1, len(self.scans) - 1)
         first[empty] = len(self.scans)
         out: list[_Filtered | None] = [None] * len(self.scans)
+        up, units = self.parameters.up, self.parameters.scale.units_per_m
         running = self.tracks.select(np.zeros(0, dtype=np.int64))
         rows = np.zeros(0, dtype=np.int64)
         previous_ns: int | None = None
@@ -167,7 +169,10 @@ class BatchSmoother:
             births = prior_of_births(self.tracks.select(entering), self.floor, self.parameters)
             rows = np.concatenate([rows[keep], entering])
             predicted = predicted.concatenate(births)
-            mean, covariance = self._updated(index, rows, predicted.mean, predicted.covariance)
+            said = self.evidence[index].total.of(_places(self.evidence[index].row, rows))
+            manoeuvre = manoeuvre_hypothesis(predicted, elapsed, units, up)
+            widened = widened_by_evidence(predicted, manoeuvre, said.information, said.vector)
+            mean, covariance = self._updated(index, rows, predicted.mean, widened)
             running = replace(predicted, mean=mean, covariance=covariance)
             out[index] = _Filtered(rows, predicted, mean, covariance)
             previous_ns = scan.now_ns
@@ -185,15 +190,18 @@ class BatchSmoother:
         """Every scan associated again, given past and future."""
         first, last = self._extents()
         due, self._changed = self._near_changes(), np.zeros(len(self.scans), dtype=np.bool_)
+        times = np.array([scan.now_ns for scan in self.scans])
+        since = (np.diff(times, prepend=times[:1], append=times[-1:]) / NANOSECONDS).tolist()
         out = []
         for index, (scan, past, future) in enumerate(zip(self.scans, forward, backward, strict=True)):
             _, a, b = np.intersect1d(past.row, future.row, return_indices=True)
             row = past.row[a]
-            mean, covariance = _fused(
-                past.predicted.mean[a],
-                past.predicted.covariance[a],
-                future.predicted.mean[b],
-                future.predicted.covariance[b],
+            mean, covariance = fused_predictions(
+                past.predicted.select(a),
+                future.predicted.select(b),
+                (since[index], since[index + 1]),
+                self.parameters.scale.units_per_m,
+                self.parameters.up,
             )
             inside = (first[row] <= index) & (index <= last[row])
             prior = replace(
@@ -304,40 +312,43 @@ class BatchSmoother:
         first, last = self._extents()
         n = len(self.tracks)
         label, count, source = np.arange(n), n, list(range(n))
-        lost: dict[int, tuple[int, int]] = {}  # by track: scan of its last detection, label
-        missed = np.zeros(n)
+        lost: list[tuple[int, int, int]] = []  # pasts without a future: track, scan of its last detection, label
+        missed, cut = np.zeros(n), np.zeros(n, dtype=np.bool_)
         for index in range(len(self.scans)):
             missed[self.evidence[index].row] = self.evidence[index].total.missed
             if index + 1 == len(self.scans):
                 self._rename(index, label)
                 break
-            after = self.scans[index + 1].now_ns
-            alive = (first <= index) & (index <= last)
+            oldest = self.scans[index + 1].now_ns - _MAX_GAP_S * NANOSECONDS
+            alive = (first <= index) & (index < last)
             tails = np.flatnonzero((first <= index + 1) & (index + 1 <= last))
-            for track in np.flatnonzero(last == index).tolist():
-                lost[track] = index, int(label[track])
-            lost = {t: v for t, v in lost.items() if (after - self.scans[v[0]].now_ns) / NANOSECONDS <= _MAX_GAP_S}
-            heads = np.concatenate([np.flatnonzero(alive & (last > index)), np.array(list(lost), dtype=np.int64)])
-            new = label.copy()
-            if len(heads) and len(tails):
-                ends = np.array([lost[head][0] if head in lost else index for head in heads.tolist()])
+            lost += [(track, index, int(label[track])) for track in np.flatnonzero(last == index).tolist()]
+            lost = [one for one in lost if self.scans[one[1]].now_ns >= oldest]
+            # A track may be lost and alive: where it was cut, its row holds one person's past and another's present.
+            pasts = [(track, index, int(label[track])) for track in np.flatnonzero(alive).tolist()] + lost
+            new, present = label.copy(), len(pasts) - len(lost)
+            if pasts and len(tails):
+                heads, ends = np.array([one[:2] for one in pasts]).T
                 score = self._link_scores(forward, backward[index + 1], heads, tails, ends, index)
                 score += np.maximum((index - ends) * missed[heads], _LOG_HIDDEN)[:, None]
-                score = np.where(heads[:, None] == tails[None, :], score + _PRESENT, score)
+                own = heads[:present, None] == tails
+                score[:present] += _PRESENT * own
+                # The states of a track that was cut still hold who was before: the next iteration judges the rest.
+                done = cut[heads[:present]]
+                score[:present][done] = np.where(own[done], _CERTAIN, -np.inf)
                 a, b = linear_sum_assignment(np.where(score > 0.0, -score, 0.0))
-                linked = score[a, b] > 0.0
-                follows = {int(tails[j]): int(heads[i]) for i, j in zip(a[linked], b[linked], strict=True)}
-                for tail in tails.tolist():
-                    head = follows.get(tail)
-                    self._changed[index] |= head != tail and bool(alive[tail])
+                follows = {int(j): int(i) for i, j in zip(a, b, strict=True) if score[i, j] > 0.0}
+                for j, tail in enumerate(tails.tolist()):
+                    head = follows.get(j)
+                    if alive[tail] and (head is None or pasts[head][:2] != (tail, index)):
+                        self._changed[index], cut[tail] = True, True
                     if head is not None:
-                        new[tail] = lost.pop(head)[1] if head in lost else label[head]
+                        new[tail] = pasts[head][2]
                     elif alive[tail]:  # its past goes on elsewhere, or ends
                         new[tail] = count
                         source.append(tail)
                         count += 1
-                for head in set(heads.tolist()) - set(follows.values()) - set(lost):
-                    lost[head] = index, int(label[head])
+                lost = [one for i, one in enumerate(pasts) if i not in set(follows.values())]
             self._rename(index, label)
             label = new
         self._select(source)
@@ -348,33 +359,33 @@ class BatchSmoother:
         """Log odds (h, t) of tail t, at the scan after ``index``, continuing head h, last seen in scan ends[h]."""
         scan = self.scans[index + 1]
         past = self.tracks.select(heads)
-        mean, covariance, gap = past.mean.copy(), past.covariance.copy(), np.zeros(len(heads))
+        mean, covariance, gap, ahead = (
+            past.mean.copy(),
+            past.covariance.copy(),
+            np.zeros(len(heads)),
+            np.zeros(len(heads)),
+        )
         for at in np.unique(ends).tolist():
             chosen = ends == at
             rows = _places(forward[at].row, heads[chosen])
             state = replace(past.select(chosen), mean=forward[at].mean[rows], covariance=forward[at].covariance[rows])
             elapsed = (scan.now_ns - self.scans[at].now_ns) / NANOSECONDS
             state = on_floor(predict_targets(state, elapsed, self.parameters), self.floor, elapsed)
-            mean[chosen], covariance[chosen] = state.mean, state.covariance
+            mean[chosen], covariance[chosen], ahead[chosen] = state.mean, state.covariance, elapsed
             gap[chosen] = (self.scans[index].now_ns - self.scans[at].now_ns) / NANOSECONDS
         past = replace(past, mean=mean, covariance=covariance)
         rows = _places(after.row, tails)
         future = replace(self.tracks.select(tails), mean=after.mean[rows], covariance=after.covariance[rows])
         typical = float(np.median(self.tracks.mean[:, LOG_SIZE]))
-        return continuation_scores(past, future, gap, self.parameters.scale.units_per_m, typical, self.colour_std)
+        units = self.parameters.scale.units_per_m
+        manoeuvre = manoeuvre_hypothesis(past, ahead, units, self.parameters.up)
+        return continuation_scores(past, future, manoeuvre, gap, units, typical, self.colour_std)
 
 
 def _places(rows: Ints, wanted: Ints) -> Ints:
     """Where each of ``wanted`` is in ``rows``, -1 = nowhere."""
     place = {track: at for at, track in enumerate(rows.tolist())}
     return np.array([place.get(track, -1) for track in wanted.tolist()], dtype=np.int64)
-
-
-def _fused(mean: Floats, covariance: Floats, other_mean: Floats, other_covariance: Floats) -> tuple[Floats, Floats]:
-    """Two independent estimates (n, 7), (n, 7, 7) of the same states as one."""
-    one, two = np.linalg.inv(covariance), np.linalg.inv(other_covariance)
-    both = _symmetric(np.linalg.inv(one + two))
-    return (both @ (one @ mean[:, :, None] + two @ other_mean[:, :, None]))[:, :, 0], both
 
 
 def _symmetric(matrix: npt.NDArray[np.floating[Any]]) -> Floats:

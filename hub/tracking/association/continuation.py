@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY
+from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY, log_density
+from hub.tracking.filter.manoeuvre import ManoeuvreHypothesis
 from hub.tracking.filter.target_models import TARGET_MODELS
 from hub.tracking.filter.target_states import Targets
 from protocols.geometry.types import Floats
@@ -19,12 +20,19 @@ _CLUTTER_COLOUR_STD, _COLOUR_MAX = 60.0, 12.0
 
 
 def continuation_scores(
-    past: Targets, future: Targets, gap_s: Floats, units_per_m: float, typical: float, colour_std: float
+    past: Targets,
+    future: Targets,
+    manoeuvre: ManoeuvreHypothesis,
+    gap_s: Floats,
+    units_per_m: float,
+    typical: float,
+    colour_std: float,
 ) -> Floats:
     """Log odds (h, t) of each future continuing each past, against the past ending and the future beginning anywhere.
 
     past, future: h and t tracks at one time, from the detections before and from those after it; two with one
-    ``initiation_number`` are the same track. gap_s: (h,) since the last detections. typical: log of a typical size.
+    ``initiation_number`` are the same track. manoeuvre: second hypothesis of the pasts.
+    gap_s: (h,) since the last detections. typical: log of a typical size.
     """
     off = past.mean[:, None] - future.mean[None]
     near = np.linalg.norm(off[..., POSITION], axis=2) < _MAX_LINK_M * units_per_m
@@ -33,8 +41,10 @@ def continuation_scores(
     if not len(a):
         return score
     total = past.covariance[a] + future.covariance[b]
-    solved = np.linalg.solve(total, off[a, b][:, :, None])[:, :, 0]
-    fit = -0.5 * ((off[a, b] * solved).sum(axis=1) + np.linalg.slogdet(total)[1])
+    odds = manoeuvre.prior_odds[a]
+    with np.errstate(divide="ignore"):
+        changed = log_density(off[a, b], manoeuvre.covariance[a] + future.covariance[b]) + np.log(odds)
+    fit = np.logaddexp(log_density(off[a, b], total), changed) - np.log1p(odds)
     # The same, had the future begun anywhere: position uniform, velocity and size from their priors.
     model = [TARGET_MODELS[kind] for kind in future.kind.tolist()]
     speed = np.array([one.speed_std_m_s for one in model]) * units_per_m

@@ -27,6 +27,7 @@ from hub.tracking.filter.detection_model import (
     with_frame_noise,
 )
 from hub.tracking.filter.kalman import STATE_DIM
+from hub.tracking.filter.manoeuvre import ManoeuvreHypothesis, widened_by_evidence
 from hub.tracking.filter.measurement import PredictedMeasurement, predict_measurement
 from hub.tracking.filter.target_states import ScanFrame, Targets
 from protocols.core.clocks import NANOSECONDS
@@ -100,11 +101,12 @@ def associate_jointly(
     colour_std: float,
     sweeps: int = MAX_SWEEPS,
     evidence: tuple[FrameEvidence, ...] | None = None,
+    manoeuvre: ManoeuvreHypothesis | None = None,
 ) -> ScanResult:
     """The joint association of frames with targets.
 
     targets: at ``now_ns``, with the frames' present associations. prior: the same targets without these frames.
-    evidence: of the frames, where it is known from before.
+    evidence: of the frames, where it is known from before. manoeuvre: second hypothesis of ``prior``.
     """
     row = {number: i for i, number in enumerate(targets.initiation_number.tolist())}
     before = []
@@ -119,6 +121,9 @@ def associate_jointly(
         found = [
             _evidence(one, targets, now_ns, up, colour_std, column) for one, column in zip(frames, before, strict=True)
         ]
+    if manoeuvre is not None:
+        said = reduce(operator.add, found)
+        prior = replace(prior, covariance=widened_by_evidence(prior, manoeuvre, said.information, said.vector))
     information = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
     vector = (information @ prior.mean[:, :, None])[:, :, 0]
     odds = log_odds(prior.existence)

@@ -14,12 +14,18 @@ POSITION, VELOCITY, LOG_SIZE = slice(0, 3), slice(3, 6), 6
 
 
 def predict(
-    mean: Floats, covariance: Floats, elapsed: float, acceleration_psd: Floats, log_size_psd: float
+    mean: Floats,
+    covariance: Floats,
+    elapsed: float,
+    acceleration_psd: Floats,
+    log_size_psd: float,
+    velocity_psd: Floats | float = 0.0,
 ) -> tuple[Floats, Floats]:
     """Predict states by ``elapsed`` seconds. A negative value extrapolates backwards but still adds process noise.
 
     mean: (n, 7). covariance: (n, 7, 7). acceleration_psd: (n,) spectral density of the white acceleration [unit²/s³].
-    log_size_psd: power spectral density of the random walk of log size [1/s]. Discretisation of Bar-Shalom, Li,
+    velocity_psd: (n,) that of the white velocity beside it [unit²/s]. log_size_psd: that of the random walk of log size
+    [1/s]. Discretisation of Bar-Shalom, Li,
     Kirubarajan (2001), eqs. 6.2.2-12 and -13: two steps equal one step of their sum, so the result does not depend
     on the times at which other cameras capture.
     """
@@ -28,7 +34,7 @@ def predict(
     dt = abs(elapsed)
     noise = np.zeros_like(covariance)
     for axis in range(3):
-        noise[:, axis, axis] = acceleration_psd * (dt**3 / 3.0)
+        noise[:, axis, axis] = acceleration_psd * (dt**3 / 3.0) + velocity_psd * dt
         noise[:, axis, axis + 3] = acceleration_psd * (0.5 * dt * elapsed)
         noise[:, axis + 3, axis] = acceleration_psd * (0.5 * dt * elapsed)
         noise[:, axis + 3, axis + 3] = acceleration_psd * dt
@@ -96,3 +102,17 @@ def mask_rows(innovation: Floats, jacobian: Floats, noise: Floats, used: Bools) 
     row = np.arange(used.shape[1])
     clear[:, row, row] = np.where(off, 1.0, clear[:, row, row])
     return np.where(used, innovation, 0.0), np.where(used[:, :, None], jacobian, 0.0), clear
+
+
+def log_density(off: Floats, covariance: Floats) -> Floats:
+    """Logarithm (n,) of Gaussian densities at ``off`` (n, d) from their means, without the constant term."""
+    squared = (off * np.linalg.solve(covariance, off[:, :, None])[:, :, 0]).sum(axis=1)
+    return np.asarray(-0.5 * (squared + np.linalg.slogdet(covariance)[1]))
+
+
+def fused(mean: Floats, covariance: Floats, other_mean: Floats, other_covariance: Floats) -> tuple[Floats, Floats]:
+    """Two independent estimates (n, 7), (n, 7, 7) of the same states as one."""
+    one, two = np.linalg.inv(covariance), np.linalg.inv(other_covariance)
+    both = np.linalg.inv(one + two)
+    both = 0.5 * (both + both.transpose(0, 2, 1))
+    return (both @ (one @ mean[:, :, None] + two @ other_mean[:, :, None]))[:, :, 0], both

@@ -1,27 +1,27 @@
 """Manoeuvre model: an abrupt change of velocity as a second hypothesis beside the white-acceleration model.
 
-Examples are a bouncing ball, a waved wand, a drone that is hit. The manoeuvre hypothesis is that the velocity changed
-once, at an unknown time since the target was last observed. It has its own covariance, and each frame weighs the two
-hypotheses by their likelihoods.
+Examples are a bouncing ball, a waved wand, a drone that is hit, somebody who stops or sets off. The manoeuvre
+hypothesis is that the velocity changed once, at an unknown time since the target was last observed. It has its own
+covariance, and each frame weighs the two hypotheses by their likelihoods.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hub.tracking.filter import kalman
-from hub.tracking.filter.kalman import POSITION, VELOCITY
+from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY
 from hub.tracking.filter.target_models import TARGET_MODELS
 from hub.tracking.filter.target_states import Targets
-from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Bools, Floats
 
-_MAX_UNSEEN_S = 0.3
-"""After a longer gap the target could be anywhere: track initiation must find it again, to avoid wrong associations."""
+_MAX_SPREAD_M = 0.7
+"""Std of the position after a change: beyond, the target could be anywhere, and track initiation must find it again."""
 _MANOEUVRE_STD = np.array([model.manoeuvre_std_m_s for model in TARGET_MODELS])
 _MANOEUVRE_RATE = np.array([model.manoeuvres_per_s for model in TARGET_MODELS])
+_UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,24 +37,90 @@ def can_manoeuvre(targets: Targets) -> Bools:
     return np.asarray(_MANOEUVRE_STD[targets.kind] > 0.0)
 
 
-def manoeuvre_hypothesis(targets: Targets, time_ns: int, units_per_m: float) -> ManoeuvreHypothesis:
-    """The covariances under one velocity change since each target was last observed, and the prior odds of a change.
+def manoeuvre_hypothesis(
+    targets: Targets, elapsed: Floats | float, units_per_m: float, up: Floats | None = None
+) -> ManoeuvreHypothesis:
+    """The covariances under one velocity change within a time, and the prior odds of a change.
 
-    targets: predicted to ``time_ns``. units_per_m: world units per metre. The time of the change is uniform over the
-    unobserved time t, so the position variance grows by v t² / 3 and its covariance with the velocity by v t / 2, where
-    v is the variance of the velocity change.
+    targets: predicted by ``elapsed`` (n,) [s], negative backwards in time. units_per_m: world units per metre. up: (3,)
+    along which upright targets do not change their velocity. The time of the change is uniform over the time t, so the
+    position variance grows by v t² / 3 and its covariance with the velocity by v t / 2, where v is the variance of the
+    velocity change.
     """
-    unseen = np.maximum((time_ns - targets.seen_ns) / NANOSECONDS, 0.0)
-    velocity_variance = (_MANOEUVRE_STD[targets.kind] * units_per_m) ** 2
+    time = np.broadcast_to(np.asarray(elapsed, dtype=np.float64), (len(targets),))
+    std = _MANOEUVRE_STD[targets.kind] * units_of(targets, units_per_m)
+    axes = np.broadcast_to(np.eye(3), (len(targets), 3, 3))
+    if up is not None:
+        axes = axes - _UPRIGHT[targets.kind][:, None, None] * np.outer(up, up)
+    change = (std**2)[:, None, None] * axes
     covariance = targets.covariance.copy()
-    for axis in range(3):
-        i, j = POSITION.start + axis, VELOCITY.start + axis
-        covariance[:, i, i] += velocity_variance * unseen**2 / 3.0
-        covariance[:, i, j] += velocity_variance * unseen / 2.0
-        covariance[:, j, i] += velocity_variance * unseen / 2.0
-        covariance[:, j, j] += velocity_variance
-    prior_odds = np.expm1(_MANOEUVRE_RATE[targets.kind] * np.minimum(unseen, _MAX_UNSEEN_S))
-    return ManoeuvreHypothesis(covariance, np.where(unseen <= _MAX_UNSEEN_S, prior_odds, 0.0))
+    covariance[:, POSITION, POSITION] += change * (time**2 / 3.0)[:, None, None]
+    covariance[:, POSITION, VELOCITY] += change * (time / 2.0)[:, None, None]
+    covariance[:, VELOCITY, POSITION] += change * (time / 2.0)[:, None, None]
+    covariance[:, VELOCITY, VELOCITY] += change
+    return ManoeuvreHypothesis(covariance, np.expm1(_MANOEUVRE_RATE[targets.kind] * np.abs(time)))
+
+
+def within_reach(targets: Targets, elapsed: Floats, hypothesis: ManoeuvreHypothesis) -> ManoeuvreHypothesis:
+    """The same without targets that could be anywhere by now. elapsed: (n,) since the last detection [s]."""
+    near = _MANOEUVRE_STD[targets.kind] * elapsed <= np.sqrt(3.0) * _MAX_SPREAD_M
+    return replace(hypothesis, prior_odds=np.where(near, hypothesis.prior_odds, 0.0))
+
+
+def units_of(targets: Targets, units_per_m: float) -> Floats:
+    """World units per metre (n,), of upright targets by their own size: the world's scale may be unknown."""
+    typical = np.array([model.size_m for model in TARGET_MODELS])[targets.kind]
+    return np.where(_UPRIGHT[targets.kind], np.exp(targets.mean[:, LOG_SIZE]) / typical, units_per_m)
+
+
+def widened_by_evidence(
+    predicted: Targets, hypothesis: ManoeuvreHypothesis, information: Floats, vector: Floats
+) -> Floats:
+    """The covariances (n, 7, 7) of the mixture of both hypotheses, given measurements.
+
+    information: (n, 7, 7) of the measurements, and its vector (n, 7).
+    """
+    likelihoods = [
+        _log_evidence(predicted.mean, covariance, information, vector)
+        for covariance in (predicted.covariance, hypothesis.covariance)
+    ]
+    return _mixed(predicted.covariance, hypothesis, *likelihoods)
+
+
+def fused_predictions(
+    past: Targets, future: Targets, elapsed: tuple[float, float], units_per_m: float, up: Floats | None
+) -> tuple[Floats, Floats]:
+    """The states (n, 7), (n, 7, 7) of targets from their past and their future, which may differ by a manoeuvre.
+
+    past, future: predicted by ``elapsed`` forward and backward in time to the same moment.
+    """
+    off = past.mean - future.mean
+    one = manoeuvre_hypothesis(past, elapsed[0], units_per_m, up)
+    two = manoeuvre_hypothesis(future, -elapsed[1], units_per_m, up)
+    smooth = kalman.log_density(off, past.covariance + future.covariance)
+    changed = kalman.log_density(off, one.covariance + two.covariance)
+    odds = one.prior_odds + two.prior_odds
+    before, after = (
+        _mixed(state.covariance, replace(change, prior_odds=odds), smooth, changed)
+        for state, change in ((past, one), (future, two))
+    )
+    return kalman.fused(past.mean, before, future.mean, after)
+
+
+def _mixed(covariance: Floats, hypothesis: ManoeuvreHypothesis, smooth: Floats, changed: Floats) -> Floats:
+    """Moments (n, 7, 7) of the mixture, given the log likelihoods (n,) of both hypotheses."""
+    weight = hypothesis.prior_odds / (hypothesis.prior_odds + np.exp(np.clip(smooth - changed, -700.0, 700.0)))
+    return np.asarray(covariance + weight[:, None, None] * (hypothesis.covariance - covariance))
+
+
+def _log_evidence(mean: Floats, covariance: Floats, information: Floats, vector: Floats) -> Floats:
+    """Log likelihood (n,) of measurements in information form, but for what does not depend on the prior."""
+    prior = np.linalg.inv(covariance)
+    total = prior + information
+    both = (prior @ mean[:, :, None])[:, :, 0] + vector
+    squared = (both * np.linalg.solve(total, both[:, :, None])[:, :, 0]).sum(axis=1)
+    squared -= np.einsum("ni,nij,nj->n", mean, prior, mean)
+    return np.asarray(0.5 * (squared + np.linalg.slogdet(prior)[1] - np.linalg.slogdet(total)[1]))
 
 
 def gpb1_update(

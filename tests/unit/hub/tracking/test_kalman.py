@@ -17,7 +17,7 @@ def prior() -> tuple[Floats, Floats]:
     return rng.normal(size=(1, STATE_DIM)), (root @ root.T + np.eye(STATE_DIM))[None]
 
 
-def motion(elapsed: float, acceleration_psd: float, log_size_psd: float) -> tuple[Floats, Floats]:
+def motion(elapsed: float, acceleration_psd: float, log_size_psd: float, velocity_psd: float) -> tuple[Floats, Floats]:
     """Transition and noise by definition: the integral of F(s) G q Gᵀ F(s)ᵀ."""
     step = np.eye(STATE_DIM)
     step[:3, 3:6] = elapsed * np.eye(3)
@@ -26,6 +26,7 @@ def motion(elapsed: float, acceleration_psd: float, log_size_psd: float) -> tupl
         jacobian = np.zeros((STATE_DIM, 4))
         jacobian[:3, :3], jacobian[3:6, :3], jacobian[6, 3] = s * np.eye(3), np.eye(3), 1.0
         noise += jacobian @ np.diag([acceleration_psd] * 3 + [log_size_psd]) @ jacobian.T * elapsed / 2000
+    noise[:3, :3] += velocity_psd * elapsed * np.eye(3)
     return step, noise
 
 
@@ -33,7 +34,7 @@ def test_filtering_equals_the_batch_least_squares_solution() -> None:
     """States at three times, all as unknowns of one linear problem with dense weights: same mean, same covariance."""
     rng = np.random.default_rng(2)
     mean, covariance = prior()
-    steps, acceleration_psd, log_size_psd = (0.11, 0.034, 0.3), 0.7, 0.02
+    steps, psd = (0.11, 0.034, 0.3), (0.7, 0.02, 0.05)
     measurements = [
         (rng.normal(size=(4, STATE_DIM)), rng.normal(size=4), np.diag(rng.uniform(0.1, 2.0, 4))) for _ in steps
     ]
@@ -45,7 +46,7 @@ def test_filtering_equals_the_batch_least_squares_solution() -> None:
     gradient[first] += np.linalg.inv(covariance[0]) @ mean[0]
     for k, (elapsed, (jacobian, seen, noise)) in enumerate(zip(steps, measurements, strict=True)):
         here, then = slice(k * STATE_DIM, (k + 1) * STATE_DIM), slice((k + 1) * STATE_DIM, (k + 2) * STATE_DIM)
-        step, drift = motion(elapsed, acceleration_psd, log_size_psd)
+        step, drift = motion(elapsed, *psd)
         weight = np.linalg.inv(drift)
         hessian[then, then] += weight + jacobian.T @ np.linalg.inv(noise) @ jacobian
         hessian[here, here] += step.T @ weight @ step
@@ -56,7 +57,7 @@ def test_filtering_equals_the_batch_least_squares_solution() -> None:
     spread = np.linalg.inv(hessian)[-STATE_DIM:, -STATE_DIM:]
 
     for elapsed, (jacobian, seen, noise) in zip(steps, measurements, strict=True):
-        mean, covariance = kalman.predict(mean, covariance, elapsed, np.array([acceleration_psd]), log_size_psd)
+        mean, covariance = kalman.predict(mean, covariance, elapsed, np.array([psd[0]]), *psd[1:])
         off = (seen - jacobian @ mean[0])[None]
         mean, covariance = kalman.update(
             mean, covariance, off, jacobian[None], noise[None], np.ones((1, 4), dtype=bool)
@@ -67,10 +68,9 @@ def test_filtering_equals_the_batch_least_squares_solution() -> None:
 
 def test_two_predictions_equal_one_of_their_sum() -> None:
     mean, covariance = prior()
-    acceleration_psd = np.array([0.7])
-    once = kalman.predict(mean, covariance, 0.5, acceleration_psd, 0.1)
-    half = kalman.predict(mean, covariance, 0.2, acceleration_psd, 0.1)
-    twice = kalman.predict(*half, 0.3, acceleration_psd, 0.1)
+    noise = np.array([0.7]), 0.1, np.array([0.3])
+    once = kalman.predict(mean, covariance, 0.5, *noise)
+    twice = kalman.predict(*kalman.predict(mean, covariance, 0.2, *noise), 0.3, *noise)
     for a, b in zip(once, twice, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,13 @@ import pytest
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter import kalman
 from hub.tracking.filter.kalman import STATE_DIM
-from hub.tracking.filter.manoeuvre import gpb1_update, manoeuvre_hypothesis
+from hub.tracking.filter.manoeuvre import (
+    fused_predictions,
+    gpb1_update,
+    manoeuvre_hypothesis,
+    widened_by_evidence,
+    within_reach,
+)
 from hub.tracking.filter.target_models import KIND_INDEX, MARKER
 from hub.tracking.filter.target_states import Targets
 from hub.tracking.parameters import TrackerParameters
@@ -93,21 +100,40 @@ def test_the_manoeuvre_covariance_matches_sampling() -> None:
     unseen, units_per_m = 0.2, 100.0
     jump = rng.normal(0.0, MARKER.manoeuvre_std_m_s * units_per_m, 400_000)
     drawn = np.cov(jump * rng.uniform(0.0, unseen, jump.size), jump)
-    manoeuvre = manoeuvre_hypothesis(seen_before("marker", unseen), NANOSECONDS, units_per_m)
+    manoeuvre = manoeuvre_hypothesis(seen_before("marker", unseen), unseen, units_per_m)
     added = manoeuvre.covariance[0] - np.eye(STATE_DIM)
     for axis in range(3):
         rows = [axis, axis + 3]
         np.testing.assert_allclose(added[np.ix_(rows, rows)], drawn, rtol=0.02)
     assert manoeuvre.prior_odds[0] == pytest.approx(MARKER.manoeuvres_per_s * unseen, rel=0.1)
-    assert manoeuvre_hypothesis(seen_before("marker", 1.0), NANOSECONDS, units_per_m).prior_odds[0] == 0.0, (
-        "by then it could be anywhere"
-    )
+    long = within_reach(seen_before("marker", 1.0), np.ones(1), manoeuvre)
+    assert long.prior_odds[0] == 0.0, "by then it could be anywhere"
 
 
-def test_people_have_no_manoeuvre_hypothesis() -> None:
-    manoeuvre = manoeuvre_hypothesis(seen_before("person", 0.2), NANOSECONDS, 1.0)
-    np.testing.assert_array_equal(manoeuvre.covariance[0], np.eye(STATE_DIM))
-    assert manoeuvre.prior_odds[0] == 0.0
+def test_people_set_off_and_stop_along_the_ground_and_sometimes() -> None:
+    person, up = seen_before("person", 0.5), np.array([0.0, 0.0, 1.0])
+    manoeuvre = manoeuvre_hypothesis(person, 0.5, 1.0, up)
+    added = np.diag(manoeuvre.covariance[0] - np.eye(STATE_DIM))
+    assert (added[[0, 1, 3, 4]] > 0.0).all()
+    assert not added[[2, 5, 6]].any()
+    assert 0.0 < manoeuvre.prior_odds[0] < 0.2
+
+
+@pytest.mark.parametrize("off", [0.1, 2.0])
+def test_a_surprise_widens_a_prediction_and_what_was_expected_does_not(off: float) -> None:
+    """In information form, and where past and future disagree."""
+    person = seen_before("person", 0.5)
+    tight = replace(person, covariance=0.01 * np.eye(STATE_DIM)[None])
+    manoeuvre = manoeuvre_hypothesis(tight, 0.5, 1.0)
+    information = np.zeros((1, STATE_DIM, STATE_DIM))
+    information[:, :3, :3] = 400.0 * np.eye(3)
+    measured = tight.mean + off * (np.arange(STATE_DIM) == 0)
+    widened = widened_by_evidence(tight, manoeuvre, information, (information @ measured[:, :, None])[:, :, 0])
+    surprised = off > 1.0
+    assert (widened[0, 3, 3] > 0.2) == surprised
+    later = replace(tight, mean=measured)
+    _, covariance = fused_predictions(tight, later, (0.5, 0.5), 1.0, None)
+    assert (covariance[0, 3, 3] > 0.05) == surprised
 
 
 def test_the_more_likely_hypothesis_dominates() -> None:

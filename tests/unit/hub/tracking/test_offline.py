@@ -8,9 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deploy.evaluation.clear_mot import EvaluationFrame, MotScores, clear_mot
+from hub.tracking import offline
 from hub.tracking.filter.detection_model import posterior_existence
 from hub.tracking.filter.floor import Floor
+from hub.tracking.filter.target_states import MultiTargetState
 from hub.tracking.offline import FollowResult, follow
+from hub.tracking.parameters import TrackerParameters
+from hub.tracking.smoothing import BatchSmoother
 from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.core.errors import Refused
 from protocols.geometry import so3
@@ -138,6 +142,55 @@ def test_who_walks_up_to_somebody_and_stops_is_not_exchanged_with_him(seed: int)
     assert scores(result, place).idf1 > 0.95
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_who_stands_beside_somebody_and_sets_off_keeps_his_identity(seed: int) -> None:
+    """Three pairs, 0.6 m apart, at 2 Hz: one of each walks off at 1.4 m/s from one frame to the next."""
+    rng = np.random.default_rng(seed)
+    time, paths = np.arange(24) / FPS, []
+    for index, middle in enumerate(([-2.0, -2.0], [2.0, -1.5], [0.0, 2.0])):
+        angle = rng.uniform(0.0, 2.0 * np.pi, 2)
+        beside, along = (np.array([np.cos(a), np.sin(a)]) for a in angle)
+        away = 1.4 * np.clip(time - 5.0 - index, 0.0, 2.5)
+        paths += [np.tile(middle, (24, 1)), middle + 0.6 * beside + away[:, None] * along]
+    place = np.stack(paths, axis=1) + rng.normal(0.0, 0.02, (24, 6, 2))
+    messages, calibration = boxes(rng, place, cameras=4, height=3.0)
+    result = follow(messages, calibration, [round(at * NANOSECONDS) for at in time])
+    assert scores(result, place).idf1 > 0.97
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_track_that_takes_over_somebody_else_is_cut_once(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where one leaves and another enters, a head taller, the tracker has given both one track."""
+    rng = np.random.default_rng(seed)
+    time, paths = np.arange(24) / FPS, []
+    for index, corner in enumerate(([-4.0, -3.0], [-4.0, 0.0], [-4.0, 3.0])):
+        change = 4.0 + index
+        leaving = corner + np.array([1.3, 0.0]) * time[:, None]
+        entering = corner + np.array([1.3 * change + 0.3, 0.0]) - np.array([1.3, 0.0]) * (time[:, None] - change)
+        paths += [np.where(time[:, None] < change, leaving, np.nan), np.where(time[:, None] < change, np.nan, entering)]
+    place = np.stack(paths, axis=1) + rng.normal(0.0, 0.02, (24, 6, 2))
+    messages, calibration = boxes(rng, place, cameras=4, height=3.0, tall=np.tile([1.55, 1.95], 3))
+    smoother_of = offline._smoother
+
+    def taken_over(recorded: list[MultiTargetState], parameters: TrackerParameters) -> BatchSmoother | None:
+        smoother = smoother_of(recorded, parameters)
+        assert smoother is not None
+        first, last = smoother._extents()
+        names = np.arange(len(first))
+        for row in np.flatnonzero(first > 5).tolist():
+            names[row] = np.flatnonzero(np.abs(last - first[row]) < 2)[0]
+        assert (names != np.arange(len(first))).any()
+        for index in range(len(smoother.scans)):
+            smoother._rename(index, names)
+        smoother.run(1)
+        first, last = smoother._extents()
+        assert (first <= last).sum() == 6
+        return smoother
+
+    monkeypatch.setattr(offline, "_smoother", taken_over)
+    assert len(follow(messages, calibration, [round(at * NANOSECONDS) for at in time]).tracks) == 6
+
+
 def test_a_hall_that_is_full_at_the_first_frame() -> None:
     """Eighty people at once are not taken for eighty false detections."""
     rng = np.random.default_rng(1)
@@ -149,9 +202,9 @@ def test_a_hall_that_is_full_at_the_first_frame() -> None:
 
 
 def boxes(
-    rng: np.random.Generator, place: Floats, cameras: int, height: float
+    rng: np.random.Generator, place: Floats, cameras: int, height: float, tall: float | Floats = 1.72
 ) -> tuple[list[pb.Observation], Calibration]:
-    """Boxes of people at places (frames, p, 2), with 10 % misses and 3 % noise, by cameras on a ring."""
+    """Boxes of people at places (frames, p, 2), NaN = absent, with 10 % misses and 3 % noise, by cameras on a ring."""
     messages, known = [], {}
     for index in range(cameras):
         name, angle = f"cam{index}", 2.0 * np.pi * index / cameras + 0.2
@@ -159,14 +212,16 @@ def boxes(
         known[name] = CameraCalibration(name, LENS, pose, TimeMap(1.0, 0.0), 1e-3, np.zeros(3), 1.0)
         for frame, here in enumerate(place):
             foot = np.column_stack([here, np.zeros(len(here))])
-            feet, heads = (LENS.project(pose.camera_from_world(foot + up)) for up in (0.0 * UP, 1.72 * UP))
+            feet, heads = (
+                LENS.project(pose.camera_from_world(foot + up)) for up in (0.0 * UP, np.multiply.outer(tall, UP))
+            )
             message = pb.Observation(
                 schema_version=1, camera=name, boot_id="b", sequence=frame, frame=frame,
                 device_time_ns=round(frame / FPS * NANOSECONDS),
             )  # fmt: skip
             for (u, bottom), (_, top) in zip(feet, heads, strict=True):
                 noise = 0.03 * (bottom - top) * rng.normal(size=3)
-                if rng.random() > 0.1:
+                if rng.random() > 0.1 and np.isfinite(u):
                     add(message, u + noise[0], top + noise[1], bottom + noise[2])
             messages.append(message)
     return messages, Calibration(cameras=known, reference="cam0", scale="metric", units="m", solver="given", version="")
