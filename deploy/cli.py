@@ -26,7 +26,10 @@ from cyclopts import App, CycloptsError  # noqa: E402
 from cyclopts.exceptions import UnknownCommandError  # noqa: E402
 
 from protocols.core.errors import EXIT_BUG, EXIT_DONE, EXIT_INPUT, SynclineError  # noqa: E402
+from protocols.core.lazy import defer_modules  # noqa: E402
 from protocols.core.version import VERSION  # noqa: E402
+
+defer_modules("numpy", ("f2py", "testing", "ma", "polynomial", "ctypeslib"))
 
 # Name, import path, one-line summary for the overview.
 COMMANDS: tuple[tuple[str, str, str], ...] = (

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from hub.baselines.session_lags import solve_pair_by_paper
 from hub.bundle import covariance as cov
 from hub.bundle import model_comparison
 from hub.bundle.adjustment import adjust, estimate_noise, residual_norms
@@ -31,8 +30,6 @@ from hub.bundle.timestamp_jitter import estimate_frame_times
 from hub.calibration.given_values import refuted_lens
 from hub.calibration.pair_network import Progress, coincide, describe_timing, frame_rate_warnings, solve_pairs
 from hub.calibration.result import assemble_calibration, focal_stds, isolated_pair_report
-from hub.calibration.rigid_body.solve import calibrate_bodies
-from hub.calibration.rigid_body.views import body_labels
 from hub.calibration.self_calibration import MAX_FOCAL_STD, initial_self_calibration, with_updated_lenses
 from hub.calibration.solution import Solution
 from hub.calibration.unconnected import connect_by_resection
@@ -95,7 +92,9 @@ def calibrate(
     report = progress or (lambda text, share: None)
     if known is not None:
         rig = with_known_intrinsics(rig, known)
-    if rig.bodies and solver == "joint" and not online and body_labels(observations, rig.bodies):
+    if rig.bodies and solver == "joint" and not online and _has_bodies(rig, observations):
+        from hub.calibration.rigid_body.solve import calibrate_bodies
+
         try:
             return calibrate_bodies(rig, observations, report, known)
         except Refused:
@@ -151,6 +150,13 @@ def calibrate(
         raise
 
 
+def _has_bodies(rig: Rig, observations: Observations) -> bool:
+    """Whether observations are of the points of a rigid body."""
+    from hub.calibration.rigid_body.views import body_labels
+
+    return bool(body_labels(observations, rig.bodies))
+
+
 def _diagonals(rig: Rig) -> tuple[tuple[str, str, float], ...]:
     """The diagonals of single tags as scale bars, where their size is known."""
     if not rig.bodies_metric:
@@ -177,6 +183,8 @@ def with_known_intrinsics(rig: Rig, known: FixedCalibration) -> Rig:
 
 def paper_pairs(prepared: PreparedSession, observations: Observations, report: Progress) -> list[PairSolution]:
     """All pairs by the asynchronous calibration paper's method. Raises Refused for a shared clock (no lags)."""
+    from hub.baselines.session_lags import solve_pair_by_paper
+
     if prepared.shared_clock:
         raise Refused('the paper\'s method finds lags, and clock = "shared" says there are none', {})
     pairs = []
@@ -525,22 +533,23 @@ def fits_trajectory(reconstruction: Reconstruction, name: str) -> bool:
 
 def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
     """Problem and state with the rows after clock steps corrected, as far as these explain the observations better."""
+    step = model_comparison.find_clock_step(problem, state)
     for _ in range(_MAX_CLOCK_STEPS):
-        step = model_comparison.find_clock_step(problem, state)
         if step is None:
             break
-        middle = state.cameras[step.camera].centre
-        trial, trial_state, _ = adjust(model_comparison.with_clock_step(problem, step, middle), state, rounds=2)
-        for _ in range(_STEP_ITERATIONS):  # the size is of one Gauss-Newton step, which leaves a part of a large one
-            left = model_comparison.find_clock_step(trial, trial_state)
-            if left is None or left.camera != step.camera or abs(left.time - step.time) > _SAME_STEP_S:
+        middle, trial_state = state.cameras[step.camera].centre, state
+        for left in range(_STEP_ITERATIONS, -1, -1):
+            trial, trial_state, _ = adjust(
+                model_comparison.with_clock_step(problem, step, middle), trial_state, rounds=2
+            )
+            more = model_comparison.find_clock_step(trial, trial_state)
+            if more is None or more.camera != step.camera or abs(more.time - step.time) > _SAME_STEP_S or not left:
                 break
-            step = replace(step, size=step.size + left.size)
-            corrected = model_comparison.with_clock_step(problem, step, middle)
-            trial, trial_state, _ = adjust(corrected, trial_state, rounds=2)
+            # The size is of one Gauss-Newton step, which leaves a part of a large one.
+            step = replace(step, size=step.size + more.size)
         if not _bic_prefers(trial, trial_state, problem, state):
             break
-        problem, state = trial, replace(trial_state, clock_steps=(*trial_state.clock_steps, step))
+        problem, state, step = trial, replace(trial_state, clock_steps=(*trial_state.clock_steps, step)), more
     return problem, state
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-from importlib import metadata
 
 import numpy as np
 
@@ -140,6 +139,8 @@ def _capital(text: str) -> str:
 
 def provenance(facts: dict[str, str], rig: Rig, command: str) -> str:
     """Provenance: command, input, versions."""
+    from importlib import metadata  # 15 ms, most of it the standard library's e-mail parser
+
     versions = [f"Python {platform.python_version()}"]
     for name in _LIBRARIES:
         try:

@@ -88,18 +88,20 @@ def refine(
     final_width: of the Cauchy weight [sigma].
     """
     damping, width = 1e-3, max(3.0 * initial_misfit, final_width)
-    system = _normal_equations(sampler, geometry, inverse_rate, intercept, width, noise, fixed_geometry)
-    if system is None:
+    rows = _linearise(sampler, geometry, inverse_rate, intercept, noise, fixed_geometry)
+    if rows is None:
         return None
+    system = _normal_equations(*rows, inverse_rate, width, noise)
     for _ in range(iterations):
         normal, gradient, cost = system
         damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
         step: Floats = np.asarray(np.linalg.solve(damped, -gradient), dtype=np.float64)
         trial_geometry = geometry if fixed_geometry else geometry.retract(step[:-2])
         trial_map = inverse_rate + float(step[-1]), intercept + float(step[-2])
-        trial = _normal_equations(sampler, trial_geometry, *trial_map, width, noise, fixed_geometry)
-        if trial is not None and trial[2] < cost:
-            geometry, (inverse_rate, intercept) = trial_geometry, trial_map
+        trial_rows = _linearise(sampler, trial_geometry, *trial_map, noise, fixed_geometry)
+        trial = None if trial_rows is None else _normal_equations(*trial_rows, trial_map[0], width, noise)
+        if trial_rows is not None and trial is not None and trial[2] < cost:
+            geometry, (inverse_rate, intercept), rows = trial_geometry, trial_map, trial_rows
             damping = max(damping / 5.0, 1e-9)
             if width == final_width:
                 system = trial
@@ -112,24 +114,21 @@ def refine(
                 break
             continue
         width = max(final_width, 0.5 * width)
-        system = _normal_equations(sampler, geometry, inverse_rate, intercept, width, noise, fixed_geometry)
-        if system is None:
-            return None
+        system = _normal_equations(*rows, inverse_rate, width, noise)
     if not 0.5 < inverse_rate < 2.0 or width > final_width:
         return None
     return RefinementResult(system[2], inverse_rate, intercept, geometry, system[0])
 
 
-def _normal_equations(
+def _linearise(
     sampler: Sampler,
     geometry: TwoViewGeometry,
     inverse_rate: float,
     intercept: float,
-    width: float,
     noise: NoiseModel,
     fixed_geometry: bool,
-) -> tuple[Floats, Floats, float] | None:
-    """Normal matrix, gradient and mean robust cost; None without overlap.
+) -> tuple[Floats, Floats] | None:
+    """Sampson residuals (n,) in units of the noise and their derivatives (n, k + 2); None without overlap.
 
     Parameters: the geometry's local ones (none if it is fixed), intercept, inverse rate.
     """
@@ -146,7 +145,6 @@ def _normal_equations(
     variance += noise.sigma_a**2 * (line_a[:, 0] ** 2 + line_a[:, 1] ** 2)
     over = 1.0 / np.sqrt(np.maximum(variance, 1e-30))
     residual = (pairs.b[:, 0] * line_b[:, 0] + pairs.b[:, 1] * line_b[:, 1] + line_b[:, 2]) * over
-    ratio = (residual / width) ** 2
     free = 0 if fixed_geometry else 5 if isinstance(geometry, RelativePose) else 7
     jacobian = np.empty((count, free + 2))
     if free:
@@ -159,6 +157,14 @@ def _normal_equations(
     jacobian[:, free] = line_b[:, 0] * pairs.velocity_b[:, 0] + line_b[:, 1] * pairs.velocity_b[:, 1]
     jacobian[:, free + 1] = jacobian[:, free] * pairs.centred_time
     jacobian *= over[:, None]
+    return residual, jacobian
+
+
+def _normal_equations(
+    residual: Floats, jacobian: Floats, inverse_rate: float, width: float, noise: NoiseModel
+) -> tuple[Floats, Floats, float]:
+    """Normal matrix, gradient and mean robust cost at a width of the Cauchy weight."""
+    ratio = (residual / width) ** 2
     weighted = jacobian / (1.0 + ratio)[:, None]
     normal = weighted.T @ jacobian
     gradient = weighted.T @ residual
@@ -166,4 +172,4 @@ def _normal_equations(
     normal[-1, -1] += prior
     gradient[-1] += prior * (inverse_rate - 1.0)
     cost = float((width**2 * np.log1p(ratio)).sum()) + prior * (inverse_rate - 1.0) ** 2
-    return normal, gradient, cost / count
+    return normal, gradient, cost / len(residual)

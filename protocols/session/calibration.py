@@ -194,7 +194,8 @@ def trajectory_text(calibration: Calibration) -> str:
     lines = ["time,x,y,z,std,label" if several else "time,x,y,z,std"]
     for table in calibration.trajectories:
         tail = f",{csv_cell(table.label)}" if several else ""
-        for t, (x, y, z), std in zip(table.time, table.position, table.std, strict=True):
+        rows = zip(table.time.tolist(), table.position.tolist(), table.std.tolist(), strict=True)
+        for t, (x, y, z), std in rows:  # Python's own floats are written three times as fast as numpy's
             lines.append(f"{t:.17g},{x:.17g},{y:.17g},{z:.17g},{std:.17g}{tail}")
     return "\n".join(lines) + "\n"
 

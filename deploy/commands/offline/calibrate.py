@@ -141,6 +141,8 @@ def _load(
 
 def _with_scale(read: Session, height: float | None, limb: str | None) -> Session:
     """The session with scale bars of a person's height, or of one limb. Raises InputError."""
+    if height is None and limb is None:
+        return read
     from protocols.formats.keypoints import limbs_of_height
 
     labels, bars = read.observations.labels, list(read.rig.scale_bars)
