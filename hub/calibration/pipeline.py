@@ -19,12 +19,13 @@ from hub.bundle.correlated_noise import MIN_INFLATION, refit_with_correlated_noi
 from hub.bundle.initialisation import (
     Reconstruction,
     inlier_share,
+    place_cameras,
     reconstruct_incrementally,
     reconstruct_with_known_poses,
 )
 from hub.bundle.noise_scale import correlation_inflation
 from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
-from hub.bundle.problem import AdjustmentState, FreeParameters, Problem
+from hub.bundle.problem import AdjustmentState, CameraState, FreeParameters, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.bundle.timestamp_jitter import estimate_frame_times
 from hub.calibration.given_values import refuted_lens
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from hub.distributed.solver import DistributedPoseSolver
 
 _MIN_INLIER_SHARE = 0.5  # share of a camera's rows that must fit the trajectory
+_HOPELESS_SHARE = 0.5 * _MIN_INLIER_SHARE  # the same before the final adjustment
 _MIN_ROWS = 30
 _MAX_ROTATION_STD = 0.05  # rad
 _MAX_CLOCK_STD = 10e-3  # s: a frame is more than three of them
@@ -284,14 +286,20 @@ def solve_network(
     graph = _largest_component(prepared, list(prepared.cameras), pairs, refused)
     unfit: set[str] = set()
     with_rate_prior = replace(free_parameters, rate_std=_rate_prior_std(graph, free_parameters.rate_std))
+    placed: dict[str, CameraState] = {}
     while True:
         if distributed_solver is not None:
             reconstruction, unplaced = distributed_solver(graph)
         else:
-            reconstruction, unplaced = reconstruct_incrementally(
-                prepared.cameras, graph, prepared.rows, prepared.labels, lambda text: report(text, 0.6), with_rate_prior
+            session = prepared.cameras, graph, prepared.rows, prepared.labels
+            reconstruction, unplaced = (
+                place_cameras(*session, placed, with_rate_prior)
+                if placed.keys() == graph.clocks.keys()
+                else reconstruct_incrementally(*session, lambda text: report(text, 0.6), with_rate_prior)
             )
-            reconstruction = final_adjustment(reconstruction, report, online=online, refine_lenses=refine_lenses)
+            # A camera of which next to nothing fits is left out at once: its errors would be adjusted for nothing.
+            if min(inlier_share(reconstruction, name)[0] for name in reconstruction.names) > _HOPELESS_SHARE:
+                reconstruction = final_adjustment(reconstruction, report, online=online, refine_lenses=refine_lenses)
             # The narrow rate prior only stabilises the estimate; stds are computed with the usual one.
             usual = replace(reconstruction.problem.free_parameters, rate_std=free_parameters.rate_std)
             reconstruction.problem = replace(reconstruction.problem, free_parameters=usual)
@@ -300,7 +308,8 @@ def solve_network(
         # A wrong lens of an uncalibrated camera may be the cause of all the others' misfit: it goes first.
         inconsistent = [name for name in inconsistent if prepared.cameras[name].lens_prior is not None] or inconsistent
         if inconsistent:
-            # The worst one is removed, and the reconstruction that it may have distorted is repeated without it.
+            # The worst one is removed, and the reconstruction that it may have distorted is adjusted without it; from
+            # the pairs on where more cameras do not fit.
             worst = min(inconsistent, key=lambda name: inlier_share(reconstruction, name)[0])
             share, count = inlier_share(reconstruction, worst)
             refused[worst] = (
@@ -322,6 +331,8 @@ def solve_network(
         remaining = [name for name in reconstruction.names if name != worst]
         if len(remaining) < 2:
             raise Refused(f"no two cameras can be placed ({worst}: {refused[worst]})", refused)
+        states = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
+        placed = {name: states[name] for name in remaining} if len(inconsistent) < 2 and len(remaining) > 2 else {}
         graph = _largest_component(prepared, remaining, list(graph.inlier_pairs), refused)
     unconnected = [name for name in prepared.cameras if name in refused and name not in unfit]
     if thorough and unconnected and not prepared.shared_clock:
