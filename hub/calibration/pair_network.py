@@ -11,7 +11,7 @@ are used last, so that they change no lag that the images determine.
 from __future__ import annotations
 
 import itertools
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import replace
 from typing import Literal
@@ -74,7 +74,15 @@ def solve_pairs(
     unguided: dict[tuple[str, str], PairSolution] = {}
     synchronised, cache = _SynchronisedGroups(), TrackCache()
     is_ranked = len(todo) > 1 and not prepared.shared_clock
-    for done, (a, b) in enumerate(_ranked(prepared, todo, report, cache) if is_ranked else todo):
+    queue = deque(_ranked(prepared, todo, report, cache) if is_ranked else todo)
+    postponed = set[tuple[str, str]]()
+    while queue:
+        a, b = queue.popleft()
+        if thorough == "first pair" and (a, b) not in postponed and synchronised.has_failed(a, b, pairs.values()):
+            postponed.add((a, b))  # until the others are connected, whose path may spare the search
+            queue.append((a, b))
+            continue
+        done = len(pairs)
         report(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
         expected = expected_lag(prepared, a, b, arrivals) if arrivals and not prepared.shared_clock else None
         if expected is not None:
@@ -270,6 +278,14 @@ class _SynchronisedGroups:
             if any(self._maps.get(other, ("", 1.0, 0.0))[0] == group for other in tried):
                 return True
         return False
+
+    def has_failed(self, a: str, b: str, pairs: Iterable[PairSolution]) -> bool:
+        """Whether one of two cameras is connected to none, and a pair of it with a connected one has failed."""
+        tried = [(pair.a, pair.b) for pair in pairs]
+        return any(
+            new not in self._maps and any(new in both and any(one in self._maps for one in both) for both in tried)
+            for new in (a, b)
+        )
 
     def lag(self, prepared: PreparedSession, a: str, b: str) -> float | None:
         """``t_a - t_b`` [s] in the middle of the common recording time; None if they are not connected."""
