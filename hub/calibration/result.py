@@ -18,7 +18,7 @@ from hub.bundle.noise_scale import rescale_noise
 from hub.bundle.preprocessing import PreparedSession
 from hub.bundle.problem import CAMERA_PARAMETERS, CRYSTAL_RATE_STD, FOCAL, READOUT, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
-from hub.calibration.given_values import refuted_lens_warnings
+from hub.calibration.given_values import refuted_lens_warnings, sensitivities
 from hub.calibration.held_gauge import similarity_to_published
 from hub.calibration.pair_network import RATE_TOLERANCE, pair_lag
 from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
@@ -84,9 +84,9 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
     else:
         gauge = identity_gauge(len(names), solution.known.scale)
     prior = estimate_smoothness(problem, state)
-    covariance = cov.covariance(
-        problem, rescale_noise(problem, state, prior), prior, gauge.information, datum_points, gauge.exact
-    )
+    scaled = rescale_noise(problem, state, prior)
+    covariance = cov.covariance(problem, scaled, prior, gauge.information, datum_points, gauge.exact)
+    effects = sensitivities(rig, names, problem, scaled, prior, covariance)
     lens_stds = focal_stds(problem, state, covariance)
     readout_stds = np.sqrt(np.maximum(np.diag(covariance.cameras)[READOUT::CAMERA_PARAMETERS], 0.0))
     time_origins = [solution.prepared.time_origins[name] for name in names]
@@ -123,6 +123,7 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
             clock_rate_std=cov.clock_rate_std(covariance, state, i, reference)
             if problem.free_parameters.clock
             else 0.0,
+            sensitivities=effects[i],
             clock_steps=tuple(
                 (step.time / time_scales[i] + time_origins[i], step.size / time_scales[i], step.std / time_scales[i])
                 for step in state.clock_steps

@@ -50,6 +50,9 @@ _NOISE_COST = 0.8  # mean robust cost at which a fit is at the noise: it is abou
 _PREDICTED_LAG_CANDIDATES = 3
 _NO_FIT = "no alignment of the two tracks agrees with any geometry"
 _HARDLY_MOVES = "the point hardly moves while both could have seen it"
+_HARDLY_MOVES_AT_PREDICTED_LAG = (
+    "the point hardly moves at the lag that the other cameras imply; other lags were not searched"
+)
 NO_FIT_AT_PREDICTED_LAG = "no geometry agrees at the lag that the other cameras imply; other lags were not searched"
 _MAX_STARTS = 4
 _FIVE_POINT_SEEDS = 8  # random seeds of five-point hypotheses; more than _MAX_STARTS hypotheses are tried only …
@@ -193,7 +196,7 @@ class _PairSearch:
         if lag_window is not None:
             near = moments.support[moments.within(*lag_window)]
             if float(near.max(initial=0.0)) < s.min_scan_support:
-                return PairSolution(*names, _HARDLY_MOVES)
+                return PairSolution(*names, _HARDLY_MOVES_AT_PREDICTED_LAG)
         known_fundamental = None if self.known_pose is None else self.known_pose.essential.T
         scan = scan_lags(moments, s.min_scan_support, known_fundamental, lag_window)
         null_distributions = _NullDistributions(moments, scan, known_fundamental, self.bandwidth)

@@ -207,3 +207,37 @@ def test_detectors_covariances_weigh_the_rows() -> None:
         ratios.append([session.turn_error({n: c.pose for n, c in one.cameras.items()}) for one in found])
     plain_error, weighed_error = np.sqrt(np.mean(np.square(ratios), axis=0))
     assert weighed_error < 0.75 * plain_error
+
+
+def test_the_stated_effect_of_an_error_of_a_given_value_is_what_happens() -> None:
+    session = rigs.simulate(1, 4, 20.0)
+    cameras = {
+        name: replace(camera, position=session.poses[name].position, position_std=np.full(3, 0.02))
+        for name, camera in session.rig.cameras.items()
+    }
+    found = calibrate(replace(session.rig, cameras=cameras), session.observations())
+    stated = {one.given: one for one in found.cameras["cam1"].sensitivities}
+    document = result_document(found, session.rig)["cameras"]["cam1"]["sensitivity"]
+    assert document["position"] == {
+        "std": 0.02,
+        "position": stated["position"].position,
+        "of_camera": stated["position"].camera,
+        "lag_s": stated["position"].lag,
+    }
+
+    def moved(changed: RigCamera) -> float:
+        again = calibrate(replace(session.rig, cameras=cameras | {"cam1": changed}), session.observations())
+        return max(
+            float(np.linalg.norm(again.cameras[name].pose.position - camera.pose.position))
+            for name, camera in found.cameras.items()
+        )
+
+    camera = cameras["cam1"]
+    assert camera.position is not None
+    assert camera.intrinsics is not None
+    each = [moved(replace(camera, position=camera.position + 0.02 * axis)) for axis in np.eye(3)]
+    assert max(each) == pytest.approx(stated["position"].position, rel=0.05)
+    matrix = camera.intrinsics.matrix.copy()
+    matrix[:2, :2] *= 1.01
+    lens = replace(camera, intrinsics=replace(camera.intrinsics, matrix=matrix))
+    assert moved(lens) == pytest.approx(stated["lens"].position, rel=0.05)
