@@ -266,7 +266,7 @@ def with_clock_step(problem: Problem, step: ClockStep, middle: float) -> Problem
 def _common_terms(
     problem: Problem, state: AdjustmentState, prior: SmoothnessPrior
 ) -> tuple[BorderedSystem, Elimination, Floats, Floats]:
-    """The system, its elimination, the cameras' reduced gradient (p,) and covariance (p, p): the same for every step."""
+    """The system, its elimination, the cameras' reduced gradient (p,) and covariance (p, p): common to all steps."""
     system, _ = build_system(problem, state, prior, robust=False)
     parts = eliminate(system)
     tangent = gauge_tangent(problem, state)

@@ -71,7 +71,9 @@ def sensitivities(
                 continue
             at = i * CAMERA_PARAMETERS + first
             moved = [(found.cameras[:, at + k] / std[k], float(std[k])) for k in range(3)]
-            worst = max((_effect(given, one, change, names, problem) for change, one in moved), key=lambda e: e.position)
+            worst = max(
+                (_effect(given, one, change, names, problem) for change, one in moved), key=lambda e: e.position
+            )
             mine.append(worst)
         if i in lenses:
             mine.append(_effect("lens", _LENS_STD, lenses[i], names, problem))

@@ -62,6 +62,7 @@ class CameraCalibration:
     self-calibration; 0 = the lens was given. readout: seconds from the image's first row to its last; 0 = not known.
     readout_std: its std where it was estimated, else 0. clock_steps: camera time, size and std [s] of each step of its
     clock; the map holds on the side of ``lag_time``. sensitivities: to the references and the lens given for it.
+    detector_z: robust rms of its residuals over the stds that its detector states; 0 = it states none.
     """
 
     name: str
@@ -79,6 +80,7 @@ class CameraCalibration:
     clock_rate_std: float = 0.0
     clock_steps: tuple[tuple[float, float, float], ...] = ()
     sensitivities: tuple[Sensitivity, ...] = ()
+    detector_z: float = 0.0
 
     @property
     def lag(self) -> float:

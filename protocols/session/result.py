@@ -25,7 +25,8 @@ def result_document(calibration: Calibration, rig: Rig, *, command: str = "") ->
     Lengths are in the rig's units, times in seconds. ``cameras`` holds calibration.toml's tables plus
     position (camera centre in the world), lag_s (reference time less camera time) and lag_std_s at camera time
     lag_time_s, clock_rate_ppm with its std, clock_steps, sensitivity (what one std of a given position, rotation or lens
-    would do: largest displacement of a camera, largest change of a lag), and rows_used; ``trajectory`` summarises trajectory.csv. A missing
+    would do: largest displacement of a camera, largest change of a lag), detector_z (rms of residuals over the detector's
+    stds) and rows_used; ``trajectory`` summarises trajectory.csv. A missing
     or non-finite value is None.
     """
     tables = calibration_tables(calibration, rig)
@@ -46,6 +47,7 @@ def result_document(calibration: Calibration, rig: Rig, *, command: str = "") ->
             one.given: {"std": one.std, "position": one.position, "of_camera": one.camera, "lag_s": one.lag}
             for one in camera.sensitivities
         }
+        tables[name]["detector_z"] = camera.detector_z or None
         tables[name]["rows_used"] = None if residuals is None else len(residuals)
     return _document(
         status="solved",

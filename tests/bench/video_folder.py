@@ -241,7 +241,9 @@ def focal_scores(given: argparse.Namespace, size: tuple[int, int]) -> None:
             continue
         ratios += [error / found.focal_std[name] for name, error in found.focal.items()]
         errors += found.focal.values()
-        texts = (f"{name} {100 * error:+.2f} ± {100 * found.focal_std[name]:.2f}" for name, error in found.focal.items())
+        texts = (
+            f"{name} {100 * error:+.2f} ± {100 * found.focal_std[name]:.2f}" for name, error in found.focal.items()
+        )
         print(f"{seed}: {', '.join(texts)} %; path {found.path_mm:.2f} mm", flush=True)
     z, percent = np.array(ratios), 100 * np.array(errors)
     print(

@@ -10,7 +10,6 @@ from pathlib import Path
 from tests.bench.real_rigs import MVUS, CommandFailed, cpu_seconds, run_calibrate
 from tests.bench.speed.rows import Limit, Row, Section
 
-
 _MUST_S = {"drone1": 1.5, "drone2": 2.5}
 _REFERENCE = """
 import numpy as np, scipy.linalg

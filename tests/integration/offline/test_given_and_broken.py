@@ -241,3 +241,25 @@ def test_the_stated_effect_of_an_error_of_a_given_value_is_what_happens() -> Non
     matrix[:2, :2] *= 1.01
     lens = replace(camera, intrinsics=replace(camera.intrinsics, matrix=matrix))
     assert moved(lens) == pytest.approx(stated["lens"].position, rel=0.05)
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.25])
+def test_the_stds_that_a_detector_states_are_checked_against_its_residuals(factor: float) -> None:
+    session = rigs.simulate(2, 3, 20.0, noise=0.5)
+    rows = gather_tracks(
+        session.camera,
+        session.label,
+        session.frame,
+        session.time,
+        session.pixels,
+        np.full(len(session.time), np.nan),
+        stds=np.where(of(session, "cam1"), factor * 0.5, np.nan),
+        order=session.rig.cameras,
+    )
+    found = calibrate(session.rig, rows)
+    document = result_document(found, session.rig)["cameras"]
+    assert found.cameras["cam1"].detector_z == pytest.approx(1.0 / factor, rel=0.1)
+    assert document["cam1"]["detector_z"] == found.cameras["cam1"].detector_z
+    assert document["cam0"]["detector_z"] is None
+    warned = [text.split(":")[0] for text in found.warnings if "z-scores" in text]
+    assert warned == ([] if factor == 1.0 else ["cam1"])
