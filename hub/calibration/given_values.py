@@ -71,10 +71,8 @@ def sensitivities(
                 continue
             at = i * CAMERA_PARAMETERS + first
             moved = [(found.cameras[:, at + k] / std[k], float(std[k])) for k in range(3)]
-            worst = max(
-                (_effect(given, one, change, names, problem) for change, one in moved), key=lambda e: e.position
-            )
-            mine.append(worst)
+            effects = [_effect(given, one, change, names, problem) for change, one in moved]
+            mine.append(max(effects, key=lambda effect: effect.position))
         if i in lenses:
             mine.append(_effect("lens", _LENS_STD, lenses[i], names, problem))
         out.append(tuple(mine))

@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from hub.distributed.solver import DistributedPoseSolver
 
 _MIN_INLIER_SHARE = 0.5  # share of a camera's rows that must fit the trajectory
-_MIN_TO_LEAVE_ONE = 3  # cameras
 _MIN_ROWS = 30
 _MAX_ROTATION_STD = 0.05  # rad
 _MAX_CLOCK_STD = 10e-3  # s: a frame is more than three of them
@@ -297,11 +296,7 @@ def solve_network(
                 if placed.keys() == graph.clocks.keys()
                 else reconstruct_incrementally(*session, lambda text: report(text, 0.6), with_rate_prior)
             )
-            # A camera that does not fit yet is left out at once where resection tries it again: its errors would be
-            # adjusted for nothing.
-            share = min(inlier_share(reconstruction, name)[0] for name in reconstruction.names)
-            if not thorough or share >= _MIN_INLIER_SHARE or len(reconstruction.names) < _MIN_TO_LEAVE_ONE:
-                reconstruction = final_adjustment(reconstruction, report, online=online, refine_lenses=refine_lenses)
+            reconstruction = final_adjustment(reconstruction, report, online=online, refine_lenses=refine_lenses)
             # The narrow rate prior only stabilises the estimate; stds are computed with the usual one.
             usual = replace(reconstruction.problem.free_parameters, rate_std=free_parameters.rate_std)
             reconstruction.problem = replace(reconstruction.problem, free_parameters=usual)
@@ -613,9 +608,6 @@ def final_adjustment(
             return _with_state(reconstruction, *refitted)
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
     if not online:
-        adjusted = _with_state(reconstruction, problem, state)
-        if misfits(adjusted) or _wrong_lens(adjusted)[0]:
-            return adjusted  # a camera that will be left out: what its errors look like is of no interest
         problem, state = _with_clock_steps(problem, state)
     problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
     problem = model_comparison.with_crystal_rates(problem, state)
@@ -643,7 +635,7 @@ def final_adjustment(
             problem, state = read_problem, read_state
     adjusted = _with_state(reconstruction, problem, state)
     if not online and (misfits(adjusted) or _wrong_lens(adjusted)[0]):
-        return adjusted
+        return adjusted  # a camera that will be left out: its errors are no noise
     report("correlated noise", 0.92)
     refit = _refit_online if online else refit_with_correlated_noise
     refitted = refit(problem, state, refine_lenses)
