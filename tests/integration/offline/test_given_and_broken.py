@@ -263,3 +263,24 @@ def test_the_stds_that_a_detector_states_are_checked_against_its_residuals(facto
     assert document["cam0"]["detector_z"] is None
     warned = [text.split(":")[0] for text in found.warnings if "z-scores" in text]
     assert warned == ([] if factor == 1.0 else ["cam1"])
+
+
+def test_of_two_references_that_explain_a_contradiction_alike_neither_is_blamed() -> None:
+    """The reference of cam1 is 8 std off; noise makes cam2's the likelier of the two, by a factor of 80."""
+    session, rng = rigs.simulate(3, 4, 20.0), np.random.default_rng(3)
+    cameras = {
+        name: replace(
+            camera,
+            position=session.poses[name].position + 0.02 * rng.standard_normal(3),
+            position_std=np.full(3, 0.02),
+        )
+        for name, camera in session.rig.cameras.items()
+    }
+    off = rng.standard_normal(3)
+    wrong = cameras["cam1"]
+    assert wrong.position is not None
+    cameras["cam1"] = replace(wrong, position=wrong.position + 0.16 * off / np.linalg.norm(off))
+    found = calibrate(replace(session.rig, cameras=cameras), session.observations())
+    (warning,) = [text for text in found.warnings if "reference" in text]
+    assert "cannot be decided" in warning
+    assert "cam1" in warning.split(" is wrong")[0]
