@@ -165,7 +165,8 @@ class RecursivePoseNode:
             if k not in ready or self.position_known:
                 continue
             edge = ready[k]
-            y = direction(edge.points_k, edge.points_l, rotation_of(edge.matrix))
+            # By the attitudes, which rest on all edges: this edge's own rotation has its errors at every update alike.
+            y = direction(edge.points_k, edge.points_l, self.rotation @ poses[k][0].rotation.T)
             if float(np.linalg.norm(y)) < 1e-9:
                 continue
             h = direction_jacobian(y, self.rotation)

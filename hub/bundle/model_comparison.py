@@ -18,7 +18,7 @@ from scipy.linalg import cho_solve_banded
 from scipy.special import chdtri
 
 from hub.bundle.adjustment import gauge_tangent
-from hub.bundle.bordered_system import border_block, cho_solve_path, eliminate
+from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block, cho_solve_path, eliminate
 from hub.bundle.noise_scale import correlation_inflation, modelled_inflation
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import (
@@ -227,13 +227,14 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
         return None
     noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
     prior = estimate_smoothness(problem, state)
+    common = _common_terms(problem, noisy, prior)
     best: ClockStep | None = None
     for camera in cameras:
         used = [part.time[part.use] for part in problem.rows if part.camera == camera]
         times = np.sort(np.concatenate([np.zeros(0), *used]))
         if len(times) < _MIN_STEP_ROWS:
             continue
-        found = _best_step(problem, noisy, prior, camera, np.quantile(times, np.linspace(0.05, 0.95, _STEP_TIMES)))
+        found = _best_step(problem, noisy, common, camera, np.quantile(times, np.linspace(0.05, 0.95, _STEP_TIMES)))
         if best is None or found.statistic > best.statistic:
             best = found
     if best is None:
@@ -241,7 +242,7 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     times = np.concatenate([part.time[part.use] for part in problem.rows if part.camera == best.camera])
     width = 0.9 * float(np.ptp(times)) / (_STEP_TIMES - 1)
     near = np.linspace(max(best.time - width, times.min()), min(best.time + width, times.max()), _STEP_TIMES)
-    best = _best_step(problem, noisy, prior, best.camera, near)
+    best = _best_step(problem, noisy, common, best.camera, near)
     freed = with_free_readouts(problem)
     of_readouts = freed.free_columns() % CAMERA_PARAMETERS == READOUT
     readout = _cost_reduction(freed, noisy, prior, of_readouts) if of_readouts.any() else 0.0
@@ -262,16 +263,29 @@ def with_clock_step(problem: Problem, step: ClockStep, middle: float) -> Problem
     return replace(problem, rows=tuple(rows))
 
 
-def _best_step(
-    problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, camera: int, times: Floats
-) -> ClockStep:
-    """The best of a camera's steps at camera times (k,)."""
+def _common_terms(
+    problem: Problem, state: AdjustmentState, prior: SmoothnessPrior
+) -> tuple[BorderedSystem, Elimination, Floats, Floats]:
+    """The system, its elimination, the cameras' reduced gradient (p,) and covariance (p, p): common to all steps."""
     system, _ = build_system(problem, state, prior, robust=False)
     parts = eliminate(system)
-    columns, tangent = problem.free_columns(), gauge_tangent(problem, state)
+    tangent = gauge_tangent(problem, state)
     gradient = system.gradient_cameras - system.border.T @ cho_solve_path(parts, system.gradient_path)
-    directions: Floats = np.eye(len(columns)) if tangent is None else tangent
+    directions: Floats = np.eye(len(gradient)) if tangent is None else tangent
     covariance = directions @ np.linalg.solve(directions.T @ parts.reduced @ directions, directions.T)
+    return system, parts, gradient, covariance
+
+
+def _best_step(
+    problem: Problem,
+    state: AdjustmentState,
+    common: tuple[BorderedSystem, Elimination, Floats, Floats],
+    camera: int,
+    times: Floats,
+) -> ClockStep:
+    """The best of a camera's steps at camera times (k,). common: of `_common_terms`."""
+    system, parts, gradient, covariance = common
+    columns = problem.free_columns()
     seen = evaluate_labels(
         [part for part in problem.rows if part.camera == camera],
         state.cameras[camera],

@@ -153,7 +153,7 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
         time_origins[name] = time_origin
         rows[name] = mine
         (uncalibrated if is_uncalibrated else cameras)[name] = CameraInput(
-            name, lens, smooth, readout_given=rig_camera.readout is not None
+            name, lens, smooth, readout_given=rig_camera.readout is not None, stated_std=_typical_std(tracks)
         )
 
     for name, rig_camera in rig.cameras.items():
@@ -176,17 +176,21 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
     )
 
 
+def _typical_std(tracks: list[Track]) -> float:
+    """Median std [px] that the detector states for a camera's rows; 0 without any."""
+    known = np.concatenate([np.zeros(0), *(one.std for one in tracks if one.std is not None)])
+    known = known[known > 0.0]
+    return float(np.median(known)) if len(known) else 0.0
+
+
 def _relative_stds(track: Track, tracks: list[Track]) -> Floats | None:
     """Stds (n,) of a track's rows by the detector, over the median of the camera's; None if it states none.
 
     Only ratios count: the noise of a camera is estimated from its residuals.
     """
-    stated = [one.std for one in tracks if one.std is not None]
-    known = np.concatenate([np.zeros(0), *stated])
-    known = known[known > 0.0]
-    if track.std is None or not len(known):
+    typical = _typical_std(tracks)
+    if track.std is None or typical <= 0.0:
         return None
-    typical = float(np.median(known))
     std = np.where(track.std > 0.0, track.std, typical)
     return np.clip(std / typical, 1.0 / _MAX_STD_RATIO, _MAX_STD_RATIO)
 

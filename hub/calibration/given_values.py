@@ -1,9 +1,23 @@
-"""Tests of what the rig states as known: measured lenses."""
+"""What the rig states as known: tests of measured lenses, and what an error of a given value would do to the answer."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
+
+from hub.bundle.bordered_system import eliminate
+from hub.bundle.covariance import Covariance
 from hub.bundle.model_comparison import LensTest, refuted_lenses
-from hub.bundle.problem import AdjustmentState, Problem
+from hub.bundle.normal_equations import build_system
+from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, OFFSET, AdjustmentState, Problem
+from hub.bundle.smoothness_prior import SmoothnessPrior
+from protocols.geometry.types import Floats
+from protocols.session.calibration import Sensitivity
+from protocols.session.rig import Rig
+
+_LENS_STD = 0.01
+"""Relative std of a measured focal length for which no std is given: as `--refine-lenses` allows for."""
 
 
 def refuted_lens(test: LensTest) -> str:
@@ -23,3 +37,52 @@ def refuted_lens_warnings(names: list[str], problem: Problem, state: AdjustmentS
         "with --refine-lenses"
         for one in refuted_lenses(problem, state)
     )
+
+
+def sensitivities(
+    rig: Rig, names: list[str], problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, found: Covariance
+) -> list[tuple[Sensitivity, ...]]:
+    """By camera: what an error of one std of its given position, rotation and lens would do to the answer.
+
+    problem, state, found: in the published world, the references among the covariance's information. With the normal
+    matrix N and its inverse C the answer moves by C times the pull of the error: C[:, i] / std for a reference of
+    parameter i, whose weight is 1 / std², and -C N[:, f] std for a focal length f that was held. Of three axes, the
+    worst one. References without std have no error to speak of, and estimated lenses have theirs in the covariance.
+    """
+    free, base = problem.free_parameters, problem.free_columns()
+    if not free.pose:
+        return [() for _ in names]
+    lenses: dict[int, Floats] = {}
+    held = [i for i in range(len(names)) if problem.lens_prior(i) is None and not free.lens]
+    if held:
+        freed = replace(problem, free_parameters=replace(free, lens=True))
+        normal, columns = eliminate(build_system(freed, state, prior, robust=False)[0]).reduced, freed.free_columns()
+        rows = np.searchsorted(columns, base)
+        covariance = found.cameras[:, base]
+        for i in held:
+            focal = int(np.searchsorted(columns, i * CAMERA_PARAMETERS + FOCAL))
+            lenses[i] = -covariance @ normal[rows, focal] * _LENS_STD
+    out: list[tuple[Sensitivity, ...]] = []
+    for i, name in enumerate(names):
+        camera, mine = rig.cameras[name], list[Sensitivity]()
+        for given, std, first in (("position", camera.position_std, 3), ("rotation", camera.rotation_std, 0)):
+            value = camera.position if given == "position" else camera.rotation
+            if value is None or std is None or not (std > 0.0).all():
+                continue
+            at = i * CAMERA_PARAMETERS + first
+            moved = [(found.cameras[:, at + k] / std[k], float(std[k])) for k in range(3)]
+            effects = [_effect(given, one, change, names, problem) for change, one in moved]
+            mine.append(max(effects, key=lambda effect: effect.position))
+        if i in lenses:
+            mine.append(_effect("lens", _LENS_STD, lenses[i], names, problem))
+        out.append(tuple(mine))
+    return out
+
+
+def _effect(given: str, std: float, change: Floats, names: list[str], problem: Problem) -> Sensitivity:
+    """The effect of a change (18 n,) of all cameras' parameters."""
+    by_camera = change.reshape(len(names), CAMERA_PARAMETERS)
+    moved = np.linalg.norm(by_camera[:, 3:6], axis=1)
+    lags = by_camera[:, OFFSET] - by_camera[problem.clock_reference, OFFSET]
+    farthest = int(np.argmax(moved))
+    return Sensitivity(given, std, float(moved[farthest]), names[farthest], float(np.abs(lags).max()))

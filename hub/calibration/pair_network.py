@@ -10,8 +10,8 @@ are used last, so that they change no lag that the images determine.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import replace
 from typing import Literal
 
@@ -24,7 +24,7 @@ from hub.clocks.external_prior import MAX_CAMERA_DELAY_S, ExternalClockPrior
 from hub.sync.common_clock import solve_common_clock_pair
 from hub.sync.hypothesis import PairFit, PairSolution, evidence
 from hub.sync.pair_ranking import ranking_score
-from hub.sync.pair_solver import solve_pair
+from hub.sync.pair_solver import NO_FIT_AT_PREDICTED_LAG, solve_pair
 from hub.sync.settings import PairSettings
 from hub.sync.track_cache import TrackCache
 from hub.trajectory.image_tracks import smooth_only
@@ -43,6 +43,10 @@ _SMALL_NETWORK = 8  # cameras up to which all failed guided searches are repeate
 _MIN_REDUNDANT = 3  # cameras from which on pairs are checked against each other
 _LONG_OVERLAP = 8.0  # s of common motion
 _ENOUGH_PAIRS = 2  # of a new camera with placed ones: the second checks the first
+_FEW_CANDIDATES = 4
+"""Lags that are refined for a camera that resection can still find: a right lag is among the first, as a rule, and a
+camera that is broken costs a search of all 18 of them."""
+_MIN_CONTRADICTIONS = 2  # pairs that refute the only other pair of a camera
 _MAX_PRIOR_WINDOW = 0.5  # s on either side: a less precise prior selects nothing
 
 
@@ -68,9 +72,17 @@ def solve_pairs(
     is_large = len(names) > _SMALL_NETWORK and not prepared.shared_clock
     pairs: dict[tuple[str, str], PairSolution] = {}
     unguided: dict[tuple[str, str], PairSolution] = {}
-    synchronised, cache, searched_again = _SynchronisedGroups(), TrackCache(), set[str]()
+    synchronised, cache = _SynchronisedGroups(), TrackCache()
     is_ranked = len(todo) > 1 and not prepared.shared_clock
-    for done, (a, b) in enumerate(_ranked(prepared, todo, report, cache) if is_ranked else todo):
+    queue = deque(_ranked(prepared, todo, report, cache) if is_ranked else todo)
+    postponed = set[tuple[str, str]]()
+    while queue:
+        a, b = queue.popleft()
+        if thorough == "first pair" and (a, b) not in postponed and synchronised.has_failed(a, b, pairs.values()):
+            postponed.add((a, b))  # until the others are connected, whose path may spare the search
+            queue.append((a, b))
+            continue
+        done = len(pairs)
         report(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
         if arrivals and len(names) > LARGE_NETWORK and synchronised.has_enough(a, b):
             pairs[a, b] = PairSolution(a, b, "not searched: both cameras are in enough solved pairs")
@@ -86,14 +98,15 @@ def solve_pairs(
         if thorough == "first pair" and predicted_lag is None and synchronised.leaves(a, b, pairs.values()):
             pairs[a, b] = PairSolution(a, b, "not searched: the most promising pair of the same camera had failed")
             continue
-        solution = _solve(prepared, (a, b), known, predicted_lag=predicted_lag, cache=cache)
+        # Resection against the path of three cameras finds what a short search does not.
+        spared = thorough == "first pair" and {a, b} <= prepared.cameras.keys()
+        spared &= max(synchronised.size(a), synchronised.size(b)) >= _MIN_REDUNDANT
+        brief = PairSettings(max_candidates=_FEW_CANDIDATES) if spared else None
+        solution = _solve(prepared, (a, b), known, predicted_lag=predicted_lag, settings=brief, cache=cache)
         # If the predicted lag is right, a pair with a long overlap must agree with it; else it is solved over all lags.
         again = predicted_lag is not None and not solution.solved and (not is_large or _has_long_overlap(solution))
-        if again and thorough == "first pair" and synchronised.size(a) > _MIN_REDUNDANT:
-            again = not {a, b} & searched_again  # resection corrects a camera that a wrong pair has connected
-            searched_again |= {a, b}
-        if again:
-            solution, predicted_lag = _solve(prepared, (a, b), known, cache=cache), None
+        if again and not (spared and synchronised.size(a) > _MIN_REDUNDANT):
+            solution, predicted_lag = _solve(prepared, (a, b), known, settings=brief, cache=cache), None
         if predicted_lag is None:
             unguided[a, b] = solution
         if clock_priors and not solution.solved and not prepared.shared_clock:
@@ -102,6 +115,8 @@ def solve_pairs(
         pairs[a, b] = solution
         synchronised.add(solution)
     pairs = {both: pairs[both] for both in todo}  # in the rig's order
+    if thorough == "first pair" and not prepared.shared_clock:
+        _leave_to_resection(pairs, prepared.cameras)
     if len(names) >= _MIN_REDUNDANT and not prepared.shared_clock and known is None:
         for both in _isolated_pairs(pairs):
             if unguided.get(both) is not pairs[both]:
@@ -139,6 +154,24 @@ def solve_new_pairs(
             if solved >= _ENOUGH_PAIRS:
                 break
     return prepared, out
+
+
+def _leave_to_resection(pairs: dict[tuple[str, str], PairSolution], calibrated: Container[str]) -> None:
+    """Undo the only solved pair of a calibrated camera, next to three others, that its other pairs refute; in place."""
+    solved = Counter(name for both, solution in pairs.items() if solution.solved for name in both)
+    refuted = Counter(
+        name
+        for both, solution in pairs.items()
+        if solution.status == NO_FIT_AT_PREDICTED_LAG or (not solution.solved and _has_long_overlap(solution))
+        for name in both
+    )
+    for (a, b), pair in pairs.items():
+        for name, other in ((a, b), (b, a)):
+            contradicted = refuted[name] >= max(_MIN_CONTRADICTIONS, solved[name] + 1)
+            alone = name in calibrated and solved[name] == 1 and solved[other] >= _MIN_REDUNDANT
+            if pair.solved and alone and contradicted:
+                text = f"its lag contradicts {refuted[name]} other pairs of {name}"
+                pairs[a, b] = replace(pair, status=text)
 
 
 def _isolated_pairs(pairs: Mapping[tuple[str, str], PairSolution]) -> list[tuple[str, str]]:
@@ -240,8 +273,8 @@ class _SynchronisedGroups:
                 self._maps[name] = (group_a, rate * r, rate * o + offset)
 
     def size(self, name: str) -> int:
-        """Number of cameras in the group of a camera."""
-        group = self._maps[name][0]
+        """Number of cameras in the group of a camera; 0 where it is connected to none."""
+        group = self._maps.get(name, ("", 1.0, 0.0))[0]
         return sum(other == group for other, _, _ in self._maps.values())
 
     def leaves(self, a: str, b: str, pairs: Iterable[PairSolution]) -> bool:
@@ -255,6 +288,14 @@ class _SynchronisedGroups:
             if any(self._maps.get(other, ("", 1.0, 0.0))[0] == group for other in tried):
                 return True
         return False
+
+    def has_failed(self, a: str, b: str, pairs: Iterable[PairSolution]) -> bool:
+        """Whether one of two cameras is connected to none, and a pair of it with a connected one has failed."""
+        tried = [(pair.a, pair.b) for pair in pairs]
+        return any(
+            new not in self._maps and any(new in both and any(one in self._maps for one in both) for both in tried)
+            for new in (a, b)
+        )
 
     def lag(self, prepared: PreparedSession, a: str, b: str) -> float | None:
         """``t_a - t_b`` [s] in the middle of the common recording time; None if they are not connected."""

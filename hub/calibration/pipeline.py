@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from hub.baselines.session_lags import solve_pair_by_paper
 from hub.bundle import covariance as cov
 from hub.bundle import model_comparison
 from hub.bundle.adjustment import adjust, estimate_noise, residual_norms
@@ -20,19 +19,18 @@ from hub.bundle.correlated_noise import MIN_INFLATION, refit_with_correlated_noi
 from hub.bundle.initialisation import (
     Reconstruction,
     inlier_share,
+    place_cameras,
     reconstruct_incrementally,
     reconstruct_with_known_poses,
 )
 from hub.bundle.noise_scale import correlation_inflation
 from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
-from hub.bundle.problem import AdjustmentState, FreeParameters, Problem
+from hub.bundle.problem import AdjustmentState, CameraState, FreeParameters, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.bundle.timestamp_jitter import estimate_frame_times
 from hub.calibration.given_values import refuted_lens
 from hub.calibration.pair_network import Progress, coincide, describe_timing, frame_rate_warnings, solve_pairs
 from hub.calibration.result import assemble_calibration, focal_stds, isolated_pair_report
-from hub.calibration.rigid_body.solve import calibrate_bodies
-from hub.calibration.rigid_body.views import body_labels
 from hub.calibration.self_calibration import MAX_FOCAL_STD, initial_self_calibration, with_updated_lenses
 from hub.calibration.solution import Solution
 from hub.calibration.unconnected import connect_by_resection
@@ -95,7 +93,9 @@ def calibrate(
     report = progress or (lambda text, share: None)
     if known is not None:
         rig = with_known_intrinsics(rig, known)
-    if rig.bodies and solver == "joint" and not online and body_labels(observations, rig.bodies):
+    if rig.bodies and solver == "joint" and not online and _has_bodies(rig, observations):
+        from hub.calibration.rigid_body.solve import calibrate_bodies
+
         try:
             return calibrate_bodies(rig, observations, report, known)
         except Refused:
@@ -151,6 +151,13 @@ def calibrate(
         raise
 
 
+def _has_bodies(rig: Rig, observations: Observations) -> bool:
+    """Whether observations are of the points of a rigid body."""
+    from hub.calibration.rigid_body.views import body_labels
+
+    return bool(body_labels(observations, rig.bodies))
+
+
 def _diagonals(rig: Rig) -> tuple[tuple[str, str, float], ...]:
     """The diagonals of single tags as scale bars, where their size is known."""
     if not rig.bodies_metric:
@@ -177,6 +184,8 @@ def with_known_intrinsics(rig: Rig, known: FixedCalibration) -> Rig:
 
 def paper_pairs(prepared: PreparedSession, observations: Observations, report: Progress) -> list[PairSolution]:
     """All pairs by the asynchronous calibration paper's method. Raises Refused for a shared clock (no lags)."""
+    from hub.baselines.session_lags import solve_pair_by_paper
+
     if prepared.shared_clock:
         raise Refused('the paper\'s method finds lags, and clock = "shared" says there are none', {})
     pairs = []
@@ -276,12 +285,16 @@ def solve_network(
     graph = _largest_component(prepared, list(prepared.cameras), pairs, refused)
     unfit: set[str] = set()
     with_rate_prior = replace(free_parameters, rate_std=_rate_prior_std(graph, free_parameters.rate_std))
+    placed: dict[str, CameraState] = {}
     while True:
         if distributed_solver is not None:
             reconstruction, unplaced = distributed_solver(graph)
         else:
-            reconstruction, unplaced = reconstruct_incrementally(
-                prepared.cameras, graph, prepared.rows, prepared.labels, lambda text: report(text, 0.6), with_rate_prior
+            session = prepared.cameras, graph, prepared.rows, prepared.labels
+            reconstruction, unplaced = (
+                place_cameras(*session, placed, with_rate_prior)
+                if placed.keys() == graph.clocks.keys()
+                else reconstruct_incrementally(*session, lambda text: report(text, 0.6), with_rate_prior)
             )
             reconstruction = final_adjustment(reconstruction, report, online=online, refine_lenses=refine_lenses)
             # The narrow rate prior only stabilises the estimate; stds are computed with the usual one.
@@ -292,7 +305,8 @@ def solve_network(
         # A wrong lens of an uncalibrated camera may be the cause of all the others' misfit: it goes first.
         inconsistent = [name for name in inconsistent if prepared.cameras[name].lens_prior is not None] or inconsistent
         if inconsistent:
-            # The worst one is removed, and the reconstruction that it may have distorted is repeated without it.
+            # The worst one is removed, and the reconstruction that it may have distorted is adjusted without it; from
+            # the pairs on where more cameras do not fit.
             worst = min(inconsistent, key=lambda name: inlier_share(reconstruction, name)[0])
             share, count = inlier_share(reconstruction, worst)
             refused[worst] = (
@@ -314,6 +328,8 @@ def solve_network(
         remaining = [name for name in reconstruction.names if name != worst]
         if len(remaining) < 2:
             raise Refused(f"no two cameras can be placed ({worst}: {refused[worst]})", refused)
+        states = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
+        placed = {name: states[name] for name in remaining} if len(inconsistent) < 2 and len(remaining) > 2 else {}
         graph = _largest_component(prepared, remaining, list(graph.inlier_pairs), refused)
     unconnected = [name for name in prepared.cameras if name in refused and name not in unfit]
     if thorough and unconnected and not prepared.shared_clock:
@@ -525,22 +541,23 @@ def fits_trajectory(reconstruction: Reconstruction, name: str) -> bool:
 
 def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
     """Problem and state with the rows after clock steps corrected, as far as these explain the observations better."""
+    step = model_comparison.find_clock_step(problem, state)
     for _ in range(_MAX_CLOCK_STEPS):
-        step = model_comparison.find_clock_step(problem, state)
         if step is None:
             break
-        middle = state.cameras[step.camera].centre
-        trial, trial_state, _ = adjust(model_comparison.with_clock_step(problem, step, middle), state, rounds=2)
-        for _ in range(_STEP_ITERATIONS):  # the size is of one Gauss-Newton step, which leaves a part of a large one
-            left = model_comparison.find_clock_step(trial, trial_state)
-            if left is None or left.camera != step.camera or abs(left.time - step.time) > _SAME_STEP_S:
+        middle, trial_state = state.cameras[step.camera].centre, state
+        for left in range(_STEP_ITERATIONS, -1, -1):
+            trial, trial_state, _ = adjust(
+                model_comparison.with_clock_step(problem, step, middle), trial_state, rounds=2
+            )
+            more = model_comparison.find_clock_step(trial, trial_state)
+            if more is None or more.camera != step.camera or abs(more.time - step.time) > _SAME_STEP_S or not left:
                 break
-            step = replace(step, size=step.size + left.size)
-            corrected = model_comparison.with_clock_step(problem, step, middle)
-            trial, trial_state, _ = adjust(corrected, trial_state, rounds=2)
+            # The size is of one Gauss-Newton step, which leaves a part of a large one.
+            step = replace(step, size=step.size + more.size)
         if not _bic_prefers(trial, trial_state, problem, state):
             break
-        problem, state = trial, replace(trial_state, clock_steps=(*trial_state.clock_steps, step))
+        problem, state, step = trial, replace(trial_state, clock_steps=(*trial_state.clock_steps, step)), more
     return problem, state
 
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
+from numpy.fft import irfft, rfft
 
 from hub.bundle.initialisation import CameraInput, Reconstruction, seen_by_two
 from hub.bundle.problem import CameraState
 from hub.clocks.clock_graph import TimeMapEstimate
-from hub.sync.lag_scan import grid_tracks
+from hub.sync.lag_scan import fast_length, grid_tracks
 from hub.trajectory.image_tracks import ImageTrack, SmoothTrack
 from protocols.geometry.types import Floats
 
@@ -188,7 +188,7 @@ def _moment_scan(
     products = (homogeneous[:, :, first] * homogeneous[:, :, second]).transpose(2, 0, 1)
     u, v = grid.points[:, :, 0], grid.points[:, :, 1]
     image = grid.weight * np.stack([np.ones_like(u), u, v, u**2 + v**2])
-    length = next_fast_len(world.shape[1] + u.shape[1], real=True)
+    length = fast_length(world.shape[1] + u.shape[1])
     spectra, others = rfft(products, length), np.conj(rfft(image, length))
     sums = np.stack([irfft(np.einsum("plm,lm->pm", spectra, one), length) for one in others])
     lags = np.arange(-(u.shape[1] - 1), world.shape[1])

@@ -18,7 +18,7 @@ from hub.bundle.noise_scale import rescale_noise
 from hub.bundle.preprocessing import PreparedSession
 from hub.bundle.problem import CAMERA_PARAMETERS, CRYSTAL_RATE_STD, FOCAL, READOUT, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
-from hub.calibration.given_values import refuted_lens_warnings
+from hub.calibration.given_values import refuted_lens_warnings, sensitivities
 from hub.calibration.held_gauge import similarity_to_published
 from hub.calibration.pair_network import RATE_TOLERANCE, pair_lag
 from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
@@ -38,6 +38,8 @@ SEEN_WITHIN = 0.2
 _SHORT_GAPS, _MAX_NOMINAL = 0.05, 4.0
 """Quantile of a camera's gaps between rows that stands for consecutive frames, and how much faster than those its
 nominal rate may be: a target seen in every fourth frame at best."""
+_MAX_Z = 2.0
+"""Residuals over the detector's stds, or the reverse, from which these are reported as wrong."""
 _MAX_SAMPLES = 4_000_000
 """Of one path: 4.6 hours at 240 Hz."""
 
@@ -84,9 +86,9 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
     else:
         gauge = identity_gauge(len(names), solution.known.scale)
     prior = estimate_smoothness(problem, state)
-    covariance = cov.covariance(
-        problem, rescale_noise(problem, state, prior), prior, gauge.information, datum_points, gauge.exact
-    )
+    scaled = rescale_noise(problem, state, prior)
+    covariance = cov.covariance(problem, scaled, prior, gauge.information, datum_points, gauge.exact)
+    effects = sensitivities(rig, names, problem, scaled, prior, covariance)
     lens_stds = focal_stds(problem, state, covariance)
     readout_stds = np.sqrt(np.maximum(np.diag(covariance.cameras)[READOUT::CAMERA_PARAMETERS], 0.0))
     time_origins = [solution.prepared.time_origins[name] for name in names]
@@ -115,6 +117,7 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
             if solution.known is None
             else solution.known.cameras[name].position_std,
             rms_px=_rms(problem, state, i),
+            detector_z=_detector_z(solution.prepared, name, float(state.sigma[i])),
             focal_std=float(lens_stds[i]),
             readout=_readout(rig, name, state.cameras[i].readout / time_scales[i]),
             readout_std=float(readout_stds[i]) / time_scales[i],
@@ -123,6 +126,7 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
             clock_rate_std=cov.clock_rate_std(covariance, state, i, reference)
             if problem.free_parameters.clock
             else 0.0,
+            sensitivities=effects[i],
             clock_steps=tuple(
                 (step.time / time_scales[i] + time_origins[i], step.size / time_scales[i], step.std / time_scales[i])
                 for step in state.clock_steps
@@ -165,7 +169,8 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         + _other_frame_rates(rig, cameras, names[reference])
         + _estimated_readouts(cameras)
         + _estimated_jitter(names, state, time_scales)
-        + _clock_step_warnings(cameras),
+        + _clock_step_warnings(cameras)
+        + _wrong_detector_stds(cameras),
         residuals={
             name: _residual_rows(problem, state, i, time_origins[i], time_scales[i]) for i, name in enumerate(names)
         },
@@ -310,6 +315,22 @@ def _clock_step_warnings(cameras: dict[str, CameraCalibration]) -> tuple[str, ..
         f"{'before' if time > camera.lag_time else 'after'} the step, and the rows on the other side were corrected"
         for name, camera in cameras.items()
         for time, size, std in camera.clock_steps
+    )
+
+
+def _detector_z(prepared: PreparedSession, name: str, sigma: float) -> float:
+    """Noise of a camera's residuals [px] over the median std that its detector states; 0 where it states none."""
+    stated = prepared.camera(name).stated_std
+    return sigma / stated if stated > 0.0 else 0.0
+
+
+def _wrong_detector_stds(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
+    """One sentence for each camera whose residuals are not what its detector's covariances say."""
+    return tuple(
+        f"{name}: its residuals are {camera.detector_z:.2g} times the stds that its detector states (z-scores); only "
+        "the ratios of its covariances were used, as weights"
+        for name, camera in cameras.items()
+        if camera.detector_z > 0.0 and not 1.0 / _MAX_Z < camera.detector_z < _MAX_Z
     )
 
 

@@ -170,7 +170,7 @@ def with_lens(prepared: PreparedSession, name: str, lens: Intrinsics, prior: Len
         smooth = _smooth(part, lens)
         if smooth is not None:
             tracks[label] = smooth
-    return CameraInput(name, lens, tracks, prior)
+    return CameraInput(name, lens, tracks, prior, stated_std=camera.stated_std)
 
 
 def _smooth(part: TrackObservations, lens: Intrinsics) -> SmoothTrack | None:

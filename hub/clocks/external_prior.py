@@ -13,11 +13,14 @@ import math
 import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.core.ranges import MAX_TIME_S
-from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration
+
+if TYPE_CHECKING:
+    from protocols.messages import syncline_pb2 as pb
 
 MAX_CAMERA_DELAY_S = 0.1
 """Largest delay from exposure to time stamp [s], unknown to time services: frames stamped on arrival are late."""
@@ -44,6 +47,8 @@ class ExternalClockPriors:
 
     def handle(self, message: pb.Observation | pb.AgentStatus) -> None:
         """Add a camera agent's status (its prior), or an observation (its time)."""
+        from protocols.messages import syncline_pb2 as pb  # sessions from files need no protobuf
+
         if isinstance(message, pb.Observation):
             self._now[message.camera] = message.device_time_ns / NANOSECONDS
             return

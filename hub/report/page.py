@@ -80,6 +80,12 @@ def _calibration_page(
         _assessment_section(assessment, _key_figures(calibration, rig, observations, used)),
         section("Cameras", "", tables.cameras(calibration, used)),
         section(
+            "What errors of given values would do",
+            "The answer follows the given references and lenses. A larger error than these cannot always be seen in "
+            "the observations; its effect grows in proportion.",
+            tables.sensitivities(calibration),
+        ),
+        section(
             "Refused cameras",
             "These have no table in calibration.toml; the other cameras are not affected.",
             tables.refused(calibration.refused, counts) if calibration.refused else "",

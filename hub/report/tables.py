@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-from importlib import metadata
 
 import numpy as np
 
@@ -67,6 +66,27 @@ def cameras(calibration: Calibration, used: dict[str, RowUsage]) -> str:
             ]
         )
     return table(head, rows, numeric=1, kind="cameras")
+
+
+def sensitivities(calibration: Calibration) -> str:
+    """One row for each given value: what an error of one std of it would do to the answer; "" without any."""
+    unit = calibration.units if calibration.scale == "metric" else "baselines"
+    rows = []
+    for name, camera in calibration.cameras.items():
+        for one in camera.sensitivities:
+            error = {"lens": f"{100 * one.std:.2g} % of focal length", "rotation": f"{one.std:.2g} rad"}
+            moves = f"{short(one.position, figures=2)} {esc(unit)} ({esc(one.camera)})"
+            rows.append(
+                [
+                    f"<b>{esc(name)}</b>",
+                    one.given,
+                    error.get(one.given, f"{one.std:.2g} {esc(unit)}"),
+                    moves,
+                    short(1e3 * one.lag, figures=2),
+                ]
+            )
+    head = ["Camera", "Given", "Error of one std", "Moves a camera by up to", "Moves a lag by up to <small>ms</small>"]
+    return table(head, rows, numeric=3) if rows else ""
 
 
 def _position(position: Floats, std: Floats) -> str:
@@ -140,6 +160,8 @@ def _capital(text: str) -> str:
 
 def provenance(facts: dict[str, str], rig: Rig, command: str) -> str:
     """Provenance: command, input, versions."""
+    from importlib import metadata  # 15 ms, most of it the standard library's e-mail parser
+
     versions = [f"Python {platform.python_version()}"]
     for name in _LIBRARIES:
         try:

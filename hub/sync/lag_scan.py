@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.fft import irfft, rfft
 from numpy.typing import NDArray
-from scipy.fft import irfft, next_fast_len, rfft
 
 from hub.sync.settings import PairSettings
 from hub.trajectory.image_tracks import SmoothTrack
@@ -113,6 +113,14 @@ class LagScan:
     cost: Floats
 
 
+def fast_length(least: int) -> int:
+    """The smallest length of 2, 3 and 5 as factors, no less than ``least``: for the FFT of real numbers."""
+    found = 1 << (least - 1).bit_length()
+    odd = [3**i * 5**j for i in range(21) for j in range(15) if 3**i * 5**j < found]
+    lengths: list[int] = [part << (-(-least // part) - 1).bit_length() for part in odd]
+    return min([found, *lengths])
+
+
 class PairMoments:
     """Moment matrices of two grid tracks at any lag, from 36 cross-correlations of monomials.
 
@@ -123,7 +131,7 @@ class PairMoments:
     def __init__(self, a: GridTrack, b: GridTrack) -> None:
         self.a, self.b = a, b
         n_a, n_b = a.weight.shape[1], b.weight.shape[1]
-        self._length = next_fast_len(n_a + n_b, real=True)
+        self._length = fast_length(n_a + n_b)
         self.lags: Ints = np.arange(-(n_a - 1), n_b, dtype=np.int64)
         self.offset: Floats = np.asarray(a.begin - b.begin - self.lags * a.step, dtype=np.float64)
         self._weight = self._correlation(np.conj(rfft(a.weight, self._length)), rfft(b.weight, self._length))
@@ -140,7 +148,7 @@ class PairMoments:
         product = of_a[0] * of_b[0]
         for k in range(1, len(of_a)):
             product += of_a[k] * of_b[k]
-        return np.asarray(irfft(product, self._length, overwrite_x=True), dtype=np.float64)
+        return np.asarray(irfft(product, self._length), dtype=np.float64)
 
     def within(self, offset: float, window: float) -> Bools:
         """Lags (n,) within ``window`` of ``offset`` [s]."""

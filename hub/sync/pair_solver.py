@@ -49,7 +49,11 @@ _MIN_SAMPLES = 12
 _NOISE_COST = 0.8  # mean robust cost at which a fit is at the noise: it is about 0.75 with the noise of the settings
 _PREDICTED_LAG_CANDIDATES = 3
 _NO_FIT = "no alignment of the two tracks agrees with any geometry"
-_NO_FIT_AT_PREDICTED_LAG = "no geometry agrees at the lag that the other cameras imply; other lags were not searched"
+_HARDLY_MOVES = "the point hardly moves while both could have seen it"
+_HARDLY_MOVES_AT_PREDICTED_LAG = (
+    "the point hardly moves at the lag that the other cameras imply; other lags were not searched"
+)
+NO_FIT_AT_PREDICTED_LAG = "no geometry agrees at the lag that the other cameras imply; other lags were not searched"
 _MAX_STARTS = 4
 _FIVE_POINT_SEEDS = 8  # random seeds of five-point hypotheses; more than _MAX_STARTS hypotheses are tried only …
 _PROMISING = 12.0  # … while the cost is at most this many times the noise: a local minimum of E at the right lag
@@ -188,11 +192,11 @@ class _PairSearch:
         grid_b = self.cache.grid(b, self.step, s.sigma_px) if rate == 1.0 else grid_tracks(b, self.step, s.sigma_px)
         moments = PairMoments(grid_a, grid_b)
         if float(moments.support.max(initial=0.0)) < s.min_scan_support:
-            return PairSolution(*names, "the point hardly moves while both could have seen it")
+            return PairSolution(*names, _HARDLY_MOVES)
         if lag_window is not None:
             near = moments.support[moments.within(*lag_window)]
             if float(near.max(initial=0.0)) < s.min_scan_support:
-                return PairSolution(*names, _NO_FIT_AT_PREDICTED_LAG)
+                return PairSolution(*names, _HARDLY_MOVES_AT_PREDICTED_LAG)
         known_fundamental = None if self.known_pose is None else self.known_pose.essential.T
         scan = scan_lags(moments, s.min_scan_support, known_fundamental, lag_window)
         null_distributions = _NullDistributions(moments, scan, known_fundamental, self.bandwidth)
@@ -217,7 +221,7 @@ class _PairSearch:
             if is_reliable(fit, s) and (reliable is None or evidence(fit) > reliable[0]):
                 reliable = (evidence(fit), cost)
         if not fits:
-            return PairSolution(*names, _NO_FIT if lag_window is None else _NO_FIT_AT_PREDICTED_LAG)
+            return PairSolution(*names, _NO_FIT if lag_window is None else NO_FIT_AT_PREDICTED_LAG)
         solution = self._accept(names, fits, b, None if lag_window is not None else scan)
         if solution.solved and solution.fit is not None and lag_window is None:
             again = [

@@ -35,6 +35,22 @@ _REPLACED_METADATA = (
 """Metadata keys of rig.toml that the result replaces."""
 
 
+@dataclass(frozen=True, slots=True)
+class Sensitivity:
+    """What an error of one std of a given value would do to the answer, at the solution (linear).
+
+    given: "position", "rotation" or "lens". std: that error: of the worst axis [rig units, rad], or relative of the
+    focal length. position: the largest displacement of a camera's centre [rig units], that of ``camera``. lag: the
+    largest change of a lag [s].
+    """
+
+    given: str
+    std: float
+    position: float
+    camera: str
+    lag: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCalibration:
     """One calibrated camera.
@@ -45,7 +61,8 @@ class CameraCalibration:
     [rig units]. rms_px: root mean square reprojection error. focal_std: relative std of a focal length estimated by
     self-calibration; 0 = the lens was given. readout: seconds from the image's first row to its last; 0 = not known.
     readout_std: its std where it was estimated, else 0. clock_steps: camera time, size and std [s] of each step of its
-    clock; the map holds on the side of ``lag_time``.
+    clock; the map holds on the side of ``lag_time``. sensitivities: to the references and the lens given for it.
+    detector_z: robust rms of its residuals over the stds that its detector states; 0 = it states none.
     """
 
     name: str
@@ -62,6 +79,8 @@ class CameraCalibration:
     lag_std: float = 0.0
     clock_rate_std: float = 0.0
     clock_steps: tuple[tuple[float, float, float], ...] = ()
+    sensitivities: tuple[Sensitivity, ...] = ()
+    detector_z: float = 0.0
 
     @property
     def lag(self) -> float:
@@ -194,7 +213,8 @@ def trajectory_text(calibration: Calibration) -> str:
     lines = ["time,x,y,z,std,label" if several else "time,x,y,z,std"]
     for table in calibration.trajectories:
         tail = f",{csv_cell(table.label)}" if several else ""
-        for t, (x, y, z), std in zip(table.time, table.position, table.std, strict=True):
+        rows = zip(table.time.tolist(), table.position.tolist(), table.std.tolist(), strict=True)
+        for t, (x, y, z), std in rows:  # Python's own floats are written three times as fast as numpy's
             lines.append(f"{t:.17g},{x:.17g},{y:.17g},{z:.17g},{std:.17g}{tail}")
     return "\n".join(lines) + "\n"
 

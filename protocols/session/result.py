@@ -22,10 +22,11 @@ TRAJECTORY_FILE = "trajectory.csv"
 def result_document(calibration: Calibration, rig: Rig, *, command: str = "") -> dict[str, Any]:
     """The content of result.json of a solved session; keys always come in the same order.
 
-    Lengths are in the rig's units, times in seconds. ``cameras`` holds calibration.toml's tables plus
-    position (camera centre in the world), lag_s (reference time less camera time) and lag_std_s at camera time
-    lag_time_s, clock_rate_ppm with its std, and rows_used; ``trajectory`` summarises trajectory.csv. A missing
-    or non-finite value is None.
+    Lengths are in the rig's units, times in seconds. ``cameras`` holds calibration.toml's tables plus position (camera
+    centre in the world), lag_s (reference time less camera time) and lag_std_s at camera time lag_time_s,
+    clock_rate_ppm with its std, clock_steps, sensitivity (what one std of a given position, rotation or lens would do:
+    largest displacement of a camera, largest change of a lag), detector_z (rms of residuals over the detector's stds)
+    and rows_used; ``trajectory`` summarises trajectory.csv. A missing or non-finite value is None.
     """
     tables = calibration_tables(calibration, rig)
     metadata = tables.pop("metadata")
@@ -41,6 +42,11 @@ def result_document(calibration: Calibration, rig: Rig, *, command: str = "") ->
         tables[name]["clock_steps"] = [
             {"time_s": time, "size_s": size, "size_std_s": std} for time, size, std in camera.clock_steps
         ]
+        tables[name]["sensitivity"] = {
+            one.given: {"std": one.std, "position": one.position, "of_camera": one.camera, "lag_s": one.lag}
+            for one in camera.sensitivities
+        }
+        tables[name]["detector_z"] = camera.detector_z or None
         tables[name]["rows_used"] = None if residuals is None else len(residuals)
     return _document(
         status="solved",

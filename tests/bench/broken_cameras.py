@@ -1,11 +1,12 @@
 """What one broken camera costs a rig, and whether it is named and the others' answer stays.
 
-    python -m tests.bench.broken_cameras [--cameras N] [--seconds S] [--seeds N] [--first SEED]
+    python -m tests.bench.broken_cameras [--cameras N] [--seconds S] [--seeds N] [--first SEED] [--session FOLDER]
 
 Each rig is calibrated without its last camera, with it as it is, and with it broken in one way after the other: rows
 labelled by another frame numbering, rows shuffled, another recording, a mirrored picture, a wrong lens (focal length
 1.3 times too long). CPU seconds are those of `calibrate`; change: the largest change of another camera's position or
 lag, in its stated stds. Requirement: at most twice the CPU without it, named, changes below one std.
+--session: a recorded session instead of simulated ones, each of its cameras broken in turn.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from hub.calibration.pipeline import calibrate
 from protocols.geometry.types import Bools
 from protocols.session.calibration import Calibration
+from protocols.session.folder import read_folder
 from tests.support import rigs
 
 Breakage = Callable[[rigs.Session, str, Bools, np.random.Generator], rigs.Session]
@@ -40,7 +43,11 @@ def shuffled(session: rigs.Session, name: str, mine: Bools, random: np.random.Ge
 
 
 def another_recording(session: rigs.Session, name: str, mine: Bools, random: np.random.Generator) -> rigs.Session:
-    """The camera watched another path."""
+    """The camera watched another path; a recorded one: its own, in reverse."""
+    if not session.paths:
+        pixels = session.pixels.copy()
+        pixels[mine] = pixels[mine][::-1]
+        return replace(session, pixels=pixels)
     other = rigs.random_path(np.random.default_rng([7, int(random.integers(1 << 30))]))
     true = np.array([session.true_time(name, float(t)) for t in session.time[mine]])
     lens = session.rig.cameras[name].intrinsics
@@ -53,7 +60,7 @@ def another_recording(session: rigs.Session, name: str, mine: Bools, random: np.
 def mirrored(session: rigs.Session, name: str, mine: Bools, random: np.random.Generator) -> rigs.Session:
     """The picture is a mirror image."""
     pixels = session.pixels.copy()
-    pixels[mine, 0] = rigs.SIZE[0] - 1 - pixels[mine, 0]
+    pixels[mine, 0] = session.rig.cameras[name].size[0] - 1 - pixels[mine, 0]
     return replace(session, pixels=pixels)
 
 
@@ -74,6 +81,24 @@ BREAKAGES: dict[str, Breakage] = {
     "mirrored": mirrored,
     "wrong lens": wrong_lens,
 }
+
+
+def recorded(folder: Path) -> rigs.Session:
+    """A recorded session, whose truth is unknown."""
+    rig, found = read_folder(folder)
+    tracks = [(name, track) for name in rig.cameras for track in found.of_camera(name)]
+    counts = [len(track.time) for _, track in tracks]
+    return rigs.Session(
+        rig,
+        [name for (name, _), count in zip(tracks, counts, strict=True) for _ in range(count)],
+        [track.label for (_, track), count in zip(tracks, counts, strict=True) for _ in range(count)],
+        np.concatenate([np.arange(count) for count in counts]),
+        np.concatenate([track.time for _, track in tracks]),
+        np.concatenate([track.pixels for _, track in tracks]),
+        {},
+        {},
+        {},
+    )
 
 
 def without(session: rigs.Session, name: str) -> rigs.Session:
@@ -126,11 +151,17 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=40.0)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--session", type=Path)
     options = parser.parse_args()
     ratios, bad = [], []
-    for seed in range(options.first, options.first + options.seeds):
-        session = rigs.simulate(seed, options.cameras, options.seconds)
-        name = list(session.rig.cameras)[-1]
+    if options.session is None:
+        seeds = range(options.first, options.first + options.seeds)
+        tasks = [(seed, rigs.simulate(seed, options.cameras, options.seconds), -1) for seed in seeds]
+    else:
+        real = recorded(options.session)
+        tasks = [(number, real, number) for number in range(len(real.rig.cameras))]
+    for seed, session, number in tasks:
+        name = list(session.rig.cameras)[number]
         mine = np.array([one == name for one in session.camera])
         before, base = timed(without(session, name))
         whole = timed(session)[1]

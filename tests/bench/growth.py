@@ -2,9 +2,10 @@
 
     python -m tests.bench.growth [--quick] [--out docs/pictures/growth.png]
 
-CPU of the adjustment against observations and cameras, of pair timing against the length of the tracks and against the
-number of pairs, of the live hub an observation against cameras, of the UAV tracker against particles, of the marker
-detector against pixels; memory of the adjustment (peak of numpy's and Python's own allocations) and of the live hub.
+CPU of the adjustment against observations and cameras, of the whole calibration against cameras, of pair timing against
+the length of the tracks and against the number of pairs, of the live hub an observation against cameras, of the UAV
+tracker against particles, of the marker detector against pixels; memory of the adjustment (peak of numpy's and Python's
+own allocations) and of the live hub.
 Beside each curve the power of the last half of it (1 = linear).
 """
 
@@ -85,6 +86,20 @@ def adjustment(quick: bool) -> list[Curve]:
         task = make(8, 20.0, count)
         cameras.add(count, _cpu(lambda task=task: ours(task)))  # type: ignore[misc]
     return [rows, memory, cameras]
+
+
+def rig(quick: bool) -> list[Curve]:
+    """The whole of `calibrate` against cameras, over the rows; required: no faster than cameras^1.3."""
+    from hub.calibration.pipeline import calibrate
+    from tests.support import rigs
+
+    curve = Curve("calibrate, 30 s", "cameras", "ms of CPU a row")
+    for count in (4, 8, 16) if quick else (4, 8, 16, 32):
+        session = rigs.simulate(9, count, 30.0, fps=(30.0,), late=2.0)
+        seen = session.observations()
+        spent = _cpu(lambda one=session, seen=seen: calibrate(one.rig, seen, thorough=True), 1)  # type: ignore[misc]
+        curve.add(count, 1e3 * spent / len(session.time))
+    return [curve]
 
 
 def pairs(quick: bool) -> list[Curve]:
@@ -214,7 +229,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     wanted = [name for name in options.only.split(",") if name]
     curves: list[Curve] = []
-    for part in (adjustment, pairs, hub, particles, pixels):
+    for part in (adjustment, rig, pairs, hub, particles, pixels):
         if not wanted or part.__name__ in wanted:
             curves += part(options.quick)
     for curve in curves:

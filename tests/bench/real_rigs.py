@@ -11,6 +11,7 @@ import argparse
 import csv
 import itertools
 import json
+import os
 import resource
 import shutil
 import subprocess
@@ -78,9 +79,9 @@ def run_calibrate(session: Path, observations: str, refine_lenses: bool = False)
     """Run the real command line and read what it wrote."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
-        before, began = _cpu(), time.perf_counter()
+        before, began = cpu_seconds(), time.perf_counter()
         _run_command(session, observations, out, refine_lenses)
-        cpu, wall = _cpu() - before, time.perf_counter() - began
+        cpu, wall = cpu_seconds() - before, time.perf_counter() - began
         _, cameras = read_calibration(out / "calibration.toml")
         times, paths = _read_paths(out / "trajectory.csv")
         tables = json.loads((out / "result.json").read_text(encoding="utf-8"))["cameras"]
@@ -88,7 +89,7 @@ def run_calibrate(session: Path, observations: str, refine_lenses: bool = False)
     return Run(cameras, times, paths, cpu, wall, steps)
 
 
-def _cpu() -> float:
+def cpu_seconds() -> float:
     """Seconds of processor time of this process and of its finished children."""
     both = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(usage.ru_utime + usage.ru_stime for usage in both)
@@ -97,9 +98,11 @@ def _cpu() -> float:
 def _run_command(session: Path, observations: str, out: Path, refine_lenses: bool) -> None:
     arguments = ["calibrate", str(session), "--out", str(out), "--observations", str(session / observations)]
     arguments += ["--refine-lenses"] if refine_lenses else []
+    cached = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     done = subprocess.run(
         [sys.executable, "-c", "from deploy.cli import main; main()", *arguments],
         cwd=REPOSITORY,
+        env=cached,  # as after an installation, where modules are compiled
         capture_output=True,
         text=True,
         check=False,

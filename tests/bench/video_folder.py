@@ -1,7 +1,7 @@
 """From six videos to 3-D: accuracy without measured lenses, and speed.
 
     python -m tests.bench.video_folder [--seconds 60] [--cameras 6] [--size 1920x1080] [--seed 400] [--crf 20]
-                                       [--cache FOLDER]
+                                       [--cache FOLDER] [--folders N]
 
 Renders the scene ``marker`` once into the cache folder: a video a camera at its own, irregular frame times with
 frames lost, two of the cameras with a fisheye. Then ``syncline calibrate FOLDER`` with the true lenses, and with what
@@ -11,6 +11,9 @@ a newcomer has (nothing for pinhole cameras, a data sheet's field of view, round
 ``--crf``: of the encoder. 20 makes 5 to 12 Mbit/s a video, no more than phones write; at 24 the noise no longer
 passes the quantiser and 0.3 Mbit/s are left, less than any camera writes: the ball's place is then wrong by up to
 0.4 px by what is behind it, and lenses take that for their own.
+
+``--folders N``: N small folders instead, of the seeds from --seed on, without lenses only: the stated stds of the focal
+lengths against their errors (z, rms).
 """
 
 from __future__ import annotations
@@ -87,7 +90,7 @@ def render(job: tuple[int, int, tuple[int, int], float, int, int, Path]) -> tupl
 
 
 def prepared(
-    cache: Path, seed: int, cameras: int, size: tuple[int, int], seconds: float, crf: int
+    cache: Path, seed: int, cameras: int, size: tuple[int, int], seconds: float, crf: int, workers: int = 2
 ) -> tuple[Path, dict[str, Floats]]:
     """The folder of videos, rendered if it is not there, and the true times of all frames by camera."""
     folder = cache / f"marker-{seed}-{cameras}x{seconds:g}s-{size[0]}x{size[1]}-crf{crf}"
@@ -97,7 +100,7 @@ def prepared(
         jobs = [(seed, cameras, size, seconds, crf, number, folder / "videos") for number in range(cameras)]
         began = time.perf_counter()
         times = {}
-        with ProcessPoolExecutor(max_workers=2) as pool:
+        with ProcessPoolExecutor(max_workers=workers) as pool:
             for done, (name, shown) in enumerate(pool.map(render, jobs), 1):
                 times[name] = shown
                 say(f"rendered {name}, {done} of {cameras}")
@@ -223,6 +226,31 @@ def line_up(
     return worst[0], worst[1], spent
 
 
+def focal_scores(given: argparse.Namespace, size: tuple[int, int]) -> None:
+    """Errors of focal lengths over their stds, over many folders without lenses; a line a folder, and the rms."""
+    ratios: list[float] = []
+    errors: list[float] = []
+    for seed in range(given.seed, given.seed + given.folders):
+        scene = the_scene(seed, given.cameras, size)
+        folder, times = prepared(given.cache, seed, given.cameras, size, given.seconds, given.crf, workers=1)
+        (folder / "rig.toml").write_text(tomli_w.dumps(rig_tables(scene, False)))
+        try:
+            found = measure(scene, times, folder.parent / "out-no", calibrate(folder, folder.parent / "out-no"))
+        except SystemExit as error:
+            print(f"{seed}: {error}", flush=True)
+            continue
+        ratios += [error / found.focal_std[name] for name, error in found.focal.items()]
+        errors += found.focal.values()
+        stds = found.focal_std
+        texts = (f"{name} {100 * error:+.2f} ± {100 * stds[name]:.2f}" for name, error in found.focal.items())
+        print(f"{seed}: {', '.join(texts)} %; path {found.path_mm:.2f} mm", flush=True)
+    z, percent = np.array(ratios), 100 * np.array(errors)
+    print(
+        f"{len(z)} focal lengths of {given.folders} folders: rms error {np.sqrt(np.mean(percent**2)):.2f} %, rms z "
+        f"{np.sqrt(np.mean(z**2)):.2f} (must 0.8 to 1.25), worst {np.abs(z).max():.1f}"
+    )
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=60.0)
@@ -232,8 +260,12 @@ def main() -> int:
     parser.add_argument("--crf", type=int, default=20)
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "syncline-video-folder")
     parser.add_argument("--render-only", action="store_true")
+    parser.add_argument("--folders", type=int, default=0)
     given = parser.parse_args()
     width, height = (int(part) for part in given.size.split("x"))
+    if given.folders:
+        focal_scores(given, (width, height))
+        return 0
     scene = the_scene(given.seed, given.cameras, (width, height))
     folder, times = prepared(given.cache, given.seed, given.cameras, (width, height), given.seconds, given.crf)
     if given.render_only:

@@ -23,8 +23,19 @@ def test_calibrate_imports_no_slow_module() -> None:
         "hub.distributed.network.node",
         "rich",
         "plotly",
+        "google.protobuf",
+        "hub.calibration.rigid_body.solve",
+        "scipy.fft",
     ):
         assert slow not in modules
+
+
+def test_commands_do_not_load_what_scipy_imports_in_vain() -> None:
+    code = "import sys, deploy.cli, scipy.linalg, numpy; print(*sys.modules); print(numpy.ma.array([1]).sum())"
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    modules, one = process.stdout.splitlines()
+    assert not {"numpy.f2py.crackfortran", "numpy.testing._private.utils", "numpy.ma.core"} & set(modules.split())
+    assert one == "1"  # what is used is loaded then
 
 
 @pytest.mark.parametrize("package", ["protocols", "edge", "hub", "deploy"])

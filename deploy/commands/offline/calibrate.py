@@ -14,6 +14,7 @@ from deploy.commands.common import Flag, Json, Scheduler
 from deploy.offline.progress import progress_bar
 from protocols.core.errors import EXIT_DONE, InputError, Refused
 from protocols.core.files import check_folder
+from protocols.core.lazy import defer_modules
 from protocols.log.read.session import load_session
 from protocols.session.session import Session
 
@@ -91,6 +92,7 @@ def calibrate(
     read = _with_scale(read, height, limb)
     command = shlex.join(["syncline", *sys.argv[1:]])
     retain_freed_memory()
+    defer_modules("numpy", ("f2py", "testing", "ma", "polynomial", "ctypeslib"))  # scipy imports them, we do not
     from deploy.offline.outputs import report_refusal, report_result
 
     try:
@@ -139,6 +141,8 @@ def _load(
 
 def _with_scale(read: Session, height: float | None, limb: str | None) -> Session:
     """The session with scale bars of a person's height, or of one limb. Raises InputError."""
+    if height is None and limb is None:
+        return read
     from protocols.formats.keypoints import limbs_of_height
 
     labels, bars = read.observations.labels, list(read.rig.scale_bars)

@@ -36,6 +36,9 @@ _REFUTED_PROBABILITY = 1e-3
 """Probability that a reference of a correct survey is refuted: what its own error leaves of five stds is about four."""
 _ALIKE_SHARE = 0.8
 """Share of the largest chi-squared from which another camera's error explains the contradiction alike."""
+_ALIKE_FACTOR = 100.0
+"""Likelihood ratio of two explanations up to which they are alike. Of 8-sigma errors on four cameras the share alone
+named a wrong camera in one case of six, at a ratio of 80."""
 _EXHAUSTIVE_LIMIT = 10
 """Control points up to which all pairs are tried; with more, the search is greedy: the worst, then the next worst."""
 
@@ -208,7 +211,8 @@ def reject_refuted(rig: Rig, names: list[str], poses: list[Pose], network: Float
         if not over:
             break
         worst = over[0]
-        alike = [names[i] for i in over if tests[i][0] > _ALIKE_SHARE * tests[worst][0]]
+        decided = min(_ALIKE_SHARE * tests[worst][0], tests[worst][0] - 2.0 * np.log(_ALIKE_FACTOR))
+        alike = [names[i] for i in over if tests[i][0] > decided]
         if len(alike) > 1:
             warnings.append(
                 f"the reference of one of {', '.join(alike)} is wrong, and which one cannot be decided "

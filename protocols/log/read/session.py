@@ -5,13 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from protocols.core.errors import InputError, Refused
-from protocols.log.read.reader import LogReader
-from protocols.session.builder import SessionBuilder
 from protocols.session.folder import read_folder
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 from protocols.session.session import Session
-from protocols.topics import CAMERA_INFO, OBSERVATION, RIG_INFO
 
 
 def load_session(path: str | Path, observations: str | Path | None = None) -> Session:
@@ -37,6 +34,10 @@ def is_log(path: Path) -> bool:
 
 def session_from_log(file: Path) -> tuple[Rig, Observations, tuple[str, ...]]:
     """The rig and the observations of a log, and warnings (a damaged end). Raises InputError, Refused."""
+    from protocols.log.read.reader import LogReader  # a session folder needs neither MCAP nor protobuf
+    from protocols.session.builder import SessionBuilder
+    from protocols.topics import CAMERA_INFO, OBSERVATION, RIG_INFO
+
     builder = SessionBuilder()
     reader = LogReader(file)
     for logged in reader.messages([OBSERVATION, CAMERA_INFO, RIG_INFO]):

@@ -207,3 +207,80 @@ def test_detectors_covariances_weigh_the_rows() -> None:
         ratios.append([session.turn_error({n: c.pose for n, c in one.cameras.items()}) for one in found])
     plain_error, weighed_error = np.sqrt(np.mean(np.square(ratios), axis=0))
     assert weighed_error < 0.75 * plain_error
+
+
+def test_the_stated_effect_of_an_error_of_a_given_value_is_what_happens() -> None:
+    session = rigs.simulate(1, 4, 20.0)
+    cameras = {
+        name: replace(camera, position=session.poses[name].position, position_std=np.full(3, 0.02))
+        for name, camera in session.rig.cameras.items()
+    }
+    found = calibrate(replace(session.rig, cameras=cameras), session.observations())
+    stated = {one.given: one for one in found.cameras["cam1"].sensitivities}
+    document = result_document(found, session.rig)["cameras"]["cam1"]["sensitivity"]
+    assert document["position"] == {
+        "std": 0.02,
+        "position": stated["position"].position,
+        "of_camera": stated["position"].camera,
+        "lag_s": stated["position"].lag,
+    }
+
+    def moved(changed: RigCamera) -> float:
+        again = calibrate(replace(session.rig, cameras=cameras | {"cam1": changed}), session.observations())
+        return max(
+            float(np.linalg.norm(again.cameras[name].pose.position - camera.pose.position))
+            for name, camera in found.cameras.items()
+        )
+
+    camera = cameras["cam1"]
+    assert camera.position is not None
+    assert camera.intrinsics is not None
+    each = [moved(replace(camera, position=camera.position + 0.02 * axis)) for axis in np.eye(3)]
+    assert max(each) == pytest.approx(stated["position"].position, rel=0.05)
+    matrix = camera.intrinsics.matrix.copy()
+    matrix[:2, :2] *= 1.01
+    lens = replace(camera, intrinsics=replace(camera.intrinsics, matrix=matrix))
+    assert moved(lens) == pytest.approx(stated["lens"].position, rel=0.05)
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.25])
+def test_the_stds_that_a_detector_states_are_checked_against_its_residuals(factor: float) -> None:
+    session = rigs.simulate(2, 3, 20.0, noise=0.5)
+    rows = gather_tracks(
+        session.camera,
+        session.label,
+        session.frame,
+        session.time,
+        session.pixels,
+        np.full(len(session.time), np.nan),
+        stds=np.where(of(session, "cam1"), factor * 0.5, np.nan),
+        order=session.rig.cameras,
+    )
+    found = calibrate(session.rig, rows)
+    document = result_document(found, session.rig)["cameras"]
+    assert found.cameras["cam1"].detector_z == pytest.approx(1.0 / factor, rel=0.1)
+    assert document["cam1"]["detector_z"] == found.cameras["cam1"].detector_z
+    assert document["cam0"]["detector_z"] is None
+    warned = [text.split(":")[0] for text in found.warnings if "z-scores" in text]
+    assert warned == ([] if factor == 1.0 else ["cam1"])
+
+
+def test_of_two_references_that_explain_a_contradiction_alike_neither_is_blamed() -> None:
+    """The reference of cam1 is 8 std off; noise makes cam2's the likelier of the two, by a factor of 80."""
+    session, rng = rigs.simulate(3, 4, 20.0), np.random.default_rng(3)
+    cameras = {
+        name: replace(
+            camera,
+            position=session.poses[name].position + 0.02 * rng.standard_normal(3),
+            position_std=np.full(3, 0.02),
+        )
+        for name, camera in session.rig.cameras.items()
+    }
+    off = rng.standard_normal(3)
+    wrong = cameras["cam1"]
+    assert wrong.position is not None
+    cameras["cam1"] = replace(wrong, position=wrong.position + 0.16 * off / np.linalg.norm(off))
+    found = calibrate(replace(session.rig, cameras=cameras), session.observations())
+    (warning,) = [text for text in found.warnings if "reference" in text]
+    assert "cannot be decided" in warning
+    assert "cam1" in warning.split(" is wrong")[0]

@@ -10,10 +10,10 @@ import pytest
 
 import hub.calibration.pair_network
 from hub.bundle.preprocessing import PreparedSession, prepare
-from hub.calibration.pair_network import _SynchronisedGroups, solve_pairs
+from hub.calibration.pair_network import _leave_to_resection, _SynchronisedGroups, solve_pairs
 from hub.sync.hypothesis import PairSolution
 from hub.sync.pair_ranking import ranking_score
-from hub.sync.pair_solver import _PairSearch, solve_pair
+from hub.sync.pair_solver import NO_FIT_AT_PREDICTED_LAG, _PairSearch, solve_pair
 from hub.sync.track_cache import TrackCache
 from hub.trajectory.image_tracks import smooth_only
 from tests.support.rigs import Session, simulate
@@ -122,3 +122,38 @@ def test_no_scan_is_made_near_a_lag_without_overlap(monkeypatch: pytest.MonkeyPa
     solution = solve_pair(tracks[0], tracks[1], ("cam0", "cam1"), predicted_lag=100.0)
     assert not solution.solved
     assert "other lags were not searched" in solution.status
+
+
+def test_the_only_pair_of_a_camera_that_its_other_pairs_refute_is_left_to_resection() -> None:
+    def network(refuting: int, calibrated: set[str]) -> str:
+        names = ["a", "b", "c", "d"]
+        pairs = {both: PairSolution(*both, "ok") for both in itertools.combinations(names, 2)}
+        pairs |= {(name, "x"): PairSolution(name, "x", NO_FIT_AT_PREDICTED_LAG) for name in names[:refuting]}
+        pairs["d", "x"] = PairSolution("d", "x", "ok")
+        _leave_to_resection(pairs, calibrated)
+        assert all(pair.solved for (_, one), pair in pairs.items() if one != "x")
+        return pairs["d", "x"].status
+
+    assert network(2, {"x"}) == "its lag contradicts 2 other pairs of x"
+    assert network(1, {"x"}) == "ok"
+    assert network(3, set()) == "ok"  # resection finds no camera without a lens
+
+
+def test_a_camera_whose_search_has_failed_waits_until_a_path_may_spare_it_the_next(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    session = simulate(3, 4, 20.0)
+    mine = np.array([name == "cam1" for name in session.camera])
+    pixels = session.pixels.copy()
+    pixels[mine] = pixels[np.random.default_rng(0).permutation(np.flatnonzero(mine))]
+    prepared = prepared_of(Session(**{**_fields(session), "pixels": pixels}))
+    order = [("cam0", "cam2"), ("cam0", "cam1"), ("cam1", "cam2"), ("cam1", "cam3"), ("cam0", "cam3"), ("cam2", "cam3")]
+    monkeypatch.setattr("hub.calibration.pair_network._ranked", lambda *_: order)
+    _, pairs = solve_pairs(prepared, lambda text, share: None, thorough="first pair")
+    assert all(pair.solved for pair in pairs if "cam1" not in (pair.a, pair.b))
+    searched = [pair for pair in pairs if "cam1" in (pair.a, pair.b) and "not searched" not in pair.status]
+    assert [(pair.a, pair.b) for pair in searched] == [("cam0", "cam1")]
+
+
+def _fields(session: Session) -> dict[str, Any]:
+    return {name: getattr(session, name) for name in session.__dataclass_fields__}

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.fft import next_fast_len
 from scipy.linalg import eigh
 
-from hub.sync.lag_scan import GridTrack, LagScan, PairMoments, candidate_lags, grid_tracks, scan_lags
+from hub.sync.lag_scan import GridTrack, LagScan, PairMoments, candidate_lags, fast_length, grid_tracks, scan_lags
 from hub.trajectory.image_tracks import SmoothTrack, smooth_track
 from protocols.geometry.types import Floats
 from tests.support.rigs import Session, simulate
 
 STEP, SIGMA_PX, LABELS = 0.05, 0.5, 2
+
+
+def test_lengths_of_transforms_are_those_that_scipy_takes() -> None:
+    lengths = [*range(1, 2000), 12_345, 999_983]
+    assert [fast_length(length) for length in lengths] == [next_fast_len(length, real=True) for length in lengths]
 
 
 def smooth(session: Session) -> list[SmoothTrack]:
