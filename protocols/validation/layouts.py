@@ -204,7 +204,7 @@ class Layouts:
         self._made += 1
         try:
             layout = _Builder(payload).layout()
-        except _OddShapeError:
+        except (_OddShapeError, IndexError):
             return
         if self._kept >= _MAX_LAYOUTS:
             self._of_size, self._kept = {}, 0
