@@ -11,10 +11,10 @@ from pathlib import Path
 
 from tests.unit.test_structure import PACKAGES, ROOT, _tracked
 
-MOST_SOURCE_LINES = 86_420
-MOST_UNEXPLAINED_CONSTANTS = 274
+MOST_SOURCE_LINES = 87_950
+MOST_UNEXPLAINED_CONSTANTS = 282
 MOST_COMPLEXITY = 15
-MOST_EXCEPTIONS = 5
+MOST_EXCEPTIONS = 4
 """Files in which ruff allows more complexity."""
 
 
