@@ -14,6 +14,7 @@ import numpy as np
 
 from edge.uav.base import Basis, Box, Estimate, Image, Telemetry, TrackState
 from edge.uav.correlation.appearance_tracker import AppearanceTracker
+from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.ground_tracker import GroundTracker
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
@@ -25,6 +26,7 @@ _AGREE, _CONTRADICT = 0.35, 0.7  # distance of the two estimates, in target leng
 _FRAMES_TO_TRUST, _FRAMES_TO_DROP = 20, 6  # consecutive frames of agreement, contradiction
 _HIDDEN_FRAMES = 3  # frames without the target after which an untrusted ground is given up
 _CHECK_EVERY = 3  # frames between two looks of the appearance tracker while the ground is trusted
+_COMPLETE = 0.9  # share of a box in the image from which the appearance can learn it
 _RETRY_S = 4.0  # after which the ground is tried again; doubles each time
 _ATTITUDE = "the attitude says that the camera looks down"
 
@@ -109,9 +111,8 @@ class AdaptiveTracker:
             self._steep, self._trust = False, 1.0
 
     def _is_complete(self, box: Box) -> bool:
-        """Whether a box lies in the image without touching its border."""
-        right, bottom = self._size[0] - box.x - box.width, self._size[1] - box.y - box.height
-        return min(box.x, box.y, right, bottom) > 1.0
+        """Whether nearly all of a box lies in the image."""
+        return OrientedBox.upright(box).share_inside(self._size) > _COMPLETE
 
     def _complete(self, image: Image, ground: Estimate, time: float) -> Estimate:
         """A target that the border cut in the first image: the ground tracker learns all of it as it comes in."""

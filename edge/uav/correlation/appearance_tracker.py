@@ -50,7 +50,7 @@ _SCALE_GAIN = 0.5  # of the scale filter's correction, per frame
 _ANCHOR_GAIN = 0.02  # similarity to the first view that another size, shape or angle must gain
 _ANCHOR_STEP = 0.3  # share of the way to it
 _EXTENT_STEP = 0.3  # share of the way to the extent that the colours measure
-_TRIAL_SIZES = (0.8, 1.25)
+_TRIAL_SIZES = (0.9, 1.1)
 _LEARN_ABOVE = 1.0  # log likelihood ratio above which appearance is learnt
 _KEEP_EVERY = 5  # frames between two keyframes
 _RELOCATE_EVERY = 4  # frames between two attempts to recognise the scene
@@ -347,7 +347,10 @@ class AppearanceTracker:
         candidate = self._candidate
         assert candidate is not None
         box, peak = self._respond(image, candidate.box)
-        score = self._memory.score(image, box)
+        # Its size may have changed while it was away.
+        trials = [box, *(box.sized(factor * box.sides) for factor in _TRIAL_SIZES)]
+        scores = [self._memory.score(image, trial) for trial in trials]
+        score, box = max(scores), trials[int(np.argmax(scores))]
         evidence = self._memory.log_ratio(score, _CHANGE)
         self.debug |= {"score": score, "llr": evidence, "peak": peak, "usual": self._peak, "prior": candidate.prior}
         candidate.hits += 1
