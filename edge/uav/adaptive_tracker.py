@@ -84,7 +84,8 @@ class AdaptiveTracker:
         if self._cut and image is not None:
             return self._complete(image, ground, time)
         trusted = self._trust >= 1.0
-        if trusted and self._frame % _CHECK_EVERY and ground.state is TrackState.VISIBLE:
+        agreed = ground.state is TrackState.VISIBLE and self._appearance.sees
+        if trusted and self._frame % _CHECK_EVERY and agreed:
             return self._on_ground(self._corrected(ground))
         if trusted:
             self._appearance.expect(ground)
@@ -92,6 +93,8 @@ class AdaptiveTracker:
         self._compare(ground, seen, time)
         if self._ground is None or self._trust < 1.0:
             return self._on_image(seen)
+        if ground.state is TrackState.VISIBLE and seen.state is not TrackState.VISIBLE:
+            return self._on_ground(replace(ground, state=TrackState.COASTING, std=max(ground.std, seen.std)))
         if seen.state is TrackState.VISIBLE and ground.state is TrackState.VISIBLE:
             self._shift = np.array([seen.x - ground.x, seen.y - ground.y])
             self._sides = np.array([seen.width / ground.width, seen.height / ground.height])
@@ -149,6 +152,12 @@ class AdaptiveTracker:
             # Whether it would have held is not known, and two searches would cost twice.
             self._hidden += 1
             if self._hidden > _HIDDEN_FRAMES:
+                self._ground, self._retry_at = None, time + self._retry_s
+            return
+        if seen.state is not TrackState.VISIBLE and ground.state is TrackState.VISIBLE:
+            # It has found something that does not look like the target.
+            self._hidden += 1
+            if self._hidden > _FRAMES_TO_DROP:
                 self._ground, self._retry_at = None, time + self._retry_s
             return
         self._hidden = 0

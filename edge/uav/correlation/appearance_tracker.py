@@ -32,6 +32,7 @@ _TENTATIVE = -3.0  # log odds below which a place is not tested further
 _MARGIN = 1.0  # log odds by which a re-detection must exceed the next best place
 _MAX_TESTS = 8  # frames for which a place is tested
 _ANYWHERE = 0.01  # prior probability that the target is not near its prediction
+_PROPOSED = -1.0  # log prior of a place that another tracker has found
 _OBSERVE_EVERY = 6  # frames between two looks at the background
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
 _DETECTION = 0.25  # probability that one search finds a target in view
@@ -106,7 +107,7 @@ class AppearanceTracker:
         self._near = 1.0 - _ANYWHERE
         self._ratio = 0.0
         self._broken = False  # whether the motion of the scene was unknown in a frame since the last sight
-        self._expected: Floats | None = None
+        self._expected: tuple[Floats, bool] | None = None
         self._candidate: _Candidate | None = None
         return self._estimate(time)
 
@@ -144,14 +145,19 @@ class AppearanceTracker:
         return float(0.5 + self.length * (0.05 + _DRIFT * t + 0.5 * _ACCELERATION * t * t))
 
     @property
+    def sees(self) -> bool:
+        """Whether the last frame shows the target."""
+        return self._missed == 0
+
+    @property
     def certain(self) -> bool:
         """Whether the last frame shows the target, by clear evidence."""
         return self._missed == 0 and self._ratio > _CERTAIN
 
     def expect(self, other: Estimate) -> None:
-        """Take the place where another tracker has the target before this frame: the search begins there."""
-        if np.isfinite([other.x, other.y]).all() and (self._missed or other.state is TrackState.VISIBLE):
-            self._expected = np.array([other.x, other.y])
+        """Take the place where another tracker has the target in the next image: what it sees there is tested first."""
+        if np.isfinite([other.x, other.y]).all() and self._missed:
+            self._expected = np.array([other.x, other.y]), other.state is TrackState.VISIBLE
 
     def _predict(self, dt: float) -> Floats:
         """Move the box with the scene and its own velocity; returns where the scene alone would have moved it (2,)."""
@@ -184,8 +190,12 @@ class AppearanceTracker:
                 if relocated is not None:
                     box, origin, self._broken = relocated, relocated.centre, False
         self.box = box.at(origin + self._velocity * dt)
-        if self._expected is not None and self._missed:
-            self.box, self._expected = box.at(self._expected), None
+        if self._expected is not None:
+            (place, found), self._expected = self._expected, None
+            if found and self._candidate is None:
+                self._candidate = _Candidate(box.at(place), _PROPOSED)
+            elif not found:
+                self.box = box.at(place)
         return origin
 
     def _relocated(self) -> OrientedBox | None:
