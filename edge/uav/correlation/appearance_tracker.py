@@ -27,11 +27,12 @@ _LEARN_INSIDE = 0.97  # share of the box in the image above which appearance, si
 _MEASURE_INSIDE = 0.6  # below it nothing is measured
 _GRACE_FRAMES = 3  # frames with clear evidence against the target before it is searched for
 _REJECT = -3.0  # log likelihood ratio of clear evidence against the target
-_ACCEPT = 0.0  # log odds of a re-detection
+_ACCEPT = 1.0  # log odds of a re-detection
 _TENTATIVE = -3.0  # log odds below which a place is not tested further
 _MARGIN = 1.0  # log odds by which a re-detection must exceed the next best place
 _MAX_TESTS = 8  # frames for which a place is tested
-_ANYWHERE = 0.01  # prior probability that the target is not near its prediction
+_ANYWHERE = 0.03  # prior probability that the target is not near its prediction
+_PROBATION = 10  # frames after a re-detection in which any evidence against the target ends it
 _PROPOSED = -1.0  # log prior of a place that another tracker has found
 _OBSERVE_EVERY = 6  # frames between two looks at the background
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
@@ -107,7 +108,9 @@ class AppearanceTracker:
         self._near = 1.0 - _ANYWHERE
         self._ratio = 0.0
         self._broken = False  # whether the motion of the scene was unknown in a frame since the last sight
-        self._expected: tuple[Floats, bool] | None = None
+        self._expected: tuple[OrientedBox, bool] | None = None
+        self._heading = float("nan")  # of the other tracker's estimate, at the last sight [rad]
+        self._confirmed = _PROBATION  # frames since the target was found again
         self._candidate: _Candidate | None = None
         return self._estimate(time)
 
@@ -156,8 +159,12 @@ class AppearanceTracker:
 
     def expect(self, other: Estimate) -> None:
         """Take the place where another tracker has the target in the next image: what it sees there is tested first."""
-        if np.isfinite([other.x, other.y]).all() and self._missed:
-            self._expected = np.array([other.x, other.y]), other.state is TrackState.VISIBLE
+        if not self._missed:
+            self._heading = other.heading
+        elif np.isfinite([other.x, other.y]).all():
+            turn = other.heading - self._heading if other.state is TrackState.VISIBLE else float("nan")
+            box = self.box.at(np.array([other.x, other.y])).turned(turn if np.isfinite(turn) else 0.0)
+            self._expected = box, other.state is TrackState.VISIBLE
 
     def _predict(self, dt: float) -> Floats:
         """Move the box with the scene and its own velocity; returns where the scene alone would have moved it (2,)."""
@@ -191,11 +198,11 @@ class AppearanceTracker:
                     box, origin, self._broken = relocated, relocated.centre, False
         self.box = box.at(origin + self._velocity * dt)
         if self._expected is not None:
-            (place, found), self._expected = self._expected, None
+            (expected, found), self._expected = self._expected, None
             if found and self._candidate is None:
-                self._candidate = _Candidate(box.at(place), _PROPOSED)
+                self._candidate = _Candidate(expected, _PROPOSED)
             elif not found:
-                self.box = box.at(place)
+                self.box = box.at(expected.centre)
         return origin
 
     def _relocated(self) -> OrientedBox | None:
@@ -223,7 +230,10 @@ class AppearanceTracker:
         score = self._memory.score(image, box)
         ratio = self._ratio = self._memory.log_ratio(score) + self._peak_ratio(peak)
         self.debug = {"peak": peak, "score": score, "llr": ratio}
-        if ratio < _REJECT:
+        self._confirmed += 1
+        if ratio < (_REJECT if self._confirmed > _PROBATION else 0.0):
+            if self._confirmed <= _PROBATION:
+                self._missed = _GRACE_FRAMES  # it was taken for the target by mistake: no grace
             self._miss(dt)
             return
         self._accept(image, box, score, peak, origin, dt)
@@ -374,7 +384,7 @@ class AppearanceTracker:
         elif candidate.hits >= _HITS and odds > _ACCEPT:
             self._candidate = None
             self._steps.clear()
-            self._missed, self._unseen_s = 0, 0.0
+            self._missed, self._unseen_s, self._confirmed = 0, 0.0, 0
             self.box = box
             self._flow.remember(image, box)
 
