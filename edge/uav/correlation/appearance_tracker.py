@@ -53,6 +53,7 @@ _ANCHOR_GAIN = 0.02  # similarity to the first view that another size, shape or 
 _ANCHOR_STEP = 0.3  # share of the way to it
 _EXTENT_STEP = 0.3  # share of the way to the extent that the colours measure
 _TRIAL_SIZES = (0.9, 1.1)
+_FIRST_SIZES = (0.7, 0.84, 1.2, 1.4)  # of a place that is tested for the first time
 _LEARN_ABOVE = 1.0  # log likelihood ratio above which appearance is learnt
 _KEEP_EVERY = 5  # frames between two keyframes
 _RELOCATE_EVERY = 4  # frames between two attempts to recognise the scene
@@ -368,7 +369,8 @@ class AppearanceTracker:
         assert candidate is not None
         box, peak = self._respond(image, candidate.box)
         # Its size may have changed while it was away.
-        trials = [box, *(box.sized(factor * box.sides) for factor in _TRIAL_SIZES)]
+        factors = _TRIAL_SIZES if candidate.hits else _FIRST_SIZES
+        trials = [box, *(box.sized(factor * box.sides) for factor in factors)]
         scores = [self._memory.score(image, trial) for trial in trials]
         score, box = max(scores), trials[int(np.argmax(scores))]
         evidence = self._memory.log_ratio(score, _CHANGE)
