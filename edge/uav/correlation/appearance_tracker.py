@@ -200,7 +200,7 @@ class AppearanceTracker:
         self.box = box.at(origin + self._velocity * dt)
         if self._expected is not None:
             (expected, found), self._expected = self._expected, None
-            if found and self._candidate is None:
+            if found and self._candidate is None and self._missed % 2:
                 self._candidate = _Candidate(expected, _PROPOSED)
             elif not found:
                 self.box = box.at(expected.centre)
