@@ -8,7 +8,7 @@ the region in which it can be is searched. No lens and no telemetry are used.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -63,12 +63,17 @@ _ANGLES = (0.0, 0.0, 0.35, 0.0, -0.35, 0.0, 0.7, 0.0, -0.7, 0.0, 1.1, 0.0, -1.1,
 
 @dataclass(slots=True)
 class _Candidate:
-    """A re-detection under test: its log prior, for how many frames it has held, and their mean evidence."""
+    """A re-detection under test: its log prior, for how many frames it has held, and their mean evidence.
+
+    steps: its velocities over the scene [px/s]; origin: (2,) where the scene alone would have moved it.
+    """
 
     box: OrientedBox
     prior: float
     hits: int = 0
     evidence: float = 0.0
+    origin: Floats | None = None
+    steps: list[Floats] = field(default_factory=list)
 
 
 class AppearanceTracker:
@@ -182,9 +187,10 @@ class AppearanceTracker:
             if self._missed == 0:
                 box = box.sized(box.sides * motion.zoom).turned(turn)
             if self._candidate is not None:
-                moved = self._candidate.box
-                moved = moved.at(motion.at(moved.centre, self._scene.reach)).sized(moved.sides * motion.zoom)
-                self._candidate.box = moved.turned(turn)
+                moved, steps = self._candidate.box, self._candidate.steps
+                self._candidate.origin = place = motion.at(moved.centre, self._scene.reach)
+                place = place + (np.median(steps, axis=0) * dt if steps else 0.0)
+                self._candidate.box = moved.at(place).sized(moved.sides * motion.zoom).turned(turn)
         if self._missed:
             self._broken |= not motion.trusted
             angle = self._turn_rate * dt
@@ -329,7 +335,7 @@ class AppearanceTracker:
         self._missed += 1
         self._unseen_s += dt
         if self._candidate is not None:
-            self._test(image)
+            self._test(image, dt)
             return
         k = self._missed - _GRACE_FRAMES
         box = self.box.sized(self.box.sides * _SIZES[k // 2 % len(_SIZES)]).turned(_ANGLES[k // 2 % len(_ANGLES)])
@@ -338,7 +344,7 @@ class AppearanceTracker:
             box, reach = tile(box, self._size, k // 2)
         found = search(image, self._memory, box, reach)
         if found:
-            self._consider(image, found)
+            self._consider(image, found, dt)
         if k % 2 == 0:
             # Where it was expected and is not seen, it is less and less likely to be.
             self._near *= 1.0 - _DETECTION * self.box.share_within(reach, self._size)
@@ -352,7 +358,7 @@ class AppearanceTracker:
         near = np.log(share + 1e-12) - 0.5 * squared + np.log(min(area / (2.0 * np.pi * std * std), 1.0))
         return float(np.logaddexp(near, np.log((1.0 - share) * area / (self._size[0] * self._size[1]))))
 
-    def _consider(self, image: Image, found: list[Found]) -> None:
+    def _consider(self, image: Image, found: list[Found], dt: float) -> None:
         """Take up the likeliest of the places found, if it is likelier by far than any other."""
         odds = [self._memory.log_ratio(f.score, _CHANGE) + self._log_prior(f.box.centre) for f in found]
         order = np.argsort(odds)[::-1]
@@ -361,9 +367,9 @@ class AppearanceTracker:
         if len(odds) > 1 and odds[best] - odds[int(order[1])] < _MARGIN:
             return
         self._candidate = _Candidate(found[best].box, self._log_prior(found[best].box.centre))
-        self._test(image)
+        self._test(image, dt)
 
-    def _test(self, image: Image) -> None:
+    def _test(self, image: Image, dt: float) -> None:
         """Add a frame's evidence to the candidate's odds; take it for the target, or drop it."""
         candidate = self._candidate
         assert candidate is not None
@@ -379,6 +385,8 @@ class AppearanceTracker:
         # Further frames show the same look-alike, if it is one: they make the evidence surer, not larger.
         candidate.evidence += (evidence - candidate.evidence) / candidate.hits
         candidate.box = box
+        if candidate.origin is not None and candidate.hits > 1:
+            candidate.steps.append((box.centre - candidate.origin) / dt)
         odds = candidate.prior + candidate.evidence
         weak = evidence < 0.0 or peak < _PEAK_SHARE * self._peak or box.share_inside(self._size) < _MEASURE_INSIDE
         if weak or odds < _TENTATIVE or candidate.hits > _MAX_TESTS:
@@ -386,6 +394,9 @@ class AppearanceTracker:
         elif candidate.hits >= _HITS and odds > _ACCEPT:
             self._candidate = None
             self._steps.clear()
+            self._steps.extend(candidate.steps)
+            if candidate.steps:
+                self._velocity = np.median(candidate.steps, axis=0)
             self._missed, self._unseen_s, self._confirmed = 0, 0.0, 0
             self.box = box
             self._flow.remember(image, box)
