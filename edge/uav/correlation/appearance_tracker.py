@@ -129,7 +129,10 @@ class AppearanceTracker:
         self._time += dt
         self._frame += 1
         if image is None or image.shape[:2] != (self._size[1], self._size[0]):
+            # Nothing speaks against the target: it is looked for where it was going, but needs evidence for it.
+            searching, self._confirmed = self._missed > _GRACE_FRAMES, 0
             self._miss(dt)
+            self._missed = self._missed if searching else min(self._missed, _GRACE_FRAMES)
             return self._estimate(time)
         self.motion = self._scene.update(image, self._outline() if self._missed == 0 else None)
         origin = self._predict(dt)
@@ -374,7 +377,11 @@ class AppearanceTracker:
         candidate = self._candidate
         assert candidate is not None
         box, peak = self._respond(image, candidate.box)
-        # Its size may have changed while it was away.
+        if candidate.hits == 0:
+            # Before another size or angle is believed: the last one, localised about the same place.
+            same, same_peak = self._respond(image, self.box.at(candidate.box.centre))
+            if self._memory.score(image, same) > self._memory.score(image, box):
+                box, peak = same, same_peak
         factors = _TRIAL_SIZES if candidate.hits else _FIRST_SIZES
         trials = [box, *(box.sized(factor * box.sides) for factor in factors)]
         scores = [self._memory.score(image, trial) for trial in trials]

@@ -23,7 +23,7 @@ _PADDING = 2.4  # of the window, over the mean side of the target, added on both
 _LABEL_STD = 1.0 / 16.0  # of the wanted peak, over the geometric mean of the target's sides
 _ITERATIONS, _PENALTY, _PENALTY_GROWTH, _REGULARISATION = 3, 5.0, 3.0, 0.01  # of the published method
 _LEARNING_RATE = 0.025
-_CENTRE_STD = 0.7  # of the mask, over half a side: a box's corners show background
+_CENTRE_STD = 0.8  # of the mask, over half a side: a box's corners show background
 
 Spectrum = npt.NDArray[np.complex64]
 
