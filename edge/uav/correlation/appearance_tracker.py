@@ -8,11 +8,11 @@ the region in which it can be is searched. No lens and no telemetry are used.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
+from edge.uav.correlation.candidate import Candidate
 from edge.uav.correlation.filter import CorrelationFilter
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
@@ -27,10 +27,7 @@ _LEARN_INSIDE = 0.97  # share of the box in the image above which appearance, si
 _MEASURE_INSIDE = 0.6  # below it nothing is measured
 _GRACE_FRAMES = 3  # frames with clear evidence against the target before it is searched for
 _REJECT = -3.0  # log likelihood ratio of clear evidence against the target
-_ACCEPT = 1.0  # log odds of a re-detection
-_TENTATIVE = -3.0  # log odds below which a place is not tested further
 _MARGIN = 1.0  # log odds by which a re-detection must exceed the next best place
-_MAX_TESTS = 8  # frames for which a place is tested
 _ANYWHERE = 0.03  # prior probability that the target is not near its prediction
 _PROBATION = 10  # frames after a re-detection in which any evidence against the target ends it
 _PROPOSED = -1.0  # log prior of a place that another tracker has found
@@ -38,7 +35,6 @@ _OBSERVE_EVERY = 6  # frames between two looks at the background
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
 _DETECTION = 0.25  # probability that one search finds a target in view
 _CHANGE = 0.1  # std of the similarity of a target that has been away
-_HITS = 3  # consecutive frames of a re-detection
 _PEAK_SHARE = 0.55  # of the usual height of the filter's answer, at a re-detection
 _PEAK_TARGET, _PEAK_BACKGROUND = (0.9, 0.2), (0.3, 0.15)  # mean and std of that share, on and off the target
 _PEAK_LIMIT = 3.0  # of the log likelihood ratio of that share
@@ -61,28 +57,12 @@ _SIZES = (1.0, 0.87, 1.15)
 _ANGLES = (0.0, 0.0, 0.35, 0.0, -0.35, 0.0, 0.7, 0.0, -0.7, 0.0, 1.1, 0.0, -1.1, 0.0, 1.57)
 
 
-@dataclass(slots=True)
-class _Candidate:
-    """A re-detection under test: its log prior, for how many frames it has held, and their mean evidence.
-
-    steps: its velocities over the scene [px/s]; origin: (2,) where the scene alone would have moved it.
-    """
-
-    box: OrientedBox
-    prior: float
-    hits: int = 0
-    evidence: float = 0.0
-    origin: Floats | None = None
-    steps: list[Floats] = field(default_factory=list)
-
-
 class AppearanceTracker:
     """Tracker of one target. size: (width, height) of the images [px]; fps: nominal frame rate."""
 
-    def __init__(self, size: tuple[int, int], fps: float = 30.0, seed: int = 0) -> None:
+    def __init__(self, size: tuple[int, int], fps: float = 30.0) -> None:
         self._size = size
         self._fps = fps
-        self._rng = np.random.default_rng(seed)
         self._scene = SceneMotion(size)
         self.debug: dict[str, float] = {}
 
@@ -117,7 +97,7 @@ class AppearanceTracker:
         self._expected: tuple[OrientedBox, bool] | None = None
         self._heading = float("nan")  # of the other tracker's estimate, at the last sight [rad]
         self._confirmed = _PROBATION  # frames since the target was found again
-        self._candidate: _Candidate | None = None
+        self._candidate: Candidate | None = None
         return self._estimate(time)
 
     def handle_telemetry(self, sample: Telemetry) -> None:
@@ -130,9 +110,9 @@ class AppearanceTracker:
         self._frame += 1
         if image is None or image.shape[:2] != (self._size[1], self._size[0]):
             # Nothing speaks against the target: it is looked for where it was going, but needs evidence for it.
-            searching, self._confirmed = self._missed > _GRACE_FRAMES, 0
+            most, self._confirmed = max(self._missed, _GRACE_FRAMES), 0
             self._miss(dt)
-            self._missed = self._missed if searching else min(self._missed, _GRACE_FRAMES)
+            self._missed = min(self._missed, most)
             return self._estimate(time)
         self.motion = self._scene.update(image, self._outline() if self._missed == 0 else None)
         origin = self._predict(dt)
@@ -190,10 +170,7 @@ class AppearanceTracker:
             if self._missed == 0:
                 box = box.sized(box.sides * motion.zoom).turned(turn)
             if self._candidate is not None:
-                moved, steps = self._candidate.box, self._candidate.steps
-                self._candidate.origin = place = motion.at(moved.centre, self._scene.reach)
-                place = place + (np.median(steps, axis=0) * dt if steps else 0.0)
-                self._candidate.box = moved.at(place).sized(moved.sides * motion.zoom).turned(turn)
+                self._candidate.move(motion, self._scene.reach, dt)
         if self._missed:
             self._broken |= not motion.trusted
             angle = self._turn_rate * dt
@@ -210,7 +187,7 @@ class AppearanceTracker:
         if self._expected is not None:
             (expected, found), self._expected = self._expected, None
             if found and self._candidate is None and self._missed % 2:
-                self._candidate = _Candidate(expected, _PROPOSED)
+                self._candidate = Candidate(expected, _PROPOSED)
             elif not found:
                 self.box = box.at(expected.centre)
         return origin
@@ -241,12 +218,12 @@ class AppearanceTracker:
         ratio = self._ratio = self._memory.log_ratio(score) + self._peak_ratio(peak)
         self.debug = {"peak": peak, "score": score, "llr": ratio}
         self._confirmed += 1
-        if ratio < (_REJECT if self._confirmed > _PROBATION else 0.0):
-            if self._confirmed <= _PROBATION:
-                self._missed = _GRACE_FRAMES  # it was taken for the target by mistake: no grace
-            self._miss(dt)
+        if self._confirmed <= _PROBATION and ratio < 0.0:
+            self._missed = _GRACE_FRAMES  # it was taken for the target by mistake: no grace
+        elif ratio >= _REJECT:
+            self._accept(image, box, score, peak, origin, dt)
             return
-        self._accept(image, box, score, peak, origin, dt)
+        self._miss(dt)
 
     def _peak_ratio(self, peak: float) -> float:
         """log likelihood ratio of the filter's answer: target against background, bounded."""
@@ -369,7 +346,7 @@ class AppearanceTracker:
         self.debug = {"score": found[best].score, "odds": odds[best], "near": self._near}
         if len(odds) > 1 and odds[best] - odds[int(order[1])] < _MARGIN:
             return
-        self._candidate = _Candidate(found[best].box, self._log_prior(found[best].box.centre))
+        self._candidate = Candidate(found[best].box, self._log_prior(found[best].box.centre))
         self._test(image, dt)
 
     def _test(self, image: Image, dt: float) -> None:
@@ -382,26 +359,18 @@ class AppearanceTracker:
             same, same_peak = self._respond(image, self.box.at(candidate.box.centre))
             if self._memory.score(image, same) > self._memory.score(image, box):
                 box, peak = same, same_peak
-        factors = _TRIAL_SIZES if candidate.hits else _FIRST_SIZES
-        trials = [box, *(box.sized(factor * box.sides) for factor in factors)]
+        trials = [box, *(box.sized(f * box.sides) for f in (_TRIAL_SIZES if candidate.hits else _FIRST_SIZES))]
         scores = [self._memory.score(image, trial) for trial in trials]
         score, box = max(scores), trials[int(np.argmax(scores))]
         evidence = self._memory.log_ratio(score, _CHANGE)
         self.debug |= {"score": score, "llr": evidence, "peak": peak, "usual": self._peak, "prior": candidate.prior}
-        candidate.hits += 1
-        # Further frames show the same look-alike, if it is one: they make the evidence surer, not larger.
-        candidate.evidence += (evidence - candidate.evidence) / candidate.hits
-        candidate.box = box
-        if candidate.origin is not None and candidate.hits > 1:
-            candidate.steps.append((box.centre - candidate.origin) / dt)
-        odds = candidate.prior + candidate.evidence
+        candidate.add(box, evidence, dt)
         weak = evidence < 0.0 or peak < _PEAK_SHARE * self._peak or box.share_inside(self._size) < _MEASURE_INSIDE
-        if weak or odds < _TENTATIVE or candidate.hits > _MAX_TESTS:
+        if weak or candidate.hopeless:
             self._candidate = None
-        elif candidate.hits >= _HITS and odds > _ACCEPT:
+        elif candidate.accepted:
             self._candidate = None
-            self._steps.clear()
-            self._steps.extend(candidate.steps)
+            self._steps = deque(candidate.steps, maxlen=self._steps.maxlen)
             if candidate.steps:
                 self._velocity = np.median(candidate.steps, axis=0)
             self._missed, self._unseen_s, self._confirmed = 0, 0.0, 0
@@ -415,16 +384,14 @@ class AppearanceTracker:
 
     def _estimate(self, time: float) -> Estimate:
         state = TrackState.VISIBLE if self._missed == 0 else TrackState.COASTING
-        std = self.std
-        if self._missed and (std > _LOST_STD * self.length or self._unseen_s > _LOST_AFTER_S):
+        if self._missed and (self.std > _LOST_STD * self.length or self._unseen_s > _LOST_AFTER_S):
             state = TrackState.LOST
-        nan = float("nan")
         centre, extent = self._shape.bounds(self.box)
-        x, y = (nan, nan) if state is TrackState.LOST else (float(centre[0]), float(centre[1]))
+        x, y = (np.nan, np.nan) if state is TrackState.LOST else (float(centre[0]), float(centre[1]))
         # Below it, the direction of the velocity is noise.
         moves = state is not TrackState.LOST and np.hypot(*self._velocity) > _MOVES * self.length
-        heading = float(np.arctan2(self._velocity[1], self._velocity[0])) if moves else nan
-        return Estimate(time, state, x, y, float(extent[0]), float(extent[1]), heading, std)
+        heading = float(np.arctan2(self._velocity[1], self._velocity[0])) if moves else np.nan
+        return Estimate(time, state, x, y, float(extent[0]), float(extent[1]), heading, self.std)
 
 
 def _square(matrix: Floats) -> Floats:
