@@ -14,6 +14,7 @@ import numpy as np
 
 from edge.uav.base import Basis, Box, Estimate, Image, Telemetry, TrackState
 from edge.uav.correlation.appearance_tracker import AppearanceTracker
+from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.ground_tracker import GroundTracker
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
@@ -25,6 +26,7 @@ _AGREE, _CONTRADICT = 0.35, 0.7  # distance of the two estimates, in target leng
 _FRAMES_TO_TRUST, _FRAMES_TO_DROP = 20, 6  # consecutive frames of agreement, contradiction
 _HIDDEN_FRAMES = 3  # frames without the target after which an untrusted ground is given up
 _CHECK_EVERY = 3  # frames between two looks of the appearance tracker while the ground is trusted
+_COMPLETE = 0.9  # share of a box in the image from which the appearance can learn it
 _RETRY_S = 4.0  # after which the ground is tried again; doubles each time
 _ATTITUDE = "the attitude says that the camera looks down"
 
@@ -82,7 +84,8 @@ class AdaptiveTracker:
         if self._cut and image is not None:
             return self._complete(image, ground, time)
         trusted = self._trust >= 1.0
-        if trusted and self._frame % _CHECK_EVERY and ground.state is TrackState.VISIBLE:
+        agreed = ground.state is TrackState.VISIBLE and self._appearance.sees
+        if trusted and self._frame % _CHECK_EVERY and agreed:
             return self._on_ground(self._corrected(ground))
         if trusted:
             self._appearance.expect(ground)
@@ -90,6 +93,8 @@ class AdaptiveTracker:
         self._compare(ground, seen, time)
         if self._ground is None or self._trust < 1.0:
             return self._on_image(seen)
+        if ground.state is TrackState.VISIBLE and seen.state is not TrackState.VISIBLE:
+            return self._on_ground(replace(ground, state=TrackState.COASTING, std=max(ground.std, seen.std)))
         if seen.state is TrackState.VISIBLE and ground.state is TrackState.VISIBLE:
             self._shift = np.array([seen.x - ground.x, seen.y - ground.y])
             self._sides = np.array([seen.width / ground.width, seen.height / ground.height])
@@ -109,9 +114,8 @@ class AdaptiveTracker:
             self._steep, self._trust = False, 1.0
 
     def _is_complete(self, box: Box) -> bool:
-        """Whether a box lies in the image without touching its border."""
-        right, bottom = self._size[0] - box.x - box.width, self._size[1] - box.y - box.height
-        return min(box.x, box.y, right, bottom) > 1.0
+        """Whether nearly all of a box lies in the image."""
+        return OrientedBox.upright(box).share_inside(self._size) > _COMPLETE
 
     def _complete(self, image: Image, ground: Estimate, time: float) -> Estimate:
         """A target that the border cut in the first image: the ground tracker learns all of it as it comes in."""
@@ -148,6 +152,12 @@ class AdaptiveTracker:
             # Whether it would have held is not known, and two searches would cost twice.
             self._hidden += 1
             if self._hidden > _HIDDEN_FRAMES:
+                self._ground, self._retry_at = None, time + self._retry_s
+            return
+        if seen.state is not TrackState.VISIBLE and ground.state is TrackState.VISIBLE:
+            # It has found something that does not look like the target.
+            self._hidden += 1
+            if self._hidden > _FRAMES_TO_DROP:
                 self._ground, self._retry_at = None, time + self._retry_s
             return
         self._hidden = 0

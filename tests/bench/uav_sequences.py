@@ -95,11 +95,12 @@ def aerial(folder: Path) -> Iterator[Sequence]:
             if 0 <= frame - first < len(images):
                 box[frame - first] = values
         if np.isfinite(box[:, 0]).sum() >= 0.9 * len(images) and np.isfinite(box[0, 0]):
+            box = box[: int(np.flatnonzero(np.isfinite(box[:, 0]))[-1]) + 1]  # nothing is known after the last label
             for k in range(4):
                 known = np.isfinite(box[:, k])
                 box[:, k] = np.interp(np.arange(len(box)), np.flatnonzero(known), box[known, k])
             size = (images[0].shape[1], images[0].shape[0])
-            yield Sequence(f"car{track}", "nadir", images, box, 30.0, share_inside(box, size))
+            yield Sequence(f"car{track}", "nadir", images[: len(box)], box, 30.0, share_inside(box, size))
 
 
 def pan_away(

@@ -8,11 +8,11 @@ the region in which it can be is searched. No lens and no telemetry are used.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
 from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
+from edge.uav.correlation.candidate import Candidate
 from edge.uav.correlation.filter import CorrelationFilter
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
@@ -27,16 +27,14 @@ _LEARN_INSIDE = 0.97  # share of the box in the image above which appearance, si
 _MEASURE_INSIDE = 0.6  # below it nothing is measured
 _GRACE_FRAMES = 3  # frames with clear evidence against the target before it is searched for
 _REJECT = -3.0  # log likelihood ratio of clear evidence against the target
-_ACCEPT = 0.0  # log odds of a re-detection
-_TENTATIVE = -3.0  # log odds below which a place is not tested further
 _MARGIN = 1.0  # log odds by which a re-detection must exceed the next best place
-_MAX_TESTS = 8  # frames for which a place is tested
-_ANYWHERE = 0.01  # prior probability that the target is not near its prediction
+_ANYWHERE = 0.03  # prior probability that the target is not near its prediction
+_PROBATION = 10  # frames after a re-detection in which any evidence against the target ends it
+_PROPOSED = -1.0  # log prior of a place that another tracker has found
 _OBSERVE_EVERY = 6  # frames between two looks at the background
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
 _DETECTION = 0.25  # probability that one search finds a target in view
 _CHANGE = 0.1  # std of the similarity of a target that has been away
-_HITS = 3  # consecutive frames of a re-detection
 _PEAK_SHARE = 0.55  # of the usual height of the filter's answer, at a re-detection
 _PEAK_TARGET, _PEAK_BACKGROUND = (0.9, 0.2), (0.3, 0.15)  # mean and std of that share, on and off the target
 _PEAK_LIMIT = 3.0  # of the log likelihood ratio of that share
@@ -50,7 +48,8 @@ _SCALE_GAIN = 0.5  # of the scale filter's correction, per frame
 _ANCHOR_GAIN = 0.02  # similarity to the first view that another size, shape or angle must gain
 _ANCHOR_STEP = 0.3  # share of the way to it
 _EXTENT_STEP = 0.3  # share of the way to the extent that the colours measure
-_TRIAL_SIZES = (0.8, 1.25)
+_TRIAL_SIZES = (0.9, 1.1)
+_FIRST_SIZES = (0.7, 0.84, 1.2, 1.4)  # of a place that is tested for the first time
 _LEARN_ABOVE = 1.0  # log likelihood ratio above which appearance is learnt
 _KEEP_EVERY = 5  # frames between two keyframes
 _RELOCATE_EVERY = 4  # frames between two attempts to recognise the scene
@@ -58,23 +57,12 @@ _SIZES = (1.0, 0.87, 1.15)
 _ANGLES = (0.0, 0.0, 0.35, 0.0, -0.35, 0.0, 0.7, 0.0, -0.7, 0.0, 1.1, 0.0, -1.1, 0.0, 1.57)
 
 
-@dataclass(slots=True)
-class _Candidate:
-    """A re-detection under test: its log prior, for how many frames it has held, and their mean evidence."""
-
-    box: OrientedBox
-    prior: float
-    hits: int = 0
-    evidence: float = 0.0
-
-
 class AppearanceTracker:
     """Tracker of one target. size: (width, height) of the images [px]; fps: nominal frame rate."""
 
-    def __init__(self, size: tuple[int, int], fps: float = 30.0, seed: int = 0) -> None:
+    def __init__(self, size: tuple[int, int], fps: float = 30.0) -> None:
         self._size = size
         self._fps = fps
-        self._rng = np.random.default_rng(seed)
         self._scene = SceneMotion(size)
         self.debug: dict[str, float] = {}
 
@@ -106,8 +94,10 @@ class AppearanceTracker:
         self._near = 1.0 - _ANYWHERE
         self._ratio = 0.0
         self._broken = False  # whether the motion of the scene was unknown in a frame since the last sight
-        self._expected: Floats | None = None
-        self._candidate: _Candidate | None = None
+        self._expected: tuple[OrientedBox, bool] | None = None
+        self._heading = float("nan")  # of the other tracker's estimate, at the last sight [rad]
+        self._confirmed = _PROBATION  # frames since the target was found again
+        self._candidate: Candidate | None = None
         return self._estimate(time)
 
     def handle_telemetry(self, sample: Telemetry) -> None:
@@ -119,7 +109,10 @@ class AppearanceTracker:
         self._time += dt
         self._frame += 1
         if image is None or image.shape[:2] != (self._size[1], self._size[0]):
+            # Nothing speaks against the target: it is looked for where it was going, but needs evidence for it.
+            most, self._confirmed = max(self._missed, _GRACE_FRAMES), 0
             self._miss(dt)
+            self._missed = min(self._missed, most)
             return self._estimate(time)
         self.motion = self._scene.update(image, self._outline() if self._missed == 0 else None)
         origin = self._predict(dt)
@@ -144,14 +137,23 @@ class AppearanceTracker:
         return float(0.5 + self.length * (0.05 + _DRIFT * t + 0.5 * _ACCELERATION * t * t))
 
     @property
+    def sees(self) -> bool:
+        """Whether the last frame shows the target."""
+        return self._missed == 0
+
+    @property
     def certain(self) -> bool:
         """Whether the last frame shows the target, by clear evidence."""
         return self._missed == 0 and self._ratio > _CERTAIN
 
     def expect(self, other: Estimate) -> None:
-        """Take the place where another tracker has the target before this frame: the search begins there."""
-        if np.isfinite([other.x, other.y]).all() and (self._missed or other.state is TrackState.VISIBLE):
-            self._expected = np.array([other.x, other.y])
+        """Take the place where another tracker has the target in the next image: what it sees there is tested first."""
+        if not self._missed:
+            self._heading = other.heading
+        elif np.isfinite([other.x, other.y]).all():
+            turn = other.heading - self._heading if other.state is TrackState.VISIBLE else float("nan")
+            box = self.box.at(np.array([other.x, other.y])).turned(turn if np.isfinite(turn) else 0.0)
+            self._expected = box, other.state is TrackState.VISIBLE
 
     def _predict(self, dt: float) -> Floats:
         """Move the box with the scene and its own velocity; returns where the scene alone would have moved it (2,)."""
@@ -168,9 +170,7 @@ class AppearanceTracker:
             if self._missed == 0:
                 box = box.sized(box.sides * motion.zoom).turned(turn)
             if self._candidate is not None:
-                moved = self._candidate.box
-                moved = moved.at(motion.at(moved.centre, self._scene.reach)).sized(moved.sides * motion.zoom)
-                self._candidate.box = moved.turned(turn)
+                self._candidate.move(motion, self._scene.reach, dt)
         if self._missed:
             self._broken |= not motion.trusted
             angle = self._turn_rate * dt
@@ -184,8 +184,12 @@ class AppearanceTracker:
                 if relocated is not None:
                     box, origin, self._broken = relocated, relocated.centre, False
         self.box = box.at(origin + self._velocity * dt)
-        if self._expected is not None and self._missed:
-            self.box, self._expected = box.at(self._expected), None
+        if self._expected is not None:
+            (expected, found), self._expected = self._expected, None
+            if found and self._candidate is None and self._missed % 2:
+                self._candidate = Candidate(expected, _PROPOSED)
+            elif not found:
+                self.box = box.at(expected.centre)
         return origin
 
     def _relocated(self) -> OrientedBox | None:
@@ -213,10 +217,13 @@ class AppearanceTracker:
         score = self._memory.score(image, box)
         ratio = self._ratio = self._memory.log_ratio(score) + self._peak_ratio(peak)
         self.debug = {"peak": peak, "score": score, "llr": ratio}
-        if ratio < _REJECT:
-            self._miss(dt)
+        self._confirmed += 1
+        if self._confirmed <= _PROBATION and ratio < 0.0:
+            self._missed = _GRACE_FRAMES  # it was taken for the target by mistake: no grace
+        elif ratio >= _REJECT:
+            self._accept(image, box, score, peak, origin, dt)
             return
-        self._accept(image, box, score, peak, origin, dt)
+        self._miss(dt)
 
     def _peak_ratio(self, peak: float) -> float:
         """log likelihood ratio of the filter's answer: target against background, bounded."""
@@ -308,7 +315,7 @@ class AppearanceTracker:
         self._missed += 1
         self._unseen_s += dt
         if self._candidate is not None:
-            self._test(image)
+            self._test(image, dt)
             return
         k = self._missed - _GRACE_FRAMES
         box = self.box.sized(self.box.sides * _SIZES[k // 2 % len(_SIZES)]).turned(_ANGLES[k // 2 % len(_ANGLES)])
@@ -317,7 +324,7 @@ class AppearanceTracker:
             box, reach = tile(box, self._size, k // 2)
         found = search(image, self._memory, box, reach)
         if found:
-            self._consider(image, found)
+            self._consider(image, found, dt)
         if k % 2 == 0:
             # Where it was expected and is not seen, it is less and less likely to be.
             self._near *= 1.0 - _DETECTION * self.box.share_within(reach, self._size)
@@ -331,7 +338,7 @@ class AppearanceTracker:
         near = np.log(share + 1e-12) - 0.5 * squared + np.log(min(area / (2.0 * np.pi * std * std), 1.0))
         return float(np.logaddexp(near, np.log((1.0 - share) * area / (self._size[0] * self._size[1]))))
 
-    def _consider(self, image: Image, found: list[Found]) -> None:
+    def _consider(self, image: Image, found: list[Found], dt: float) -> None:
         """Take up the likeliest of the places found, if it is likelier by far than any other."""
         odds = [self._memory.log_ratio(f.score, _CHANGE) + self._log_prior(f.box.centre) for f in found]
         order = np.argsort(odds)[::-1]
@@ -339,29 +346,34 @@ class AppearanceTracker:
         self.debug = {"score": found[best].score, "odds": odds[best], "near": self._near}
         if len(odds) > 1 and odds[best] - odds[int(order[1])] < _MARGIN:
             return
-        self._candidate = _Candidate(found[best].box, self._log_prior(found[best].box.centre))
-        self._test(image)
+        self._candidate = Candidate(found[best].box, self._log_prior(found[best].box.centre))
+        self._test(image, dt)
 
-    def _test(self, image: Image) -> None:
+    def _test(self, image: Image, dt: float) -> None:
         """Add a frame's evidence to the candidate's odds; take it for the target, or drop it."""
         candidate = self._candidate
         assert candidate is not None
         box, peak = self._respond(image, candidate.box)
-        score = self._memory.score(image, box)
+        if candidate.hits == 0:
+            # Before another size or angle is believed: the last one, localised about the same place.
+            same, same_peak = self._respond(image, self.box.at(candidate.box.centre))
+            if self._memory.score(image, same) > self._memory.score(image, box):
+                box, peak = same, same_peak
+        trials = [box, *(box.sized(f * box.sides) for f in (_TRIAL_SIZES if candidate.hits else _FIRST_SIZES))]
+        scores = [self._memory.score(image, trial) for trial in trials]
+        score, box = max(scores), trials[int(np.argmax(scores))]
         evidence = self._memory.log_ratio(score, _CHANGE)
         self.debug |= {"score": score, "llr": evidence, "peak": peak, "usual": self._peak, "prior": candidate.prior}
-        candidate.hits += 1
-        # Further frames show the same look-alike, if it is one: they make the evidence surer, not larger.
-        candidate.evidence += (evidence - candidate.evidence) / candidate.hits
-        candidate.box = box
-        odds = candidate.prior + candidate.evidence
+        candidate.add(box, evidence, dt)
         weak = evidence < 0.0 or peak < _PEAK_SHARE * self._peak or box.share_inside(self._size) < _MEASURE_INSIDE
-        if weak or odds < _TENTATIVE or candidate.hits > _MAX_TESTS:
+        if weak or candidate.hopeless:
             self._candidate = None
-        elif candidate.hits >= _HITS and odds > _ACCEPT:
+        elif candidate.accepted:
             self._candidate = None
-            self._steps.clear()
-            self._missed, self._unseen_s = 0, 0.0
+            self._steps = deque(candidate.steps, maxlen=self._steps.maxlen)
+            if candidate.steps:
+                self._velocity = np.median(candidate.steps, axis=0)
+            self._missed, self._unseen_s, self._confirmed = 0, 0.0, 0
             self.box = box
             self._flow.remember(image, box)
 
@@ -372,16 +384,14 @@ class AppearanceTracker:
 
     def _estimate(self, time: float) -> Estimate:
         state = TrackState.VISIBLE if self._missed == 0 else TrackState.COASTING
-        std = self.std
-        if self._missed and (std > _LOST_STD * self.length or self._unseen_s > _LOST_AFTER_S):
+        if self._missed and (self.std > _LOST_STD * self.length or self._unseen_s > _LOST_AFTER_S):
             state = TrackState.LOST
-        nan = float("nan")
         centre, extent = self._shape.bounds(self.box)
-        x, y = (nan, nan) if state is TrackState.LOST else (float(centre[0]), float(centre[1]))
+        x, y = (np.nan, np.nan) if state is TrackState.LOST else (float(centre[0]), float(centre[1]))
         # Below it, the direction of the velocity is noise.
         moves = state is not TrackState.LOST and np.hypot(*self._velocity) > _MOVES * self.length
-        heading = float(np.arctan2(self._velocity[1], self._velocity[0])) if moves else nan
-        return Estimate(time, state, x, y, float(extent[0]), float(extent[1]), heading, std)
+        heading = float(np.arctan2(self._velocity[1], self._velocity[0])) if moves else np.nan
+        return Estimate(time, state, x, y, float(extent[0]), float(extent[1]), heading, self.std)
 
 
 def _square(matrix: Floats) -> Floats:

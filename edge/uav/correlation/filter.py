@@ -23,6 +23,7 @@ _PADDING = 2.4  # of the window, over the mean side of the target, added on both
 _LABEL_STD = 1.0 / 16.0  # of the wanted peak, over the geometric mean of the target's sides
 _ITERATIONS, _PENALTY, _PENALTY_GROWTH, _REGULARISATION = 3, 5.0, 3.0, 0.01  # of the published method
 _LEARNING_RATE = 0.025
+_CENTRE_STD = 0.8  # of the mask, over half a side: a box's corners show background
 
 Spectrum = npt.NDArray[np.complex64]
 
@@ -61,7 +62,8 @@ class CorrelationFilter:
         self._label = self._fft(np.fft.ifftshift(label).astype(np.float32))
         middle = 0.5 * (cells - 1.0)
         outside = np.maximum(np.abs(x - middle[0]) - 0.5 * target[0], np.abs(y - middle[1]) - 0.5 * target[1])
-        self._mask = np.clip(0.5 - outside, 0.0, 1.0).astype(np.float32)
+        squared = ((x - middle[0]) / (0.5 * target[0])) ** 2 + ((y - middle[1]) / (0.5 * target[1])) ** 2
+        self._mask = (np.clip(0.5 - outside, 0.0, 1.0) * np.exp(-0.5 * squared / _CENTRE_STD**2)).astype(np.float32)
         self._exclude = max(1.5, 0.35 * float(target.min()))
         self._filter: Spectrum | None = None
         self._weights = np.full((CHANNELS, 1, 1), 1.0 / CHANNELS, np.float32)

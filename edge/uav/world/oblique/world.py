@@ -47,7 +47,7 @@ class ObliqueWorld:
     """A pure function of its arguments.
 
     target: of ``TARGETS``; flight: of ``FLIGHTS``; frames: number; away_s: how long ``away`` looks elsewhere.
-    occluders: trees and buildings stand between camera and target too. quality: of the JPEG compression.
+    quality: of the JPEG compression. range_factor: of the camera's distance; 5 makes a car some 12 px long.
     """
 
     target: str
@@ -58,6 +58,7 @@ class ObliqueWorld:
     frames: int = 150
     away_s: float = 2.0
     quality: int = 75
+    range_factor: float = 1.0
 
     def __post_init__(self) -> None:
         if self.target not in TARGETS or self.flight not in FLIGHTS:
@@ -84,7 +85,7 @@ class ObliqueWorld:
         rng = np.random.default_rng([self.seed, 2])
         place, _ = self._path
         n, t = self.frames, self._times
-        distance = _RANGES[self.target] * rng.uniform(0.7, 1.4)
+        distance = self.range_factor * _RANGES[self.target] * rng.uniform(0.7, 1.4)
         depression = np.deg2rad(rng.uniform(12.0, 40.0))
         bearing = rng.uniform(-np.pi, np.pi) + np.zeros(n)
         if self.flight == "orbit":

@@ -134,6 +134,33 @@ def test_a_look_alike_elsewhere_is_not_the_target(scene: Image) -> None:
     assert np.hypot(found[-1].x - truth[-1, 0], found[-1].y - truth[-1, 1]) < 4.0
 
 
+def follow_with_another(images: list[Image], truth: np.ndarray, offset: float) -> list[Estimate]:
+    """Follow while, from frame 47 on, another tracker sees the target ``offset`` px beside its true place."""
+    tracker = AppearanceTracker(SIZE, FPS)
+    box = Box(float(truth[0, 0] - TARGET[0] / 2), float(truth[0, 1] - TARGET[1] / 2), *map(float, TARGET))
+    found = [tracker.begin(images[0], 0.0, box)]
+    for k in range(1, len(images)):
+        if k == 47:
+            tracker.box = tracker.box.at(np.array([-2000.0, 120.0]))  # its own prediction has failed
+        if k >= 47:
+            x = float(truth[k, 0] + offset)
+            tracker.expect(Estimate(k / FPS, TrackState.VISIBLE, x, float(truth[k, 1]), 34.0, 22.0, float("nan"), 2.0))
+        found.append(tracker.handle_frame(images[k], k / FPS))
+    return found
+
+
+def test_what_another_tracker_finds_is_taken_up_where_it_looks_like_the_target(scene: Image) -> None:
+    images, truth = flight(scene, away=420.0)
+    found = follow_with_another(images, truth, 0.0)
+    assert all(e.state is TrackState.VISIBLE for e in found[60:])
+    assert np.hypot(found[-1].x - truth[-1, 0], found[-1].y - truth[-1, 1]) < 4.0
+
+
+def test_what_another_tracker_finds_is_not_the_target_where_it_looks_otherwise(scene: Image) -> None:
+    images, truth = flight(scene, away=420.0, shown_again=False)
+    assert not any(e.state is TrackState.VISIBLE for e in follow_with_another(images, truth, 0.0)[30:])
+
+
 def test_a_scene_is_recognised_after_a_cut(scene: Image) -> None:
     gray = cv2.cvtColor(scene, cv2.COLOR_BGR2GRAY)
     matrix = Keyframe(np.ascontiguousarray(gray[200:440, 150:470])).locate(np.ascontiguousarray(gray[230:470, 240:560]))
