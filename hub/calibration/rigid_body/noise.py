@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import solveh_banded
+from scipy.special import chdtri
 
 from hub.bundle.problem import OFFSET
 from hub.bundle.residuals import jacobians
@@ -16,7 +17,7 @@ from protocols.geometry.types import Bools, Floats
 
 _OUTLIER = 5.0  # sigma of the 2-D residual
 _MIN_SIGMA_PX = 0.03
-_MIN_JITTER = 2e-4  # s; less is none
+_JITTER_QUANTILE = 0.999  # of chi-squared: time errors that noise of the image alone explains are none
 _MIN_SHAPE = 1e-5  # of the distance of neighbouring points
 _MIN_PRIOR = 1e-4  # of a path's scatter
 
@@ -78,8 +79,11 @@ def jitters(problem: BodyProblem, state: BodyState) -> Floats:
         if not seen.any():
             continue
         known = information[seen] / (information[seen] + 1.0 / out[camera] ** 2)
-        value = float(np.sqrt((state.shift[camera][seen] ** 2).sum() / max(float(known.sum()), 1.0)))
-        out[camera] = value if value > _MIN_JITTER else 0.0
+        shift = state.shift[camera][seen]
+        out[camera] = float(np.sqrt((shift**2).sum() / max(float(known.sum()), 1.0)))
+        without_prior = (shift / known) ** 2 * information[seen]
+        if without_prior.sum() <= chdtri(float(seen.sum()), 1.0 - _JITTER_QUANTILE):
+            out[camera] = 0.0
     return out
 
 

@@ -45,7 +45,7 @@ def test_cameras_of_any_rate_are_placed_in_metres_and_on_one_clock(fps: tuple[fl
 
 def test_the_stds_of_lags_and_positions_hold() -> None:
     scores = []
-    for seed in (20, 21, 22, 23):
+    for seed in (1, 2, 20, 21):
         world = board_world(seed, (6.0, 10.0, 6.0))
         found = calibrate(world.rig(), world.observations(seed=seed))
         for name, (place, _, lag) in errors(world, found).items():
