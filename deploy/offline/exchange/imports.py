@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import tomli_w
@@ -22,20 +22,8 @@ from protocols.session.folder import RIG_FILE, write_rig
 from protocols.session.observations import Observations, gather_tracks
 from protocols.session.rig import parse_camera_table
 
-if TYPE_CHECKING:
-    pass
-
-CALIBRATIONS = (
-    "aniposelib",
-    "caliscope",
-    "pose2sim",
-    "freemocap",
-    "opencv",
-    "kalibr",
-    "colmap",
-    "opensfm",
-    "qualisys",
-    "vicon",
+CALIBRATIONS = tuple(
+    "aniposelib caliscope pose2sim freemocap opencv kalibr colmap opensfm qualisys vicon optitrack".split()
 )
 POINTS = ("caliscope-points", "deeplabcut", "mvus", *keypoints.FORMATS)
 FORMATS = (*CALIBRATIONS, *POINTS, "session")
@@ -111,7 +99,7 @@ def read_foreign_calibration(source: ImportSource) -> ForeignRig:
         return colmap.read(file)
     if source.kind == "kalibr":
         return yaml_rigs.read_kalibr(file)
-    if source.kind in ("qualisys", "vicon"):
+    if source.kind in ("qualisys", "vicon", "optitrack"):
         return xml_rigs.read(file, source.kind)
     if source.kind == "opensfm":
         return opensfm.read(file)
@@ -254,10 +242,9 @@ def _kind_of(file: Path) -> str | None:
         return toml_rigs.detect_format(read_toml(file, "calibration")[0])
     if suffix in _YAML:
         return yaml_rigs.detect_format(yaml_rigs.load(file)[0])
-    begin = _beginning(file)
-    if suffix in (".xml", ".xcp") or begin.lstrip().startswith("<"):
+    if suffix in (".xml", ".xcp", ".mcal") or _beginning(file).lstrip().startswith("<"):
         return xml_rigs.detect_format(file)
-    return points.detect_format(begin)
+    return points.detect_format(_beginning(file))
 
 
 def _beginning(file: Path) -> str:
