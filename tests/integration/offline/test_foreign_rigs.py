@@ -63,9 +63,10 @@ def test_a_vicon_calibration_has_quaternions_with_the_scalar_last(tmp_path: Path
 
 
 def test_an_optitrack_calibration_has_world_from_camera_rotations_in_utf16(tmp_path: Path) -> None:
-    # A camera in Motive's frame (y up) at 2.5 m height and z = -3 m, level, that sees the origin at its image's centre.
-    backward = np.array([0.0, 2.5, -3.0]) / np.hypot(2.5, 3.0)
-    right = np.array([-1.0, 0.0, 0.0])
+    # A level camera in Motive's frame (y up) that sees the origin at its image's centre.
+    centre = np.array([2.0, 2.5, -3.0])
+    backward = centre / np.linalg.norm(centre)
+    right = np.array([-3.0, 0.0, -2.0]) / np.hypot(3.0, 2.0)
     axes = np.column_stack([right, np.cross(backward, right), backward])
     turn = " ".join(f'OrientMatrix{i}="{value}"' for i, value in enumerate(axes.ravel().tolist()))
     lens = 'LensCenterX="960" LensCenterY="538" HorizontalFocalLength="1248" VerticalFocalLength="1247"'
@@ -75,7 +76,7 @@ def test_an_optitrack_calibration_has_world_from_camera_rotations_in_utf16(tmp_p
         <Camera Serial="C11764"><Attributes ImagerPixelWidth="1920" ImagerPixelHeight="1080"/>
         <Intrinsic {lens} k1="9" k2="9" k3="9" TangentialX="9" TangentialY="9"/>
         <IntrinsicStandardCameraModel {lens} k1="-0.1" k2="0.02" k3="0.003" TangentialX="1e-4" TangentialY="2e-4"/>
-        <Extrinsic X="0" Y="2.5" Z="-3" {turn}/></Camera></Cameras></Calibration></calibrationProfile>""",
+        <Extrinsic X="2" Y="2.5" Z="-3" {turn}/></Camera></Cameras></Calibration></calibrationProfile>""",
         encoding="utf-16",
     )
     out = tmp_path / "rig.toml"
@@ -84,10 +85,10 @@ def test_an_optitrack_calibration_has_world_from_camera_rotations_in_utf16(tmp_p
     camera = cameras["C11764"]
     assert rig.units == "m"
     assert camera.intrinsics.distortions == pytest.approx([-0.1, 0.02, 1e-4, 2e-4, 0.003])
-    seen = camera.pose.camera_from_world(np.array([[0.0, 0.0, 0.0], [-0.1, 0.0, 0.0], [0.0, 0.1, 0.0]]))
+    seen = camera.pose.camera_from_world(np.array([[0.0, 0.0, 0.0], 0.1 * right, [0.0, 0.1, 0.0]]))
     assert camera.intrinsics.project(seen[:1])[0] == pytest.approx([960, 538])
     across, down = (camera.intrinsics.project(seen)[1:] - [960, 538]).tolist()
-    assert across[0] > 20, "the world's -x is to the right of a camera that looks along +z with y up"
+    assert across == pytest.approx([0.1 * 1248 / np.linalg.norm(centre), 0.0], abs=0.1)
     assert down[1] < -20, "what is higher is higher in the image"
 
 
