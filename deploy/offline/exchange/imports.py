@@ -57,7 +57,7 @@ def detect_source(sources: list[Path], wanted: str | None) -> ImportSource:
         folder = sources[0]
         if wanted == "session" or (wanted is None and ((folder / RIG_FILE).exists() or (folder / BOXES_FILE).exists())):
             return ImportSource("session", [folder])
-        if wanted == "colmap" or (wanted is None and (folder / colmap.IMAGES).exists()):
+        if wanted == "colmap" or (wanted is None and colmap.is_model(folder)):
             return ImportSource("colmap", [folder])
         volume = folder / "camera_array.toml"
         if wanted in (None, "caliscope") and volume.exists() and (folder / "image_points.csv").exists():
@@ -79,7 +79,8 @@ def detect_source(sources: list[Path], wanted: str | None) -> ImportSource:
     found = {path: _kind_of(path) for path in files}
     unknown = next((path for path, kind in found.items() if kind is None), None)
     if unknown is not None:
-        nearest = points.nearest_layout(_beginning(unknown)) if unknown.suffix.lower() in (".csv", ".txt") else ""
+        is_text = unknown.suffix.lower() in (".csv", ".txt", *_YAML)
+        nearest = points.nearest_layout(_beginning(unknown)) if is_text else ""
         raise InputError(f"unknown format{f': {nearest}' if nearest else ''}", file=unknown, line=1, remedy=_REMEDY)
     kinds_found = sorted({str(kind) for kind in found.values()})
     if len(kinds_found) > 1:
