@@ -45,10 +45,19 @@ _MODELS: dict[str, tuple[int, tuple[int, int, int, int], bool, tuple[int, ...]]]
 _CENTRE = 0.5
 
 
+def is_model(folder: Path) -> bool:
+    """Whether a folder has a file of a model, as text or binary."""
+    return any((folder / name).with_suffix(end).exists() for name in (CAMERAS, IMAGES) for end in (".txt", ".bin"))
+
+
 def read(folder: Path) -> ForeignRig:
     """Read a text model with one image per camera; a camera is named after its image without the suffix.
 
     Raises InputError: file, line, what, remedy."""
+    gone = next((name for name in (CAMERAS, IMAGES) if not (folder / name).exists()), None)
+    if gone is not None:
+        remedy = "save the model as text: colmap model_converter --output_type TXT"
+        raise InputError(f"looks like a COLMAP model, but {gone} is missing", file=folder, remedy=remedy)
     lenses = _read_cameras(folder / CAMERAS)
     cameras: dict[str, ForeignCamera] = {}
     file = folder / IMAGES

@@ -196,7 +196,11 @@ def _openpose(folder: Path) -> Iterator[Keypoint]:
         if not numbers:
             continue
         people = []
-        for person in _json(file)["people"]:
+        document = _json(file)
+        if not isinstance(document, dict) or not isinstance(document.get("people"), list):
+            what = "looks like a frame of OpenPose, but key people is missing"
+            raise InputError(what, file=file, remedy="export it again, or remove it")
+        for person in document["people"]:
             values = np.asarray(person["pose_keypoints_2d"], dtype=np.float64).reshape(-1, 3)
             identity = person.get("person_id", [-1])
             number = identity[0] if isinstance(identity, list) and identity else identity

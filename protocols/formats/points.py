@@ -32,8 +32,10 @@ _LAYOUTS = {
     "Syncline's observations.csv": "camera frame time u v",
     "Syncline's boxes.csv": "camera frame time x y width height",
     "DeepLabCut's CSV": "scorer bodyparts coords",
+    "ROS' camera_info": "image_width image_height camera_name camera_matrix distortion_model distortion_coefficients",
 }
-"""Columns of tables by name, for what is nearly one of them."""
+"""Columns of tables by name, or rows or keys, for what is nearly one of them."""
+_PARTS = {"DeepLabCut's CSV": "row", "ROS' camera_info": "key"}
 
 
 @dataclass(slots=True)
@@ -56,8 +58,8 @@ def detect_format(text: str) -> str | None:
     header = [cell.strip() for cell in lines[0].split(",")]
     if all(name in header for name in _CALISCOPE) and any(name in header for name in _CALISCOPE_POINTS):
         return "caliscope-points"
-    if header[0] == "scorer" and any(line.startswith("bodyparts,") for line in lines):
-        return "deeplabcut"
+    if {"bodyparts", "coords"} <= {line.split(",")[0].strip() for line in lines}:
+        return "deeplabcut"  # its first row, scorer, is not needed
     try:
         first = [float(word) for word in lines[0].replace(",", " ").split()]
     except ValueError:
@@ -67,7 +69,8 @@ def detect_format(text: str) -> str | None:
 
 def nearest_layout(text: str) -> str:
     """Which known table the beginning of a text is nearest to, and what it lacks; "" where it resembles none."""
-    header = [cell.strip().lower() for cell in (text.splitlines() or [""])[0].split(",")]
+    lines = text.splitlines() or [""]
+    header = [cell.strip().lower() for cell in [*lines[0].split(","), *(re.split("[,:]", line)[0] for line in lines)]]
     found = []
     for name, columns in _LAYOUTS.items():
         wanted = columns.split()
@@ -76,7 +79,7 @@ def nearest_layout(text: str) -> str:
     share, name, missing = min(found)
     if share > 0.5 or not missing:
         return ""
-    return f"looks like {name}, but column {', '.join(missing)} is missing"
+    return f"looks like {name}, but {_PARTS.get(name, 'column')} {', '.join(missing)} is missing"
 
 
 def read(kind: str, files: list[Path], times: Times, likelihood: float, camera: str | None) -> Observations:

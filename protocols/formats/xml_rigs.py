@@ -1,7 +1,9 @@
-"""Calibrations of motion capture systems in XML: Qualisys (QTM's calibration, .qca.txt) and Vicon (.xcp).
+"""Calibrations of motion capture systems in XML: Qualisys (.qca.txt), Vicon (.xcp), OptiTrack (Motive 3.2, .mcal).
 
-Both give camera centres in millimetres and rotations, camera from world. Qualisys' cameras look along -z with y up, and
-its pixels are in 64ths. The conversion is that of Pose2Sim's reader.
+Qualisys and Vicon give camera centres in millimetres and rotations, camera from world; the conversion is that of
+Pose2Sim's reader. Qualisys' pixels are in 64ths. OptiTrack gives centres in metres and rotations, world from camera,
+row by row; ``IntrinsicStandardCameraModel`` is OpenCV's, ``Intrinsic`` is Motive's own and is not read. The cameras of
+Qualisys and OptiTrack look along -z with y up. Layout: docs.optitrack.com, ".mcal XML Calibration Files".
 """
 
 from __future__ import annotations
@@ -21,24 +23,28 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 
+FORMATS = ("qualisys", "vicon", "optitrack")
 _MAX_FILE = 1 << 24
 _QUALISYS_UNIT = 64.0
+_FROM_Y_UP = np.diag([1.0, -1.0, -1.0])  # the axes of a camera that looks along -z with y up, to OpenCV's
 
 
 def detect_format(file: Path) -> str | None:
-    """``qualisys`` or ``vicon``; None = another XML file. Raises InputError."""
+    """``qualisys``, ``vicon`` or ``optitrack``; None = another XML file. Raises InputError."""
     root = _root(file)
     if root.find("cameras/camera/intrinsic") is not None:
         return "qualisys"
+    if root.find("Calibration/Cameras/Camera/Extrinsic") is not None:
+        return "optitrack"
     return "vicon" if root.find("Camera/KeyFrames/KeyFrame") is not None else None
 
 
 def read(file: Path, kind: str) -> ForeignRig:
-    """The video cameras of a file, in millimetres. Raises InputError."""
-    root = _root(file)
+    """The video cameras of a file, in its own unit. Raises InputError."""
+    reader = {"qualisys": _qualisys, "vicon": _vicon, "optitrack": _optitrack}[kind]
     cameras: dict[str, ForeignCamera] = {}
     left_out = []
-    for name, is_video, camera in _qualisys(root, file) if kind == "qualisys" else _vicon(root, file):
+    for name, is_video, camera in reader(_root(file), file):
         if name in cameras:
             raise InputError(f"two cameras are named {name!r}", file=file, remedy="give each its own name")
         if is_video:
@@ -48,14 +54,14 @@ def read(file: Path, kind: str) -> ForeignRig:
     if not cameras:
         raise InputError("no video camera in it", file=file, remedy="calibrate the video cameras too")
     warnings = (f"marker cameras without video were left out: {', '.join(left_out)}",) if left_out else ()
-    return ForeignRig(cameras, "mm", "metric", warnings)
+    return ForeignRig(cameras, "m" if kind == "optitrack" else "mm", "metric", warnings)
 
 
 def _root(file: Path) -> ElementTree.Element:
-    remedy = "give QTM's calibration or Vicon's .xcp"
+    remedy = "give QTM's calibration, Vicon's .xcp or Motive's .mcal"
     data = read_bytes(file, "calibration", _MAX_FILE)
-    # Entities could make a small file expand without bound.
-    if b"<!ENTITY" in data or b"<!DOCTYPE" in data:
+    # Entities could make a small file expand without bound. Motive writes UTF-16.
+    if any(word in data.replace(b"\0", b"") for word in (b"<!ENTITY", b"<!DOCTYPE")):
         raise InputError("has a document type of its own", file=file, remedy=remedy)
     try:
         return ElementTree.fromstring(data)
@@ -77,7 +83,7 @@ def _qualisys(root: ElementTree.Element, file: Path) -> Iterator[tuple[str, bool
         centre = _numbers(place, ("x", "y", "z"), file, name)
         cells = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
         rotation = so3.nearest(_numbers(place, cells, file, name).reshape(3, 3))
-        pose = Pose(np.diag([1.0, -1.0, -1.0]) @ rotation, centre)
+        pose = Pose(_FROM_Y_UP @ rotation, centre)
         model = tag.get("model", "").lower()
         yield name, "video" in model or "none" in model or not model, ForeignCamera(name, intrinsics, pose)
 
@@ -103,6 +109,21 @@ def _vicon(root: ElementTree.Element, file: Path) -> Iterator[tuple[str, bool, F
         position = _words(frame, "POSITION", 3, file, name)
         pose = Pose(turn, position)
         yield name, "video" in tag.get("TYPE", "video").lower(), ForeignCamera(name, intrinsics, pose)
+
+
+def _optitrack(root: ElementTree.Element, file: Path) -> Iterator[tuple[str, bool, ForeignCamera]]:
+    for tag in root.findall("Calibration/Cameras/Camera"):
+        name = check_name(tag.get("Serial") or "", file=file)
+        parts = ("Attributes", "IntrinsicStandardCameraModel", "Extrinsic")
+        view, lens, place = (_child(tag, part, file, name) for part in parts)
+        width, height = _numbers(view, ("ImagerPixelWidth", "ImagerPixelHeight"), file, name)
+        keys = ("HorizontalFocalLength", "VerticalFocalLength", "LensCenterX", "LensCenterY")
+        fu, fv, cu, cv = _numbers(lens, keys, file, name).tolist()
+        distortions = _numbers(lens, ("k1", "k2", "TangentialX", "TangentialY", "k3"), file, name)
+        intrinsics = _intrinsics(width, height, (fu, fv, cu, cv), distortions, file)
+        turn = so3.nearest(_numbers(place, [f"OrientMatrix{i}" for i in range(9)], file, name).reshape(3, 3))
+        pose = Pose(_FROM_Y_UP @ turn.T, _numbers(place, ("X", "Y", "Z"), file, name))
+        yield name, True, ForeignCamera(name, intrinsics, pose)
 
 
 def _intrinsics(

@@ -218,6 +218,10 @@ def _opencv_camera(values: Mapping[str, Any], text: str, file: Path) -> ForeignC
     fisheye = model in _FISHEYE
     place = next((key for key in _DISTORTION if key in values), None)
     flat = [] if place is None else _rows(values[place])
+    # Four coefficients may be plumb_bob's or equidistant's, and camera_info names its model.
+    if "projection_matrix" in values and "distortion_model" not in values and flat and len(flat) == 4:
+        what = "looks like ROS' camera_info, but key distortion_model is missing"
+        raise InputError(what, file=file, line=_line(text, str(place)), remedy="add plumb_bob or equidistant")
     if not isinstance(flat, list):
         raise InputError(f"{place} is not numbers", file=file, line=_line(text, str(place)), remedy="give 4 or 5")
     bent = parse_array(flat, (len(flat),), str(place), file, _line(text, str(place)))

@@ -24,6 +24,7 @@ def import_(
         "opensfm",
         "qualisys",
         "vicon",
+        "optitrack",
         "caliscope-points",
         "deeplabcut",
         "mvus",
@@ -52,8 +53,8 @@ def import_(
     """Convert another tool's calibration or 2-D tracks, or a session folder.
 
     Calibrations (aniposelib, caliscope, Pose2Sim, FreeMoCap, OpenCV YAML, Kalibr camchain, ROS camera_info, COLMAP
-    text, OpenSfM, Qualisys and Vicon XML) become a rig.toml, which also serves as a calibration.toml if it has all
-    poses.
+    text, OpenSfM; XML of Qualisys, Vicon and OptiTrack) become a rig.toml, which also serves as a calibration.toml if
+    it has all poses.
     Tracks (caliscope CSV, DeepLabCut CSV, mvus text) and keypoints of people or animals (OpenPose, RTMPose, MMPose and
     Pose2Sim JSON folders, DeepLabCut and SLEAP HDF5, FreeMoCap npy, COCO and MediaPipe JSON) become an observations.csv
     with a label a joint, and a session folder becomes a .mcap log. The format is detected from the content.

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import tomli_w
@@ -22,21 +22,8 @@ from protocols.session.folder import RIG_FILE, write_rig
 from protocols.session.observations import Observations, gather_tracks
 from protocols.session.rig import parse_camera_table
 
-if TYPE_CHECKING:
-    pass
-
-CALIBRATIONS = (
-    "aniposelib",
-    "caliscope",
-    "pose2sim",
-    "freemocap",
-    "opencv",
-    "kalibr",
-    "colmap",
-    "opensfm",
-    "qualisys",
-    "vicon",
-)
+_TABLES = ("aniposelib", "caliscope", "pose2sim", "freemocap", "opencv", "kalibr", "colmap", "opensfm")
+CALIBRATIONS = (*_TABLES, *xml_rigs.FORMATS)
 POINTS = ("caliscope-points", "deeplabcut", "mvus", *keypoints.FORMATS)
 FORMATS = (*CALIBRATIONS, *POINTS, "session")
 _CROWDED_SHARE = 0.1  # of the frames with more than one person: above it, they are different labels
@@ -70,7 +57,7 @@ def detect_source(sources: list[Path], wanted: str | None) -> ImportSource:
         folder = sources[0]
         if wanted == "session" or (wanted is None and ((folder / RIG_FILE).exists() or (folder / BOXES_FILE).exists())):
             return ImportSource("session", [folder])
-        if wanted == "colmap" or (wanted is None and (folder / colmap.IMAGES).exists()):
+        if wanted == "colmap" or (wanted is None and colmap.is_model(folder)):
             return ImportSource("colmap", [folder])
         volume = folder / "camera_array.toml"
         if wanted in (None, "caliscope") and volume.exists() and (folder / "image_points.csv").exists():
@@ -92,7 +79,8 @@ def detect_source(sources: list[Path], wanted: str | None) -> ImportSource:
     found = {path: _kind_of(path) for path in files}
     unknown = next((path for path, kind in found.items() if kind is None), None)
     if unknown is not None:
-        nearest = points.nearest_layout(_beginning(unknown)) if unknown.suffix.lower() in (".csv", ".txt") else ""
+        is_text = unknown.suffix.lower() in (".csv", ".txt", *_YAML)
+        nearest = points.nearest_layout(_beginning(unknown)) if is_text else ""
         raise InputError(f"unknown format{f': {nearest}' if nearest else ''}", file=unknown, line=1, remedy=_REMEDY)
     kinds_found = sorted({str(kind) for kind in found.values()})
     if len(kinds_found) > 1:
@@ -111,7 +99,7 @@ def read_foreign_calibration(source: ImportSource) -> ForeignRig:
         return colmap.read(file)
     if source.kind == "kalibr":
         return yaml_rigs.read_kalibr(file)
-    if source.kind in ("qualisys", "vicon"):
+    if source.kind in xml_rigs.FORMATS:
         return xml_rigs.read(file, source.kind)
     if source.kind == "opensfm":
         return opensfm.read(file)
@@ -254,10 +242,9 @@ def _kind_of(file: Path) -> str | None:
         return toml_rigs.detect_format(read_toml(file, "calibration")[0])
     if suffix in _YAML:
         return yaml_rigs.detect_format(yaml_rigs.load(file)[0])
-    begin = _beginning(file)
-    if suffix in (".xml", ".xcp") or begin.lstrip().startswith("<"):
+    if suffix in (".xml", ".xcp", ".mcal") or _beginning(file).lstrip().startswith("<"):
         return xml_rigs.detect_format(file)
-    return points.detect_format(begin)
+    return points.detect_format(_beginning(file))
 
 
 def _beginning(file: Path) -> str:

@@ -62,12 +62,45 @@ def test_a_vicon_calibration_has_quaternions_with_the_scalar_last(tmp_path: Path
     assert camera.intrinsics.distortions[:2] == pytest.approx([-0.1, 0.02])
 
 
+def test_an_optitrack_calibration_has_world_from_camera_rotations_in_utf16(tmp_path: Path) -> None:
+    # A level camera in Motive's frame (y up) that sees the origin at its image's centre.
+    centre = np.array([2.0, 2.5, -3.0])
+    backward = centre / np.linalg.norm(centre)
+    right = np.array([-3.0, 0.0, -2.0]) / np.hypot(3.0, 2.0)
+    axes = np.column_stack([right, np.cross(backward, right), backward])
+    turn = " ".join(f'OrientMatrix{i}="{value}"' for i, value in enumerate(axes.ravel().tolist()))
+    lens = 'LensCenterX="960" LensCenterY="538" HorizontalFocalLength="1248" VerticalFocalLength="1247"'
+    file = tmp_path / "calibration.mcal"
+    file.write_text(
+        f"""<?xml version="1.0" encoding="UTF-16"?><calibrationProfile version="1"><Calibration><Cameras Count="1">
+        <Camera Serial="C11764"><Attributes ImagerPixelWidth="1920" ImagerPixelHeight="1080"/>
+        <Intrinsic {lens} k1="9" k2="9" k3="9" TangentialX="9" TangentialY="9"/>
+        <IntrinsicStandardCameraModel {lens} k1="-0.1" k2="0.02" k3="0.003" TangentialX="1e-4" TangentialY="2e-4"/>
+        <Extrinsic X="2" Y="2.5" Z="-3" {turn}/></Camera></Cameras></Calibration></calibrationProfile>""",
+        encoding="utf-16",
+    )
+    out = tmp_path / "rig.toml"
+    assert run(["import", str(file), "--out", str(out)]) == 0
+    rig, cameras = read_calibration(out)
+    camera = cameras["C11764"]
+    assert rig.units == "m"
+    assert camera.intrinsics.distortions == pytest.approx([-0.1, 0.02, 1e-4, 2e-4, 0.003])
+    seen = camera.pose.camera_from_world(np.array([[0.0, 0.0, 0.0], 0.1 * right, [0.0, 0.1, 0.0]]))
+    assert camera.intrinsics.project(seen[:1])[0] == pytest.approx([960, 538])
+    across, down = (camera.intrinsics.project(seen)[1:] - [960, 538]).tolist()
+    assert across == pytest.approx([0.1 * 1248 / np.linalg.norm(centre), 0.0], abs=0.1)
+    assert down[1] < -20, "what is higher is higher in the image"
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
 @pytest.mark.parametrize("text", ["<a><b></a>", '<!DOCTYPE x [<!ENTITY y "z">]><Cameras/>', "<Cameras/>"])
-def test_other_xml_is_bad_input_in_one_line(tmp_path: Path, capsys: Capture, text: str) -> None:
+def test_other_xml_is_bad_input_in_one_line(tmp_path: Path, capsys: Capture, text: str, encoding: str) -> None:
     file = tmp_path / "rig.xcp"
-    file.write_text(text)
+    file.write_text(text, encoding=encoding)
     assert run(["import", str(file), "--out", str(tmp_path / "rig.toml")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert ("document type" in printed) == ("DOCTYPE" in text)
 
 
 @pytest.mark.parametrize(("to", "target", "posed"), [("opensfm", "reconstruction.json", True), ("ros", "ros", False)])
@@ -101,8 +134,46 @@ def test_caliscopes_table_of_today_is_read(tmp_path: Path) -> None:
     assert track.time.tolist() == [0.25, 0.3]
 
 
-def test_an_unknown_table_is_compared_with_the_nearest_layout(tmp_path: Path, capsys: Capture) -> None:
-    file = tmp_path / "xy.csv"
-    file.write_text("sync_index,cam_id,frame_index,frame_time,object_id,img_loc_x,img_loc_y\n0,1,5,0.2,0,1,2\n")
-    assert run(["import", str(file), "--out", str(tmp_path / "o.csv")]) == 2
-    assert "looks like caliscope's xy.csv of 2025, but column keypoint_id is missing" in capsys.readouterr().err
+ROS = """image_width: 640
+image_height: 480
+camera_name: left
+camera_matrix: {rows: 3, cols: 3, data: [500, 0, 320, 0, 500, 240, 0, 0, 1]}
+distortion_coefficients: {rows: 1, cols: 4, data: [0.1, 0, 0, 0]}
+projection_matrix: {rows: 3, cols: 4, data: [500, 0, 320, 0, 0, 500, 240, 0, 0, 0, 1, 0]}
+"""
+FRAME = '{"people": [{"pose_keypoints_2d": [1, 2, 0.9]}]}'
+DAMAGED = {
+    "caliscope's xy.csv of 2025, but column keypoint_id is missing": {
+        "xy.csv": "sync_index,cam_id,frame_index,frame_time,object_id,img_loc_x,img_loc_y\n0,1,5,0.2,0,1,2\n"
+    },
+    "DeepLabCut's CSV, but row coords is missing": {"cam0DLC_x.csv": "scorer,a,a,a\nbodyparts,x,x,x\n0,1,2,0.9\n"},
+    "a COLMAP model, but images.txt is missing": {"cameras.txt": "1 PINHOLE 4 4 1 1 1 1\n"},
+    "a COLMAP model, but cameras.txt is missing": {"cameras.bin": "", "images.bin": ""},
+    "a frame of OpenPose, but key people is missing": {"cam1_000.json": FRAME, "cam1_001.json": "[]"},
+    "ROS' camera_info, but key distortion_model is missing": {"left.yaml": ROS},
+    "ROS' camera_info, but key camera_matrix is missing": {
+        "left.yaml": ROS.replace("camera_matrix", "other") + "distortion_model: plumb_bob\n"
+    },
+}
+
+
+@pytest.mark.parametrize("line", DAMAGED)
+def test_a_damaged_layout_is_named_with_what_is_missing(line: str, tmp_path: Path, capsys: Capture) -> None:
+    source = tmp_path / "source"
+    source.mkdir()
+    for name, text in DAMAGED[line].items():
+        (source / name).write_text(text)
+    is_table = any(name.endswith((".csv", ".json")) for name in DAMAGED[line])
+    out = tmp_path / ("o.csv" if is_table else "o.toml")
+    assert run(["import", str(source), "--fps", "30", "--out", str(out)]) == 2
+    printed = capsys.readouterr().err
+    assert f"looks like {line}" in printed
+    assert printed.count("\n") == 1
+    assert not out.exists()
+
+
+def test_deeplabcuts_table_without_its_first_row_is_read(tmp_path: Path) -> None:
+    file, out = tmp_path / "cam0DLC_x.csv", tmp_path / "o.csv"
+    file.write_text("bodyparts,nose,nose,nose\ncoords,x,y,likelihood\n0,1,2,0.9\n1,2,3,0.9\n")
+    assert run(["import", str(file), "--fps", "30", "--out", str(out)]) == 0
+    assert read_observations(out, ["cam0"]).tracks["cam0", "marker"].frame.tolist() == [0, 1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import tomllib
 from pathlib import Path
@@ -21,6 +22,7 @@ from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
 from protocols.session.calibration import read_calibration
 from protocols.session.folder import read_folder
+from tests.support.videos import numbered_image, write_video
 
 Capture = pytest.CaptureFixture[str]
 
@@ -486,15 +488,20 @@ def test_a_broken_colmap_model_is_told_by_line(tmp_path: Path, capsys: Capture) 
     assert "camera 7 is not in cameras.txt" in capsys.readouterr().err
 
 
-NAMED = ("CVLab1", "GoPro 2", "Kamera.Süd")
+NAMED = ("CVLab1", "GoPro 2", "Front-left", "Kamera.Süd")
 
 
 @pytest.fixture(scope="module")
 def named_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated session whose cameras have upper case, a space, a full stop and an umlaut in their names."""
+    """A simulated session; its cameras' names have upper case, a space, a hyphen, a full stop and an umlaut."""
     session = tmp_path_factory.mktemp("named") / "session"
-    assert run(["simulate", "marker", "--cameras", "3", "--seconds", "20", "--out", str(session)]) == 0
-    for file in (session / "rig.toml", session / "observations.csv"):
+    assert run(["simulate", "marker", "--cameras", "4", "--seconds", "15", "--out", str(session)]) == 0
+    return rename_cameras(session)
+
+
+def rename_cameras(session: Path) -> Path:
+    """Give the cameras of a simulated session the names of ``NAMED``."""
+    for file in (session / "rig.toml", session / "truth_calibration.toml", session / "observations.csv"):
         text = file.read_text(encoding="utf-8")
         for number, name in enumerate(NAMED):
             text = text.replace(f"[cam{number}]", f'["{name}"]').replace(f'"cam{number}"', f'"{name}"')
@@ -520,6 +527,57 @@ def test_cameras_keep_their_names_through_calibrate_log_and_every_export(named_s
     back = tmp_path / "back"
     assert run(["export", str(log), "--to", "session", "--out", str(back)]) == 0
     assert set(read_folder(back)[1].cameras) == set(NAMED)
+
+
+@pytest.fixture(scope="module")
+def named_results(named_session: Path) -> Path:
+    """The folder of the session, its result, its log, a tiny video a camera, and a session of people."""
+    folder = named_session.parent
+    assert run(["calibrate", str(named_session), "--out", str(folder / "solved")]) == 0
+    log = ["import", str(named_session), "--calibration", str(folder / "solved" / "calibration.toml")]
+    assert run([*log, "--out", str(folder / "log.mcap")]) == 0
+    people = ["simulate", "people", "--cameras", str(len(NAMED)), "--people", "1", "--seconds", "4"]
+    assert run([*people, "--out", str(folder / "people")]) == 0
+    rename_cameras(folder / "people")
+    (folder / "videos").mkdir()
+    for k, name in enumerate(NAMED):
+        write_video(folder / "videos" / f"{name}.mp4", [numbered_image(n + k) for n in range(8)], np.arange(8) / 30.0)
+    # The simulated clocks are decades apart, these videos all begin at 0.
+    solved = (folder / "solved" / "calibration.toml").read_text(encoding="utf-8")
+    aligned = re.sub(r"time_offset = \S+", "time_offset = 0.0", solved)
+    (folder / "aligned.toml").write_text(aligned, encoding="utf-8")
+    pairs = [{"cameras": [NAMED[0], name], "lag_s": 0.05} for name in NAMED[1:]]
+    (folder / "lags.json").write_text(json.dumps({"pairs": pairs}), encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("command", "named_in"),
+    [
+        ("triangulate session --calibration solved/calibration.toml --out OUT.csv", None),
+        ("triangulate log.mcap --calibration solved/calibration.toml --out OUT.csv", None),
+        ("sync videos --calibration aligned.toml --out OUT", "OUT/synchronised.csv"),
+        ("sync videos --calibration lags.json --videos none --out OUT", "OUT/synchronised.csv"),
+        ("follow people --calibration people/truth_calibration.toml --out OUT", "OUT/result.json"),
+        ("replay log.mcap --through hub --calibration solved/calibration.toml --out OUT.mcap", None),
+        ("replay log.mcap --compare log.mcap", None),
+        ("info log.mcap", "printed"),
+        ("report solved --out OUT.html", "OUT.html"),
+    ],
+)
+def test_every_other_command_takes_cameras_as_users_name_them(
+    named_results: Path, tmp_path: Path, capsys: Capture, command: str, named_in: str | None
+) -> None:
+    def place(word: str) -> str:
+        if word.startswith("OUT"):
+            return str(tmp_path / word)
+        return str(named_results / word) if (named_results / word).exists() else word
+
+    assert run([place(word) for word in command.split()]) == 0
+    printed = capsys.readouterr().out
+    if named_in is not None:
+        text = printed if named_in == "printed" else (tmp_path / named_in).read_text(encoding="utf-8")
+        assert [name for name in NAMED if name not in text] == []
 
 
 @pytest.mark.parametrize("bad", ["../up", "a/b", "cam?", ".hidden", "x" * 64])
