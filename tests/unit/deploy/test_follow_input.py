@@ -152,7 +152,7 @@ def test_a_head_below_its_foot_is_named_with_its_line(tmp_path: Path) -> None:
         read_objects(rows(tmp_path, text), SIZES)
 
 
-@pytest.mark.parametrize("scale", [0.001, 100.0, 1000.0])
+@pytest.mark.parametrize("scale", [0.001, 100.0, 1000.0, 3.281, 39.37])
 def test_a_calibration_in_other_units_is_refused(scale: float, tmp_path: Path) -> None:
     (tmp_path / "boxes.csv").write_text(boxes_csv(3.0), encoding="utf-8")
     known = read_given_calibration(write_calibration(tmp_path / "calibration.toml", scale=scale))
@@ -160,7 +160,7 @@ def test_a_calibration_in_other_units_is_refused(scale: float, tmp_path: Path) -
         InputError, match=r"calibration.toml:2: the cameras' positions are about .* times too"
     ) as caught:
         read_follow_input(tmp_path, known, "person", tmp_path)
-    assert f"{max(scale, 1.0 / scale):g} times too {'large' if scale > 1.0 else 'small'}" in str(caught.value)
+    assert f"{max(scale, 1.0 / scale):.4g} times too {'large' if scale > 1.0 else 'small'}" in str(caught.value)
 
 
 def test_nobody_is_a_refusal(tmp_path: Path) -> None:
