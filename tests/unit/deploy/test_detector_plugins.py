@@ -58,7 +58,8 @@ def test_calibrate_refuses_what_is_no_detector(
     videos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name, message in (
-        ("yolo", "there is no detector 'yolo'; give a network's .toml file, or one of"),
+        ("yolo", "there is no detector 'yolo'; use one of person, vehicle"),
+        ("yolo.onnx", "there is no detector 'yolo.onnx'; give the .toml file that describes the network"),
         (str(tmp_path / "none.toml"), "this network's file does not exist"),
     ):
         assert run(["calibrate", str(videos), "--detector", name, "--out", str(tmp_path / "out")]) == 2
