@@ -122,6 +122,7 @@ def bad(folder: Path, text: str) -> InputError:
         ("left,1,0.2,5000,200,40,160", "outside the 960x720 picture"),
         ("left,1,0.2,100,-900,40,160", "outside the 960x720 picture"),
         ("left,1,0.2,100,200,40,-160", "its foot is not below its head"),
+        ("left,1,0.2,100,200,-40,160", "its right side is not right of its left"),
         ("left,1,0.2,100,nan,40,160", "y 'nan' is not a number"),
         ("left,1,0.2,100,,40,160", "y '' is not a number"),
         ("left,1,soon,100,200,40,160", "time 'soon' is not a number"),
