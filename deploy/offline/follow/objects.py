@@ -48,9 +48,9 @@ class LeftOut:
 
 
 def is_boxes_file(file: Path) -> bool:
-    """Whether a CSV file has the columns camera,frame,time,x,y,width,height in place of u,v. Raises InputError."""
-    header = read_csv_header(file, "observations")
-    return not {"u", "v"} <= set(header) and set(_BOX_COLUMNS) <= set(header)
+    """Whether a CSV file has boxes by x,y in place of points u,v. Raises InputError."""
+    header = set(read_csv_header(file, "observations"))
+    return {"x", "y"} <= header and not {"u", "v"} <= header
 
 
 def read_objects(file: Path, sizes: Mapping[str, tuple[int, int]]) -> DetectionRows:

@@ -109,6 +109,11 @@ def test_lags_of_the_calibration_are_applied(tmp_path: Path) -> None:
     assert source.frame_times(known)[1] == pytest.approx(0.2)
 
 
+def test_boxes_without_heights_are_asked_for_heights_not_for_points(tmp_path: Path) -> None:
+    error = bad(tmp_path, "camera,frame,time,x,y,width\nleft,0,0,100,200,40\n")
+    assert "column height is missing" in str(error)
+
+
 def bad(folder: Path, text: str) -> InputError:
     with pytest.raises(InputError) as caught:
         read(folder, text)
