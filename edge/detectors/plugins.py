@@ -11,7 +11,7 @@ where ``make_detector(options: DetectorOptions) -> Detector`` (a class with such
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import get_args
@@ -25,6 +25,14 @@ GROUP = "syncline.detectors"
 def is_plugin(name: str) -> bool:
     """Whether a detector's name stands for a network's TOML file or for another package's entry point."""
     return is_network_file(name) or any(point.name == name for point in entry_points(group=GROUP))
+
+
+def unknown_detector(name: str, known: Sequence[str]) -> InputError:
+    """The error for a name that no detector has. known: the names that may stand in its place."""
+    remedy = f"use one of {', '.join(known)}, or a network's .toml file"
+    if Path(name).suffix.lower() == ".onnx":
+        remedy = "give the .toml file that describes the network; see docs/guide/detectors.md"
+    return InputError(f"there is no detector {name!r}", remedy=remedy)
 
 
 def is_network_file(name: str | Path) -> bool:
@@ -98,8 +106,7 @@ def _from_entry_point(name: str, options: DetectorOptions) -> Detector:
     points = entry_points(group=GROUP)
     named = {point.value: point for point in points if point.name == name}  # a package may be found twice
     if not named:
-        known = ", ".join([*get_args(Kind), *sorted({point.name for point in points})])
-        raise InputError(f"there is no detector {name!r}", remedy=f"give a network's .toml file, or one of {known}")
+        raise unknown_detector(name, [*get_args(Kind), *sorted({point.name for point in points})])
     if len(named) > 1:
         raise InputError(
             f"several packages have a detector {name!r}: {', '.join(named)}", remedy="uninstall all but one"

@@ -13,7 +13,7 @@ import tomli_w
 from edge.detectors.base import Detector, Kind
 from edge.detectors.marker.ball import MarkerModel, learn_marker_model
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
-from edge.detectors.plugins import is_plugin, load_detector
+from edge.detectors.plugins import is_plugin, load_detector, unknown_detector
 from edge.devices.base import check_size
 from edge.devices.playback.video_reader import VideoReader
 from edge.offline.detections import Collected, VideoDetections, detection_rows, run_detector
@@ -89,8 +89,7 @@ def detect_video(
     detector = str(detector)
     shipped = detector in (names := get_args(VideoDetector))
     if not shipped and not is_plugin(detector):
-        remedy = f"use one of {', '.join(names)}, or a network's .toml file"
-        raise InputError(f"there is no detector {detector!r}", remedy=remedy)
+        raise unknown_detector(detector, names)
     if kind is not None and shipped:
         raise InputError(f"kind has no effect on the detector {detector}", remedy="leave it out")
     if detector != "marker" and (marker is not None or intrinsics is not None):

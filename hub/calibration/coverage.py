@@ -103,8 +103,9 @@ class CoverageMonitor:
 
 
 def target_of(rig: Rig, labels: list[str]) -> str:
-    """What the user moves, in one word: as the session says, a board where there are bodies, a person with joints."""
-    given = rig.metadata.get("target")
+    """What the user moves, in one word: as the session or the only label says, a board where there are bodies, a person
+    with joints."""
+    given = rig.metadata.get("target", labels[0] if len(labels) == 1 else None)
     if isinstance(given, str) and given in _VERBS:
         return given
     if rig.bodies:

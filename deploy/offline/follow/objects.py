@@ -48,9 +48,9 @@ class LeftOut:
 
 
 def is_boxes_file(file: Path) -> bool:
-    """Whether a CSV file has the columns camera,frame,time,x,y,width,height in place of u,v. Raises InputError."""
-    header = read_csv_header(file, "observations")
-    return not {"u", "v"} <= set(header) and set(_BOX_COLUMNS) <= set(header)
+    """Whether a CSV file has boxes by x,y in place of points u,v. Raises InputError."""
+    header = set(read_csv_header(file, "observations"))
+    return {"x", "y"} <= header and not {"u", "v"} <= header
 
 
 def read_objects(file: Path, sizes: Mapping[str, tuple[int, int]]) -> DetectionRows:
@@ -84,10 +84,14 @@ def _outside(what: str, limit: Floats, row: int) -> str:
     return f"{what} lies outside the {limit[row, 0]:g}x{limit[row, 1]:g} picture"
 
 
+def _flat(box: Floats, wrong: str, row: int) -> str:
+    return f"the box is {box[row, 2]:g} x {box[row, 3]:g} px: {wrong}"
+
+
 def _box_rows(table: CsvTable, sizes: Mapping[str, tuple[int, int]]) -> DetectionRows:
     box = np.column_stack([table.numbers(name, _MAX_PIXEL) for name in ("x", "y", "width", "height")])
-    flat = np.asarray((box[:, 2:] <= 0.0).any(axis=1))
-    table.refuse(flat, lambda row: f"the box is {box[row, 2]:g} x {box[row, 3]:g} px: its foot is not below its head")
+    for side, wrong in ((3, "its foot is not below its head"), (2, "its right side is not right of its left")):
+        table.refuse(box[:, side] <= 0.0, partial(_flat, box, wrong))
     limit = np.array([sizes[name] for name in table.columns["camera"]], dtype=np.float64)
     # Annotations of people at the border, drawn from the ground up, may just miss the picture.
     outside = ((box[:, :2] >= limit + box[:, 2:]) | (box[:, :2] + 2.0 * box[:, 2:] <= 0.0)).any(axis=1)

@@ -21,7 +21,8 @@ from protocols.session.rig import METRES_PER_UNIT
 if TYPE_CHECKING:
     from deploy.offline.follow.calibration import GivenCalibration
 
-_FACTORS = (1.0, 1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3)
+_FEET, _INCHES = 1.0 / 0.3048, 1.0 / 0.0254
+_FACTORS = (1.0, 1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3, _FEET, 1.0 / _FEET, _INCHES, 1.0 / _INCHES)
 _FRAMES = 60
 """Frames that are looked at, spread over the session: some hundred people."""
 _WITHIN = 0.35
@@ -30,12 +31,11 @@ somebody walks between two frames 0.4 s apart."""
 _SAME_TIME_NS = 250_000_000
 _MIN_SHARE, _CLEARLY = 0.2, 4.0
 """Least share of people whom two cameras see at one place, and how many times the share in the stated units it must be.
-In the crowd of seven cameras the share is 0.42 in metres, and 0.05, by chance, with translations 10 to 1000 times too
-large or too small."""
+In the crowd of seven cameras the share is 0.42 in metres, and at most 0.11, by chance, in any other of these units."""
 
 
 def check_units(messages: Sequence[pb.Observation], known: GivenCalibration, kind: str) -> None:
-    """Refuse a calibration in which people meet only if they are 10, 100 or 1000 times too tall or too short.
+    """Refuse a calibration in which people meet only in other units: 10, 100 or 1000 times the stated, feet, inches.
 
     Every camera alone gives a person's place in multiples of the person's height. In the right units the places that
     several cameras give coincide. Raises InputError. Without a vertical, or for an arbitrary scale, nothing is checked.
@@ -49,7 +49,7 @@ def check_units(messages: Sequence[pb.Observation], known: GivenCalibration, kin
     if shares[best] < max(_MIN_SHARE, _CLEARLY * shares[0]):
         return
     factor = _FACTORS[best]
-    wrong = f"{factor:g} times too large" if factor > 1.0 else f"{1.0 / factor:g} times too small"
+    wrong = f"{factor:.4g} times too large" if factor > 1.0 else f"{1.0 / factor:.4g} times too small"
     units = known.calibration.units
     raise InputError(
         f"the cameras' positions are about {wrong} for people of {PERSON.size_m:g} m: they are not in {units}",

@@ -32,7 +32,11 @@ _FIELDS: dict[str, dict[str, tuple[int, str, bool]]] = {
         "input": (11, "Value", True),
         "sparse_initializer": (15, "Sparse", True),
     },
-    "Value": {"name": (1, "string", False)},
+    "Value": {"name": (1, "string", False), "type": (2, "Type", False)},
+    "Type": {"tensor_type": (1, "TensorType", False)},
+    "TensorType": {"shape": (2, "Shape", False)},
+    "Shape": {"dim": (1, "Dimension", True)},
+    "Dimension": {"dim_value": (1, "int64", False), "dim_param": (2, "string", False)},
     "Node": {
         "input": (1, "string", True),
         "output": (2, "string", True),
@@ -57,8 +61,11 @@ _FIELDS: dict[str, dict[str, tuple[int, str, bool]]] = {
 }
 
 
-def check_model_file(file: Path) -> None:
-    """Raise InputError unless an ONNX file can be given to a runtime."""
+def check_model_file(file: Path) -> dict[str, list[int | str]]:
+    """The shapes of a model's inputs. A size that is not fixed is a name, or 0.
+
+    Raises InputError unless the file can be given to a runtime.
+    """
     try:
         size = file.stat().st_size
         if not file.is_file():
@@ -85,6 +92,12 @@ def check_model_file(file: Path) -> None:
             size += _external_size(message, file)
             if size > MAX_BYTES:
                 raise InputError(f"the model's data exceeds {MAX_BYTES >> 20} MiB", file=file, remedy=_REMEDY)
+    constants = {one.name for one in model.graph.initializer}  # until IR version 3, these are listed as inputs too
+    return {
+        one.name: [size.dim_param or size.dim_value for size in one.type.tensor_type.shape.dim]
+        for one in model.graph.input
+        if one.name not in constants
+    }
 
 
 def _check_inputs(graph: Any, outer: frozenset[str], file: Path) -> None:

@@ -36,20 +36,20 @@ def open_runtime(
     file: Path, backend: Literal["auto", "onnxruntime", "opencv"], size: tuple[int, int], threads: int
 ) -> Runtime:
     """Load a model that takes images of ``size`` (width, height). threads: at most as many as cores. InputError."""
-    check_model_file(file)
+    batch = _fixed_batch(check_model_file(file), size, file)
     installed = find_spec("onnxruntime") is not None
     if backend == "onnxruntime" and not installed:
         remedy = 'pip install onnxruntime, or set backend = "opencv"'
         raise InputError("onnxruntime is not installed", file=file, remedy=remedy)
     if installed and backend != "opencv":
-        return OnnxRuntime(file, size, min(threads, os.cpu_count() or 1))
-    return OpenCvRuntime(file)
+        return OnnxRuntime(file, batch, min(threads, os.cpu_count() or 1))
+    return OpenCvRuntime(file, batch)
 
 
 class OnnxRuntime:
     """onnxruntime on the processor. Raises InputError where the model is not usable."""
 
-    def __init__(self, file: Path, size: tuple[int, int], threads: int) -> None:
+    def __init__(self, file: Path, batch: int, threads: int) -> None:
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
@@ -68,16 +68,12 @@ class OnnxRuntime:
             self._session = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # noqa: BLE001 - onnxruntime's errors have no other common class
             raise _unusable(file, error) from None
-        inputs = self._session.get_inputs()
-        if len(inputs) != 1:
-            names = ", ".join(one.name for one in inputs)[:120]
-            raise InputError(f"the model has {len(inputs)} inputs ({names})", file=file, remedy="export it with one")
-        self._input = inputs[0].name
-        if inputs[0].type not in _INPUT_TYPES:
-            what = f"the model's input is a {inputs[0].type}"
+        (images,) = self._session.get_inputs()
+        self._input, self.batch = images.name, batch
+        if images.type not in _INPUT_TYPES:
+            what = f"the model's input is a {images.type}"
             raise InputError(what, file=file, remedy="export it with an input of 32 or 16 bit floating point")
-        self._type = _INPUT_TYPES[inputs[0].type]
-        self.batch = _check_input_shape(list(inputs[0].shape), size, file)
+        self._type = _INPUT_TYPES[images.type]
         self._outputs = [one.name for one in self._session.get_outputs()]
 
     def run(self, images: npt.NDArray[np.float32]) -> dict[str, Array]:
@@ -89,12 +85,10 @@ class OnnxRuntime:
 
 
 class OpenCvRuntime:
-    """OpenCV's dnn module, one image at a time. Raises InputError where the model is not usable."""
+    """OpenCV's dnn module, one image at a time if the model allows. Raises InputError where it is not usable."""
 
-    batch = 1  # the shape of the model's input, which may be fixed, cannot be asked for
-
-    def __init__(self, file: Path) -> None:
-        self._file = file
+    def __init__(self, file: Path, batch: int) -> None:
+        self._file, self.batch = file, batch or 1
         try:
             self._net = cv2.dnn.readNetFromONNX(str(file))
             self._outputs = list(self._net.getUnconnectedOutLayersNames())
@@ -110,10 +104,14 @@ class OpenCvRuntime:
         return _checked(dict(zip(self._outputs, found, strict=True)), self._file)
 
 
-def _check_input_shape(shape: list[int | str | None], size: tuple[int, int], file: Path) -> int:
-    """The fixed batch of an input's shape, 0 = any. Names and None stand for any number."""
+def _fixed_batch(inputs: dict[str, list[int | str]], size: tuple[int, int], file: Path) -> int:
+    """The number of images that a model takes at once, 0 = any. inputs: shapes by name. InputError if not images."""
+    if len(inputs) != 1:
+        names = ", ".join(inputs)[:120]
+        raise InputError(f"the model has {len(inputs)} inputs ({names})", file=file, remedy="export it with one")
+    (shape,) = inputs.values()
     fixed = [one if isinstance(one, int) and one > 0 else 0 for one in shape]
-    written = "x".join(str(one) for one in shape)[:80]
+    written = "x".join(str(one or "?") for one in shape)[:80]
     if len(fixed) != 4 or fixed[1] not in (0, 3):
         what = f"the model's input is {written or 'one number'}"
         raise InputError(what, file=file, remedy="export it with an input of images, batch x 3 x height x width")

@@ -58,7 +58,8 @@ def test_calibrate_refuses_what_is_no_detector(
     videos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name, message in (
-        ("yolo", "there is no detector 'yolo'; give a network's .toml file, or one of"),
+        ("yolo", "there is no detector 'yolo'; use one of person, vehicle"),
+        ("yolo.onnx", "there is no detector 'yolo.onnx'; give the .toml file that describes the network"),
         (str(tmp_path / "none.toml"), "this network's file does not exist"),
     ):
         assert run(["calibrate", str(videos), "--detector", name, "--out", str(tmp_path / "out")]) == 2
@@ -81,3 +82,14 @@ def test_what_a_network_detects_is_a_valid_message_and_matches_predictions(tmp_p
     person = message.detections[0]
     assert (person.kind, person.label, len(person.head), len(person.foot)) == ("person", "cam1-p0", 2, 2)
     assert (person.colour.red, len(person.covariance), len(person.box)) == (0, 3, 4)
+
+
+def test_advice_names_the_person_that_a_network_detects(
+    videos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = network(tmp_path / "net", ONE)
+    assert run(["calibrate", str(videos), "--detector", str(file), "--out", str(tmp_path / "out")]) == 3
+    printed = capsys.readouterr().out
+    assert "has seen the person in" in printed
+    assert "walk at the" in printed
+    assert "marker" not in printed

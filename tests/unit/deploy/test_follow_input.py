@@ -109,6 +109,11 @@ def test_lags_of_the_calibration_are_applied(tmp_path: Path) -> None:
     assert source.frame_times(known)[1] == pytest.approx(0.2)
 
 
+def test_boxes_without_heights_are_asked_for_heights_not_for_points(tmp_path: Path) -> None:
+    error = bad(tmp_path, "camera,frame,time,x,y,width\nleft,0,0,100,200,40\n")
+    assert "column height is missing" in str(error)
+
+
 def bad(folder: Path, text: str) -> InputError:
     with pytest.raises(InputError) as caught:
         read(folder, text)
@@ -122,6 +127,7 @@ def bad(folder: Path, text: str) -> InputError:
         ("left,1,0.2,5000,200,40,160", "outside the 960x720 picture"),
         ("left,1,0.2,100,-900,40,160", "outside the 960x720 picture"),
         ("left,1,0.2,100,200,40,-160", "its foot is not below its head"),
+        ("left,1,0.2,100,200,-40,160", "its right side is not right of its left"),
         ("left,1,0.2,100,nan,40,160", "y 'nan' is not a number"),
         ("left,1,0.2,100,,40,160", "y '' is not a number"),
         ("left,1,soon,100,200,40,160", "time 'soon' is not a number"),
@@ -152,7 +158,7 @@ def test_a_head_below_its_foot_is_named_with_its_line(tmp_path: Path) -> None:
         read_objects(rows(tmp_path, text), SIZES)
 
 
-@pytest.mark.parametrize("scale", [0.001, 100.0, 1000.0])
+@pytest.mark.parametrize("scale", [0.001, 100.0, 1000.0, 3.281, 39.37])
 def test_a_calibration_in_other_units_is_refused(scale: float, tmp_path: Path) -> None:
     (tmp_path / "boxes.csv").write_text(boxes_csv(3.0), encoding="utf-8")
     known = read_given_calibration(write_calibration(tmp_path / "calibration.toml", scale=scale))
@@ -160,7 +166,7 @@ def test_a_calibration_in_other_units_is_refused(scale: float, tmp_path: Path) -
         InputError, match=r"calibration.toml:2: the cameras' positions are about .* times too"
     ) as caught:
         read_follow_input(tmp_path, known, "person", tmp_path)
-    assert f"{max(scale, 1.0 / scale):g} times too {'large' if scale > 1.0 else 'small'}" in str(caught.value)
+    assert f"{max(scale, 1.0 / scale):.4g} times too {'large' if scale > 1.0 else 'small'}" in str(caught.value)
 
 
 def test_nobody_is_a_refusal(tmp_path: Path) -> None:

@@ -158,11 +158,16 @@ def test_torchvision_leaves_out_the_axis_of_the_batch() -> None:
         assert found.keypoints.shape == (count, 1, 3)
 
 
-@pytest.mark.parametrize(("batch", "size"), [("n", 4), (3, 3), (1, 1)])
-def test_a_batch_gives_what_single_images_give(tmp_path: Path, batch: int | str, size: int) -> None:
+@pytest.mark.parametrize(
+    ("batch", "size", "backend"),
+    [("n", 4, "auto"), (3, 3, "auto"), (1, 1, "auto"), (3, 3, "opencv"), ("n", 1, "opencv")],
+)
+def test_a_batch_gives_what_single_images_give(tmp_path: Path, batch: int | str, size: int, backend: str) -> None:
     from edge.detectors.base import BatchDetector
 
-    file = write_network(tmp_path, constant_model(OUTPUTS['layout = "yolov8"'], batch), "", CLASSES)
+    file = write_network(
+        tmp_path, constant_model(OUTPUTS['layout = "yolov8"'], batch), f'backend = "{backend}"', CLASSES
+    )
     detector = load_detector(file)
     assert isinstance(detector, BatchDetector)
     assert detector.batch == size
