@@ -18,6 +18,9 @@ from protocols.core.lazy import defer_modules
 from protocols.log.read.session import load_session
 from protocols.session.session import Session
 
+UNUSED_OF_NUMPY = ("f2py", "testing", "ma", "polynomial", "ctypeslib")
+"""Imported by scipy: a third of its import time."""
+
 
 def calibrate(
     session: Path,
@@ -92,7 +95,7 @@ def calibrate(
     read = _with_scale(read, height, limb)
     command = shlex.join(["syncline", *sys.argv[1:]])
     retain_freed_memory()
-    defer_modules("numpy", ("f2py", "testing", "ma", "polynomial", "ctypeslib"))  # scipy imports them, we do not
+    defer_modules("numpy", UNUSED_OF_NUMPY)
     from deploy.offline.outputs import report_refusal, report_result
 
     try:
