@@ -31,7 +31,7 @@ COLOURS: dict[CameraState, tuple[int, int, int]] = {
     "gone": (190, 190, 190),
 }
 _PATHS = ((214, 96, 20), (30, 130, 90), (120, 70, 170), (20, 120, 160), (170, 40, 90))
-"""RGB, told apart by the colour-blind too."""
+"""RGB, for the colour-blind too."""
 _IMAGES_PER_S = 24.0  # over all cameras: decoding and encoding one image costs 2 ms
 _PATH_S = 20.0  # length of the trajectory that is drawn [s]
 _FADE_S = 1.0  # how often a trajectory fades: between, only what is new is sent [s]
