@@ -219,6 +219,7 @@ def save_refusal(
         cpu_seconds=refusal.cpu_seconds,
         pairs=refusal.pairs,
         warnings=refusal.warnings,
+        acceptance=refusal.acceptance,
     )
     report = build_report(refusal, session.rig, session.observations, command)
     write_together({folder / RESULT: result_text(document), folder / REPORT: report})

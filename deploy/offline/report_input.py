@@ -6,15 +6,18 @@ import json
 import math
 import shlex
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from hub.api import CALIBRATION, RESULT, TRAJECTORY, calibrate
 from hub.report.convergence import OffsetStdSample
 from protocols import topics
+from protocols.core.acceptance import AcceptanceTest
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
 from protocols.core.files import read_text
@@ -89,13 +92,15 @@ def _input_from_folder(folder: Path, session: Path | None) -> ReportInput:
     refused = {str(name): str(why) for name, why in _table(metadata.get("refused")).items()}
     warnings = tuple(str(text) for text in document.get("warnings") or ())
     pairs = tuple(_pair(pair) for pair in document.get("pairs") or ())
+    acceptance = {name: _tests(tests) for name, tests in _table(document.get("acceptance")).items()}
     if document.get("status") != "solved":
         if rig is None:
             raise InputError(
                 "refused, and its session is no longer here", file=folder, remedy="give the session with --session"
             )
         reason = str(document.get("reason") or "no reason given")
-        return ReportInput(Refused(reason, refused, pairs, warnings), rig, observations, command, missing)
+        refusal = Refused(reason, refused, pairs, warnings, acceptance)
+        return ReportInput(refusal, rig, observations, command, missing)
     known, cameras = read_calibration(folder / CALIBRATION)
     cameras = {name: _with_lag(camera, _table(document.get("cameras"))) for name, camera in cameras.items()}
     file = folder / TRAJECTORY
@@ -113,6 +118,7 @@ def _input_from_folder(folder: Path, session: Path | None) -> ReportInput:
         warnings=warnings + ((missing,) if missing else ()),
         cpu_seconds=float(document.get("cpu_seconds") or 0.0),
         convergence=_steps(document.get("convergence")),
+        acceptance=acceptance,
         residuals={name: camera_residuals(camera, tables, observations) for name, camera in cameras.items()},
     )
     return ReportInput(calibration, rig or known, observations, command, missing, offset_std_history(place))
@@ -220,7 +226,17 @@ def _pair(pair: Any) -> PairReport:
         fundamental,
         number("inliers"),
         number("rms_px"),
+        _tests(table.get("acceptance")),
     )
+
+
+def _tests(value: Any) -> tuple[AcceptanceTest, ...]:
+    """Acceptance tests as result.json has them; invalid entries, as in files of older versions, are skipped."""
+    out = []
+    for one in value if isinstance(value, list) else []:
+        with suppress(msgspec.ValidationError):
+            out.append(msgspec.convert(one, AcceptanceTest))
+    return tuple(out)
 
 
 def _with_lag(camera: CameraCalibration, tables: dict[str, Any]) -> CameraCalibration:

@@ -19,15 +19,15 @@ import numpy as np
 from hub.bundle.adjustment import residual_norms
 from hub.bundle.initialisation import (
     Reconstruction,
-    inlier_share,
     place_cameras,
     triangulate_and_adjust,
 )
 from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.bundle.problem import CameraState, FreeParameters
+from hub.calibration.acceptance import least_certain_camera, misfits
 from hub.calibration.pair_network import expected_lag, solve_new_pairs
 from hub.calibration.pair_overlap import LARGE_NETWORK
-from hub.calibration.pipeline import calibrate, final_adjustment, fits_trajectory, least_certain_camera
+from hub.calibration.pipeline import calibrate, final_adjustment
 from hub.calibration.resection_scan import scan_resection
 from hub.calibration.result import assemble_calibration
 from hub.calibration.self_calibration import focal_prior, with_cameras, with_lens
@@ -143,13 +143,14 @@ def update_calibration(
         reconstruction = final_adjustment(
             reconstruction, lambda text, share: None, warm=not full, online=True, refine_lenses=refine_lenses
         )
-        worst, reason = _inconsistent(reconstruction)
-        if reason:
-            refuted.add(worst)
+        failure = next(iter(misfits(reconstruction)), None)
+        if failure is not None:
+            refuted.add(failure[0])
         else:
-            worst, reason = least_certain_camera(reconstruction)
-        if not reason:
+            failure = least_certain_camera(reconstruction)
+        if failure is None:
             break
+        worst, reason = failure[0], failure[1].reason
         reasons[worst] = reason
         remaining = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
         del remaining[worst]
@@ -320,16 +321,6 @@ def _expected_clock(
 def _failed_with(name: str, pairs: list[PairSolution]) -> str:
     tried = "; ".join(f"with {p.b if p.a == name else p.a}: {p.status}" for p in pairs if name in (p.a, p.b))
     return tried or "no other camera to compare with"
-
-
-def _inconsistent(reconstruction: Reconstruction) -> tuple[str, str]:
-    """The camera that fits the others' trajectory worst, and why it does not fit; "" where all do."""
-    names = [name for name in reconstruction.names if not fits_trajectory(reconstruction, name)]
-    if not names:
-        return "", ""
-    worst = min(names, key=lambda name: inlier_share(reconstruction, name)[0])
-    share, count = inlier_share(reconstruction, worst)
-    return worst, f"only {100 * share:.0f} % of its {count} observations fit the trajectory seen by the other cameras"
 
 
 def _tied_pairs(names: list[str], pairs: list[PairSolution]) -> tuple[PairSolution, ...]:

@@ -24,7 +24,7 @@ from hub.clocks.external_prior import MAX_CAMERA_DELAY_S, ExternalClockPrior
 from hub.sync.common_clock import solve_common_clock_pair
 from hub.sync.hypothesis import PairFit, PairSolution, evidence
 from hub.sync.pair_ranking import ranking_score
-from hub.sync.pair_solver import NO_FIT_AT_PREDICTED_LAG, solve_pair
+from hub.sync.pair_solver import solve_pair
 from hub.sync.settings import PairSettings
 from hub.sync.track_cache import TrackCache
 from hub.trajectory.image_tracks import smooth_only
@@ -162,7 +162,7 @@ def _leave_to_resection(pairs: dict[tuple[str, str], PairSolution], calibrated: 
     refuted = Counter(
         name
         for both, solution in pairs.items()
-        if solution.status == NO_FIT_AT_PREDICTED_LAG or (not solution.solved and _has_long_overlap(solution))
+        if solution.refuted or (not solution.solved and _has_long_overlap(solution))
         for name in both
     )
     for (a, b), pair in pairs.items():

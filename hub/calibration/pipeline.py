@@ -12,13 +12,11 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from hub.bundle import covariance as cov
 from hub.bundle import model_comparison
 from hub.bundle.adjustment import adjust, estimate_noise, residual_norms
-from hub.bundle.correlated_noise import MIN_INFLATION, refit_with_correlated_noise
+from hub.bundle.correlated_noise import refit_with_correlated_noise
 from hub.bundle.initialisation import (
     Reconstruction,
-    inlier_share,
     place_cameras,
     reconstruct_incrementally,
     reconstruct_with_known_poses,
@@ -28,10 +26,17 @@ from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
 from hub.bundle.problem import AdjustmentState, CameraState, FreeParameters, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.bundle.timestamp_jitter import estimate_frame_times
-from hub.calibration.given_values import refuted_lens
+from hub.calibration.acceptance import (
+    LAG_CONFLICT,
+    CameraTests,
+    least_certain_camera,
+    misfits,
+    network_failure,
+    wrong_lens,
+)
 from hub.calibration.pair_network import Progress, coincide, describe_timing, frame_rate_warnings, solve_pairs
-from hub.calibration.result import assemble_calibration, focal_stds, isolated_pair_report
-from hub.calibration.self_calibration import MAX_FOCAL_STD, initial_self_calibration, with_updated_lenses
+from hub.calibration.result import assemble_calibration, isolated_pair_report
+from hub.calibration.self_calibration import initial_self_calibration, with_updated_lenses
 from hub.calibration.solution import Solution
 from hub.calibration.unconnected import connect_by_resection
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate, connected_components, synchronise_clocks
@@ -39,6 +44,7 @@ from hub.clocks.external_prior import ExternalClockPrior
 from hub.sync.hypothesis import PairSolution
 from hub.trajectory.image_tracks import smooth_only
 from hub.two_view.relative_pose import fundamental_from
+from protocols.core.acceptance import first_failure
 from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, FixedCalibration
@@ -48,18 +54,10 @@ from protocols.session.rig import Rig
 if TYPE_CHECKING:
     from hub.distributed.solver import DistributedPoseSolver
 
-_MIN_INLIER_SHARE = 0.5  # share of a camera's rows that must fit the trajectory
-_MIN_ROWS = 30
-_MAX_ROTATION_STD = 0.05  # rad
-_MAX_CLOCK_STD = 10e-3  # s: a frame is more than three of them
-_MAX_LAG_CHANGE = 20e-3  # s
-_LAG_CONFLICT = "the trajectory puts its clock"
 _LENS_ITERATIONS = 3
 _SMALL_BODY = 4  # points of a single tag
 _MAX_CLOCK_STEPS, _STEP_ITERATIONS = 2, 2
 _SAME_STEP_S = 2.0
-_WRONG_LENS = 0.05  # relative error of a focal length that no zoom, crop or temperature explains: another lens
-_MIN_TO_BLAME_A_LENS = 4  # cameras: of three, another camera's pose absorbs too much of a wrong lens
 _ONLINE_MIN_INFLATION = 2.0  # rows per effective row from which the noise of a recording that goes on is correlated
 _MAX_ONLINE_ROW_RATE = 120.0  # rows a second, of all cameras
 
@@ -144,8 +142,9 @@ def calibrate(
         report("covariances", 0.95)
         return assemble_calibration(rig, solution)
     except Refused as refusal:
-        conflicting = {name: reason for name, reason in refusal.cameras.items() if reason.startswith(_LAG_CONFLICT)}
-        rejected = [replace(pair, status=conflicting[pair.b]) if pair.b in conflicting else pair for pair in pairs]
+        failed = ((name, first_failure(tests)) for name, tests in refusal.acceptance.items())
+        conflicting = {name: test for name, test in failed if test is not None and test.name == LAG_CONFLICT}
+        rejected = [replace(p, status=conflicting[p.b].reason) if p.b in conflicting else p for p in pairs]
         refusal.pairs = tuple(isolated_pair_report(pair, prepared) for pair in rejected)
         refusal.warnings = prepared.warnings
         raise
@@ -283,7 +282,7 @@ def solve_network(
     refused = dict(prepared.refused)
     free_parameters = FreeParameters(clock=not prepared.shared_clock)
     graph = _largest_component(prepared, list(prepared.cameras), pairs, refused)
-    unfit: set[str] = set()
+    unfit, failures = set[str](), CameraTests()
     with_rate_prior = replace(free_parameters, rate_std=_rate_prior_std(graph, free_parameters.rate_std))
     placed: dict[str, CameraState] = {}
     while True:
@@ -301,33 +300,21 @@ def solve_network(
             usual = replace(reconstruction.problem.free_parameters, rate_std=free_parameters.rate_std)
             reconstruction.problem = replace(reconstruction.problem, free_parameters=usual)
         refused |= unplaced
-        inconsistent = misfits(reconstruction)
-        # A wrong lens of an uncalibrated camera may be the cause of all the others' misfit: it goes first.
-        inconsistent = [name for name in inconsistent if prepared.cameras[name].lens_prior is not None] or inconsistent
-        if inconsistent:
-            # The worst one is removed, and the reconstruction that it may have distorted is adjusted without it; from
-            # the pairs on where more cameras do not fit.
-            worst = min(inconsistent, key=lambda name: inlier_share(reconstruction, name)[0])
-            share, count = inlier_share(reconstruction, worst)
-            refused[worst] = (
-                f"only {100 * share:.0f} % of its {count} observations fit the trajectory seen by the other cameras"
-            )
-        else:
-            worst, reason = _wrong_lens(reconstruction)
-            if not reason:
-                worst, reason = _least_certain_lens(reconstruction)
-            if not reason:
-                worst, reason = least_certain_camera(reconstruction)
-            if not reason:
-                worst, reason = _conflicts_with_pair(reconstruction, graph)
-            if not reason:
-                break
-            refused[worst] = reason
+        tests: CameraTests = {}
+        lenses = [name for name in reconstruction.names if prepared.cameras[name].lens_prior is not None]
+        inconsistent = misfits(reconstruction, lenses)
+        failure = inconsistent[0] if inconsistent else network_failure(reconstruction, graph.inlier_pairs, tests)
+        if failure is None:
+            break
+        # The worst one is removed, and the reconstruction that it may have distorted is adjusted without it; from the
+        # pairs on where more cameras do not fit.
+        worst, failed = failure
+        refused[worst], failures[worst] = failed.reason, [failed]
         if not inconsistent:
             unfit.add(worst)  # resection would place it alike
         remaining = [name for name in reconstruction.names if name != worst]
         if len(remaining) < 2:
-            raise Refused(f"no two cameras can be placed ({worst}: {refused[worst]})", refused)
+            raise Refused(f"no two cameras can be placed ({worst}: {failed.reason})", refused, acceptance=failures)
         states = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
         placed = {name: states[name] for name in remaining} if len(inconsistent) < 2 and len(remaining) > 2 else {}
         graph = _largest_component(prepared, remaining, list(graph.inlier_pairs), refused)
@@ -348,22 +335,23 @@ def solve_network(
             prepared = replace(prepared, warnings=prepared.warnings + frame_rate_warnings(prepared, pairs))
         refused = {name: reason for name, reason in refused.items() if name not in reconstruction.names}
         refused |= {name: f"{reason}; {refused[name]}" for name, reason in reasons.items()}
+    acceptance = {name: made for name, made in failures.items() if name in refused} | tests
     warnings = tuple(
         f"pair {pair.a}–{pair.b} contradicts the other pairs and was rejected" for pair in graph.outlier_pairs
     )
     solver = "joint"
     if distributed_solver is not None:
         solver, warnings = "distributed", warnings + distributed_solver.warnings
-    return Solution(reconstruction, tuple(pairs), in_rig_order(refused, prepared), prepared, solver, warnings)
+    refused = in_rig_order(refused, prepared)
+    return Solution(reconstruction, tuple(pairs), refused, prepared, solver, warnings, acceptance=acceptance)
 
 
 def _misfit(reconstruction: Reconstruction, name: str) -> str:
     """Why a camera does not fit the others; "" if it does."""
-    if not fits_trajectory(reconstruction, name):
-        share, count = inlier_share(reconstruction, name)
-        return f"only {100 * share:.0f} % of its {count} observations fit the trajectory seen by the other cameras"
-    worst, reason = least_certain_camera(reconstruction)
-    return reason if worst == name else ""
+    failures = [failure for failure in misfits(reconstruction) if failure[0] == name]
+    certain = least_certain_camera(reconstruction) if not failures else None
+    failures += [certain] if certain is not None and certain[0] == name else []
+    return failures[0][1].reason if failures else ""
 
 
 def _rate_prior_std(graph: ClockGraph, usual: float) -> float:
@@ -377,61 +365,6 @@ def _rate_prior_std(graph: ClockGraph, usual: float) -> float:
         if pair.fit is not None and np.isfinite(pair.fit.total_lag_std)
     ]
     return min([usual, *stds])
-
-
-def _least_certain_lens(reconstruction: Reconstruction) -> tuple[str, str]:
-    """The uncalibrated camera with the largest focal length std, and the reason; "" where all are within the limit."""
-    stds = focal_stds(reconstruction.problem, reconstruction.state)
-    worst = int(np.argmax(stds))
-    if stds[worst] <= MAX_FOCAL_STD:
-        return "", ""
-    return reconstruction.names[
-        worst
-    ], f"the common motion determines its focal length only to {100 * stds[worst]:.1f} % (std)"
-
-
-def least_certain_camera(reconstruction: Reconstruction) -> tuple[str, str]:
-    """The camera whose pose or clock relative to every other is most uncertain, and the reason; "" if within limits."""
-    problem, state = reconstruction.problem, reconstruction.state
-    found = cov.covariance(problem, state, estimate_smoothness(problem, state))
-    turns = cov.relative_rotation_stds(found.cameras, state)
-    clocks = np.zeros_like(turns)
-    if problem.free_parameters.clock:
-        clocks = cov.relative_clock_stds(found, problem, state)
-    for between, limit, unit, text in (
-        (
-            turns,
-            _MAX_ROTATION_STD,
-            np.rad2deg(1.0),
-            "the common motion determines its orientation only to {:.1f}° (std)",
-        ),
-        (clocks, _MAX_CLOCK_STD, 1e3, "the common motion determines its clock only to {:.1f} ms (std, mid-overlap)"),
-    ):
-        np.fill_diagonal(between, np.inf)
-        best = between.min(axis=1)
-        # Of two with equal std, the later one: the first camera is usually the reference.
-        loosest = int(len(best) - 1 - np.argmax(best[::-1]))
-        if best[loosest] > limit:
-            return reconstruction.names[loosest], text.format(unit * best[loosest])
-    return "", ""
-
-
-def _conflicts_with_pair(reconstruction: Reconstruction, graph: ClockGraph) -> tuple[str, str]:
-    """The later camera of an isolated pair whose lag the adjustment moved too far, and the reason; "" if none.
-
-    Epipolar geometry and trajectory are two estimates of the lag with different sensitivities: where they differ, one
-    of them is wrong. With three and more cameras a pair's lag is only an initial value.
-    """
-    for pair in graph.inlier_pairs:
-        if pair.fit is None or not np.isfinite(pair.fit.total_lag_std):
-            continue
-        a, b = (reconstruction.state.cameras[reconstruction.names.index(name)] for name in (pair.a, pair.b))
-        at_a = np.array([pair.fit.mid_time])
-        at_b = (at_a - pair.fit.offset) / pair.fit.rate
-        difference = float(abs(a.reference_time(at_a) - b.reference_time(at_b))[0])
-        if difference > _MAX_LAG_CHANGE:
-            return pair.b, f"{_LAG_CONFLICT} {1e3 * difference:.0f} ms from the lag of the epipolar geometry"
-    return "", ""
 
 
 def solve_paper(
@@ -534,11 +467,6 @@ def in_rig_order(refused: dict[str, str], prepared: PreparedSession) -> dict[str
     return {name: refused[name] for name in prepared.camera_order if name in refused}
 
 
-def fits_trajectory(reconstruction: Reconstruction, name: str) -> bool:
-    share, count = inlier_share(reconstruction, name)
-    return share >= _MIN_INLIER_SHARE and count >= _MIN_ROWS
-
-
 def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
     """Problem and state with the rows after clock steps corrected, as far as these explain the observations better."""
     step = model_comparison.find_clock_step(problem, state)
@@ -559,27 +487,6 @@ def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem
             break
         problem, state, step = trial, replace(trial_state, clock_steps=(*trial_state.clock_steps, step)), more
     return problem, state
-
-
-def misfits(reconstruction: Reconstruction) -> list[str]:
-    """Cameras that do not fit the trajectory that the others give."""
-    return [name for name in reconstruction.names if not fits_trajectory(reconstruction, name)]
-
-
-def _wrong_lens(reconstruction: Reconstruction) -> tuple[str, str]:
-    """The camera whose measured lens is refuted most, by far more than any lens changes in the field, and the reason.
-
-    Without correlated residuals there is none: a wrong lens displaces successive rows alike.
-    """
-    problem, state, names = reconstruction.problem, reconstruction.state, reconstruction.names
-    if state.correlated_noise is not None or not problem.free_parameters.clock or len(names) < _MIN_TO_BLAME_A_LENS:
-        return "", ""
-    if max(correlation_inflation(problem, state, camera) for camera in range(len(names))) < MIN_INFLATION:
-        return "", ""
-    for one in model_comparison.refuted_lenses(problem, state)[:1]:
-        if abs(one.focal_change) - 3.0 * one.focal_std > _WRONG_LENS:
-            return names[one.camera], refuted_lens(one)
-    return "", ""
 
 
 def final_adjustment(
@@ -634,7 +541,7 @@ def final_adjustment(
         ):
             problem, state = read_problem, read_state
     adjusted = _with_state(reconstruction, problem, state)
-    if not online and (misfits(adjusted) or _wrong_lens(adjusted)[0]):
+    if not online and (misfits(adjusted) or wrong_lens(adjusted)):
         return adjusted  # a camera that will be left out: its errors are no noise
     report("correlated noise", 0.92)
     refit = _refit_online if online else refit_with_correlated_noise

@@ -143,6 +143,7 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         solver=solution.solver,
         version=VERSION,
         refused=solution.refused,
+        acceptance=solution.acceptance,
         convergence=reconstruction.state.steps,
         trajectories=tuple(
             _trajectory_table(
@@ -479,6 +480,7 @@ def _pair_report(
             fundamental=fundamental_from(relative, a.intrinsics.matrix, b.intrinsics.matrix),
             inliers=None if fit is None else fit.inliers,
             rms_px=None if fit is None or not np.isfinite(fit.residual_px) else fit.residual_px,
+            acceptance=pair.acceptance,
         )
     return isolated_pair_report(pair, solution.prepared)
 
@@ -487,7 +489,7 @@ def isolated_pair_report(pair: PairSolution, prepared: PreparedSession) -> PairR
     """Report of a pair from its own solution, where no joint solution contains both cameras."""
     fit = pair.fit
     if fit is None or not pair.solved:
-        return PairReport((pair.a, pair.b), pair.status, fundamental=pair.fundamental)
+        return PairReport((pair.a, pair.b), pair.status, fundamental=pair.fundamental, acceptance=pair.acceptance)
     matrix = pair.fundamental
     if matrix is None:
         lenses = [prepared.camera(name).intrinsics.matrix for name in (pair.a, pair.b)]
@@ -500,6 +502,7 @@ def isolated_pair_report(pair: PairSolution, prepared: PreparedSession) -> PairR
         matrix,
         fit.inliers,
         fit.residual_px,
+        pair.acceptance,
     )
 
 

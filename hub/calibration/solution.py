@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from hub.bundle.initialisation import Reconstruction
 from hub.bundle.preprocessing import PreparedSession
 from hub.sync.hypothesis import PairSolution
+from protocols.core.acceptance import AcceptanceTest
 from protocols.session.calibration import FixedCalibration
 
 
@@ -25,3 +27,5 @@ class Solution:
     warnings: tuple[str, ...] = field(default=())
     known: FixedCalibration | None = None
     """Poses that were given and are kept; their world is then the published one."""
+    acceptance: Mapping[str, Sequence[AcceptanceTest]] = field(default_factory=dict)
+    """The acceptance tests by camera, those of refused cameras among them."""

@@ -26,6 +26,10 @@ _POLICY = (
     "img-src data: blob:; font-src data:; worker-src blob:"
 )
 
+_TESTS = (
+    "What an answer must pass, each with its value, its limit and where the limit comes from. Where another test "
+    "decided in its stead, that one is named."
+)
 _GLOSSARY = (
     (
         "Clock offset and rate",
@@ -135,6 +139,7 @@ def _calibration_page(
         "Reference clock": calibration.reference,
         "Lengths": calibration.units if calibration.scale == "metric" else "arbitrary: the first baseline is 1",
     }
+    parts.append(section("Acceptance tests", _TESTS, tables.acceptance(calibration)))
     parts.append(section("Provenance", "", tables.provenance(facts, rig, command)))
     return html_page("Calibration report", assessment.headline, parts, rig_figure.rig_figure_script(drawn))
 
@@ -168,6 +173,7 @@ def _refusal_page(refused: Refused, rig: Rig, observations: Observations, comman
             "Motion across most of every image, at different depths, constrains the calibration best.",
             image_maps.seen_maps(seen, sizes) if seen else "",
         ),
+        section("Acceptance tests", _TESTS, tables.acceptance(refused)),
         section("Provenance", "", tables.provenance({"Syncline": VERSION}, rig, command)),
     ]
     return html_page("Calibration refused", assessment.headline, parts)

@@ -17,6 +17,7 @@ from protocols.session.calibration import Calibration
 from protocols.session.rig import Rig
 
 _LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "plotly")
+_MAX_TESTS = 1000  # rows of the table of tests, of a hundred pairs
 _MAX_UNFOLDED = 30  # more pairs than this are folded away
 _SIGNS = {"agrees": "✓ consistent", "contradicts": "≠ contradicts the others", "refused": "✕"}
 
@@ -137,6 +138,27 @@ def pairs(outcome: Calibration | Refused) -> str:
     if len(rows) <= _MAX_UNFOLDED:
         return inner
     return f"<details><summary>All {len(rows)} pairs</summary>{inner}</details>"
+
+
+def acceptance(outcome: Calibration | Refused) -> str:
+    """One row per acceptance test of each camera and pair: value, limit, and where the limit comes from; folded."""
+    tested = [(name, tests) for name, tests in outcome.acceptance.items()]
+    tested += [("–".join(pair.cameras), pair.acceptance) for pair in outcome.pairs]
+    rows = [
+        [
+            f"<b>{esc(name)}</b>",
+            esc(test.name),
+            f"{short(test.value)} {'≤' if test.sense == '<=' else '≥'} {short(test.limit)} {esc(test.unit)}",
+            "✓" if test.passed and not test.alternative else esc(test.alternative) or "✕",
+            esc(test.source),
+        ]
+        for name, tests in tested
+        for test in tests
+    ]
+    if not rows:
+        return ""
+    head = ["Of", "Test", "Value and limit", "Passed", "Where the limit comes from"]
+    return f"<details><summary>All {len(rows)} tests</summary>{table(head, rows[:_MAX_TESTS])}</details>"
 
 
 def refused(reasons: dict[str, str], counts: dict[str, int]) -> str:

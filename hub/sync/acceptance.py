@@ -2,15 +2,57 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import replace
+
 import numpy as np
 
 from hub.sync.hypothesis import PairFit, PairSolution, evidence
 from hub.sync.null_distribution import COST_FLOOR
 from hub.sync.settings import PairSettings
 from hub.two_view.relative_pose import RelativePose
+from protocols.core.acceptance import AcceptanceTest, first_failure
 
 _MIN_INLIERS = 0.9  # fraction of the common motion that counts as nearly all
 _CHANCE_MISFIT = 9.0  # over the squared noise: upper bound for wrong alignments with nearly all rows as inliers
+
+
+_BENCH = "measured: python -m tests.bench.pair_timing"
+_LIMITS = {
+    "inlier support": ("s", ">=", _BENCH),
+    "residual": ("px", "<=", "largest residual that a lens of a few per cent error leaves"),
+    "clock rate error": ("", "<=", "crystals stay within 1e-4; beyond 1e-2 the frame rate is wrong"),
+    "points in front of both cameras": ("", ">=", "cheirality, less an outlier in twenty"),
+    "plane's residual over the residual": ("", ">=", _BENCH),
+    "inliers": ("", ">=", _BENCH),
+    "inlier support without a null distribution": ("s", ">=", _BENCH),
+    "log10 of the false-alarm probability": ("", "<=", "quantile: 5 % of the null distribution"),
+    "evidence of the next alignment": ("", "<=", _BENCH),
+    "inlier support of discontinuous tracks": ("s", ">=", _BENCH),
+    "inlier seconds above other lags": ("std", ">=", "quantile: three standard deviations of other lags"),
+    "next lag's inlier support": ("", "<=", _BENCH),
+    "angle between equally likely rotations": ("rad", "<=", "half a radian: another minimum, no longer noise"),
+    "std of the lag by noise": ("s", "<=", "a tenth of a frame at 25 fps; where slow, the time of a pixel's motion"),
+    "std of the relative rotation": ("rad", "<=", _BENCH),
+    "std of the lag with lens and readout": ("s", "<=", _BENCH),
+    "change of the lag without a fifth of the samples": ("s", "<=", _BENCH),
+}
+"""By name: unit, sense, and where the limit comes from (the limits themselves are `PairSettings`)."""
+
+
+def acceptance_test(name: str, value: float, limit: float, reason: str, alternative: str = "") -> AcceptanceTest:
+    """One of the pair's acceptance tests. alternative: the test that decides in its stead where it passed, or ""."""
+    unit, sense, source = _LIMITS[name]
+    test = AcceptanceTest(name, float(value), float(limit), unit, source, reason, sense)
+    return test if test.passed else replace(test, alternative=alternative)
+
+
+def with_tests(solution: PairSolution, tests: Iterable[AcceptanceTest], fit: PairFit) -> PairSolution:
+    """The solution with further tests, refused where one of them fails."""
+    tests = tuple(tests)
+    failed = first_failure(tests)
+    status = solution.status if failed is None else failed.reason
+    return replace(solution, status=status, fit=fit, acceptance=solution.acceptance + tests)
 
 
 def accept_or_reject(
@@ -21,66 +63,77 @@ def accept_or_reject(
     fits: best first. independent_lags: approximate number of independent alignments that were searched.
     """
     best = fits[0]
-    others = tuple(fits[1:4])
     competing = [fit for fit in fits[1:] if is_competing(fit, best, s)]
     credible = [fit for fit in competing if not is_chance_level(fit, best, independent_lags, s)]
-    second = max((evidence(fit) / max(evidence(best), 1e-12) for fit in credible), default=0.0)
-    log10_false_alarms = None if best.log10_false_alarm is None else best.log10_false_alarm + np.log10(independent_lags)
-    # Periodic motion fits nearly as well one period later. With enough support the residual decides: nothing else
-    # comes near the tracks' own noise.
-    at_noise = (
-        not competing
-        and best.support >= s.min_support_without_null
-        and best.residual_px <= s.max_noise_ratio * best.track_noise_px
-    )
-    rejection = rejection_reason(best, s)
-    large_gap = not competing and best.log10_gap < s.max_log10_gap
-    unique = is_unique_at_noise_floor(best, fits[1:], s)
-    if rejection:
-        reason = rejection
-    elif best.inliers < min_inliers(best, s):
-        reason = f"only {100 * best.inliers:.0f} % of the common motion agrees with one geometry"
-    elif log10_false_alarms is None and best.support < s.min_support_without_null:
-        reason = (
+    other = max(credible, key=evidence, default=None)
+    unique = "unique at the noise floor" if is_unique_at_noise_floor(best, fits[1:], s) else ""
+    limit = min_inliers(best, s)
+    share = f"only {100 * best.inliers:.0f} % of the common motion agrees with one geometry"
+    tests = [*absolute_tests(best, s), acceptance_test("inliers", best.inliers, limit, share)]
+    if best.log10_false_alarm is None:
+        too_short = (
             f"the recordings overlap too little ({best.moving_overlap:.1f} s of motion) to distinguish one lag "
             "from another"
         )
-    elif (
-        log10_false_alarms is not None
-        and log10_false_alarms > s.max_log10_false_alarm
-        and not (at_noise or large_gap or unique)
-    ):
-        reason = (
-            "other lags fit nearly as well (one of them would by chance in "
-            f"{100 * min(1.0, 10.0**log10_false_alarms):.0f} % of cases): too little or too regular common motion, or "
-            "two different objects"
-        )
-    elif second > s.max_evidence_ratio and not unique:
-        other = max(credible, key=evidence)
-        reason = f"two alignments are about as good ({best.offset:.2f} s and {other.offset:.2f} s)"
+        name = "inlier support without a null distribution"
+        tests.append(acceptance_test(name, best.support, s.min_support_without_null, too_short))
     else:
-        return PairSolution(*names, "ok", best, others)
-    return PairSolution(*names, reason, best, others)
+        tests.append(_false_alarm_test(best, bool(competing), independent_lags, unique, s))
+    if other is not None:
+        ratio = evidence(other) / max(evidence(best), 1e-12)
+        two = f"two alignments are about as good ({best.offset:.2f} s and {other.offset:.2f} s)"
+        tests.append(acceptance_test("evidence of the next alignment", ratio, s.max_evidence_ratio, two, unique))
+    return with_tests(PairSolution(*names, "ok", alternatives=tuple(fits[1:4])), tests, best)
 
 
-def rejection_reason(fit: PairFit, s: PairSettings) -> str:
-    """Why an alignment fails the absolute limits; "" if it passes them."""
-    if rejection_reason_ignoring_planarity(fit, s) or not is_planar(fit, s):
-        return rejection_reason_ignoring_planarity(fit, s)
-    return "the motion lies in one plane (or the cameras stand in one place), which leaves the geometry undetermined"
+def _false_alarm_test(
+    best: PairFit, has_competition: bool, independent_lags: float, unique: str, s: PairSettings
+) -> AcceptanceTest:
+    """Whether unrelated motion would hardly ever fit as well at one of the lags that were searched."""
+    found = float(best.log10_false_alarm or 0.0) + float(np.log10(independent_lags))
+    alternative = unique
+    # Periodic motion fits nearly as well one period later. With enough support the residual decides: nothing else
+    # comes near the tracks' own noise.
+    at_noise = best.residual_px <= s.max_noise_ratio * best.track_noise_px
+    if not has_competition and best.support >= s.min_support_without_null and at_noise:
+        alternative = "residual at the noise floor"
+    elif not has_competition and best.log10_gap < s.max_log10_gap:
+        alternative = "gap to the next lag"
+    chance = f"{100 * min(1.0, 10.0**found):.0f} %"
+    reason = (
+        f"other lags fit nearly as well (one of them would by chance in {chance} of cases): too little or too regular "
+        "common motion, or two different objects"
+    )
+    name, limit = "log10 of the false-alarm probability", s.max_log10_false_alarm
+    return acceptance_test(name, found, limit, reason, alternative)
 
 
-def rejection_reason_ignoring_planarity(fit: PairFit, s: PairSettings) -> str:
-    """Why an alignment fails the absolute limits other than planarity; "" if it passes them."""
-    if fit.support < s.min_support:
-        return f"only {fit.support:.1f} s of motion agree (of {fit.moving_overlap:.1f} s)"
-    if fit.residual_px > s.max_residual_px:
-        return f"the best alignment leaves a residual of {fit.residual_px:.1f} px"
-    if abs(fit.rate - 1.0) > s.max_rate_error:
-        return f"the best alignment needs a clock that is {1e6 * abs(fit.rate - 1.0):.0f} ppm off"
-    if fit.in_front < s.min_in_front:
-        return "the best geometry puts points behind a camera"
-    return ""
+def absolute_tests(fit: PairFit, s: PairSettings) -> tuple[AcceptanceTest, ...]:
+    """The absolute limits of an alignment; that of planarity comes last."""
+    support = f"only {fit.support:.1f} s of motion agree (of {fit.moving_overlap:.1f} s)"
+    residual = f"the best alignment leaves a residual of {fit.residual_px:.1f} px"
+    rate = abs(fit.rate - 1.0)
+    behind = "the best geometry puts points behind a camera"
+    clock = f"the best alignment needs a clock that is {1e6 * rate:.0f} ppm off"
+    return (
+        acceptance_test("inlier support", fit.support, s.min_support, support),
+        acceptance_test("residual", fit.residual_px, s.max_residual_px, residual),
+        acceptance_test("clock rate error", rate, s.max_rate_error, clock),
+        acceptance_test("points in front of both cameras", fit.in_front, s.min_in_front, behind),
+        acceptance_test(
+            "plane's residual over the residual",
+            # Where no plane was fitted (few points), none explains the motion.
+            np.nan_to_num(fit.planar_residual_px, nan=np.inf) / max(fit.residual_px, s.sigma_px),
+            s.min_planar_ratio,
+            "the motion lies in one plane (or the cameras stand in one place), which leaves the geometry undetermined",
+        ),
+    )
+
+
+def passes_absolute_tests(fit: PairFit, s: PairSettings, *, ignore_planarity: bool = False) -> bool:
+    """Whether an alignment is within the absolute limits."""
+    tests = absolute_tests(fit, s)
+    return first_failure(tests[:-1] if ignore_planarity else tests) is None
 
 
 def is_planar(fit: PairFit, s: PairSettings) -> bool:
@@ -99,7 +152,7 @@ def is_competing(fit: PairFit, best: PairFit, s: PairSettings) -> bool:
         return False
     if fit.log10_false_alarm is None or best.log10_false_alarm is None:
         return True
-    if fit.support > best.support and fit.inliers > _MIN_INLIERS and not rejection_reason(fit, s):
+    if fit.support > best.support and fit.inliers > _MIN_INLIERS and passes_absolute_tests(fit, s):
         return True  # as good for longer: the null distribution of a periodic motion cannot decide
     return fit.log10_false_alarm < best.log10_false_alarm + s.competing_log10_margin
 
@@ -148,7 +201,7 @@ def is_unique_maximum(best: PairFit, fits: list[PairFit], s: PairSettings) -> bo
         return False
     if (
         best.inliers < _MIN_INLIERS
-        or rejection_reason_ignoring_planarity(best, s)
+        or not passes_absolute_tests(best, s, ignore_planarity=True)
         or best.planar_residual_px < s.min_planar_ratio * best.residual_px
     ):
         return False
@@ -181,7 +234,7 @@ def rank_distinct(fits: list[PairFit], s: PairSettings) -> list[PairFit]:
     """
 
     def merit(fit: PairFit) -> tuple[bool, float, float]:
-        acceptable = not rejection_reason(fit, s) and fit.inliers >= min_inliers(fit, s)
+        acceptable = passes_absolute_tests(fit, s) and fit.inliers >= min_inliers(fit, s)
         return (acceptable, strength(fit), evidence(fit))
 
     ordered = sorted(fits, key=merit, reverse=True)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from hub.sync.acceptance import acceptance_test, with_tests
 from hub.sync.hypothesis import PairFit, PairSolution
 from hub.sync.settings import PairSettings
 from hub.trajectory.discrete import find_instants
@@ -74,9 +75,10 @@ def solve_common_clock_pair(
         mid_time=float(np.median(time)),
         parallax=relative_pose.parallax(best.geometry, a_points, b_points),
     )
-    if result.inliers < s.min_inliers_long:
-        reason = f"only {100 * result.inliers:.0f} % of the {count} common rows agree with one geometry"
-        return PairSolution(*names, reason, result)
-    if result.in_front < s.min_in_front:
-        return PairSolution(*names, "the best geometry puts points behind a camera", result)
-    return PairSolution(*names, "ok", result)
+    share = f"only {100 * result.inliers:.0f} % of the {count} common rows agree with one geometry"
+    behind = "the best geometry puts points behind a camera"
+    tests = (
+        acceptance_test("inliers", result.inliers, s.min_inliers_long, share),
+        acceptance_test("points in front of both cameras", result.in_front, s.min_in_front, behind),
+    )
+    return with_tests(PairSolution(*names, "ok"), tests, result)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hub.sync.acceptance import acceptance_test, with_tests
 from hub.sync.hypothesis import PairFit, PairSolution
 from hub.sync.lag_uncertainty import estimate_lag_uncertainty, recentred
 from hub.sync.samples import Samples
@@ -55,9 +56,11 @@ def refine_and_test(
     has_pose = isinstance(fit.geometry, RelativePose) and not fixed_geometry
     if has_pose and s.standalone and not lts:
         most_likely, ambiguity = _most_likely_geometry(samples, fit, noise)
-        if ambiguity > s.max_rotation_ambiguity:
-            reason = f"rotations {np.rad2deg(ambiguity):.0f}° apart fit the motion equally well"
-            return replace(solution, status=reason, fit=fit)
+        reason = f"rotations {np.rad2deg(ambiguity):.0f}° apart fit the motion equally well"
+        name = "angle between equally likely rotations"
+        solution = with_tests(solution, [acceptance_test(name, ambiguity, s.max_rotation_ambiguity, reason)], fit)
+        if not solution.solved:
+            return solution
         fit = replace(fit, geometry=most_likely)
     found = refine(
         samples,
@@ -83,20 +86,20 @@ def refine_and_test(
     )
     speed = float(np.nanmedian(np.linalg.norm(samples.interpolate_b((samples.time - last.offset) / rate)[1], axis=1)))
     a_pixel = 1.0 / max(speed * b[0].focal, 1e-9)
-    if last.lag_std > min(max(s.max_lag_std, a_pixel), s.max_slow_lag_std):
-        return replace(
-            solution, status=f"the motion determines the lag only to {1e3 * last.lag_std:.0f} ms (std)", fit=last
-        )
+    lag_limit = min(max(s.max_lag_std, a_pixel), s.max_slow_lag_std)
     certain_lag = fit.log10_false_alarm is not None and fit.log10_false_alarm < s.certain_lag_log10_false_alarm
-    if last.rotation_std > (s.max_rotation_std_certain_lag if certain_lag else s.max_rotation_std):
-        reason = f"the motion determines the relative rotation only to {np.rad2deg(last.rotation_std):.1f}° (std)"
-        return replace(solution, status=reason, fit=last)
-    solution = replace(solution, fit=last)
-    return (
-        _test_sensitivity(solution, last, samples, found, noise, rate_prior_std, s)
-        if has_pose and s.standalone
-        else solution
-    )
+    rotation_limit = s.max_rotation_std_certain_lag if certain_lag else s.max_rotation_std
+    lag_reason = f"the motion determines the lag only to {1e3 * last.lag_std:.0f} ms (std)"
+    tests = [acceptance_test("std of the lag by noise", last.lag_std, lag_limit, lag_reason)]
+    if has_pose:
+        std = np.rad2deg(last.rotation_std)
+        reason = f"the motion determines the relative rotation only to {std:.1f}° (std)"
+        name = "std of the relative rotation"
+        tests.append(acceptance_test(name, last.rotation_std, rotation_limit, reason))
+    solution = with_tests(solution, tests, last)
+    if not (solution.solved and has_pose and s.standalone):
+        return solution
+    return _test_sensitivity(solution, last, samples, found, noise, rate_prior_std, s)
 
 
 def _most_likely_geometry(samples: Samples, fit: PairFit, noise: NoiseModel) -> tuple[TwoViewGeometry, float]:
@@ -189,17 +192,20 @@ def _test_sensitivity(
     )
     rate = 1.0 / uncertainty.inverse_rate
     fit = replace(fit, rate=rate, offset=coarse.centre - rate * uncertainty.intercept, total_lag_std=uncertainty.std)
-    if uncertainty.std > s.max_total_lag_std:
-        std = f"{1e3 * uncertainty.std:.0f} ms (std)"
-        reason = f"the motion determines the lag only to {std}, with lens and readout uncertainty included"
-        return replace(solution, status=reason, fit=fit)
-    if uncertainty.leave_out_change > s.max_leave_out_change:
-        change = f"{1e3 * uncertainty.leave_out_change:.0f} ms"
-        reason = (
-            f"the motion determines the lag only to {change}: it changes by that much without a fifth of the samples"
-        )
-        return replace(solution, status=reason, fit=fit)
-    return replace(solution, fit=fit)
+    std, change = f"{1e3 * uncertainty.std:.0f} ms (std)", f"{1e3 * uncertainty.leave_out_change:.0f} ms"
+    only = "the motion determines the lag only to"
+    total = f"{only} {std}, with lens and readout uncertainty included"
+    leave_out = f"{only} {change}: it changes by that much without a fifth of the samples"
+    tests = (
+        acceptance_test("std of the lag with lens and readout", uncertainty.std, s.max_total_lag_std, total),
+        acceptance_test(
+            "change of the lag without a fifth of the samples",
+            uncertainty.leave_out_change,
+            s.max_leave_out_change,
+            leave_out,
+        ),
+    )
+    return with_tests(solution, tests, fit)
 
 
 __all__ = ["LTS_INLIER_PX", "refine_and_test"]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hub.two_view.relative_pose import RelativePose, TwoViewGeometry
+from protocols.core.acceptance import AcceptanceTest
 from protocols.geometry.types import Floats
 
 
@@ -75,7 +76,8 @@ class PairFit:
 class PairSolution:
     """Result for a pair of cameras a and b: the accepted alignment, or a refusal with the best hypothesis if any.
 
-    status: "ok" or the reason of the refusal. alternatives: next best alignments, best first.
+    status: "ok" or the reason of the refusal. alternatives: next best alignments, best first. acceptance: the tests
+    that were made, in order. refuted: whether no geometry agrees at the lag that other cameras imply.
     """
 
     a: str
@@ -85,6 +87,8 @@ class PairSolution:
     alternatives: tuple[PairFit, ...] = field(default=())
     fundamental: Floats | None = None
     """(3, 3) of undistorted pixels, ``m_aᵀ F m_b = 0``, where the method found it directly."""
+    acceptance: tuple[AcceptanceTest, ...] = ()
+    refuted: bool = False
 
     @property
     def solved(self) -> bool:

@@ -13,15 +13,17 @@ from dataclasses import replace
 import numpy as np
 
 from hub.sync.acceptance import (
+    absolute_tests,
     accept_or_reject,
+    acceptance_test,
     cannot_compete,
     is_at_noise_floor,
     is_planar,
     is_reliable,
     is_unique_maximum,
     rank_distinct,
-    rejection_reason,
     strength,
+    with_tests,
 )
 from hub.sync.final_refinement import LTS_INLIER_PX, refine_and_test
 from hub.sync.hypothesis import PairFit, PairSolution, evidence, swap_cameras
@@ -53,7 +55,7 @@ _HARDLY_MOVES = "the point hardly moves while both could have seen it"
 _HARDLY_MOVES_AT_PREDICTED_LAG = (
     "the point hardly moves at the lag that the other cameras imply; other lags were not searched"
 )
-NO_FIT_AT_PREDICTED_LAG = "no geometry agrees at the lag that the other cameras imply; other lags were not searched"
+_NO_FIT_AT_PREDICTED_LAG = "no geometry agrees at the lag that the other cameras imply; other lags were not searched"
 _MAX_STARTS = 4
 _FIVE_POINT_SEEDS = 8  # random seeds of five-point hypotheses; more than _MAX_STARTS hypotheses are tried only …
 _PROMISING = 12.0  # … while the cost is at most this many times the noise: a local minimum of E at the right lag
@@ -221,7 +223,8 @@ class _PairSearch:
             if is_reliable(fit, s) and (reliable is None or evidence(fit) > reliable[0]):
                 reliable = (evidence(fit), cost)
         if not fits:
-            return PairSolution(*names, _NO_FIT if lag_window is None else NO_FIT_AT_PREDICTED_LAG)
+            reason = _NO_FIT if lag_window is None else _NO_FIT_AT_PREDICTED_LAG
+            return PairSolution(*names, reason, refuted=lag_window is not None)
         solution = self._accept(names, fits, b, None if lag_window is not None else scan)
         if solution.solved and solution.fit is not None and lag_window is None:
             again = [
@@ -248,7 +251,11 @@ class _PairSearch:
         best = max(ordered, key=strength)
         if not is_unique_maximum(best, ordered, s):
             return solution
-        unique = PairSolution(*names, "ok", best, tuple(fit for fit in ordered if fit is not best)[:3])
+        tests = solution.acceptance if best is solution.fit else absolute_tests(best, s)
+        instead = "unique maximum with a precise lag"
+        tests = tuple(test if test.passed else replace(test, alternative=instead) for test in tests)
+        others = tuple(fit for fit in ordered if fit is not best)[:3]
+        unique = PairSolution(*names, "ok", best, others, acceptance=tests)
         return unique if self._is_precise(unique, best, b) else solution
 
     def _is_precise(self, unique: PairSolution, best: PairFit, b: Sequence[SmoothTrack]) -> bool:
@@ -311,19 +318,20 @@ class _PairSearch:
         fits.sort(key=lambda fit: -fit.support * fit.in_front)
         fit = fits[0]
         second = max((one.support for one in fits[1:] if abs(one.offset - fit.offset) > 0.1), default=0.0)
-        reason = rejection_reason(fit, s)
-        if reason:
-            pass
-        elif fit.support < s.min_lts_support:
-            reason = f"the tracks are discontinuous, and only {fit.support:.1f} s of motion agree"
-        elif zscore < s.min_lts_zscore or second > s.max_evidence_ratio * fit.support:
-            reason = (
-                "the tracks are discontinuous, and other lags fit nearly as well (the best agrees for "
-                f"{fit.support:.1f} s, the next for {second:.1f} s; the best is {zscore:.1f} sigma above the others)"
-            )
-        if reason:
-            return PairSolution(*names, reason, fit)
-        return refine_and_test(PairSolution(*names, "ok", fit), fit, self.a, self.b, s, lts=True)
+        little = f"the tracks are discontinuous, and only {fit.support:.1f} s of motion agree"
+        rivals = (
+            "the tracks are discontinuous, and other lags fit nearly as well (the best agrees for "
+            f"{fit.support:.1f} s, the next for {second:.1f} s; the best is {zscore:.1f} sigma above the others)"
+        )
+        share = second / max(fit.support, 1e-9)
+        tests = (
+            *absolute_tests(fit, s),
+            acceptance_test("inlier support of discontinuous tracks", fit.support, s.min_lts_support, little),
+            acceptance_test("inlier seconds above other lags", zscore, s.min_lts_zscore, rivals),
+            acceptance_test("next lag's inlier support", share, s.max_evidence_ratio, rivals),
+        )
+        solution = with_tests(PairSolution(*names, "ok"), tests, fit)
+        return refine_and_test(solution, fit, self.a, self.b, s, lts=True) if solution.solved else solution
 
     def _repetitions(
         self, b: Sequence[SmoothTrack], moments: PairMoments, scan: LagScan, best: PairFit

@@ -9,8 +9,10 @@ Anything else that escapes is a bug: exit status 1.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from protocols.core.acceptance import AcceptanceTest
 from protocols.core.pair_report import PairReport
 
 EXIT_DONE = 0  # the result is there
@@ -56,7 +58,8 @@ class Refused(SynclineError):
     """The input is well-formed, but no reliable result can be estimated from it; ``reason`` says why.
 
     cameras: reasons by camera, where they concern single cameras. pairs: results of camera pairs that are known
-    nevertheless. warnings: further warnings for the user. cpu_seconds: spent by the solver before it refused.
+    nevertheless. warnings: further warnings for the user. acceptance: the cameras' acceptance tests. cpu_seconds: spent
+    by the solver before it refused.
     """
 
     exit_status = EXIT_REFUSED
@@ -70,8 +73,9 @@ class Refused(SynclineError):
         cameras: dict[str, str] | None = None,
         pairs: tuple[PairReport, ...] = (),
         warnings: tuple[str, ...] = (),
+        acceptance: Mapping[str, Sequence[AcceptanceTest]] | None = None,
     ) -> None:
-        self.pairs, self.warnings = pairs, warnings
+        self.pairs, self.warnings, self.acceptance = pairs, warnings, dict(acceptance or {})
         self.reason = printable(" ".join(reason.split()))
         self.cameras = dict(cameras or {})
         super().__init__(self.reason)

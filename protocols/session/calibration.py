@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
+from protocols.core.acceptance import AcceptanceTest
 from protocols.core.clocks import TimeMap
 from protocols.core.errors import InputError
 from protocols.core.files import read_toml, write_atomically
@@ -126,7 +128,7 @@ class Calibration:
     reference: camera whose clock is the reference. scale: "metric" or "arbitrary" (then the first camera is
     the world and the first baseline is 1). refused: reasons by camera. cpu_seconds: of the solver.
     residuals: per camera (n, 5): camera time, u, v, and the residual du, dv [px] of the rows used (inliers).
-    convergence: the iterations of the last adjustment, in order.
+    convergence: the iterations of the last adjustment, in order. acceptance: tests by camera, refused ones included.
     """
 
     cameras: dict[str, CameraCalibration]
@@ -142,6 +144,7 @@ class Calibration:
     cpu_seconds: float = 0.0
     residuals: dict[str, Floats] = field(default_factory=dict)
     convergence: tuple[AdjustmentStep, ...] = ()
+    acceptance: Mapping[str, Sequence[AcceptanceTest]] = field(default_factory=dict)
 
 
 def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from protocols.core.acceptance import AcceptanceTest
 from protocols.core.files import write_atomically
 from protocols.core.pair_report import PairReport
 from protocols.core.version import VERSION
@@ -60,6 +62,7 @@ def result_document(calibration: Calibration, rig: Rig, *, command: str = "") ->
         },
         pairs=[_pair(pair) for pair in calibration.pairs],
         convergence=[{"stage": step.stage, "residual_px": step.residual_px} for step in calibration.convergence],
+        acceptance={name: _tests(tests) for name, tests in calibration.acceptance.items()},
         warnings=list(calibration.warnings),
         cpu_seconds=calibration.cpu_seconds,
     )
@@ -75,10 +78,11 @@ def refusal_document(
     cpu_seconds: float = 0.0,
     pairs: Iterable[PairReport] = (),
     warnings: Iterable[str] = (),
+    acceptance: Mapping[str, Sequence[AcceptanceTest]] | None = None,
 ) -> dict[str, Any]:
     """The content of result.json of a refused session: the same keys, and the reason.
 
-    refused: reasons by camera.
+    refused: reasons by camera. acceptance: their tests.
     """
     metadata = {
         **rig.metadata,
@@ -98,6 +102,7 @@ def refusal_document(
         trajectory={"file": None, "labels": []},
         pairs=[_pair(pair) for pair in pairs],
         convergence=[],
+        acceptance={name: _tests(tests) for name, tests in (acceptance or {}).items()},
         warnings=list(warnings),
         cpu_seconds=cpu_seconds,
     )
@@ -126,7 +131,12 @@ def _pair(pair: PairReport) -> dict[str, Any]:
         "inliers": pair.inliers,
         "rms_px": pair.rms_px,
         "status": pair.status,
+        "acceptance": _tests(pair.acceptance),
     }
+
+
+def _tests(tests: Iterable[AcceptanceTest]) -> list[dict[str, Any]]:
+    return [{**asdict(test), "passed": test.passed} for test in tests]
 
 
 def _summary(table: TrajectoryTable) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.calibration.pair_network import _leave_to_resection, _SynchronisedGroups, solve_pairs
 from hub.sync.hypothesis import PairSolution
 from hub.sync.pair_ranking import ranking_score
-from hub.sync.pair_solver import NO_FIT_AT_PREDICTED_LAG, _PairSearch, solve_pair
+from hub.sync.pair_solver import _PairSearch, solve_pair
 from hub.sync.track_cache import TrackCache
 from hub.trajectory.image_tracks import smooth_only
 from tests.support.rigs import Session, simulate
@@ -128,7 +128,7 @@ def test_the_only_pair_of_a_camera_that_its_other_pairs_refute_is_left_to_resect
     def network(refuting: int, calibrated: set[str]) -> str:
         names = ["a", "b", "c", "d"]
         pairs = {both: PairSolution(*both, "ok") for both in itertools.combinations(names, 2)}
-        pairs |= {(name, "x"): PairSolution(name, "x", NO_FIT_AT_PREDICTED_LAG) for name in names[:refuting]}
+        pairs |= {(name, "x"): PairSolution(name, "x", "refuted", refuted=True) for name in names[:refuting]}
         pairs["d", "x"] = PairSolution("d", "x", "ok")
         _leave_to_resection(pairs, calibrated)
         assert all(pair.solved for (_, one), pair in pairs.items() if one != "x")

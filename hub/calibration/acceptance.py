@@ -1,0 +1,218 @@
+"""Acceptance tests of the cameras of an adjusted network, in the order in which their failures explain one another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from hub.bundle import covariance as cov
+from hub.bundle import model_comparison
+from hub.bundle.correlated_noise import MIN_INFLATION
+from hub.bundle.initialisation import Reconstruction, inlier_share
+from hub.bundle.noise_scale import correlation_inflation
+from hub.bundle.smoothness_prior import estimate_smoothness
+from hub.calibration.given_values import refuted_lens
+from hub.calibration.result import focal_stds
+from hub.calibration.self_calibration import MAX_FOCAL_STD
+from hub.sync.hypothesis import PairSolution
+from protocols.core.acceptance import AcceptanceTest, first_failure
+from protocols.geometry.types import Floats
+
+_MIN_INLIER_SHARE = 0.5  # share of a camera's rows that must fit the trajectory
+_MIN_ROWS = 30
+"""Rows of a camera: with two coordinates each, five times its ten unknowns (pose, clock, focal length, k1)."""
+_MAX_ROTATION_STD = 0.05  # rad
+_MAX_CLOCK_STD = 10e-3  # s: a frame is more than three of them
+_MAX_LAG_CHANGE = 20e-3  # s
+_WRONG_LENS = 0.05  # relative error of a focal length that no zoom, crop or temperature explains: another lens
+_MIN_TO_BLAME_A_LENS = 4  # cameras: of three, another camera's pose absorbs too much of a wrong lens
+LAG_CONFLICT = "difference of the lags by trajectory and by epipolar geometry"
+
+CameraTests = dict[str, list[AcceptanceTest]]
+"""The tests by camera."""
+
+
+Failure = tuple[str, AcceptanceTest]
+"""A camera, and the test that it fails."""
+
+
+def misfits(reconstruction: Reconstruction, unknown_lenses: Iterable[str] = ()) -> list[Failure]:
+    """The cameras that do not fit the trajectory that the others give, the worst one first.
+
+    unknown_lenses: cameras whose lens is estimated: a wrong one may be the cause of all the others' misfit. Where one
+    of them fails, only they are returned.
+    """
+    failed = ((name, first_failure(tests)) for name, tests in _fit(reconstruction).items())
+    found = sorted(((name, test) for name, test in failed if test is not None), key=lambda item: -item[1].excess)
+    return [item for item in found if item[0] in set(unknown_lenses)] or found
+
+
+def network_failure(
+    reconstruction: Reconstruction, pairs: Iterable[PairSolution], tests: CameraTests
+) -> Failure | None:
+    """The camera of a network without misfits that fails first; None if all pass. ``tests`` gets what was tested.
+
+    pairs: that the network was made from.
+    """
+    lens = wrong_lens(reconstruction)
+    if lens is not None:
+        return lens
+    found = _covariance(reconstruction)
+    groups = (
+        _fit(reconstruction),
+        _focal_lengths(reconstruction, found),
+        _precision(reconstruction, found),
+        _lag_conflicts(reconstruction, pairs),
+    )
+    for group in groups:
+        for name, made in group.items():
+            tests.setdefault(name, []).extend(made)
+    return next((failure for failure in map(_worst, groups) if failure is not None), None)
+
+
+def least_certain_camera(reconstruction: Reconstruction) -> Failure | None:
+    """The camera whose pose or clock relative to every other is most uncertain, if beyond the limit, and the test."""
+    return _worst(_precision(reconstruction, _covariance(reconstruction)))
+
+
+def wrong_lens(reconstruction: Reconstruction) -> Failure | None:
+    """The camera whose measured lens is refuted most, by far more than any lens changes in the field, and the test.
+
+    Without correlated residuals there is none: a wrong lens displaces successive rows alike.
+    """
+    problem, state, names = reconstruction.problem, reconstruction.state, reconstruction.names
+    if state.correlated_noise is not None or not problem.free_parameters.clock or len(names) < _MIN_TO_BLAME_A_LENS:
+        return None
+    if max(correlation_inflation(problem, state, camera) for camera in range(len(names))) < MIN_INFLATION:
+        return None
+    for one in model_comparison.refuted_lenses(problem, state)[:1]:
+        test = AcceptanceTest(
+            "error of the given focal length, less three stds",
+            abs(one.focal_change) - 3.0 * one.focal_std,
+            _WRONG_LENS,
+            "relative",
+            "no zoom, crop or temperature changes a lens by more",
+            refuted_lens(one),
+        )
+        return None if test.passed else (names[one.camera], test)
+    return None
+
+
+def _covariance(reconstruction: Reconstruction) -> cov.Covariance:
+    problem, state = reconstruction.problem, reconstruction.state
+    return cov.covariance(problem, state, estimate_smoothness(problem, state))
+
+
+def _worst(group: CameraTests) -> Failure | None:
+    """Of the first test of the group that a camera fails, the camera that exceeds the limit most.
+
+    Of two with equal values, the later one: the first camera is usually the reference.
+    """
+    for row in zip(*group.values(), strict=True):
+        failed = [(test.excess, number) for number, test in enumerate(row) if not test.passed]
+        if failed:
+            number = max(failed)[1]
+            return list(group)[number], row[number]
+    return None
+
+
+def _fit(reconstruction: Reconstruction) -> CameraTests:
+    """Whether each camera fits the trajectory that the others give."""
+    out: CameraTests = {}
+    for name in reconstruction.names:
+        share, count = inlier_share(reconstruction, name)
+        fits = "observations fit the trajectory seen by the other cameras"
+        bench = "measured: python -m tests.bench.broken_cameras"
+        out[name] = [
+            AcceptanceTest(
+                "observations that fit the trajectory",
+                share,
+                _MIN_INLIER_SHARE,
+                "share",
+                bench,
+                f"only {100 * share:.0f} % of its {count} {fits}",
+                ">=",
+            ),
+            AcceptanceTest(
+                "observations", count, _MIN_ROWS, "", "five rows an unknown", f"only {count} of its {fits}", ">="
+            ),
+        ]
+    return out
+
+
+def _focal_lengths(reconstruction: Reconstruction, found: cov.Covariance) -> CameraTests:
+    """Precision of the focal lengths that were estimated."""
+    stds = focal_stds(reconstruction.problem, reconstruction.state, found)
+    name, source = "std of the focal length", "measured: python -m tests.bench.lenses"
+    return {
+        camera: [
+            AcceptanceTest(
+                name,
+                float(std),
+                MAX_FOCAL_STD,
+                "relative",
+                source,
+                f"the common motion determines its focal length only to {100 * std:.1f} % (std)",
+            )
+        ]
+        for camera, std in zip(reconstruction.names, stds, strict=True)
+        if std > 0.0
+    }
+
+
+def _precision(reconstruction: Reconstruction, found: cov.Covariance) -> CameraTests:
+    """Precision of each camera's orientation and clock relative to the camera to which they are known best."""
+    problem, state = reconstruction.problem, reconstruction.state
+    rotations = _best(cov.relative_rotation_stds(found.cameras, state))
+    shared = not problem.free_parameters.clock
+    clocks = np.zeros_like(rotations) if shared else _best(cov.relative_clock_stds(found, problem, state))
+    only = "the common motion determines its"
+    return {
+        name: [
+            AcceptanceTest(
+                "std of the orientation",
+                float(rotation),
+                _MAX_ROTATION_STD,
+                "rad",
+                "measured: python -m tests.bench.simulated_rigs",
+                f"{only} orientation only to {np.rad2deg(rotation):.1f}° (std)",
+            ),
+            AcceptanceTest(
+                "std of the clock at mid-overlap",
+                float(clock),
+                _MAX_CLOCK_STD,
+                "s",
+                "a third of a frame at 30 fps",
+                f"{only} clock only to {1e3 * clock:.1f} ms (std, mid-overlap)",
+            ),
+        ]
+        for name, rotation, clock in zip(reconstruction.names, rotations, clocks, strict=True)
+    }
+
+
+def _best(between: Floats) -> Floats:
+    """(n,) the smallest of each camera's values (n, n) with another one."""
+    between = between.copy()
+    np.fill_diagonal(between, np.inf)
+    return np.asarray(between.min(axis=1))
+
+
+def _lag_conflicts(reconstruction: Reconstruction, pairs: Iterable[PairSolution]) -> CameraTests:
+    """How far the adjustment moved the lag of an isolated pair, by its later camera.
+
+    Epipolar geometry and trajectory are two estimates of the lag with different sensitivities: where they differ, one
+    of them is wrong. With three and more cameras a pair's lag is only an initial value.
+    """
+    out: CameraTests = {}
+    for pair in pairs:
+        if pair.fit is None or not np.isfinite(pair.fit.total_lag_std):
+            continue
+        a, b = (reconstruction.state.cameras[reconstruction.names.index(name)] for name in (pair.a, pair.b))
+        at_a = np.array([pair.fit.mid_time])
+        at_b = (at_a - pair.fit.offset) / pair.fit.rate
+        difference = float(abs(a.reference_time(at_a) - b.reference_time(at_b))[0])
+        reason = f"the trajectory puts its clock {1e3 * difference:.0f} ms from the lag of the epipolar geometry"
+        source = "twice the largest std that a pair's lag may have"
+        out[pair.b] = [AcceptanceTest(LAG_CONFLICT, difference, _MAX_LAG_CHANGE, "s", source, reason)]
+    return out

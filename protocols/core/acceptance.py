@@ -1,0 +1,43 @@
+"""One named test of an estimate: what was measured, its limit, and where the limit comes from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptanceTest:
+    """A row of the table of acceptance tests, as in result.json and the report.
+
+    value, limit: in ``unit``. source: the distribution, physical bound or bench that the limit comes from. reason: of
+    the refusal in words, where the test fails. sense: "<=" or ">=", of value to limit. alternative: the test that
+    decided in its stead, if any; then it counts as passed.
+    """
+
+    name: str
+    value: float
+    limit: float
+    unit: str
+    source: str
+    reason: str = ""
+    sense: str = "<="
+    alternative: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the value is within the limit, or another test decided; a value that is no number is not within."""
+        within = self.value <= self.limit if self.sense == "<=" else self.value >= self.limit
+        return bool(self.alternative) or (not math.isnan(self.value) and within)
+
+    @property
+    def excess(self) -> float:
+        """How far beyond the limit: the factor by which the value exceeds it, or falls short of it."""
+        small, large = (self.limit, self.value) if self.sense == "<=" else (self.value, self.limit)
+        return large / max(small, 1e-300)
+
+
+def first_failure(tests: Iterable[AcceptanceTest]) -> AcceptanceTest | None:
+    """The first test that fails; None if all pass."""
+    return next((test for test in tests if not test.passed), None)
