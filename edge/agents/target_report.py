@@ -10,8 +10,8 @@ from edge.mavlink.roles.camera_messages import TrackingStatus
 from edge.mavlink.roles.vehicle import Vehicle
 from edge.uav.base import Estimate, TrackState
 from edge.uav.georeference import ground_point
-from edge.uav.navigation import quaternion_from_rotation
 from protocols.core.clocks import NANOSECONDS
+from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
@@ -43,7 +43,7 @@ def update_tracking_status(
     mount = vehicle.mount
     if mount is not None and mounting is not None and now_ns - mount.host_ns < _STALE_NS:
         ned_from_camera = mount.ned_from_mount @ mounting
-        status.quaternion = quaternion_from_rotation(ned_from_camera @ _CAMERA_FROM_FRD)
+        status.quaternion = so3.quaternion(ned_from_camera @ _CAMERA_FROM_FRD).tolist()
         if origin is not None and mount.position is not None:
             middle = np.array([[0.5 * (width - 1), 0.5 * (height - 1)]])
             ray = np.array([0.0, 0.0, 1.0]) if lens is None else np.append(lens.unproject(middle)[0], 1.0)

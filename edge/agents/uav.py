@@ -28,11 +28,11 @@ from edge.mavlink.roles.guidance import Guidance
 from edge.mavlink.roles.vehicle import MountSample, Vehicle
 from edge.uav.base import Box, Estimate, Telemetry
 from edge.uav.estimator import TargetEstimator, decode_image
-from edge.uav.navigation import quaternion_from_rotation
 from edge.uav.timing.clock_alignment import CameraHostClock, ClockAligner
 from protocols.bus.base import Bus
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.version import VERSION
+from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
@@ -309,7 +309,7 @@ class UavAgent:
             device_time_ns=mapped,
             vehicle_time_ns=sample.vehicle_ns,
             time_std_s=std if math.isfinite(std) else 1e3,
-            ned_from_body=quaternion_from_rotation(sample.ned_from_mount),
+            ned_from_body=so3.quaternion(sample.ned_from_mount).tolist(),
         )
         if sample.position is not None:
             message.position.extend(sample.position.tolist())

@@ -27,22 +27,7 @@ def rotation_from_quaternion(q: Any) -> Floats | None:
     size = float(np.linalg.norm(parts))
     if not (np.isfinite(parts).all() and 0.9 < size < 1.1):
         return None
-    w, x, y, z = parts / size
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def quaternion_from_rotation(rotation: Floats) -> list[float]:
-    """Quaternion w, x, y, z of a rotation (3, 3), w ≥ 0."""
-    vector = so3.log(rotation)
-    angle = float(np.linalg.norm(vector))
-    axis = vector / angle if angle > 1e-12 else np.zeros(3)
-    return [math.cos(0.5 * angle), *(math.sin(0.5 * angle) * axis).tolist()]
+    return so3.from_quaternion(parts)
 
 
 def curvature_radii(latitude: float) -> tuple[float, float]:

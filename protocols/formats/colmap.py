@@ -6,7 +6,6 @@ translations are camera from world. It has no clock maps and no units.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
@@ -26,7 +25,6 @@ from protocols.formats.cameras import (
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
-from protocols.geometry.types import Floats
 from protocols.session.calibration import CameraCalibration
 
 CAMERAS, IMAGES, POINTS = "cameras.txt", "images.txt", "points3D.txt"
@@ -79,7 +77,7 @@ def read(folder: Path) -> ForeignRig:
         size = float(np.linalg.norm(values[:4]))
         if not 0.5 < size < 2.0:
             raise InputError("the quaternion has no direction", file=file, line=number, remedy="correct it")
-        rotation = _rotation(values[:4] / size)
+        rotation = so3.from_quaternion(values[:4] / size)
         cameras[name] = ForeignCamera(name, lenses[words[8]], Pose(rotation, -rotation.T @ values[4:]))
     if not cameras:
         raise InputError("no image in it", file=file, line=1, remedy="give a model with its images")
@@ -100,7 +98,7 @@ def write(cameras: Mapping[str, CameraCalibration]) -> ExportedFiles:
             model, values = ("OPENCV", [k1, k2, p1, p2]) if k3 == 0 else ("FULL_OPENCV", [k1, k2, p1, p2, k3, 0, 0, 0])
         parameters = _numbers([fx, fy, cx + _CENTRE, cy + _CENTRE, *values])
         lenses.append(f"{number} {model} {lens.width} {lens.height} {parameters}")
-        quaternion = _quaternion(camera.pose.rotation)
+        quaternion = so3.quaternion(camera.pose.rotation).tolist()
         images.append(f"{number} {_numbers([*quaternion, *camera.pose.translation])} {number} {_image(name)}\n")
         if camera.time_map.time_offset != 0.0 or camera.time_map.clock_rate != 1.0:
             warnings.append(name)
@@ -157,24 +155,6 @@ def _name(image: str, taken: Mapping[str, ForeignCamera]) -> str:
     path = PurePosixPath(image.replace("\\", "/"))
     name = name_of_segment(path.stem) or path.stem
     return name if name not in taken else "_".join(path.with_suffix("").parts)
-
-
-def _quaternion(rotation: Floats) -> list[float]:
-    """w, x, y, z of a rotation matrix (3, 3), w >= 0."""
-    turn = so3.log(rotation)
-    angle = float(np.linalg.norm(turn))
-    axis = turn / angle if angle > 1e-12 else np.zeros(3)
-    return [math.cos(0.5 * angle), *(math.sin(0.5 * angle) * axis).tolist()]
-
-
-def _rotation(quaternion: Floats) -> Floats:
-    """(3, 3) of a unit quaternion w, x, y, z."""
-    w, *rest = quaternion.tolist()
-    axis = np.array(rest)
-    size = float(np.linalg.norm(axis))
-    if size < 1e-300:
-        return np.eye(3)
-    return so3.exp(2.0 * math.atan2(size, w) / size * axis)
 
 
 def _numbers(values: list[float]) -> str:

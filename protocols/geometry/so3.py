@@ -36,33 +36,37 @@ def exp(w: Floats) -> Floats:
     return np.asarray(np.eye(3) + a * k + b * (k @ k))
 
 
-def log(rotation: Floats) -> Floats:
-    """Rotation vector (3,) [rad], |w| <= pi, of one rotation matrix (3, 3).
+def quaternion(rotation: Floats) -> Floats:
+    """Unit quaternion (4,) w, x, y, z, w >= 0, of one rotation matrix (3, 3), accurate at every angle.
 
-    Computed through the quaternion, so that it is accurate both near 0 and near pi.
+    Shepperd's method: of the four rows, each a multiple of the quaternion, the one with the largest component.
     """
     m = np.asarray(rotation, dtype=np.float64)
-    # The largest of the four squared quaternion components keeps the division well conditioned.
-    squares = np.array(
+    x, y, z = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
+    rows = np.array(
         [
-            1.0 + m[0, 0] + m[1, 1] + m[2, 2],
-            1.0 + m[0, 0] - m[1, 1] - m[2, 2],
-            1.0 - m[0, 0] + m[1, 1] - m[2, 2],
-            1.0 - m[0, 0] - m[1, 1] + m[2, 2],
+            [1.0 + m[0, 0] + m[1, 1] + m[2, 2], x, y, z],
+            [x, 1.0 + m[0, 0] - m[1, 1] - m[2, 2], xy, xz],
+            [y, xy, 1.0 - m[0, 0] + m[1, 1] - m[2, 2], yz],
+            [z, xz, yz, 1.0 - m[0, 0] - m[1, 1] + m[2, 2]],
         ]
     )
-    largest = int(np.argmax(squares))
-    if largest == 0:
-        q = np.array([squares[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
-    elif largest == 1:
-        q = np.array([m[2, 1] - m[1, 2], squares[1], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]])
-    elif largest == 2:
-        q = np.array([m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], squares[2], m[1, 2] + m[2, 1]])
-    else:
-        q = np.array([m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], squares[3]])
-    q /= np.linalg.norm(q)
-    if q[0] < 0:
-        q = -q
+    q = rows[int(np.argmax(np.diag(rows)))]
+    q = q / np.linalg.norm(q)
+    return np.asarray(-q if q[0] < 0 else q)
+
+
+def from_quaternion(q: Floats) -> Floats:
+    """Rotation matrix (3, 3) of a quaternion (4,) w, x, y, z of any length but zero."""
+    w, vector = float(q[0]), np.asarray(q[1:], dtype=np.float64)
+    size = float(np.linalg.norm(vector))
+    return exp(2.0 * np.arctan2(size, w) / max(size, 1e-300) * vector)
+
+
+def log(rotation: Floats) -> Floats:
+    """Rotation vector (3,) [rad], |w| <= pi, of one rotation matrix (3, 3)."""
+    q = quaternion(rotation)
     sine = float(np.linalg.norm(q[1:]))
     if sine < 1e-12:
         return np.asarray(2.0 * q[1:])

@@ -6,6 +6,10 @@ Success: accepted, with a time map within 5 ms RMS over the overlap and F within
 10 px off. Unrelated: pairs that saw different motions, of which none may be accepted. The lag error is the RMS at
 mid-overlap of all accepted solutions that are not wrong, in ms and over each one's Cramér-Rao bound
 (`tests.bench.pair_trials.lag_bound`); ms are CPU time of smoothing both tracks and of solving the pair on one core.
+
+The last table says what each acceptance test decides: how many wrong and right alignments failed it, how many failed
+nothing else, and how many were accepted because another test decided in its stead. One that is alone nowhere decides
+nothing here.
 """
 
 from __future__ import annotations
@@ -14,6 +18,7 @@ import argparse
 import json
 import os
 import time
+from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -92,6 +97,9 @@ class Outcome:
     floor_s: float
     smooth_ms: float
     pair_ms: float
+    failed: tuple[str, ...] = ()
+    decided: tuple[tuple[str, str], ...] = ()
+    """Tests that failed, and those in whose stead another one decided, with that one."""
 
     @property
     def accepted(self) -> bool:
@@ -120,12 +128,18 @@ def run(trial: Trial, calibrated: bool, related: bool = True) -> Outcome:
     answer = solve_pair({"": a}, {"": b}, ("a", "b"), calibrated=calibrated, thorough=True)
     solved = time.process_time()
     spent = 1e3 * (smoothed - begin), 1e3 * (solved - smoothed)
+    tests = (
+        tuple(test.name for test in answer.acceptance if not test.passed),
+        tuple((test.name, test.alternative) for test in answer.acceptance if test.alternative),
+    )
     if answer.fit is None or not related:
-        return Outcome(answer.status, np.inf, np.inf, np.inf, np.nan, *spent)
+        return Outcome(answer.status, np.inf, np.inf, np.inf, np.nan, *spent, *tests)
     rate = answer.fit.rate
     lag, error = time_map_error(trial, rate, answer.fit.offset + a.time_origin - rate * b.time_origin)
     found = fundamental_from(answer.fit.geometry, MATRIX, MATRIX)
-    return Outcome(answer.status, lag, error, geometry_error(trial, found), lag_bound(trial, calibrated), *spent)
+    return Outcome(
+        answer.status, lag, error, geometry_error(trial, found), lag_bound(trial, calibrated), *spent, *tests
+    )
 
 
 def _one(name: str, calibrated: bool, job: tuple[int, bool]) -> Outcome:
@@ -156,14 +170,17 @@ def main() -> None:
         f"{'/ bound':>8s} {'need':>8s} {'F px':>6s} {'smooth':>7s} {'pair':>7s}"
     )
     results: dict[str, object] = {}
+    all_done: list[Outcome] = []
     with ProcessPoolExecutor(options.jobs) as pool:
         for name in names:
             trials = options.trials
             jobs = [(options.start + k, True) for k in range(trials)]
             jobs += [(options.start + k, False) for k in range(options.unrelated)]
             done = list(pool.map(partial(_one, name, not options.uncalibrated), jobs, chunksize=4))
+            all_done += done
             results[name] = [asdict(one) for one in done]
             _print(name, done[:trials], done[trials:])
+    _print_tests(all_done)
     if options.json:
         options.json.write_text(json.dumps(results, indent=1))
 
@@ -191,6 +208,21 @@ def _print(name: str, done: list[Outcome], unrelated: list[Outcome]) -> None:
             reasons[text[:100]] = reasons.get(text[:100], 0) + 1
     for reason, count in sorted(reasons.items(), key=lambda item: -item[1])[:4]:
         print(f"{'':6s}{count} × {reason}")
+
+
+def _print_tests(done: list[Outcome]) -> None:
+    names = dict.fromkeys(name for one in done for name in (*one.failed, *(test for test, _ in one.decided)))
+    print(
+        f"\n{'acceptance test':50s} {'wrong':>6s} {'alone':>6s} {'right':>6s} {'alone':>6s} {'decided by another':>19s}"
+    )
+    for name in names:
+        failed = [one for one in done if name in one.failed]
+        right = [one for one in failed if one.map_s < GOOD_S and one.f_px < GOOD_PX]
+        wrong = [one for one in failed if one not in right]
+        alone = [sum(one.failed == (name,) for one in group) for group in (wrong, right)]
+        instead = Counter(other for one in done if one.accepted for test, other in one.decided if test == name)
+        others = ", ".join(f"{count} {other}" for other, count in instead.items())
+        print(f"{name:50s} {len(wrong):6d} {alone[0]:6d} {len(right):6d} {alone[1]:6d} {others:>19s}")
 
 
 def _percent(share: float | None) -> str:

@@ -47,6 +47,15 @@ def test_log_undoes_exp(w: Floats) -> None:
     np.testing.assert_allclose(so3.log(so3.exp(w)), w, atol=1e-9, rtol=1e-9)
 
 
+@given(rotations)
+def test_quaternions_agree_with_scipy_and_give_the_rotation_back(rotation: Floats) -> None:
+    q = so3.quaternion(rotation)
+    assert q[0] >= 0.0
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    assert abs(abs(q @ np.array([w, x, y, z])) - 1.0) < 1e-14
+    np.testing.assert_allclose(so3.from_quaternion(3.0 * q), rotation, atol=1e-14)
+
+
 @given(_axes, st.floats(1e-12, 1e-6))
 def test_log_of_a_tiny_turn_keeps_its_relative_precision(axis: tuple[float, ...], angle: float) -> None:
     w = _vector(axis, angle)

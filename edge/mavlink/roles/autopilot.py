@@ -19,8 +19,9 @@ from edge.mavlink.dialect import AUTOPILOT, GIMBAL, mavlink, message_name
 from edge.mavlink.link.framing import Framer
 from edge.mavlink.link.signing import Signing
 from edge.mavlink.link.transport import Address, Transport
-from edge.uav.navigation import Origin, quaternion_from_rotation
+from edge.uav.navigation import Origin
 from protocols.core.clocks import NANOSECONDS
+from protocols.geometry import so3
 from protocols.geometry.types import Floats
 
 _DEFAULT_RATES = {
@@ -282,7 +283,7 @@ class Autopilot:
             )
         elif kind == "ATTITUDE_QUATERNION":
             yield (
-                mavlink.MAVLink_attitude_quaternion_message(boot_ms, *quaternion_from_rotation(r), *now.rates),
+                mavlink.MAVLink_attitude_quaternion_message(boot_ms, *so3.quaternion(r).tolist(), *now.rates),
                 AUTOPILOT,
             )
         elif kind == "LOCAL_POSITION_NED":
@@ -305,7 +306,7 @@ class Autopilot:
         elif kind == "GIMBAL_DEVICE_ATTITUDE_STATUS" and now.ned_from_gimbal is not None:
             flags = mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
             own_ms = (boot_ms + round(1e3 * self._gimbal_ahead_s)) & 0xFFFFFFFF
-            q = quaternion_from_rotation(now.ned_from_gimbal)
+            q = so3.quaternion(now.ned_from_gimbal).tolist()
             yield (
                 mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, own_ms, flags, q, 0.0, 0.0, 0.0, 0),
                 GIMBAL,

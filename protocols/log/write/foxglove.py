@@ -32,6 +32,7 @@ from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from protocols.core.clocks import NANOSECONDS
+from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.log.schemas import FOXGLOVE_PREFIX
@@ -285,17 +286,6 @@ def _target(target: pb.TargetState, stamp: Timestamp) -> ImageAnnotations:
 
 
 def quaternion(rotation: Floats) -> Quaternion:
-    """The unit quaternion, w >= 0, of a 3x3 rotation matrix (Shepperd's method: divides by the largest part)."""
-    m = rotation
-    four = np.array(
-        [
-            [1 + m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [m[2, 1] - m[1, 2], 1 + m[0, 0] - m[1, 1] - m[2, 2], m[1, 0] + m[0, 1], m[0, 2] + m[2, 0]],
-            [m[0, 2] - m[2, 0], m[1, 0] + m[0, 1], 1 - m[0, 0] + m[1, 1] - m[2, 2], m[2, 1] + m[1, 2]],
-            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], 1 - m[0, 0] - m[1, 1] + m[2, 2]],
-        ]
-    )
-    q = four[int(np.argmax(np.diag(four)))]
-    q = q / np.linalg.norm(q)
-    w, x, y, z = (float(value) for value in (q if q[0] >= 0.0 else -q))
+    """The unit quaternion, w >= 0, of a 3x3 rotation matrix."""
+    w, x, y, z = so3.quaternion(rotation).tolist()
     return Quaternion(x=x, y=y, z=z, w=w)
