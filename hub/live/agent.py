@@ -248,7 +248,9 @@ def status_message(
         for camera, count in of_cameras.most_common(_NAMED_CAMERAS):
             message.counters[f"{kind}.{camera}"[:64]] = count
     ages = hub.frame_ages(now)
-    rates = {camera: ppm for camera, ppm in hub.clocks.rates_ppm().items() if ages.get(camera, SILENT_S) < SILENT_S}
+    rates = {
+        camera: ppm for camera, ppm in hub.stream.clocks.rates_ppm().items() if ages.get(camera, SILENT_S) < SILENT_S
+    }
     for kind, values in (("ppm", rates), ("frame_age_s", ages), ("offset_std_s", hub.offset_stds())):
         for camera in heapq.nlargest(_MEASURED_CAMERAS, values, key=lambda name, of=values: abs(of[name])):  # type: ignore[misc]
             message.gauges[f"{kind}.{camera}"[:64]] = values[camera]
@@ -258,7 +260,7 @@ def status_message(
         # What is waited for, per camera: the search needs motion that two cameras see at the same time.
         shared = [f"{one.camera} {one.shared_motion_s:.0f} s" for one in hub.progress()[:_NAMED_CAMERAS]]
         message.message += f"; motion shared with another camera: {', '.join(shared)}" if shared else ""
-    alarms = [*hub.clocks.alarms.values(), *hub.clock_contradictions()]
+    alarms = [*hub.stream.clocks.alarms.values(), *hub.clock_contradictions()]
     if alarms:
         message.message = "; ".join([*alarms, message.message])[:1000]
     _add_parts(message, hub, now)

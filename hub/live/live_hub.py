@@ -15,23 +15,20 @@ import numpy as np
 from google.protobuf.message import Message
 
 from hub.calibration.coverage import CoverageMonitor
-from hub.clocks.arrival_prior import ERROR_BOUND_S, ArrivalPriors
-from hub.clocks.external_prior import ExternalClockPriors
-from hub.clocks.rate_change import RateChanges
-from hub.clocks.segments import SEGMENT_MIN_ROWS, ClockSegments
+from hub.clocks.arrival_prior import ERROR_BOUND_S
 from hub.distributed.network.host import NodeHost
 from hub.distributed.solver import node_calibration
 from hub.live.budgets import CameraBudgets
 from hub.live.messages import calibration_message, refusal_message, solver_event
+from hub.live.observation_stream import ObservationStream
 from hub.live.solver import InlineSolver, Solver, SolverAnswer, SolverJob
 from hub.tracking.calibration.people import PeopleTracklets
-from hub.tracking.detections import tracked_kind
 from hub.tracking.live_tracking import LiveTracking
 from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.core.errors import InputError, Refused
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.builder import SessionBuilder, rig_camera_from_info
+from protocols.session.builder import SessionBuilder
 from protocols.session.calibration import Calibration, CameraCalibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
@@ -123,13 +120,9 @@ class LiveHub:
         self._revision = 0
         self._jobs = self._superseded = 0
         self._now = 0.0
-        self._infos: dict[str, pb.CameraInfo] = {}
         self._last_frame: dict[str, float] = {}
         self.counters: Counter[str] = Counter()
-        self.clocks = ClockSegments()
-        self._rate_changes = RateChanges()
-        self.clock_priors = ExternalClockPriors()
-        self._arrivals = ArrivalPriors()
+        self.stream = ObservationStream(self.settings.window_s)
         self.delays: dict[str, float] = {}
         """By camera, arrival of its newest frame on the hub's clock less its time on the camera's [s]."""
         self._camera_time: dict[str, float] = {}
@@ -155,8 +148,7 @@ class LiveHub:
 
     def _begin(self) -> None:
         """No observations and no result."""
-        self._builder = SessionBuilder(self.settings.window_s)
-        self._people = PeopleTracklets(self.settings.window_s)
+        self.stream.forget()
         self.tracking = LiveTracking() if self.settings.track else None
         self._next = self._next_search = self._next_full = 0.0
         self._received, self._solved_at, self._full_rows = 0, -1, 0
@@ -216,43 +208,35 @@ class LiveHub:
 
     def _handle(self, message: Message, arrival: float | None, backlog: bool) -> None:
         if isinstance(message, pb.AgentStatus):
-            self.clock_priors.handle(message)
+            self.stream.clock_priors.handle(message)
             return
         if isinstance(message, pb.Observation):
-            self.clock_priors.handle(message)
-            message, event = self.clocks.assign(message, None if backlog else arrival)
+            message, event = self.stream.assign(message, arrival, backlog=backlog)
             if event is not None:
                 self.counters[f"clock_{event.kind}s"] += 1
-                self._builder.require_rows(event.segment, SEGMENT_MIN_ROWS)
-                self._rate_changes.handle(event)
                 self._clock_stepped = True
             if arrival is not None:
                 camera_time = message.device_time_ns / NANOSECONDS
                 if not backlog:
                     self._fresh.add(message.camera)
-                    self._arrivals.handle(message.camera, message.boot_id, camera_time, arrival)
                 self.delays[message.camera] = arrival - camera_time
                 self._camera_time[message.camera] = camera_time
             self._last_frame[message.camera] = self._now
         self.guidance.handle(message)
         if self.tracking is not None:
             self.tracking.handle(message)
-        if isinstance(message, pb.CameraInfo):
-            self._infos[message.camera] = message
-        if isinstance(message, pb.Observation) and any(d.kind and tracked_kind(d) for d in message.detections):
-            if self.budgets.admits_people(message):
-                self._people.handle(message)
-            else:
-                self.counters["people_over_budget"] += 1
-            message = without_tracked(message)
-        self._builder.handle(message, self._now)
-        if isinstance(message, pb.Observation):
-            self._extend_old_segment(message)
+        message = self.stream.store(message, self._now, self._admits_people)
         if self.nodes is not None:
             self.nodes.handle(message)
         if isinstance(message, pb.Observation):
             self._received += 1
             self.counters["observations"] += 1
+
+    def _admits_people(self, message: pb.Observation) -> bool:
+        admitted = self.budgets.admits_people(message)
+        if not admitted:
+            self.counters["people_over_budget"] += 1
+        return admitted
 
     def reset(self) -> None:
         """Forget observations and results, as after the rig was rebuilt; clock state and message numbering are kept."""
@@ -283,21 +267,21 @@ class LiveHub:
         """Cameras whose external clock prior (NTP/PTP) the calibration contradicts, one line each."""
         if self.calibration is None:
             return []
-        return self.clock_priors.contradictions(self.calibration, self._solved_boot_ids)
+        return self.stream.clock_priors.contradictions(self.calibration, self._solved_boot_ids)
 
     def missing(self) -> str:
         """What is missing before solving is tried; "" if nothing."""
-        cameras = self._builder.cameras
+        cameras = self.stream.marker.cameras
         if self.unverified:
             assert self._unverified is not None
-            rows = [self._builder.rows(name) for name in self._unverified.cameras]
+            rows = [self.stream.marker.rows(name) for name in self._unverified.cameras]
             return "" if sum(count >= _VERIFY_ROWS for count in rows) >= 2 else "verifying the reloaded calibration"
         if len(cameras) < 2:
             return f"{len(cameras)} of at least 2 cameras heard of"
-        rows_by_camera = {name: self._builder.rows(name) for name in cameras}
+        rows_by_camera = {name: self.stream.marker.rows(name) for name in cameras}
         ready = [name for name, rows in rows_by_camera.items() if rows >= self.settings.least_rows]
-        if len(ready) < 2 and self._people.cameras:
-            durations = {name: self._people.seconds(name) for name in self._people.cameras}
+        if len(ready) < 2 and self.stream.people.cameras:
+            durations = {name: self.stream.people.seconds(name) for name in self.stream.people.cameras}
             if sum(seconds >= _MIN_PEOPLE_S for seconds in durations.values()) < 2:
                 counts = _listed(f"{name} {seconds:.0f} s" for name, seconds in durations.items())
                 return f"people observed too briefly yet ({counts}; two cameras need {_MIN_PEOPLE_S:.0f} s): walk about"
@@ -410,10 +394,10 @@ class LiveHub:
         tied = {} if self.calibration is None else self.calibration.cameras
         waiting = {} if self.calibration is None else self.calibration.refused
         out = []
-        shared = self._builder.shared_motions_s()
-        for name in self._builder.cameras:
+        shared = self.stream.marker.shared_motions_s()
+        for name in self.stream.marker.cameras:
             reason = waiting.get(name, refused.get(name, ""))
-            rows, least = self._builder.rows(name), self.settings.least_rows
+            rows, least = self.stream.marker.rows(name), self.settings.least_rows
             state = "searching" if rows >= least else "collecting"
             if state == "collecting" and not reason:
                 reason = f"{rows} of {least} detections"
@@ -476,7 +460,7 @@ class LiveHub:
         last = self._start_from(boots)
         self._solved_at = self._received
         rows = len(observations)
-        arrivals = {name: p for name, p in self._arrivals.priors().items() if p.boot_id == boots.get(name)}
+        arrivals = self.stream.arrivals(boots)
         untied = last is None or any(name not in last.cameras for name in observations.cameras)
         search = untied and (final or now >= self._next_search)
         if last is None and arrivals and not self._next_full:
@@ -499,11 +483,11 @@ class LiveHub:
             search or last is None,
             full or (last is None and not arrivals),
             verify,
-            self.clock_priors.for_boots(boots),
+            self.stream.clock_priors.for_boots(boots),
             arrivals,
             self.settings.refine_lenses,
         )
-        ranges = [one for one in self._builder.ranges() if one[0] in rig.cameras] if self._has_marker() else []
+        ranges = [one for one in self.stream.marker.ranges() if one[0] in rig.cameras] if self._has_marker() else []
         return self._hand_over(job, boots, ranges, now)
 
     def _hand_over(
@@ -554,7 +538,7 @@ class LiveHub:
         found = answer.calibration
         for name, since in answer.moved.items():
             self.counters["moved"] += 1
-            self._builder.forget_before(name, since)
+            self.stream.marker.forget_before(name, since)
         rows = len(job.observations)
         # As many rows may have larger stds, once the noise is known better: only fewer must not replace more.
         fewer = rows < self._answer_rows and not job.verify and self.calibration is not None
@@ -621,7 +605,7 @@ class LiveHub:
     def _publish_unverified(self) -> list[Message]:
         """Publish a reloaded answer as soon as two of its cameras are heard of on the clocks that it knows."""
         assert self._unverified is not None
-        boots = {name: boot for name in self._builder.cameras if (boot := self._builder.boot(name))}
+        boots = {name: boot for name in self.stream.marker.cameras if (boot := self.stream.marker.boot(name))}
         last = self._unverified
         heard = {name: last.cameras[name] for name in boots if name in last.cameras and name in self.delays}
         shifts = {name: self.delays[name] - self._unverified_delays.get(name, -np.inf) for name in heard}
@@ -657,51 +641,15 @@ class LiveHub:
 
     def _has_marker(self) -> bool:
         """Whether to calibrate from markers: there are enough marker detections, or no people."""
-        rows = [self._builder.rows(name) for name in self._builder.cameras]
-        return not self._people.cameras or sum(count >= self.settings.least_rows for count in rows) >= 2
+        return self.stream.has_marker(self.settings.least_rows)
 
     def _build_session(self) -> tuple[Rig, Observations]:
         """The rig and the observations: of the marker or, if there is none, of people."""
-        if self._has_marker() or not self.settings.solve:
-            rig, observations = self._builder.build()
-            observations = self._with_rate_changes_corrected(observations)
-        else:
-            rig = Rig({name: rig_camera_from_info(self._infos[name]) for name in sorted(self._infos)})
-            observations = self._people.observations()
-            if not len(observations):
-                raise Refused("the colours of the people are ambiguous, or no two cameras observed the same person")
+        rig, observations = self.stream.build(self._has_marker() or not self.settings.solve)
         return merge_rigs(rig, self._rig), observations
 
-    def _extend_old_segment(self, message: pb.Observation) -> None:
-        """Also add the frame to the clock segment before a rate change, with the time stamp of the old clock."""
-        old = self._rate_changes.to_previous_clock(message.camera, message.boot_id, message.device_time_ns)
-        if old is None:
-            return
-        if self._rate_changes.active(message.camera, self._builder.boot(message.camera)) is None:
-            return
-        copy = pb.Observation()
-        copy.CopyFrom(message)
-        copy.boot_id, copy.device_time_ns = old
-        self._builder.handle(copy, self._now)
-
-    def _with_rate_changes_corrected(self, observations: Observations) -> Observations:
-        """The observations with corrected time stamps between a rate change of a clock and its detection."""
-        active = {
-            name: self._rate_changes.active(name, self._builder.boot(name)) for name in self._rate_changes.cameras
-        }
-        rate_changes = {
-            name: change.refined(self.clocks.change_into(change.segment)) for name, change in active.items() if change
-        }
-        tracks = {
-            key: track
-            if (change := rate_changes.get(key[0])) is None
-            else replace(track, time=change.corrected(track.time))
-            for key, track in observations.tracks.items()
-        }
-        return replace(observations, tracks=tracks)
-
     def _source(self) -> SessionBuilder | PeopleTracklets:
-        return self._builder if self._has_marker() else self._people
+        return self.stream.marker if self._has_marker() else self.stream.people
 
     def _use_known(self, known: KnownCalibration) -> None:
         """Use the given calibration as this hub's result."""
@@ -750,7 +698,7 @@ class LiveHub:
         """The calibration in the clocks' present segments, and the boot ids of those."""
         source = self._source()
         boots = {name: self._solved_boot_ids.get(name) or source.boot(name) for name in calibration.cameras}
-        return self.clocks.to_present(calibration, boots)
+        return self.stream.clocks.to_present(calibration, boots)
 
 
 def on_new_clock(camera: CameraCalibration, shift: float, elapsed: float) -> CameraCalibration:
@@ -779,15 +727,6 @@ def without_camera(rig: Rig, observations: Observations, camera: str) -> tuple[R
     tracks = {key: track for key, track in observations.tracks.items() if key[0] != camera}
     up = None if isinstance(rig.up, str) and rig.up == camera else rig.up
     return replace(rig, cameras=cameras, distances=distances, up=up), replace(observations, tracks=tracks)
-
-
-def without_tracked(message: pb.Observation) -> pb.Observation:
-    """The observation without people, vehicles and unlabelled markers: they have no common label across cameras."""
-    plain = pb.Observation()
-    plain.CopyFrom(message)
-    del plain.detections[:]
-    plain.detections.extend(d for d in message.detections if not tracked_kind(d))
-    return plain
 
 
 def merge_rigs(observed: Rig, own: Rig | None) -> Rig:

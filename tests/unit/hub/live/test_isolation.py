@@ -95,7 +95,7 @@ def test_a_clock_prior_that_cannot_be_is_not_used(offset: float, bound: float) -
         status.gauges[name] = value
     hub = LiveHub()
     hub.handle(status)
-    assert hub.clock_priors.for_boots({"a": "b0"}) == {}
+    assert hub.stream.clock_priors.for_boots({"a": "b0"}) == {}
 
 
 def test_clock_priors_of_invented_agents_are_not_kept_without_end() -> None:
@@ -105,7 +105,7 @@ def test_clock_priors_of_invented_agents_are_not_kept_without_end() -> None:
         for name in ("clock_synchronised", "unix_minus_camera_s", "clock_error_s"):
             status.gauges[name] = 1.0
         hub.handle(status)
-    assert len(hub.clock_priors._priors) == MAX_CAMERAS
+    assert len(hub.stream.clock_priors._priors) == MAX_CAMERAS
 
 
 def test_labels_and_runs_without_end_are_not_kept() -> None:
@@ -121,7 +121,7 @@ def test_labels_and_runs_without_end_are_not_kept() -> None:
     hub = LiveHub(LiveSettings(track=False))
     for number in range(300):
         hub.handle(frame("a", 0, boot_id=f"run{number}"), number / 30.0)
-    assert len(hub.clocks._detector._clocks) <= 8
+    assert len(hub.stream.clocks._detector._clocks) <= 8
 
 
 def test_a_clock_that_is_set_again_and_again_is_no_longer_watched() -> None:
@@ -131,7 +131,7 @@ def test_a_clock_that_is_set_again_and_again_is_no_longer_watched() -> None:
         time_ns = number * 33_000_000 + 3600 * NANOSECONDS * (number // 10 % 2)
         hub.handle(frame("a", number, device_time_ns=time_ns), number / 30.0)
     assert 60 <= hub.counters["clock_steps"] <= 64
-    assert len(hub._builder._boots["a"]) <= 8
+    assert len(hub.stream.marker._boots["a"]) <= 8
 
 
 def test_who_has_most_rows_gives_them_up(monkeypatch: pytest.MonkeyPatch) -> None:

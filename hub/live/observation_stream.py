@@ -1,0 +1,137 @@
+"""What a hub makes of the messages of cameras: the observations to calibrate from, and what is known of their clocks.
+
+Live, in a replay, and from a recorded log alike: marker and people apart, clock segments, changes of a clock's rate,
+external clock priors and arrivals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from google.protobuf.message import Message
+
+from hub.clocks.arrival_prior import ArrivalPriors
+from hub.clocks.change_detector import ClockChange
+from hub.clocks.external_prior import ExternalClockPrior, ExternalClockPriors
+from hub.clocks.rate_change import RateChanges
+from hub.clocks.segments import SEGMENT_MIN_ROWS, ClockSegments
+from hub.tracking.calibration.people import PeopleTracklets
+from hub.tracking.detections import tracked_kind
+from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import Refused
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.builder import SessionBuilder, rig_camera_from_info
+from protocols.session.observations import Observations
+from protocols.session.rig import Rig
+
+_PEOPLE_WINDOW_S = 600.0
+"""Of a recorded log: labels by colour of more tracklets take a minute and more."""
+
+
+class ObservationStream:
+    """Collects the messages of cameras, in any order and with duplicates.
+
+    window_s: what is kept, None = all, as of a log.
+    """
+
+    def __init__(self, window_s: float | None = None) -> None:
+        self._window_s = window_s
+        self.clocks = ClockSegments()
+        self.clock_priors = ExternalClockPriors()
+        self._rate_changes = RateChanges()
+        self._arrivals = ArrivalPriors()
+        self._infos: dict[str, pb.CameraInfo] = {}
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the observations; what is known of the clocks is kept."""
+        self.marker = SessionBuilder(self._window_s)
+        self.people = PeopleTracklets(_PEOPLE_WINDOW_S if self._window_s is None else self._window_s)
+
+    def assign(
+        self, message: pb.Observation, arrival: float | None, *, backlog: bool = False
+    ) -> tuple[pb.Observation, ClockChange | None]:
+        """The observation with its clock segment as boot id, and the change of its clock that begins with it, if any.
+
+        arrival: on the hub's clock [s], None = unknown. backlog: it waited, so that its arrival says little.
+        """
+        self.clock_priors.handle(message)
+        message, change = self.clocks.assign(message, None if backlog else arrival)
+        if change is not None:
+            self.marker.require_rows(change.segment, SEGMENT_MIN_ROWS)
+            self._rate_changes.handle(change)
+        if arrival is not None and not backlog:
+            self._arrivals.handle(message.camera, message.boot_id, message.device_time_ns / NANOSECONDS, arrival)
+        return message, change
+
+    def store(
+        self, message: Message, now: float = 0.0, admits_people: Callable[[pb.Observation], bool] | None = None
+    ) -> Message:
+        """Add a message; returns it without people and vehicles.
+
+        now: of its arrival [s], any fixed clock. admits_people: whether an observation's people are stored.
+        """
+        if isinstance(message, pb.CameraInfo):
+            self._infos[message.camera] = message
+        if isinstance(message, pb.Observation) and any(d.kind and tracked_kind(d) for d in message.detections):
+            if admits_people is None or admits_people(message):
+                self.people.handle(message)
+            message = without_tracked(message)
+        self.marker.handle(message, now)
+        if isinstance(message, pb.Observation):
+            self._extend_old_segment(message, now)
+        return message
+
+    def arrivals(self, boots: Mapping[str, str]) -> dict[str, ExternalClockPrior]:
+        """Clock priors by times of arrival, of the clocks with the given boot ids."""
+        return {name: prior for name, prior in self._arrivals.priors().items() if prior.boot_id == boots.get(name)}
+
+    def has_marker(self, least_rows: int) -> bool:
+        """Whether to calibrate from markers: two cameras have enough detections of them, or nobody saw people."""
+        rows = [self.marker.rows(name) for name in self.marker.cameras]
+        return not self.people.cameras or sum(count >= least_rows for count in rows) >= 2
+
+    def build(self, of_marker: bool) -> tuple[Rig, Observations]:
+        """The rig and the observations of the marker, or of people. Raises Refused where there are none."""
+        if of_marker:
+            rig, observations = self.marker.build()
+            return rig, self._with_rate_changes_corrected(observations)
+        rig = Rig({name: rig_camera_from_info(self._infos[name]) for name in sorted(self._infos)})
+        observations = self.people.observations()
+        if not len(observations):
+            raise Refused("the colours of the people are ambiguous, or no two cameras observed the same person")
+        return rig, observations
+
+    def _extend_old_segment(self, message: pb.Observation, now: float) -> None:
+        """Also add the frame to the clock segment before a rate change, with the time stamp of the old clock."""
+        old = self._rate_changes.to_previous_clock(message.camera, message.boot_id, message.device_time_ns)
+        if old is None or self._rate_changes.active(message.camera, self.marker.boot(message.camera)) is None:
+            return
+        copy = pb.Observation()
+        copy.CopyFrom(message)
+        copy.boot_id, copy.device_time_ns = old
+        self.marker.handle(copy, now)
+
+    def _with_rate_changes_corrected(self, observations: Observations) -> Observations:
+        """The observations with corrected time stamps between a rate change of a clock and its detection."""
+        active = {name: self._rate_changes.active(name, self.marker.boot(name)) for name in self._rate_changes.cameras}
+        rate_changes = {
+            name: change.refined(self.clocks.change_into(change.segment)) for name, change in active.items() if change
+        }
+        tracks = {
+            key: track
+            if (change := rate_changes.get(key[0])) is None
+            else replace(track, time=change.corrected(track.time))
+            for key, track in observations.tracks.items()
+        }
+        return replace(observations, tracks=tracks)
+
+
+def without_tracked(message: pb.Observation) -> pb.Observation:
+    """The observation without people, vehicles and unlabelled markers: they have no common label across cameras."""
+    plain = pb.Observation()
+    plain.CopyFrom(message)
+    del plain.detections[:]
+    plain.detections.extend(d for d in message.detections if not tracked_kind(d))
+    return plain
