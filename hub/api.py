@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -18,7 +18,7 @@ from protocols.core.errors import InputError, Refused
 from protocols.core.files import check_folder, write_atomically, write_together
 from protocols.core.tables import dataframe
 from protocols.geometry import so3
-from protocols.log.read.session import load_session
+from protocols.log.read.session import is_log, load_session
 from protocols.session.calibration import (
     Calibration,
     CameraCalibration,
@@ -37,6 +37,8 @@ from protocols.session.session import Session
 
 if TYPE_CHECKING:
     import pandas
+
+    from hub.clocks.external_prior import ExternalClockPrior
 
 CALIBRATION, TRAJECTORY, RESULT, REPORT = "calibration.toml", "trajectory.csv", "result.json", "report.html"
 Progress: TypeAlias = Callable[[str, float], None]
@@ -158,13 +160,44 @@ class TriangulationResult:
         return _trajectories(self.tables)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedSession(Session):
+    """A session from a recorded log. clock_priors: external clock priors (NTP, PTP) of its cameras, by name."""
+
+    clock_priors: Mapping[str, ExternalClockPrior] = field(default_factory=dict)
+
+
+def read_session(path: str | Path, observations: str | Path | None = None) -> Session:
+    """The session of a folder, or that a live hub would make of a log, with people and what is known of its clocks.
+
+    observations: another observations file in place of the folder's own. Raises InputError: file, line, what, remedy.
+    """
+    path = Path(path)
+    if not is_log(path) or observations is not None:
+        return load_session(path, observations)
+    from hub.clocks.observation_stream import session_from_messages
+    from protocols.log.read.reader import LogReader
+    from protocols.topics import CAMERA_INFO, OBSERVATION, RIG_INFO, STATUS
+
+    reader = LogReader(path)
+    messages = (logged.message for logged in reader.messages([OBSERVATION, CAMERA_INFO, RIG_INFO, STATUS]))
+    try:
+        rig, found, priors, warnings = session_from_messages(messages)
+    except Refused as refusal:
+        remedy = "record cameras that see the marker, or people"
+        raise InputError(f"no session in this log: {refusal.reason}", file=path, remedy=remedy) from None
+    damage = (f"the log is damaged: {reader.damage}",) if reader.damage else ()
+    return RecordedSession(rig, found, damage + warnings, path.stem, priors)
+
+
 def calibrate(
     session: Session | str | Path, options: CalibrationOptions | None = None, progress: Progress | None = None
 ) -> CalibrationResult:
     """Estimate the clocks and poses of a session's cameras, and the trajectories of the observed points.
 
-    session: as `load_session` returns it, or a path that it reads. Raises InputError for what cannot be read, and
-    Refused, with reasons by camera, where the data do not determine the result for at least two cameras.
+    session: as `load_session` or `read_session` returns it, or a path that the latter reads. Raises InputError for
+    what cannot be read, and Refused, with reasons by camera, where the data do not determine the result for at least
+    two cameras.
     """
     from hub.calibration.pipeline import calibrate as estimate_calibration
 
@@ -174,7 +207,7 @@ def calibrate(
     if options.refine_lenses and (options.from_known is not None or options.solver != "joint"):
         remedy = "leave --from-known and --solver out"
         raise InputError("--refine-lenses goes with --solver joint and without --from-known", remedy=remedy)
-    session = session if isinstance(session, Session) else load_session(session)
+    session = session if isinstance(session, Session) else read_session(session)
     known = None
     if options.from_known is not None:
         known, rig = _fixed(Path(options.from_known), session.rig)
@@ -190,6 +223,7 @@ def calibrate(
             thorough=options.thorough,
             seed=options.seed,
             refine_lenses=options.refine_lenses,
+            clock_priors=session.clock_priors if isinstance(session, RecordedSession) else None,
         )
     except Refused as refused:
         refused.warnings = (*session.warnings, *refused.warnings)

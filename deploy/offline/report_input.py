@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from hub.api import CALIBRATION, RESULT, TRAJECTORY, calibrate
+from hub.api import CALIBRATION, RESULT, TRAJECTORY, calibrate, read_session
 from hub.report.convergence import OffsetStdSample
 from protocols import topics
 from protocols.core.acceptance import AcceptanceTest
@@ -24,7 +24,7 @@ from protocols.core.files import read_text
 from protocols.core.pair_report import PairReport
 from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
-from protocols.log.read.session import is_log, load_session
+from protocols.log.read.session import is_log
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import (
     AdjustmentStep,
@@ -67,7 +67,7 @@ def load_report_input(source: Path, session: Path | None, progress: Callable[[st
     if not is_log(source) and not (source / "rig.toml").exists():
         remedy = f"name a folder with {RESULT}, a session folder or a .mcap log"
         raise InputError("neither results nor a session", file=source, remedy=remedy)
-    read = load_session(source)
+    read = read_session(source)
     outcome: Calibration | Refused
     try:
         outcome = calibrate(read, progress=progress).calibration
@@ -85,7 +85,7 @@ def _input_from_folder(folder: Path, session: Path | None) -> ReportInput:
     observations = Observations({}, ())
     missing = ""
     if place is not None:
-        read = load_session(place)
+        read = read_session(place)
         rig, observations = read.rig, read.observations
     else:
         missing = "the session is no longer here: figures that need the observations are left out (--session)"

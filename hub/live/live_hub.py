@@ -16,11 +16,11 @@ from google.protobuf.message import Message
 
 from hub.calibration.coverage import CoverageMonitor
 from hub.clocks.arrival_prior import ERROR_BOUND_S
+from hub.clocks.observation_stream import LEAST_ROWS, ObservationStream
 from hub.distributed.network.host import NodeHost
 from hub.distributed.solver import node_calibration
 from hub.live.budgets import CameraBudgets
 from hub.live.messages import calibration_message, refusal_message, solver_event
-from hub.live.observation_stream import ObservationStream
 from hub.live.solver import InlineSolver, Solver, SolverAnswer, SolverJob
 from hub.tracking.calibration.people import PeopleTracklets
 from hub.tracking.live_tracking import LiveTracking
@@ -81,7 +81,7 @@ class LiveSettings:
 
     window_s: float = 180.0
     interval_s: float = 2.0
-    least_rows: int = 90
+    least_rows: int = LEAST_ROWS
     solve: bool = True
     track: bool = True
     refine_lenses: bool = False

@@ -8,8 +8,8 @@ from collections.abc import Iterable
 from google.protobuf.message import Message
 
 from hub.clocks.external_prior import ExternalClockPrior
+from hub.clocks.observation_stream import without_tracked
 from hub.live.live_hub import LiveHub, merge_rigs
-from hub.live.observation_stream import without_tracked
 from hub.live.solver import SolverJob
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder

@@ -12,10 +12,10 @@ from typing import Literal
 from deploy.agents.malloc_tuning import retain_freed_memory
 from deploy.commands.common import Flag, Json, Scheduler
 from deploy.offline.progress import progress_bar
+from hub.api import read_session
 from protocols.core.errors import EXIT_DONE, InputError, Refused
 from protocols.core.files import check_folder
 from protocols.core.lazy import defer_modules
-from protocols.log.read.session import load_session
 from protocols.session.session import Session
 
 UNUSED_OF_NUMPY = ("f2py", "testing", "ma", "polynomial", "ctypeslib")
@@ -139,7 +139,7 @@ def _load(
         raise InputError("--marker goes with a folder of videos", remedy="leave it out for a session")
     if detector is not None:
         raise InputError("--detector goes with a folder of videos", remedy="leave it out for a session")
-    return load_session(session, observations)
+    return read_session(session, observations)
 
 
 def _with_scale(read: Session, height: float | None, limb: str | None) -> Session:

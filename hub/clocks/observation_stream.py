@@ -6,7 +6,7 @@ external clock priors and arrivals.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 
 from google.protobuf.message import Message
@@ -25,6 +25,8 @@ from protocols.session.builder import SessionBuilder, rig_camera_from_info
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
+LEAST_ROWS = 90
+"""Detections of a marker that two cameras need to be calibrated by them: three seconds at 30 Hz."""
 _PEOPLE_WINDOW_S = 600.0
 """Of a recorded log: labels by colour of more tracklets take a minute and more."""
 
@@ -126,6 +128,32 @@ class ObservationStream:
             for key, track in observations.tracks.items()
         }
         return replace(observations, tracks=tracks)
+
+
+def session_from_messages(
+    messages: Iterable[Message],
+) -> tuple[Rig, Observations, dict[str, ExternalClockPrior], tuple[str, ...]]:
+    """The session that a hub would have after the messages of a log, its cameras' external clock priors, and warnings.
+
+    Times of arrival are not used: a log of other makers holds whatever they wrote. Raises Refused where there is
+    nothing to calibrate from.
+    """
+    stream = ObservationStream()
+    for message in messages:
+        if isinstance(message, pb.AgentStatus):
+            stream.clock_priors.handle(message)
+            continue
+        if isinstance(message, pb.Observation):
+            message, _ = stream.assign(message, None)
+        stream.store(message)
+    of_marker = stream.has_marker(LEAST_ROWS)
+    rig, observations = stream.build(of_marker)
+    source = stream.marker if of_marker else stream.people
+    priors = stream.clock_priors.for_boots({name: source.boot(name) for name in rig.cameras})
+    alarms = tuple(
+        f"{text}: its rows on one side of that were left out" for text in stream.clocks.alarms.values() if of_marker
+    )
+    return rig, observations, priors, alarms + stream.marker.warnings
 
 
 def without_tracked(message: pb.Observation) -> pb.Observation:

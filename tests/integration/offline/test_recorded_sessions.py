@@ -1,0 +1,67 @@
+"""Calibration from a log makes of its messages what a live hub would: people apart, clock segments, clock priors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from google.protobuf.message import Message
+
+from edge import scenes
+from hub.api import calibrate, read_session
+from protocols.core.clocks import CameraTime
+from protocols.core.errors import Refused
+from protocols.log.write.writer import LogWriter
+from protocols.messages import syncline_pb2 as pb
+from protocols.topics import CAMERA_INFO, OBSERVATION, STATUS
+from tests.integration.live.test_external_clock_prior import clock_status, regular_session
+from tests.integration.live.test_live_hub import messages
+from tests.support.people_traffic import film
+from tests.support.rigs import simulate
+
+TOPICS = {"CameraInfo": CAMERA_INFO, "Observation": OBSERVATION, "AgentStatus": STATUS}
+
+
+def recorded(file: Path, content: Iterable[Message]) -> Path:
+    with LogWriter(file, {}) as writer:
+        for number, message in enumerate(content):
+            agent = getattr(message, "camera", "") or getattr(message, "agent", "")
+            writer.write(TOPICS[message.DESCRIPTOR.name], agent, "yard", message, 10**6 * number)
+    return file
+
+
+def test_a_clock_prior_in_the_log_selects_among_ambiguous_lags(tmp_path: Path) -> None:
+    session = regular_session(900)
+    plain = recorded(tmp_path / "plain.mcap", messages(session))
+    with pytest.raises(Refused):
+        calibrate(plain)
+    statuses = [clock_status(session, name) for name in ("cam0", "cam1")]
+    found = calibrate(recorded(tmp_path / "ntp.mcap", [*statuses, *messages(session)])).calibration
+    assert abs(session.clock_error("cam1", "cam0", found.cameras["cam1"].time_map)) < 2e-3
+    assert any("external clock priors" in warning for warning in found.warnings)
+
+
+def test_a_clock_that_is_set_in_the_middle_of_a_log_costs_the_shorter_side(tmp_path: Path) -> None:
+    session = simulate(72, 3, 40)
+    content = []
+    for message in messages(session):
+        if isinstance(message, pb.Observation) and message.camera == "cam1" and message.sequence >= 850:
+            message.device_time_ns += 7 * 10**9
+        content.append(message)
+    found = calibrate(recorded(tmp_path / "set.mcap", content)).calibration
+    camera = found.cameras["cam1"]
+    reference = float(camera.time_map.reference_from_camera(CameraTime(camera.lag_time)))
+    true = session.true_time("cam1", camera.lag_time) - session.true_time("cam0", reference)
+    assert abs(true) < 3e-3
+    (warning,) = [text for text in found.warnings if "clock of cam1 stepped" in text]
+    assert "+7.0" in warning
+
+
+def test_people_in_a_log_become_labelled_walkers(tmp_path: Path) -> None:
+    traffic = film(scenes.get_people_scene(21, 4, 2), 45.0, 21)
+    content = [*traffic.infos, *(message for _, message in traffic.arrivals)]
+    session = read_session(recorded(tmp_path / "people.mcap", content))
+    assert {label.partition("-")[2] for _, label in session.observations.tracks} == {"head", "foot"}
+    assert np.all([label.startswith("walker") for _, label in session.observations.tracks])
