@@ -138,25 +138,10 @@ def update_calibration(
             _free_parameters(prepared),
         )
         reasons |= unplaced
-    refuted = set(moved)
-    while True:
-        reconstruction = final_adjustment(
-            reconstruction, lambda text, share: None, warm=not full, online=True, refine_lenses=refine_lenses
-        )
-        failure = next(iter(misfits(reconstruction)), None)
-        if failure is not None:
-            refuted.add(failure[0])
-        else:
-            failure = least_certain_camera(reconstruction)
-        if failure is None:
-            break
-        worst, reason = failure[0], failure[1].reason
-        reasons[worst] = reason
-        remaining = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
-        del remaining[worst]
-        if len(remaining) < 2:
-            raise Refused(f"no two cameras can be placed ({worst}: {reason})", refused | reasons)
-        reconstruction = _warm_start(prepared, remaining)
+    reconstruction, failures, misfitting = _adjust_without_failures(
+        prepared, reconstruction, refused | reasons, warm=not full, refine_lenses=refine_lenses
+    )
+    reasons, refuted = reasons | failures, {*moved, *misfitting}
     joint = tuple(pair for pair in pairs if pair.solved) + _tied_pairs(reconstruction.names, pairs)
     solution = Solution(
         reconstruction,
@@ -170,6 +155,39 @@ def update_calibration(
     kept = {name: camera for name, camera in last.cameras.items() if name not in found.cameras and name not in refuted}
     refused = {name: reason for name, reason in found.refused.items() if name not in kept}
     return Update(replace(found, cameras=found.cameras | kept, refused=refused), moved)
+
+
+def _adjust_without_failures(
+    prepared: PreparedSession,
+    reconstruction: Reconstruction,
+    refused: Mapping[str, str],
+    *,
+    warm: bool,
+    refine_lenses: bool,
+) -> tuple[Reconstruction, dict[str, str], set[str]]:
+    """The adjusted network without cameras that fail, their reasons, and which of them do not fit the trajectory.
+
+    refused: reasons so far. Raises Refused where fewer than two cameras are left.
+    """
+    reasons, refuted = dict[str, str](), set[str]()
+    while True:
+        reconstruction = final_adjustment(
+            reconstruction, lambda text, share: None, warm=warm, online=True, refine_lenses=refine_lenses
+        )
+        failure = next(iter(misfits(reconstruction)), None)
+        if failure is not None:
+            refuted.add(failure[0])
+        else:
+            failure = least_certain_camera(reconstruction)
+        if failure is None:
+            return reconstruction, reasons, refuted
+        worst, reason = failure[0], failure[1].reason
+        reasons[worst] = reason
+        remaining = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
+        del remaining[worst]
+        if len(remaining) < 2:
+            raise Refused(f"no two cameras can be placed ({worst}: {reason})", {**refused, **reasons})
+        reconstruction = _warm_start(prepared, remaining)
 
 
 def _free_parameters(prepared: PreparedSession) -> FreeParameters:
