@@ -142,7 +142,7 @@ def _fit(reconstruction: Reconstruction) -> CameraTests:
 
 
 def _focal_lengths(reconstruction: Reconstruction, found: cov.Covariance) -> CameraTests:
-    """Precision of the focal lengths that were estimated."""
+    """Precision of the focal lengths; 0 of one that was given."""
     stds = focal_stds(reconstruction.problem, reconstruction.state, found)
     name, source = "std of the focal length", "measured: python -m tests.bench.lenses"
     return {
@@ -157,7 +157,6 @@ def _focal_lengths(reconstruction: Reconstruction, found: cov.Covariance) -> Cam
             )
         ]
         for camera, std in zip(reconstruction.names, stds, strict=True)
-        if std > 0.0
     }
 
 

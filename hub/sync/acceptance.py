@@ -18,7 +18,7 @@ _CHANCE_MISFIT = 9.0  # over the squared noise: upper bound for wrong alignments
 
 
 _BENCH = "measured: python -m tests.bench.pair_timing"
-_LIMITS = {
+LIMITS = {
     "inlier support": ("s", ">=", _BENCH),
     "residual": ("px", "<=", "largest residual that a lens of a few per cent error leaves"),
     "clock rate error": ("", "<=", "crystals stay within 1e-4; beyond 1e-2 the frame rate is wrong"),
@@ -42,7 +42,7 @@ _LIMITS = {
 
 def acceptance_test(name: str, value: float, limit: float, reason: str, alternative: str = "") -> AcceptanceTest:
     """One of the pair's acceptance tests. alternative: the test that decides in its stead where it passed, or ""."""
-    unit, sense, source = _LIMITS[name]
+    unit, sense, source = LIMITS[name]
     test = AcceptanceTest(name, float(value), float(limit), unit, source, reason, sense)
     return test if test.passed else replace(test, alternative=alternative)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hub.bundle import initialisation
-from hub.calibration import pipeline as calibrating
+from hub.calibration import acceptance as calibrating
 from hub.calibration.pipeline import calibrate
 from hub.calibration.triangulation import triangulate
 from hub.sync.pair_solver import _PairSearch, solve_pair
