@@ -22,10 +22,11 @@ from hub.bundle.initialisation import (
     place_cameras,
     reconstruct_incrementally,
     reconstruct_with_known_poses,
+    sigma_limits,
 )
 from hub.bundle.noise_scale import correlation_inflation
 from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
-from hub.bundle.problem import AdjustmentState, CameraState, FreeParameters, Problem
+from hub.bundle.problem import AdjustmentState, CameraState, ClockStep, FreeParameters, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.bundle.timestamp_jitter import estimate_frame_times
 from hub.calibration.given_values import refuted_lens
@@ -313,7 +314,8 @@ def solve_network(
                 f"only {100 * share:.0f} % of its {count} observations fit the trajectory seen by the other cameras"
             )
         else:
-            worst, reason = _wrong_lens(reconstruction)
+            lens = _wrong_lens(reconstruction.problem, reconstruction.state)
+            worst, reason = ("", "") if lens is None else (reconstruction.names[lens.camera], refuted_lens(lens))
             if not reason:
                 worst, reason = _least_certain_lens(reconstruction)
             if not reason:
@@ -539,9 +541,13 @@ def fits_trajectory(reconstruction: Reconstruction, name: str) -> bool:
     return share >= _MIN_INLIER_SHARE and count >= _MIN_ROWS
 
 
-def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
-    """Problem and state with the rows after clock steps corrected, as far as these explain the observations better."""
-    step = model_comparison.find_clock_step(problem, state)
+def _with_clock_steps(
+    problem: Problem, state: AdjustmentState, step: ClockStep | None
+) -> tuple[Problem, AdjustmentState]:
+    """Problem and state with the rows after clock steps corrected, as far as these explain the observations better.
+
+    step: the first one, of `find_clock_step`.
+    """
     for _ in range(_MAX_CLOCK_STEPS):
         if step is None:
             break
@@ -566,20 +572,21 @@ def misfits(reconstruction: Reconstruction) -> list[str]:
     return [name for name in reconstruction.names if not fits_trajectory(reconstruction, name)]
 
 
-def _wrong_lens(reconstruction: Reconstruction) -> tuple[str, str]:
-    """The camera whose measured lens is refuted most, by far more than any lens changes in the field, and the reason.
+def _wrong_lens(problem: Problem, state: AdjustmentState) -> model_comparison.LensTest | None:
+    """Test of the lens refuted by most, where that is far more than any lens changes in the field; else None.
 
-    Without correlated residuals there is none: a wrong lens displaces successive rows alike.
+    It need not be the most significant one: the others' residuals, which are small, show what it does to them. Without
+    correlated residuals there is none: a wrong lens displaces successive rows alike.
     """
-    problem, state, names = reconstruction.problem, reconstruction.state, reconstruction.names
-    if state.correlated_noise is not None or not problem.free_parameters.clock or len(names) < _MIN_TO_BLAME_A_LENS:
-        return "", ""
-    if max(correlation_inflation(problem, state, camera) for camera in range(len(names))) < MIN_INFLATION:
-        return "", ""
-    for one in model_comparison.refuted_lenses(problem, state)[:1]:
-        if abs(one.focal_change) - 3.0 * one.focal_std > _WRONG_LENS:
-            return names[one.camera], refuted_lens(one)
-    return "", ""
+    cameras = range(len(state.cameras))
+    if state.correlated_noise is not None or not problem.free_parameters.clock or len(cameras) < _MIN_TO_BLAME_A_LENS:
+        return None
+    if max(correlation_inflation(problem, state, camera) for camera in cameras) < MIN_INFLATION:
+        return None
+    refuted = model_comparison.refuted_lenses(problem, state)
+    wrong = {abs(one.focal_change) - 3.0 * one.focal_std: one for one in refuted}
+    excess = max(wrong, default=0.0)
+    return wrong[excess] if excess > _WRONG_LENS else None
 
 
 def final_adjustment(
@@ -606,9 +613,14 @@ def final_adjustment(
         refitted = _refit_online(problem, state, refine_lenses)
         if refitted[1] is not state:
             return _with_state(reconstruction, *refitted)
+    if not online and np.any(state.sigma > sigma_limits(state)) and _wrong_lens(problem, state) is not None:
+        return reconstruction  # the camera will be left out
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
     if not online:
-        problem, state = _with_clock_steps(problem, state)
+        step, lens = model_comparison.find_clock_step(problem, state), _wrong_lens(problem, state)
+        if lens is not None and (step is None or step.statistic < lens.statistic):
+            return _with_state(reconstruction, problem, state)
+        problem, state = _with_clock_steps(problem, state, step)
     problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
     problem = model_comparison.with_crystal_rates(problem, state)
     if refine_lenses and not warm:
@@ -634,7 +646,7 @@ def final_adjustment(
         ):
             problem, state = read_problem, read_state
     adjusted = _with_state(reconstruction, problem, state)
-    if not online and (misfits(adjusted) or _wrong_lens(adjusted)[0]):
+    if not online and (misfits(adjusted) or _wrong_lens(problem, state)):
         return adjusted  # a camera that will be left out: its errors are no noise
     report("correlated noise", 0.92)
     refit = _refit_online if online else refit_with_correlated_noise
