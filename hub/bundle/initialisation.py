@@ -423,15 +423,19 @@ def _intersect_bearings(camera: CameraInput, graph: ClockGraph, reconstruction: 
     )
 
 
+def sigma_limits(state: AdjustmentState) -> Floats:
+    """(cameras,) noise of one pixel coordinate that a camera that fits has at most: thrice the others' median."""
+    return np.array([3.0 * float(np.median(np.delete(state.sigma, i))) for i in range(len(state.sigma))])
+
+
 def inlier_share(reconstruction: Reconstruction, name: str) -> tuple[float, int]:
     """Share of a placed camera's rows that fit the trajectories within 5 sigma or 3 px, and how many rows there are.
 
-    The sigma of a camera that saw something else is inflated by its own residuals: it is limited to three times the
-    median of the other cameras'.
+    The sigma of a camera that saw something else is inflated by its own residuals: it is limited by `sigma_limits`.
     """
     number = reconstruction.names.index(name)
-    others = np.delete(reconstruction.state.sigma, number)
-    sigma = min(float(reconstruction.state.sigma[number]), 3.0 * float(np.median(others)))
+    state = reconstruction.state
+    sigma = min(float(state.sigma[number]), float(sigma_limits(state)[number]))
     norms = [
         residual_norms(rows, reconstruction.state.cameras[number], reconstruction.state.trajectories[rows.label])
         for rows in reconstruction.problem.rows

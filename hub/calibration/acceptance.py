@@ -7,10 +7,11 @@ from collections.abc import Iterable
 import numpy as np
 
 from hub.bundle import covariance as cov
-from hub.bundle import model_comparison
 from hub.bundle.correlated_noise import MIN_INFLATION
 from hub.bundle.initialisation import Reconstruction, inlier_share
+from hub.bundle.model_comparison import LensTest, refuted_lenses
 from hub.bundle.noise_scale import correlation_inflation
+from hub.bundle.problem import AdjustmentState, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.calibration.given_values import refuted_lens
 from hub.calibration.result import focal_stds
@@ -55,9 +56,11 @@ def network_failure(
 
     pairs: that the network was made from.
     """
-    lens = wrong_lens(reconstruction)
+    lens = wrong_lens(reconstruction.problem, reconstruction.state)
     if lens is not None:
-        return lens
+        name, source = "change of the given focal length, less three stds", "no zoom, crop or temperature changes more"
+        test = AcceptanceTest(name, _excess(lens), _WRONG_LENS, "relative", source, refuted_lens(lens))
+        return reconstruction.names[lens.camera], test
     found = _covariance(reconstruction)
     groups = (
         _fit(reconstruction),
@@ -76,27 +79,24 @@ def least_certain_camera(reconstruction: Reconstruction) -> Failure | None:
     return _worst(_precision(reconstruction, _covariance(reconstruction)))
 
 
-def wrong_lens(reconstruction: Reconstruction) -> Failure | None:
-    """The camera whose measured lens is refuted most, by far more than any lens changes in the field, and the test.
+def wrong_lens(problem: Problem, state: AdjustmentState) -> LensTest | None:
+    """Test of the lens refuted by most, where that is far more than any lens changes in the field; else None.
 
-    Without correlated residuals there is none: a wrong lens displaces successive rows alike.
+    It need not be the most significant one: the others' residuals, which are small, show what it does to them. Without
+    correlated residuals there is none: a wrong lens displaces successive rows alike.
     """
-    problem, state, names = reconstruction.problem, reconstruction.state, reconstruction.names
-    if state.correlated_noise is not None or not problem.free_parameters.clock or len(names) < _MIN_TO_BLAME_A_LENS:
+    cameras = range(len(state.cameras))
+    if state.correlated_noise is not None or not problem.free_parameters.clock or len(cameras) < _MIN_TO_BLAME_A_LENS:
         return None
-    if max(correlation_inflation(problem, state, camera) for camera in range(len(names))) < MIN_INFLATION:
+    if max(correlation_inflation(problem, state, camera) for camera in cameras) < MIN_INFLATION:
         return None
-    for one in model_comparison.refuted_lenses(problem, state)[:1]:
-        test = AcceptanceTest(
-            "error of the given focal length, less three stds",
-            abs(one.focal_change) - 3.0 * one.focal_std,
-            _WRONG_LENS,
-            "relative",
-            "no zoom, crop or temperature changes a lens by more",
-            refuted_lens(one),
-        )
-        return None if test.passed else (names[one.camera], test)
-    return None
+    worst = max(refuted_lenses(problem, state), key=_excess, default=None)
+    return None if worst is None or _excess(worst) <= _WRONG_LENS else worst
+
+
+def _excess(test: LensTest) -> float:
+    """By how much a focal length differs from the given one, less three stds; relative."""
+    return abs(test.focal_change) - 3.0 * test.focal_std
 
 
 def _covariance(reconstruction: Reconstruction) -> cov.Covariance:

@@ -37,6 +37,12 @@ _CANDIDATES, _CANDIDATES_PER_OCTAVE = 12, 3
 """Lags that are verified in all, and per octave of support: each costs ten resections of some 0.3 ms."""
 _MIN_COMMON_S = 3.0
 """Common motion [s] without which a lag is not scanned."""
+_SCALES = [np.array([mirror * scale, scale]) for mirror in (1.0, -1.0) for scale in np.geomspace(0.5, 2.0, 17)]
+"""Scales of an image about its centre, mirrored or not, that are tried where a camera fits at no lag: no view is so
+wide or narrow that a lens is mistaken by more."""
+_SCALE_STEPS = (1.04, 1.02, 1.01, 1.005)
+_LIKELY_CANDIDATES, _MIN_SCALE_CHANGE = 4, 0.03
+"""Candidates of the moment scan, which does not use the lens, whose scale is searched; scale that the lens gives."""
 _MIN_INLIERS, _MIN_CANDIDATE_RATIO = 0.8, 4.0
 """Share of the common rows that a time map without any bound from a clock has to explain, and cost of the next best."""
 
@@ -133,6 +139,8 @@ def find_time_map(
 ) -> tuple[TimeMapEstimate | None, str]:
     """Time map of a camera from its view of a solved path, over all lags and the given rates; else why there is none.
 
+    rates: the nominal one first; where no lag fits at it, the camera is also tried with other focal lengths.
+
     The resection of every lag comes from the same sums over the rows (`_moment_scan`), so a rate costs as much as some
     correlations. The best candidates are verified by a calibrated resection, which has to be by far the best of all
     lags, to explain most of the common rows, and to predict either half of them from the other half.
@@ -141,24 +149,20 @@ def find_time_map(
     labels = [(i, tracks[label]) for i, label in enumerate(reconstruction.labels) if label in tracks]
     if not labels:
         return None, "no label that the others saw"
-    found = [candidate for rate in rates for candidate in _moment_scan(labels, reconstruction, rate)]
+    found = sorted(_moment_scan(labels, reconstruction, rates[0]), key=lambda one: one.score)
+    likely = found[:_LIKELY_CANDIDATES]
+    if likely and _misfit([_verify(one, labels, reconstruction, camera) for one in likely]):
+        reason = _other_image([_verify(one, labels, reconstruction, camera, _SCALES) for one in likely])
+        if reason:
+            return None, reason
+    found += [candidate for rate in rates[1:] for candidate in _moment_scan(labels, reconstruction, rate)]
     found = sorted(found, key=lambda one: one.score)[:_CANDIDATES]
     if not found:
         return None, "too little seen together with the other cameras"
-    verified = sorted((_verify(one, labels, reconstruction, camera) for one in found), key=lambda one: one.cost)
-    best = verified[0]
-    other = min(
-        (
-            one.cost
-            for one in verified
-            if abs(one.rate - best.rate) > 1e-3 or abs(one.offset - best.offset) > _DISTINCT_S
-        ),
-        default=_TRUNCATION_PX**2,
-    )
-    if best.inliers < _MIN_INLIERS or not best.predicts:
-        return None, "its view of the path that the others agree on fits at no lag and no frame rate"
-    if best.cost * _MIN_CANDIDATE_RATIO > other:
-        return None, f"another lag fits nearly as well (cost ratio {other / max(best.cost, 1e-9):.1f})"
+    verified = [_verify(one, labels, reconstruction, camera) for one in found]
+    if reason := _misfit(verified):
+        return None, reason
+    best = _best_and_next(verified)[0]
     centre = 0.5 * (
         min(float(track.time[0]) for _, track in labels) + max(float(track.time[-1]) for _, track in labels)
     )
@@ -223,14 +227,22 @@ def _moment_scan(
 
 @dataclass(frozen=True, slots=True)
 class _Verified:
-    """A candidate after resection at the best lag near it. cost: mean truncated squared residual [px²] of the common
-    rows; inliers: share of them below the truncation; predicts: whether either half of them predicts the other."""
+    """A candidate after resection at the best lag near it.
+
+    scale: (2,) of the image against the given lens's. cost: mean truncated squared residual [px²] of the common rows;
+    inliers: share of them below the truncation; predicts: whether either half of them predicts the other.
+    """
 
     rate: float
     offset: float
+    scale: Floats
     cost: float
     inliers: float
     predicts: bool
+
+    @property
+    def fits(self) -> bool:
+        return self.inliers >= _MIN_INLIERS and self.predicts
 
 
 def _verify(
@@ -238,39 +250,82 @@ def _verify(
     labels: list[tuple[int, SmoothTrack]],
     reconstruction: Reconstruction,
     camera: CameraInput,
+    scales: Sequence[Floats] = (),
 ) -> _Verified:
+    """The candidate at the best lag near it, with the lens as it is given or at the best of ``scales``."""
     samples = [(number, *_along_path(track)) for number, track in labels]
-    focal = camera.intrinsics.focal
 
-    def at(offset: float) -> tuple[float, float, bool]:
+    def common(offset: float, scale: Floats) -> tuple[Floats, Floats, Floats, float]:
         world, image, times = [], [], []
         for number, time, points in samples:
             internal = np.asarray(candidate.rate * time + offset, dtype=np.float64)
             where = reconstruction.state.trajectories[number].at(internal)
             good = np.isfinite(where).all(axis=1) & seen_by_two(reconstruction, number, internal)
             world.append(where[good])
-            image.append(points[good])
+            image.append(points[good] * scale)
             times.append(internal[good])
-        positions, seen, when = np.concatenate(world), np.concatenate(image), np.concatenate(times)
-        if len(positions) < _MIN_POINTS:
-            return _TRUNCATION_PX**2, 0.0, False
-        residual = _resected_residuals(positions, seen, positions, seen, focal)
-        cost = float((np.minimum(residual, _TRUNCATION_PX) ** 2).mean())
-        late = when > np.median(when)
-        halves = (
-            _resected_residuals(positions[part], seen[part], positions[~part], seen[~part], focal)
-            for part in (late, ~late)
-        )
-        predicts = all(float(np.median(one)) < _TRUNCATION_PX for one in halves)
-        return cost, float((residual < _TRUNCATION_PX).mean()), predicts
+        focal = camera.intrinsics.focal / float(scale[1])
+        return np.concatenate(world), np.concatenate(image), np.concatenate(times), focal
 
-    offset, (cost, inliers, predicts) = candidate.offset, at(candidate.offset)
+    def cost(offset: float, scale: Floats) -> float:
+        positions, seen, _, focal = common(offset, scale)
+        if len(positions) < _MIN_POINTS:
+            return _TRUNCATION_PX**2
+        residual = _resected_residuals(positions, seen, positions, seen, focal)
+        return float((np.minimum(residual, _TRUNCATION_PX) ** 2).mean())
+
+    scale, offset = min(scales, key=lambda one: cost(candidate.offset, one), default=np.ones(2)), candidate.offset
+    lowest = cost(offset, scale)
     for step in (_STEP_S / 2, _STEP_S / 4, _STEP_S / 8, _STEP_S / 16):
         for trial in (offset - step, offset + step):
-            there = at(trial)
-            if there[0] < cost:
-                offset, (cost, inliers, predicts) = trial, there
-    return _Verified(candidate.rate, offset, cost, inliers, predicts)
+            there = cost(trial, scale)
+            if there < lowest:
+                offset, lowest = trial, there
+    for factor in _SCALE_STEPS if len(scales) else ():
+        scale = min((scale, scale * factor, scale / factor), key=lambda one: cost(offset, one))
+    positions, seen, when, focal = common(offset, scale)
+    if len(positions) < _MIN_POINTS:
+        return _Verified(candidate.rate, offset, scale, _TRUNCATION_PX**2, 0.0, False)
+    residual = _resected_residuals(positions, seen, positions, seen, focal)
+    late = when > np.median(when)
+    halves = (
+        _resected_residuals(positions[part], seen[part], positions[~part], seen[~part], focal) for part in (late, ~late)
+    )
+    predicts = all(float(np.median(one)) < _TRUNCATION_PX for one in halves)
+    truncated = float((np.minimum(residual, _TRUNCATION_PX) ** 2).mean())
+    return _Verified(candidate.rate, offset, scale, truncated, float((residual < _TRUNCATION_PX).mean()), predicts)
+
+
+def _misfit(verified: list[_Verified]) -> str:
+    """Why none of the candidates is by far the best and fits; "" where one is and does."""
+    best, other = _best_and_next(verified)
+    if not best.fits:
+        return "its view of the path that the others agree on fits at no lag and no frame rate"
+    if best.cost * _MIN_CANDIDATE_RATIO > other:
+        return f"another lag fits nearly as well (cost ratio {other / max(best.cost, 1e-9):.1f})"
+    return ""
+
+
+def _other_image(verified: list[_Verified]) -> str:
+    """What is wrong with a camera whose image fits by far best at another scale than its lens's; "" if none fits."""
+    scale = _best_and_next(verified)[0].scale
+    if _misfit(verified) or abs(scale[0] - 1.0) < _MIN_SCALE_CHANGE:
+        return ""
+    if scale[0] < 0.0:
+        return "its image is mirrored: so it fits the path that the others agree on"
+    return (
+        "its lens is wrong: its view of the path that the others agree on fits with a focal length "
+        f"{1.0 / scale[1]:.2f} times the given one"
+    )
+
+
+def _best_and_next(verified: list[_Verified]) -> tuple[_Verified, float]:
+    """The verified candidate that costs least, and the cost of the next one at another time map."""
+    best = min(verified, key=lambda one: one.cost)
+    others = (
+        one.cost for one in verified if abs(one.rate - best.rate) > 1e-3 or abs(one.offset - best.offset) > _DISTINCT_S
+    )
+    return best, min(others, default=_TRUNCATION_PX**2)
 
 
 def _resected_residuals(positions: Floats, seen: Floats, others: Floats, others_seen: Floats, focal: float) -> Floats:

@@ -77,7 +77,8 @@ class PairSolution:
     """Result for a pair of cameras a and b: the accepted alignment, or a refusal with the best hypothesis if any.
 
     status: "ok" or the reason of the refusal. alternatives: next best alignments, best first. acceptance: the tests
-    that were made, in order. refuted: whether no geometry agrees at the lag that other cameras imply.
+    that were made, in order. refuted: whether no geometry agrees at the lag that other cameras imply. incomplete:
+    whether further lags were not searched.
     """
 
     a: str
@@ -89,6 +90,7 @@ class PairSolution:
     """(3, 3) of undistorted pixels, ``m_aᵀ F m_b = 0``, where the method found it directly."""
     acceptance: tuple[AcceptanceTest, ...] = ()
     refuted: bool = False
+    incomplete: bool = False
 
     @property
     def solved(self) -> bool:

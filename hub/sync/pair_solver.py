@@ -56,6 +56,7 @@ _HARDLY_MOVES_AT_PREDICTED_LAG = (
     "the point hardly moves at the lag that the other cameras imply; other lags were not searched"
 )
 _NO_FIT_AT_PREDICTED_LAG = "no geometry agrees at the lag that the other cameras imply; other lags were not searched"
+_NONE_RELIABLE = "none of the most promising lags fits; further ones were not searched"
 _MAX_STARTS = 4
 _FIVE_POINT_SEEDS = 8  # random seeds of five-point hypotheses; more than _MAX_STARTS hypotheses are tried only …
 _PROMISING = 12.0  # … while the cost is at most this many times the noise: a local minimum of E at the right lag
@@ -207,6 +208,8 @@ class _PairSearch:
         reliable: tuple[float, float] | None = None  # evidence and scan cost of the best reliable fit so far
         count = s.max_candidates if lag_window is None else _PREDICTED_LAG_CANDIDATES
         for index in candidate_lags(scan, s.candidates_per_octave, count, lag_window):
+            if reliable is None and len(fits) >= s.max_unreliable_candidates:
+                return PairSolution(*names, _NONE_RELIABLE, rank_distinct(fits, s)[0], incomplete=True)
             offset, cost = float(scan.offset[index]), float(scan.cost[index])
             if reliable is not None and cannot_compete(float(scan.support[index]), cost, *reliable, s):
                 continue

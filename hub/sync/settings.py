@@ -27,6 +27,8 @@ class PairSettings:
     """Candidate lags per octave of support."""
     max_candidates: int = 18
     """Candidate lags in all."""
+    max_unreliable_candidates: int = 18
+    """Candidate lags that are refined while none of them is reliable; then the search ends without a solution."""
     start_samples: int = 160
     """Point pairs in the choice among a candidate's initial geometries."""
     refinement_samples: int = 500

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from hub.bundle import model_comparison
+from hub.bundle.preprocessing import prepare
 from hub.bundle.problem import AdjustmentState, CameraState, Problem, TrackObservations
-from hub.calibration.pipeline import calibrate
+from hub.calibration.pair_network import solve_pairs
+from hub.calibration.pipeline import calibrate, solve_network
+from hub.calibration.resection_scan import find_time_map
 from hub.calibration.triangulation import triangulate
+from hub.sync.pair_solver import _PairSearch
 from protocols.core.errors import Refused
 from protocols.geometry.camera import Intrinsics
 from protocols.session.calibration import Calibration, FixedCalibration
@@ -87,6 +92,42 @@ def test_a_broken_camera_is_named_and_the_others_stay(kind: str) -> None:
     found, _ = broken_cameras.timed(broken)
     assert "lens is refuted" in found.refused["cam4"] if kind == "wrong lens" else "cam4" in found.refused
     assert broken_cameras.change(before, found) < 1.0
+
+
+def test_resection_tells_a_wrong_lens_and_a_mirrored_image_from_a_camera_that_saw_something_else() -> None:
+    session = rigs.simulate(2, 4, 30.0)
+    good = broken_cameras.without(session, "cam3")
+    prepared, pairs = solve_pairs(prepare(good.rig, good.observations()), lambda text, share: None)
+    path = solve_network(prepared, pairs, lambda text, share: None).reconstruction
+    mine, rng = of(session, "cam3"), np.random.default_rng(0)
+    for broken, words in (
+        (with_focal(session, "cam3", 0.6), "focal length 1.6"),
+        (broken_cameras.mirrored(session, "cam3", mine, rng), "mirrored"),
+        (broken_cameras.shuffled(session, "cam3", mine, rng), "fits at no lag"),
+    ):
+        found, reason = find_time_map(prepare(broken.rig, broken.observations()).cameras["cam3"], path, (1.0,))
+        assert found is None
+        assert words in reason
+
+
+def test_a_broken_camera_does_not_get_the_long_search_that_a_pair_alone_gets(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = rigs.simulate(0, 4, 30.0)
+    broken = broken_cameras.shuffled(session, "cam0", of(session, "cam0"), np.random.default_rng(0))
+    prepared, tried = prepare(broken.rig, broken.observations()), list[float]()
+    refine = _PairSearch._refine_candidate
+
+    def counted(*arguments: Any, **options: Any) -> Any:
+        tried.append(arguments[2])
+        return refine(*arguments, **options)
+
+    monkeypatch.setattr(_PairSearch, "_refine_candidate", counted)
+    counts = {}
+    for thorough in (False, "first pair"):
+        tried.clear()
+        _, pairs = solve_pairs(prepared, lambda text, share: None, thorough=thorough)  # type: ignore[arg-type]
+        assert [pair.solved for pair in pairs] == [False, False, False, True, True, True]
+        counts[thorough] = len(tried)
+    assert counts["first pair"] < 0.5 * counts[False]
 
 
 def test_a_camera_that_shares_no_moment_with_the_first_pair_is_connected() -> None:
