@@ -213,6 +213,7 @@ def calibrate(
         known, rig = _fixed(Path(options.from_known), session.rig)
         session = replace(session, rig=rig)
     began = time.process_time()
+    session = _with_associated_people(session, progress, known)
     try:
         found = estimate_calibration(
             session.rig,
@@ -231,6 +232,16 @@ def calibrate(
         raise
     spent = time.process_time() - began
     return CalibrationResult(replace(found, cpu_seconds=spent, warnings=session.warnings + found.warnings), session)
+
+
+def _with_associated_people(session: Session, progress: Progress | None, known: FixedCalibration | None) -> Session:
+    """The session with one name for one person in all cameras, and a note of what was associated."""
+    from hub.calibration.people.association import associate_people
+
+    if session.rig.bodies:
+        return session
+    rig, observations, note = associate_people(session.rig, session.observations, progress, known)
+    return replace(session, rig=rig, observations=observations, warnings=session.warnings + ((note,) if note else ()))
 
 
 def save_refusal(
@@ -284,6 +295,7 @@ def triangulate(
     calibration does not know are left out with a warning. Raises InputError, and Refused where no point is seen by two
     cameras or the observations contradict the calibration.
     """
+    from hub.calibration.people.association import associate_with_calibration
     from hub.calibration.triangulation import triangulate as estimate_trajectories
 
     if isinstance(session, Session) and observations is not None:
@@ -299,8 +311,10 @@ def triangulate(
     left = [name for name in seen.cameras if name not in known]
     if left:
         warnings = (*warnings, f"not in the calibration, left out: {', '.join(left)}")
-    tracks = {key: track for key, track in seen.tracks.items() if key[0] in known}
-    found = estimate_trajectories(rig, known, Observations(tracks), progress)
+    used = Observations({key: track for key, track in seen.tracks.items() if key[0] in known})
+    used, note = associate_with_calibration(rig, known, used)
+    warnings = (*warnings, note) if note else warnings
+    found = estimate_trajectories(rig, known, used, progress)
     return TriangulationResult(
         rig, found.tables, found.sigma_px, found.unused, found.unplaced, (*warnings, *found.warnings)
     )

@@ -349,6 +349,11 @@ def _solve(
     )
 
 
+def solve_one_pair(prepared: PreparedSession, names: tuple[str, str], known: FixedCalibration | None) -> PairSolution:
+    """One pair of cameras by itself, over all lags. known: given poses; then only lag and rate are estimated."""
+    return _solve(prepared, names, known, standalone=True)
+
+
 def coincide(*positions: Floats) -> bool:
     """Whether positions (3,) differ by no more than rounding, so that rays from them meet nowhere else."""
     extent = np.ptp(np.array(positions), axis=0)
@@ -485,4 +490,4 @@ def _time_span(prepared: PreparedSession, name: str) -> tuple[float, float]:
     return min(float(track.time[0]) for track in tracks), max(float(track.time[-1]) for track in tracks)
 
 
-__all__ = ["Progress", "describe_timing", "frame_rate_warnings", "pair_lag", "solve_pairs"]
+__all__ = ["Progress", "describe_timing", "frame_rate_warnings", "pair_lag", "solve_one_pair", "solve_pairs"]

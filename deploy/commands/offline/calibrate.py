@@ -80,9 +80,10 @@ def calibrate(
         cameras. auto (default): looks at some frames with all of them. Or the .toml file of an ONNX network, or a
         detector that another package registers: only one target at a time in view.
     height
-        For keypoints of a person: the height [rig units], which gives the scale by thighs and shanks (about 3 %).
+        For keypoints: the people's (mean) height [rig units], which gives the scale by thighs and shanks (about 3 %).
     limb
-        The distance between two labels, as left_knee-left_ankle=0.41 [rig units]: gives the scale.
+        The distance between two labels, as left_knee-left_ankle=0.41 [rig units]: gives the scale. Of several people
+        it is the mean.
     seed
         Seed of the pose nodes' random samples (--solver distributed); the other solvers use no random numbers.
     """
@@ -149,6 +150,8 @@ def _with_scale(read: Session, height: float | None, limb: str | None) -> Sessio
     from protocols.formats.keypoints import limbs_of_height
 
     labels, bars = read.observations.labels, list(read.rig.scale_bars)
+    # A joint without a name before it is that of each of several people.
+    labels = [*labels, *dict.fromkeys(label.rpartition(".")[2] for label in labels if "." in label)]
     if limb is not None:
         found = re.fullmatch(r"\s*(.+?)\s*[-–]\s*(.+?)\s*=\s*([0-9.eE+]+)\s*", limb)
         if found is None or not {found[1], found[2]} <= set(labels):
