@@ -29,7 +29,6 @@ from protocols.geometry.types import Bools, Floats, Ints
 
 ITERATIONS = 4
 """Association, smoothing and linking. Of two crowds a fifth changed MOTA and IDF1 by less than 0.003."""
-WIDTHS = (1, 2, 3, 4)
 _INSIDE, _BESIDE = 0.99, 0.3
 """Existence of a target between its first and its last detection, and one scan before and after."""
 _MAX_GAP_S = 6.0
@@ -132,9 +131,10 @@ class BatchSmoother:
                 forward, backward = self._filter(1), self._filter(-1)
                 self._rates = self._entry_exit_rates(forward, backward)
                 self._link(forward, backward)
+            if 0 < number < iterations:
                 forward, backward = self._filter(1), self._filter(-1)
                 self._rates = self._entry_exit_rates(forward, backward)
-                self._exchange(forward, backward, WIDTHS[number - 1])
+                self._exchange(forward, backward, number)
             forward, backward = self._filter(1), self._filter(-1)
             out = self._associate(forward, backward, relink=number < iterations)
             if progress is not None:
