@@ -29,7 +29,7 @@ from protocols.geometry.types import Bools, Floats, Ints
 
 ITERATIONS = 4
 """Association, smoothing and linking. Of two crowds a fifth changed MOTA and IDF1 by less than 0.003."""
-_INSIDE, _BESIDE = 0.99, 0.3
+INSIDE, _BESIDE = 0.99, 0.3
 """Existence of a target between its first and its last detection, and one scan before and after."""
 _MAX_GAP_S = 6.0
 """Longest time over which a lost track is continued by its motion."""
@@ -211,7 +211,7 @@ class BatchSmoother:
             inside = (first[row] <= index) & (index <= last[row])
             prior = replace(
                 past.predicted.select(a), mean=mean, covariance=covariance,
-                existence=np.where(inside, _INSIDE, _BESIDE), initiation_number=row,
+                existence=np.where(inside, INSIDE, _BESIDE), initiation_number=row,
             )  # fmt: skip
             mean, covariance = self._updated(index, row, mean, covariance)
             there = replace(prior, mean=mean, covariance=covariance)
