@@ -15,7 +15,7 @@ from hub.tracking.filter.target_models import TARGET_MODELS
 from hub.tracking.filter.target_states import MultiTargetState, Targets
 from hub.tracking.frame_update import jointly, process_frame
 from hub.tracking.parameters import TrackerParameters
-from hub.tracking.smoothing import INSIDE, BatchSmoother, RecordedScan, SmoothedScan
+from hub.tracking.smoothing import LOG_ABSENT, BatchSmoother, RecordedScan, SmoothedScan
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import Refused
 from protocols.geometry.types import Bools, Floats, Ints
@@ -25,8 +25,6 @@ from protocols.session.rig import METRES_PER_UNIT
 
 _MIN_LOG_ODDS = 3.0
 """Of a track's existence over its whole life: one in twenty of the accepted ones at the limit is false."""
-_LOG_ABSENT = -float(np.log(INSIDE / (1.0 - INSIDE)))
-"""Log odds from unseen scans, below which a track was more probably out of sight of all cameras than missed by them."""
 _COASTING_S = 0.35
 """Without a detection for longer, a row is marked so; at few frames a second, for more than one and a half frames."""
 
@@ -230,7 +228,7 @@ def _absences(scans: list[SmoothedScan], count: int) -> list[list[tuple[int, int
     last, unseen = np.full(count, -1), np.zeros(count)
     for scan in scans:
         hit, missed = scan.row[scan.hits > 0], scan.hits == 0
-        for row in hit[(unseen[hit] < _LOG_ABSENT) & (last[hit] >= 0)].tolist():
+        for row in hit[(unseen[hit] < LOG_ABSENT) & (last[hit] >= 0)].tolist():
             out[row].append((int(last[row]), scan.now_ns))
         last[hit], unseen[hit] = scan.now_ns, 0.0
         unseen[scan.row[missed]] += scan.odds[missed]
