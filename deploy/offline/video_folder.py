@@ -19,6 +19,7 @@ import numpy as np
 import tomli_w
 
 from deploy.offline.recognition import DETECTORS, Target, find_target
+from deploy.offline.single_target import rows_of_one_target
 from edge.detectors.base import Detector, Kind
 from edge.detectors.board.description import Board
 from edge.detectors.board.detector import BoardDetector
@@ -142,12 +143,9 @@ def session_from_videos(
         if video.camera not in found:
             continue
         one, kept = found[video.camera]
-        several = 0 if target.board is not None else _label_count_if_many(one)
-        if several:
-            warnings.append(
-                f"{video.path.name}: {several} {what}s in it, and who is who in two videos is not known; left out"
-            )
-            one = replace(one, rows=())
+        several = False
+        if target.board is None:
+            one, several = _one_target(video, one, what, warnings)
         rows += one.rows
         again = " (kept from before)" if kept else ""
         if refusal is None:
@@ -156,13 +154,7 @@ def session_from_videos(
         if not one.rows and not several and refusal is None:
             warnings.append(f"{video.path.name}: no {what} in any of its frames")
         table = _camera_table(video, one, tables.get(video.camera, {}), warnings)
-        lens = _measured_lens(given, video.camera)
-        # A ball's centre does not project to the centre of its outline: without measured intrinsics, the solver
-        # corrects that with the intrinsics it estimates.
-        table.pop("ball_outline", None)
-        if detector == "marker" and (lens is None or (lens.width, lens.height) != one.size):
-            table["ball_outline"] = True
-        tables[video.camera] = table
+        tables[video.camera] = table | _ball_outline(detector, one, _measured_lens(given, video.camera))
     metadata = tables.pop("metadata", {})
     if target.board is not None:
         metadata |= _body_metadata(target.board, rows)
@@ -232,7 +224,15 @@ def _camera_table(
             "taken as a camera without intrinsics"
         )
         table = {key: value for key, value in table.items() if key not in _LENS} | {"size": list(found.size)}
+    table.pop("ball_outline", None)
     return table
+
+
+def _ball_outline(detector: str, found: VideoDetections, lens: Intrinsics | None) -> dict[str, bool]:
+    """A ball's centre does not project to the centre of its outline: without measured intrinsics, the solver corrects
+    that with the intrinsics it estimates."""
+    wanted = detector == "marker" and (lens is None or (lens.width, lens.height) != found.size)
+    return {"ball_outline": True} if wanted else {}
 
 
 def _detect_all(
@@ -348,11 +348,18 @@ def _detect_people_or_vehicles(film: VideoReader, camera: str, kind: str, progre
     return detect_moving(film, camera, moving_detector(kind, "mog2", film.info.fps), progress)
 
 
-def _label_count_if_many(found: VideoDetections) -> int:
-    """Number of different labels in a video if more than one, else 0."""
-    column = HEADER.split(",").index("label")
-    labels = {cells[column] for cells in csv.reader(found.rows)}
-    return len(labels) if len(labels) > 1 else 0
+def _one_target(
+    video: VideoFile, found: VideoDetections, what: str, warnings: list[str]
+) -> tuple[VideoDetections, bool]:
+    """The video's detections of its only target, and whether there are several instead; then none are left."""
+    rows, removed, targets = rows_of_one_target(found.rows)
+    if targets > 1:
+        warnings.append(
+            f"{video.path.name}: {targets} {what}s in it, and who is who in two videos is not known; left out"
+        )
+    elif removed:
+        warnings.append(f"{video.path.name}: {removed} detections beside the {what} were taken as false and removed")
+    return replace(found, rows=rows), targets > 1
 
 
 def _cache_key(video: VideoFile, model: MarkerModel | None, lens: Any, target: Target) -> str:

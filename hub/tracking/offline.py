@@ -223,7 +223,7 @@ def _sampled(
 
 
 def _absences(scans: list[SmoothedScan], count: int) -> list[list[tuple[int, int]]]:
-    """Of each track, the spans [ns] between two detections in which cameras that should have seen it did not."""
+    """Of each track, the spans [ns] between two detections in which it was more probably out of all cameras' sight."""
     out: list[list[tuple[int, int]]] = [[] for _ in range(count)]
     last, unseen = np.full(count, -1), np.zeros(count)
     for scan in scans:

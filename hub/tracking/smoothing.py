@@ -16,10 +16,10 @@ import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
 from hub.tracking.association.assignment import matching_colour_std
-from hub.tracking.association.continuation import continuation_scores
+from hub.tracking.association.continuation import EntryExitRates, continuation_scores
 from hub.tracking.association.scan import FrameEvidence, associate_jointly
 from hub.tracking.filter.floor import Floor
-from hub.tracking.filter.kalman import LOG_SIZE
+from hub.tracking.filter.kalman import LOG_SIZE, POSITION
 from hub.tracking.filter.manoeuvre import fused_predictions, manoeuvre_hypothesis, widened_by_evidence
 from hub.tracking.filter.target_states import ScanFrame, Targets
 from hub.tracking.frame_update import on_floor, predict_targets, prior_of_births
@@ -33,8 +33,9 @@ _INSIDE, _BESIDE = 0.99, 0.3
 """Existence of a target between its first and its last detection, and one scan before and after."""
 _MAX_GAP_S = 6.0
 """Longest time over which a lost track is continued by its motion."""
-LOG_ABSENT = -7.0
-"""Log odds of existence in a gap, from which on a track is cut there."""
+LOG_ABSENT = -float(np.log(_INSIDE / (1.0 - _INSIDE)))
+"""Log odds from unseen scans, below which a track was more probably away than missed by all cameras: it has no place
+there, and is cut."""
 _LOG_HIDDEN = -5.0
 """Log probability that no camera detects somebody for a while, whatever it should see: one in 150 is behind something
 that is not known, or where nobody looks for people."""
@@ -108,6 +109,8 @@ class BatchSmoother:
             found = associate_jointly(scan.frames, there, scan.now_ns, there, parameters.up, self.colour_std, 0)
             self.evidence.append(_ScanEvidence(row, found.evidence, found.total))
         self._changed = np.ones(len(self.scans), dtype=np.bool_)
+        nowhere = np.full((len(tracks), 3), np.nan)
+        self._rates = EntryExitRates.of(nowhere, nowhere, np.zeros((0, 3)), 1, parameters.scale.units_per_m)
         self._initial(states)
 
     def _initial(self, states: Iterable[tuple[Ints, Floats, Floats]]) -> None:
@@ -127,9 +130,12 @@ class BatchSmoother:
             if number:
                 self._cut(out)
                 forward, backward = self._filter(1), self._filter(-1)
+                self._rates = self._entry_exit_rates(forward, backward)
                 self._link(forward, backward)
+            if 0 < number < iterations:
                 forward, backward = self._filter(1), self._filter(-1)
-                self._exchange(forward, backward)
+                self._rates = self._entry_exit_rates(forward, backward)
+                self._exchange(forward, backward, number)
             forward, backward = self._filter(1), self._filter(-1)
             out = self._associate(forward, backward, relink=number < iterations)
             if progress is not None:
@@ -257,28 +263,30 @@ class BatchSmoother:
             self._rename(index, label)
         self._select(source)
 
-    def _exchange(self, forward: list[_Filtered], backward: list[_Filtered]) -> None:
-        """Exchange tracks that continue each other better if the scan between is left out.
+    def _exchange(self, forward: list[_Filtered], backward: list[_Filtered], width: int) -> None:
+        """Exchange tracks that continue each other better if the ``width`` scans between are left out.
 
-        Where two people meet, a scan's detections of both may be mixed, so that neither boundary of it shows which past
-        belongs to which future. It is associated anew.
+        Where two people meet, the detections of both may be mixed for a while, so that no boundary of two scans shows
+        which past belongs to which future: both tracks glide from one to the other. What lies between is associated
+        anew.
         """
         first, last = self._extents()
         label, untouched = np.arange(len(self.tracks)), 1
         for index in range(len(self.scans)):
-            new = label
-            tracks = np.flatnonzero((first < index) & (index < last))
+            new, after = label, index + width
+            tracks = np.flatnonzero((first < index) & (after - 1 < last))
             if index >= untouched and len(tracks) > 1:
                 ends = np.full(len(tracks), index - 1)
-                score = self._link_scores(forward, backward[index + 1], tracks, tracks, ends, index)
+                score = self._link_scores(forward, backward[after], tracks, tracks, ends, after - 1)
                 score += np.diag(np.full(len(tracks), _PRESENT))
                 _, follows = linear_sum_assignment(-np.maximum(score, _IMPOSSIBLE))
                 heads, tails = tracks[moved := follows != np.arange(len(tracks))], tracks[follows[moved]]
                 if len(heads) and score[moved, follows[moved]].min() > _IMPOSSIBLE:
                     new = label.copy()
                     new[tails] = label[heads]
-                    self._forget(index, heads)
-                    untouched = index + 2
+                    for between in range(index, after):
+                        self._forget(between, heads)
+                    untouched = after + 1
             self._rename(index, label)
             label = new
 
@@ -353,6 +361,20 @@ class BatchSmoother:
             label = new
         self._select(source)
 
+    def _entry_exit_rates(self, forward: list[_Filtered], backward: list[_Filtered]) -> EntryExitRates:
+        """Where the tracks begin and end; the recording's own ends are none of theirs."""
+        first, last = self._extents()
+        starts, ends, visits = np.full((len(first), 3), np.nan), np.full((len(first), 3), np.nan), []
+        for index, (past, future) in enumerate(zip(forward, backward, strict=True)):
+            visits.append(past.mean[(first[past.row] <= index) & (index <= last[past.row])][:, POSITION])
+            begun, ended = first[future.row] == index, last[past.row] == index
+            if index > 0:
+                starts[future.row[begun]] = future.mean[begun][:, POSITION]
+            if index + 1 < len(self.scans):
+                ends[past.row[ended]] = past.mean[ended][:, POSITION]
+        units = self.parameters.scale.units_per_m
+        return EntryExitRates.of(starts, ends, np.concatenate(visits), len(self.scans), units)
+
     def _link_scores(
         self, forward: list[_Filtered], after: _Filtered, heads: Ints, tails: Ints, ends: Ints, index: int
     ) -> Floats:
@@ -365,10 +387,12 @@ class BatchSmoother:
             np.zeros(len(heads)),
             np.zeros(len(heads)),
         )
+        seen = past.mean[:, POSITION].copy()
         for at in np.unique(ends).tolist():
             chosen = ends == at
             rows = _places(forward[at].row, heads[chosen])
             state = replace(past.select(chosen), mean=forward[at].mean[rows], covariance=forward[at].covariance[rows])
+            seen[chosen] = state.mean[:, POSITION]
             elapsed = (scan.now_ns - self.scans[at].now_ns) / NANOSECONDS
             state = on_floor(predict_targets(state, elapsed, self.parameters), self.floor, elapsed)
             mean[chosen], covariance[chosen], ahead[chosen] = state.mean, state.covariance, elapsed
@@ -379,7 +403,8 @@ class BatchSmoother:
         typical = float(np.median(self.tracks.mean[:, LOG_SIZE]))
         units = self.parameters.scale.units_per_m
         manoeuvre = manoeuvre_hypothesis(past, ahead, units, self.parameters.up)
-        return continuation_scores(past, future, manoeuvre, gap, units, typical, self.colour_std)
+        rates = self._rates.log_exit(heads, seen), self._rates.log_entry(tails, future.mean[:, POSITION])
+        return continuation_scores(past, future, manoeuvre, gap, rates, units, typical, self.colour_std)
 
 
 def _places(rows: Ints, wanted: Ints) -> Ints:

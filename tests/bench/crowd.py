@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from deploy.cli import run
-from deploy.evaluation.tracking_scores import read_ground_truth, score_tracks
+from deploy.evaluation.tracking_scores import ScoredTrack, read_ground_truth, score_tracks
 from deploy.offline.csv_table import read_csv_table
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats
@@ -98,7 +98,7 @@ def replayed(data: Path, folder: Path) -> dict[str, Any]:
     return {**score_tracks(truth, published_tracks(out), times, 1.0), "cpu": cpu / (times[-1] - times[0])}
 
 
-def published_tracks(log: Path) -> list[_HubTrack]:
+def published_tracks(log: Path) -> list[ScoredTrack]:
     """The confirmed and coasting tracks of people in a hub's log, by label."""
     rows: dict[str, dict[int, list[float]]] = defaultdict(dict)
     for logged in LogReader(log).messages([TRACK]):
@@ -106,6 +106,11 @@ def published_tracks(log: Path) -> list[_HubTrack]:
         assert isinstance(message, pb.Track)
         if message.kind == "person" and message.state != "lost":
             rows[message.label][message.reference_time_ns] = list(message.position)
+    return published_positions(rows)
+
+
+def published_positions(rows: dict[str, dict[int, list[float]]]) -> list[ScoredTrack]:
+    """Tracks from positions by label and reference time [ns]."""
     return [
         _HubTrack(index, np.array(sorted(mine)) / NANOSECONDS, np.array([mine[time] for time in sorted(mine)]))
         for index, mine in enumerate(rows.values())

@@ -290,49 +290,16 @@ def main() -> None:
     parser.add_argument("--data")
     options = parser.parse_args()
     seeds = range(options.first, options.first + (1 if options.quick else options.seeds))
+    say = (lambda line: None) if options.json else (lambda line: print(line, flush=True))
+    wanted = (options.only,) if options.only else ("tracking", "clocks", "walkers")
     out: dict[str, Any] = {"tracking": [], "clocks": [], "walkers": []}
-    if options.only in (None, "tracking"):
+    if "tracking" in wanted:
         for seed in seeds:
-            scene = scenes.get_people_scene(seed, 5, 5)
-            runs = [("geometry", film(scene, options.seconds, seed))]
-            if options.rendered:
-                runs.append(("rendered", rendered(scene, options.seconds, seed, options.kept)))
-            for source, traffic in runs:
-                moments, cpu = followed(traffic)
-                parts = {source: moments}
-                if source == "rendered":
-                    parts[f"rendered after {BEGUN_S:.0f} s"] = moments[round(BEGUN_S / EVERY_S) :]
-                for name, part in parts.items():
-                    flat, space = scores(part)
-                    row = {"seed": seed, "source": name, "floor": asdict(flat), "space": asdict(space)}
-                    out["tracking"].append(row | {"cpu_ms": 1e3 * cpu})
-                    if not options.json:
-                        print(
-                            f"{name} seed {seed}: {in_words(flat, space)}, {1e3 * cpu:.1f} ms CPU a frame", flush=True
-                        )
-    if options.only in (None, "clocks"):
-        for seed in range(options.first, options.first + (3 if options.quick else 10)):
-            plain, filtered = nearest_frames(seed)
-            out["clocks"].append({"seed": seed, "nearest_m": plain, "filter_m": filtered})
-        plain, filtered = (float(np.mean([row[k] for row in out["clocks"]])) for k in ("nearest_m", "filter_m"))
-        if not options.json:
-            print(
-                f"1.4 m/s, five cameras at 10 fps, 1 px: nearest frames {100 * plain:.2f} cm, asynchronous filter "
-                f"{100 * filtered:.2f} cm: {plain / filtered:.1f} times better; worst seed "
-                f"{min(row['nearest_m'] / row['filter_m'] for row in out['clocks']):.1f}",
-                flush=True,
-            )
-    if options.only in (None, "walkers"):
-        for people in (1, 5):
-            for seed in seeds:
-                row = self_calibrated(seed, people)
-                out["walkers"].append(row)
-                if not options.json:
-                    figures = ", ".join(f"{k} {v:.2f}" for k, v in row.items() if isinstance(v, float))
-                    print(
-                        f"{people} people, seed {seed}: {row['cameras']} of 5 cameras; {figures or row.get('refused')}",
-                        flush=True,
-                    )
+            out["tracking"] += _tracking_rows(seed, options, say)
+    if "clocks" in wanted:
+        out["clocks"] = _clock_rows(options.first, 3 if options.quick else 10, say)
+    if "walkers" in wanted:
+        out["walkers"] = _walker_rows(seeds, say)
     if options.json:
         print(json.dumps(out))
     else:
@@ -340,6 +307,51 @@ def main() -> None:
             "the paper (section 4): 7.35 cm, 0.85° of five cameras after 10,000 synchronous points; of tracking, "
             "pictures only"
         )
+
+
+def _tracking_rows(seed: int, options: argparse.Namespace, say: Callable[[str], None]) -> list[dict[str, Any]]:
+    scene = scenes.get_people_scene(seed, 5, 5)
+    runs = [("geometry", film(scene, options.seconds, seed))]
+    if options.rendered:
+        runs.append(("rendered", rendered(scene, options.seconds, seed, options.kept)))
+    rows = []
+    for source, traffic in runs:
+        moments, cpu = followed(traffic)
+        parts = {source: moments}
+        if source == "rendered":
+            parts[f"rendered after {BEGUN_S:.0f} s"] = moments[round(BEGUN_S / EVERY_S) :]
+        for name, part in parts.items():
+            flat, space = scores(part)
+            rows.append(
+                {"seed": seed, "source": name, "floor": asdict(flat), "space": asdict(space), "cpu_ms": 1e3 * cpu}
+            )
+            say(f"{name} seed {seed}: {in_words(flat, space)}, {1e3 * cpu:.1f} ms CPU a frame")
+    return rows
+
+
+def _clock_rows(first: int, count: int, say: Callable[[str], None]) -> list[dict[str, Any]]:
+    rows = []
+    for seed in range(first, first + count):
+        plain, filtered = nearest_frames(seed)
+        rows.append({"seed": seed, "nearest_m": plain, "filter_m": filtered})
+    plain, filtered = (float(np.mean([row[k] for row in rows])) for k in ("nearest_m", "filter_m"))
+    say(
+        f"1.4 m/s, five cameras at 10 fps, 1 px: nearest frames {100 * plain:.2f} cm, asynchronous filter "
+        f"{100 * filtered:.2f} cm: {plain / filtered:.1f} times better; worst seed "
+        f"{min(row['nearest_m'] / row['filter_m'] for row in rows):.1f}"
+    )
+    return rows
+
+
+def _walker_rows(seeds: range, say: Callable[[str], None]) -> list[dict[str, Any]]:
+    rows = []
+    for people in (1, 5):
+        for seed in seeds:
+            row = self_calibrated(seed, people)
+            rows.append(row)
+            figures = ", ".join(f"{k} {v:.2f}" for k, v in row.items() if isinstance(v, float))
+            say(f"{people} people, seed {seed}: {row['cameras']} of 5 cameras; {figures or row.get('refused')}")
+    return rows
 
 
 __all__ = ["followed", "main", "nearest_frames", "self_calibrated"]

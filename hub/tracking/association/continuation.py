@@ -2,21 +2,63 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from scipy.spatial import cKDTree
 
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY, log_density
 from hub.tracking.filter.manoeuvre import ManoeuvreHypothesis
 from hub.tracking.filter.target_models import TARGET_MODELS
 from hub.tracking.filter.target_states import Targets
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Ints
 
-_LOG_CONTINUED = 3.0
-"""Log odds of a track going on against one ending and another beginning: one in twenty does, a scan."""
-_ARRIVAL_AREA_M2 = 200.0
-"""In which new tracks begin."""
+_REGION_M = 1.5
+"""Radius within which entries and exits are counted: a walker's way in a second."""
 _MAX_LINK_M = 6.0
 _CLUTTER_COLOUR_STD, _COLOUR_MAX = 60.0, 12.0
 """Of a channel of other people's colours; limit of a squared difference, over its variance."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EntryExitRates:
+    """Where tracks begin and end, a scan, as estimated from all tracks of a recording.
+
+    Rates by counts within a radius, with Jeffreys' prior (half an event): people come and go at doors and at the
+    borders of what the cameras see, not in the middle of a hall. Entry and exit zones: Makris and Ellis, "Learning
+    semantic scene models from observing activity in visual surveillance" (2005).
+
+    starts, ends: (n, 3) of each track, NaN where that is unknown. scans: their number.
+    """
+
+    starts: Floats
+    ends: Floats
+    scans: int
+    radius: float
+    _trees: tuple[cKDTree, cKDTree, cKDTree]
+
+    @classmethod
+    def of(cls, starts: Floats, ends: Floats, visits: Floats, scans: int, units_per_m: float) -> EntryExitRates:
+        """From where tracks begin and end. visits: (v, 3) places of all tracks at all scans."""
+        trees = [cKDTree(points[np.isfinite(points).all(axis=1)]) for points in (starts, ends, visits)]
+        return cls(starts, ends, scans, _REGION_M * units_per_m, (trees[0], trees[1], trees[2]))
+
+    def log_entry(self, track: Ints, place: Floats) -> Floats:
+        """Log rate (n,) of others' beginnings, an area unit and a scan, where a track is. track: (n,) its number."""
+        begun = self._within(0, place) - self._is_own(self.starts, track, place)
+        return np.asarray(np.log((begun + 0.5) / (np.pi * self.radius**2 * self.scans)))
+
+    def log_exit(self, track: Ints, place: Floats) -> Floats:
+        """Log odds (n,) of ending at a scan, against going on, where a track is."""
+        ended = self._within(1, place) - self._is_own(self.ends, track, place)
+        return np.asarray(np.log((ended + 0.5) / (np.maximum(self._within(2, place) - ended, 0.0) + 0.5)))
+
+    def _within(self, which: int, place: Floats) -> Floats:
+        found = self._trees[which].query_ball_point(place, self.radius, return_length=True)
+        return np.asarray(found, dtype=np.float64)
+
+    def _is_own(self, points: Floats, track: Ints, place: Floats) -> Floats:
+        return np.asarray(np.linalg.norm(points[track] - place, axis=1) <= self.radius, dtype=np.float64)
 
 
 def continuation_scores(
@@ -24,6 +66,7 @@ def continuation_scores(
     future: Targets,
     manoeuvre: ManoeuvreHypothesis,
     gap_s: Floats,
+    rates: tuple[Floats, Floats],
     units_per_m: float,
     typical: float,
     colour_std: float,
@@ -32,7 +75,8 @@ def continuation_scores(
 
     past, future: h and t tracks at one time, from the detections before and from those after it; two with one
     ``initiation_number`` are the same track. manoeuvre: second hypothesis of the pasts.
-    gap_s: (h,) since the last detections. typical: log of a typical size.
+    gap_s: (h,) since the last detections. rates: log odds (h,) of the pasts' ending, and log rate (t,) of new tracks
+    where the futures begin. typical: log of a typical size.
     """
     off = past.mean[:, None] - future.mean[None]
     near = np.linalg.norm(off[..., POSITION], axis=2) < _MAX_LINK_M * units_per_m
@@ -55,9 +99,9 @@ def continuation_scores(
     chance -= 0.5 * ((future.mean[:, LOG_SIZE] - typical) ** 2 / size2 + np.log(size2))
     # The height is that of the floor in both cases: only the two horizontal dimensions are free.
     vertical = np.linalg.eigvalsh(total[:, POSITION, POSITION])[:, 0]
-    chance_of = chance[b] - np.log(_ARRIVAL_AREA_M2 * units_per_m**2) - 0.5 * np.log(vertical) + np.log(2.0 * np.pi)
+    chance_of = chance[b] + rates[1][b] - 0.5 * np.log(vertical) + np.log(2.0 * np.pi)
     off2 = ((past.colour[a] - future.colour[b]) ** 2).sum(axis=1) / colour_std**2
     alike = np.nan_to_num(3.0 * np.log(_CLUTTER_COLOUR_STD / colour_std) - 0.5 * np.minimum(off2, _COLOUR_MAX))
     alike[past.initiation_number[a] == future.initiation_number[b]] = 0.0  # one track's colour says nothing of it
-    score[a, b] = fit - chance_of + _LOG_CONTINUED - gap_s[a] + alike
+    score[a, b] = fit - chance_of - rates[0][a] - gap_s[a] + alike
     return score

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 
 from deploy.evaluation.clear_mot import EvaluationFrame, MotScores, clear_mot
 from hub.tracking import offline
+from hub.tracking.association.continuation import EntryExitRates
 from hub.tracking.filter.detection_model import posterior_existence
 from hub.tracking.filter.floor import Floor
 from hub.tracking.filter.target_states import MultiTargetState
@@ -189,6 +192,51 @@ def test_a_track_that_takes_over_somebody_else_is_cut_once(seed: int, monkeypatc
 
     monkeypatch.setattr(offline, "_smoother", taken_over)
     assert len(follow(messages, calibration, [round(at * NANOSECONDS) for at in time]).tracks) == 6
+
+
+def test_what_lies_between_two_exchanged_tracks_is_associated_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two stand together, and over three scans their tracks may have glided from one to the other."""
+    rng = np.random.default_rng(0)
+    place = np.array([[-0.4, 0.0], [0.4, 0.0]]) + rng.normal(0.0, 0.02, (14, 2, 2))
+    messages, calibration = boxes(rng, place, cameras=4, height=3.0)
+    made: list[BatchSmoother] = []
+    monkeypatch.setattr(BatchSmoother, "run", lambda self, **_: made.append(self) or [])
+    follow(messages, calibration, [0])
+    (smoother,) = made
+    forward, backward = smoother._filter(1), smoother._filter(-1)
+    own = np.eye(2, dtype=np.bool_)
+
+    def scored(*given: Any) -> Floats:
+        return np.where(own, 0.0, 9.0) if given[5] == 6 else np.where(own, 9.0, 0.0)
+
+    monkeypatch.setattr(smoother, "_link_scores", scored)
+    before = [[one.ids.tolist() for one in scan.frames] for scan in smoother.scans]
+    smoother._exchange(forward, backward, 3)
+    after = [[one.ids.tolist() for one in scan.frames] for scan in smoother.scans]
+    assert after[:4] == before[:4]
+    assert after[4:7] == [[[]] * 4] * 3
+    assert after[7:] == [[[1 - row for row in ids] for ids in scan] for scan in before[7:]]
+    assert smoother._changed[4:7].all()
+
+
+def test_people_come_and_go_at_doors() -> None:
+    """Thirty walk from one wall of a hall of 10 m to the other; their own beginning and end are no evidence."""
+    side = np.linspace(-3.0, 3.0, 30)
+    starts, ends = (np.column_stack([np.full(30, x), side, np.zeros(30)]) for x in (0.0, 10.0))
+    along = np.linspace(0.0, 10.0, 16)
+    visits = np.stack([np.broadcast_to(along, (30, 16)), np.repeat(side[:, None], 16, axis=1), np.zeros((30, 16))], -1)
+    rates = EntryExitRates.of(starts, ends, visits.reshape(-1, 3), 200, 1.0)
+    here = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
+    entry, leaving = (
+        rates.log_entry(np.zeros(3, dtype=np.int64), here),
+        rates.log_exit(np.zeros(3, dtype=np.int64), here),
+    )
+    assert entry[0] - entry[1] > 3.0
+    assert leaving[2] - leaving[1] > 3.0
+    alone = EntryExitRates.of(starts[:1], ends[:1], visits[0], 200, 1.0)
+    assert alone.log_entry(np.zeros(1, dtype=np.int64), starts[:1]) == alone.log_entry(
+        np.zeros(1, dtype=np.int64), here[1:2]
+    )
 
 
 def test_a_hall_that_is_full_at_the_first_frame() -> None:

@@ -1,0 +1,51 @@
+"""The one target of a video: what a detector found beside it is removed, unless it is too much to be false."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import defaultdict
+from collections.abc import Sequence
+
+from edge.offline.detections import HEADER
+
+MAX_FALSE_SHARE = 0.1
+"""Of false rows beside the target's. As many as that may be among the target's own, in frames in which it is missed,
+and with 10 % outliers pair synchronisation found the lag in every run (``python -m tests.bench.pair_timing``)."""
+_CONFIRMED_ROWS = 3
+"""As of a tracklet: below, a label in a gap of the target is a flicker, not the target seen again."""
+
+
+def rows_of_one_target(rows: Sequence[str]) -> tuple[tuple[str, ...], int, int]:
+    """The rows of a video's only target, how many others were removed, and how many targets there are.
+
+    rows: of observations.csv. The target's track may have been lost in between: labels that are never seen at one time
+    are it, the longest first, and get the name of their kind. With more than one target no rows are left, and all
+    labels count that are more than false detections.
+    """
+    labels: dict[str, dict[str, int]] = defaultdict(dict)
+    cells = list(csv.reader(rows))
+    frame, label, kind = (HEADER.split(",").index(name) for name in ("frame", "label", "kind"))
+    for index, row in enumerate(cells):
+        labels[row[label]][row[frame]] = index
+    if len(labels) < 2:
+        return tuple(rows), 0, len(labels)
+    ordered = sorted(labels.values(), key=lambda one: (-len(one), min(one.values())))
+    frames = set(ordered[0])
+    kept = sorted(ordered[0].values())
+    beside: list[int] = []
+    for one in ordered[1:]:
+        same = cells[kept[0]][kind] == cells[min(one.values())][kind]
+        if same and len(one) >= _CONFIRMED_ROWS and frames.isdisjoint(one):
+            frames |= set(one)
+            kept = sorted([*kept, *one.values()])
+        else:
+            beside.append(len(one))
+    if sum(beside) > MAX_FALSE_SHARE * len(kept):
+        return (), 0, 1 + max(sum(count >= _CONFIRMED_ROWS for count in beside), 1)
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    for index in kept:
+        row = cells[index]
+        writer.writerow([*row[:label], row[kind] or cells[kept[0]][label], *row[label + 1 :]])
+    return tuple(out.getvalue().splitlines()), sum(beside), 1

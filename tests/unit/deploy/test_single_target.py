@@ -1,0 +1,49 @@
+"""What a detector finds beside the only target of a video is removed; several targets are named as such."""
+
+from __future__ import annotations
+
+import csv
+
+from deploy.offline.single_target import rows_of_one_target
+from edge.detectors.base import Detection
+from edge.offline.detections import HEADER, detection_rows
+
+
+def _rows(*labels: tuple[str, range], kind: str = "person") -> tuple[str, ...]:
+    """Rows of labels in ranges of frames."""
+    at: dict[int, list[Detection]] = {}
+    for label, frames in labels:
+        for frame in frames:
+            at.setdefault(frame, []).append(Detection(10.0, 20.0, 30.0, 0.9, label, kind=kind))
+    return tuple(detection_rows("cam", {frame: (frame / 10, seen) for frame, seen in sorted(at.items())}))
+
+
+def _labels(rows: tuple[str, ...]) -> list[tuple[int, str]]:
+    frame, label = (HEADER.split(",").index(name) for name in ("frame", "label"))
+    return [(int(row[frame]), row[label]) for row in csv.reader(rows)]
+
+
+def test_a_few_false_detections_do_not_cost_the_camera() -> None:
+    rows, removed, targets = rows_of_one_target(_rows(("p0", range(100)), ("p1", range(40, 44)), ("p2", range(70, 71))))
+    assert (removed, targets) == (5, 1)
+    assert _labels(rows) == [(frame, "person") for frame in range(100)]
+
+
+def test_a_track_that_was_lost_in_between_is_one_target() -> None:
+    rows, removed, targets = rows_of_one_target(
+        _rows(("p0", range(50)), ("p1", range(20, 22)), ("p2", range(52, 53)), ("p3", range(60, 100)))
+    )
+    assert (removed, targets) == (3, 1)
+    assert _labels(rows) == [(frame, "person") for frame in (*range(50), *range(60, 100))]
+
+
+def test_more_than_a_tenth_beside_it_is_a_second_target() -> None:
+    assert rows_of_one_target(_rows(("p0", range(100)), ("p1", range(20, 31)))) == ((), 0, 2)
+    assert rows_of_one_target(_rows(("p0", range(100)), ("p1", range(20, 30))))[1:] == (10, 1)
+    assert rows_of_one_target(_rows(("p0", range(9)), ("p1", range(9)), ("p2", range(9))))[2] == 3
+
+
+def test_one_label_and_none_stay_as_they_are() -> None:
+    one = _rows(("tag-3", range(5)), kind="corner")
+    assert rows_of_one_target(one) == (one, 0, 1)
+    assert rows_of_one_target(()) == ((), 0, 0)
