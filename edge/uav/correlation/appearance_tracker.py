@@ -11,12 +11,13 @@ import numpy as np
 
 from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
 from edge.uav.correlation.belief import Belief
-from edge.uav.correlation.candidate import Candidate, Kinematics
+from edge.uav.correlation.candidate import Kinematics
 from edge.uav.correlation.filter import CorrelationFilter, Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
+from edge.uav.correlation.redetection import Prediction, Redetection
 from edge.uav.correlation.scale import BoxFlow, ScaleFilter
-from edge.uav.correlation.search import Found, search, tile
+from edge.uav.correlation.search import search, tile
 from edge.uav.correlation.shape import Outline
 from edge.uav.correlation.velocity import VelocityFilter
 from edge.uav.image_motion.scene_motion import STILL, Motion, SceneMotion
@@ -25,14 +26,8 @@ from protocols.geometry.types import Floats
 
 _LEARN_INSIDE = 0.97  # share of the box in the image above which appearance, size and velocity are learnt
 _MEASURE_INSIDE = 0.6  # below it nothing is measured
-_MARGIN = 1.0  # log odds by which a re-detection must exceed the next best place
-_ANYWHERE = 0.03  # prior probability that the target is not near its prediction
-_PROPOSED = -1.0  # log prior of a place that another tracker has found
 _OBSERVE_EVERY, _OBSERVE_DOUBTFUL_EVERY = 6, 2  # frames between two looks at what lies around, surely on target or not
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
-_DETECTION = 0.25  # probability that one search finds a target in view
-_CHANGE = 0.1  # std of the similarity of a target that has been away
-_PEAK_SHARE = 0.55  # of the usual height of the filter's answer, at a re-detection
 _MOVES = 0.3  # speed over the scene at which a heading is given, in target lengths a second
 _LOST_STD, _LOST_AFTER_S = 8.0, 15.0  # in target lengths; as of the ground tracker
 _MAX_GROWTH = 8.0  # of a side since the first frame
@@ -41,12 +36,9 @@ _ANCHOR_GAIN = 0.02  # similarity to the first view that another size, shape or 
 _ANCHOR_STEP = 0.3  # share of the way to it
 _EXTENT_STEP = 0.3  # share of the way to the extent that the colours measure
 _TRIAL_SIZES = (0.9, 1.1)
-_FIRST_SIZES = (0.7, 0.84, 1.2, 1.4)  # of a place that is tested for the first time
 _LEARN_ABOVE = 1.0  # log likelihood ratio above which appearance is learnt
 _KEEP_EVERY = 5  # frames between two keyframes
 _RELOCATE_EVERY = 4  # frames between two attempts to recognise the scene
-_SIZES = (1.0, 0.87, 1.15)
-_ANGLES = (0.0, 0.0, 0.35, 0.0, -0.35, 0.0, 0.7, 0.0, -0.7, 0.0, 1.1, 0.0, -1.1, 0.0, 1.57)
 
 
 class AppearanceTracker:
@@ -82,14 +74,13 @@ class AppearanceTracker:
         self._unseen_s = 0.0
         self._scene.keep()
         self._last_sight, self._since_keyframe = (self.box, np.zeros(2)), np.eye(3)
-        self._near = 1.0 - _ANYWHERE
+        self._redetection = Redetection(self._size, self._memory, self._respond)
         self._ratio = 0.0
         self._broken = False  # whether the motion of the scene was unknown in a frame since the last sight
         self._expected: tuple[OrientedBox, bool] | None = None
         self._heading = float("nan")  # of the other tracker's estimate, at the last sight [rad]
         self._belief = Belief()
         self._searching = False
-        self._candidate: Candidate | None = None
         return self._estimate(time)
 
     def handle_telemetry(self, sample: Telemetry) -> None:
@@ -156,8 +147,7 @@ class AppearanceTracker:
             turn = float(np.arctan2(linear[1, 0], linear[0, 0]))
             if self._missed == 0:
                 box = box.sized(box.sides * motion.zoom).turned(turn)
-            if self._candidate is not None:
-                self._candidate.move(motion, self._scene.reach, dt)
+            self._redetection.move(motion, self._scene.reach, dt)
         if self._missed:
             self._broken |= not motion.trusted
             angle = self._turn_rate * dt
@@ -172,8 +162,8 @@ class AppearanceTracker:
         self.box = box.at(origin + self._motion_filter.predict(dt, self.length))
         if self._expected is not None:
             (expected, found), self._expected = self._expected, None
-            if found and self._candidate is None and self._missed % 2:
-                self._candidate = Candidate(expected, _PROPOSED, self._kinematics())
+            if found and self._searching:
+                self._redetection.propose(expected, self._prediction())
             elif not found:
                 self.box = box.at(expected.centre)
         return origin
@@ -213,7 +203,7 @@ class AppearanceTracker:
             self._observe_background(image, box)
 
     def _accept(self, image: Image, box: OrientedBox, score: float, peak: float, dt: float) -> None:
-        self._missed, self._unseen_s, self._near = 0, 0.0, 1.0 - _ANYWHERE
+        self._missed, self._unseen_s = 0, 0.0
         self._broken = False
         if box.share_inside(self._size) > _LEARN_INSIDE:
             self._motion_filter.correct(box.centre - self.box.centre, self.length)
@@ -287,80 +277,27 @@ class AppearanceTracker:
                 self._memory.observe_rival(max(away))
 
     def _miss(self, dt: float) -> None:
+        if self._missed == 0:
+            self._redetection = Redetection(self._size, self._memory, self._respond)
         self._missed += 1
         self._unseen_s += dt
-        self._candidate = None
 
     def _look_for(self, image: Image, dt: float) -> None:
         """Search for the target where it can be."""
         self._missed += 1
         self._unseen_s += dt
-        if self._candidate is not None:
-            self._test(image, dt)
-            return
-        k = self._missed
-        box = self.box.sized(self.box.sides * _SIZES[k // 2 % len(_SIZES)]).turned(_ANGLES[k // 2 % len(_ANGLES)])
-        reach = 2.5 * self.std + 0.3 * box.sides
-        if k % 2:
-            box, reach = tile(box, self._size, k // 2)
-        found = search(image, self._memory, box, reach)
-        if found:
-            self._consider(image, found, dt)
-        if k % 2 == 0:
-            # Where it was expected and is not seen, it is less and less likely to be.
-            self._near *= 1.0 - _DETECTION * self.box.share_within(reach, self._size)
-
-    def _log_prior(self, place: Floats) -> float:
-        """Log probability that the target is in the box about ``place`` (2,): near the prediction, or anywhere."""
-        area = float(self.box.width * self.box.height)
-        variance = self.std**2
-        squared = float(np.square(place - self.box.centre).sum()) / variance
-        share = self._near / (self._near + _ANYWHERE)
-        # Student's t with two degrees of freedom: what turns or brakes leaves the Gaussian.
-        near = np.log(share + 1e-12) - 2.0 * np.log1p(0.5 * squared) + np.log(min(area / (2.0 * np.pi * variance), 1.0))
-        return float(np.logaddexp(near, np.log((1.0 - share) * area / (self._size[0] * self._size[1]))))
-
-    def _consider(self, image: Image, found: list[Found], dt: float) -> None:
-        """Take up the likeliest of the places found, if it is likelier by far than any other."""
-        odds = [self._memory.log_ratio(f.score, _CHANGE) + self._log_prior(f.box.centre) for f in found]
-        order = np.argsort(odds)[::-1]
-        best = int(order[0])
-        self.debug = {"score": found[best].score, "odds": odds[best], "near": self._near}
-        if len(odds) > 1 and odds[best] - odds[int(order[1])] < _MARGIN:
-            return
-        self._candidate = Candidate(found[best].box, self._log_prior(found[best].box.centre), self._kinematics())
-        self._test(image, dt)
-
-    def _test(self, image: Image, dt: float) -> None:
-        """Add a frame's evidence to the candidate's odds; take it for the target, or drop it."""
-        candidate = self._candidate
-        assert candidate is not None
-        box, answer = self._respond(image, candidate.box)
-        if candidate.hits == 0:
-            # Before another size or angle is believed: the last one, localised about the same place.
-            same, same_answer = self._respond(image, self.box.at(candidate.box.centre))
-            if self._memory.score(image, same) > self._memory.score(image, box):
-                box, answer = same, same_answer
-        trials = [box, *(box.sized(f * box.sides) for f in (_TRIAL_SIZES if candidate.hits else _FIRST_SIZES))]
-        scores = [self._memory.score(image, trial) for trial in trials]
-        score, box = max(scores), trials[int(np.argmax(scores))]
-        evidence = self._memory.log_ratio(score, _CHANGE, answer.log_ratio)
-        self.debug |= {"score": score, "llr": evidence, "ratio": answer.ratio, "prior": candidate.prior}
-        candidate.add(box, evidence, dt, self.length)
-        weak = evidence < 0.0 or answer.peak < _PEAK_SHARE * self._peak or box.share_inside(self._size) < _MEASURE_INSIDE
-        if weak or candidate.hopeless:
-            self._candidate = None
-        elif candidate.accepted:
-            self._candidate = None
+        found = self._redetection.look(image, self._prediction(), dt)
+        self.debug = self._redetection.debug
+        if found is not None:
             self._missed, self._unseen_s, self._searching = 0, 0.0, False
-            self.box = box
-            self._motion_filter.restart(*candidate.velocity(self.length), self.length)
-            self._belief = Belief(candidate.log_odds)
-            self._near = 1.0 - _ANYWHERE
-            self._flow.remember(image, box)
+            self.box = found.box
+            self._motion_filter.restart(*found.velocity(), self.length)
+            self._belief = Belief(found.log_odds)
+            self._flow.remember(image, self.box)
 
-    def _kinematics(self) -> Kinematics:
-        return Kinematics(self._motion_filter.velocity, self._motion_filter.velocity_std, self.length)
+    def _prediction(self) -> Prediction:
+        motion = Kinematics(self._motion_filter.velocity, self._motion_filter.velocity_std, self.length)
+        return Prediction(self.box, self.std, motion, self._missed, self._unseen_s)
 
     def _outline(self) -> Floats:
         """x0, y0, x1, y1 about the target [px]."""

@@ -10,14 +10,14 @@ from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.image_motion.scene_motion import Motion
 from protocols.geometry.types import Floats
 
-_ACCEPT = 1.0  # log odds of a re-detection
+_ACCEPT = 2.0  # log odds of a re-detection
 _TENTATIVE = -3.0  # log odds below which a place is not tested further
 _MAX_TESTS = 8  # frames for which a place is tested
 _HITS = 3  # consecutive frames of a re-detection
 _PLACE_STD = 0.05  # of a place measured twice, in target lengths
 _KEEPS, _TURNS, _STOPS = 0.75, 0.15, 0.1  # probabilities of what a target has done while away
 _STILL, _STILL_STD = 0.5, 0.1  # share of the look-alikes that stand, and std of their speed, in lengths a second
-_SLOWEST = 0.5  # std of the speed of what moves, at least, in lengths a second
+_SLOWEST = 0.35  # std of the velocity of what moves, at least, one coordinate, in lengths a second
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Kinematics:
 
         velocity: (2,) measured with ``std``, one coordinate [px/s].
         """
-        wide = max(float(np.hypot(*self.velocity)), _SLOWEST * self.length) / np.sqrt(2.0)
+        wide = np.sqrt(0.5 * np.square(self.velocity).sum() + self.std**2 + (_SLOWEST * self.length) ** 2)
         keeps = _normal(velocity - self.velocity, np.hypot(self.std, std))
         moves = _normal(velocity, np.hypot(wide, std))
         stands = _normal(velocity, np.hypot(_STILL_STD * self.length, std))
@@ -70,7 +70,7 @@ class Candidate:
         moved = self.box.at(self.origin + speed * dt).sized(self.box.sides * motion.zoom)
         self.box = moved.turned(float(np.arctan2(linear[1, 0], linear[0, 0])))
 
-    def add(self, box: OrientedBox, evidence: float, dt: float, length: float) -> None:
+    def add(self, box: OrientedBox, evidence: float, dt: float) -> None:
         """Add one frame: where it was found, and its log likelihood ratio.
 
         Further frames show the same look-alike, if it is one: they make the evidence surer, not larger.
@@ -82,16 +82,20 @@ class Candidate:
             self.moved = self.moved + box.centre - self.origin
             self.time += dt
 
-    def velocity(self, length: float) -> tuple[Floats, float]:
+    def covers(self, other: OrientedBox) -> bool:
+        """Whether another box is about the same place."""
+        return bool((np.abs(self.box.centre - other.centre) < 0.5 * np.maximum(self.box.extent, other.extent)).all())
+
+    def velocity(self) -> tuple[Floats, float]:
         """Over the scene (2,), and its std, one coordinate [px/s]; as expected where it was seen once."""
         if self.time == 0.0:
             return self.expected.velocity, self.expected.std
-        return self.moved / self.time, np.sqrt(2.0) * (_PLACE_STD * length + 0.3) / self.time
+        return self.moved / self.time, np.sqrt(2.0) * (_PLACE_STD * self.expected.length + 0.3) / self.time
 
     @property
     def log_odds(self) -> float:
         """That it is the target: by its place, what it looks like, and how it moves."""
-        motion = self.expected.log_ratio(*self.velocity(self.expected.length)) if self.time else 0.0
+        motion = self.expected.log_ratio(*self.velocity()) if self.time else 0.0
         return self.prior + self.evidence + motion
 
     @property

@@ -45,7 +45,6 @@ class Response:
     peak: float
     ratio: float
 
-
     @property
     def log_ratio(self) -> float:
         """log p(ratio | on the target) - log p(ratio | on the background), natural, bounded."""

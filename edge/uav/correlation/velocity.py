@@ -10,7 +10,7 @@ import numpy as np
 
 from protocols.geometry.types import Floats
 
-_ACCELERATION = 0.4  # power spectral density, in squared target lengths a second cubed
+_ACCELERATION = 0.8  # power spectral density, in squared target lengths a second cubed
 _NOISE, _NOISE_PX = 0.03, 0.3  # std of one measured place, in target lengths and pixels
 _SCENE_DRIFT = 0.05  # std of the scene's chained motion after a second, in target lengths
 _FIRST_SPEED = 1.5  # std of the velocity before anything was measured, in target lengths a second
