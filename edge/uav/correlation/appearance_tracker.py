@@ -205,8 +205,9 @@ class AppearanceTracker:
     def _accept(self, image: Image, box: OrientedBox, score: float, peak: float, dt: float) -> None:
         self._missed, self._unseen_s = 0, 0.0
         self._broken = False
-        if box.share_inside(self._size) > _LEARN_INSIDE:
-            self._motion_filter.correct(box.centre - self.box.centre, self.length)
+        inside = box.share_inside(self._size)
+        self._motion_filter.correct(box.centre - self.box.centre, self.length, 1.0 - inside)
+        if inside > _LEARN_INSIDE:
             wider, higher, turn = self._flow.change(image, box.centre)
             box = box.sized(box.sides * [wider, higher]).turned(turn)
             self._turn_rate += min(1.0, 4.0 * dt) * (turn / dt - self._turn_rate)
@@ -224,8 +225,6 @@ class AppearanceTracker:
                 self._scene.keep()
                 self._since_keyframe = np.eye(3)
             self._last_sight = box, self._motion_filter.velocity
-        else:
-            self._motion_filter.fix(self.length)
         self.box = box
         self._flow.remember(image, box)
 

@@ -27,7 +27,7 @@ _CHANGE = 0.1  # std of the similarity of a target that has been away
 _MIN_INSIDE = 0.6  # share of a place in the image
 _TRIAL_SIZES = (0.9, 1.1)
 _FIRST_SIZES = (0.7, 0.84, 1.2, 1.4)  # of a place that is tested for the first time
-_SIZES = (1.0, 0.87, 1.15)
+_SIZES = (1.0, 0.87, 1.15, 0.75, 1.33)
 _ANGLES = (0.0, 0.0, 0.35, 0.0, -0.35, 0.0, 0.7, 0.0, -0.7, 0.0, 1.1, 0.0, -1.1, 0.0, 1.57)
 
 Localise = Callable[[Image, OrientedBox], tuple[OrientedBox, Response]]
@@ -35,7 +35,7 @@ Localise = Callable[[Image, OrientedBox], tuple[OrientedBox, Response]]
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Where the target is predicted: box; std of its centre, one coordinate [px]; how it moves; since when it is away."""
+    """Where the target is predicted: box; std of its centre, one coordinate [px]; how it moves; how long it is away."""
 
     box: OrientedBox
     std: float

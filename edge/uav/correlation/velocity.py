@@ -55,18 +55,13 @@ class VelocityFilter:
         self._covariance = move @ self._covariance @ move.T + noise
         return np.asarray(step)
 
-    def correct(self, offset: Floats, length: float) -> None:
-        """Measured at ``offset`` (2,) from the predicted place [px]."""
-        variance = (_NOISE * length + _NOISE_PX) ** 2
+    def correct(self, offset: Floats, length: float, cut: float) -> None:
+        """Measured at ``offset`` (2,) from the predicted place [px]; cut: share of the target beyond the border."""
+        variance = ((_NOISE + cut) * length + _NOISE_PX) ** 2
         gain = self._covariance[:, 0] / (self._covariance[0, 0] + variance)
         self.velocity = self.velocity + gain[1] * offset
         self._lag = (gain[0] - 1.0) * offset
         self._covariance = self._covariance - np.outer(gain, self._covariance[0])
-
-    def fix(self, length: float) -> None:
-        """The place is known again, by a measurement that says nothing about the velocity."""
-        self._covariance[0] = (_NOISE * length + _NOISE_PX) ** 2, 0.0
-        self._covariance[1, 0] = 0.0
 
     def restart(self, velocity: Floats, std: float, length: float) -> None:
         """The target was found again with this velocity (2,) and its std [px/s]."""
